@@ -1,0 +1,1 @@
+"""Chapter 3: projective geometry as pure functions of arrays."""

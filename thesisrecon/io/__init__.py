@@ -1,0 +1,1 @@
+"""Files: photographs, COLMAP models, the run directory."""

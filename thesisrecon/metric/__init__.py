@@ -1,0 +1,1 @@
+"""After chapter 7: postponed cameras, metric refinement, intervals and the self-check."""

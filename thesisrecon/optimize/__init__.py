@@ -1,0 +1,1 @@
+"""Levenberg-Marquardt and sparse bundle adjustment."""

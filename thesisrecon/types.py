@@ -1,0 +1,229 @@
+"""The records that travel between the stages.
+
+Frozen dataclasses around plain NumPy arrays; the mathematics takes and returns plain arrays.
+Conventions: ``xy`` are pixels, x right, y down, (0, 0) the centre of the top-left pixel;
+``P = K [R t]`` with R world-to-camera; ``x2' F x1 = 0``; views, points and observations are
+numbered i, j, k. A view's number is its place in the sorted list of photographs and never changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
+B8 = NDArray[np.bool_]
+
+Stratum = Literal["projective", "affine", "metric"]
+
+
+@dataclass(frozen=True)
+class Image:
+    """One photograph at working size.
+
+    ``rgb`` (H, W, 3) uint8; ``original_size`` (width, height) of the file after EXIF rotation.
+    """
+
+    name: str
+    rgb: NDArray[np.uint8]
+    original_size: tuple[int, int]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) at working size."""
+        return self.rgb.shape[1], self.rgb.shape[0]
+
+    @property
+    def gray(self) -> F32:
+        """(H, W) float32 luminance, 0 to 255 (ITU-R BT.601 weights)."""
+        weights = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+        return np.ascontiguousarray(self.rgb.astype(np.float32) @ weights)
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Corners of several scales with a small normalised patch each: matched without a search radius.
+
+    ``xy`` (S, 2) px; ``scale`` (S,) px per sample unit of the level they were found on; ``angle`` (S,) rad of
+    the patch (0 = upright); ``patches`` (S, D) float32, zero mean and unit norm.
+    """
+
+    xy: F64
+    scale: F32
+    angle: F32
+    patches: F32
+
+
+@dataclass(frozen=True)
+class Features:
+    """Corners of one photograph: ``xy`` (N, 2) px, ``scale`` (N,), ``response`` (N,) float32, strongest first."""
+
+    xy: F64
+    scale: F32
+    response: F32
+    seeds: Seeds | None = None
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Corners of view i taken for the same scene point as corners of view j.
+
+    ``index1, index2`` (M,) into ``Features.xy``, each corner at most once; ``xy1, xy2`` (M, 2) px the positions
+    after sub-pixel alignment of the pair; ``score`` (M,) correlation in [-1, 1]; ``affine`` (M, 2, 2) the local
+    map of image 1 to image 2 around the match (identity where it was not estimated).
+    """
+
+    i: int
+    j: int
+    index1: I64
+    index2: I64
+    xy1: F64
+    xy2: F64
+    score: F32
+    affine: F64
+
+
+@dataclass(frozen=True)
+class FundamentalFit:
+    """A robust estimate of F: ``F`` (3, 3) unit Frobenius norm, ``inliers`` (M,) bool, ``sigma_px`` the standard
+    deviation of one image coordinate estimated from the inliers, ``covariance`` (9, 9) of vec(F) row-major."""
+
+    F: F64
+    inliers: B8
+    sigma_px: float
+    covariance: F64
+    iterations: int = 0
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """A pair of views with its epipolar geometry; the arrays hold the verified matches only.
+
+    ``accepted`` says whether the pair enters the tracks, ``reason`` why not. ``homography_share`` is the share of
+    the verified matches that one homography explains (near 1: a plane or a pure rotation).
+    """
+
+    i: int
+    j: int
+    F: F64
+    sigma_px: float
+    index1: I64
+    index2: I64
+    xy1: F64
+    xy2: F64
+    affine: F64
+    candidates: int
+    homography_share: float
+    accepted: bool
+    reason: str = ""
+
+    @property
+    def inliers(self) -> int:
+        """Number of verified matches."""
+        return len(self.xy1)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of scene points: K of them, sorted by (point, view).
+
+    ``view_index, point_index`` (K,), ``xy`` (K, 2) px. A point is seen at most once in a view.
+    """
+
+    view_index: I64
+    point_index: I64
+    xy: F64
+    n_views: int
+    n_points: int
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Cameras and points in one stratum, with the tracks they explain.
+
+    ``P`` (V, 3, 4) (zeros where not ``registered``), ``X`` (N, 4) homogeneous (zeros where not ``valid``);
+    ``inlier`` (K,) bool per observation; ``reasons`` per view, empty where registered. In the metric stratum
+    ``P = K [R t]`` before distortion, ``K`` (V, 3, 3) and ``k1`` (V,): a normalised image point (x, y) is seen at
+    (x, y) (1 + k1 (x^2 + y^2)) before K; ``X[:, 3] = 1`` where valid.
+    """
+
+    stratum: Stratum
+    P: F64
+    X: F64
+    registered: B8
+    valid: B8
+    inlier: B8
+    tracks: Tracks
+    sizes: I64
+    sigma_px: float
+    reasons: tuple[str, ...]
+    K: F64 | None = None
+    k1: F64 | None = None
+
+
+@dataclass(frozen=True)
+class Upgrade:
+    """One candidate answer of self-calibration: ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) (zeros where not
+    registered), the ``cost`` it reached and the ``method`` it came from."""
+
+    metric_from_projective: F64
+    K: F64
+    cost: float
+    method: str
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """The answer of chapter 7: the best upgrade, its rivals (best first, the best included), and how sure it is.
+
+    ``K_std`` (V, 3, 3) standard deviations; ``identifiable`` False where the motion does not determine the
+    answer, with ``reasons``.
+    """
+
+    metric_from_projective: F64
+    K: F64
+    K_std: F64
+    identifiable: bool
+    reasons: tuple[str, ...]
+    candidates: tuple[Upgrade, ...] = ()
+
+
+@dataclass(frozen=True)
+class IntrinsicInterval:
+    """One intrinsic of one view: value and standard deviation (px, or pure number for k1) and where it is from."""
+
+    value: float
+    std: float
+    source: str
+
+
+@dataclass(frozen=True)
+class MetricResult:
+    """The end of the metric stage: the reconstruction, the intrinsics of each view with intervals, the self-check.
+
+    ``intrinsics[i]`` maps "focal_px", "principal_x_px", "principal_y_px", "k1" to an interval (empty where view i is
+    not registered); ``self_check`` holds measured numbers; ``trusted`` False with ``doubts`` where it failed.
+    """
+
+    reconstruction: Reconstruction
+    intrinsics: tuple[Mapping[str, IntrinsicInterval], ...]
+    self_check: Mapping[str, float]
+    trusted: bool
+    doubts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """What one stage did: seconds, counts, metrics (name -> number), warnings (sentences)."""
+
+    stage: str
+    seconds: float
+    counts: Mapping[str, int] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()

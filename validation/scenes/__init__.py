@@ -1,0 +1,1 @@
+"""Cross-checks of thesisrecon against reference tools and truth."""
