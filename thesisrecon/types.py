@@ -227,3 +227,12 @@ class StageReport:
     counts: Mapping[str, int] = field(default_factory=dict)
     metrics: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FocalPrior:
+    """What the user says of the focal length: ``focal_px`` (V,) NaN = unknown, ``std_rel`` its relative standard
+    deviation (the weight). Nothing is assumed of a focal without one."""
+
+    focal_px: F64
+    std_rel: float
