@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,11 @@ class Image:
     def size(self) -> tuple[int, int]:
         """(width, height) at working size."""
         return self.rgb.shape[1], self.rgb.shape[0]
+
+    @property
+    def scale(self) -> float:
+        """Working pixels per original pixel, the same along x and y: ``xy = (xy_original + 0.5) scale - 0.5``."""
+        return max(self.size) / max(self.original_size)
 
     @property
     def gray(self) -> F32:
@@ -236,3 +242,32 @@ class FocalPrior:
 
     focal_px: F64
     std_rel: float
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Everything one run found; what lies beyond ``until`` or could not be made is None.
+
+    ``images`` are the V views at working size, ``features`` one per view, ``pairs`` every pair that was matched,
+    accepted or not. ``refused`` maps the photographs that never became a view to the reason; a view that was not
+    registered has its reason in ``metric.reconstruction.reasons``. ``groups`` (V,) is the camera number of each
+    view. ``reports`` holds one record per stage, ``settings`` the configuration as plain tables (stage -> field ->
+    value), ``summary`` what ``summary.json`` says. All coordinates are pixels at working size; ``summary`` and the
+    exported model are in original pixels. ``failure`` is the sentence that ended the run early, empty otherwise.
+    """
+
+    out: Path
+    images: tuple[Image, ...]
+    refused: Mapping[str, str]
+    features: tuple[Features, ...]
+    pairs: tuple[TwoView, ...]
+    groups: I64
+    settings: Mapping[str, Mapping[str, Any]]
+    tracks: Tracks | None = None
+    projective: Reconstruction | None = None
+    calibration: SelfCalibration | None = None
+    metric: MetricResult | None = None
+    reports: tuple[StageReport, ...] = ()
+    warnings: tuple[str, ...] = ()
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    failure: str = ""
