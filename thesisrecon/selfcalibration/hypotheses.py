@@ -1,0 +1,219 @@
+"""Chapter 7 as a whole: many hypotheses, one refinement, the survivors with their order.
+
+Every closed form of the chapter fails on some photographs; together they do not. All of them only propose; what
+decides is one robust criterion over all cameras, cheirality, and later the metric bundle adjustment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.selfcalibration.focal_scan import plane_from_focals
+from thesisrecon.selfcalibration.frame import ReferenceFrame, build_frame, metric_from_reference
+from thesisrecon.selfcalibration.infinity_search import InfinitySearch
+from thesisrecon.selfcalibration.quadric import quadric_hypotheses
+from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std, refine_hypotheses
+from thesisrecon.selfcalibration.verdict import identifiability
+from thesisrecon.types import FocalPrior, I64, Reconstruction, SelfCalibration, Upgrade
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HypothesesAndRefinement:
+    """Self-calibration of square-pixel cameras with an unknown focal each or in common.
+
+    ``focal_range`` (in long sides) and ``focal_steps`` of the scans; ``subsets`` random camera subsets for the
+    quadric; ``refined`` hypotheses that are refined; ``kept`` answers that go on to bundle adjustment;
+    ``min_positive`` share of points in front that an answer needs; ``search`` Hartley's search, None to leave it out.
+    """
+
+    focal_range: tuple[float, float] = (0.3, 10.0)
+    focal_steps: int = 33
+    subsets: int = 6
+    refined: int = 40
+    kept: int = 3
+    min_positive: float = 0.95
+    criterion: RotationCriterion = RotationCriterion()
+    search: InfinitySearch | None = InfinitySearch()
+
+    def calibrate(
+        self, reconstruction: Reconstruction, *, groups: I64, focal_prior: FocalPrior | None, rng: np.random.Generator
+    ) -> SelfCalibration:
+        """Upgrade a projective reconstruction of at least three cameras; ``StageFailure`` where nothing holds."""
+        require_cameras(reconstruction)
+        frame = build_frame(reconstruction, groups)
+        criterion = criterion_with_prior(self.criterion, frame, focal_prior)
+        planes, log_f = self._propose(frame, reconstruction, rng)
+        cost = np.nan_to_num(criterion.cost(frame, planes, log_f), nan=np.inf)
+        best = np.argsort(cost, kind="stable")[: self.refined]
+        theta = np.concatenate([planes[best], log_f[best]], axis=1)
+        theta, cost = refine_hypotheses(criterion, frame, theta)
+        return conclude(frame, reconstruction, criterion, (theta, cost), kept=self.kept, min_positive=self.min_positive)
+
+    def _propose(
+        self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
+    ) -> tuple[F64, F64]:
+        """Hypotheses (p (B, 3), log focal per group (B, G)) of every method."""
+        focals = np.geomspace(*self.focal_range, self.focal_steps)
+        found = [quadric_hypotheses(frame, focals)]
+        others = np.delete(np.arange(len(frame.views)), frame.reference)
+        for _ in range(self.subsets if len(others) > 3 else 0):
+            size = int(rng.integers(3, len(others)))
+            chosen = np.sort(np.append(rng.choice(others, size, replace=False), frame.reference))
+            found.append(quadric_hypotheses(frame.subset(chosen), focals[::4]))
+        for other in others:
+            f1, f2 = self._focal_pairs(focals, frame.group[other] == frame.group[frame.reference])
+            found.append((plane_from_focals(frame, int(other), f1, f2), np.concatenate([f1, f1])))
+        if self.search is not None:
+            found.append(self.search.search(frame, reconstruction, rng))
+        p = np.concatenate([part[0] for part in found])
+        f = np.concatenate([part[1] for part in found])
+        good = np.isfinite(p).all(axis=1) & np.isfinite(f)
+        return p[good], focals_of_groups(frame, p[good], f[good])
+
+    def _focal_pairs(self, focals: F64, same_camera: bool) -> tuple[F64, F64]:
+        if same_camera:
+            return focals, focals
+        first, second = np.meshgrid(focals[::2], focals[::2])
+        return first.ravel(), second.ravel()
+
+
+def require_cameras(reconstruction: Reconstruction) -> None:
+    """``StageFailure`` below three registered cameras."""
+    n = int(reconstruction.registered.sum())
+    if n < 3:
+        raise StageFailure(
+            "self-calibration needs at least 3 photographs that are tied together",
+            f"{n} could be registered",
+            "add photographs with more overlap",
+        )
+
+
+def criterion_with_prior(
+    criterion: RotationCriterion, frame: ReferenceFrame, focal_prior: FocalPrior | None
+) -> RotationCriterion:
+    """The criterion with the user's word on the focal in place of the weak pull."""
+    if focal_prior is None:
+        return criterion
+    unit_focal = focal_prior.focal_px[frame.views] / frame.pixel_from_unit[frame.views, 0, 0]
+    if not np.isfinite(unit_focal).any():
+        return criterion
+    mean = float(np.nanmedian(np.log(unit_focal)))
+    noise = 0.01
+    return RotationCriterion(criterion.scale, mean, focal_prior.std_rel, noise)
+
+
+def focals_of_groups(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
+    """Log focals (B, G) that suit planes p (B, 3) and reference focals (B,).
+
+    From w*_i = H_i K_r K_r' H_i': f_i^2 = (w11 + w22) / (2 w33); a group takes the median of its cameras, the
+    reference camera's group its own focal.
+    """
+    f = np.clip(f_reference, 0.05, 50.0)
+    H = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
+    H[..., :2] *= f[:, None, None, None]
+    ww = np.sum(H**2, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_f = 0.5 * np.log((ww[..., 0] + ww[..., 1]) / (2.0 * ww[..., 2]))
+    log_f = np.clip(np.nan_to_num(log_f, nan=0.0, posinf=3.0, neginf=-3.0), -3.0, 3.9)
+    groups = np.stack([np.median(log_f[:, frame.group == g], axis=1) for g in range(frame.n_groups)], axis=1)
+    groups[:, frame.group[frame.reference]] = np.log(f)
+    return groups
+
+
+def conclude(
+    frame: ReferenceFrame,
+    reconstruction: Reconstruction,
+    criterion: RotationCriterion,
+    refined: tuple[F64, F64],
+    *,
+    kept: int,
+    min_positive: float,
+) -> SelfCalibration:
+    """Distinct refined answers with the scene in front of the cameras, best first, and the verdict on the motion."""
+    theta, cost = refined
+    upgrades: list[Upgrade] = []
+    thetas: list[F64] = []
+    for b in np.argsort(cost, kind="stable"):
+        if len(upgrades) == kept or not np.isfinite(cost[b]):
+            break
+        if any(np.abs(theta[b, 3:] - t[3:]).max() < 0.03 for t in thetas):
+            continue
+        upgrade = _upgrade(frame, reconstruction, theta[b], float(cost[b]), min_positive)
+        if upgrade is not None:
+            upgrades.append(upgrade)
+            thetas.append(theta[b])
+    if not upgrades:
+        raise StageFailure(
+            "no camera calibration puts the scene in front of all cameras",
+            f"{len(theta)} hypotheses were refined over {len(frame.views)} cameras",
+            "photograph the scene from more directions, turning the camera between shots",
+        )
+    std_log_f, noise = focal_std(criterion, frame, thetas[0])
+    identifiable, reasons = identifiability(frame, thetas[0], std_log_f, noise)
+    K_std = np.zeros_like(upgrades[0].K)
+    K_std[frame.views, 0, 0] = K_std[frame.views, 1, 1] = (
+        upgrades[0].K[frame.views, 0, 0] * np.minimum(std_log_f[frame.group], 1e3)
+    )
+    best = upgrades[0]
+    return SelfCalibration(best.metric_from_projective, best.K, K_std, identifiable, reasons, tuple(upgrades))
+
+
+def _upgrade(
+    frame: ReferenceFrame, reconstruction: Reconstruction, theta: F64, cost: float, min_positive: float
+) -> Upgrade | None:
+    f = np.exp(theta[3:])[frame.group]
+    G = metric_from_reference(theta[:3], float(f[frame.reference])) @ frame.reference_from_projective
+    if not np.isfinite(G).all() or abs(np.linalg.det(G)) < 1e-300:
+        return None
+    keep = reconstruction.inlier
+    view, point = reconstruction.tracks.view_index[keep], reconstruction.tracks.point_index[keep]
+    P = reconstruction.P @ np.linalg.inv(G)
+    P *= np.where(np.linalg.det(P[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
+    X = reconstruction.X @ G.T
+    in_front = np.einsum("kj,kj->k", P[view, 2], X[point]) * X[point, 3] > 0
+    share = float(in_front.mean())
+    if share < 0.5:
+        G = np.diag([-1.0, -1.0, -1.0, 1.0]) @ G
+        share = 1.0 - share
+    if share < min_positive:
+        return None
+    K = np.zeros((len(reconstruction.P), 3, 3))
+    unit = np.zeros((len(frame.views), 3, 3))
+    unit[:, 0, 0] = unit[:, 1, 1] = f
+    unit[:, 2, 2] = 1.0
+    K[frame.views] = frame.pixel_from_unit[frame.views] @ unit
+    return Upgrade(G, K, cost, "refined")
+
+
+@dataclass(frozen=True)
+class HartleySearch:
+    """Section 7.7 as the thesis has it: cheirality bounds, grid search, the best plane, one nonlinear refinement."""
+
+    search: InfinitySearch = InfinitySearch(steps=20, keep=1)
+    criterion: RotationCriterion = RotationCriterion()
+
+    def calibrate(
+        self, reconstruction: Reconstruction, *, groups: I64, focal_prior: FocalPrior | None, rng: np.random.Generator
+    ) -> SelfCalibration:
+        """Upgrade by Hartley's search alone; ``StageFailure`` where the inequalities leave no plane."""
+        require_cameras(reconstruction)
+        frame = build_frame(reconstruction, groups)
+        criterion = criterion_with_prior(self.criterion, frame, focal_prior)
+        p, f = self.search.search(frame, reconstruction, rng)
+        if len(p) == 0:
+            raise StageFailure(
+                "Hartley's search found no plane at infinity",
+                "no plane leaves all points and cameras on one side with a real image of the absolute conic",
+                "use the default preset, which does not depend on every single point being right",
+            )
+        theta = np.concatenate([p, focals_of_groups(frame, p, f)], axis=1)
+        refined = refine_hypotheses(criterion, frame, theta)
+        return conclude(frame, reconstruction, criterion, refined, kept=1, min_positive=0.5)
+
+

@@ -1,0 +1,141 @@
+"""Refinement of (plane at infinity, focals): one criterion for the hypotheses of every method.
+
+With C_i = K_i^-1 (A_i - a_i p') K_r every right hypothesis makes C_i a scaled rotation. The residuals are the six
+entries of 3 C C' / tr(C C') - I, the nonlinear criterion of Pollefeys et al. (IJCV 32(1), 1999) in its
+scale-free form; the focals are log f per camera group. Many hypotheses are refined at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.selfcalibration.frame import ReferenceFrame
+
+F64 = NDArray[np.float64]
+
+_UPPER = np.triu_indices(3)
+_ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
+
+
+@dataclass(frozen=True)
+class RotationCriterion:
+    """How far the upgraded cameras are from scaled rotations, robustly.
+
+    ``scale``: residual norm of a camera beyond which it counts linearly (soft L1). ``focal_log_mean`` and
+    ``focal_log_std`` with ``focal_weight``: a weak pull of every log focal (in long sides) that keeps hypotheses
+    out of the absurd and is far below the noise of a well-determined problem.
+    """
+
+    scale: float = 0.05
+    focal_log_mean: float = 0.2
+    focal_log_std: float = 1.0
+    focal_weight: float = 2e-3
+
+    def camera_residuals(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
+        """p (B, 3), log_f (B, G) -> (B, R, 6) weighted entries of 3CC'/tr(CC') - I."""
+        f = np.exp(log_f)[:, frame.group]
+        C = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
+        C[..., :2] *= f[:, frame.reference, None, None, None]
+        C[..., :2, :] /= f[..., None, None]
+        CC = C @ C.swapaxes(-1, -2)
+        trace = np.trace(CC, axis1=-2, axis2=-1)[..., None, None]
+        E = 3.0 * CC / np.maximum(trace, 1e-300) - np.eye(3)
+        return E[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT
+
+    def cost(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
+        """Robust cost per camera of each hypothesis; (B,)."""
+        norm2 = np.sum(self.camera_residuals(frame, p, log_f) ** 2, axis=-1)
+        robust = 2.0 * self.scale**2 * (np.sqrt(1.0 + norm2 / self.scale**2) - 1.0)
+        pull = self._pull(log_f)
+        return robust.sum(axis=1) / len(frame.views) + np.sum(pull**2, axis=1) / pull.shape[1]
+
+    def _pull(self, log_f: F64) -> F64:
+        return self.focal_weight * (log_f - self.focal_log_mean) / self.focal_log_std
+
+    def weighted_residuals(self, frame: ReferenceFrame, theta: F64, weights: F64) -> F64:
+        """Residual vectors (B, 6 R + G) of theta = (p, log f) with fixed robust weights (B, R)."""
+        residuals = self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) * weights[..., None]
+        scale = np.sqrt(len(frame.views) / (theta.shape[1] - 3.0))
+        return np.concatenate([residuals.reshape(len(theta), -1), scale * self._pull(theta[:, 3:])], axis=1)
+
+    def weights(self, frame: ReferenceFrame, theta: F64) -> F64:
+        """Square roots of the soft-L1 weights of each camera, (B, R)."""
+        norm2 = np.sum(self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) ** 2, axis=-1)
+        return (1.0 + norm2 / self.scale**2) ** -0.25
+
+
+def _jacobian(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, weights: F64) -> F64:
+    n = theta.shape[1]
+    steps = 1e-6 * (1.0 + np.abs(theta))
+    columns = []
+    for k in range(n):
+        shifted_up, shifted_down = theta.copy(), theta.copy()
+        shifted_up[:, k] += steps[:, k]
+        shifted_down[:, k] -= steps[:, k]
+        difference = criterion.weighted_residuals(frame, shifted_up, weights) - criterion.weighted_residuals(
+            frame, shifted_down, weights
+        )
+        columns.append(difference / (2.0 * steps[:, k, None]))
+    return np.stack(columns, axis=-1)
+
+
+def refine_hypotheses(
+    criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, *, iterations: int = 25
+) -> tuple[F64, F64]:
+    """Levenberg-Marquardt on every row of theta (B, 3 + G) at once; -> refined theta and cost (B,)."""
+    theta = theta.copy()
+    damping = np.full(len(theta), 1e-3)
+    cost = criterion.cost(frame, theta[:, :3], theta[:, 3:])
+    for _ in range(iterations):
+        weights = criterion.weights(frame, theta)
+        r = criterion.weighted_residuals(frame, theta, weights)
+        J = _jacobian(criterion, frame, theta, weights)
+        N = np.einsum("bri,brj->bij", J, J)
+        g = np.einsum("bri,br->bi", J, r)
+        diagonal = np.einsum("bii->bi", N)
+        N = N + damping[:, None, None] * np.eye(theta.shape[1]) * (diagonal + 1e-12)[:, None, :]
+        trial = theta - solve_guarded(N, g)
+        trial[:, 3:] = np.clip(trial[:, 3:], -4.0, 5.0)
+        trial_cost = criterion.cost(frame, trial[:, :3], trial[:, 3:])
+        better = trial_cost < cost
+        converged = better & (cost - trial_cost < 1e-10 * cost)
+        theta[better], cost[better] = trial[better], trial_cost[better]
+        damping = np.where(better, damping / 5.0, damping * 4.0)
+        if (converged | (damping > 1e8)).all():
+            break
+    return theta, cost
+
+
+def solve_guarded(N: F64, g: F64) -> F64:
+    """Solve symmetric positive systems N x = g (B, n, n), (B, n); singular or non-finite ones give 0."""
+    bad = ~(np.isfinite(N).all(axis=(1, 2)) & np.isfinite(g).all(axis=1))
+    N = np.where(bad[:, None, None], np.eye(N.shape[1]), N)
+    g = np.where(bad[:, None], 0.0, g)
+    scale = np.maximum(np.abs(np.einsum("bii->bi", N)), 1e-300) ** -0.5
+    scaled = N * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(N.shape[1])
+    try:
+        return np.linalg.solve(scaled, (g * scale)[..., None])[..., 0] * scale
+    except np.linalg.LinAlgError:
+        return np.zeros_like(g)
+
+
+def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> tuple[F64, float]:
+    """Standard deviations (G,) of log f at theta (3 + G,) and the noise of the residual entries.
+
+    From J'J with the noise estimated from the residuals themselves (5 independent entries a camera, the reference
+    included, less the unknowns); infinite where J'J is singular to rounding.
+    """
+    row = theta[None]
+    weights = criterion.weights(frame, row)
+    r = criterion.weighted_residuals(frame, row, weights)[0]
+    J = _jacobian(criterion, frame, row, weights)[0]
+    dof = max(5 * len(frame.views) - len(theta), 1)
+    noise = float(np.sqrt(np.sum(r**2) / dof))
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
+    S, Vt = np.linalg.svd(J / scale)[1:]
+    with np.errstate(divide="ignore"):
+        variance = np.sum((Vt / np.maximum(S, 1e-300)[:, None]) ** 2, axis=0) / scale**2
+    return noise * np.sqrt(variance[3:]), noise
