@@ -42,7 +42,7 @@ class Image:
 
     @property
     def scale(self) -> float:
-        """Working pixels per original pixel, the same along x and y: ``xy = (xy_original + 0.5) scale - 0.5``."""
+        """Working pixels per original pixel along x and y: ``xy = (xy_original + 0.5) scale - 0.5``."""
         return max(self.size) / max(self.original_size)
 
     @property
@@ -56,8 +56,8 @@ class Image:
 class Seeds:
     """Corners of several scales with a small normalised patch each: matched without a search radius.
 
-    ``xy`` (S, 2) px; ``scale`` (S,) px per sample unit of the level they were found on; ``angle`` (S,) rad of
-    the patch (0 = upright); ``patches`` (S, D) float32, zero mean and unit norm.
+    ``xy`` (S, 2) px; ``scale`` (S,) px per sample unit of the level they were found on; ``angle`` (S,) rad
+    of the patch (0 = upright); ``patches`` (S, D) float32, zero mean and unit norm.
     """
 
     xy: F64
@@ -68,7 +68,9 @@ class Seeds:
 
 @dataclass(frozen=True)
 class Features:
-    """Corners of one photograph: ``xy`` (N, 2) px, ``scale`` (N,), ``response`` (N,) float32, strongest first."""
+    """Corners of one photograph: ``xy`` (N, 2) px, ``scale`` (N,), ``response`` (N,) float32, strongest
+    first.
+    """
 
     xy: F64
     scale: F32
@@ -80,9 +82,9 @@ class Features:
 class Matches:
     """Corners of view i taken for the same scene point as corners of view j.
 
-    ``index1, index2`` (M,) into ``Features.xy``, each corner at most once; ``xy1, xy2`` (M, 2) px the positions
-    after sub-pixel alignment of the pair; ``score`` (M,) correlation in [-1, 1]; ``affine`` (M, 2, 2) the local
-    map of image 1 to image 2 around the match (identity where it was not estimated).
+    ``index1, index2`` (M,) into ``Features.xy``, each corner at most once; ``xy1, xy2`` (M, 2) px the
+    positions after sub-pixel alignment of the pair; ``score`` (M,) correlation in [-1, 1]; ``affine`` (M, 2, 2)
+    the local map of image 1 to image 2 around the match (identity where it was not estimated).
     """
 
     i: int
@@ -97,8 +99,10 @@ class Matches:
 
 @dataclass(frozen=True)
 class FundamentalFit:
-    """A robust estimate of F: ``F`` (3, 3) unit Frobenius norm, ``inliers`` (M,) bool, ``sigma_px`` the standard
-    deviation of one image coordinate estimated from the inliers, ``covariance`` (9, 9) of vec(F) row-major."""
+    """A robust estimate of F: ``F`` (3, 3) unit Frobenius norm, ``inliers`` (M,) bool, ``sigma_px`` the
+    standard deviation of one image coordinate estimated from the inliers, ``covariance`` (9, 9) of vec(F)
+    row-major.
+    """
 
     F: F64
     inliers: B8
@@ -111,8 +115,8 @@ class FundamentalFit:
 class TwoView:
     """A pair of views with its epipolar geometry; the arrays hold the verified matches only.
 
-    ``accepted`` says whether the pair enters the tracks, ``reason`` why not. ``homography_share`` is the share of
-    the verified matches that one homography explains (near 1: a plane or a pure rotation).
+    ``accepted`` says whether the pair enters the tracks, ``reason`` why not. ``homography_share`` is the
+    share of the verified matches that one homography explains (near 1: a plane or a pure rotation).
     """
 
     i: int
@@ -155,8 +159,8 @@ class Reconstruction:
 
     ``P`` (V, 3, 4) (zeros where not ``registered``), ``X`` (N, 4) homogeneous (zeros where not ``valid``);
     ``inlier`` (K,) bool per observation; ``reasons`` per view, empty where registered. In the metric stratum
-    ``P = K [R t]`` before distortion, ``K`` (V, 3, 3) and ``k1`` (V,): a normalised image point (x, y) is seen at
-    (x, y) (1 + k1 (x^2 + y^2)) before K; ``X[:, 3] = 1`` where valid.
+    ``P = K [R t]`` before distortion, ``K`` (V, 3, 3) and ``k1`` (V,): a normalised image point (x, y) is
+    seen at (x, y) (1 + k1 (x^2 + y^2)) before K; ``X[:, 3] = 1`` where valid.
     """
 
     stratum: Stratum
@@ -175,8 +179,9 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class Upgrade:
-    """One candidate answer of self-calibration: ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) (zeros where not
-    registered), the ``cost`` it reached and the ``method`` it came from."""
+    """One candidate answer of self-calibration: ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) (zeros
+    where not registered), the ``cost`` it reached and the ``method`` it came from.
+    """
 
     metric_from_projective: F64
     K: F64
@@ -186,7 +191,8 @@ class Upgrade:
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """The answer of chapter 7: the best upgrade, its rivals (best first, the best included), and how sure it is.
+    """The answer of chapter 7: the best upgrade, its rivals (best first, the best included), and how sure it
+    is.
 
     ``K_std`` (V, 3, 3) standard deviations; ``identifiable`` False where the motion does not determine the
     answer, with ``reasons``.
@@ -202,7 +208,9 @@ class SelfCalibration:
 
 @dataclass(frozen=True)
 class IntrinsicInterval:
-    """One intrinsic of one view: value and standard deviation (px, or pure number for k1) and where it is from."""
+    """One intrinsic of one view: value and standard deviation (px, or pure number for k1) and where it is
+    from.
+    """
 
     value: float
     std: float
@@ -211,10 +219,12 @@ class IntrinsicInterval:
 
 @dataclass(frozen=True)
 class MetricResult:
-    """The end of the metric stage: the reconstruction, the intrinsics of each view with intervals, the self-check.
+    """The end of the metric stage: the reconstruction, the intrinsics of each view with intervals, the
+    self-check.
 
-    ``intrinsics[i]`` maps "focal_px", "principal_x_px", "principal_y_px", "k1" to an interval (empty where view i is
-    not registered); ``self_check`` holds measured numbers; ``trusted`` False with ``doubts`` where it failed.
+    ``intrinsics[i]`` maps "focal_px", "principal_x_px", "principal_y_px", "k1" to an interval (empty where
+    view i is not registered); ``self_check`` holds measured numbers; ``trusted`` False with ``doubts`` where
+    it failed.
     """
 
     reconstruction: Reconstruction
@@ -237,8 +247,9 @@ class StageReport:
 
 @dataclass(frozen=True)
 class FocalPrior:
-    """What the user says of the focal length: ``focal_px`` (V,) NaN = unknown, ``std_rel`` its relative standard
-    deviation (the weight). Nothing is assumed of a focal without one."""
+    """What the user says of the focal length: ``focal_px`` (V,) NaN = unknown, ``std_rel`` its relative
+    standard deviation (the weight). Nothing is assumed of a focal without one.
+    """
 
     focal_px: F64
     std_rel: float
@@ -248,12 +259,13 @@ class FocalPrior:
 class RunResult:
     """Everything one run found; what lies beyond ``until`` or could not be made is None.
 
-    ``images`` are the V views at working size, ``features`` one per view, ``pairs`` every pair that was matched,
-    accepted or not. ``refused`` maps the photographs that never became a view to the reason; a view that was not
-    registered has its reason in ``metric.reconstruction.reasons``. ``groups`` (V,) is the camera number of each
-    view. ``reports`` holds one record per stage, ``settings`` the configuration as plain tables (stage -> field ->
-    value), ``summary`` what ``summary.json`` says. All coordinates are pixels at working size; ``summary`` and the
-    exported model are in original pixels. ``failure`` is the sentence that ended the run early, empty otherwise.
+    ``images`` are the V views at working size, ``features`` one per view, ``pairs`` every pair that was
+    matched, accepted or not. ``refused`` maps the photographs that never became a view to the reason; a view
+    that was not registered has its reason in ``metric.reconstruction.reasons``. ``groups`` (V,) is the
+    camera number of each view. ``reports`` holds one record per stage, ``settings`` the configuration as
+    plain tables (stage -> field -> value), ``summary`` what ``summary.json`` says. All coordinates are
+    pixels at working size; ``summary`` and the exported model are in original pixels. ``failure`` is the
+    sentence that ended the run early, empty otherwise.
     """
 
     out: Path
