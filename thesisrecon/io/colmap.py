@@ -1,0 +1,308 @@
+"""COLMAP sparse models in and out: the only place that knows COLMAP's conventions.
+
+COLMAP puts the centre of the top-left pixel at (0.5, 0.5), numbers things from 1, and keeps a camera apart
+from the images it took. Its SIMPLE_RADIAL distortion is the one used here: x (1 + k1 r^2) on normalised
+points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import compose_camera, project_camera
+from thesisrecon.io.colmap_files import read_colmap_model, write_colmap_model
+from thesisrecon.io.colmap_model import NO_POINT, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
+from thesisrecon.types import F64, I64, Reconstruction, Tracks
+
+__all__ = [
+    "ColmapCamera",
+    "ColmapImage",
+    "ColmapModel",
+    "ColmapPoints",
+    "colmap_from_reconstruction",
+    "read_colmap_model",
+    "reconstruction_from_colmap",
+    "write_colmap_model",
+]
+
+_PIXEL_CENTRE = 0.5
+
+
+def colmap_from_reconstruction(
+    reconstruction: Reconstruction,
+    names: Sequence[str],
+    *,
+    colors: NDArray[np.uint8],
+    groups: I64,
+    scales: F64,
+) -> ColmapModel:
+    """The metric reconstruction as a COLMAP model in the pixels of the original photographs.
+
+    Registered views are written, and the valid points with at least two inlier observations in them; view i
+    is image i + 1 and point j is point j + 1. A point's error is its mean distance in original pixels.
+
+    Parameters
+    ----------
+    reconstruction : in the metric stratum, with K; sizes (V, 2) are (width, height) at working size.
+    names : V file names.
+    colors : (N, 3) uint8 RGB of the points.
+    groups : (V,) views of one group share a camera, as far as their intrinsics and sizes are the same.
+    scales : (V,) or (V, 2) for x and y apart: original over working size.
+
+    Raises
+    ------
+    ValueError : another stratum, arrays of other lengths, a K with skew (COLMAP has no camera for it), or a P
+        that is not K [R t].
+    """
+    _check_export(reconstruction, names, colors, groups, scales)
+    scales = np.broadcast_to(scales.reshape(len(names), -1), (len(names), 2))
+    view, point, xy = _kept_observations(reconstruction)
+    cameras, camera_ids = _cameras(reconstruction, groups, scales)
+    poses = {int(i): _pose(reconstruction, int(i)) for i in np.flatnonzero(reconstruction.registered)}
+    seen = _reproject(reconstruction, poses, view, point)
+    distance = np.linalg.norm((seen - xy) * scales[view], axis=1)
+    images, row = _images(names, poses, camera_ids, (view, point, (xy + _PIXEL_CENTRE) * scales[view]))
+    return ColmapModel(cameras, images, _points(reconstruction.X, colors, (view, point, row), distance))
+
+
+def _check_export(
+    reconstruction: Reconstruction, names: Sequence[str], colors: NDArray[np.uint8], groups: I64, scales: F64
+) -> None:
+    n_views, n_points = len(reconstruction.P), len(reconstruction.X)
+    if reconstruction.stratum != "metric" or reconstruction.K is None:
+        raise ValueError(
+            f"colmap_from_reconstruction needs a metric reconstruction with K; got {reconstruction.stratum}"
+        )
+    if len(names) != n_views or groups.shape != (n_views,) or scales.shape not in ((n_views,), (n_views, 2)):
+        raise ValueError(
+            f"colmap_from_reconstruction needs a name, group and scale for each of {n_views} views"
+        )
+    if colors.shape != (n_points, 3) or colors.dtype != np.uint8:
+        raise ValueError(
+            f"colmap_from_reconstruction needs ({n_points}, 3) uint8 colours; got {colors.shape}"
+        )
+    if not (np.isfinite(scales).all() and (scales > 0).all()):
+        raise ValueError("colmap_from_reconstruction needs finite scales above 0")
+
+
+def _kept_observations(reconstruction: Reconstruction) -> tuple[I64, I64, F64]:
+    tracks = reconstruction.tracks
+    view, point = tracks.view_index, tracks.point_index
+    kept = reconstruction.inlier & reconstruction.registered[view] & reconstruction.valid[point]
+    kept &= np.bincount(point[kept], minlength=len(reconstruction.X))[point] >= 2
+    return view[kept], point[kept], tracks.xy[kept]
+
+
+def _pose(reconstruction: Reconstruction, i: int) -> tuple[F64, F64]:
+    """R (3, 3) and t (3,) of P = K [R t], whatever the positive scale of P."""
+    assert reconstruction.K is not None
+    pose = np.linalg.solve(reconstruction.K[i], reconstruction.P[i])
+    pose /= np.cbrt(np.linalg.det(pose[:, :3]))
+    if not np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-6):
+        raise ValueError(f"P of view {i} is not K [R t]: its left part is no rotation after K is taken off")
+    return pose[:, :3], pose[:, 3]
+
+
+def _reproject(
+    reconstruction: Reconstruction, poses: dict[int, tuple[F64, F64]], view: I64, point: I64
+) -> F64:
+    xy = np.empty((len(view), 2))
+    assert reconstruction.K is not None
+    for i, (R, t) in poses.items():
+        here = view == i
+        Xh = reconstruction.X[point[here]]
+        xy[here] = project_camera(reconstruction.K[i], R, t, Xh[:, :3] / Xh[:, 3:], k1=_k1(reconstruction, i))
+    return xy
+
+
+def _k1(reconstruction: Reconstruction, i: int) -> float:
+    return 0.0 if reconstruction.k1 is None else float(reconstruction.k1[i])
+
+
+def _cameras(
+    reconstruction: Reconstruction, groups: I64, scales: F64
+) -> tuple[tuple[ColmapCamera, ...], dict[int, int]]:
+    """One camera for each group and set of intrinsics in it, and the camera's number of each view."""
+    assert reconstruction.K is not None
+    cameras: dict[tuple[object, ...], ColmapCamera] = {}
+    numbers = {}
+    for i in np.flatnonzero(reconstruction.registered).tolist():
+        width, height = (int(size) for size in np.rint(reconstruction.sizes[i] * scales[i]))
+        model, params = _camera_params(reconstruction.K[i], _k1(reconstruction, i), scales[i])
+        key = (int(groups[i]), width, height, params)
+        camera = cameras.setdefault(key, ColmapCamera(len(cameras) + 1, model, width, height, params))
+        numbers[i] = camera.camera_id
+    return tuple(cameras.values()), numbers
+
+
+def _camera_params(K: F64, k1: float, scale: F64) -> tuple[str, tuple[float, ...]]:
+    """The smallest COLMAP model that holds K and k1, and its parameters in original pixels."""
+    if abs(K[0, 1]) > 1e-9 * K[0, 0]:
+        raise ValueError(
+            f"COLMAP has no camera with skew; K has {K[0, 1]:.3g} px, set it to 0 before the export"
+        )
+    fx, fy = float(K[0, 0] * scale[0]), float(K[1, 1] * scale[1])
+    centre = tuple(float(value) for value in (K[:2, 2] + _PIXEL_CENTRE) * scale)
+    # Relative, and so small that taking one focal length for both moves no pixel by more than rounding.
+    same_focal = abs(fx - fy) <= 1e-12 * fx
+    if same_focal:
+        return ("SIMPLE_RADIAL", (fx, *centre, k1)) if k1 else ("SIMPLE_PINHOLE", (fx, *centre))
+    return ("OPENCV", (fx, fy, *centre, k1, 0.0, 0.0, 0.0)) if k1 else ("PINHOLE", (fx, fy, *centre))
+
+
+def _images(
+    names: Sequence[str],
+    poses: dict[int, tuple[F64, F64]],
+    camera_ids: dict[int, int],
+    observations: tuple[I64, I64, F64],
+) -> tuple[tuple[ColmapImage, ...], I64]:
+    """The images, and for each observation its row among the points of its image."""
+    view, point, xy = observations
+    row = np.zeros(len(view), dtype=np.int64)
+    images = []
+    for i, (R, t) in poses.items():
+        here = np.flatnonzero(view == i)
+        row[here] = np.arange(len(here))
+        quaternion = np.roll(Rotation.from_matrix(R).as_quat(canonical=True), 1)
+        images.append(ColmapImage(i + 1, quaternion, t, camera_ids[i], names[i], xy[here], point[here] + 1))
+    return tuple(images), row
+
+
+def _points(
+    X: F64, colors: NDArray[np.uint8], observations: tuple[I64, I64, I64], distance: F64
+) -> ColmapPoints:
+    view, point, row = observations
+    order = np.lexsort((view, point))
+    used, counts = np.unique(point, return_counts=True)
+    return ColmapPoints(
+        ids=used + 1,
+        xyz=X[used, :3] / X[used, 3:],
+        rgb=colors[used],
+        error=np.bincount(point, weights=distance, minlength=len(X))[used] / counts,
+        track_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        track_image=view[order] + 1,
+        track_xy=row[order],
+    )
+
+
+def reconstruction_from_colmap(model: ColmapModel, *, names: Sequence[str] | None = None) -> Reconstruction:
+    """A COLMAP model as a metric reconstruction in the pixels of its photographs.
+
+    Parameters
+    ----------
+    model : any consistent model whose cameras are pinhole with at most one radial coefficient.
+    names : the photographs, whose order numbers the views; those the model lacks become views that are not
+        registered. Without it, the images of the model in the order of their names.
+
+    Returns
+    -------
+    Reconstruction : points in the model's order, all valid, all observations inliers; ``sigma_px`` is
+    estimated
+        from the residuals (1.4826 times the median size of a coordinate). Where COLMAP sees a point twice in
+        one image the first observation is kept.
+
+    Raises
+    ------
+    StageFailure : a camera model or distortion that has no equal here, or two images of one name.
+    ValueError : an image of the model is not among ``names``.
+    """
+    by_name = {image.name: image for image in model.images}
+    if len(by_name) < len(model.images):
+        raise StageFailure(
+            "two images of the COLMAP model have the same name", advice="give every image its own name"
+        )
+    names = sorted(by_name) if names is None else names
+    unknown = sorted(set(by_name) - set(names))
+    if unknown or len(set(names)) < len(names):
+        raise ValueError(
+            f"names must hold each image of the model once; missing or doubled: {unknown[:3] or names[:3]}"
+        )
+    cameras = {camera.camera_id: camera for camera in model.cameras}
+    K, k1 = np.zeros((len(names), 3, 3)), np.zeros(len(names))
+    P, sizes = np.zeros((len(names), 3, 4)), np.zeros((len(names), 2), dtype=np.int64)
+    poses = {}
+    for i, name in enumerate(names):
+        if name in by_name:
+            image = by_name[name]
+            camera = cameras[image.camera_id]
+            K[i], k1[i] = _intrinsics(camera)
+            poses[i] = Rotation.from_quat(np.roll(image.quaternion_wxyz, -1)).as_matrix(), image.translation
+            P[i], sizes[i] = compose_camera(K[i], *poses[i]), (camera.width, camera.height)
+    return _with_observations(model, names, (P, K, k1, sizes), poses)
+
+
+def _with_observations(
+    model: ColmapModel,
+    names: Sequence[str],
+    cameras: tuple[F64, F64, F64, I64],
+    poses: dict[int, tuple[F64, F64]],
+) -> Reconstruction:
+    P, K, k1, sizes = cameras
+    registered = np.isin(np.arange(len(names)), list(poses))
+    tracks = _tracks(model, names)
+    reconstruction = Reconstruction(
+        stratum="metric",
+        P=P,
+        X=np.column_stack([model.points.xyz, np.ones(len(model.points.ids))]),
+        registered=registered,
+        valid=np.ones(len(model.points.ids), dtype=np.bool_),
+        inlier=np.ones(len(tracks.xy), dtype=np.bool_),
+        tracks=tracks,
+        sizes=sizes,
+        sigma_px=0.0,
+        reasons=tuple("" if known else "not in the COLMAP model" for known in registered),
+        K=K,
+        k1=k1,
+    )
+    seen = _reproject(reconstruction, poses, tracks.view_index, tracks.point_index)
+    sigma = 1.4826 * float(np.median(np.abs(seen - tracks.xy))) if len(seen) else 0.0
+    return replace(reconstruction, sigma_px=sigma)
+
+
+def _tracks(model: ColmapModel, names: Sequence[str]) -> Tracks:
+    view_of_name = {name: i for i, name in enumerate(names)}
+    views, points, xy = [], [], []
+    order = np.argsort(model.points.ids, kind="stable")
+    for image in model.images:
+        seen = image.point_ids != NO_POINT
+        place = order[np.searchsorted(model.points.ids[order], image.point_ids[seen])]
+        points.append(place.astype(np.int64))
+        views.append(np.full(len(place), view_of_name[image.name], dtype=np.int64))
+        xy.append(image.xy[seen] - _PIXEL_CENTRE)
+    view = np.concatenate([*views, np.zeros(0, dtype=np.int64)])
+    point = np.concatenate([*points, np.zeros(0, dtype=np.int64)])
+    _, first = np.unique(point * len(names) + view, return_index=True)
+    positions = np.concatenate([*xy, np.zeros((0, 2))])[first]
+    return Tracks(view[first], point[first], positions, len(names), len(model.points.ids))
+
+
+def _intrinsics(camera: ColmapCamera) -> tuple[F64, float]:
+    """K (3, 3) and k1 in our pixels; refuses every other distortion that is not zero."""
+    params = camera.params
+    single = camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+    if not single and camera.model not in ("PINHOLE", "OPENCV", "FULL_OPENCV"):
+        raise StageFailure(
+            f"camera {camera.camera_id} of the COLMAP model is of the kind {camera.model}",
+            "one radial coefficient is all that is supported",
+            "undistort the images, or reconstruct with SIMPLE_RADIAL",
+        )
+    focal, rest = ((params[0], params[0]), params[1:]) if single else ((params[0], params[1]), params[2:])
+    centre, distortion = rest[:2], rest[2:] or (0.0,)
+    if any(distortion[1:]):
+        raise StageFailure(
+            f"camera {camera.camera_id} of the COLMAP model has the distortion {distortion}",
+            "only the first radial coefficient is supported",
+            "undistort the images, or reconstruct with SIMPLE_RADIAL",
+        )
+    if min(focal) <= 0:
+        raise StageFailure(
+            f"camera {camera.camera_id} of the COLMAP model has a focal length that is not positive"
+        )
+    x, y = (value - _PIXEL_CENTRE for value in centre)
+    return np.array([[focal[0], 0.0, x], [0.0, focal[1], y], [0.0, 0.0, 1.0]]), distortion[0]

@@ -1,0 +1,83 @@
+"""COLMAP's incremental reconstruction (Schönberger and Frahm, CVPR 2016) through pycolmap, in our types.
+
+Prior-free: the focal length in a photograph's EXIF is forgotten and COLMAP's default guess, 1.2 times the long
+side, takes its place, to be refined freely.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.types import Reconstruction
+
+_DEFAULT_FOCAL_REL = 1.2
+
+
+@dataclass(frozen=True)
+class ReferenceRun:
+    """What COLMAP made of a folder of photographs: ``names[i]`` is view i of ``reconstruction`` (its largest model,
+    in our pixel convention), ``seconds`` of "extract", "match" and "map"."""
+
+    names: tuple[str, ...]
+    reconstruction: Reconstruction
+    seconds: Mapping[str, float]
+
+
+def reconstruct_with_pycolmap(
+    images: Path, out: Path, *, shared_camera: bool = True, refine_principal_point: bool = False, threads: int = 2
+) -> ReferenceRun:
+    """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
+
+    ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database and the
+    models. Raises :class:`StageFailure` where COLMAP makes no model.
+    """
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    pycolmap.set_random_seed(0)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    database, seconds, start = out / "database.db", {}, time.perf_counter()
+
+    mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
+    pycolmap.extract_features(
+        database, images, camera_mode=mode, extraction_options=extraction, device=pycolmap.Device.cpu
+    )
+    _forget_focal_priors(database)
+    seconds["extract"], start = time.perf_counter() - start, time.perf_counter()
+
+    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+    seconds["match"], start = time.perf_counter() - start, time.perf_counter()
+
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=threads, ba_refine_principal_point=refine_principal_point
+    )
+    options.mapper.num_threads = threads
+    models = pycolmap.incremental_mapping(database, images, out / "sparse", options)
+    seconds["map"] = time.perf_counter() - start
+
+    if not models:
+        raise StageFailure("COLMAP made no model of these photographs")
+    largest = max(models, key=lambda number: int(models[number].num_reg_images()))
+    names = tuple(sorted(path.name for path in images.iterdir() if path.is_file()))
+    model = read_colmap_model(out / "sparse" / str(largest))
+    return ReferenceRun(names, reconstruction_from_colmap(model, names=names), seconds)
+
+
+def _forget_focal_priors(database: Path) -> None:
+    """Put COLMAP's default guess in the place of every focal length that came from EXIF."""
+    store = pycolmap.Database.open(database)
+    for camera in store.read_all_cameras():
+        guess = _DEFAULT_FOCAL_REL * max(camera.width, camera.height)
+        camera.params = [guess, *camera.params[1:]]
+        camera.has_prior_focal_length = False
+        store.update_camera(camera)
+    store.close()
