@@ -1,0 +1,184 @@
+"""A small made-up run: cameras on an arc before a curved, coloured wall, and all the page shows of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from PIL import Image as PillowImage
+from PIL import ImageDraw
+
+from thesisrecon.geometry.camera import compose_camera, project_camera
+from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
+from thesisrecon.report import Photograph, ReportData
+from thesisrecon.types import (
+    F64,
+    IntrinsicInterval,
+    MetricResult,
+    Reconstruction,
+    StageReport,
+    Tracks,
+    TwoView,
+)
+
+SIZE = (480, 320)
+K = np.array([[520.0, 0.0, 231.0], [0.0, 520.0, 166.0], [0.0, 0.0, 1.0]])
+K1 = -0.03
+NOISE_PX = 0.3
+CONFIG = (
+    '[features]\nkind = "corners"\n\n[matching]\n# a </script> in a comment must not hurt\nradius = 0.2\n'
+)
+
+
+def made_up_points(rng: np.random.Generator, count: int) -> tuple[F64, np.ndarray]:
+    """Points (N, 3) of a wall with a bulge, and colours (N, 3) uint8 that change over it."""
+    u, v = rng.uniform(-1, 1, (2, count))
+    depth = 6.0 - 1.2 * np.exp(-3 * (u**2 + v**2)) + 0.3 * np.sin(6 * u)
+    X = np.stack([3.2 * u, 1.9 * v, depth], axis=1)
+    colours = np.stack(
+        [140 + 90 * np.sin(3 * u), 130 + 80 * np.cos(4 * v), 110 + 60 * np.sin(5 * u * v)], axis=1
+    )
+    return X, (colours + rng.normal(0, 10, colours.shape)).clip(0, 255).astype(np.uint8)
+
+
+def made_up_cameras(count: int) -> tuple[F64, F64]:
+    """World-to-camera R (C, 3, 3) and t (C, 3) of cameras on an arc that all look at the wall, y down."""
+    rotations, translations = [], []
+    for angle in np.linspace(-0.45, 0.45, count):
+        centre = np.array([6 * np.sin(angle), 0.2 * np.cos(9 * angle), 5.5 - 6 * np.cos(angle)])
+        z = np.array([0.0, 0.1, 5.5]) - centre
+        z /= np.linalg.norm(z)
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        R = np.stack([x, np.cross(z, x), z])
+        rotations.append(R)
+        translations.append(-R @ centre)
+    return np.stack(rotations), np.stack(translations)
+
+
+def made_up_photograph(xy: F64, colours: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(H, W, 3) uint8: smooth shading with a disc of its own colour at every point."""
+    coarse = rng.integers(70, 120, (5, 7, 3), dtype=np.uint8)
+    picture = PillowImage.fromarray(coarse).resize(SIZE, PillowImage.Resampling.BICUBIC)
+    draw = ImageDraw.Draw(picture)
+    for (x, y), rgb in zip(xy.tolist(), colours.tolist(), strict=True):
+        draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=tuple(rgb), outline="#202020")
+    return np.asarray(picture)
+
+
+def made_up_pair(i: int, j: int, cameras: tuple[F64, F64], xy: list[F64], seen: list[np.ndarray]) -> TwoView:
+    """The true epipolar geometry of two of the cameras with the points both see."""
+    R = cameras[0][j] @ cameras[0][i].T
+    t = cameras[1][j] - R @ cameras[1][i]
+    F = np.linalg.inv(K).T @ cross_matrix(t) @ R @ np.linalg.inv(K)
+    both = np.flatnonzero(seen[i] & seen[j])
+    # Fewer points survive between views far apart, as with photographs.
+    both = both[: max(8, len(both) // (1 + abs(i - j)))]
+    accepted = abs(i - j) < 5
+    return TwoView(
+        i=i,
+        j=j,
+        F=F / np.linalg.norm(F),
+        sigma_px=0.2,
+        index1=both,
+        index2=both,
+        xy1=xy[i][both],
+        xy2=xy[j][both],
+        affine=np.tile(np.eye(2), (len(both), 1, 1)),
+        candidates=2 * len(both),
+        homography_share=0.35,
+        accepted=accepted,
+        reason="" if accepted else "too few verified matches",
+    )
+
+
+def made_up_run(*, names: list[str] | None = None, points: int = 1500, seed: int = 4) -> ReportData:
+    """A whole run with one refused view (the last) and one file that is no photograph."""
+    rng = np.random.default_rng(seed)
+    names = names or [f"IMG_{2040 + n}.JPG" for n in range(9)]
+    count = len(names)
+    X, colours = made_up_points(rng, points)
+    cameras = made_up_cameras(count)
+    xy = [project_camera(K, R, t, X, k1=K1) for R, t in zip(*cameras, strict=True)]
+    seen = [((p > 5) & (p < np.array(SIZE) - 6)).all(axis=1) & (rng.random(points) < 0.7) for p in xy]
+    reconstruction = _reconstruction(X, cameras, xy, seen, rng)
+    photographs = tuple(
+        Photograph(
+            name, SIZE, (SIZE[0] * 4, SIZE[1] * 4), made_up_photograph(p[s][:200], colours[s][:200], rng)
+        )
+        for name, p, s in zip(names, xy, seen, strict=True)
+    )
+    interval = {
+        "focal_px": IntrinsicInterval(520.34, 0.42, "metric bundle adjustment, shared by all views"),
+        "principal_x_px": IntrinsicInterval(231.2, 0.9, "metric bundle adjustment under a weak prior"),
+        "principal_y_px": IntrinsicInterval(165.7, 0.8, "metric bundle adjustment under a weak prior"),
+        "k1": IntrinsicInterval(-0.0301, 0.0004, "metric bundle adjustment"),
+    }
+    metric = MetricResult(
+        reconstruction,
+        tuple(interval if registered else {} for registered in reconstruction.registered),
+        {"positive_depth_share_rel": 1.0, "focal_spread_rel": 0.0008, "residual_rms_px": 0.42},
+        trusted=True,
+    )
+    pairs = [
+        made_up_pair(i, j, cameras, xy, seen) for i in range(count) for j in range(i + 1, min(i + 7, count))
+    ]
+    return ReportData(
+        title="Courtyard wall",
+        photographs=photographs,
+        reports=_reports(),
+        config_text=CONFIG,
+        summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5},
+        version="0.1.0",
+        unread=(("notes.jpg", "it is no image that Pillow can read"),),
+        pairs=pairs,
+        metric=metric,
+        colours=colours,
+    )
+
+
+def projective_run() -> ReportData:
+    """The same run as it is when the user asked to end after the projective reconstruction."""
+    data = made_up_run()
+    assert data.metric is not None
+    before = data.metric.reconstruction
+    undistorted = dataclasses.replace(before, stratum="projective", K=None, k1=None)
+    return dataclasses.replace(
+        data, metric=None, colours=None, reconstruction=undistorted, until="projective"
+    )
+
+
+def _reconstruction(
+    X: F64, cameras: tuple[F64, F64], xy: list[F64], seen: list[np.ndarray], rng: np.random.Generator
+) -> Reconstruction:
+    count = len(xy)
+    point, view = np.nonzero(np.stack(seen, axis=1))
+    clean = np.stack(xy, axis=1)[point, view]
+    registered = np.arange(count) < count - 1
+    P = np.stack([compose_camera(K, R, t) for R, t in zip(*cameras, strict=True)])
+    tracks = Tracks(view, point, clean + rng.normal(0, NOISE_PX, clean.shape), count, len(X))
+    return Reconstruction(
+        stratum="metric",
+        P=P * registered[:, None, None],
+        X=homogenize(X),
+        registered=registered,
+        valid=np.ones(len(X), dtype=bool),
+        inlier=rng.random(len(point)) < 0.97,
+        tracks=tracks,
+        sizes=np.tile(np.array(SIZE), (count, 1)),
+        sigma_px=NOISE_PX,
+        reasons=(*[""] * (count - 1), "only 14 matches lead to known points (20 are needed)"),
+        K=np.tile(K, (count, 1, 1)) * registered[:, None, None],
+        k1=np.full(count, K1),
+    )
+
+
+def _reports() -> tuple[StageReport, ...]:
+    return (
+        StageReport("features", 1.4, {"corners": 27_000}, {}),
+        StageReport(
+            "matches", 6.2, {"pairs": 36, "accepted": 26}, {"sigma_px": 0.19}, ("2 pairs lie on one plane",)
+        ),
+        StageReport("projective", 2.3, {"cameras": 8}, {"rms_px": 0.47}),
+        StageReport("metric", 1.1, {"cameras": 8, "points": 1500}, {"rms_px": 0.42}),
+    )

@@ -1,0 +1,95 @@
+"""What the page of one run is made from: one record, filled by whoever ran the stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.types import MetricResult, Reconstruction, StageReport, TwoView
+
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One view as the page shows it.
+
+    ``rgb`` (H, W, 3) uint8 of any size with the photograph's aspect, or None (a long side of about 800 px is
+    enough for the drawn pairs; the page shrinks it further); ``size`` (width, height) px at the size the stages
+    worked at; ``original_size`` that of the file; ``reason`` why a view was refused before it reached the
+    reconstruction, empty otherwise.
+    """
+
+    name: str
+    size: tuple[int, int]
+    original_size: tuple[int, int]
+    rgb: U8 | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """Everything ``report.html`` says, for a run that ended well, ended early or failed.
+
+    Parameters
+    ----------
+    title : the name of the run, usually that of the folder of photographs.
+    photographs : the views; a view's number is its place here (as in every other record).
+    reports : what each stage that ran did, in order.
+    config_text : the whole configuration as TOML.
+    summary : the contents of ``summary.json``; shown as it is.
+    version : of thesisrecon.
+    unread : (name, reason) of the files that are no photographs and hence no views.
+    pairs : the pairs of views whose epipolar geometry was estimated, accepted or not.
+    reconstruction : the projective reconstruction, where the run has one; ``metric`` goes before it.
+    metric : the result of the metric stage.
+    colours : (N, 3) uint8 of the points of the metric reconstruction (valid or not), or None.
+    until : the stage the user asked to end with, None where all were asked for.
+    failure : why the run could not go on, None where it did.
+
+    Raises
+    ------
+    ValueError
+        where two of these speak of different numbers of views or points.
+    """
+
+    title: str
+    photographs: tuple[Photograph, ...]
+    reports: tuple[StageReport, ...]
+    config_text: str
+    summary: Mapping[str, object]
+    version: str
+    unread: tuple[tuple[str, str], ...] = ()
+    pairs: Sequence[TwoView] = field(default=())
+    reconstruction: Reconstruction | None = None
+    metric: MetricResult | None = None
+    colours: U8 | None = None
+    until: str | None = None
+    failure: StageFailure | None = None
+
+    def __post_init__(self) -> None:
+        views = len(self.photographs)
+        best = self.best_reconstruction
+        if best is not None and len(best.registered) != views:
+            raise ValueError(
+                f"one camera per photograph: got {len(best.registered)} cameras, {views} photographs"
+            )
+        if self.metric is not None and len(self.metric.intrinsics) != views:
+            raise ValueError(
+                f"intrinsics per photograph: got {len(self.metric.intrinsics)} for {views} photographs"
+            )
+        if any(not (0 <= pair.i < views and 0 <= pair.j < views) for pair in self.pairs):
+            raise ValueError(f"pairs must name views below {views}, the number of photographs")
+        if self.colours is not None and self.metric is not None:
+            points = len(self.metric.reconstruction.X)
+            if self.colours.shape != (points, 3):
+                raise ValueError(f"colours must be ({points}, 3), one per point; got {self.colours.shape}")
+
+    @property
+    def best_reconstruction(self) -> Reconstruction | None:
+        """The metric reconstruction, else the projective one, else None."""
+        return self.metric.reconstruction if self.metric is not None else self.reconstruction

@@ -1,0 +1,153 @@
+"""Pictures of the page, drawn with Pillow: thumbnails, and two photographs with their epipolar geometry."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image as PillowImage
+from PIL import ImageDraw, ImageFont
+
+from thesisrecon.report.data import Photograph
+from thesisrecon.types import F64, I64, TwoView
+
+THUMBNAIL_BYTES = 2_000_000
+PANEL_LONG_SIDE = 640
+GAP = 8
+# Hues of similar lightness that stay apart on a photograph; the numbers serve those who see them as equal.
+HUES = (
+    "#ffd166", "#06d6a0", "#4cc9f0", "#ff7096", "#f9844a", "#b8f35a",
+    "#c77dff", "#80ffdb", "#ffadad", "#72b0ff", "#fdffb6", "#ff9ff3",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EmbeddedPicture:
+    """A JPEG as a ``data:`` address, with its size in px for a page that does not jump while loading."""
+
+    uri: str
+    width: int
+    height: int
+
+
+def thumbnail(photograph: Photograph, how_many: int) -> EmbeddedPicture | None:
+    """A small JPEG of a photograph; all ``how_many`` of them together take about ``THUMBNAIL_BYTES``.
+
+    None where the pixels are not known.
+    """
+    if photograph.rgb is None or 0 in photograph.rgb.shape:
+        return None
+    # A JPEG of this quality spends about a quarter byte on a pixel, a third more in base64.
+    area = THUMBNAIL_BYTES / max(how_many, 1) / 0.33
+    side = int(np.clip(np.sqrt(1.5 * area), 64, 360))
+    picture = PillowImage.fromarray(photograph.rgb)
+    picture.thumbnail((side, side), PillowImage.Resampling.LANCZOS)
+    return embed_jpeg(picture, quality=80)
+
+
+def embed_jpeg(picture: PillowImage.Image, *, quality: int) -> EmbeddedPicture:
+    """A picture as a JPEG in a ``data:`` address."""
+    buffer = io.BytesIO()
+    picture.convert("RGB").save(buffer, format="JPEG", quality=quality, optimize=True)
+    text = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return EmbeddedPicture(f"data:image/jpeg;base64,{text}", picture.width, picture.height)
+
+
+def draw_pair(pair: TwoView, first: Photograph, second: Photograph) -> EmbeddedPicture | None:
+    """Both photographs side by side, with their verified matches and epipolar lines.
+
+    Every match is a dot; a few spread ones are numbered and come with the epipolar line of their partner: F x1 in
+    the second photograph, F' x2 in the first. None where the pixels of one are not known.
+    """
+    if first.rgb is None or second.rgb is None:
+        return None
+    chosen = spread_matches(pair.xy1, len(HUES))
+    left = _draw_half(first, pair.xy1, chosen, pair.xy2[chosen] @ pair.F[:2] + pair.F[2])
+    right = _draw_half(second, pair.xy2, chosen, pair.xy1[chosen] @ pair.F[:, :2].T + pair.F[:, 2])
+    sheet = PillowImage.new("RGB", (left.width + GAP + right.width, max(left.height, right.height)), "white")
+    sheet.paste(left, (0, 0))
+    sheet.paste(right, (left.width + GAP, 0))
+    return embed_jpeg(sheet, quality=84)
+
+
+def spread_matches(xy: F64, count: int) -> I64:
+    """Indices of up to ``count`` points (N, 2) far from each other: each next one is the farthest from those
+    chosen, the first the nearest to the middle."""
+    if len(xy) == 0:
+        return np.zeros(0, dtype=np.int64)
+    chosen = [int(np.argmin(np.linalg.norm(xy - xy.mean(axis=0), axis=1)))]
+    distance = np.linalg.norm(xy - xy[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(xy)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(xy - xy[chosen[-1]], axis=1))
+    return np.array(chosen, dtype=np.int64)
+
+
+def clip_line(
+    line: F64, width: float, height: float
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Where a line (3,) a x + b y + c = 0 enters and leaves a photograph; None where it passes by."""
+    a, b, c = (float(v) for v in line)
+    low, right, bottom = -0.5, width - 0.5, height - 0.5
+    hits: list[tuple[float, float]] = []
+    if b != 0:
+        hits += [(x, -(a * x + c) / b) for x in (low, right)]
+    if a != 0:
+        hits += [(-(b * y + c) / a, y) for y in (low, bottom)]
+    slack = 1e-6 * max(width, height)
+    inside = [
+        (x, y) for x, y in hits if low - slack <= x <= right + slack and low - slack <= y <= bottom + slack
+    ]
+    if len(inside) < 2:
+        return None
+    return min(inside), max(inside)
+
+
+def _draw_half(photograph: Photograph, xy: F64, chosen: I64, lines: F64) -> PillowImage.Image:
+    """One photograph with dots, numbers and lines; drawn twice as large and shrunk, which smooths edges."""
+    assert photograph.rgb is not None
+    picture, s = _faded(photograph)
+    draw = ImageDraw.Draw(picture)
+    width, height = photograph.size
+    for x, y in _to_drawing(xy, s):
+        draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill="#ffffff", outline="#1b2733")
+    for n, line in enumerate(lines):
+        ends = clip_line(line, width, height)
+        if ends is not None:
+            draw.line([tuple(p) for p in _to_drawing(np.array(ends), s)], fill=HUES[n], width=3)
+    font = ImageFont.load_default(size=24)
+    for n, (x, y) in enumerate(_to_drawing(xy[chosen], s)):
+        draw.ellipse((x - 10, y - 10, x + 10, y + 10), fill=HUES[n], outline="#101418", width=3)
+        _write_number(draw, n + 1, (x, y), picture.size, font)
+    return picture.resize((picture.width // 2, picture.height // 2), PillowImage.Resampling.LANCZOS)
+
+
+def _write_number(
+    draw: ImageDraw.ImageDraw,
+    number: int,
+    at: tuple[float, float],
+    size: tuple[int, int],
+    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
+) -> None:
+    """The number beside a dot, on the side where there is room."""
+    x = at[0] + 15 if at[0] < size[0] - 60 else at[0] - 45
+    y = min(max(at[1] - 28, 2), size[1] - 32)
+    draw.text((x, y), str(number), font=font, fill="white", stroke_width=3, stroke_fill="#101418")
+
+
+def _faded(photograph: Photograph) -> tuple[PillowImage.Image, float]:
+    """The photograph at twice the panel's size, paler and darker, and the scale from working pixels."""
+    assert photograph.rgb is not None
+    width, height = photograph.size
+    s = 2.0 * PANEL_LONG_SIDE / max(width, height)
+    even = (max(2, 2 * round(s * width / 2)), max(2, 2 * round(s * height / 2)))
+    colour = PillowImage.fromarray(photograph.rgb).resize(even, PillowImage.Resampling.BILINEAR)
+    grey = colour.convert("L").convert("RGB")
+    return PillowImage.blend(grey, colour, 0.45).point(lambda v: 0.78 * v), s
+
+
+def _to_drawing(xy: F64, s: float) -> list[tuple[float, float]]:
+    """Pixels of the photograph as Pillow's drawing coordinates at scale s."""
+    return [(float(x), float(y)) for x, y in (xy + 0.5) * s - 0.5]

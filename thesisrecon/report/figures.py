@@ -1,0 +1,218 @@
+"""The two interactive figures as plotly.js mappings, and the histograms as SVG paths.
+
+Plain mappings rather than plotly's classes: the page needs only what plotly.js reads, and lists of rounded
+numbers are understood by every version of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.report.scene import Scene
+from thesisrecon.types import F64, I64, TwoView
+
+INK, ACCENT, PANEL = "#1b2733", "#ff9f43", "#131a22"
+# White to deep blue-green; lightness falls evenly, so the order survives grey printing and colour blindness.
+PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1f8089"], [1.0, "#0b4a5c"]]
+REFUSED_SCALE = [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]]
+MAX_MATRIX = 200
+MAX_ANNOTATED = 14
+
+Figure = dict[str, Any]
+
+
+def scene_figure(scene: Scene, names: Sequence[str], colours: NDArray[np.uint8] | None) -> Figure:
+    """Cameras and coloured points; ``names`` per view, ``colours`` (N, 3) per point of X or None."""
+    digits = _useful_digits(scene)
+    paint = "#9fb4c7" if colours is None else [_hex(rgb) for rgb in colours[scene.index]]
+    points = {
+        "type": "scatter3d",
+        "mode": "markers",
+        "name": "points",
+        "hoverinfo": "skip",
+        "marker": {"size": 2, "color": paint, "line": {"width": 0}},
+        **_xyz(scene.points, digits),
+    }
+    extent = scene.high - scene.low
+    aspect = 1.7 * extent / max(float(extent.max()), 1e-12)
+    axes = {
+        f"{name}axis": {"visible": False, "range": [float(scene.low[d]), float(scene.high[d])]}
+        for d, name in enumerate("xyz")
+    }
+    layout = {
+        "paper_bgcolor": PANEL,
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "showlegend": False,
+        "scene": {
+            **axes,
+            "aspectmode": "manual",
+            "aspectratio": dict(zip("xyz", aspect.tolist(), strict=True)),
+            "dragmode": "turntable",
+            "camera": {"eye": {"x": 0.35, "y": -1.45, "z": 0.6}, "center": {"x": 0, "y": 0, "z": -0.05}},
+        },
+        "hoverlabel": {"font": {"family": "system-ui, sans-serif"}},
+    }
+    return {"data": [points, _pyramids(scene, digits), _camera_marks(scene, names, digits)], "layout": layout}
+
+
+def _pyramids(scene: Scene, digits: int) -> Figure:
+    """One line trace through all pyramids: rim, roof over the upper edge, four edges; None lifts the pen."""
+    rows: list[list[float] | None] = []
+    for centre, corners in zip(scene.centres, scene.corners, strict=True):
+        top = corners[:2].mean(axis=0) + 0.25 * (corners[:2].mean(axis=0) - corners.mean(axis=0))
+        strokes = [[*corners, corners[0]], [corners[0], top, corners[1]]]
+        strokes += [[centre, corner] for corner in corners]
+        for stroke in strokes:
+            rows += [np.round(vertex, digits).tolist() for vertex in stroke]
+            rows.append(None)
+    columns = {name: [None if row is None else row[d] for row in rows] for d, name in enumerate("xyz")}
+    return {
+        "type": "scatter3d",
+        "mode": "lines",
+        "name": "cameras",
+        "hoverinfo": "skip",
+        "line": {"color": ACCENT, "width": 2.5},
+        **columns,
+    }
+
+
+def _camera_marks(scene: Scene, names: Sequence[str], digits: int) -> Figure:
+    return {
+        "type": "scatter3d",
+        "mode": "markers",
+        "name": "centres",
+        "text": [f"{i + 1} · {escape(names[i])}" for i in scene.views],
+        "hovertemplate": "%{text}<extra></extra>",
+        "marker": {"size": 4, "color": ACCENT, "line": {"width": 0}},
+        **_xyz(scene.centres, digits),
+    }
+
+
+def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure:
+    """Heat map of the verified matches of every tried pair (logarithmic), the pairs not accepted in red.
+
+    More than ``MAX_MATRIX`` views are shown in blocks of neighbours, each with its strongest pair.
+    """
+    block = max(1, -(-len(names) // MAX_MATRIX))
+    labels = [_block_label(first, block, names) for first in range(0, len(names), block)]
+    accepted, refused = (_count_matrix(pairs, len(labels), block, wanted) for wanted in (True, False))
+    refused[accepted >= 0] = -1
+    counts = np.concatenate([accepted[accepted >= 0], refused[refused >= 0]])
+    low = 1.0 if counts.min(initial=10) >= 10 else 0.0
+    scale = {"zmin": low, "zmax": max(low + 1.0, float(np.log10(counts.max(initial=1))))}
+    traces = [
+        {
+            **_heat(accepted, labels, "", "verified matches"),
+            "colorscale": PAIR_SCALE,
+            "colorbar": _count_bar(),
+        },
+        {
+            **_heat(refused, labels, "× ", "verified matches, not accepted"),
+            "colorscale": REFUSED_SCALE,
+            "showscale": False,
+        },
+    ]
+    return {"data": [trace | scale for trace in traces], "layout": _matrix_layout(labels, block)}
+
+
+def _count_matrix(pairs: Sequence[TwoView], cells: int, block: int, accepted: bool) -> I64:
+    """(cells, cells) most verified matches of the pairs in each cell, -1 without any."""
+    best = np.full((cells, cells), -1, dtype=np.int64)
+    for pair in pairs:
+        if pair.accepted == accepted:
+            a, b = pair.i // block, pair.j // block
+            best[a, b] = best[b, a] = max(int(best[a, b]), pair.inliers)
+    return best
+
+
+def _heat(counts: I64, labels: list[str], mark: str, words: str) -> Figure:
+    rows = counts.tolist()
+    gap = 2 if len(labels) <= 30 else (1 if len(labels) <= 80 else 0)
+    heat: Figure = {
+        "type": "heatmap",
+        "x": labels,
+        "y": labels,
+        "z": [[None if n < 0 else round(float(np.log10(max(n, 1))), 3) for n in row] for row in rows],
+        "customdata": [[None if n < 0 else n for n in row] for row in rows],
+        "xgap": gap,
+        "ygap": gap,
+        "hoverongaps": False,
+        "hovertemplate": "%{y}<br>%{x}<br><b>%{customdata}</b> " + words + "<extra></extra>",
+    }
+    if len(labels) <= MAX_ANNOTATED:
+        heat["text"] = [["" if n < 0 else f"{mark}{n}" for n in row] for row in rows]
+        heat["texttemplate"] = "%{text}"
+    return heat
+
+
+def _matrix_layout(labels: list[str], block: int) -> Figure:
+    step = max(1, -(-len(labels) // 20))
+    ticks = {
+        "type": "category",
+        "tickmode": "array",
+        "tickvals": labels[::step],
+        "ticktext": [str(first * block + 1) for first in range(0, len(labels), step)],
+        "showgrid": False,
+        "zeroline": False,
+        "fixedrange": True,
+        "tickangle": 0,
+        "ticks": "",
+    }
+    return {
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "#e9edf0",
+        "margin": {"l": 34, "r": 8, "t": 30, "b": 8},
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},
+        "showlegend": False,
+        "xaxis": {**ticks, "side": "top", "constrain": "domain"},
+        "yaxis": {**ticks, "autorange": "reversed", "scaleanchor": "x", "constrain": "domain"},
+    }
+
+
+def _count_bar() -> Figure:
+    counts = [1, 10, 30, 100, 300, 1000, 3000, 10_000]
+    return {
+        "tickvals": [round(float(np.log10(n)), 3) for n in counts],
+        "ticktext": [str(n) for n in counts],
+        "thickness": 12,
+        "outlinewidth": 0,
+        "x": 1.01,
+        "xpad": 4,
+        "len": 1.0,
+    }
+
+
+def histogram_path(shares: F64, tallest: float, *, width: float, height: float) -> str:
+    """SVG path of the bars of a histogram (B,) in a box, the share ``tallest`` as high as the box."""
+    step = width / max(len(shares), 1)
+    strokes = []
+    for n, share in enumerate(shares.tolist()):
+        bar = min(share / max(tallest, 1e-12), 1.0) * height
+        if bar > 0:
+            strokes.append(f"M{n * step:.1f} {height:.1f}v-{bar:.1f}h{0.86 * step:.2f}v{bar:.1f}z")
+    return "".join(strokes)
+
+
+def _block_label(first: int, block: int, names: Sequence[str]) -> str:
+    last = min(first + block, len(names))
+    # plotly.js reads a little HTML in labels; escaped text is shown as it is.
+    return f"{first + 1} · {escape(names[first])}" if block == 1 else f"views {first + 1}–{last}"
+
+
+def _useful_digits(scene: Scene) -> int:
+    """Decimals that keep a ten-thousandth of the scene."""
+    extent = float((scene.high - scene.low).max())
+    return int(np.clip(4 - np.floor(np.log10(max(extent, 1e-12))), 0, 15))
+
+
+def _xyz(points: F64, digits: int) -> Figure:
+    return {name: np.round(points[:, d], digits).tolist() for d, name in enumerate("xyz")}
+
+
+def _hex(rgb: NDArray[np.uint8]) -> str:
+    return f"#{int(rgb[0]):02x}{int(rgb[1]):02x}{int(rgb[2]):02x}"

@@ -1,0 +1,249 @@
+"""``report.html``: one file that opens from disk, with its scripts, style and pictures inside.
+
+Nothing on the page may come from elsewhere, and nothing a file is named may run: the template escapes all text,
+data for the scripts is JSON that cannot close its element, and a content security policy names the two scripts
+by their hash and forbids every address but ``data:``.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from plotly.offline import get_plotlyjs
+
+from thesisrecon.report.data import ReportData
+from thesisrecon.report.drawing import EmbeddedPicture, draw_pair, thumbnail
+from thesisrecon.report.figures import histogram_path, pair_matrix_figure, scene_figure
+from thesisrecon.report.residuals import (
+    ResidualSummary,
+    common_limit_px,
+    histogram_shares,
+    reprojection_distances,
+    summarize_distances,
+)
+from thesisrecon.report.scene import build_scene
+from thesisrecon.report.wording import (
+    count_of,
+    duration,
+    first_glance,
+    grouped,
+    judge,
+    named_numbers,
+    plus_minus,
+)
+from thesisrecon.types import F64, IntrinsicInterval, StageReport, TwoView
+
+HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 200.0, 44.0
+MAX_LISTED_PAIRS = 120
+
+
+@dataclass(frozen=True)
+class Card:
+    """A photograph on the page: its state in a word, why, and its residuals where it has a camera."""
+
+    number: int
+    name: str
+    state: str
+    level: str
+    reason: str
+    size: str
+    picture: EmbeddedPicture | None
+    residuals: ResidualSummary | None
+    bars: str
+    intrinsics: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class DrawnPair:
+    """A pair of photographs with its picture and its numbers."""
+
+    title: str
+    names: tuple[str, str]
+    numbers: tuple[int, int]
+    facts: str
+    picture: EmbeddedPicture
+
+
+def write_report(path: str | os.PathLike[str], data: ReportData) -> None:
+    """Write the page of a run; the file appears whole or not at all.
+
+    Raises ``OSError`` where the place cannot be written.
+    """
+    target = Path(path)
+    text = render_report(data)
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+        # mkstemp makes private files; a report is for whoever may read the folder.
+        Path(name).chmod(0o644)
+        Path(name).replace(target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def render_report(data: ReportData) -> str:
+    """The page as text; the same data gives the same text."""
+    best = data.best_reconstruction
+    distances = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.photographs)
+    everything = np.concatenate([np.zeros(0), *distances])
+    overall = summarize_distances(everything)
+    limit_px = common_limit_px(everything)
+    plotly, script = get_plotlyjs().replace("</script", "<\\/script"), _resource("page.js")
+    figures, shown = _figures(data)
+    return (
+        _environment()
+        .from_string(_resource("template.html.j2"))
+        .render(
+            data=data,
+            verdict=judge(data),
+            facts=first_glance(data, overall),
+            overall=overall,
+            cards=_cards(data, distances, limit_px),
+            limit_px=limit_px,
+            figures=figures,
+            shown_points=shown,
+            all_points=int(best.valid.sum()) if best is not None else 0,
+            drawn_pairs=_drawn_pairs(data),
+            listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:MAX_LISTED_PAIRS],
+            stages=_stages(data.reports),
+            warnings=[(report.stage, text) for report in data.reports for text in report.warnings],
+            self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
+            summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
+            style=_resource("style.css"),
+            plotly=plotly,
+            script=script,
+            script_hashes=" ".join(f"'{_hash(text)}'" for text in (plotly, script)),
+            histogram_size=(HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT),
+        )
+    )
+
+
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters.update(grouped=grouped, duration=duration)
+    environment.globals.update(count_of=count_of)
+    # NaN is no JSON: better an error here than a page whose script cannot read its data.
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    return environment
+
+
+def _resource(name: str) -> str:
+    return files("thesisrecon.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _hash(script: str) -> str:
+    digest = hashlib.sha256(script.encode("utf-8")).digest()
+    return "sha256-" + base64.b64encode(digest).decode("ascii")
+
+
+def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
+    """The interactive figures by the id of their element, and how many points the 3D one shows."""
+    names = [photograph.name for photograph in data.photographs]
+    figures: dict[str, Any] = {}
+    scene = build_scene(data.metric.reconstruction) if data.metric is not None else None
+    if scene is not None:
+        figures["scene"] = scene_figure(scene, names, data.colours)
+    if data.pairs:
+        figures["matrix"] = pair_matrix_figure(data.pairs, names)
+    return figures, len(scene.points) if scene is not None else 0
+
+
+def _cards(data: ReportData, distances: list[F64], limit_px: float) -> list[Card]:
+    shares = [histogram_shares(d, limit_px) for d in distances]
+    tallest = max((float(s.max()) for s in shares if len(s)), default=1.0)
+    cards = []
+    for i, photograph in enumerate(data.photographs):
+        state, level, reason = _state(data, i)
+        intrinsics = data.metric.intrinsics[i] if data.metric is not None else {}
+        cards.append(
+            Card(
+                number=i + 1,
+                name=photograph.name,
+                state=state,
+                level=level,
+                reason=reason,
+                size=_size_words(photograph.original_size, photograph.size),
+                picture=thumbnail(photograph, len(data.photographs)),
+                residuals=summarize_distances(distances[i]),
+                bars=histogram_path(shares[i], tallest, width=HISTOGRAM_WIDTH, height=HISTOGRAM_HEIGHT),
+                intrinsics={name: _interval_words(interval) for name, interval in intrinsics.items()},
+            )
+        )
+    return cards
+
+
+def _state(data: ReportData, i: int) -> tuple[str, str, str]:
+    """(word, level, reason) of a view."""
+    best, own = data.best_reconstruction, data.photographs[i].reason
+    if best is None:
+        return ("refused", "bad", own) if own else ("read", "open", "")
+    if best.registered[i]:
+        return "registered", "good", ""
+    return "refused", "bad", own or best.reasons[i] or "no reason was recorded"
+
+
+def _interval_words(interval: IntrinsicInterval) -> str:
+    return plus_minus(interval.value, interval.std)
+
+
+def _size_words(original: tuple[int, int], working: tuple[int, int]) -> str:
+    text = f"{original[0]} × {original[1]} px"
+    return text if original == working else f"{text}, worked at {working[0]} × {working[1]}"
+
+
+def _drawn_pairs(data: ReportData) -> list[DrawnPair]:
+    """The accepted pairs with most and with fewest verified matches; without any, the best of the refused."""
+    accepted = [pair for pair in data.pairs if pair.accepted]
+    ranked = sorted(accepted or data.pairs, key=lambda pair: (-pair.inliers, pair.i, pair.j))
+    if not ranked:
+        return []
+    titles = [("Best pair" if accepted else "Best pair, not accepted", ranked[0])]
+    if len(accepted) > 1:
+        titles.append(("Weakest accepted pair", ranked[-1]))
+    drawn = []
+    for title, pair in titles:
+        first, second = data.photographs[pair.i], data.photographs[pair.j]
+        picture = draw_pair(pair, first, second)
+        if picture is not None:
+            numbers = (pair.i + 1, pair.j + 1)
+            drawn.append(DrawnPair(title, (first.name, second.name), numbers, _pair_words(pair), picture))
+    return drawn
+
+
+def _pair_words(pair: TwoView) -> str:
+    """The numbers of a pair in a line."""
+    share = f" ({100 * pair.inliers / pair.candidates:.0f} %)" if pair.candidates else ""
+    words = f"{grouped(pair.inliers)} verified of {grouped(pair.candidates)} candidate matches{share}"
+    if np.isfinite(pair.sigma_px):
+        words += f", noise {pair.sigma_px:.2f} px per coordinate"
+    if np.isfinite(pair.homography_share):
+        words += f", one plane explains {100 * pair.homography_share:.0f} %"
+    return words
+
+
+def _stages(reports: tuple[StageReport, ...]) -> list[dict[str, Any]]:
+    longest = max((report.seconds for report in reports), default=0.0) or 1.0
+    return [
+        {
+            "name": report.stage,
+            "seconds": duration(report.seconds),
+            "share": round(100 * report.seconds / longest, 1),
+            "numbers": named_numbers(report.counts) + named_numbers(report.metrics),
+        }
+        for report in reports
+    ]
