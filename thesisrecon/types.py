@@ -83,8 +83,8 @@ class Matches:
     """Corners of view i taken for the same scene point as corners of view j.
 
     ``index1, index2`` (M,) into ``Features.xy``, each corner at most once; ``xy1, xy2`` (M, 2) px the
-    positions after sub-pixel alignment of the pair; ``score`` (M,) correlation in [-1, 1]; ``affine`` (M, 2, 2)
-    the local map of image 1 to image 2 around the match (identity where it was not estimated).
+    positions after sub-pixel alignment of the pair; ``score`` (M,) correlation in [-1, 1]; ``affine``
+    (M, 2, 2) the local map of image 1 to image 2 around the match (identity where it was not estimated).
     """
 
     i: int
