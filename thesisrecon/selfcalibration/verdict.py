@@ -46,22 +46,16 @@ def rotation_spread(R: F64) -> tuple[float, float]:
 
 def identifiability(frame: ReferenceFrame, theta: F64, std_log_f: F64, noise: float) -> tuple[bool, tuple[str, ...]]:
     """Verdict and its reasons for a refined answer theta (3 + G,)."""
-    reasons = []
     angle, spread = rotation_spread(upgraded_rotations(frame, theta))
-    if angle < _MIN_ROTATION_DEG:
-        reasons.append(
-            f"the cameras hardly turn (largest rotation {angle:.1f} deg): close to a pure translation, "
-            "which leaves the calibration undetermined"
-        )
-    elif spread < _MIN_AXIS_SPREAD_DEG:
-        reasons.append(
-            f"all rotations share one axis to within {spread:.1f} deg: close to a planar or turntable motion, "
-            "which leaves the scale along the axis undetermined"
-        )
     worst = float(std_log_f.max())
-    if not worst < _MAX_FOCAL_STD:
-        reasons.append(
-            f"the cameras fix the focal length only to {min(worst, 9.99):.0%} (residual noise {noise:.3f}): "
-            "turn the camera more between photographs, or give a focal prior"
-        )
-    return not reasons, tuple(reasons)
+    if worst < _MAX_FOCAL_STD and angle >= _MIN_ROTATION_DEG:
+        return True, ()
+    reasons = [
+        f"the cameras fix the focal length only to {min(worst, 9.99):.0%} (residual noise {noise:.3f}); "
+        "turn the camera more between photographs, or give a focal prior"
+    ]
+    if angle < _MIN_ROTATION_DEG:
+        reasons.append(f"the cameras hardly turn (largest rotation {angle:.1f} deg): close to a pure translation")
+    elif spread < _MIN_AXIS_SPREAD_DEG:
+        reasons.append(f"all rotations share one axis to within {spread:.1f} deg: close to a planar or turntable motion")
+    return False, tuple(reasons)

@@ -1,0 +1,102 @@
+"""Section 6.4: a camera from space points and their images.
+
+Linear (DLT) in any projective frame, and from three points for a calibrated camera (Grunert's quartic in the form of
+Haralick et al., IJCV 13(3), 1994).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.homogeneous import normalizing_transform
+
+F64 = NDArray[np.float64]
+
+
+def resection_rows(X: F64, xy: F64) -> F64:
+    """DLT rows, X (..., M, 4), xy (..., M, 2) -> (..., 2 M, 12): u p3'X - p1'X and v p3'X - p2'X."""
+    zero = np.zeros_like(X)
+    first = np.concatenate([-X, zero, xy[..., :1] * X], axis=-1)
+    second = np.concatenate([zero, -X, xy[..., 1:] * X], axis=-1)
+    return np.concatenate([first, second], axis=-2)
+
+
+def resect_linear(X: F64, xy: F64) -> F64:
+    """Cameras P (..., 3, 4) of unit norm that minimise the algebraic residual.
+
+    X (..., M, 4) homogeneous, best with whitened unit rows; xy (..., M, 2) px, M >= 6. Coplanar points leave a family:
+    some member of it comes back, and the covariance of the refined camera tells.
+    """
+    if X.shape[-2] < 6:
+        raise ValueError(f"resect_linear needs at least 6 points; got {X.shape[-2]}")
+    flat = xy.reshape(-1, 2)
+    T = normalizing_transform(flat)
+    conditioned = xy * T[0, 0] + T[:2, 2]
+    A = resection_rows(X, conditioned)
+    p = np.linalg.eigh(A.swapaxes(-1, -2) @ A)[1][..., 0]
+    P = np.linalg.inv(T) @ p.reshape(*p.shape[:-1], 3, 4)
+    return P / np.linalg.norm(P, axis=(-2, -1), keepdims=True)
+
+
+def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, F64]:
+    """All poses of a calibrated camera that sees three points along three rays (P3P).
+
+    X (B, 3, 3) space points, rays (B, 3, 3) unit directions in the camera frame. Returns R (C, 3, 3), t (C, 3) and the
+    sample number (C,) each candidate belongs to; up to four a sample, possibly none. With side lengths a = |X2 - X3|,
+    b = |X1 - X3|, c = |X1 - X2| and the angles between the rays, the ratio v = s3 / s1 of the distances solves
+    Grunert's quartic. Collinear points and coinciding rays give nothing.
+    """
+    a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
+    ca, cb, cc = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = (a2 - c2) / b2
+        c_b, a_b = c2 / b2, a2 / b2
+        # Quartic in v = s3/s1: A4 v^4 + ... + A0 (Haralick et al., eq. for Grunert's method).
+        A4 = (q - 1) ** 2 - 4 * c_b * ca**2
+        A3 = 4 * (q * (1 - q) * cb - (1 - (a2 + c2) / b2) * ca * cc + 2 * c_b * ca**2 * cb)
+        A2 = 2 * (
+            q**2 - 1 + 2 * q**2 * cb**2 + 2 * (1 - c_b) * ca**2 - 4 * (a2 + c2) / b2 * ca * cb * cc
+            + 2 * (1 - a_b) * cc**2
+        )  # fmt: skip
+        A1 = 4 * (-q * (1 + q) * cb + 2 * a_b * cc**2 * cb - (1 - (a2 + c2) / b2) * ca * cc)
+        A0 = (1 + q) ** 2 - 4 * a_b * cc**2
+    v, sample = _real_quartic_roots(np.stack([A4, A3, A2, A1, A0], axis=1))
+    return _poses_from_ratio(X, rays, v, sample)
+
+
+def _real_quartic_roots(c: F64) -> tuple[F64, NDArray[np.int64]]:
+    """Positive real roots of quartics c (B, 5), highest power first, with the row they come from."""
+    good = np.isfinite(c).all(axis=1) & (np.abs(c[:, 0]) > 1e-12 * np.abs(c).max(axis=1, initial=1e-300))
+    companion = np.zeros((len(c), 4, 4))
+    companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
+    companion[good, 0] = -c[good, 1:] / c[good, :1]
+    roots = np.linalg.eigvals(companion)
+    real = good[:, None] & (np.abs(roots.imag) < 1e-4 * (1.0 + np.abs(roots.real))) & (roots.real > 0)
+    sample, which = np.nonzero(real)
+    return roots.real[sample, which], sample
+
+
+def _poses_from_ratio(X: F64, rays: F64, v: F64, sample: NDArray[np.int64]) -> tuple[F64, F64, NDArray[np.int64]]:
+    """Distances along the rays, then the rotation that takes the space triangle to the camera triangle."""
+    X, rays = X[sample], rays[sample]
+    a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
+    ca, cb, cc = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = (a2 - c2) / b2
+        u = ((q - 1) * v**2 - 2 * q * cb * v + 1 + q) / (2 * (cc - v * ca))
+        s1 = np.sqrt(b2 / (1 + v**2 - 2 * v * cb))
+    Y = np.stack([s1, u * s1, v * s1], axis=1)[:, :, None] * rays
+    good = np.isfinite(Y).all(axis=(1, 2)) & (u > 0)
+    X, Y, sample = X[good], Y[good], sample[good]
+    R = _triad(Y) @ _triad(X).swapaxes(1, 2)
+    return R, Y.mean(axis=1) - np.einsum("bij,bj->bi", R, X.mean(axis=1)), sample
+
+
+def _triad(X: F64) -> F64:
+    """Orthonormal columns (B, 3, 3) that follow a triangle."""
+    first = X[:, 1] - X[:, 0]
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
+    third = np.cross(first, X[:, 2] - X[:, 0])
+    third /= np.maximum(np.linalg.norm(third, axis=1, keepdims=True), 1e-300)
+    return np.stack([first, np.cross(third, first), third], axis=2)

@@ -1,0 +1,58 @@
+"""Which tracks take part while the cameras are found: long ones, spread over every view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from thesisrecon.types import B8, I64, Reconstruction, Tracks
+
+
+def select_tracks(tracks: Tracks, *, points_per_view: int, cells: int = 8) -> B8:
+    """The longest tracks, taken until each view has about ``points_per_view``; -> (n_points,) bool.
+
+    Every view's points are spread over a grid of ``cells`` x ``cells`` of its own extent: within a cell the longest
+    tracks come first, and all cells get their turn before a cell gets its next, so that detail in a corner of the
+    picture is not starved by a textured middle.
+    """
+    length = np.bincount(tracks.point_index, minlength=tracks.n_points)
+    keep = np.zeros(tracks.n_points, dtype=bool)
+    for view in range(tracks.n_views):
+        k = np.flatnonzero(tracks.view_index == view)
+        keep[tracks.point_index[k][_first_in_turn(tracks, k, length, cells)[:points_per_view]]] = True
+    return keep
+
+
+def _first_in_turn(tracks: Tracks, k: I64, length: I64, cells: int) -> I64:
+    if len(k) == 0:
+        return k
+    xy = tracks.xy[k]
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    cell = np.minimum((xy - low) / np.maximum(high - low, 1e-9) * cells, cells - 1).astype(np.int64)
+    cell_number = cell[:, 0] * cells + cell[:, 1]
+    by_length = np.lexsort((k, -length[tracks.point_index[k]], cell_number))
+    sorted_cells = cell_number[by_length]
+    start = np.searchsorted(sorted_cells, sorted_cells)
+    turn = np.arange(len(k)) - start
+    return by_length[np.lexsort((by_length, -length[tracks.point_index[k]][by_length], turn))]
+
+
+def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:
+    """The tracks marked in ``keep`` (n_points,) bool, numbered anew in the same order."""
+    chosen = keep[tracks.point_index]
+    number = np.cumsum(keep) - 1
+    return Tracks(
+        tracks.view_index[chosen], number[tracks.point_index[chosen]], tracks.xy[chosen], tracks.n_views, int(keep.sum())
+    )
+
+
+def onto_all_tracks(reconstruction: Reconstruction, tracks: Tracks, keep: B8) -> Reconstruction:
+    """A reconstruction of the tracks marked in ``keep``, told in the numbers of all ``tracks``."""
+    X = np.zeros((tracks.n_points, 4))
+    X[keep] = reconstruction.X
+    valid = np.zeros(tracks.n_points, dtype=bool)
+    valid[keep] = reconstruction.valid
+    inlier = np.zeros(len(tracks.xy), dtype=bool)
+    inlier[keep[tracks.point_index]] = reconstruction.inlier
+    return replace(reconstruction, X=X, valid=valid, inlier=inlier, tracks=tracks)
