@@ -37,7 +37,9 @@ def estimate_similarity(source: F64, target: F64) -> Similarity:
     Raises ``ValueError`` for fewer than 3 points or points on a line (the rotation about it is free).
     """
     if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) < 3:
-        raise ValueError(f"estimate_similarity needs two (N >= 3, 3) arrays; got {source.shape} and {target.shape}")
+        raise ValueError(
+            f"estimate_similarity needs two (N >= 3, 3) arrays; got {source.shape} and {target.shape}"
+        )
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - mean_s, target - mean_t
     U, D, Vt = np.linalg.svd(t.T @ s / len(s))

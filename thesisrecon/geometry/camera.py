@@ -21,8 +21,8 @@ def compose_camera(K: F64, R: F64, t: F64) -> F64:
 def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
     """K, R, t of P (3.21), with K33 = 1, positive focals and det R = 1.
 
-    P (3, 4) may have any scale and sign. Raises ``ValueError`` where the left 3x3 part is singular (a camera at
-    infinity has no K).
+    P (3, 4) may have any scale and sign. Raises ``ValueError`` where the left 3x3 part is singular (a camera
+    at infinity has no K).
     """
     M = P[:, :3]
     det = np.linalg.det(M)

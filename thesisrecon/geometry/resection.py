@@ -1,7 +1,7 @@
 """Section 6.4: a camera from space points and their images.
 
-Linear (DLT) in any projective frame, and from three points for a calibrated camera (Grunert's quartic in the form of
-Haralick et al., IJCV 13(3), 1994).
+Linear (DLT) in any projective frame, and from three points for a calibrated camera (Grunert's quartic in the
+form of Haralick et al., IJCV 13(3), 1994).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def resection_rows(X: F64, xy: F64) -> F64:
 def resect_linear(X: F64, xy: F64) -> F64:
     """Cameras P (..., 3, 4) of unit norm that minimise the algebraic residual.
 
-    X (..., M, 4) homogeneous, best with whitened unit rows; xy (..., M, 2) px, M >= 6. Coplanar points leave a family:
-    some member of it comes back, and the covariance of the refined camera tells.
+    X (..., M, 4) homogeneous, best with whitened unit rows; xy (..., M, 2) px, M >= 6. Coplanar points leave
+    a family: some member of it comes back, and the covariance of the refined camera tells.
     """
     if X.shape[-2] < 6:
         raise ValueError(f"resect_linear needs at least 6 points; got {X.shape[-2]}")
@@ -42,10 +42,10 @@ def resect_linear(X: F64, xy: F64) -> F64:
 def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, F64]:
     """All poses of a calibrated camera that sees three points along three rays (P3P).
 
-    X (B, 3, 3) space points, rays (B, 3, 3) unit directions in the camera frame. Returns R (C, 3, 3), t (C, 3) and the
-    sample number (C,) each candidate belongs to; up to four a sample, possibly none. With side lengths a = |X2 - X3|,
-    b = |X1 - X3|, c = |X1 - X2| and the angles between the rays, the ratio v = s3 / s1 of the distances solves
-    Grunert's quartic. Collinear points and coinciding rays give nothing.
+    X (B, 3, 3) space points, rays (B, 3, 3) unit directions in the camera frame. Returns R (C, 3, 3), t (C,
+    3) and the sample number (C,) each candidate belongs to; up to four a sample, possibly none. With side
+    lengths a = |X2 - X3|, b = |X1 - X3|, c = |X1 - X2| and the angles between the rays, the ratio v = s3 /
+    s1 of the distances solves Grunert's quartic. Collinear points and coinciding rays give nothing.
     """
     a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
     ca, cb, cc = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
@@ -77,7 +77,9 @@ def _real_quartic_roots(c: F64) -> tuple[F64, NDArray[np.int64]]:
     return roots.real[sample, which], sample
 
 
-def _poses_from_ratio(X: F64, rays: F64, v: F64, sample: NDArray[np.int64]) -> tuple[F64, F64, NDArray[np.int64]]:
+def _poses_from_ratio(
+    X: F64, rays: F64, v: F64, sample: NDArray[np.int64]
+) -> tuple[F64, F64, NDArray[np.int64]]:
     """Distances along the rays, then the rotation that takes the space triangle to the camera triangle."""
     X, rays = X[sample], rays[sample]
     a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))

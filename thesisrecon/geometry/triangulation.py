@@ -15,8 +15,9 @@ I64 = NDArray[np.int64]
 def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:
     """Linear triangulation of all points of an observation list; -> (n_points, 4) with unit norm.
 
-    P (V, 3, 4); view, point (K,), xy (K, 2) px. Minimises the algebraic residual u p3'X - p1'X, v p3'X - p2'X with
-    each row pair scaled by the norm of its camera's first two rows. Points with fewer than two observations come out as zeros.
+    P (V, 3, 4); view, point (K,), xy (K, 2) px. Minimises the algebraic residual u p3'X - p1'X, v p3'X -
+    p2'X with each row pair scaled by the norm of its camera's first two rows. Points with fewer than two
+    observations come out as zeros.
     """
     scale = np.linalg.norm(P[:, :2], axis=(1, 2))
     Q = (P / np.where(scale > 0, scale, 1.0)[:, None, None])[view]

@@ -1,9 +1,10 @@
 """Intervals of the intrinsics that may be believed.
 
-The covariance of bundle adjustment is right for independent noise and a right model, and too small on photographs:
-matches err together and lenses have more coefficients than ours. Two things are measured on top of it. Where views
-share a camera, each view alone gives its own intrinsics, and their scatter around the common value against what the
-covariance promises is a factor of inflation. And a floor stands for what the camera model leaves out.
+The covariance of bundle adjustment is right for independent noise and a right model, and too small on
+photographs: matches err together and lenses have more coefficients than ours. Two things are measured on top
+of it. Where views share a camera, each view alone gives its own intrinsics, and their scatter around the
+common value against what the covariance promises is a factor of inflation. And a floor stands for what the
+camera model leaves out.
 """
 
 from __future__ import annotations
@@ -64,9 +65,9 @@ def measured_inflation(
 ) -> tuple[float, str]:
     """How many times too small the covariance is, and how that is known.
 
-    Adjusts once more with a focal of its own for every view of the largest camera group and compares the scatter of
-    those focals with their standard deviations: rms of (f_i - weighted mean) / std_i, at least 1. With fewer than
-    four views in the group nothing can be measured and ``DEFAULT_INFLATION`` is taken.
+    Adjusts once more with a focal of its own for every view of the largest camera group and compares the
+    scatter of those focals with their standard deviations: rms of (f_i - weighted mean) / std_i, at least 1.
+    With fewer than four views in the group nothing can be measured and ``DEFAULT_INFLATION`` is taken.
     """
     registered = np.flatnonzero(model.registered)
     group = model.cameras.group
@@ -85,7 +86,10 @@ def measured_inflation(
         loss_px=2.0 * model.sigma_px, max_iterations=8, covariance=True,
     )  # fmt: skip
     log_f = np.log(result.cameras.intrinsics[views, 0])
-    std = np.sqrt(np.maximum(result.intrinsics_covariance[views, 0, 0], 0.0)) / result.cameras.intrinsics[views, 0]
+    std = (
+        np.sqrt(np.maximum(result.intrinsics_covariance[views, 0, 0], 0.0))
+        / result.cameras.intrinsics[views, 0]
+    )
     if not (np.isfinite(std).all() and (std > 0).all()):
         return DEFAULT_INFLATION, f"covariance x {DEFAULT_INFLATION:.0f}"
     weight = 1.0 / std**2

@@ -1,4 +1,5 @@
-"""The metric model while it is refined: cameras with shared intrinsics, points, and which observations agree."""
+"""The metric model while it is refined: cameras with shared intrinsics, points, and which observations
+agree."""
 
 from __future__ import annotations
 
@@ -6,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from thesisrecon.optimize.triangulation_refine import refine_points
 
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.optimize.metric_bundle import MetricCameras
-from thesisrecon.optimize.triangulation_refine import refine_points
 from thesisrecon.types import B8, I64, Tracks
 
 F64 = NDArray[np.float64]
@@ -33,7 +34,9 @@ class MetricModel:
 
     def with_cameras(self, cameras: MetricCameras, registered: B8 | None = None) -> MetricModel:
         """The same with other cameras."""
-        return replace(self, cameras=cameras, registered=self.registered if registered is None else registered)
+        return replace(
+            self, cameras=cameras, registered=self.registered if registered is None else registered
+        )
 
 
 def project_observations(cameras: MetricCameras, X: F64, view: I64, point: I64) -> tuple[F64, F64]:
@@ -67,9 +70,9 @@ def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
 def retriangulate(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
     """All points afresh from all observations in registered views, then the gate of ``sigmas`` noise sigmas.
 
-    Distortion is taken off the observations first, so that triangulation sees pinhole cameras. A point with a wrong
-    observation is triangulated once more from those that agreed; points seen under less than ``min_angle`` (rad)
-    have no reliable depth and are left out.
+    Distortion is taken off the observations first, so that triangulation sees pinhole cameras. A point with
+    a wrong observation is triangulated once more from those that agreed; points seen under less than
+    ``min_angle`` (rad) have no reliable depth and are left out.
     """
     t = model.tracks
     near = np.flatnonzero(model.registered[t.view_index])
@@ -98,7 +101,8 @@ def _triangulate(poses: F64, xy: F64, view: I64, point: I64, n_points: int, loss
 
 
 def mark(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
-    """Mark the observations in front of their camera and within the gate, and the points that keep two of them."""
+    """Mark the observations in front of their camera and within the gate, and the points that keep two of
+    them."""
     t = model.tracks
     k = np.flatnonzero(model.registered[t.view_index])
     view, point = t.view_index[k], t.point_index[k]
@@ -142,5 +146,3 @@ def truncated_cost(model: MetricModel, gate_px: float) -> float:
     squared = np.ones(len(model.tracks.xy))
     squared[model.ok] = np.minimum(residual_norms(model) ** 2 / gate_px**2, 1.0)
     return float(squared.mean())
-
-

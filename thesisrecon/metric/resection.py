@@ -1,4 +1,5 @@
-"""Calibrated resection of the cameras that the projective stage had to postpone (P3P in RANSAC, then refinement)."""
+"""Calibrated resection of the cameras that the projective stage had to postpone (P3P in RANSAC, then
+refinement)."""
 
 from __future__ import annotations
 
@@ -6,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from thesisrecon.optimize.triangulation_refine import refine_pose
 
 from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.metric.model import MetricModel, normalized_observations
-from thesisrecon.optimize.triangulation_refine import refine_pose
 from thesisrecon.types import B8
 
 F64 = NDArray[np.float64]
@@ -18,10 +19,11 @@ F64 = NDArray[np.float64]
 def resect_calibrated(
     X: F64, normalized: F64, *, threshold: float, rng: np.random.Generator, samples: int = 300
 ) -> tuple[F64, F64, B8] | None:
-    """Pose R, t and inliers of a calibrated camera; X (M, 3), normalised image points (M, 2), threshold in their unit.
+    """Pose R, t and inliers of a calibrated camera; X (M, 3), normalised image points (M, 2), threshold in
+    their unit.
 
-    Truncated-quadratic score over all candidates of ``samples`` three-point samples; None below four points or where
-    no sample has a pose.
+    Truncated-quadratic score over all candidates of ``samples`` three-point samples; None below four points
+    or where no sample has a pose.
     """
     if len(X) < 4:
         return None
@@ -49,8 +51,8 @@ def add_missing_cameras(
 ) -> tuple[MetricModel, dict[int, str]]:
     """Register by calibrated resection every view that sees enough of the model; the reasons of the others.
 
-    A camera is taken with its group's intrinsics; when it has a group of its own, its focal is refined with the pose.
-    Views are tried with most points first.
+    A camera is taken with its group's intrinsics; when it has a group of its own, its focal is refined with
+    the pose. Views are tried with most points first.
     """
     t = model.tracks
     counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
@@ -71,7 +73,9 @@ def add_missing_cameras(
     return model, refused
 
 
-def _add(model: MetricModel, view: int, sigmas: float, rng: np.random.Generator, min_points: int) -> MetricModel | str:
+def _add(
+    model: MetricModel, view: int, sigmas: float, rng: np.random.Generator, min_points: int
+) -> MetricModel | str:
     t, cameras = model.tracks, model.cameras
     k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
     X = model.X[t.point_index[k]]

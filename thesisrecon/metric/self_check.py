@@ -30,13 +30,19 @@ def self_check(
     check = {
         "focal_min_long_sides": float((rows[:, 0] / longest).min()),
         "focal_max_long_sides": float((rows[:, 0] / longest).max()),
-        "focal_std_rel_max": max(intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views),
+        "focal_std_rel_max": max(
+            intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views
+        ),
         "explained_share": float(model.ok[near].mean()),
-        "sigma_rel": float(np.median(residual_norms(model)) / 1.1774 / np.median(longest)) if model.ok.any() else np.inf,
+        "sigma_rel": float(np.median(residual_norms(model)) / 1.1774 / np.median(longest))
+        if model.ok.any()
+        else np.inf,
         "principal_shift_max_long_sides": float(
             (np.linalg.norm(rows[:, 3:5] - (model.sizes[views] - 1) / 2, axis=1) / longest).max()
         ),
-        "focal_change_since_calibration": float(np.abs(np.log(rows[both, 0] / before[both])).max()) if both.any() else 0.0,
+        "focal_change_since_calibration": float(np.abs(np.log(rows[both, 0] / before[both])).max())
+        if both.any()
+        else 0.0,
     }
     return check, _doubts(check, calibration)
 
@@ -52,10 +58,9 @@ def _doubts(check: Mapping[str, float], calibration: SelfCalibration) -> list[st
         doubts.append(f"the model explains only {check['explained_share']:.0%} of the matches it should")
     if not check["sigma_rel"] < _MAX_SIGMA_REL:
         doubts.append(f"the reprojection noise is {check['sigma_rel']:.2%} of the long side")
-    if not check["principal_shift_max_long_sides"] < _MAX_PRINCIPAL_SHIFT:
-        doubts.append(
-            f"the principal point lies {check['principal_shift_max_long_sides']:.0%} of the long side off the centre"
-        )
+    shift = check["principal_shift_max_long_sides"]
+    if not shift < _MAX_PRINCIPAL_SHIFT:
+        doubts.append(f"the principal point lies {shift:.0%} of the long side off the image centre")
     if not check["focal_change_since_calibration"] < _MAX_FOCAL_CHANGE:
         doubts.append(
             f"bundle adjustment moved the focal by {check['focal_change_since_calibration']:.0%} "

@@ -1,8 +1,9 @@
 """From the upgrade of chapter 7 to the final metric model.
 
-Every candidate calibration is tried on the cameras it came from; the best goes on: cameras that the projective stage
-postponed join by calibrated resection, all tracks are triangulated, the principal point and the radial distortion are
-freed under their priors, and what remains is adjusted together. The end is a self-check in numbers.
+Every candidate calibration is tried on the cameras it came from; the best goes on: cameras that the
+projective stage postponed join by calibrated resection, all tracks are triangulated, the principal point and
+the radial distortion are freed under their priors, and what remains is adjusted together. The end is a
+self-check in numbers.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from thesisrecon.optimize.metric_bundle import (
 )
 from thesisrecon.types import (
     B8,
-    FocalPrior,
     I64,
+    FocalPrior,
     MetricResult,
     Reconstruction,
     SelfCalibration,
@@ -61,8 +62,8 @@ class UpgradeAndBundle:
     max_rotation_residual : an upgraded camera further from a scaled rotation than this (Frobenius norm of
         3 C C' / tr - I) was made wrong by bad matches and is postponed too.
     rounds : final rounds of triangulation and adjustment of everything.
-    model_floor_rel : floor of every stated standard deviation, relative to the focal: what the pinhole model with one
-        radial coefficient leaves unexplained in real lenses.
+    model_floor_rel : floor of every stated standard deviation, relative to the focal: what the pinhole model
+        with one radial coefficient leaves unexplained in real lenses.
     """
 
     principal_point_std: float = 0.01
@@ -99,7 +100,11 @@ class UpgradeAndBundle:
         model, reasons = self._complete(model, reconstruction, focal_prior, rng)
         model, bundle, bundle_index = self._finish(model, focal_prior)
         intervals = intrinsic_intervals(
-            model, bundle, self._prior(model, focal_prior), floor_rel=self.model_floor_rel, indices=bundle_index
+            model,
+            bundle,
+            self._prior(model, focal_prior),
+            floor_rel=self.model_floor_rel,
+            indices=bundle_index,
         )
         check, doubts = self_check(model, calibration, intervals)
         final = _as_reconstruction(model, reasons)
@@ -122,9 +127,14 @@ class UpgradeAndBundle:
         return model
 
     def _complete(
-        self, model: MetricModel, reconstruction: Reconstruction, focal_prior: FocalPrior | None, rng: np.random.Generator
+        self,
+        model: MetricModel,
+        reconstruction: Reconstruction,
+        focal_prior: FocalPrior | None,
+        rng: np.random.Generator,
     ) -> tuple[MetricModel, list[str]]:
-        """All tracks triangulated, and the postponed cameras, in two passes since each adds points for the other."""
+        """All tracks triangulated, and the postponed cameras, in two passes since each adds points for the
+        other."""
         early, late = self.outlier_sigmas
         angle = np.radians(self.min_angle_deg)
         refused: dict[int, str] = {}
@@ -140,12 +150,16 @@ class UpgradeAndBundle:
             model = self._bundle(model, FOCAL_ONLY, focal_prior, iterations=6)[0]
             model = retriangulate(model, sigmas=late, min_angle=angle)
         reasons = [
-            "" if model.registered[v] else refused.get(v, reconstruction.reasons[v] or "shares no points with the model")
+            ""
+            if model.registered[v]
+            else refused.get(v, reconstruction.reasons[v] or "shares no points with the model")
             for v in range(len(model.registered))
         ]
         return model, reasons
 
-    def _finish(self, model: MetricModel, focal_prior: FocalPrior | None) -> tuple[MetricModel, MetricBundleResult, I64]:
+    def _finish(
+        self, model: MetricModel, focal_prior: FocalPrior | None
+    ) -> tuple[MetricModel, MetricBundleResult, I64]:
         free = np.array([True, False, False, *[self.principal_point_std > 0] * 2, self.k1_std > 0])
         angle = np.radians(self.min_angle_deg)
         for _ in range(self.rounds):
@@ -221,12 +235,20 @@ def _upgraded_model(
     cameras = MetricCameras(R, t / spread, intrinsics, group)
     ok = reconstruction.inlier & registered[reconstruction.tracks.view_index]
     return MetricModel(
-        reconstruction.tracks, reconstruction.sizes, cameras, registered, X / spread, finite, ok, reconstruction.sigma_px
+        reconstruction.tracks,
+        reconstruction.sizes,
+        cameras,
+        registered,
+        X / spread,
+        finite,
+        ok,
+        reconstruction.sigma_px,
     )
 
 
 def _intrinsics(K: F64, registered: B8, group: I64, sizes: I64) -> F64:
-    """(G, 6) rows from the K of the registered views; a group without any starts from the others' field of view."""
+    """(G, 6) rows from the K of the registered views; a group without any starts from the others' field of
+    view."""
     longest = sizes.max(axis=1)
     typical = float(np.median(K[registered, 0, 0] / longest[registered]))
     rows = np.zeros((int(group.max()) + 1, 6))
@@ -248,5 +270,16 @@ def _as_reconstruction(model: MetricModel, reasons: list[str]) -> Reconstruction
     norms = residual_norms(model)
     sigma = float(np.median(norms)) / RAYLEIGH_MEDIAN if len(norms) else model.sigma_px
     return Reconstruction(
-        "metric", P, X, registered, model.valid, model.ok, model.tracks, model.sizes, sigma, tuple(reasons), K, k1
+        "metric",
+        P,
+        X,
+        registered,
+        model.valid,
+        model.ok,
+        model.tracks,
+        model.sizes,
+        sigma,
+        tuple(reasons),
+        K,
+        k1,
     )

@@ -1,1 +1,6 @@
 """Chapter 6: projective reconstruction."""
+
+from thesisrecon.projective.incremental import GatedIncremental
+from thesisrecon.projective.sequential import SequentialProjective
+
+__all__ = ["GatedIncremental", "SequentialProjective"]

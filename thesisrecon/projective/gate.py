@@ -15,8 +15,8 @@ F64 = NDArray[np.float64]
 def predicted_spread_px(P: F64, covariance: F64, X: F64) -> F64:
     """Standard deviation (px) of the projection of each point under the camera's covariance.
 
-    P (3, 4), covariance (12, 12) of its row-major entries, X (N, 4) -> (N,): root of half the trace of J C J'.
-    Points near the camera's principal plane come out infinite.
+    P (3, 4), covariance (12, 12) of its row-major entries, X (N, 4) -> (N,): root of half the trace of J C
+    J'. Points near the camera's principal plane come out infinite.
     """
     xh = X @ P.T
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,8 +1,9 @@
 """Chapter 6 as a whole: from tracks and fundamental matrices to cameras and points in one projective frame.
 
-Begin with a pair, add one camera after the other by resection, triangulate, adjust, discard (Beardsley, Zisserman and
-Murray, IJCV 23, 1997). What makes it hold on photographs is the gate: a camera enters only when its covariance says
-that it is determined; the others wait, and those still waiting at the end are left to calibrated resection.
+Begin with a pair, add one camera after the other by resection, triangulate, adjust, discard (Beardsley,
+Zisserman and Murray, IJCV 23, 1997). What makes it hold on photographs is the gate: a camera enters only
+when its covariance says that it is determined; the others wait, and those still waiting at the end are left
+to calibrated resection.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from thesisrecon.optimize.triangulation_refine import refine_camera, refine_points
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.optimize.conditioning import whitening_transform
 from thesisrecon.optimize.projective_bundle import refine_projective_bundle
-from thesisrecon.optimize.triangulation_refine import refine_camera, refine_points
 from thesisrecon.projective.gate import predicted_spread_px
 from thesisrecon.projective.initial_pair import cameras_from_fundamental, rank_initial_pairs
 from thesisrecon.projective.resection import resect_robust
@@ -28,7 +29,7 @@ F64 = NDArray[np.float64]
 
 
 @dataclass
-class _State:
+class GrowingModel:
     """The reconstruction while it grows. ``ok`` marks the observations that the current cameras explain."""
 
     tracks: Tracks
@@ -57,13 +58,13 @@ class GatedIncremental:
 
     Parameters
     ----------
-    points_per_view : tracks that take part, longest first, so that each view has about this many (the others are
-        triangulated in the metric stage, where all are used).
+    points_per_view : tracks that take part, longest first, so that each view has about this many (the others
+        are triangulated in the metric stage, where all are used).
     min_points : matches a resection needs.
     outlier_sigmas : residual gates in noise sigmas of the early and the late rounds.
     noise_floor_px : the noise is never taken to be below this (localisation of corners).
-    max_spread : gate on a camera: the 80 % quantile of its predicted spread over all points, as a share of the
-        long side of the image. None lets every camera in.
+    max_spread : gate on a camera: the 80 % quantile of its predicted spread over all points, as a share of
+        the long side of the image. None lets every camera in.
     bundle_iterations, final_rounds : Levenberg-Marquardt steps after each camera; rounds of re-triangulation,
         adjustment and filtering at the end.
     """
@@ -88,8 +89,8 @@ class GatedIncremental:
     ) -> Reconstruction:
         """Cameras and points from tracks (the whole of them; a selection does the work) and verified pairs.
 
-        ``sizes`` (V, 2) width, height; ``attempt`` > 0 begins with another initial pair. ``StageFailure`` where no pair
-        begins or fewer than two cameras result.
+        ``sizes`` (V, 2) width, height; ``attempt`` > 0 begins with another initial pair. ``StageFailure``
+        where no pair begins or fewer than two cameras result.
         """
         ranked = rank_initial_pairs(tracks, pairs)
         if not ranked:
@@ -113,29 +114,34 @@ class GatedIncremental:
             )
         return onto_all_tracks(best, tracks, keep)
 
-    def _from_pair(self, tracks: Tracks, pair: TwoView, sizes: I64, rng: np.random.Generator) -> Reconstruction:
-        state = self._begin(tracks, pair, sizes)
-        while self._add_next_camera(state, rng):
-            self._adjust(state, self.bundle_iterations, self.outlier_sigmas[0])
+    def _from_pair(
+        self, tracks: Tracks, pair: TwoView, sizes: I64, rng: np.random.Generator
+    ) -> Reconstruction:
+        state = self.begin(tracks, pair, sizes)
+        while self.add_next_camera(state, rng):
+            self.adjust(state, self.bundle_iterations, self.outlier_sigmas[0])
         for round_number in range(self.final_rounds):
             late = round_number > 0
-            self._adjust(state, 2 * self.bundle_iterations, self.outlier_sigmas[int(late)])
-        return _finish(state)
+            self.adjust(state, 2 * self.bundle_iterations, self.outlier_sigmas[int(late)])
+        return finish(state)
 
-    def _begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> _State:
+    def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> GrowingModel:
+        """Cameras (3.42) and points of the first two views."""
         P = np.zeros((tracks.n_views, 3, 4))
         P[pair.i], P[pair.j] = cameras_from_fundamental(pair.F, sizes[[pair.i, pair.j]])
         registered = np.zeros(tracks.n_views, dtype=bool)
         registered[[pair.i, pair.j]] = True
-        state = _State(tracks, sizes, P, np.zeros((tracks.n_points, 4)), registered, np.zeros(len(tracks.xy), bool))
+        state = GrowingModel(
+            tracks, sizes, P, np.zeros((tracks.n_points, 4)), registered, np.zeros(len(tracks.xy), bool)
+        )
         state.reasons = ["" for _ in range(tracks.n_views)]
         state.sigma_px = max(pair.sigma_px, self.noise_floor_px)
         for _ in range(2):
             self._retriangulate(state, self.outlier_sigmas[0])
-            self._adjust(state, 2 * self.bundle_iterations, self.outlier_sigmas[0])
+            self.adjust(state, 2 * self.bundle_iterations, self.outlier_sigmas[0])
         return state
 
-    def _retriangulate(self, state: _State, sigmas: float) -> None:
+    def _retriangulate(self, state: GrowingModel, sigmas: float) -> None:
         """Points afresh from all observations in registered views; mark what the cameras explain."""
         t = state.tracks
         near = state.registered[t.view_index]
@@ -155,7 +161,7 @@ class GatedIncremental:
             state.X = np.where(better[:, None], Y, state.X)
             self._mark(state, sigmas)
 
-    def _mark(self, state: _State, sigmas: float) -> None:
+    def _mark(self, state: GrowingModel, sigmas: float) -> None:
         """Signs of cameras and points made consistent, then ``ok`` = in front and within the gate."""
         t = state.tracks
         near = state.registered[t.view_index] & (np.abs(state.X[t.point_index]).sum(axis=1) > 0)
@@ -173,7 +179,8 @@ class GatedIncremental:
         lonely = ~state.valid
         state.ok &= ~lonely[t.point_index]
 
-    def _adjust(self, state: _State, iterations: int, sigmas: float) -> None:
+    def adjust(self, state: GrowingModel, iterations: int, sigmas: float) -> None:
+        """Bundle adjustment, the noise estimated afresh, then all points anew under a gate of ``sigmas``."""
         t, used = state.tracks, state.used
         if used.sum() < 2 * 8:
             return
@@ -187,7 +194,7 @@ class GatedIncremental:
         state.sigma_px = max(float(np.median(norm)) / 1.1774, self.noise_floor_px)
         self._retriangulate(state, sigmas)
 
-    def _add_next_camera(self, state: _State, rng: np.random.Generator) -> bool:
+    def add_next_camera(self, state: GrowingModel, rng: np.random.Generator) -> bool:
         """Resect the view with the most triangulated points that passes the gate; False when none does."""
         t = state.tracks
         ready = state.valid[t.point_index]
@@ -198,21 +205,23 @@ class GatedIncremental:
                 return False
             if counts[view] < self.min_points:
                 state.reasons[view] = (
-                    f"sees only {counts[view]} points of the model (needs {self.min_points}): too little overlap"
+                    f"sees only {counts[view]} points of the model (needs {self.min_points})"
                 )
                 continue
             if self._try_camera(state, int(view), rng):
                 return True
         return False
 
-    def _try_camera(self, state: _State, view: int, rng: np.random.Generator) -> bool:
+    def _try_camera(self, state: GrowingModel, view: int, rng: np.random.Generator) -> bool:
         t = state.tracks
         k = np.flatnonzero((t.view_index == view) & state.valid[t.point_index])
         X, xy = state.X[t.point_index[k]], t.xy[k]
         threshold = self.outlier_sigmas[0] * state.sigma_px
         P, inlier = resect_robust(X, xy, threshold_px=threshold, rng=rng)
         if P is None or inlier.sum() < self.min_points or inlier.mean() < 0.3:
-            state.reasons[view] = f"only {int(inlier.sum())} of {len(k)} points of the model agree with one camera"
+            state.reasons[view] = (
+                f"only {int(inlier.sum())} of {len(k)} points of the model agree with one camera"
+            )
             return False
         refined = refine_camera(P, X[inlier], xy[inlier], loss_px=2.0 * state.sigma_px, iterations=20)
         if self.max_spread is not None:
@@ -222,8 +231,8 @@ class GatedIncremental:
             quantile = float(np.quantile(spread, 0.8))
             if not quantile < limit:
                 state.reasons[view] = (
-                    f"its {int(inlier.sum())} points do not determine its camera before calibration "
-                    f"(predicted spread {min(quantile, 1e6):.0f} px, limit {limit:.0f} px): they lie near one plane"
+                    f"its {int(inlier.sum())} points, near one plane, do not determine its camera before "
+                    f"calibration (predicted spread {min(quantile, 1e6):.0f} px, limit {limit:.0f} px)"
                 )
                 return False
         P = refined.P * np.sign(np.median(X[inlier] @ refined.P[2]))
@@ -234,7 +243,7 @@ class GatedIncremental:
         return True
 
 
-def _whitened(P: F64, X: F64, state: _State) -> tuple[F64, F64]:
+def _whitened(P: F64, X: F64, state: GrowingModel) -> tuple[F64, F64]:
     """Keep the frame well-conditioned: sum XX' = I over the valid points, unit norms, signs kept."""
     valid = state.valid
     T = whitening_transform(X[valid])
@@ -245,7 +254,8 @@ def _whitened(P: F64, X: F64, state: _State) -> tuple[F64, F64]:
     return P / np.where(norm > 0, norm, 1.0), X / np.where(length > 0, length, 1.0)
 
 
-def _finish(state: _State) -> Reconstruction:
+def finish(state: GrowingModel) -> Reconstruction:
+    """The record of a grown model, with a reason for every view that is not in it."""
     for view in np.flatnonzero(~state.registered):
         if not state.reasons[view]:
             state.reasons[view] = "shares no points with the model"

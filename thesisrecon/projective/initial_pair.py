@@ -1,7 +1,7 @@
 """Section 6.2: which two views to begin with, and their cameras.
 
-The pair must be tied by many points that go on into other views and must not look like a plane or a pure rotation,
-since a homography then explains it and F, hence the cameras, is not determined.
+The pair must be tied by many points that go on into other views and must not look like a plane or a pure
+rotation, since a homography then explains it and F, hence the cameras, is not determined.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ F64 = NDArray[np.float64]
 def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView]:
     """Accepted pairs, best beginning first.
 
-    The score is the number of points the pair shares, those seen in a third view counting twice, times the share that
-    no single homography explains.
+    The score is the number of points the pair shares, those seen in a third view counting twice, times the
+    share that no single homography explains.
     """
     table = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
     table[tracks.view_index, tracks.point_index] = True
@@ -38,9 +38,9 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 def cameras_from_fundamental(F: F64, sizes: I64) -> tuple[F64, F64]:
     """Initial cameras (3.42), P1 = [I | 0] and P2 = [[e]x F + e pi' | e], in pixels.
 
-    ``sizes`` (2, 2) width and height of the two images. The plane pi (and the scale of F) is the one that brings the
-    left part of P2 closest to the identity in unit-free pixels: a pair of similar photographs then starts near a
-    metric frame, and the left part is not singular although [e]x F alone is.
+    ``sizes`` (2, 2) width and height of the two images. The plane pi (and the scale of F) is the one that
+    brings the left part of P2 closest to the identity in unit-free pixels: a pair of similar photographs
+    then starts near a metric frame, and the left part is not singular although [e]x F alone is.
     """
     T1, T2 = (_pixel_from_unit(size) for size in sizes)
     Fu = T2.T @ F @ T1

@@ -18,9 +18,9 @@ def resect_robust(
 ) -> tuple[F64 | None, B8]:
     """RANSAC over six-point samples with a truncated-quadratic score; X (M, 4), xy (M, 2) px.
 
-    Samples are drawn and solved a batch at a time; it stops when a sample free of outliers has been drawn with
-    probability 0.999 at the best inlier share so far. Returns the camera of the best sample re-estimated from its
-    inliers (None where there are fewer than six) and the inliers (M,).
+    Samples are drawn and solved a batch at a time; it stops when a sample free of outliers has been drawn
+    with probability 0.999 at the best inlier share so far. Returns the camera of the best sample
+    re-estimated from its inliers (None where there are fewer than six) and the inliers (M,).
     """
     none = np.zeros(len(X), dtype=bool)
     if len(X) < _SAMPLE:

@@ -12,9 +12,9 @@ from thesisrecon.types import B8, I64, Reconstruction, Tracks
 def select_tracks(tracks: Tracks, *, points_per_view: int, cells: int = 8) -> B8:
     """The longest tracks, taken until each view has about ``points_per_view``; -> (n_points,) bool.
 
-    Every view's points are spread over a grid of ``cells`` x ``cells`` of its own extent: within a cell the longest
-    tracks come first, and all cells get their turn before a cell gets its next, so that detail in a corner of the
-    picture is not starved by a textured middle.
+    Every view's points are spread over a grid of ``cells`` x ``cells`` of its own extent: within a cell the
+    longest tracks come first, and all cells get their turn before a cell gets its next, so that detail in a
+    corner of the picture is not starved by a textured middle.
     """
     length = np.bincount(tracks.point_index, minlength=tracks.n_points)
     keep = np.zeros(tracks.n_points, dtype=bool)
@@ -43,7 +43,11 @@ def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:
     chosen = keep[tracks.point_index]
     number = np.cumsum(keep) - 1
     return Tracks(
-        tracks.view_index[chosen], number[tracks.point_index[chosen]], tracks.xy[chosen], tracks.n_views, int(keep.sum())
+        tracks.view_index[chosen],
+        number[tracks.point_index[chosen]],
+        tracks.xy[chosen],
+        tracks.n_views,
+        int(keep.sum()),
     )
 
 

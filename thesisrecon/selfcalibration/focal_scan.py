@@ -1,7 +1,8 @@
-"""Plane at infinity from guessed focals of two cameras (Gherardi and Fusiello, "Practical autocalibration", ECCV 2010).
+"""Plane at infinity from guessed focals of two cameras (Gherardi and Fusiello, "Practical autocalibration",
+ECCV 2010).
 
-Two cameras with known K fix the plane at infinity in closed form; scanning the two focals over the plausible range
-and looking at all the other cameras replaces every nonconvex search.
+Two cameras with known K fix the plane at infinity in closed form; scanning the two focals over the plausible
+range and looking at all the other cameras replaces every nonconvex search.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ def _rotation_to_first_axis(t: F64) -> F64:
 
 
 def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
-    """Planes at infinity p (2 B, 3) for guessed unit-free focals (B,) of the reference and of camera ``other``.
+    """Planes at infinity p (2 B, 3) for guessed unit-free focals (B,) of the reference and of camera
+    ``other``.
 
     Both signs of the second camera are returned, since a projective camera has none.
     """

@@ -1,8 +1,8 @@
 """The frame in which chapter 7 is solved: unit-free pixels, and one camera at [I | 0].
 
-A plane at infinity is then three numbers p with H = [[K_r, 0], [-p' K_r, 1]] (methods of Pollefeys and of Hartley
-alike): P H is metric when p and K_r are right, and p is finite for every real camera because its centre is not
-at infinity.
+A plane at infinity is then three numbers p with H = [[K_r, 0], [-p' K_r, 1]] (methods of Pollefeys and of
+Hartley alike): P H is metric when p and K_r are right, and p is finite for every real camera because its
+centre is not at infinity.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ F64 = NDArray[np.float64]
 class ReferenceFrame:
     """Registered cameras in unit-free pixels with the reference camera at [I | 0].
 
-    ``A`` (R, 3, 3), ``a`` (R, 3) with camera i ~ [A_i | a_i]; ``views`` (R,) their view numbers; ``reference`` the
-    place of the reference camera in ``views``; ``group`` (R,) camera number, 0-based and dense;
-    ``pixel_from_unit`` (V, 3, 3) for all views; ``reference_from_projective`` (4, 4).
+    ``A`` (R, 3, 3), ``a`` (R, 3) with camera i ~ [A_i | a_i]; ``views`` (R,) their view numbers;
+    ``reference`` the place of the reference camera in ``views``; ``group`` (R,) camera number, 0-based and
+    dense; ``pixel_from_unit`` (V, 3, 3) for all views; ``reference_from_projective`` (4, 4).
     """
 
     A: F64
@@ -59,11 +59,13 @@ def unit_pixels(sizes: I64) -> F64:
     return T
 
 
-def build_frame(reconstruction: Reconstruction, groups: I64, *, reference: int | None = None) -> ReferenceFrame:
+def build_frame(
+    reconstruction: Reconstruction, groups: I64, *, reference: int | None = None
+) -> ReferenceFrame:
     """Move the registered cameras of a projective reconstruction into a reference frame.
 
-    ``groups`` (V,) camera number of every view; ``reference`` a registered view (by default the one with the most
-    observations).
+    ``groups`` (V,) camera number of every view; ``reference`` a registered view (by default the one with the
+    most observations).
     """
     views = np.flatnonzero(reconstruction.registered)
     pixel_from_unit = unit_pixels(reconstruction.sizes)
@@ -82,12 +84,19 @@ def build_frame(reconstruction: Reconstruction, groups: I64, *, reference: int |
     Q[:, :, 3] /= max(baseline, 1e-12)
     dense_group = np.unique(groups[views], return_inverse=True)[1].astype(np.int64)
     return ReferenceFrame(
-        Q[:, :, :3], Q[:, :, 3], views, place, dense_group, pixel_from_unit, np.linalg.inv(projective_from_reference)
+        Q[:, :, :3],
+        Q[:, :, 3],
+        views,
+        place,
+        dense_group,
+        pixel_from_unit,
+        np.linalg.inv(projective_from_reference),
     )
 
 
 def metric_from_reference(p: F64, focal: float) -> F64:
-    """The upgrade H^-1 of a plane at infinity p (3,) and the reference camera's unit-free focal; -> (4, 4)."""
+    """The upgrade H^-1 of a plane at infinity p (3,) and the reference camera's unit-free focal; -> (4,
+    4)."""
     K = np.diag([focal, focal, 1.0])
     H = np.eye(4)
     H[:3, :3] = K

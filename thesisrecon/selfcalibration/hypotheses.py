@@ -1,12 +1,12 @@
 """Chapter 7 as a whole: many hypotheses, one refinement, the survivors with their order.
 
-Every closed form of the chapter fails on some photographs; together they do not. All of them only propose; what
-decides is one robust criterion over all cameras, cheirality, and later the metric bundle adjustment.
+Every closed form of the chapter fails on some photographs; together they do not. All of them only propose;
+what decides is one robust criterion over all cameras, cheirality, and later the metric bundle adjustment.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from thesisrecon.selfcalibration.infinity_search import InfinitySearch
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std, refine_hypotheses
 from thesisrecon.selfcalibration.verdict import identifiability
-from thesisrecon.types import FocalPrior, I64, Reconstruction, SelfCalibration, Upgrade
+from thesisrecon.types import I64, FocalPrior, Reconstruction, SelfCalibration, Upgrade
 
 F64 = NDArray[np.float64]
 
@@ -27,9 +27,10 @@ F64 = NDArray[np.float64]
 class HypothesesAndRefinement:
     """Self-calibration of square-pixel cameras with an unknown focal each or in common.
 
-    ``focal_range`` (in long sides) and ``focal_steps`` of the scans; ``subsets`` random camera subsets for the
-    quadric; ``refined`` hypotheses that are refined; ``kept`` answers that go on to bundle adjustment;
-    ``min_positive`` share of points in front that an answer needs; ``search`` Hartley's search, None to leave it out.
+    ``focal_range`` (in long sides) and ``focal_steps`` of the scans; ``subsets`` random camera subsets for
+    the quadric; ``refined`` hypotheses that are refined; ``kept`` answers that go on to bundle adjustment;
+    ``min_positive`` share of points in front that an answer needs; ``search`` Hartley's search, None to
+    leave it out.
     """
 
     focal_range: tuple[float, float] = (0.3, 10.0)
@@ -38,13 +39,19 @@ class HypothesesAndRefinement:
     refined: int = 40
     kept: int = 3
     min_positive: float = 0.95
-    criterion: RotationCriterion = RotationCriterion()
-    search: InfinitySearch | None = InfinitySearch()
+    criterion: RotationCriterion = field(default_factory=RotationCriterion)
+    search: InfinitySearch | None = field(default_factory=InfinitySearch)
 
     def calibrate(
-        self, reconstruction: Reconstruction, *, groups: I64, focal_prior: FocalPrior | None, rng: np.random.Generator
+        self,
+        reconstruction: Reconstruction,
+        *,
+        groups: I64,
+        focal_prior: FocalPrior | None,
+        rng: np.random.Generator,
     ) -> SelfCalibration:
-        """Upgrade a projective reconstruction of at least three cameras; ``StageFailure`` where nothing holds."""
+        """Upgrade a projective reconstruction of at least three cameras; ``StageFailure`` where nothing
+        holds."""
         require_cameras(reconstruction)
         frame = build_frame(reconstruction, groups)
         criterion = criterion_with_prior(self.criterion, frame, focal_prior)
@@ -53,7 +60,9 @@ class HypothesesAndRefinement:
         best = np.argsort(cost, kind="stable")[: self.refined]
         theta = np.concatenate([planes[best], log_f[best]], axis=1)
         theta, cost = refine_hypotheses(criterion, frame, theta)
-        return conclude(frame, reconstruction, criterion, (theta, cost), kept=self.kept, min_positive=self.min_positive)
+        return conclude(
+            frame, reconstruction, criterion, (theta, cost), kept=self.kept, min_positive=self.min_positive
+        )
 
     def _propose(
         self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
@@ -135,7 +144,8 @@ def conclude(
     kept: int,
     min_positive: float,
 ) -> SelfCalibration:
-    """Distinct refined answers with the scene in front of the cameras, best first, and the verdict on the motion."""
+    """Distinct refined answers with the scene in front of the cameras, best first, and the verdict on the
+    motion."""
     theta, cost = refined
     upgrades: list[Upgrade] = []
     thetas: list[F64] = []
@@ -157,8 +167,8 @@ def conclude(
     std_log_f, noise = focal_std(criterion, frame, thetas[0])
     identifiable, reasons = identifiability(frame, thetas[0], std_log_f, noise)
     K_std = np.zeros_like(upgrades[0].K)
-    K_std[frame.views, 0, 0] = K_std[frame.views, 1, 1] = (
-        upgrades[0].K[frame.views, 0, 0] * np.minimum(std_log_f[frame.group], 1e3)
+    K_std[frame.views, 0, 0] = K_std[frame.views, 1, 1] = upgrades[0].K[frame.views, 0, 0] * np.minimum(
+        std_log_f[frame.group], 1e3
     )
     best = upgrades[0]
     return SelfCalibration(best.metric_from_projective, best.K, K_std, identifiable, reasons, tuple(upgrades))
@@ -193,13 +203,19 @@ def _upgrade(
 
 @dataclass(frozen=True)
 class HartleySearch:
-    """Section 7.7 as the thesis has it: cheirality bounds, grid search, the best plane, one nonlinear refinement."""
+    """Section 7.7 as the thesis has it: cheirality bounds, grid search, the best plane, one nonlinear
+    refinement."""
 
-    search: InfinitySearch = InfinitySearch(steps=20, keep=1)
-    criterion: RotationCriterion = RotationCriterion()
+    search: InfinitySearch = field(default_factory=lambda: InfinitySearch(steps=20, keep=1))
+    criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
     def calibrate(
-        self, reconstruction: Reconstruction, *, groups: I64, focal_prior: FocalPrior | None, rng: np.random.Generator
+        self,
+        reconstruction: Reconstruction,
+        *,
+        groups: I64,
+        focal_prior: FocalPrior | None,
+        rng: np.random.Generator,
     ) -> SelfCalibration:
         """Upgrade by Hartley's search alone; ``StageFailure`` where the inequalities leave no plane."""
         require_cameras(reconstruction)
@@ -215,5 +231,3 @@ class HartleySearch:
         theta = np.concatenate([p, focals_of_groups(frame, p, f)], axis=1)
         refined = refine_hypotheses(criterion, frame, theta)
         return conclude(frame, reconstruction, criterion, refined, kept=1, min_positive=0.5)
-
-

@@ -1,9 +1,10 @@
 """Hartley's way: cheirality bounds the plane at infinity, a search finds it.
 
-R. Hartley, E. Hayman, L. de Agapito, I. Reid, "Camera calibration and the search for infinity", ICCV 1999. The plane
-at infinity leaves all points and all camera centres on one side; these inequalities make a bounded polytope in a
-quasi-affine frame, which is searched on a grid. Each candidate plane gives infinite homographies, and these give
-the image of the absolute conic linearly (de Agapito, Hartley and Hayman, CVPR 1999).
+R. Hartley, E. Hayman, L. de Agapito, I. Reid, "Camera calibration and the search for infinity", ICCV 1999.
+The plane at infinity leaves all points and all camera centres on one side; these inequalities make a bounded
+polytope in a quasi-affine frame, which is searched on a grid. Each candidate plane gives infinite
+homographies, and these give the image of the absolute conic linearly (de Agapito, Hartley and Hayman, CVPR
+1999).
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ def cheirality_inequalities(
 ) -> tuple[F64, F64]:
     """Oriented points (N, 4) and camera centres (R, 4) in the reference frame, unit norm.
 
-    Only points of three or more views take part: one wrong two-view point, which nothing contradicts, would cut the
-    true plane away. Points that the orientation cannot satisfy in every view are left out.
+    Only points of three or more views take part: one wrong two-view point, which nothing contradicts, would
+    cut the true plane away. Points that the orientation cannot satisfy in every view are left out.
     """
     tracks, keep = reconstruction.tracks, reconstruction.inlier
     view, point = tracks.view_index[keep], tracks.point_index[keep]
@@ -54,17 +55,21 @@ def _unit_rows(A: F64) -> F64:
 
 
 def deepest_plane(X: F64, C: F64) -> F64 | None:
-    """Plane v with X v >= d, C v >= d, |v| <= 1 and the largest d (a linear program); None where no d > 0 exists."""
+    """Plane v with X v >= d, C v >= d, |v| <= 1 and the largest d (a linear program); None where no d > 0
+    exists."""
     rows = np.concatenate([X, C])
     A = np.column_stack([-rows, np.ones(len(rows))])
-    answer = linprog([0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=[(-1, 1)] * 4 + [(None, None)])
+    answer = linprog(
+        [0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=[(-1, 1)] * 4 + [(None, None)]
+    )
     if answer.x is None or not answer.x[4] > 0:
         return None
     return np.asarray(answer.x[:4], dtype=np.float64)
 
 
 def quasi_affine_frame(X: F64, v: F64) -> F64:
-    """Transform (4, 4) that sends the plane v to infinity and makes the points' centroid 0 and covariance 1."""
+    """Transform (4, 4) that sends the plane v to infinity and makes the points' centroid 0 and covariance
+    1."""
     basis = np.linalg.svd(v[None])[2][1:]
     Y = X @ basis.T / (X @ v)[:, None]
     centre = Y.mean(axis=0)
@@ -77,7 +82,8 @@ def quasi_affine_frame(X: F64, v: F64) -> F64:
 
 
 def plane_box(X: F64, C: F64) -> F64 | None:
-    """Bounds (3, 2) of v for planes (v, 1) that satisfy the inequalities (six linear programs); None if unbounded."""
+    """Bounds (3, 2) of v for planes (v, 1) that satisfy the inequalities (six linear programs); None if
+    unbounded."""
     rows = np.concatenate([X, C])
     box = np.zeros((3, 2))
     for k in range(3):
@@ -94,9 +100,9 @@ def plane_box(X: F64, C: F64) -> F64 | None:
 def image_conic_from_homographies(H: F64) -> tuple[F64, F64]:
     """Image of the absolute conic in the reference view from infinite homographies H (B, R, 3, 3), linearly.
 
-    Each view j has w_j = H_j^-T w H_j^-1; no skew, square pixels and a centred principal point are four equations in
-    the six entries of w. Returns the squared unit-free focal (B,), NaN where w is not positive, and the score (B,):
-    smallest over second smallest singular value.
+    Each view j has w_j = H_j^-T w H_j^-1; no skew, square pixels and a centred principal point are four
+    equations in the six entries of w. Returns the squared unit-free focal (B,), NaN where w is not positive,
+    and the score (B,): smallest over second smallest singular value.
     """
     det = np.linalg.det(H)
     Hn = H / np.cbrt(np.where(np.abs(det) < 1e-12, 1e-12, det))[..., None, None]
@@ -133,7 +139,8 @@ class InfinitySearch:
     def search(
         self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
     ) -> tuple[F64, F64]:
-        """Planes p (B, 3) and reference focals (B,) in the reference frame, best score first; both orientations
+        """Planes p (B, 3) and reference focals (B,) in the reference frame, best score first; both
+        orientations
         are tried, and either may have no plane at all."""
         X, C = cheirality_inequalities(frame, reconstruction, max_points=self.max_points, rng=rng)
         found = [self._search_side(frame, X, sign * C) for sign in (1.0, -1.0)] if len(X) >= 8 else []

@@ -1,8 +1,8 @@
 """Section 7.3, direct: the absolute dual quadric by weighted linear equations.
 
-Pollefeys, Verbiest and Van Gool (ECCV 2002): each camera that is square, without skew and with its principal point
-in the middle gives six equations linear in the quadric. The weights suppose a focal near 1; scanning a normalising
-focal over the plausible range makes them right for one of the scanned values whatever the lens.
+Pollefeys, Verbiest and Van Gool (ECCV 2002): each camera that is square, without skew and with its principal
+point in the middle gives six equations linear in the quadric. The weights suppose a focal near 1; scanning a
+normalising focal over the plausible range makes them right for one of the scanned values whatever the lens.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ _PAIRS = [(a, b) for a in range(4) for b in range(a, 4)]
 
 
 def _quadratic_rows(x: F64, y: F64) -> F64:
-    """Rows r with r . q = x' Q y for the upper-triangle vector q of a symmetric Q; (..., 4), (..., 4) -> (..., 10)."""
+    """Rows r with r . q = x' Q y for the upper-triangle vector q of a symmetric Q; (..., 4), (..., 4) ->
+    (..., 10)."""
     terms = [x[..., a] * y[..., b] + (x[..., b] * y[..., a] if a != b else 0.0) for a, b in _PAIRS]
     return np.stack(terms, axis=-1)
 
@@ -31,10 +32,11 @@ def _symmetric(q: F64) -> F64:
 
 
 def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -> F64:
-    """Absolute dual quadrics (B, 4, 4) in the reference frame for each normalising focal (B,), rank 3, Q[2, 2] >= 0.
+    """Absolute dual quadrics (B, 4, 4) in the reference frame for each normalising focal (B,), rank 3, Q[2,
+    2] >= 0.
 
-    The rows are those of Pollefeys et al. with uncertainties 9 (focal), 0.2 (aspect), 0.01 (skew), 0.1 (principal
-    point), divided by the w33 of the previous iterate.
+    The rows are those of Pollefeys et al. with uncertainties 9 (focal), 0.2 (aspect), 0.01 (skew), 0.1
+    (principal point), divided by the w33 of the previous iterate.
     """
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
     P[:, :, :2] /= focals[:, None, None, None]
@@ -47,7 +49,9 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
     nu = np.linalg.norm(w33, axis=-1)
     q = np.zeros((len(focals), 10))
     for _ in range(iterations):
-        A = (rows / np.maximum(nu, 1e-9 * nu.max(axis=1, keepdims=True))[:, :, None, None]).reshape(len(focals), -1, 10)
+        A = (rows / np.maximum(nu, 1e-9 * nu.max(axis=1, keepdims=True))[:, :, None, None]).reshape(
+            len(focals), -1, 10
+        )
         q = np.linalg.eigh(np.einsum("bri,brj->bij", A, A))[1][:, :, 0]
         nu = np.abs(np.einsum("bvk,bk->bv", w33, q))
     Q = _symmetric(q)

@@ -1,8 +1,8 @@
 """Refinement of (plane at infinity, focals): one criterion for the hypotheses of every method.
 
-With C_i = K_i^-1 (A_i - a_i p') K_r every right hypothesis makes C_i a scaled rotation. The residuals are the six
-entries of 3 C C' / tr(C C') - I, the nonlinear criterion of Pollefeys et al. (IJCV 32(1), 1999) in its
-scale-free form; the focals are log f per camera group. Many hypotheses are refined at once.
+With C_i = K_i^-1 (A_i - a_i p') K_r every right hypothesis makes C_i a scaled rotation. The residuals are
+the six entries of 3 C C' / tr(C C') - I, the nonlinear criterion of Pollefeys et al. (IJCV 32(1), 1999) in
+its scale-free form; the focals are log f per camera group. Many hypotheses are refined at once.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class RotationCriterion:
     """How far the upgraded cameras are from scaled rotations, robustly.
 
     ``scale``: residual norm of a camera beyond which it counts linearly (soft L1). ``focal_log_mean`` and
-    ``focal_log_std`` with ``focal_weight``: a weak pull of every log focal (in long sides) that keeps hypotheses
-    out of the absurd and is far below the noise of a well-determined problem.
+    ``focal_log_std`` with ``focal_weight``: a weak pull of every log focal (in long sides) that keeps
+    hypotheses out of the absurd and is far below the noise of a well-determined problem.
     """
 
     scale: float = 0.05
@@ -125,8 +125,8 @@ def solve_guarded(N: F64, g: F64) -> F64:
 def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> tuple[F64, float]:
     """Standard deviations (G,) of log f at theta (3 + G,) and the noise of the residual entries.
 
-    From J'J with the noise estimated from the residuals themselves (5 independent entries a camera, the reference
-    included, less the unknowns); infinite where J'J is singular to rounding.
+    From J'J with the noise estimated from the residuals themselves (5 independent entries a camera, the
+    reference included, less the unknowns); infinite where J'J is singular to rounding.
     """
     row = theta[None]
     weights = criterion.weights(frame, row)

@@ -31,20 +31,25 @@ def upgraded_rotations(frame: ReferenceFrame, theta: F64) -> F64:
 
 
 def rotation_spread(R: F64) -> tuple[float, float]:
-    """Largest rotation angle between views and how far the rotations are from sharing one axis, both in degrees.
+    """Largest rotation angle between views and how far the rotations are from sharing one axis, both in
+    degrees.
 
-    The second number is the rms angle out of the best common axis: with rotation vectors r of all view pairs it is
-    the square root of the smallest but one eigenvalue of mean(r r').
+    The second number is the rms angle out of the best common axis: with rotation vectors r of all view pairs
+    it is the square root of the smallest but one eigenvalue of mean(r r').
     """
     i, j = np.triu_indices(len(R), 1)
     vectors = Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).as_rotvec()
     # Axes in the world frame, so that a turntable shows one axis whatever the cameras look like.
     world = np.einsum("kba,kb->ka", R[i], vectors)
     values = np.linalg.eigvalsh(world.T @ world / len(world))
-    return float(np.degrees(np.linalg.norm(vectors, axis=1).max())), float(np.degrees(np.sqrt(max(values[1], 0.0))))
+    return float(np.degrees(np.linalg.norm(vectors, axis=1).max())), float(
+        np.degrees(np.sqrt(max(values[1], 0.0)))
+    )
 
 
-def identifiability(frame: ReferenceFrame, theta: F64, std_log_f: F64, noise: float) -> tuple[bool, tuple[str, ...]]:
+def identifiability(
+    frame: ReferenceFrame, theta: F64, std_log_f: F64, noise: float
+) -> tuple[bool, tuple[str, ...]]:
     """Verdict and its reasons for a refined answer theta (3 + G,)."""
     angle, spread = rotation_spread(upgraded_rotations(frame, theta))
     worst = float(std_log_f.max())
@@ -55,7 +60,11 @@ def identifiability(frame: ReferenceFrame, theta: F64, std_log_f: F64, noise: fl
         "turn the camera more between photographs, or give a focal prior"
     ]
     if angle < _MIN_ROTATION_DEG:
-        reasons.append(f"the cameras hardly turn (largest rotation {angle:.1f} deg): close to a pure translation")
+        reasons.append(
+            f"the cameras hardly turn (largest rotation {angle:.1f} deg): close to a pure translation"
+        )
     elif spread < _MIN_AXIS_SPREAD_DEG:
-        reasons.append(f"all rotations share one axis to within {spread:.1f} deg: close to a planar or turntable motion")
+        reasons.append(
+            f"all rotations share one axis to within {spread:.1f} deg: close to a planar or turntable motion"
+        )
     return False, tuple(reasons)

@@ -1,0 +1,112 @@
+"""Triangulation and resection on exact data, and the signs of cheirality."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.geometry.camera import camera_centre, decompose_camera, distort, project, undistort
+from thesisrecon.geometry.cheirality import cheirality, depth, orient_signs
+from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
+from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_observations
+
+
+def test_linear_triangulation_is_exact_on_exact_data() -> None:
+    scene = make_scene()
+    t = scene.tracks
+    X = triangulate_observations(scene.P, t.view_index, t.point_index, t.xy, t.n_points)
+    np.testing.assert_allclose(X[:, :3] / X[:, 3:], scene.X, atol=1e-6)
+
+
+def test_triangulation_leaves_points_seen_once_at_zero() -> None:
+    scene = make_scene(points=20)
+    xy = np.full((8, 20, 2), np.nan)
+    xy[scene.tracks.view_index, scene.tracks.point_index] = scene.tracks.xy
+    xy[1:, 3] = np.nan
+    X = triangulate_linear(scene.P, xy)
+    assert not X[3].any()
+    keep = np.arange(20) != 3
+    np.testing.assert_allclose(X[keep, :3] / X[keep, 3:], scene.X[keep], atol=1e-6)
+
+
+def test_triangulation_refuses_wrong_shapes() -> None:
+    with pytest.raises(ValueError, match="triangulate needs"):
+        triangulate_linear(np.zeros((2, 3, 4)), np.zeros((3, 5, 2)))
+
+
+def test_linear_resection_recovers_the_camera() -> None:
+    scene = make_scene()
+    Xh = np.column_stack([scene.X, np.ones(len(scene.X))])
+    P = resect_linear(Xh[:10], project(scene.P[2], Xh[:10]))
+    np.testing.assert_allclose(project(P, Xh), project(scene.P[2], Xh), atol=1e-5)
+
+
+def test_three_point_pose_contains_the_truth() -> None:
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(500, 3, 3))
+    R = Rotation.random(500, random_state=1).as_matrix()
+    t = 0.5 * rng.normal(size=(500, 3)) + [0.0, 0.0, 5.0]
+    Y = np.einsum("bij,bkj->bki", R, X) + t[:, None]
+    found_R, found_t, sample = pose_from_three_points(X, Y / np.linalg.norm(Y, axis=2, keepdims=True))
+    error = np.abs(found_R - R[sample]).max(axis=(1, 2)) + np.abs(found_t - t[sample]).max(axis=1)
+    best = np.full(500, np.inf)
+    np.minimum.at(best, sample, error)
+    assert best.max() < 1e-6
+    np.testing.assert_allclose(np.linalg.det(found_R), 1.0)
+
+
+def test_three_point_pose_gives_nothing_for_collinear_points() -> None:
+    X = np.array([[[0.0, 0.0, 5.0], [1.0, 0.0, 5.0], [2.0, 0.0, 5.0]]])
+    X[:, 1] = X[:, 0]
+    rays = X / np.linalg.norm(X, axis=2, keepdims=True)
+    R, t, _ = pose_from_three_points(X, rays)
+    assert np.isfinite(R).all()
+    assert np.isfinite(t).all()
+
+
+def test_orientation_makes_every_depth_positive() -> None:
+    scene = make_scene()
+    reconstruction = projective_reconstruction(scene, seed=3)
+    t = scene.tracks
+    views, points, share = orient_signs(reconstruction.P, reconstruction.X, t.view_index, t.point_index)
+    P = reconstruction.P * views[:, None, None]
+    X = reconstruction.X * points[:, None]
+    w = np.einsum("kj,kj->k", P[t.view_index, 2], X[t.point_index])
+    assert share == 1.0
+    assert (w > 0).all() or (w < 0).all()
+
+
+def test_cheirality_has_the_sign_of_depth_and_ignores_scale() -> None:
+    scene = make_scene()
+    X = np.column_stack([scene.X, np.ones(len(scene.X))])
+    X[0, :3] = scene.centres[0] - 3.0 * scene.R[0][2]
+    chi, z = cheirality(X, scene.P[0]), depth(X, scene.P[0])
+    assert z[0] < 0 < z[1:].min()
+    np.testing.assert_array_equal(np.sign(chi), np.sign(z))
+    np.testing.assert_allclose(cheirality(-2.0 * X, -0.5 * scene.P[0]), chi)
+    np.testing.assert_allclose(z[1:], (scene.X[1:] @ scene.R[0].T + scene.t[0])[:, 2])
+
+
+def test_camera_parts_and_centre_by_minors() -> None:
+    scene = make_scene()
+    for v in range(3):
+        K, R, t = decompose_camera(-3.0 * scene.P[v])
+        np.testing.assert_allclose(K, scene.K[v], atol=1e-8)
+        np.testing.assert_allclose(R, scene.R[v], atol=1e-10)
+        np.testing.assert_allclose(t, scene.t[v], atol=1e-8)
+        C = camera_centre(scene.P[v])
+        np.testing.assert_allclose(C[:3] / C[3], scene.centres[v], atol=1e-9)
+        assert np.abs(scene.P[v] @ C).max() < 1e-6 * np.abs(C).max() * np.abs(scene.P[v]).max()
+
+
+def test_a_camera_at_infinity_is_refused() -> None:
+    with pytest.raises(ValueError, match="finite camera"):
+        decompose_camera(np.eye(3, 4) * np.array([[1.0], [1.0], [0.0]]))
+
+
+def test_undistortion_inverts_distortion() -> None:
+    xy = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
+    for k1 in (-0.2, 0.0, 0.15):
+        np.testing.assert_allclose(undistort(distort(xy, k1), k1), xy, atol=1e-9)

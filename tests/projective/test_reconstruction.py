@@ -1,0 +1,169 @@
+"""Chapter 6 on exact and noisy tracks: both variants, the gate, the initial pair, robust resection."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic import TrueScene, make_scene, true_pairs
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import project
+from thesisrecon.projective import GatedIncremental, SequentialProjective
+from thesisrecon.projective.gate import predicted_spread_px
+from thesisrecon.projective.initial_pair import cameras_from_fundamental, rank_initial_pairs
+from thesisrecon.projective.resection import resect_robust
+from thesisrecon.projective.selection import select_tracks
+from thesisrecon.types import Reconstruction, Tracks
+
+
+def residuals(found: Reconstruction) -> np.ndarray:
+    t, k = found.tracks, found.inlier
+    xh = np.einsum("kab,kb->ka", found.P[t.view_index[k]], found.X[t.point_index[k]])
+    return np.linalg.norm(xh[:, :2] / xh[:, 2:] - t.xy[k], axis=1)
+
+
+def projective_error(found: Reconstruction, scene: TrueScene) -> float:
+    """Largest distance (scene units) of the points from the truth after the best projective alignment."""
+    valid = found.valid
+    X, Y = found.X[valid], np.column_stack([scene.X[valid], np.ones(valid.sum())])
+    rows = []
+    for a in range(3):
+        row = np.zeros((len(X), 4, 4))
+        row[:, a] = X
+        row[:, 3] = -Y[:, a : a + 1] * X
+        rows.append(row.reshape(len(X), 16))
+    H = np.linalg.svd(np.concatenate(rows))[2][-1].reshape(4, 4)
+    Z = X @ H.T
+    return float(np.abs(Z[:, :3] / Z[:, 3:] - scene.X[valid]).max())
+
+
+@pytest.mark.parametrize(
+    "variant", [GatedIncremental(), SequentialProjective()], ids=lambda v: type(v).__name__
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_exact_tracks_give_the_true_scene_up_to_a_projective_transform(
+    variant: GatedIncremental, seed: int
+) -> None:
+    scene = make_scene(seed=seed)
+    found = variant.reconstruct(scene.tracks, true_pairs(scene), scene.sizes, rng=np.random.default_rng(0))
+    assert found.stratum == "projective"
+    assert found.registered.all()
+    assert found.valid.all()
+    assert found.inlier.all()
+    assert residuals(found).max() < 1e-3
+    assert projective_error(found, scene) < 1e-3
+
+
+def test_noise_comes_back_as_residual_and_wrong_observations_are_left_out() -> None:
+    scene = make_scene(seed=2, sigma_px=0.5, points=500)
+    t = scene.tracks
+    rng = np.random.default_rng(5)
+    wrong = rng.random(len(t.xy)) < 0.05
+    xy = t.xy + np.where(wrong[:, None], rng.uniform(-200, 200, t.xy.shape), 0.0)
+    spoiled = replace(scene, tracks=replace(t, xy=xy))
+    found = GatedIncremental().reconstruct(spoiled.tracks, true_pairs(scene), scene.sizes, rng=rng)
+    assert found.registered.all()
+    assert found.sigma_px == pytest.approx(0.5, rel=0.25)
+    far = wrong & (np.linalg.norm(xy - t.xy, axis=1) > 30.0)
+    assert found.inlier[far].mean() < 0.02
+    assert found.inlier[~wrong].mean() > 0.9
+
+
+def test_a_view_of_a_plane_is_postponed_with_its_reason() -> None:
+    scene = make_scene(seed=3, sigma_px=0.3, points=400)
+    t = scene.tracks
+    X = scene.X.copy()
+    flat = X[:, 2] < 0.0
+    X[flat, 2] = -0.75
+    # View 7 sees the plane z = -0.75 only; all others see everything they saw.
+    xy = np.concatenate([project(scene.P[v], X[t.point_index[t.view_index == v]]) for v in range(8)])
+    order = np.concatenate([np.flatnonzero(t.view_index == v) for v in range(8)])
+    pixels = np.empty_like(t.xy)
+    pixels[order] = xy + np.random.default_rng(0).normal(0, 0.3, xy.shape)
+    keep = (t.view_index != 7) | flat[t.point_index]
+    tracks = Tracks(t.view_index[keep], t.point_index[keep], pixels[keep], 8, 400)
+    planar = replace(scene, tracks=tracks, X=X)
+    pairs = [replace(p, accepted=p.j != 7) for p in true_pairs(planar)]
+    found = GatedIncremental().reconstruct(tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
+    assert found.registered[:7].all()
+    assert not found.registered[7]
+    assert "plane" in found.reasons[7]
+
+
+def test_without_accepted_pairs_there_is_one_clear_sentence() -> None:
+    scene = make_scene()
+    pairs = [replace(p, accepted=False) for p in true_pairs(scene)]
+    for variant in (GatedIncremental(), SequentialProjective()):
+        with pytest.raises(StageFailure, match="photographs"):
+            variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
+
+
+def test_initial_cameras_have_the_fundamental_matrix_they_came_from() -> None:
+    scene = make_scene()
+    pair = true_pairs(scene)[0]
+    P1, P2 = cameras_from_fundamental(pair.F, scene.sizes[:2])
+    M = P2[:, :3] @ np.linalg.inv(P1[:, :3])
+    e = P2[:, 3] - M @ P1[:, 3]
+    cross = np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
+    F = cross @ M
+    F /= np.linalg.norm(F) * np.sign(np.sum(F * pair.F))
+    np.testing.assert_allclose(F, pair.F, atol=1e-9)
+    assert np.linalg.cond(M) < 1e5
+
+
+def test_a_planar_pair_is_not_the_first_choice() -> None:
+    pairs = true_pairs(make_scene())
+    flat = [replace(p, homography_share=1.0 if (p.i, p.j) != (2, 5) else 0.3) for p in pairs]
+    assert (
+        rank_initial_pairs(make_scene().tracks, flat)[0].i,
+        rank_initial_pairs(make_scene().tracks, flat)[0].j,
+    ) == (
+        2,
+        5,
+    )
+
+
+def test_robust_resection_finds_the_camera_among_wrong_points() -> None:
+    scene = make_scene()
+    rng = np.random.default_rng(0)
+    Xh = np.column_stack([scene.X, np.ones(len(scene.X))])
+    Xh /= np.linalg.norm(Xh, axis=1, keepdims=True)
+    xy = project(scene.P[1], Xh)
+    wrong = np.arange(len(xy)) < 90
+    xy[wrong] += rng.uniform(30, 300, (90, 2))
+    P, inlier = resect_robust(Xh, xy, threshold_px=2.0, rng=rng)
+    assert P is not None
+    np.testing.assert_array_equal(inlier, ~wrong)
+    np.testing.assert_allclose(project(P, Xh[~wrong]), xy[~wrong], atol=1e-3)
+
+
+def test_too_few_points_give_no_camera() -> None:
+    P, inlier = resect_robust(
+        np.ones((5, 4)), np.ones((5, 2)), threshold_px=1.0, rng=np.random.default_rng(0)
+    )
+    assert P is None
+    assert not inlier.any()
+
+
+def test_spread_of_the_gate_is_the_spread_of_perturbed_cameras() -> None:
+    scene = make_scene()
+    rng = np.random.default_rng(0)
+    X = np.column_stack([scene.X[:20], np.ones(20)])
+    P = scene.P[0] / np.linalg.norm(scene.P[0])
+    A = 1e-5 * rng.normal(size=(12, 12)) * np.abs(P).ravel()[:, None]
+    draws = P + (rng.normal(size=(20000, 12)) @ A.T).reshape(-1, 3, 4)
+    xh = np.einsum("dab,nb->dna", draws, X)
+    measured = np.sqrt((xh[..., :2] / xh[..., 2:]).var(axis=0).mean(axis=1))
+    np.testing.assert_allclose(predicted_spread_px(P, A @ A.T, X), measured, rtol=0.05)
+
+
+def test_selection_keeps_the_longest_tracks_of_every_view() -> None:
+    scene = make_scene(points=2000)
+    keep = select_tracks(scene.tracks, points_per_view=100)
+    seen = np.bincount(scene.tracks.view_index[keep[scene.tracks.point_index]], minlength=8)
+    length = np.bincount(scene.tracks.point_index)
+    assert seen.min() >= 100
+    assert keep.sum() < 800
+    assert length[keep].mean() > length.mean()

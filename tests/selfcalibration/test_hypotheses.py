@@ -1,0 +1,124 @@
+"""Self-calibration on exact and noisy scenes, shared and varying focals, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from thesisrecon.errors import StageFailure
+from thesisrecon.selfcalibration import HartleySearch, HypothesesAndRefinement
+from thesisrecon.selfcalibration.focal_scan import plane_from_focals
+from thesisrecon.selfcalibration.frame import build_frame, metric_from_reference
+from thesisrecon.selfcalibration.quadric import quadric_hypotheses
+from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.types import FocalPrior, SelfCalibration
+
+METHODS = [HypothesesAndRefinement(), HartleySearch()]
+
+
+def calibrate(method: object, scene: TrueScene, *, shared: bool = True, seed: int = 0) -> SelfCalibration:
+    reconstruction = projective_reconstruction(scene, seed=seed)
+    groups = np.zeros(len(scene.P), dtype=np.int64) if shared else np.arange(len(scene.P))
+    return method.calibrate(  # type: ignore[attr-defined]
+        reconstruction, groups=groups, focal_prior=None, rng=np.random.default_rng(seed)
+    )
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("zoom", [0.0, 0.3])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_exact_cameras_give_the_exact_focal(method: object, zoom: float, seed: int) -> None:
+    scene = make_scene(zoom=zoom, seed=seed)
+    answer = calibrate(method, scene, shared=zoom == 0.0, seed=seed)
+    # The weak pull on the focal moves exact data by far less than any noise would.
+    np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[:, 0, 0], rtol=2e-3)
+    assert answer.identifiable
+
+
+def test_the_upgrade_makes_every_camera_a_scaled_rotation() -> None:
+    scene = make_scene(seed=4)
+    reconstruction = projective_reconstruction(scene, seed=4)
+    answer = calibrate(HypothesesAndRefinement(), scene, seed=4)
+    P = reconstruction.P @ np.linalg.inv(answer.metric_from_projective)
+    C = np.linalg.inv(answer.K) @ P[:, :, :3]
+    CC = C @ C.swapaxes(1, 2)
+    CC /= np.trace(CC, axis1=1, axis2=2)[:, None, None] / 3.0
+    np.testing.assert_allclose(CC, np.tile(np.eye(3), (len(C), 1, 1)), atol=5e-3)
+
+
+def test_points_end_in_front_of_the_cameras() -> None:
+    scene = make_scene(seed=5)
+    reconstruction = projective_reconstruction(scene, seed=5)
+    G = calibrate(HypothesesAndRefinement(), scene, seed=5).metric_from_projective
+    P = reconstruction.P @ np.linalg.inv(G)
+    P *= np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
+    X = reconstruction.X @ G.T
+    t = scene.tracks
+    depth = np.einsum("kj,kj->k", P[t.view_index, 2], X[t.point_index]) / X[t.point_index, 3]
+    assert (depth > 0).all()
+
+
+def test_each_closed_form_contains_the_truth() -> None:
+    scene = make_scene(seed=6)
+    frame = build_frame(projective_reconstruction(scene, seed=6), np.zeros(8, dtype=np.int64))
+    f = scene.K[0, 0, 0] / 1536.0
+    criterion = RotationCriterion(focal_weight=0.0)
+    planes, focals = quadric_hypotheses(frame, np.array([f]))
+    assert focals[0] == pytest.approx(f, rel=1e-6)
+    log_f = np.full((1, 1), np.log(f))
+    assert criterion.cost(frame, planes, log_f)[0] < 1e-12
+    other = 0 if frame.reference != 0 else 1
+    both_signs = plane_from_focals(frame, other, np.array([f]), np.array([f]))
+    assert criterion.cost(frame, both_signs, np.repeat(log_f, 2, axis=0)).min() < 1e-12
+    assert abs(np.linalg.det(metric_from_reference(planes[0], f))) > 0
+
+
+def test_two_cameras_are_refused() -> None:
+    scene = make_scene()
+    reconstruction = projective_reconstruction(scene)
+    registered = np.zeros(8, dtype=bool)
+    registered[:2] = True
+    with pytest.raises(StageFailure, match="at least 3"):
+        HypothesesAndRefinement().calibrate(
+            replace(reconstruction, registered=registered),
+            groups=np.zeros(8, dtype=np.int64),
+            focal_prior=None,
+            rng=np.random.default_rng(0),
+        )
+
+
+def test_pure_translation_is_called_unidentifiable() -> None:
+    scene = make_scene(seed=7)
+    still = replace(
+        scene, R=np.tile(scene.R[0], (8, 1, 1)), t=-np.einsum("ab,vb->va", scene.R[0], scene.centres)
+    )
+    try:
+        answer = calibrate(HypothesesAndRefinement(), still)
+    except StageFailure:
+        return
+    assert not answer.identifiable
+    assert any("translation" in reason for reason in answer.reasons)
+
+
+def test_a_prior_pulls_an_undetermined_focal() -> None:
+    scene = make_scene(seed=7)
+    still = replace(
+        scene, R=np.tile(scene.R[0], (8, 1, 1)), t=-np.einsum("ab,vb->va", scene.R[0], scene.centres)
+    )
+    reconstruction = projective_reconstruction(still)
+    answer = HypothesesAndRefinement().calibrate(
+        reconstruction,
+        groups=np.zeros(8, dtype=np.int64),
+        focal_prior=FocalPrior(np.full(8, 1500.0), 0.01),
+        rng=np.random.default_rng(0),
+    )
+    np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=0.1)
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    scene = make_scene(seed=8, sigma_px=0.5)
+    first, second = (calibrate(HypothesesAndRefinement(), scene, seed=8) for _ in range(2))
+    assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()

@@ -1,0 +1,140 @@
+"""A small general scene with exact truth, for the tests of the geometric stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.geometry.camera import compose_camera, project_camera
+from thesisrecon.types import Reconstruction, Tracks, TwoView
+
+
+@dataclass(frozen=True)
+class TrueScene:
+    """K, R, t, centres per view, points, tracks and image sizes."""
+
+    K: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+    X: np.ndarray
+    k1: float
+    tracks: Tracks
+    sizes: np.ndarray
+
+    @property
+    def P(self) -> np.ndarray:
+        return compose_camera(self.K, self.R, self.t)
+
+    @property
+    def centres(self) -> np.ndarray:
+        return -np.einsum("vba,vb->va", self.R, self.t)
+
+
+def make_scene(
+    *,
+    views: int = 8,
+    points: int = 300,
+    sigma_px: float = 0.0,
+    focal: float = 1500.0,
+    zoom: float = 0.0,
+    principal_shift: tuple[float, float] = (0.0, 0.0),
+    k1: float = 0.0,
+    seen_share: float = 0.75,
+    seed: int = 0,
+) -> TrueScene:
+    """Cameras on an irregular cap around a cloud of points, turned and rolled as a hand would."""
+    rng = np.random.default_rng(seed)
+    size = np.array([1536, 1024])
+    X = rng.uniform([-2.0, -1.6, -1.5], [2.0, 1.6, 1.5], (points, 3))
+    K, R, t = [], [], []
+    for _ in range(views):
+        azimuth, height = rng.uniform(-0.7, 0.7), rng.uniform(-0.35, 0.35)
+        direction = np.array(
+            [np.sin(azimuth) * np.cos(height), np.sin(height), -np.cos(azimuth) * np.cos(height)]
+        )
+        centre = rng.uniform(6.0, 9.0) * direction
+        z = rng.normal(0.0, 0.3, 3) - centre
+        z /= np.linalg.norm(z)
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        roll = Rotation.from_euler("z", rng.uniform(-0.3, 0.3)).as_matrix()
+        rotation = roll @ np.array([x, np.cross(z, x), z])
+        f = focal * np.exp(rng.uniform(-zoom, zoom))
+        cx, cy = (size - 1) / 2 + np.array(principal_shift)
+        K.append([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+        R.append(rotation)
+        t.append(-rotation @ centre)
+    Ka, Ra, ta = np.array(K), np.array(R), np.array(t)
+    seen = rng.random((views, points)) < seen_share
+    seen[:2] |= ~(seen.sum(axis=0) >= 2)
+    point, view = np.nonzero(seen.T)
+    xy = np.empty((len(view), 2))
+    for v in range(views):
+        mine = view == v
+        xy[mine] = project_camera(Ka[v], Ra[v], ta[v], X[point[mine]], k1=k1)
+    xy += rng.normal(0.0, sigma_px, xy.shape) if sigma_px else 0.0
+    tracks = Tracks(view, point, xy, views, points)
+    return TrueScene(Ka, Ra, ta, X, k1, tracks, np.tile(size, (views, 1)))
+
+
+def projective_reconstruction(scene: TrueScene, *, seed: int = 0) -> Reconstruction:
+    """The true cameras and points moved by a random projective transform, with random scales and signs."""
+    rng = np.random.default_rng(seed)
+    G = np.eye(4) + 0.3 * rng.normal(size=(4, 4))
+    P = scene.P @ np.linalg.inv(G)
+    P = P * (rng.uniform(0.5, 2.0, len(P)) * rng.choice([-1.0, 1.0], len(P)))[:, None, None]
+    X = np.column_stack([scene.X, np.ones(len(scene.X))]) @ G.T
+    X = X * rng.choice([-1.0, 1.0], len(X))[:, None]
+    n = len(P)
+    return Reconstruction(
+        "projective",
+        P,
+        X,
+        np.ones(n, dtype=bool),
+        np.ones(len(X), dtype=bool),
+        np.ones(len(scene.tracks.xy), dtype=bool),
+        scene.tracks,
+        scene.sizes,
+        1.0,
+        ("",) * n,
+    )
+
+
+def true_pairs(scene: TrueScene) -> list[TwoView]:
+    """Every pair with its true F and all common points as verified matches."""
+    t = scene.tracks
+    table = np.full((t.n_views, t.n_points), -1)
+    table[t.view_index, t.point_index] = np.arange(len(t.xy))
+    pairs = []
+    for i in range(t.n_views):
+        for j in range(i + 1, t.n_views):
+            both = np.flatnonzero((table[i] >= 0) & (table[j] >= 0))
+            R = scene.R[j] @ scene.R[i].T
+            translation = scene.t[j] - R @ scene.t[i]
+            cross = np.array(
+                [
+                    [0, -translation[2], translation[1]],
+                    [translation[2], 0, -translation[0]],
+                    [-translation[1], translation[0], 0],
+                ]
+            )
+            F = np.linalg.inv(scene.K[j]).T @ cross @ R @ np.linalg.inv(scene.K[i])
+            pairs.append(
+                TwoView(
+                    i,
+                    j,
+                    F / np.linalg.norm(F),
+                    0.3,
+                    both,
+                    both,
+                    t.xy[table[i, both]],
+                    t.xy[table[j, both]],
+                    np.tile(np.eye(2), (len(both), 1, 1)),
+                    len(both),
+                    0.2,
+                    True,
+                )
+            )
+    return pairs

@@ -1,0 +1,128 @@
+"""Section 3.6: what two views see of one scene: F, epipoles and lines, residuals, homographies, canonical cameras.
+
+x2' F x1 = 0; the epipolar line in image 2 is F x1, in image 1 F' x2; F e1 = 0, F' e2 = 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.camera import camera_centre
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, normalizing_transform
+
+F64 = NDArray[np.float64]
+
+
+def unit_norm(F: F64) -> F64:
+    """F with Frobenius norm 1 (zeros stay zeros); (..., 3, 3)."""
+    norm = np.sqrt(np.sum(F**2, axis=(-2, -1), keepdims=True))
+    return F / np.where(norm > 0.0, norm, 1.0)
+
+
+def enforce_rank_two(F: F64) -> F64:
+    """The nearest matrix of rank 2 (Frobenius norm), scaled to unit norm; (3, 3)."""
+    U, s, Vt = np.linalg.svd(F)
+    return unit_norm((U[:, :2] * s[:2]) @ Vt[:2])
+
+
+def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
+    """F = [e2]x P2 P1^+ (3.35) of two cameras (3, 4) with different centres, unit norm.
+
+    Raises ``ValueError`` where the centres coincide: the views are then related by a homography, not by an F.
+    """
+    P1, P2 = P1 / np.linalg.norm(P1), P2 / np.linalg.norm(P2)
+    centre = camera_centre(P1)
+    e2 = P2 @ (centre / np.linalg.norm(centre))
+    if not np.linalg.norm(e2) > 1e-12:
+        raise ValueError("fundamental_from_cameras needs cameras with different centres")
+    return unit_norm(cross_matrix(e2) @ P2 @ np.linalg.pinv(P1))
+
+
+def epipoles(F: F64) -> tuple[F64, F64]:
+    """Unit vectors e1, e2 (3,) with F e1 = 0 and F' e2 = 0, of the nearest matrix of rank 2."""
+    U, _, Vt = np.linalg.svd(F)
+    return Vt[2], U[:, 2]
+
+
+def epipolar_lines(F: F64, xy1: F64) -> F64:
+    """Lines (N, 3) in image 2 of points (N, 2) of image 1, with unit normals so that l . (x, y, 1) is a distance.
+
+    For lines in image 1 of points of image 2 pass F'. The line of an epipole is zero.
+    """
+    lines = homogenize(xy1) @ F.T
+    norm = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    return lines / np.where(norm > 0.0, norm, 1.0)
+
+
+def algebraic_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
+    """x2' F x1 of (5.2); (N,)."""
+    return np.einsum("na,ab,nb->n", homogenize(xy2), F, homogenize(xy1))
+
+
+def _gradients(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
+    """Squared norms of the gradient of x2' F x1 by x2 and by x1; (N,) each, never 0."""
+    lines2, lines1 = homogenize(xy1) @ F.T, homogenize(xy2) @ F
+    return np.sum(lines2[:, :2] ** 2, axis=1) + 1e-300, np.sum(lines1[:, :2] ** 2, axis=1) + 1e-300
+
+
+def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
+    """Signed Sampson distances in px (5.4); (N,).
+
+    To first order the distance of (x1, y1, x2, y2) to the nearest exact match; its standard deviation is that of
+    one image coordinate.
+    """
+    g2, g1 = _gradients(F, xy1, xy2)
+    return algebraic_residuals(F, xy1, xy2) / np.sqrt(g1 + g2)
+
+
+def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
+    """Root of the sum of the two squared distances to the epipolar lines, px, the summand of (5.6); (N,) >= 0."""
+    g2, g1 = _gradients(F, xy1, xy2)
+    return np.abs(algebraic_residuals(F, xy1, xy2)) * np.sqrt(1.0 / g1 + 1.0 / g2)
+
+
+def estimate_homography(xy1: F64, xy2: F64) -> F64:
+    """H (3, 3), unit norm, with x2 ~ H x1 from N >= 4 matches by the normalised direct linear transform (HZ 4.2).
+
+    Raises ``ValueError`` for fewer than 4 matches, wrong shapes or points that are all equal.
+    """
+    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2 or len(xy1) < 4:
+        raise ValueError(f"estimate_homography needs two (N >= 4, 2) arrays; got {xy1.shape} and {xy2.shape}")
+    T1, T2 = normalizing_transform(xy1), normalizing_transform(xy2)
+    x1, (u, v) = homogenize(xy1) @ T1.T, (xy2 @ T2[:2, :2].T + T2[:2, 2]).T
+    zero = np.zeros_like(x1)
+    A = np.concatenate([np.hstack([x1, zero, -u[:, None] * x1]), np.hstack([zero, x1, -v[:, None] * x1])])
+    H = np.linalg.eigh(A.T @ A)[1][:, 0].reshape(3, 3)
+    return unit_norm(np.linalg.solve(T2, H @ T1))
+
+
+def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
+    """Distances |x2 - H x1| in image 2, px; (N,), inf for points that H sends to infinity."""
+    moved = dehomogenize(homogenize(xy1) @ H.T)
+    with np.errstate(invalid="ignore"):
+        distance = np.linalg.norm(xy2 - moved, axis=1)
+    return np.where(np.isfinite(distance), distance, np.inf)
+
+
+def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -> tuple[F64, F64]:
+    """P1 = [I 0], P2 = [-[e2]x F + e2 v'  scale e2] (3.42): one projective frame in which the two cameras have F.
+
+    ``plane`` v (3,) are the free coordinates of the plane that plays the part of infinity. With v = 0 the left part
+    of P2 is singular; without a plane v is chosen such that it is the nearest to a multiple of the identity
+    (least squares). ``scale`` is the last of the four free parameters and must not be 0.
+    """
+    if scale == 0.0 or not np.isfinite(scale):
+        raise ValueError(f"canonical_cameras needs a finite scale other than 0; got {scale}")
+    F = unit_norm(F)
+    _, e2 = epipoles(F)
+    M = -cross_matrix(e2) @ F
+    if plane is None:
+        # min over (v, m) of |M + e2 v' - m I|^2 + |m|-normalisation: with v = m e2 - M'e2 + ... the part along e2
+        # is matched exactly and m is the mean of the rest's trace.
+        m = float(np.trace(M)) / 2.0
+        size = float(np.linalg.norm(M)) / np.sqrt(2.0)
+        m = m if abs(m) > 0.1 * size else size
+        plane = m * e2 - M.T @ e2
+    P2 = np.hstack([M + np.outer(e2, plane), scale * e2[:, None]])
+    return np.hstack([np.eye(3), np.zeros((3, 1))]), P2
