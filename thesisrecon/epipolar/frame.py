@@ -1,0 +1,86 @@
+"""What every estimator of F does first and last: refuse what cannot work, choose a frame, come back to pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.multiview import unit_norm
+
+F64 = NDArray[np.float64]
+
+COLLINEAR = 1e-9
+"""Spread across the longest direction, relative to it, below which points count as lying on one line."""
+
+
+def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
+    """The matches as float64 (N, 2) arrays that can determine an F.
+
+    Raises ``ValueError`` for other shapes and for coordinates that are not finite, ``StageFailure`` for fewer than
+    ``needed`` matches and for points that are all equal or on one line in an image.
+    """
+    xy1, xy2 = np.ascontiguousarray(xy1, dtype=np.float64), np.ascontiguousarray(xy2, dtype=np.float64)
+    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
+        raise ValueError(f"a fundamental matrix needs two (N, 2) arrays of pixels; got {xy1.shape} and {xy2.shape}")
+    if not (np.isfinite(xy1).all() and np.isfinite(xy2).all()):
+        raise ValueError("a fundamental matrix needs finite pixel coordinates; some are NaN or infinite")
+    if len(xy1) < needed:
+        raise StageFailure(
+            "too few matches for the geometry of the pair",
+            f"found {len(xy1)}, needed at least {needed}",
+            "Use photographs that overlap more",
+        )
+    for name, xy in (("first", xy1), ("second", xy2)):
+        spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
+        if not spread[1] > COLLINEAR * max(spread[0], float(np.abs(xy).max()) * 1e-3, 1e-300):
+            raise StageFailure(
+                f"the matched points lie on one line in the {name} image",
+                f"{len(xy)} points, spread across the line {spread[1] / np.sqrt(len(xy)):.3g} px",
+                "Such points leave the geometry of the pair free",
+            )
+    return xy1, xy2
+
+
+@dataclass(frozen=True)
+class PairFrame:
+    """Coordinates of both images about their centroids, scaled by one common factor ``scale`` (1 / px).
+
+    The common factor keeps Sampson distances what they are in pixels, times ``scale``; a factor per image would
+    weight the images against each other.
+    """
+
+    centroid1: F64
+    centroid2: F64
+    scale: float
+
+    @classmethod
+    def of(cls, xy1: F64, xy2: F64) -> PairFrame:
+        """The frame in which the mean squared coordinate over both images is 1."""
+        c1, c2 = xy1.mean(axis=0), xy2.mean(axis=0)
+        spread = np.sqrt(0.5 * (np.var(xy1, axis=0).mean() + np.var(xy2, axis=0).mean()))
+        return cls(c1, c2, 1.0 / float(spread))
+
+    def points(self, xy1: F64, xy2: F64) -> F64:
+        """Rows (x1, y1, x2, y2) in the frame; (N, 4)."""
+        return np.ascontiguousarray(np.hstack([xy1 - self.centroid1, xy2 - self.centroid2]) * self.scale)
+
+    @property
+    def to_pixels(self) -> F64:
+        """(9, 9) matrix that takes vec(F) of the frame to vec(F) of pixels, up to scale."""
+        return np.kron(self._transform(self.centroid2).T, self._transform(self.centroid1).T)
+
+    def matrix_in_pixels(self, f: F64) -> F64:
+        """F (3, 3) in pixels, unit norm, from a flat vector (9,) in the frame."""
+        return unit_norm((self.to_pixels @ f).reshape(3, 3))
+
+    def matrix_in_frame(self, F: F64) -> F64:
+        """Flat unit vector (9,) in the frame from F (3, 3) in pixels."""
+        T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
+        return np.ascontiguousarray(unit_norm(np.linalg.inv(T2).T @ F @ np.linalg.inv(T1)).ravel())
+
+    def _transform(self, centroid: F64) -> F64:
+        s = self.scale
+        return np.array([[s, 0.0, -s * centroid[0]], [0.0, s, -s * centroid[1]], [0.0, 0.0, 1.0]])

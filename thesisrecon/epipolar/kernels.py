@@ -1,0 +1,265 @@
+"""Compiled loops of chapter 5: minimal solver, orientation, score and the search that joins them.
+
+Points are rows (x1, y1, x2, y2) in one frame in which both images are scaled alike, so that Sampson distances
+are pixels times that scale. F is a flat row-major vector of 9.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
+from thesisrecon.robust.kernels import draw_sample, required_samples
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+DIAGONAL = np.sqrt(0.5)
+
+
+@njit(cache=True, nogil=True)
+def null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
+    """Two orthonormal vectors (``pencil`` (2, 9)) that span the null space of the seven equations (5.1).
+
+    Householder QR of A' (9, 7): the last two columns of Q. False where the equations are dependent.
+    """
+    A = np.empty((9, 7))
+    for k in range(7):
+        x1, y1, x2, y2 = points[sample[k]]
+        A[0, k], A[1, k], A[2, k] = x2 * x1, x2 * y1, x2
+        A[3, k], A[4, k], A[5, k] = y2 * x1, y2 * y1, y2
+        A[6, k], A[7, k], A[8, k] = x1, y1, 1.0
+    scales = np.empty(7)
+    for k in range(7):
+        norm = 0.0
+        for r in range(k, 9):
+            norm += A[r, k] * A[r, k]
+        norm = np.sqrt(norm)
+        if norm < 1e-9:
+            return False
+        head = A[k, k] + (norm if A[k, k] >= 0.0 else -norm)
+        A[k, k] = head
+        scales[k] = 1.0 / (norm * abs(head))
+        for c in range(k + 1, 7):
+            dot = 0.0
+            for r in range(k, 9):
+                dot += A[r, k] * A[r, c]
+            dot *= scales[k]
+            for r in range(k, 9):
+                A[r, c] -= dot * A[r, k]
+    for m in range(2):
+        q = pencil[m]
+        q[:] = 0.0
+        q[7 + m] = 1.0
+        for k in range(6, -1, -1):
+            dot = 0.0
+            for r in range(k, 9):
+                dot += A[r, k] * q[r]
+            dot *= scales[k]
+            for r in range(k, 9):
+                q[r] -= dot * A[r, k]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def det3(f: F64) -> float:
+    """Determinant of a 3x3 matrix given as a vector of 9."""
+    return (
+        f[0] * (f[4] * f[8] - f[5] * f[7])
+        - f[1] * (f[3] * f[8] - f[5] * f[6])
+        + f[2] * (f[3] * f[7] - f[4] * f[6])
+    )
+
+
+@njit(cache=True, nogil=True)
+def mixed_det3(f: F64, g: F64) -> float:
+    """trace(adj(f) g): the coefficient of a in det(f + a g)."""
+    return (
+        (f[4] * f[8] - f[5] * f[7]) * g[0]
+        + (f[5] * f[6] - f[3] * f[8]) * g[1]
+        + (f[3] * f[7] - f[4] * f[6]) * g[2]
+        + (f[2] * f[7] - f[1] * f[8]) * g[3]
+        + (f[0] * f[8] - f[2] * f[6]) * g[4]
+        + (f[1] * f[6] - f[0] * f[7]) * g[5]
+        + (f[1] * f[5] - f[2] * f[4]) * g[6]
+        + (f[2] * f[3] - f[0] * f[5]) * g[7]
+        + (f[0] * f[4] - f[1] * f[3]) * g[8]
+    )
+
+
+@njit(cache=True, nogil=True)
+def monic_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
+    """Real roots of x^3 + a x^2 + b x + c, a double root once; polished by Newton."""
+    Q = (a * a - 3.0 * b) / 9.0
+    R = (2.0 * a * a * a - 9.0 * a * b + 27.0 * c) / 54.0
+    gap = R * R - Q * Q * Q
+    small = 1e-12 * (R * R + abs(Q * Q * Q))
+    count = 1
+    if gap < -small:
+        theta = np.arccos(min(1.0, max(-1.0, R / np.sqrt(Q * Q * Q))))
+        for k in range(3):
+            roots[k] = -2.0 * np.sqrt(Q) * np.cos((theta + 2.0 * np.pi * (k - 1)) / 3.0) - a / 3.0
+        count = 3
+    else:
+        A = -np.sign(R) * np.cbrt(abs(R) + np.sqrt(max(gap, 0.0)))
+        B = Q / A if A != 0.0 else 0.0
+        roots[0] = A + B - a / 3.0
+        if gap <= small and A != 0.0:
+            roots[1] = -0.5 * (A + B) - a / 3.0
+            count = 2
+    for k in range(count):
+        for _ in range(2):
+            x = roots[k]
+            slope = (3.0 * x + 2.0 * a) * x + b
+            value = ((x + a) * x + b) * x + c
+            if abs(slope) > 1e-8 * (1.0 + x * x):
+                roots[k] = x - value / slope
+    return count
+
+
+@njit(cache=True, nogil=True)
+def singular_members(pencil: F64, F: F64) -> int:
+    """Members of the pencil with determinant 0, unit norm, into ``F`` (3, 9); how many (0 to 3).
+
+    det is a homogeneous cubic of the pencil's coordinates. It cannot vanish in four directions unless it vanishes
+    everywhere, so the direction of the largest |det| of four is made the first basis vector: the leading
+    coefficient is then never small and no solution is lost at infinity, as (5.2)'s affine combination loses one.
+    """
+    best, c, s = -1.0, 1.0, 0.0
+    trial = np.empty(9)
+    for k in range(4):
+        ck = (1.0, 0.0, DIAGONAL, DIAGONAL)[k]
+        sk = (0.0, 1.0, DIAGONAL, -DIAGONAL)[k]
+        for m in range(9):
+            trial[m] = ck * pencil[0, m] + sk * pencil[1, m]
+        size = abs(det3(trial))
+        if size > best:
+            best, c, s = size, ck, sk
+    if best < 1e-14:
+        return 0
+    first = c * pencil[0] + s * pencil[1]
+    second = c * pencil[1] - s * pencil[0]
+    lead = det3(first)
+    roots = np.empty(3)
+    count = monic_cubic_roots(
+        mixed_det3(first, second) / lead, mixed_det3(second, first) / lead, det3(second) / lead, roots
+    )
+    for k in range(count):
+        norm = np.sqrt(1.0 + roots[k] * roots[k])
+        for m in range(9):
+            F[k, m] = (roots[k] * first[m] + second[m]) / norm
+    return count
+
+
+@njit(cache=True, nogil=True)
+def seven_point(points: F64, sample: I64, F: F64) -> int:
+    """Fundamental matrices (``F`` (3, 9)) through seven matches; how many (0 where they are degenerate)."""
+    pencil = np.empty((2, 9))
+    if not null_pencil(points, sample, pencil):
+        return 0
+    return singular_members(pencil, F)
+
+
+@njit(cache=True, nogil=True)
+def oriented(f: F64, points: F64, sample: I64) -> bool:
+    """Whether the sample can be in front of both cameras: e2 x x2 and F x1 point to the same side for all or none.
+
+    The oriented epipolar constraint (Chum, Werner and Matas, ICPR 2004).
+    """
+    e = np.empty(3)
+    largest = 0.0
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        x = f[3 + a] * f[6 + b] - f[6 + a] * f[3 + b]
+        y = f[6 + a] * f[b] - f[a] * f[6 + b]
+        z = f[a] * f[3 + b] - f[3 + a] * f[b]
+        size = x * x + y * y + z * z
+        if size > largest:
+            largest = size
+            e[0], e[1], e[2] = x, y, z
+    side = 0.0
+    for k in range(len(sample)):
+        x1, y1, x2, y2 = points[sample[k]]
+        l0 = f[0] * x1 + f[1] * y1 + f[2]
+        l1 = f[3] * x1 + f[4] * y1 + f[5]
+        l2 = f[6] * x1 + f[7] * y1 + f[8]
+        dot = l0 * (e[1] - e[2] * y2) + l1 * (e[2] * x2 - e[0]) + l2 * (e[0] * y2 - e[1] * x2)
+        if dot * side < 0.0:
+            return False
+        if dot != 0.0:
+            side = dot
+    return True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float:
+    """Squared Sampson distance, the summand of (5.4)."""
+    a0 = f[0] * x1 + f[1] * y1 + f[2]
+    a1 = f[3] * x1 + f[4] * y1 + f[5]
+    b0 = f[0] * x2 + f[3] * y2 + f[6]
+    b1 = f[1] * x2 + f[4] * y2 + f[7]
+    e = a0 * x2 + a1 * y2 + f[6] * x1 + f[7] * y1 + f[8]
+    return e * e / (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1 + 1e-300)
+
+
+@njit(cache=True, nogil=True)
+def truncated_score(f: F64, points: F64, gate: float, give_up: float) -> tuple[float, int]:
+    """Mean of min(r^2 / gate^2, 1) over all points and the number of points with r < gate.
+
+    Given up (score 1) as soon as the sum passes ``give_up`` times the number of points, or the running mean is
+    three standard errors above it (the order of the points must be random): it cannot win, or very likely cannot.
+    """
+    total, inliers, n = 0.0, 0, len(points)
+    inverse = 1.0 / (gate * gate)
+    spread = 3.0 * np.sqrt(give_up * max(1.0 - give_up, 0.01))
+    for block in range(0, n, 32):
+        end = min(block + 32, n)
+        for k in range(block, end):
+            r2 = inverse * squared_sampson(f, points[k, 0], points[k, 1], points[k, 2], points[k, 3])
+            if r2 < 1.0:
+                total += r2
+                inliers += 1
+            else:
+                total += 1.0
+        if total > give_up * n or total > give_up * end + spread * np.sqrt(end):
+            return 1.0, 0
+    return total / n, inliers
+
+
+@njit(cache=True, nogil=True)
+def search(
+    points: F64, uniforms: F64, gate: float, confidence: float, done: int, state: F64, F: F64
+) -> int:
+    """Draw one sample per row of ``uniforms`` (B, 7) until enough were drawn; number of samples drawn in all.
+
+    ``done`` samples went before; ``state`` (2,) holds the best score and its share of inliers, ``F`` (9,) the best
+    matrix: both are read and updated. Each new best is refined a little (Huber, gate twice as wide) before it sets
+    the number of samples still needed, since a minimal sample spreads its noise over the image.
+    """
+    n = len(points)
+    sample = np.empty(7, np.int64)
+    solutions = np.empty((3, 9))
+    refined = np.empty(9)
+    largest = 1 << 40
+    for row in range(len(uniforms)):
+        if done >= required_samples(state[1], 7, confidence, largest):
+            break
+        done += 1
+        draw_sample(uniforms[row], n, sample)
+        for k in range(seven_point(points, sample, solutions)):
+            f = solutions[k]
+            if not oriented(f, points, sample):
+                continue
+            score, inliers = truncated_score(f, points, gate, state[0])
+            if score >= state[0]:
+                continue
+            state[0], state[1] = score, inliers / n
+            F[:] = f
+            refined[:] = f
+            refine(refined, points, GRADIENT, 2.0 * gate, gate, 4)
+            score, inliers = truncated_score(refined, points, gate, state[0])
+            if score < state[0]:
+                state[0], state[1] = score, inliers / n
+                F[:] = refined
+    return done

@@ -1,0 +1,206 @@
+"""Compiled refinement of F over its seven degrees of freedom: F = U diag(cos phi, sin phi, 0) V'.
+
+Orthonormal representation of Bartoli and Sturm (IJCV 2004): singular by construction, without the thesis' special
+case of an epipole at infinity. Points are rows (x1, y1, x2, y2), F is a flat row-major vector of 9.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+GRADIENT, DISTANCE = 0, 1
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(
+    f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64
+) -> tuple[float, int]:
+    """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by the entries of F.
+
+    rho is Huber's loss of width ``delta``, constant beyond ``gate``; r the Sampson distance (5.4) or the root of
+    the sum of the two squared epipolar distances (5.6). Returns the cost and the number of points inside the gate.
+    """
+    G[:] = 0.0
+    h[:] = 0.0
+    outside = delta * (gate - 0.5 * delta)
+    cost, inside = 0.0, 0
+    d = np.empty(9)
+    for k in range(len(points)):
+        x1, y1, x2, y2 = points[k]
+        a0 = f[0] * x1 + f[1] * y1 + f[2]
+        a1 = f[3] * x1 + f[4] * y1 + f[5]
+        b0 = f[0] * x2 + f[3] * y2 + f[6]
+        b1 = f[1] * x2 + f[4] * y2 + f[7]
+        e = a0 * x2 + a1 * y2 + f[6] * x1 + f[7] * y1 + f[8]
+        g1 = a0 * a0 + a1 * a1 + 1e-300
+        g2 = b0 * b0 + b1 * b1 + 1e-300
+        if criterion == GRADIENT:
+            s = 1.0 / np.sqrt(g1 + g2)
+            p = q = -e * s * s * s
+        else:
+            s = np.sqrt(1.0 / g1 + 1.0 / g2)
+            p = -e / (s * g1 * g1)
+            q = -e / (s * g2 * g2)
+        r = abs(e * s)
+        if not r < gate:
+            cost += outside
+            continue
+        inside += 1
+        w = 1.0
+        if r <= delta:
+            cost += 0.5 * r * r
+        else:
+            cost += delta * (r - 0.5 * delta)
+            w = delta / r
+        # dr = s de + p (a0 da0 + a1 da1) + q (b0 db0 + b1 db1)
+        u0, u1, v0, v1 = p * a0, p * a1, q * b0, q * b1
+        d[0] = s * x2 * x1 + u0 * x1 + v0 * x2
+        d[1] = s * x2 * y1 + u0 * y1 + v1 * x2
+        d[2] = s * x2 + u0
+        d[3] = s * y2 * x1 + u1 * x1 + v0 * y2
+        d[4] = s * y2 * y1 + u1 * y1 + v1 * y2
+        d[5] = s * y2 + u1
+        d[6] = s * x1 + v0
+        d[7] = s * y1 + v1
+        d[8] = s
+        for i in range(9):
+            wd = w * d[i]
+            h[i] += wd * e * s
+            for j in range(i, 9):
+                G[i, j] += wd * d[j]
+    for i in range(9):
+        for j in range(i):
+            G[i, j] = G[j, i]
+    return cost, inside
+
+
+@njit(cache=True, nogil=True)
+def compose(U: F64, V: F64, phi: float, f: F64) -> None:
+    """F = U diag(cos phi, sin phi, 0) V': rank 2 and unit norm by construction."""
+    c, s = np.cos(phi), np.sin(phi)
+    for i in range(3):
+        for j in range(3):
+            f[3 * i + j] = c * U[i, 0] * V[j, 0] + s * U[i, 1] * V[j, 1]
+
+
+@njit(cache=True, nogil=True)
+def tangent(U: F64, V: F64, phi: float, B: F64) -> None:
+    """Derivatives (``B`` (9, 7)) of F by small rotations of U (3), of V (3) about their own axes, and by phi."""
+    c, s = np.cos(phi), np.sin(phi)
+    for i in range(3):
+        for j in range(3):
+            m = 3 * i + j
+            B[m, 0] = s * U[i, 2] * V[j, 1]
+            B[m, 1] = -c * U[i, 2] * V[j, 0]
+            B[m, 2] = c * U[i, 1] * V[j, 0] - s * U[i, 0] * V[j, 1]
+            B[m, 3] = s * U[i, 1] * V[j, 2]
+            B[m, 4] = -c * U[i, 0] * V[j, 2]
+            B[m, 5] = c * U[i, 0] * V[j, 1] - s * U[i, 1] * V[j, 0]
+            B[m, 6] = c * U[i, 1] * V[j, 1] - s * U[i, 0] * V[j, 0]
+
+
+@njit(cache=True, nogil=True)
+def rotate_columns(U: F64, a: F64, out: F64) -> None:
+    """out = U exp([a]x), by Rodrigues' formula."""
+    angle = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    if angle < 1e-12:
+        p, q = 1.0, 0.5
+    else:
+        p, q = np.sin(angle) / angle, (1.0 - np.cos(angle)) / (angle * angle)
+    for i in range(3):
+        u0, u1, u2 = U[i]
+        # row vector times [a]x is u x a read as a row: u [a]x = (u1 a2 - u2 a1, ...)
+        c0, c1, c2 = u1 * a[2] - u2 * a[1], u2 * a[0] - u0 * a[2], u0 * a[1] - u1 * a[0]
+        d0, d1, d2 = c1 * a[2] - c2 * a[1], c2 * a[0] - c0 * a[2], c0 * a[1] - c1 * a[0]
+        out[i, 0] = u0 + p * c0 + q * d0
+        out[i, 1] = u1 + p * c1 + q * d1
+        out[i, 2] = u2 + p * c2 + q * d2
+
+
+@njit(cache=True, nogil=True)
+def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
+    """Solve (H + damping diag H) step = -g by Cholesky; False where the matrix is not positive."""
+    n = len(g)
+    L = np.zeros((n, n))
+    floor = 0.0
+    for i in range(n):
+        floor = max(floor, H[i, i])
+    floor = 1e-14 * floor + 1e-300
+    for i in range(n):
+        for j in range(i + 1):
+            total = H[i, j]
+            if i == j:
+                total += damping * max(H[i, i], floor)
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 1e-3 * damping * floor:
+                    return False
+                L[i, i] = np.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    for i in range(n):
+        total = -g[i]
+        for k in range(i):
+            total -= L[i, k] * step[k]
+        step[i] = total / L[i, i]
+    for i in range(n - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, n):
+            total -= L[k, i] * step[k]
+        step[i] = total / L[i, i]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def split(f: F64, U: F64, V: F64) -> float:
+    """U, V and phi of the nearest matrix of rank 2; phi = atan2 of the two largest singular values."""
+    u, s, vt = np.linalg.svd(f.reshape((3, 3)))
+    U[:] = u
+    V[:] = vt.T
+    return float(np.arctan2(s[1], s[0]))
+
+
+@njit(cache=True, nogil=True)
+def refine(f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int) -> tuple[float, int]:
+    """Minimise the robust cost of :func:`normal_equations` from ``f`` (finite, changed in place); cost and steps.
+
+    Levenberg-Marquardt with at most ``iterations`` solves; the cost never rises above that of the nearest matrix
+    of rank 2.
+    """
+    U, V, Un, Vn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    phi = split(f, U, V)
+    G, h, Gn, hn = np.empty((9, 9)), np.empty(9), np.empty((9, 9)), np.empty(9)
+    B, step, trial = np.empty((9, 7)), np.empty(7), np.empty(9)
+    compose(U, V, phi, f)
+    cost, _ = normal_equations(f, points, criterion, gate, delta, G, h)
+    damping, steps = 1e-3, 0
+    while steps < iterations:
+        tangent(U, V, phi, B)
+        H = B.T @ (G @ B)
+        g = B.T @ h
+        accepted = False
+        while steps < iterations and not accepted:
+            steps += 1
+            if solve_damped(H, g, damping, step):
+                rotate_columns(U, step[0:3], Un)
+                rotate_columns(V, step[3:6], Vn)
+                compose(Un, Vn, phi + step[6], trial)
+                new_cost, _ = normal_equations(trial, points, criterion, gate, delta, Gn, hn)
+                accepted = new_cost < cost
+            damping = max(1e-9, 0.1 * damping) if accepted else 10.0 * damping
+            if damping > 1e8:
+                return cost, steps
+        if not accepted:
+            break
+        gain = cost - new_cost
+        U, Un, V, Vn, phi = Un, U, Vn, V, phi + step[6]
+        G, Gn, h, hn, cost = Gn, G, hn, h, new_cost
+        f[:] = trial
+        if gain <= 1e-8 * cost:
+            break
+    return cost, steps
