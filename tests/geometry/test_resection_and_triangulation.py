@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.camera import camera_centre, decompose_camera, distort, project, undistort
 from thesisrecon.geometry.cheirality import cheirality, depth, orient_signs
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
-from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_observations
+from thesisrecon.geometry.triangulation import triangulate, triangulate_linear, triangulate_observations
 
 
 def test_linear_triangulation_is_exact_on_exact_data() -> None:
@@ -110,3 +111,45 @@ def test_undistortion_inverts_distortion() -> None:
     xy = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
     for k1 in (-0.2, 0.0, 0.15):
         np.testing.assert_allclose(undistort(distort(xy, k1), k1), xy, atol=1e-9)
+
+
+def _two_views(sigma_px: float, n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    scene = make_scene(points=n, seed=9)
+    P = scene.P[:2]
+    xy = np.stack([project(P[0], scene.X), project(P[1], scene.X)])
+    return P, xy + sigma_px * np.random.default_rng(1).normal(size=xy.shape), scene.X
+
+
+@pytest.mark.parametrize("method", ["polynomial", "linear", "midpoint"])
+def test_every_method_is_exact_on_exact_images(method: str) -> None:
+    P, xy, X = _two_views(0.0)
+    found = triangulate(P, xy, method=method)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found[:, :3] / found[:, 3:], X, atol=1e-5)
+
+
+def test_polynomial_method_reaches_the_least_reprojection_error() -> None:
+    P, xy, _ = _two_views(2.0, n=25)
+    found = triangulate(P, xy)
+    for n in range(25):
+        start = found[n, :3] / found[n, 3]
+
+        def residual(x: np.ndarray, n: int = n) -> np.ndarray:
+            return np.concatenate([project(P[v], x[None])[0] - xy[v, n] for v in range(2)])
+
+        best = least_squares(residual, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        assert np.sum(residual(start) ** 2) <= 2.0 * best.cost * (1 + 1e-6) + 1e-9
+
+
+def test_polynomial_method_does_not_change_with_the_projective_frame() -> None:
+    P, xy, _ = _two_views(1.0)
+    G = np.eye(4) + 0.3 * np.random.default_rng(2).normal(size=(4, 4))
+    X, Y = triangulate(P, xy), triangulate(P @ np.linalg.inv(G), xy) @ np.linalg.inv(G).T
+    np.testing.assert_allclose(project(P[0], X), project(P[0], Y), atol=1e-4)
+
+
+def test_unknown_method_is_refused() -> None:
+    P, xy, _ = _two_views(0.0, n=5)
+    with pytest.raises(ValueError, match="polynomial, linear, midpoint"):
+        triangulate(P, xy, method="guess")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="exactly two"):
+        triangulate(np.concatenate([P, P]), np.concatenate([xy, xy]))

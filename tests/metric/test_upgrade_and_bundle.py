@@ -1,4 +1,4 @@
-"""The metric stage on scenes with truth: exactness, freed principal point and k1, postponed cameras, honesty."""
+"""The metric stage on scenes with truth: exactness, freed lens, postponed cameras, honesty."""
 
 from __future__ import annotations
 

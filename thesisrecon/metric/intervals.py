@@ -104,4 +104,4 @@ def _thin(model: MetricModel, indices: I64, most: int) -> I64:
     step = int(np.ceil(len(indices) / most))
     point = model.tracks.point_index[indices]
     rank = np.unique(point, return_inverse=True)[1]
-    return indices[rank % step == 0]
+    return np.asarray(indices[rank % step == 0])

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from thesisrecon.optimize.triangulation_refine import refine_points
 
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.optimize.metric_bundle import MetricCameras
+from thesisrecon.optimize.triangulation_refine import refine_points
 from thesisrecon.types import B8, I64, Tracks
 
 F64 = NDArray[np.float64]
@@ -135,7 +135,7 @@ def residual_norms(model: MetricModel) -> F64:
     t = model.tracks
     view, point = t.view_index[model.ok], t.point_index[model.ok]
     xy, _ = project_observations(model.cameras, model.X, view, point)
-    return np.linalg.norm(xy - t.xy[model.ok], axis=1)
+    return np.asarray(np.linalg.norm(xy - t.xy[model.ok], axis=1))
 
 
 def truncated_cost(model: MetricModel, gate_px: float) -> float:

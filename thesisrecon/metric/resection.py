@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from thesisrecon.optimize.triangulation_refine import refine_pose
 
 from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.metric.model import MetricModel, normalized_observations
+from thesisrecon.optimize.triangulation_refine import refine_pose
 from thesisrecon.types import B8
 
 F64 = NDArray[np.float64]

@@ -21,7 +21,7 @@ def self_check(
     model: MetricModel, calibration: SelfCalibration, intervals: Sequence[Mapping[str, IntrinsicInterval]]
 ) -> tuple[dict[str, float], list[str]]:
     """Measured numbers by name, and the doubts they raise (none: the answer is trusted)."""
-    views = np.flatnonzero(model.registered)
+    views = [int(v) for v in np.flatnonzero(model.registered)]
     longest = model.sizes[views].max(axis=1)
     rows = model.cameras.intrinsics[model.cameras.group[views]]
     near = model.registered[model.tracks.view_index]

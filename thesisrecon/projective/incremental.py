@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from thesisrecon.optimize.triangulation_refine import refine_camera, refine_points
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.optimize.conditioning import whitening_transform
 from thesisrecon.optimize.projective_bundle import refine_projective_bundle
+from thesisrecon.optimize.triangulation_refine import refine_camera, refine_points
 from thesisrecon.projective.gate import predicted_spread_px
 from thesisrecon.projective.initial_pair import cameras_from_fundamental, rank_initial_pairs
 from thesisrecon.projective.resection import resect_robust
