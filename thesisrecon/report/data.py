@@ -18,9 +18,9 @@ U8 = NDArray[np.uint8]
 class Photograph:
     """One view as the page shows it.
 
-    ``rgb`` (H, W, 3) uint8 of any size with the photograph's aspect, or None (a long side of about 800 px is
-    enough for the drawn pairs; the page shrinks it further); ``size`` (width, height) px at the size the stages
-    worked at; ``original_size`` that of the file; ``reason`` why a view was refused before it reached the
+    ``rgb`` (H, W, 3) uint8 of any size with the photograph's aspect, or None (a long side of 800 px is
+    enough for the drawn pairs; the page shrinks it further); ``size`` (width, height) px as the stages had it;
+    ``original_size`` that of the file; ``reason`` why a view was refused before it reached the
     reconstruction, empty otherwise.
     """
 

@@ -58,8 +58,8 @@ def embed_jpeg(picture: PillowImage.Image, *, quality: int) -> EmbeddedPicture:
 def draw_pair(pair: TwoView, first: Photograph, second: Photograph) -> EmbeddedPicture | None:
     """Both photographs side by side, with their verified matches and epipolar lines.
 
-    Every match is a dot; a few spread ones are numbered and come with the epipolar line of their partner: F x1 in
-    the second photograph, F' x2 in the first. None where the pixels of one are not known.
+    Every match is a dot; a few spread ones are numbered and come with their partner's epipolar line: F x1
+    in the second photograph, F' x2 in the first. None where the pixels of one are not known.
     """
     if first.rgb is None or second.rgb is None:
         return None

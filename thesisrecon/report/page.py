@@ -1,8 +1,8 @@
 """``report.html``: one file that opens from disk, with its scripts, style and pictures inside.
 
-Nothing on the page may come from elsewhere, and nothing a file is named may run: the template escapes all text,
-data for the scripts is JSON that cannot close its element, and a content security policy names the two scripts
-by their hash and forbids every address but ``data:``.
+Nothing on the page may come from elsewhere, and nothing a file is named may run: the template escapes all
+text, data for the scripts is JSON that cannot close its element, and a content security policy names the two
+scripts by their hash and forbids every address but ``data:``.
 """
 
 from __future__ import annotations

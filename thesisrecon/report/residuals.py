@@ -27,7 +27,7 @@ class ResidualSummary:
 
 
 def used_observations(reconstruction: Reconstruction) -> I64:
-    """Numbers k of the observations the reconstruction explains: inliers of a registered view and a valid point."""
+    """Numbers k of the observations explained: inliers of a registered view and a valid point."""
     tracks = reconstruction.tracks
     used = (
         reconstruction.inlier
@@ -85,6 +85,6 @@ def common_limit_px(distances: F64) -> float:
 
 
 def histogram_shares(distances: F64, limit_px: float) -> NDArray[np.float64]:
-    """Share of the (N,) distances in each of ``BINS`` bins of [0, limit_px]; the last also holds what is beyond."""
+    """Share of the (N,) distances in each of ``BINS`` bins of [0, limit_px]; the last holds the rest too."""
     counts, _ = np.histogram(np.minimum(distances, limit_px), bins=BINS, range=(0.0, limit_px))
     return counts / max(len(distances), 1)

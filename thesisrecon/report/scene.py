@@ -18,7 +18,8 @@ MAX_POINTS = 25_000
 class Scene:
     """What the 3D view draws, z up.
 
-    ``points`` (M, 3) and their number ``index`` (M,) in X; ``views`` (C,) the registered ones, ``centres`` (C, 3) and ``corners`` (C, 4, 3) of their pyramids, first two along the upper
+    ``points`` (M, 3) and their number ``index`` (M,) in X; ``views`` (C,) the
+    registered ones, ``centres`` (C, 3) and ``corners`` (C, 4, 3) of their pyramids, first two along the upper
     edge of the photograph; ``low, high`` (3,) the box to show.
     """
 
@@ -62,8 +63,8 @@ def upright_rotation(rotations: F64) -> F64:
     """Turn of the world (3, 3) that puts z up and the cameras' mean gaze along +y.
 
     ``rotations`` (C, 3, 3) world-to-camera. Photographers hold the camera level, so up is orthogonal to the x
-    axes of the cameras; a little weight on the optical axes decides where all x axes are parallel. The sign is
-    that of the mean upper side of the photographs.
+    axes of the cameras; a little weight on the optical axes decides where all x axes are parallel. The sign
+    is that of the mean upper side of the photographs.
     """
     x_axes, y_axes, z_axes = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     _, vectors = np.linalg.eigh(x_axes.T @ x_axes + 0.1 * z_axes.T @ z_axes)

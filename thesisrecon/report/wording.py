@@ -18,7 +18,7 @@ THIN = "\u202f"  # a narrow space that does not break groups thousands in any la
 STAGE_WORDS = {
     "features": "corners were found",
     "matches": "pairs of photographs were matched",
-    "projective": "a projective reconstruction was made (shapes up to a perspective distortion, no focal yet)",
+    "projective": "a projective reconstruction was made (shapes up to perspective, no focal yet)",
     "metric": "metric cameras and points were made",
 }
 UNITS = {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB"}
@@ -71,7 +71,7 @@ def judge(data: ReportData) -> Verdict:
 
 
 def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
-    """The facts above everything else, as far as the run got: cameras, intrinsics, residuals, points, time."""
+    """The facts above everything else, as far as the run got: cameras, intrinsics, residuals, time."""
     facts = [_registered(data)]
     if data.metric is not None:
         facts += _intrinsic_facts(data)
