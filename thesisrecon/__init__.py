@@ -1,0 +1,42 @@
+"""From uncalibrated photographs to metric cameras and points: the classical algorithms, from scratch.
+
+The front doors are loaded when they are first used, so that importing the package costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from thesisrecon.config import PipelineConfig
+    from thesisrecon.pipeline import estimate_fundamental, match_pair, reconstruct, self_calibrate
+
+__version__ = "0.1.0"
+
+_HOME_OF = {
+    "PipelineConfig": "config",
+    "estimate_fundamental": "pipeline",
+    "match_pair": "pipeline",
+    "reconstruct": "pipeline",
+    "self_calibrate": "pipeline",
+}
+
+__all__ = [
+    "PipelineConfig",
+    "__version__",
+    "estimate_fundamental",
+    "match_pair",
+    "reconstruct",
+    "self_calibrate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'thesisrecon' has no attribute {name!r}")
+    return getattr(import_module(f"thesisrecon.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,283 @@
+"""Photographs in: every common file as 8-bit RGB at working size, and a reason for each that cannot be read.
+
+Resizing keeps one exact scale s along both axes, (x + 0.5) s - 0.5, so that square pixels stay square: the
+last row of a photograph may be cut by less than a working pixel for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import PIL.Image
+import PIL.ImageOps
+from numpy.typing import NDArray
+
+from thesisrecon.errors import UsageError
+from thesisrecon.types import F64, Image
+
+U8 = NDArray[np.uint8]
+ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
+
+# What a photograph may be called. Raw and HEIC files are listed so that they are refused by name, not
+# overlooked.
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".jp2", ".avif"),
+    *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2"),
+)
+MIN_SIDE = 64
+BLANK_RANGE = 8
+_ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+_WIDTH_35MM = 36.0
+
+
+class _Refused(Exception):
+    """One photograph cannot be used; the text is the reason."""
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph that was read: the ``image``, a ``digest`` of its content, what EXIF says of the focal
+    length (original px, NaN = nothing), and a ``note`` the user should see (empty: none)."""
+
+    image: Image
+    digest: str
+    exif_focal_px: float = math.nan
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class PhotographSet:
+    """The photographs that were read, sorted by name, and the others: name -> why not."""
+
+    photographs: tuple[Photograph, ...]
+    refused: dict[str, str]
+
+    @property
+    def images(self) -> tuple[Image, ...]:
+        """The V views."""
+        return tuple(p.image for p in self.photographs)
+
+    @property
+    def exif_focal_px(self) -> F64:
+        """(V,) original px, NaN = not said."""
+        return np.array([p.exif_focal_px for p in self.photographs])
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Photographs of a folder by the ending of their name, sorted by name; hidden files and sub-folders are
+    left out.
+
+    Raises :class:`UsageError` where there is no such folder or it cannot be read.
+    """
+    if not folder.exists():
+        raise UsageError(f"there is no folder {folder}")
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a folder; give the folder that holds the photographs")
+    try:
+        entries = sorted(folder.iterdir(), key=lambda path: path.name)
+    except OSError as error:
+        raise UsageError(f"the folder {folder} cannot be read: {error.strerror}") from None
+    return [
+        p for p in entries if p.suffix.lower() in SUFFIXES and not p.name.startswith(".") and not p.is_dir()
+    ]
+
+
+def read_photographs(
+    source: ImageSource,
+    *,
+    max_size_px: int,
+    map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
+) -> PhotographSet:
+    """All photographs of a folder, or of a list of files and arrays, at working size.
+
+    Parameters
+    ----------
+    source : a folder; or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and :class:`Image` records.
+    max_size_px : a longer long side is reduced to this.
+    map_all : runs the reading of each, in order; a thread pool's ``map`` reads several at once.
+
+    Returns
+    -------
+    PhotographSet : what was read, sorted by name; what cannot be decoded, is blank, too small, or has the
+        very pixels of an earlier one stands under ``refused``.
+
+    Raises
+    ------
+    UsageError : no such folder. ValueError : an array of another shape or type.
+    """
+    items = _named_items(source)
+
+    def read(item: tuple[str, Any]) -> Photograph | str:
+        try:
+            return _read(*item, max_size_px)
+        except _Refused as refusal:
+            return str(refusal)
+
+    read_items = list(map_all(read, items))
+    refused = {name: r for (name, _), r in zip(items, read_items, strict=True) if isinstance(r, str)}
+    kept: dict[str, Photograph] = {}
+    for photograph in (r for r in read_items if not isinstance(r, str)):
+        twin = kept.setdefault(photograph.digest, photograph)
+        if twin is not photograph:
+            refused[photograph.image.name] = f"has the same pixels as {twin.image.name}"
+    return PhotographSet(
+        tuple(sorted(kept.values(), key=lambda p: p.image.name)), dict(sorted(refused.items()))
+    )
+
+
+def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
+    if isinstance(source, str | Path):
+        return [(printable(path.name), path) for path in list_images(Path(source))]
+    paths = [Path(item) for item in source if isinstance(item, str | Path)]
+    # Files of one name from several folders are told apart by their whole path.
+    full = len({path.name for path in paths}) < len(paths)
+    width = len(str(len(source)))
+    items: list[tuple[str, Any]] = []
+    for n, item in enumerate(source):
+        if isinstance(item, str | Path):
+            items.append((printable(str(item) if full else Path(item).name), Path(item)))
+        elif isinstance(item, Image):
+            items.append((item.name, item))
+        else:
+            items.append((f"image-{n:0{width}d}", item))
+    return sorted(items, key=lambda pair: pair[0])
+
+
+def printable(name: str) -> str:
+    """A file name as text that can be written anywhere: bytes that are no UTF-8 become the replacement
+    mark.
+    """
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
+def _read(name: str, item: Any, max_size_px: int) -> Photograph:
+    if isinstance(item, Image):
+        return _finish(Photograph(item, ""))
+    if isinstance(item, Path):
+        rgb, photograph = _decode(name, item, max_size_px)
+    else:
+        rgb = _rgb_from_array(item)
+        photograph = Photograph(Image(name, rgb, (rgb.shape[1], rgb.shape[0])), "")
+        rgb = _reduced(PIL.Image.fromarray(rgb), max_size_px)
+    return _finish(replace(photograph, image=replace(photograph.image, rgb=rgb)))
+
+
+def _finish(photograph: Photograph) -> Photograph:
+    """Refuse what shows nothing, and name the content by its hash."""
+    rgb = photograph.image.rgb
+    if min(rgb.shape[:2]) < MIN_SIDE:
+        raise _Refused(
+            f"is only {rgb.shape[1]} x {rgb.shape[0]} pixels; {MIN_SIDE} x {MIN_SIDE} are the least"
+        )
+    if int(rgb.max()) - int(rgb.min()) < BLANK_RANGE:
+        raise _Refused("is blank: all its pixels have nearly the same colour")
+    content = hashlib.sha256(repr((rgb.shape, photograph.image.original_size)).encode())
+    content.update(np.ascontiguousarray(rgb).data)
+    return replace(photograph, digest=content.hexdigest()[:32])
+
+
+def _rgb_from_array(array: Any) -> U8:
+    array = np.asarray(array)
+    if array.dtype != np.uint8 or array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
+        raise ValueError(f"an image array must be (H, W) or (H, W, 3) uint8; got {array.shape} {array.dtype}")
+    return np.repeat(array[..., None], 3, axis=2) if array.ndim == 2 else array
+
+
+def _decode(name: str, path: Path, max_size_px: int) -> tuple[U8, Photograph]:
+    """Pixels at working size, and the record that waits for them."""
+    try:
+        with PIL.Image.open(path) as file:
+            note = "only its first frame is used" if getattr(file, "n_frames", 1) > 1 else ""
+            focal_35mm, upright = _exif(file)
+            file.load()
+            picture = PIL.Image.fromarray(_eight_bit(file)) if _is_deep(file.mode) else _rgb(file)
+        picture = upright(picture)
+    except PIL.Image.DecompressionBombError:
+        limit = 2 * (PIL.Image.MAX_IMAGE_PIXELS or 0) // 10**6
+        raise _Refused(f"claims more than {limit} megapixels, which no photograph has") from None
+    except PIL.UnidentifiedImageError:
+        raise _Refused("is not an image of a known format") from None
+    except MemoryError:
+        raise _Refused("does not fit in memory") from None
+    except Exception as error:
+        # Decoders raise whatever they stumble over in a damaged file; the other photographs go on.
+        raise _Refused(
+            f"cannot be decoded: {printable(getattr(error, 'strerror', None) or str(error))}"
+        ) from None
+    focal = focal_35mm / _WIDTH_35MM * max(picture.size) if focal_35mm > 0 else math.nan
+    record = Photograph(Image(name, np.zeros((0, 0, 3), np.uint8), picture.size), "", focal, note)
+    return _reduced(picture, max_size_px), record
+
+
+def _exif(file: PIL.Image.Image) -> tuple[float, Callable[[PIL.Image.Image], PIL.Image.Image]]:
+    """The 35 mm focal length (0 = not said) and the rotation that puts the photograph upright."""
+    turns = PIL.Image.Transpose
+    by_orientation = {
+        2: turns.FLIP_LEFT_RIGHT,
+        3: turns.ROTATE_180,
+        4: turns.FLIP_TOP_BOTTOM,
+        5: turns.TRANSPOSE,
+        6: turns.ROTATE_270,
+        7: turns.TRANSVERSE,
+        8: turns.ROTATE_90,
+    }
+    try:
+        exif = file.getexif()
+        orientation, focal = exif.get(_ORIENTATION), float(exif.get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
+    except Exception:
+        # A damaged header says nothing; the pixels may still be good.
+        orientation, focal = None, 0.0
+    turn = by_orientation.get(orientation) if isinstance(orientation, int) else None
+    return focal, lambda picture: picture if turn is None else picture.transpose(turn)
+
+
+def _is_deep(mode: str) -> bool:
+    return mode.startswith("I") or mode == "F"
+
+
+def _eight_bit(file: PIL.Image.Image) -> U8:
+    """Grey of more than 8 bits as 8-bit RGB: whole numbers by their bit depth, real numbers by their
+    range.
+    """
+    values = np.asarray(file).astype(np.float64)
+    values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+    if file.mode == "F":
+        low, high = values.min(), values.max()
+    else:
+        # A 12-bit sensor in a 16-bit file must not come out nearly black.
+        low, high = 0.0, 2.0 ** max(8, int(values.max()).bit_length()) - 1
+    grey = (values - low) * (255.0 / max(high - low, 1e-12))
+    return np.repeat(np.rint(np.clip(grey, 0, 255)).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def _rgb(file: PIL.Image.Image) -> PIL.Image.Image:
+    """RGB; what is transparent becomes mid-grey, since the colours under it mean nothing."""
+    if "A" in file.getbands() or "a" in file.getbands() or "transparency" in file.info:
+        layered = file.convert("RGBA")
+        ground = PIL.Image.new("RGBA", layered.size, (128, 128, 128, 255))
+        return PIL.Image.alpha_composite(ground, layered).convert("RGB")
+    return file.convert("RGB")
+
+
+def _reduced(picture: PIL.Image.Image, max_size_px: int) -> U8:
+    """The picture with its long side at most ``max_size_px``, at one exact scale."""
+    width, height = picture.size
+    scale = max_size_px / max(width, height)
+    if scale >= 1:
+        return np.array(picture)
+    size = (
+        (max_size_px, math.floor(height * scale))
+        if width >= height
+        else (math.floor(width * scale), max_size_px)
+    )
+    if min(size) < 1:
+        raise _Refused(f"is {width} x {height} pixels: too narrow to be reduced to {max_size_px}")
+    box = (0.0, 0.0, min(width, size[0] / scale), min(height, size[1] / scale))
+    resized = picture.resize(size, PIL.Image.Resampling.LANCZOS, box=box, reducing_gap=3.0)
+    return np.array(resized)
