@@ -260,9 +260,12 @@ def _with_observations(
         K=K,
         k1=k1,
     )
-    seen = _reproject(reconstruction, poses, tracks.view_index, tracks.point_index)
-    sigma = 1.4826 * float(np.median(np.abs(seen - tracks.xy))) if len(seen) else 0.0
-    return replace(reconstruction, sigma_px=sigma)
+    # A model from elsewhere may hold points in a camera's plane, or so far away that their squares overflow.
+    with np.errstate(all="ignore"):
+        seen = _reproject(reconstruction, poses, tracks.view_index, tracks.point_index)
+        size = np.abs(seen - tracks.xy)
+    size = size[np.isfinite(size)]
+    return replace(reconstruction, sigma_px=1.4826 * float(np.median(size)) if len(size) else 0.0)
 
 
 def _tracks(model: ColmapModel, names: Sequence[str]) -> Tracks:

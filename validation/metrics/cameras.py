@@ -1,0 +1,123 @@
+"""How far cameras are from the truth, and points from their images: geometry after alignment, never raw matrices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.geometry.alignment import estimate_similarity
+from thesisrecon.geometry.camera import camera_centre, project_camera
+from thesisrecon.types import F64, Reconstruction
+
+
+@dataclass(frozen=True)
+class TrueCameras:
+    """The truth: ``K, R`` (V, 3, 3), R world-to-camera, and centres ``C`` (V, 3) in some unit of length."""
+
+    K: F64
+    R: F64
+    C: F64
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """Errors of the registered cameras; None where they are too few to be aligned.
+
+    ``focal_error_pct``: median over views of |f / f_true - 1|, f the geometric mean of fx and fy.
+    ``principal_point_error_px``: median distance. ``centre_error``: mean distance after the least-squares
+    similarity, in the truth's unit. ``rotation_error_deg``: median angle after the common rotation is taken off.
+    """
+
+    focal_error_pct: float
+    principal_point_error_px: float
+    centre_error: float | None
+    rotation_error_deg: float
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """Distances of inlier observations from their projected points, px, recomputed from cameras and points."""
+
+    median_px: float
+    mean_px: float
+    rms_px: float
+    observations: int
+
+
+def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> CameraErrors:
+    """Compare the registered cameras with the truth of the same views.
+
+    Raises ``ValueError`` for a reconstruction that is not metric, has other views than the truth, or no
+    registered camera.
+    """
+    views = np.flatnonzero(reconstruction.registered)
+    if reconstruction.stratum != "metric" or reconstruction.K is None or len(views) == 0:
+        raise ValueError("measure_cameras needs a metric reconstruction with at least one registered camera")
+    if len(truth.K) != len(reconstruction.P):
+        raise ValueError(f"measure_cameras needs one truth per view; got {len(truth.K)} for {len(reconstruction.P)}")
+    K, K_true = reconstruction.K[views], truth.K[views]
+    focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1] / (K_true[:, 0, 0] * K_true[:, 1, 1]))
+    principal_point = np.linalg.norm(K[:, :2, 2] - K_true[:, :2, 2], axis=1)
+    R, centres = _poses(reconstruction)
+    return CameraErrors(
+        focal_error_pct=100.0 * float(np.median(np.abs(focal - 1.0))),
+        principal_point_error_px=float(np.median(principal_point)),
+        centre_error=_centre_error(centres, truth.C[views]),
+        rotation_error_deg=float(np.median(rotation_errors_deg(R, truth.R[views]))),
+    )
+
+
+def rotation_errors_deg(R: F64, R_true: F64) -> F64:
+    """Angles (V,) between R (V, 3, 3) and R_true after the world rotation that fits best (chordal mean)."""
+    U, _, Vt = np.linalg.svd(np.einsum("vji,vjk->ik", R_true, R))
+    common = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    difference = np.einsum("vij,jk,vlk->vil", R_true, common, R)
+    # The chord keeps its digits at small angles, where arccos of the trace loses half of them.
+    chord = np.linalg.norm(difference - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
+    return np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0)))
+
+
+def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:
+    """Project every point into every registered view that sees it as an inlier, and measure the distances.
+
+    Raises ``ValueError`` where there is no such observation.
+    """
+    assert reconstruction.K is not None
+    tracks = reconstruction.tracks
+    kept = reconstruction.inlier & reconstruction.valid[tracks.point_index]
+    distances = []
+    rotations, translations = _rotations_translations(reconstruction)
+    views = np.flatnonzero(reconstruction.registered)
+    for i, R, t in zip(views, rotations, translations, strict=True):
+        here = kept & (tracks.view_index == i)
+        X = reconstruction.X[tracks.point_index[here]]
+        k1 = 0.0 if reconstruction.k1 is None else float(reconstruction.k1[i])
+        seen = project_camera(reconstruction.K[i], R, t, X[:, :3] / X[:, 3:], k1=k1)
+        distances.append(np.linalg.norm(seen - tracks.xy[here], axis=1))
+    d = np.concatenate([*distances, np.zeros(0)])
+    if len(d) == 0:
+        raise ValueError("measure_reprojection needs at least one inlier observation in a registered view")
+    return Reprojection(float(np.median(d)), float(np.mean(d)), float(np.sqrt(np.mean(d**2))), len(d))
+
+
+def _rotations_translations(reconstruction: Reconstruction) -> tuple[F64, F64]:
+    views = np.flatnonzero(reconstruction.registered)
+    assert reconstruction.K is not None
+    pose = np.linalg.solve(reconstruction.K[views], reconstruction.P[views])
+    pose /= np.cbrt(np.linalg.det(pose[:, :, :3]))[:, None, None]
+    return pose[:, :, :3], pose[:, :, 3]
+
+
+def _poses(reconstruction: Reconstruction) -> tuple[F64, F64]:
+    R, _ = _rotations_translations(reconstruction)
+    centres = camera_centre(reconstruction.P[reconstruction.registered])
+    return R, centres[:, :3] / centres[:, 3:]
+
+
+def _centre_error(centres: F64, true_centres: F64) -> float | None:
+    try:
+        similarity = estimate_similarity(centres, true_centres)
+    except ValueError:
+        return None
+    return float(np.mean(np.linalg.norm(similarity.apply(centres) - true_centres, axis=1)))
