@@ -1,0 +1,308 @@
+"""The run directory: what a stage computed, kept so that a kill at any point loses little.
+
+Each result is one npz file with a JSON description inside, written whole or not at all. It carries the key
+of what it was made from (settings, code and inputs, all the way up), and is used again only under that key;
+a damaged file counts as absent.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon import types as records
+from thesisrecon.errors import UsageError
+from thesisrecon.types import StageReport
+
+try:
+    import fcntl
+except ImportError:  # pragma: no cover - only where there is no POSIX
+    fcntl = None  # type: ignore[assignment]
+
+FORMAT = 1
+RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
+_DESCRIPTION = "description"
+_CODE_OF_ALL_STAGES = ("types.py", "geometry", "robust", "optimize")
+
+
+def key_of(*parts: Any) -> str:
+    """A short name for JSON-like parts: equal parts give equal keys, on every machine."""
+    text = json.dumps(parts, sort_keys=True, default=_json_value, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [str(value.dtype), value.shape, hashlib.sha256(np.ascontiguousarray(value).data).hexdigest()]
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a key is made of plain values and arrays; got {type(value).__name__}")
+
+
+@cache
+def code_key(module: str) -> str:
+    """A short name for the code a variant of ``module`` runs: its stage folder and what all stages share.
+
+    Results of other code are thus never taken for results of this one. A module of the caller counts by its
+    own file alone.
+    """
+    package = Path(__file__).parent.parent
+    parts = module.split(".")
+    own = [package / parts[1]] if parts[0] == package.name and len(parts) > 1 else []
+    content = hashlib.sha256(f"{module} {FORMAT}".encode())
+    for root in [*own, *(package / part for part in _CODE_OF_ALL_STAGES)]:
+        for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
+            content.update(path.read_bytes())
+    return content.hexdigest()[:32]
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all, and on the disk when this returns.
+
+    Raises :class:`UsageError` where the place cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise UsageError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON for people and machines; NaN and infinity become null."""
+    text = json.dumps(_finite(value), indent=2, ensure_ascii=False, default=_number)
+    write_atomically(path, (text + "\n").encode("utf-8", "replace"))
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return _finite(value.tolist())
+    if isinstance(value, np.generic):
+        return _finite(value.item())
+    raise TypeError(f"{type(value).__name__} is not JSON")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file, None where it is absent or damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def bytes_from_record(record: Any, key: str) -> bytes:
+    """A record of :mod:`thesisrecon.types` as the bytes of an npz file; equal records give equal bytes."""
+
+    arrays: dict[str, np.ndarray[Any, Any]] = {}
+    description = json.dumps({"key": key, "record": _describe(record, arrays)}, sort_keys=True)
+    stream = io.BytesIO()
+    np.savez(stream, **{_DESCRIPTION: np.frombuffer(description.encode(), dtype=np.uint8)}, **arrays)
+    return stream.getvalue()
+
+
+def _describe(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
+    """``value`` as JSON in which an array is ``{"array": name}``; the arrays themselves go to ``arrays``."""
+    if isinstance(value, np.ndarray):
+        arrays[f"array{len(arrays)}"] = value
+        return {"array": f"array{len(arrays) - 1}"}
+    if isinstance(value, np.generic):
+        return value.item()
+    if dataclasses.is_dataclass(value):
+        fields = {f.name: _describe(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
+        return {"type": type(value).__name__, "fields": fields}
+    if isinstance(value, Mapping):
+        return {"mapping": {str(k): _describe(v, arrays) for k, v in value.items()}}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return {"tuple": [_describe(v, arrays) for v in value]}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"a record holds arrays, numbers, text and records; got {type(value).__name__}")
+
+
+def _rebuild(value: Any, arrays: Mapping[str, Any]) -> Any:
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        return arrays[value["array"]]
+    if "tuple" in value:
+        return tuple(_rebuild(v, arrays) for v in value["tuple"])
+    if "mapping" in value:
+        return {k: _rebuild(v, arrays) for k, v in value["mapping"].items()}
+    kind = getattr(records, value["type"])
+    return kind(**{name: _rebuild(v, arrays) for name, v in value["fields"].items()})
+
+
+def read_record(path: Path, key: str) -> Any:
+    """The record kept in ``path`` under ``key``; None where it is absent, damaged or made from something
+    else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            description = json.loads(bytes(file[_DESCRIPTION]).decode())
+            if description["key"] != key:
+                return None
+            return _rebuild(description["record"], {name: file[name] for name in file.files})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+        # Whatever a half-written or edited file makes the readers raise: it is computed again.
+        return None
+
+
+@dataclass(frozen=True)
+class StageFolder:
+    """The folder of one stage: a file per item, and a manifest that people can read."""
+
+    path: Path
+
+    def load(self, item: str, key: str) -> Any:
+        """The kept record of this item, None where it must be computed."""
+        return read_record(self.path / f"{item}.npz", key)
+
+    def save(self, item: str, key: str, record: Any) -> None:
+        """Keep the record of this item."""
+        write_atomically(self.path / f"{item}.npz", bytes_from_record(record, key))
+
+    def finish(self, report: StageReport, settings: Mapping[str, Any], keys: Mapping[str, str]) -> None:
+        """Write the manifest of a stage that is done; files of items that are no longer part of it are
+        removed.
+        """
+        for stale in self.path.glob("*.npz"):
+            if stale.stem not in keys:
+                stale.unlink(missing_ok=True)
+        content = {"format": FORMAT, "settings": settings, "keys": keys, "report": dataclasses.asdict(report)}
+        write_json(self.path / MANIFEST_FILE, content)
+
+    def finished(self, keys: Mapping[str, str]) -> StageReport | None:
+        """The report of the run that computed exactly these items, None where it did not end."""
+        content = read_json(self.path / MANIFEST_FILE)
+        try:
+            if content["keys"] != dict(keys):
+                return None
+            report = content["report"]
+            return StageReport(**{**report, "warnings": tuple(report["warnings"])})
+        except (TypeError, KeyError):
+            return None
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """The output folder of one run."""
+
+    path: Path
+
+    def stage(self, folder: str) -> StageFolder:
+        """The folder of one stage, as ``01-features``."""
+        return StageFolder(self.path / folder)
+
+    @contextmanager
+    def claimed(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
+        """Hold the folder for a run of this ``identity`` (settings, seed, photographs).
+
+        A folder of the same run is resumed. Raises :class:`UsageError` where the folder cannot be written,
+        is in use, holds things of no run, or holds another run, unless ``overwrite``; nothing in it is
+        changed then.
+        """
+        with _locked(self.path):
+            self._check(identity, overwrite)
+            write_json(self.path / RUN_FILE, identity)
+            yield
+
+    def _check(self, identity: Mapping[str, Any], overwrite: bool) -> None:
+        there = read_json(self.path / RUN_FILE)
+        if there is None:
+            strange = sorted(p.name for p in self.path.iterdir() if p.name != LOCK_FILE)
+            if strange and RUN_FILE not in strange and not _only_unfinished(strange):
+                raise UsageError(
+                    f"the output folder {self.path} holds {strange[0]!r}, which is of no run; "
+                    "choose an empty or a new folder"
+                )
+            return
+        difference = next(_differences(there, _finite(json.loads(json.dumps(identity, default=_number)))), "")
+        if difference and not overwrite:
+            raise UsageError(
+                f"the output folder {self.path} holds another run ({difference}); choose another folder, or "
+                "--overwrite to replace what differs and keep the rest"
+            )
+
+
+def _only_unfinished(names: list[str]) -> bool:
+    return all(name.startswith(".") and name.endswith(".partial") for name in names)
+
+
+def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
+    """Where two JSON values differ, one sentence part each."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        if place == "photographs":
+            yield from _photograph_difference(there, here)
+            return
+        for name in [*here, *(k for k in there if k not in here)]:
+            yield from _differences(there.get(name), here.get(name), f"{place}.{name}" if place else name)
+    elif there != here:
+        yield f"{place.removeprefix('settings.')} was {_short(there)} there and is {_short(here)} here"
+
+
+def _photograph_difference(there: dict[str, str], here: dict[str, str]) -> Iterator[str]:
+    missing, new = [n for n in there if n not in here], [n for n in here if n not in there]
+    changed = [n for n in here if n in there and there[n] != here[n]]
+    for what, names in (("without", missing), ("with a new", new), ("with a changed", changed)):
+        if names:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            yield f"its photographs are not these: this run is {what} {names[0]!r}{more}"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Make the folder, and hold it against a second run; the lock ends with the process, however that
+    ends.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise UsageError(f"the output folder {folder} cannot be written: {error.strerror}") from None
+    try:
+        _lock(handle, folder)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _lock(handle: int, folder: Path) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        raise UsageError(
+            f"another run is writing to the output folder {folder}; choose another one"
+        ) from None

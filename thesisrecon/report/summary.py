@@ -1,0 +1,151 @@
+"""``summary.json`` and ``cameras.json``: what a run found, in pixels of the original photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.report.residuals import reprojection_distances, used_observations
+from thesisrecon.types import F64, Image, IntrinsicInterval, Reconstruction, RunResult
+
+
+def summarize(result: RunResult) -> dict[str, Any]:
+    """What ``summary.json`` says of what was found; the caller adds what it knows of time and settings.
+
+    Lengths are pixels of the original photographs (``(x + 0.5) / scale - 0.5``); ``..._working_px`` are
+    pixels the stages worked at. Keys whose stage did not run are None.
+    """
+    best = result.metric.reconstruction if result.metric is not None else result.projective
+    working = reprojection_distances(best) if best is not None else [np.zeros(0) for _ in result.images]
+    original = [d / image.scale for d, image in zip(working, result.images, strict=True)]
+    everything = np.concatenate([np.zeros(0), *original])
+    views = [_view_summary(result, best, i, distances) for i, distances in enumerate(original)]
+    return {
+        "failure": result.failure or None,
+        "stratum": best.stratum if best is not None else None,
+        "images": len(result.images) + len(result.refused),
+        "registered": int(best.registered.sum()) if best is not None else 0,
+        "points": int(best.valid.sum()) if best is not None else 0,
+        "observations": len(used_observations(best)) if best is not None else 0,
+        "reprojection_rms_px": _rms(everything),
+        "reprojection_median_px": _median(everything),
+        "reprojection_median_working_px": _median(np.concatenate([np.zeros(0), *working])),
+        "trusted": result.metric.trusted if result.metric is not None else None,
+        "doubts": list(result.metric.doubts) if result.metric is not None else [],
+        "identifiable": result.calibration.identifiable if result.calibration is not None else None,
+        "self_check": dict(result.metric.self_check) if result.metric is not None else {},
+        "pairs": {
+            "matched": len(result.pairs),
+            "accepted": sum(pair.accepted for pair in result.pairs),
+            "verified_matches": sum(pair.inliers for pair in result.pairs if pair.accepted),
+        },
+        "cameras": views,
+        "refused": _refused(result, views),
+        "warnings": list(result.warnings),
+    }
+
+
+def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distances: F64) -> dict[str, Any]:
+    image = result.images[i]
+    registered = best is not None and bool(best.registered[i])
+    view: dict[str, Any] = {
+        "name": image.name,
+        "registered": registered,
+        "reason": _reason(best, i),
+        "camera": int(result.groups[i]),
+        "width_px": image.original_size[0],
+        "height_px": image.original_size[1],
+        "working_scale": image.scale,
+        "corners": len(result.features[i].xy) if result.features else None,
+        "observations": len(distances),
+        "reprojection_rms_px": _rms(distances),
+    }
+    if registered and result.metric is not None:
+        view.update(_original_intervals(result.metric.intrinsics[i], image.scale))
+    return view
+
+
+def _reason(best: Reconstruction | None, i: int) -> str:
+    if best is None or best.registered[i]:
+        return ""
+    return best.reasons[i] or "no reason was recorded"
+
+
+def _original_intervals(
+    intrinsics: Mapping[str, IntrinsicInterval], scale: float
+) -> dict[str, dict[str, Any]]:
+    """Value, standard deviation and source of each intrinsic, in original pixels."""
+    answer = {}
+    for name, interval in intrinsics.items():
+        value, std = interval.value, interval.std
+        if name.endswith("_px"):
+            value, std = value / scale, std / scale
+        if name.startswith("principal"):
+            value += 0.5 / scale - 0.5
+        answer[name] = {"value": value, "std": std, "source": interval.source}
+    return answer
+
+
+def _refused(result: RunResult, views: list[dict[str, Any]]) -> list[dict[str, str]]:
+    unread = [{"name": name, "reason": reason} for name, reason in result.refused.items()]
+    return unread + [{"name": v["name"], "reason": v["reason"]} for v in views if v["reason"]]
+
+
+def _rms(distances: F64) -> float | None:
+    return float(np.sqrt(np.mean(distances**2))) if len(distances) else None
+
+
+def _median(distances: F64) -> float | None:
+    return float(np.median(distances)) if len(distances) else None
+
+
+def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> dict[str, Any]:
+    """``cameras.json``: K, R (world-to-camera), t, centre and k1 of every registered view, in original
+    pixels.
+    """
+    if reconstruction.K is None or reconstruction.k1 is None:
+        raise ValueError(f"cameras_table needs a metric reconstruction; got {reconstruction.stratum}")
+    cameras = []
+    for i in np.flatnonzero(reconstruction.registered).tolist():
+        K, image = reconstruction.K[i], images[i]
+        Rt = np.linalg.solve(K, reconstruction.P[i])
+        cameras.append(
+            {
+                "name": image.name,
+                "width": image.original_size[0],
+                "height": image.original_size[1],
+                "K": original_from_working(image.scale) @ K,
+                "k1": float(reconstruction.k1[i]),
+                "R": Rt[:, :3],
+                "t": Rt[:, 3],
+                "centre": -Rt[:, :3].T @ Rt[:, 3],
+            }
+        )
+    convention = "x ~ K d(R X + t), d(u) = u (1 + k1 |u|^2); (0, 0) is the centre of the top-left pixel"
+    return {"convention": convention, "cameras": cameras}
+
+
+def original_from_working(scale: float) -> F64:
+    """(3, 3) map of working pixels to original ones: (x + 0.5) / scale - 0.5."""
+    offset = 0.5 / scale - 0.5
+    return np.array([[1 / scale, 0.0, offset], [0.0, 1 / scale, offset], [0.0, 0.0, 1.0]])
+
+
+def point_colours(reconstruction: Reconstruction, images: tuple[Image, ...]) -> NDArray[np.uint8]:
+    """(N, 3) mean RGB of each point where it is seen; mid-grey where it is not."""
+    used = used_observations(reconstruction)
+    tracks = reconstruction.tracks
+    view, point = tracks.view_index[used], tracks.point_index[used]
+    xy = np.rint(tracks.xy[used]).astype(np.int64)
+    total = np.zeros((len(reconstruction.X), 3))
+    for i, image in enumerate(images):
+        here = view == i
+        column = np.clip(xy[here, 0], 0, image.size[0] - 1)
+        row = np.clip(xy[here, 1], 0, image.size[1] - 1)
+        np.add.at(total, point[here], image.rgb[row, column].astype(np.float64))
+    count = np.bincount(point, minlength=len(total))
+    total[count == 0] = 128.0
+    return np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
