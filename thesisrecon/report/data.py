@@ -19,7 +19,7 @@ class Photograph:
     """One view as the page shows it.
 
     ``rgb`` (H, W, 3) uint8 of any size with the photograph's aspect, or None (a long side of 800 px is
-    enough for the drawn pairs; the page shrinks it further); ``size`` (width, height) px as the stages had it;
+    enough for the drawn pairs; the page shrinks it further); ``size`` (width, height) as the stages had it;
     ``original_size`` that of the file; ``reason`` why a view was refused before it reached the
     reconstruction, empty otherwise.
     """

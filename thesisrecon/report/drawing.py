@@ -117,7 +117,7 @@ def _draw_half(photograph: Photograph, xy: F64, chosen: I64, lines: F64) -> Pill
         ends = clip_line(line, width, height)
         if ends is not None:
             draw.line([tuple(p) for p in _to_drawing(np.array(ends), s)], fill=HUES[n], width=3)
-    font = ImageFont.load_default(size=24)
+    font = ImageFont.load_default(size=30)
     for n, (x, y) in enumerate(_to_drawing(xy[chosen], s)):
         draw.ellipse((x - 10, y - 10, x + 10, y + 10), fill=HUES[n], outline="#101418", width=3)
         _write_number(draw, n + 1, (x, y), picture.size, font)
@@ -132,8 +132,8 @@ def _write_number(
     font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
 ) -> None:
     """The number beside a dot, on the side where there is room."""
-    x = at[0] + 15 if at[0] < size[0] - 60 else at[0] - 45
-    y = min(max(at[1] - 28, 2), size[1] - 32)
+    x = at[0] + 15 if at[0] < size[0] - 64 else at[0] - 50
+    y = min(max(at[1] - 34, 2), size[1] - 38)
     draw.text((x, y), str(number), font=font, fill="white", stroke_width=3, stroke_fill="#101418")
 
 

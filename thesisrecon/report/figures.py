@@ -53,7 +53,6 @@ def scene_figure(scene: Scene, names: Sequence[str], colours: NDArray[np.uint8] 
             "aspectmode": "manual",
             "aspectratio": dict(zip("xyz", aspect.tolist(), strict=True)),
             "dragmode": "turntable",
-            "camera": {"eye": {"x": 0.35, "y": -1.45, "z": 0.6}, "center": {"x": 0, "y": 0, "z": -0.05}},
         },
         "hoverlabel": {"font": {"family": "system-ui, sans-serif"}},
     }

@@ -48,7 +48,12 @@ def judge(data: ReportData) -> Verdict:
     """The honest word on a run: trusted, doubtful, ended early as asked, or failed."""
     total = len(data.photographs)
     if data.failure is not None:
-        evidence = (_sentence(data.failure.evidence),) if data.failure.evidence else ()
+        last = (
+            f"the last stage that finished was {data.reports[-1].stage}"
+            if data.reports
+            else "no stage finished"
+        )
+        evidence = tuple(_sentence(text) for text in (data.failure.evidence, last) if text)
         return Verdict(
             "bad", "Failed", _sentence(data.failure.reason), evidence, _sentence(data.failure.advice)
         )
@@ -87,7 +92,7 @@ def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact
     if data.reports:
         slowest = max(data.reports, key=lambda report: report.seconds)
         share = round(100 * slowest.seconds / seconds) if seconds > 0 else 0
-        facts.append(Fact("Time", duration(seconds), f"{share} % of it {slowest.stage}"))
+        facts.append(Fact("Time", duration(seconds), f"longest stage: {slowest.stage}, {share} %"))
     return facts
 
 
@@ -135,7 +140,10 @@ def _intrinsic_facts(data: ReportData) -> list[Fact]:
     centre_x = [view["principal_x_px"] for view, _ in known if "principal_x_px" in view]
     centre_y = [view["principal_y_px"] for view, _ in known if "principal_y_px" in view]
     if centre_x and centre_y:
-        note = f"x, y from the top-left pixel. {source_of([*centre_x, *centre_y])}"
+        middles = (np.array([photo.size for view, photo in known if "principal_x_px" in view]) - 1.0) / 2
+        offset = np.stack([[p.value for p in centre_x], [p.value for p in centre_y]], axis=1) - middles
+        away = float(np.median(np.linalg.norm(offset, axis=1)))
+        note = f"x, y; {away:.1f} px off the middle of the photograph. {source_of([*centre_x, *centre_y])}"
         value = f"{interval_of(centre_x, '')}, {interval_of(centre_y, 'px')}"
         facts.append(Fact("Principal point", value, note))
     return facts
