@@ -15,7 +15,7 @@ F64 = NDArray[np.float64]
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:
     """P = K [R t]; K, R (..., 3, 3), t (..., 3) -> (..., 3, 4)."""
-    return K @ np.concatenate([R, t[..., None]], axis=-1)
+    return np.asarray(K @ np.concatenate([R, t[..., None]], axis=-1))
 
 
 def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
@@ -31,7 +31,7 @@ def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
     P = P * np.sign(det)
     K, R = rq(P[:, :3])
     t = np.linalg.solve(K, P[:, 3])
-    return K / K[2, 2], R, t
+    return K / K[2, 2], R, np.asarray(t, dtype=np.float64)
 
 
 def rq(M: F64) -> tuple[F64, F64]:
@@ -59,7 +59,8 @@ def project(P: F64, X: F64) -> F64:
 
 def distort(xy_normalized: F64, k1: float) -> F64:
     """(x, y) (1 + k1 r^2): the one-parameter radial model on normalised image points (N, 2)."""
-    return xy_normalized * (1.0 + k1 * np.sum(xy_normalized**2, axis=-1, keepdims=True))
+    r2 = np.sum(xy_normalized**2, axis=-1, keepdims=True)
+    return np.asarray(xy_normalized * (1.0 + k1 * r2))
 
 
 def undistort(xy_normalized: F64, k1: float, *, iterations: int = 30) -> F64:

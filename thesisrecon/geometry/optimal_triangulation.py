@@ -102,4 +102,4 @@ def _foot(E: F64, line: F64) -> F64:
     u, v, w = line.T
     foot = np.stack([-u * w, -v * w, u**2 + v**2], axis=1)
     back = np.einsum("nij,nj->ni", np.linalg.inv(E), foot)
-    return back[:, :2] / back[:, 2:]
+    return np.asarray(back[:, :2] / back[:, 2:], dtype=np.float64)

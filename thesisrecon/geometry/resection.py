@@ -36,10 +36,10 @@ def resect_linear(X: F64, xy: F64) -> F64:
     A = resection_rows(X, conditioned)
     p = np.linalg.eigh(A.swapaxes(-1, -2) @ A)[1][..., 0]
     P = np.linalg.inv(T) @ p.reshape(*p.shape[:-1], 3, 4)
-    return P / np.linalg.norm(P, axis=(-2, -1), keepdims=True)
+    return np.asarray(P / np.linalg.norm(P, axis=(-2, -1), keepdims=True))
 
 
-def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, F64]:
+def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
     """All poses of a calibrated camera that sees three points along three rays (P3P).
 
     X (B, 3, 3) space points, rays (B, 3, 3) unit directions in the camera frame. Returns R (C, 3, 3), t (C,
@@ -65,7 +65,7 @@ def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, F64]:
     return _poses_from_ratio(X, rays, v, sample)
 
 
-def _real_quartic_roots(c: F64) -> tuple[F64, NDArray[np.int64]]:
+def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
     """Positive real roots of quartics c (B, 5), highest power first, with the row they come from."""
     good = np.isfinite(c).all(axis=1) & (np.abs(c[:, 0]) > 1e-12 * np.abs(c).max(axis=1, initial=1e-300))
     companion = np.zeros((len(c), 4, 4))
@@ -77,9 +77,7 @@ def _real_quartic_roots(c: F64) -> tuple[F64, NDArray[np.int64]]:
     return roots.real[sample, which], sample
 
 
-def _poses_from_ratio(
-    X: F64, rays: F64, v: F64, sample: NDArray[np.int64]
-) -> tuple[F64, F64, NDArray[np.int64]]:
+def _poses_from_ratio(X: F64, rays: F64, v: F64, sample: NDArray[np.int64]) -> tuple[F64, F64, I64]:
     """Distances along the rays, then the rotation that takes the space triangle to the camera triangle."""
     X, rays = X[sample], rays[sample]
     a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))

@@ -61,4 +61,4 @@ def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
     xh = np.einsum("bij,mj->bmi", P, X)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         squared = np.sum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=-1)
-    return np.nan_to_num(squared, nan=np.inf)
+    return np.asarray(np.nan_to_num(squared, nan=np.inf), dtype=np.float64)

@@ -101,4 +101,4 @@ def metric_from_reference(p: F64, focal: float) -> F64:
     H = np.eye(4)
     H[:3, :3] = K
     H[3, :3] = -p @ K
-    return np.linalg.inv(H)
+    return np.asarray(np.linalg.inv(H), dtype=np.float64)

@@ -51,7 +51,7 @@ def cheirality_inequalities(
 
 
 def _unit_rows(A: F64) -> F64:
-    return A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
+    return np.asarray(A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300), dtype=np.float64)
 
 
 def deepest_plane(X: F64, C: F64) -> F64 | None:

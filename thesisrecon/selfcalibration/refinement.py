@@ -43,14 +43,16 @@ class RotationCriterion:
         CC = C @ C.swapaxes(-1, -2)
         trace = np.trace(CC, axis1=-2, axis2=-1)[..., None, None]
         E = 3.0 * CC / np.maximum(trace, 1e-300) - np.eye(3)
-        return E[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT
+        return np.asarray(E[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT, dtype=np.float64)
 
     def cost(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
         """Robust cost per camera of each hypothesis; (B,)."""
         norm2 = np.sum(self.camera_residuals(frame, p, log_f) ** 2, axis=-1)
         robust = 2.0 * self.scale**2 * (np.sqrt(1.0 + norm2 / self.scale**2) - 1.0)
         pull = self._pull(log_f)
-        return robust.sum(axis=1) / len(frame.views) + np.sum(pull**2, axis=1) / pull.shape[1]
+        return np.asarray(
+            robust.sum(axis=1) / len(frame.views) + np.sum(pull**2, axis=1) / pull.shape[1], dtype=np.float64
+        )
 
     def _pull(self, log_f: F64) -> F64:
         return self.focal_weight * (log_f - self.focal_log_mean) / self.focal_log_std
@@ -64,7 +66,7 @@ class RotationCriterion:
     def weights(self, frame: ReferenceFrame, theta: F64) -> F64:
         """Square roots of the soft-L1 weights of each camera, (B, R)."""
         norm2 = np.sum(self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) ** 2, axis=-1)
-        return (1.0 + norm2 / self.scale**2) ** -0.25
+        return np.asarray((1.0 + norm2 / self.scale**2) ** -0.25, dtype=np.float64)
 
 
 def _jacobian(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, weights: F64) -> F64:
@@ -117,7 +119,7 @@ def solve_guarded(N: F64, g: F64) -> F64:
     scale = np.maximum(np.abs(np.einsum("bii->bi", N)), 1e-300) ** -0.5
     scaled = N * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(N.shape[1])
     try:
-        return np.linalg.solve(scaled, (g * scale)[..., None])[..., 0] * scale
+        return np.asarray(np.linalg.solve(scaled, (g * scale)[..., None])[..., 0] * scale, dtype=np.float64)
     except np.linalg.LinAlgError:
         return np.zeros_like(g)
 

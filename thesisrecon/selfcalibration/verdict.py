@@ -27,7 +27,7 @@ def upgraded_rotations(frame: ReferenceFrame, theta: F64) -> F64:
     C[:, :2] /= f[:, None, None]
     C *= np.where(np.linalg.det(C) < 0, -1.0, 1.0)[:, None, None]
     U, _, Vt = np.linalg.svd(C)
-    return U @ Vt
+    return np.asarray(U @ Vt, dtype=np.float64)
 
 
 def rotation_spread(R: F64) -> tuple[float, float]:
