@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from thesisrecon.geometry.homogeneous import normalizing_transform
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
 
 def resection_rows(X: F64, xy: F64) -> F64:
@@ -74,10 +75,10 @@ def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
     roots = np.linalg.eigvals(companion)
     real = good[:, None] & (np.abs(roots.imag) < 1e-4 * (1.0 + np.abs(roots.real))) & (roots.real > 0)
     sample, which = np.nonzero(real)
-    return roots.real[sample, which], sample
+    return np.asarray(roots.real[sample, which], dtype=np.float64), sample.astype(np.int64)
 
 
-def _poses_from_ratio(X: F64, rays: F64, v: F64, sample: NDArray[np.int64]) -> tuple[F64, F64, I64]:
+def _poses_from_ratio(X: F64, rays: F64, v: F64, sample: I64) -> tuple[F64, F64, I64]:
     """Distances along the rays, then the rotation that takes the space triangle to the camera triangle."""
     X, rays = X[sample], rays[sample]
     a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))

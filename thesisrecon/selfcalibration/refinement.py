@@ -102,7 +102,7 @@ def refine_hypotheses(
         trial = theta - solve_guarded(N, g)
         trial[:, 3:] = np.clip(trial[:, 3:], -4.0, 5.0)
         trial_cost = criterion.cost(frame, trial[:, :3], trial[:, 3:])
-        better = trial_cost < cost
+        better = np.asarray(trial_cost < cost)
         converged = better & (cost - trial_cost < 1e-10 * cost)
         theta[better], cost[better] = trial[better], trial_cost[better]
         damping = np.where(better, damping / 5.0, damping * 4.0)
