@@ -42,7 +42,9 @@ def halve_image(image: F32) -> F32:
     for y in range(height):
         above, below = max(2 * y - 1, 0), min(2 * y + 2, image.shape[0] - 1)
         for x in range(image.shape[1]):
-            row[x] = one * (image[above, x] + image[below, x]) + three * (image[2 * y, x] + image[2 * y + 1, x])
+            row[x] = one * (image[above, x] + image[below, x]) + three * (
+                image[2 * y, x] + image[2 * y + 1, x]
+            )
         for x in range(width):
             left, right = row[max(2 * x - 1, 0)], row[min(2 * x + 2, image.shape[1] - 1)]
             out[y, x] = one * (left + right) + three * (row[2 * x] + row[2 * x + 1])

@@ -1,0 +1,182 @@
+"""Compiled loops of the corner detector; every one has a NumPy twin in the tests."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.types import F32, F64, I64
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def corner_response(blurred: F32, taps: F32) -> F32:
+    """R = det M / (M11 + M22) of section 4.2.1, M the products of the gradient of ``blurred`` smoothed by ``taps``.
+
+    One sweep down the image keeps the last 2 r + 1 rows of products only, so that they stay in the cache.
+    Rows and columns closer than r + 1 pixels to the border are zero.
+    """
+    height, width = blurred.shape
+    r = taps.size // 2
+    out = np.zeros((height, width), np.float32)
+    ring = np.zeros((taps.size, 3, width), np.float32)
+    column = np.empty((3, width), np.float32)
+    moment = np.empty((3, width), np.float32)
+    half = np.float32(0.5)
+    for y in range(1, height - 1):
+        above, here, below = blurred[y - 1], blurred[y], blurred[y + 1]
+        slot = ring[y % taps.size]
+        for x in range(1, width - 1):
+            gx = half * (here[x + 1] - here[x - 1])
+            gy = half * (below[x] - above[x])
+            slot[0, x] = gx * gx
+            slot[1, x] = gx * gy
+            slot[2, x] = gy * gy
+        if y < taps.size:
+            continue
+        column[:] = np.float32(0.0)
+        for k in range(taps.size):
+            products = ring[(y - taps.size + 1 + k) % taps.size]
+            weight = taps[k]
+            for c in range(3):
+                source, target = products[c], column[c]
+                for x in range(width):
+                    target[x] += weight * source[x]
+        moment[:] = np.float32(0.0)
+        for c in range(3):
+            source, target = column[c], moment[c]
+            for k in range(taps.size):
+                weight = taps[k]
+                for x in range(r + 1, width - r - 1):
+                    target[x] += weight * source[x + k - r]
+        row = out[y - r]
+        for x in range(r + 1, width - r - 1):
+            trace = moment[0, x] + moment[2, x]
+            determinant = moment[0, x] * moment[2, x] - moment[1, x] * moment[1, x]
+            row[x] = determinant / (trace + np.float32(1e-6))
+    return out
+
+
+@njit(cache=True, nogil=True)
+def fit_maxima(response: F32, threshold: float) -> tuple[F64, F32]:
+    """Maxima of the quadratic surfaces fitted by least squares to the 3 x 3 neighbourhoods of local maxima.
+
+    Returns ``xy`` (N, 2) px and the response (N,) at the pixel. A fit without a maximum within one pixel keeps
+    the pixel itself.
+    """
+    height, width = response.shape
+    count = 0
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            if response[y, x] > threshold and _is_maximum(response, x, y):
+                count += 1
+    xy = np.empty((count, 2), np.float64)
+    value = np.empty(count, np.float32)
+    n = 0
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            if response[y, x] > threshold and _is_maximum(response, x, y):
+                dx, dy = _surface_maximum(response, x, y)
+                xy[n, 0], xy[n, 1] = x + dx, y + dy
+                value[n] = response[y, x]
+                n += 1
+    return xy, value
+
+
+@njit(cache=True, nogil=True)
+def _is_maximum(response: F32, x: int, y: int) -> bool:
+    # >= on the one side and > on the other: a plateau of two pixels gives one corner.
+    v = response[y, x]
+    return bool(
+        v > response[y - 1, x - 1]
+        and v > response[y - 1, x]
+        and v > response[y - 1, x + 1]
+        and v > response[y, x - 1]
+        and v >= response[y, x + 1]
+        and v >= response[y + 1, x - 1]
+        and v >= response[y + 1, x]
+        and v >= response[y + 1, x + 1]
+    )
+
+
+@njit(cache=True, nogil=True)
+def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
+    gx = gy = gxx = gyy = gxy = 0.0
+    for k in range(-1, 2):
+        left, centre, right = response[y + k, x - 1], response[y + k, x], response[y + k, x + 1]
+        above, middle, below = response[y - 1, x + k], response[y, x + k], response[y + 1, x + k]
+        gx += (right - left) / 6.0
+        gy += (below - above) / 6.0
+        gxx += (left - 2.0 * centre + right) / 3.0
+        gyy += (above - 2.0 * middle + below) / 3.0
+    gxy = (
+        response[y + 1, x + 1] + response[y - 1, x - 1] - response[y - 1, x + 1] - response[y + 1, x - 1]
+    ) / 4.0
+    determinant = gxx * gyy - gxy * gxy
+    if not (gxx < 0.0 and determinant > 1e-12 * gxx * gxx):
+        return 0.0, 0.0
+    dx = -(gyy * gx - gxy * gy) / determinant
+    dy = -(gxx * gy - gxy * gx) / determinant
+    if abs(dx) > 1.0 or abs(dy) > 1.0:
+        return 0.0, 0.0
+    return dx, dy
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
+    """(N,) squared distance of each corner to the nearest one that is clearly stronger; inf where none is.
+
+    ``xy`` and ``response`` are sorted strongest first; clearly stronger: robustness x its response > this one's.
+    """
+    n = len(xy)
+    x, y = xy[:, 0].copy(), xy[:, 1].copy()
+    out = np.full(n, np.inf, np.float32)
+    stronger = 0
+    for i in range(n):
+        while stronger < i and robustness * response[stronger] > response[i]:
+            stronger += 1
+        best = np.float32(3.4e38)
+        for j in range(stronger):
+            dx, dy = x[j] - x[i], y[j] - y[i]
+            best = min(best, dx * dx + dy * dy)
+        if stronger > 0:
+            out[i] = best
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
+    """(N, side^2) bilinear samples on a ``side`` x ``side`` grid turned by ``angle``, clamped at the border."""
+    height, width = image.shape
+    out = np.empty((len(xy), side * side), np.float32)
+    centre = 0.5 * (side - 1)
+    for n in range(len(xy)):
+        c, s = np.cos(angle[n]) * spacing, np.sin(angle[n]) * spacing
+        for row in range(side):
+            for column in range(side):
+                a, b = column - centre, row - centre
+                u = min(max(xy[n, 0] + c * a - s * b, 0.0), width - 1.001)
+                v = min(max(xy[n, 1] + s * a + c * b, 0.0), height - 1.001)
+                x0, y0 = int(u), int(v)
+                p, q = np.float32(u - x0), np.float32(v - y0)
+                top = image[y0, x0] + p * (image[y0, x0 + 1] - image[y0, x0])
+                low = image[y0 + 1, x0] + p * (image[y0 + 1, x0 + 1] - image[y0 + 1, x0])
+                out[n, row * side + column] = top + q * (low - top)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def keep_apart(xy: F64, order: I64, distance: float) -> I64:
+    """The members of ``order`` that lie at least ``distance`` from every earlier one kept."""
+    kept = np.empty(len(order), np.int64)
+    n = 0
+    for i in order:
+        free = True
+        for k in range(n):
+            dx, dy = xy[i, 0] - xy[kept[k], 0], xy[i, 1] - xy[kept[k], 1]
+            if dx * dx + dy * dy < distance * distance:
+                free = False
+                break
+        if free:
+            kept[n] = i
+            n += 1
+    return kept[:n]

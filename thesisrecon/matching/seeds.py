@@ -1,0 +1,107 @@
+"""First matches without a search radius: mutual best patches that have no rival elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from thesisrecon.matching.kernels import scan_correlations, update_column_best
+from thesisrecon.types import B8, F32, F64, I64, Seeds
+
+ROWS_AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class SeedMatches:
+    """``xy1, xy2`` (M, 2) px, ``affine`` (M, 2, 2) a first guess of the local map, ``score`` (M,) correlation."""
+
+    xy1: F64
+    xy2: F64
+    affine: F64
+    score: F32
+
+    def __len__(self) -> int:
+        """Number of matches."""
+        return len(self.xy1)
+
+    def at(self, chosen: B8 | I64) -> SeedMatches:
+        """A part of them."""
+        return SeedMatches(self.xy1[chosen], self.xy2[chosen], self.affine[chosen], self.score[chosen])
+
+
+def match_seeds(seeds1: Seeds, seeds2: Seeds, *, turned: bool, ratio: float) -> SeedMatches:
+    """Seeds that are each other's best, with every rival elsewhere worse by ``ratio`` in distance.
+
+    ``turned`` takes the patches turned to their gradient, else the upright ones. Distance of unit patches:
+    sqrt(2 - 2 correlation). Elsewhere: farther than a quarter of the patch (8 of its level's pixels).
+    """
+    use1, use2 = (np.flatnonzero((s.angle != 0.0) == turned) for s in (seeds1, seeds2))
+    if not (len(use1) and len(use2)):
+        none = np.empty((0, 2))
+        return SeedMatches(none, none, np.empty((0, 2, 2)), np.empty(0, np.float32))
+    index, value, rival, back = _correlate(seeds1, use1, seeds2, use2)
+    mutual = back[index] == np.arange(len(use1))
+    distinct = (1.0 - value) < ratio**2 * (1.0 - rival)
+    rows = np.flatnonzero(mutual & distinct & (value > 0.5))
+    one, two = use1[rows], use2[index[rows]]
+    turn = (seeds2.angle[two] - seeds1.angle[one]).astype(np.float64)
+    grow = (seeds2.scale[two] / seeds1.scale[one]).astype(np.float64)
+    return SeedMatches(seeds1.xy[one], seeds2.xy[two], similarity(grow, turn), value[rows])
+
+
+def _correlate(seeds1: Seeds, use1: I64, seeds2: Seeds, use2: I64) -> tuple[I64, F32, F32, I64]:
+    xy2 = seeds2.xy[use2].astype(np.float32)
+    apart2 = (8.0 * seeds2.scale[use2]) ** 2
+    patches1, patches2 = seeds1.patches[use1], np.ascontiguousarray(seeds2.patches[use2].T)
+    column_value = np.full(len(use2), -2.0, np.float32)
+    back = np.zeros(len(use2), np.int64)
+    parts = []
+    # A block of rows stays in the cache between the product and the two scans.
+    for first in range(0, len(use1), ROWS_AT_ONCE):
+        correlation = patches1[first : first + ROWS_AT_ONCE] @ patches2
+        parts.append(scan_correlations(correlation, xy2, apart2))
+        update_column_best(correlation, first, column_value, back)
+    index, value, rival = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return index, value, rival, back
+
+
+def similarity(scale: F64, angle: F64) -> F64:
+    """Scaled rotations (M, 2, 2)."""
+    c, s = scale * np.cos(angle), scale * np.sin(angle)
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+
+
+def common_similarity(matches: SeedMatches) -> F64:
+    """(2, 2) the scaled rotation most matches agree on: medians of log scale and of angle (about the mean one)."""
+    a = matches.affine
+    scale = np.exp(np.median(np.log(np.hypot(a[:, 0, 0], a[:, 1, 0]))))
+    angle = np.arctan2(a[:, 1, 0], a[:, 0, 0])
+    # The mode of the angles, by a histogram of 10 degrees, and the median around it.
+    counts, edges = np.histogram(angle, bins=36, range=(-np.pi, np.pi))
+    counts = counts + np.roll(counts, 1) + np.roll(counts, -1)
+    mode = edges[np.argmax(counts)] + np.pi / 36
+    around = np.angle(np.exp(1j * (angle - mode)))
+    near = np.abs(around) < np.pi / 6
+    return similarity(np.array([scale]), np.array([mode + np.median(around[near])]))[0]
+
+
+def neighbour_support(matches: SeedMatches, *, neighbours: int = 10, tolerance: float = 0.3) -> F64:
+    """(M,) strength of each match: how many of its neighbours move as it does (equation 4.1 with c = 1).
+
+    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (tolerance |u_m - u_k|))^2), d the displacement left after
+    the rotation and scale that the two images have in common; both images serve as the first in turn.
+    """
+    if len(matches) < 2:
+        return np.zeros(len(matches))
+    a = common_similarity(matches)
+    u, v = matches.xy1 @ a.T, matches.xy2
+    k = min(neighbours + 1, len(matches))
+    support = np.zeros(len(matches))
+    for here, there in ((u, v), (v, u)):
+        near = cKDTree(here).query(here, k)[1][:, 1:]
+        apart = np.linalg.norm(here[near] - here[:, None], axis=2)
+        strain = np.linalg.norm((there[near] - there[:, None]) - (here[near] - here[:, None]), axis=2)
+        support += np.exp(-0.5 * (strain / (tolerance * apart + 1.0)) ** 2).sum(axis=1)
+    return 0.5 * support

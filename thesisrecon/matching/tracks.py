@@ -1,0 +1,90 @@
+"""From pairs to scene points: chains of verified matches, each aligned towards its middle view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.matching.kernels import align_windows
+from thesisrecon.matching.linking import Chains, link_matches, maps_to_views
+from thesisrecon.matching.prepared import PreparedView
+from thesisrecon.types import B8, F64, Tracks, TwoView
+
+
+@dataclass(frozen=True)
+class PlainTracks:
+    """Tracks as the matches give them: each observation stands at its corner."""
+
+    def build(
+        self, prepared: Sequence[PreparedView], pairs: Sequence[TwoView], rng: np.random.Generator
+    ) -> Tracks:
+        """Scene points seen in at least two views; a track never has two corners in one view."""
+        del rng
+        chains = link_matches([len(p.features.xy) for p in prepared], [p for p in pairs if p.accepted])
+        xy = np.empty((len(chains.view), 2))
+        for i, view in enumerate(prepared):
+            here = chains.view == i
+            xy[here] = view.features.xy[chains.corner[here]]
+        return _tracks(chains, xy, np.ones(len(xy), np.bool_), len(prepared))
+
+
+@dataclass(frozen=True)
+class AlignedTracks:
+    """Tracks whose observations are aligned by least squares with the window of their middle view.
+
+    Parameters
+    ----------
+    least_correlation : after alignment; an observation below it is dropped.
+    affine_std : prior standard deviation of an affine coefficient in the alignment.
+    largest_shift : in pixels of the corner's scale.
+    """
+
+    least_correlation: float = 0.75
+    affine_std: float = 0.1
+    largest_shift: float = 3.0
+
+    def build(
+        self, prepared: Sequence[PreparedView], pairs: Sequence[TwoView], rng: np.random.Generator
+    ) -> Tracks:
+        """Scene points seen in at least two views, every observation of a track at the same sub-pixel spot.
+
+        The middle view of a track is the one with most direct matches in it; the local maps to the other views
+        are chained along the matches.
+        """
+        del rng
+        accepted = [p for p in pairs if p.accepted]
+        chains = link_matches([len(p.features.xy) for p in prepared], accepted)
+        start, affine, middle = maps_to_views(chains, [p.features.xy for p in prepared], accepted)
+        xy, kept = start.copy(), np.ones(len(start), np.bool_)
+        for i, view1 in enumerate(prepared):
+            for j, view2 in enumerate(prepared):
+                group = np.flatnonzero((chains.view[middle] == i) & (chains.view == j))
+                if i == j or not len(group):
+                    continue
+                corner = chains.corner[middle[group]]
+                found, _, score = align_windows(
+                    view1.pyramid,
+                    view2.pyramid,
+                    (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group]),
+                    (12, self.affine_std, self.largest_shift),
+                )
+                xy[group], kept[group] = found, score >= self.least_correlation
+        return _tracks(chains, xy, kept, len(prepared))
+
+
+def _tracks(chains: Chains, xy: F64, kept: B8, n_views: int) -> Tracks:
+    """Observations of the tracks that still have two views, tracks numbered anew."""
+    sizes = np.bincount(chains.track[kept], minlength=chains.count)
+    use = kept & (sizes[chains.track] >= 2)
+    number = np.cumsum(sizes >= 2) - 1
+    point, view, place = number[chains.track[use]], chains.view[use], xy[use]
+    order = np.lexsort((view, point))
+    return Tracks(
+        view_index=view[order].astype(np.int64),
+        point_index=point[order].astype(np.int64),
+        xy=np.ascontiguousarray(place[order]),
+        n_views=n_views,
+        n_points=int((sizes >= 2).sum()),
+    )
