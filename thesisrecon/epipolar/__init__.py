@@ -5,16 +5,29 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_gradient
+from thesisrecon.epipolar.thesis_ransac import ThesisRansac
+from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.types import FundamentalFit
 
-__all__ = ["LocallyOptimisedRansac", "estimate_fundamental"]
+__all__ = [
+    "LocallyOptimisedRansac",
+    "PairVerification",
+    "ThesisRansac",
+    "estimate_eight_point",
+    "estimate_fundamental",
+    "estimate_seven_point",
+    "refine_epipolar_distance",
+    "refine_gradient",
+]
 
 
 def estimate_fundamental(
     xy1: NDArray[np.float64], xy2: NDArray[np.float64], *, threshold_px: float = 1.0, seed: int = 0
 ) -> FundamentalFit:
-    """Robust F of matches xy1, xy2 (N >= 8, 2) px with x2' F x1 = 0: :class:`LocallyOptimisedRansac` as it comes.
+    """Robust F of matches xy1, xy2 (N >= 8, 2) px, x2' F x1 = 0, by :class:`LocallyOptimisedRansac`.
 
     The same seed gives the same answer. Raises ``ValueError`` for a wrong call and
     :class:`~thesisrecon.errors.StageFailure` for matches that determine no F.

@@ -11,14 +11,14 @@ from thesisrecon.epipolar.rank2.kernels import GRADIENT, normal_equations, split
 F64 = NDArray[np.float64]
 
 FLATTEST_REL = 1e-14
-"""Curvatures below this share of the largest are set to it: the covariance of a plane's F is huge, not infinite."""
+"""Curvatures below this share of the largest are raised to it: a plane's F is uncertain, not inf."""
 
 
 def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) -> F64:
     """Covariance (9, 9) of vec(F), F in pixels with unit norm, to first order: sigma^2 B (J'J)^-1 B'.
 
-    ``f`` (9,) and ``points`` (N, 4) (the inliers) in ``frame``, ``sigma`` of one image coordinate in its units. J
-    are the derivatives of the Sampson distances by the seven parameters, B those of vec(F). Rank 7.
+    ``f`` (9,) and ``points`` (N, 4) (the inliers) in ``frame``, ``sigma`` of one image coordinate in its
+    units. J are the derivatives of the Sampson distances by the seven parameters, B those of vec(F). Rank 7.
     """
     U, V, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((9, 7))
     G, h = np.empty((9, 9)), np.empty(9)
@@ -31,4 +31,5 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
     norm = float(np.linalg.norm(pixels))
     moved = frame.to_pixels @ half / norm
     moved -= np.outer(pixels, pixels @ moved) / norm**2
-    return sigma**2 * moved @ moved.T
+    covariance: F64 = sigma**2 * moved @ moved.T
+    return covariance

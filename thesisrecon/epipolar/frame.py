@@ -1,4 +1,4 @@
-"""What every estimator of F does first and last: refuse what cannot work, choose a frame, come back to pixels."""
+"""What every estimator of F does first and last: refuse what cannot work, choose a frame, leave it again."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ COLLINEAR = 1e-9
 def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
     """The matches as float64 (N, 2) arrays that can determine an F.
 
-    Raises ``ValueError`` for other shapes and for coordinates that are not finite, ``StageFailure`` for fewer than
-    ``needed`` matches and for points that are all equal or on one line in an image.
+    Raises ``ValueError`` for other shapes and for coordinates that are not finite, ``StageFailure`` for fewer
+    than ``needed`` matches and for points that are all equal or on one line in an image.
     """
     xy1, xy2 = np.ascontiguousarray(xy1, dtype=np.float64), np.ascontiguousarray(xy2, dtype=np.float64)
     if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
-        raise ValueError(f"a fundamental matrix needs two (N, 2) arrays of pixels; got {xy1.shape} and {xy2.shape}")
+        raise ValueError(f"a fundamental matrix needs two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
     if not (np.isfinite(xy1).all() and np.isfinite(xy2).all()):
         raise ValueError("a fundamental matrix needs finite pixel coordinates; some are NaN or infinite")
     if len(xy1) < needed:
@@ -48,8 +48,8 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
 class PairFrame:
     """Coordinates of both images about their centroids, scaled by one common factor ``scale`` (1 / px).
 
-    The common factor keeps Sampson distances what they are in pixels, times ``scale``; a factor per image would
-    weight the images against each other.
+    The common factor keeps Sampson distances what they are in pixels, times ``scale``; a factor per image
+    would weight the images against each other.
     """
 
     centroid1: F64
@@ -70,7 +70,8 @@ class PairFrame:
     @property
     def to_pixels(self) -> F64:
         """(9, 9) matrix that takes vec(F) of the frame to vec(F) of pixels, up to scale."""
-        return np.kron(self._transform(self.centroid2).T, self._transform(self.centroid1).T)
+        T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
+        return np.asarray(np.kron(T2.T, T1.T), dtype=np.float64)
 
     def matrix_in_pixels(self, f: F64) -> F64:
         """F (3, 3) in pixels, unit norm, from a flat vector (9,) in the frame."""

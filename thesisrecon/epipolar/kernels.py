@@ -66,17 +66,18 @@ def null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
 @njit(cache=True, nogil=True)
 def det3(f: F64) -> float:
     """Determinant of a 3x3 matrix given as a vector of 9."""
-    return (
+    value: float = (
         f[0] * (f[4] * f[8] - f[5] * f[7])
         - f[1] * (f[3] * f[8] - f[5] * f[6])
         + f[2] * (f[3] * f[7] - f[4] * f[6])
     )
+    return value
 
 
 @njit(cache=True, nogil=True)
 def mixed_det3(f: F64, g: F64) -> float:
     """trace(adj(f) g): the coefficient of a in det(f + a g)."""
-    return (
+    value: float = (
         (f[4] * f[8] - f[5] * f[7]) * g[0]
         + (f[5] * f[6] - f[3] * f[8]) * g[1]
         + (f[3] * f[7] - f[4] * f[6]) * g[2]
@@ -87,6 +88,7 @@ def mixed_det3(f: F64, g: F64) -> float:
         + (f[2] * f[3] - f[0] * f[5]) * g[7]
         + (f[0] * f[4] - f[1] * f[3]) * g[8]
     )
+    return value
 
 
 @njit(cache=True, nogil=True)
@@ -123,9 +125,10 @@ def monic_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
 def singular_members(pencil: F64, F: F64) -> int:
     """Members of the pencil with determinant 0, unit norm, into ``F`` (3, 9); how many (0 to 3).
 
-    det is a homogeneous cubic of the pencil's coordinates. It cannot vanish in four directions unless it vanishes
-    everywhere, so the direction of the largest |det| of four is made the first basis vector: the leading
-    coefficient is then never small and no solution is lost at infinity, as (5.2)'s affine combination loses one.
+    det is a homogeneous cubic of the pencil's coordinates. It cannot vanish in four directions unless it
+    vanishes everywhere, so the direction of the largest |det| of four is made the first basis vector: the
+    leading coefficient is then never small and no solution is lost at infinity, as (5.2)'s affine combination
+    loses one.
     """
     best, c, s = -1.0, 1.0, 0.0
     trial = np.empty(9)
@@ -164,7 +167,7 @@ def seven_point(points: F64, sample: I64, F: F64) -> int:
 
 @njit(cache=True, nogil=True)
 def oriented(f: F64, points: F64, sample: I64) -> bool:
-    """Whether the sample can be in front of both cameras: e2 x x2 and F x1 point to the same side for all or none.
+    """Whether the sample can be in front of both cameras: e2 x x2 and F x1 agree in sign for all or none.
 
     The oriented epipolar constraint (Chum, Werner and Matas, ICPR 2004).
     """
@@ -200,15 +203,17 @@ def squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float
     b0 = f[0] * x2 + f[3] * y2 + f[6]
     b1 = f[1] * x2 + f[4] * y2 + f[7]
     e = a0 * x2 + a1 * y2 + f[6] * x1 + f[7] * y1 + f[8]
-    return e * e / (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1 + 1e-300)
+    squared: float = e * e / (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1 + 1e-300)
+    return squared
 
 
 @njit(cache=True, nogil=True)
 def truncated_score(f: F64, points: F64, gate: float, give_up: float) -> tuple[float, int]:
     """Mean of min(r^2 / gate^2, 1) over all points and the number of points with r < gate.
 
-    Given up (score 1) as soon as the sum passes ``give_up`` times the number of points, or the running mean is
-    three standard errors above it (the order of the points must be random): it cannot win, or very likely cannot.
+    Given up (score 1) as soon as the sum passes ``give_up`` times the number of points, or the running mean
+    is three standard errors above it (the order of the points must be random): it cannot win, or very likely
+    cannot.
     """
     total, inliers, n = 0.0, 0, len(points)
     inverse = 1.0 / (gate * gate)
@@ -233,9 +238,10 @@ def search(
 ) -> int:
     """Draw one sample per row of ``uniforms`` (B, 7) until enough were drawn; number of samples drawn in all.
 
-    ``done`` samples went before; ``state`` (2,) holds the best score and its share of inliers, ``F`` (9,) the best
-    matrix: both are read and updated. Each new best is refined a little (Huber, gate twice as wide) before it sets
-    the number of samples still needed, since a minimal sample spreads its noise over the image.
+    ``done`` samples went before; ``state`` (2,) holds the best score and its share of inliers, ``F`` (9,) the
+    best matrix: both are read and updated. Each new best is refined a little (Huber, gate twice as wide)
+    before it sets the number of samples still needed, since a minimal sample spreads its noise over the
+    image.
     """
     n = len(points)
     sample = np.empty(7, np.int64)

@@ -28,11 +28,11 @@ class LocallyOptimisedRansac:
     """Seven-point sampling with a truncated quadratic score, refined over rank-2 matrices.
 
     Each of ``starts`` searches draws until a sample free of outliers was seen with the probability that makes
-    ``confidence`` over all starts; its best matrix is refined by Levenberg-Marquardt on the gradient criterion (5.4)
-    under Huber's loss at the ``gates`` (times the threshold), and the best of the starts is kept. Torr and
-    Zisserman, MLESAC, CVIU 2000 (score); Chum, Matas and Kittler, DAGM 2003 (local optimisation). Fitting the
-    points of a shrinking gate alone gets stuck where the scene is nearly a plane; the several starts and the soft
-    loss do not.
+    ``confidence`` over all starts; its best matrix is refined by Levenberg-Marquardt on the gradient
+    criterion (5.4) under Huber's loss at the ``gates`` (times the threshold), and the best of the starts is
+    kept. Torr and Zisserman, MLESAC, CVIU 2000 (score); Chum, Matas and Kittler, DAGM 2003 (local
+    optimisation). Fitting the points of a shrinking gate alone gets stuck where the scene is nearly a plane;
+    the several starts and the soft loss do not.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class LocallyOptimisedRansac:
     threshold_px: float = 1.0
     confidence: float = 0.9999
     starts: int = 4
-    max_samples: int = 20000
+    max_samples: int = 50000
     gates: tuple[float, ...] = (2.0, 1.5, 1.0)
     inlier_sigmas: float = 2.5
     inlier_floor_px: float = 0.3
@@ -63,8 +63,8 @@ class LocallyOptimisedRansac:
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """F of matches (N >= 8, 2) px with its inliers, noise and covariance.
 
-        Raises ``ValueError`` for wrong shapes or coordinates that are not finite, ``StageFailure`` for fewer than 8
-        matches, points on one line, or where no F has 8 matches within the threshold. Always finite.
+        Raises ``ValueError`` for wrong shapes or coordinates that are not finite, ``StageFailure`` for fewer
+        than 8 matches, points on one line, or where no F has 8 matches within the threshold. Always finite.
         """
         xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
         frame = PairFrame.of(xy1, xy2)
@@ -106,7 +106,7 @@ class LocallyOptimisedRansac:
         if not f.any() or near.sum() < MINIMUM:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
-                f"the best of {samples} samples has {int(near.sum()) if f.any() else 0} of {len(xy1)} matches within "
+                f"the best of {samples} samples has {near.sum() * f.any()} of {len(xy1)} matches within "
                 f"{self.threshold_px:g} px, needed at least {MINIMUM}",
                 "The photographs may not overlap, or the matches are wrong",
             )

@@ -1,4 +1,4 @@
-"""Section 3.6: what two views see of one scene: F, epipoles and lines, residuals, homographies, canonical cameras.
+"""Section 3.6: what two views share: F, epipoles and lines, residuals, homographies, canonical cameras.
 
 x2' F x1 = 0; the epipolar line in image 2 is F x1, in image 1 F' x2; F e1 = 0, F' e2 = 0.
 """
@@ -46,7 +46,7 @@ def epipoles(F: F64) -> tuple[F64, F64]:
 
 
 def epipolar_lines(F: F64, xy1: F64) -> F64:
-    """Lines (N, 3) in image 2 of points (N, 2) of image 1, with unit normals so that l . (x, y, 1) is a distance.
+    """Lines (N, 3) in image 2 of points (N, 2) of image 1, unit normals: l . (x, y, 1) is a distance in px.
 
     For lines in image 1 of points of image 2 pass F'. The line of an epipole is zero.
     """
@@ -57,7 +57,8 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
 
 def algebraic_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
     """x2' F x1 of (5.2); (N,)."""
-    return np.einsum("na,ab,nb->n", homogenize(xy2), F, homogenize(xy1))
+    residuals: F64 = np.einsum("na,ab,nb->n", homogenize(xy2), F, homogenize(xy1))
+    return residuals
 
 
 def _gradients(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
@@ -69,21 +70,21 @@ def _gradients(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
     """Signed Sampson distances in px (5.4); (N,).
 
-    To first order the distance of (x1, y1, x2, y2) to the nearest exact match; its standard deviation is that of
-    one image coordinate.
+    To first order the distance of (x1, y1, x2, y2) to the nearest exact match; its standard deviation is that
+    of one image coordinate.
     """
     g2, g1 = _gradients(F, xy1, xy2)
     return algebraic_residuals(F, xy1, xy2) / np.sqrt(g1 + g2)
 
 
 def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Root of the sum of the two squared distances to the epipolar lines, px, the summand of (5.6); (N,) >= 0."""
+    """Root of the sum of the two squared distances to the epipolar lines (5.6), px; (N,) >= 0."""
     g2, g1 = _gradients(F, xy1, xy2)
     return np.abs(algebraic_residuals(F, xy1, xy2)) * np.sqrt(1.0 / g1 + 1.0 / g2)
 
 
 def estimate_homography(xy1: F64, xy2: F64) -> F64:
-    """H (3, 3), unit norm, with x2 ~ H x1 from N >= 4 matches by the normalised direct linear transform (HZ 4.2).
+    """H (3, 3), unit norm, with x2 ~ H x1 of N >= 4 matches by the normalised linear transform (HZ 4.2).
 
     Raises ``ValueError`` for fewer than 4 matches, wrong shapes or points that are all equal.
     """
@@ -93,8 +94,8 @@ def estimate_homography(xy1: F64, xy2: F64) -> F64:
     x1, (u, v) = homogenize(xy1) @ T1.T, (xy2 @ T2[:2, :2].T + T2[:2, 2]).T
     zero = np.zeros_like(x1)
     A = np.concatenate([np.hstack([x1, zero, -u[:, None] * x1]), np.hstack([zero, x1, -v[:, None] * x1])])
-    H = np.linalg.eigh(A.T @ A)[1][:, 0].reshape(3, 3)
-    return unit_norm(np.linalg.solve(T2, H @ T1))
+    H: F64 = np.linalg.eigh(A.T @ A)[1][:, 0].reshape(3, 3)
+    return unit_norm(np.asarray(np.linalg.solve(T2, H @ T1)))
 
 
 def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
@@ -106,11 +107,11 @@ def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
 
 
 def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -> tuple[F64, F64]:
-    """P1 = [I 0], P2 = [-[e2]x F + e2 v'  scale e2] (3.42): one projective frame in which the two cameras have F.
+    """P1 = [I 0], P2 = [-[e2]x F + e2 v'  scale e2] (3.42): two cameras of a projective frame that have F.
 
-    ``plane`` v (3,) are the free coordinates of the plane that plays the part of infinity. With v = 0 the left part
-    of P2 is singular; without a plane v is chosen such that it is the nearest to a multiple of the identity
-    (least squares). ``scale`` is the last of the four free parameters and must not be 0.
+    ``plane`` v (3,) are the free coordinates of the plane that plays the part of infinity. With v = 0 the
+    left part of P2 is singular; without a plane v is chosen such that it is the nearest to a multiple of the
+    identity (least squares). ``scale`` is the last of the four free parameters and must not be 0.
     """
     if scale == 0.0 or not np.isfinite(scale):
         raise ValueError(f"canonical_cameras needs a finite scale other than 0; got {scale}")
@@ -118,8 +119,9 @@ def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -
     _, e2 = epipoles(F)
     M = -cross_matrix(e2) @ F
     if plane is None:
-        # min over (v, m) of |M + e2 v' - m I|^2 + |m|-normalisation: with v = m e2 - M'e2 + ... the part along e2
-        # is matched exactly and m is the mean of the rest's trace.
+        # |M + e2 v' - m I| is least for v = m e2 - M'e2 (the row along e2 matched exactly) and m = trace(M) /
+        # 2, the other two rows' mean diagonal; a trace near 0 would leave M nearly singular, so m keeps to
+        # M's size.
         m = float(np.trace(M)) / 2.0
         size = float(np.linalg.norm(M)) / np.sqrt(2.0)
         m = m if abs(m) > 0.1 * size else size

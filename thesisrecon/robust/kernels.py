@@ -29,7 +29,7 @@ def draw_sample(uniforms: F64, n: int, out: I64) -> None:
 
 @njit(cache=True, nogil=True)
 def required_samples(inlier_share: float, sample_size: int, confidence: float, largest: int) -> int:
-    """Samples after which one free of outliers was drawn with probability ``confidence``, at most ``largest``.
+    """Samples after which one is free of outliers with probability ``confidence``, at most ``largest``.
 
     N = log(1 - confidence) / log(1 - share^size) (Fischler and Bolles 1981).
     """

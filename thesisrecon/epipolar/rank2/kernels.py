@@ -1,7 +1,7 @@
 """Compiled refinement of F over its seven degrees of freedom: F = U diag(cos phi, sin phi, 0) V'.
 
-Orthonormal representation of Bartoli and Sturm (IJCV 2004): singular by construction, without the thesis' special
-case of an epipole at infinity. Points are rows (x1, y1, x2, y2), F is a flat row-major vector of 9.
+Orthonormal representation of Bartoli and Sturm (IJCV 2004): singular by construction, without the thesis'
+special case of an epipole at infinity. Points are rows (x1, y1, x2, y2), F is a flat row-major vector of 9.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ def normal_equations(
 ) -> tuple[float, int]:
     """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by the entries of F.
 
-    rho is Huber's loss of width ``delta``, constant beyond ``gate``; r the Sampson distance (5.4) or the root of
-    the sum of the two squared epipolar distances (5.6). Returns the cost and the number of points inside the gate.
+    rho is Huber's loss of width ``delta``, constant beyond ``gate``; r the Sampson distance (5.4) or the root
+    of the sum of the two squared epipolar distances (5.6). Returns the cost and the number of points inside
+    the gate.
     """
     G[:] = 0.0
     h[:] = 0.0
@@ -89,7 +90,7 @@ def compose(U: F64, V: F64, phi: float, f: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def tangent(U: F64, V: F64, phi: float, B: F64) -> None:
-    """Derivatives (``B`` (9, 7)) of F by small rotations of U (3), of V (3) about their own axes, and by phi."""
+    """Derivatives (``B`` (9, 7)) of F by rotations of U (3) and of V (3) about their own axes, and by phi."""
     c, s = np.cos(phi), np.sin(phi)
     for i in range(3):
         for j in range(3):
@@ -166,11 +167,13 @@ def split(f: F64, U: F64, V: F64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def refine(f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int) -> tuple[float, int]:
-    """Minimise the robust cost of :func:`normal_equations` from ``f`` (finite, changed in place); cost and steps.
+def refine(
+    f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int
+) -> tuple[float, int]:
+    """Minimise the cost of :func:`normal_equations` from ``f`` (finite, changed in place); cost and steps.
 
-    Levenberg-Marquardt with at most ``iterations`` solves; the cost never rises above that of the nearest matrix
-    of rank 2.
+    Levenberg-Marquardt with at most ``iterations`` solves; the cost never rises above that of the nearest
+    matrix of rank 2.
     """
     U, V, Un, Vn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     phi = split(f, U, V)
@@ -178,8 +181,9 @@ def refine(f: F64, points: F64, criterion: int, gate: float, delta: float, itera
     B, step, trial = np.empty((9, 7)), np.empty(7), np.empty(9)
     compose(U, V, phi, f)
     cost, _ = normal_equations(f, points, criterion, gate, delta, G, h)
+    exact = 1e-26 * len(points)
     damping, steps = 1e-3, 0
-    while steps < iterations:
+    while steps < iterations and cost > exact:
         tangent(U, V, phi, B)
         H = B.T @ (G @ B)
         g = B.T @ h

@@ -1,0 +1,106 @@
+"""Algorithm 2 of the thesis: seven-point samples, the most inliers, then the gradient criterion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from thesisrecon.epipolar.covariance import fundamental_covariance
+from thesisrecon.epipolar.frame import PairFrame, check_matches
+from thesisrecon.epipolar.kernels import seven_point
+from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_gradient
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.multiview import sampson_residuals
+from thesisrecon.robust.noise import noise_scale
+from thesisrecon.robust.ransac import SampleConsensus
+from thesisrecon.types import FundamentalFit
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+B8 = NDArray[np.bool_]
+
+CHI2_1_95 = 3.841458820694124
+"""95 % of a chi-square variable with one degree of freedom lies below."""
+MINIMUM = 8
+
+
+@dataclass(frozen=True)
+class SevenPointProblem:
+    """Minimal samples of matches: ``points`` (N, 4) in ``frame``, distances in px."""
+
+    frame: PairFrame
+    points: F64
+    xy1: F64
+    xy2: F64
+    sample_size: int = 7
+
+    def solve(self, sample: I64) -> list[F64]:
+        """The one to three matrices through seven matches, in pixels."""
+        solutions = np.empty((3, 9))
+        count = seven_point(self.points, sample, solutions)
+        return [self.frame.matrix_in_pixels(f) for f in solutions[:count]]
+
+    def residuals(self, model: F64) -> F64:
+        """Sampson distances, px."""
+        return sampson_residuals(model, self.xy1, self.xy2)
+
+
+@dataclass(frozen=True)
+class ThesisRansac:
+    """Section 5.4 as it stands, its slips corrected.
+
+    Draw ``samples`` samples of seven, or stop once a share ``enough_share`` of the matches are inliers; keep
+    the F with the most; estimate sigma by the median (1.4826 (1 + 5 / (n - 7)) median |d|; the text divides
+    by Phi(0.75) where Phi^-1(0.75) is meant), discard the outliers, minimise the gradient criterion (5.4), or
+    the distances to the epipolar lines (5.6) with ``epipolar_distance``, and discard once more.
+
+    Departures: a match is tested by its Sampson distance against the chi-square of one degree of freedom (the
+    two epipolar distances are multiples of one residual, so their sum is not a chi-square of two); the search
+    counts inliers within a fixed ``threshold_px``, since the share within a multiple of the median is the
+    same for every F; the refinement runs over the orthonormal representation, which has no epipole it cannot
+    reach.
+    """
+
+    threshold_px: float = 1.0
+    samples: int = 1000
+    enough_share: float = 0.95
+    epipolar_distance: bool = False
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
+            raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
+        if self.samples < 1 or not 0.0 < self.enough_share <= 1.0:
+            raise ValueError("a search needs samples >= 1 and 0 < enough_share <= 1")
+
+    def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
+        """F of matches (N >= 8, 2) px; raises as
+        :meth:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac.estimate`."""
+        xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
+        frame = PairFrame.of(xy1, xy2)
+        problem = SevenPointProblem(frame, frame.points(xy1, xy2), xy1, xy2)
+        loop = SampleConsensus(self.threshold_px, max_samples=self.samples, enough_share=self.enough_share)
+        found = loop.search(problem, len(xy1), rng)
+        if found is None or found.inliers.sum() < MINIMUM:
+            raise StageFailure(
+                "no epipolar geometry explains the matches",
+                f"none of {self.samples} samples has {MINIMUM} of {len(xy1)} matches within {self.threshold_px:g} px",
+                "The photographs may not overlap, or the matches are wrong",
+            )
+        sigma, inliers = self._discard(found.model, xy1, xy2, found.inliers)
+        refine = refine_epipolar_distance if self.epipolar_distance else refine_gradient
+        F = refine(found.model, xy1[inliers], xy2[inliers])
+        sigma, inliers = self._discard(F, xy1, xy2, inliers)
+        f = frame.matrix_in_frame(F)
+        covariance = fundamental_covariance(frame, f, problem.points[inliers], sigma * frame.scale)
+        return FundamentalFit(F, inliers, sigma, covariance, found.samples)
+
+    @staticmethod
+    def _discard(F: F64, xy1: F64, xy2: F64, among: B8) -> tuple[float, B8]:
+        """sigma of the matches believed so far, and which matches pass the test with it."""
+        residuals = np.abs(sampson_residuals(F, xy1, xy2))
+        sigma = noise_scale(residuals[among])
+        inliers = residuals**2 <= max(CHI2_1_95 * sigma**2, 1e-12)
+        return sigma, inliers if inliers.sum() >= MINIMUM else among

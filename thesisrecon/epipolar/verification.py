@@ -1,0 +1,79 @@
+"""Which matches of a pair to believe after F is known, and whether to believe the pair at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.epipolar.planarity import homography_share
+from thesisrecon.types import FundamentalFit, Matches, TwoView
+
+HOMOGRAPHY_SIGMAS = 4.3
+"""99 % of a plane's matches: the root of chi-square(2) is 3.03, times sqrt(2) for noise in both images."""
+
+
+@dataclass(frozen=True)
+class PairVerification:
+    """Keep the matches that agree with F; accept the pair where they are many and most of what was matched.
+
+    A false F on a repetitive facade gathers about 30 inliers, and few of the matches; a right one gathers
+    more. A plane or a camera that only turned gives good tracks and an undetermined F: the pair is accepted
+    and ``homography_share`` says so.
+
+    Parameters
+    ----------
+    min_inliers : verified matches a pair needs.
+    min_share : share of the matches that must be verified.
+    homography_px : distance within which a homography explains a match, or 4.3 sigma where that is more.
+    """
+
+    min_inliers: int = 60
+    min_share: float = 0.3
+    homography_px: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.min_inliers < 8:
+            raise ValueError(f"min_inliers must be at least 8 (any 7 agree with an F); got {self.min_inliers}")
+        if not 0.0 <= self.min_share <= 1.0 or not self.homography_px > 0.0:
+            raise ValueError("min_share must lie in [0, 1] and homography_px be positive")
+
+    def verify(self, matches: Matches, fit: FundamentalFit) -> TwoView:
+        """The pair with its verified matches and the decision; raises ``ValueError`` where the two do not belong
+        together (another number of matches)."""
+        kept = fit.inliers
+        if kept.shape != (len(matches.xy1),):
+            raise ValueError(f"the fit has {kept.shape} inlier flags for {len(matches.xy1)} matches")
+        xy1, xy2 = matches.xy1[kept], matches.xy2[kept]
+        tolerance = max(self.homography_px, HOMOGRAPHY_SIGMAS * fit.sigma_px)
+        rng = np.random.default_rng((matches.i, matches.j))
+        share = homography_share(fit.F, xy1, xy2, tolerance_px=tolerance, rng=rng)
+        reason = self._objection(len(xy1), len(kept))
+        return TwoView(
+            i=matches.i,
+            j=matches.j,
+            F=fit.F,
+            sigma_px=fit.sigma_px,
+            index1=matches.index1[kept],
+            index2=matches.index2[kept],
+            xy1=xy1,
+            xy2=xy2,
+            affine=matches.affine[kept],
+            candidates=len(kept),
+            homography_share=share,
+            accepted=not reason,
+            reason=reason,
+        )
+
+    def _objection(self, verified: int, candidates: int) -> str:
+        if verified < self.min_inliers:
+            return (
+                f"only {verified} of {candidates} matches agree with one epipolar geometry; "
+                f"{self.min_inliers} are needed to tell it from chance and repeated patterns"
+            )
+        if verified < self.min_share * candidates:
+            return (
+                f"only {100.0 * verified / candidates:.0f} % of {candidates} matches agree with one epipolar "
+                f"geometry; {100.0 * self.min_share:.0f} % are needed"
+            )
+        return ""
