@@ -1,0 +1,100 @@
+"""Photographs with their truth, found by name: the fixtures of this project and the public sets beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parents[2]
+REAL_SCENES = {
+    "fountain-P11": "strecha/fountain-P11",
+    "Herz-Jesus-P8": "strecha/Herz-Jesus-P8",
+    "kermit": "kermit",
+}
+SUFFIXES = {".jpg", ".jpeg", ".png"}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A set of photographs, sorted by name, and its truth where there is one.
+
+    ``K``, ``R`` (world-to-camera) (V, 3, 3) and ``C`` (V, 3) camera centres in metres, all None without truth.
+    """
+
+    name: str
+    image_paths: tuple[Path, ...]
+    K: F64 | None = None
+    R: F64 | None = None
+    C: F64 | None = None
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the cameras are known."""
+        return self.C is not None
+
+
+def data_root() -> Path | None:
+    """The folder of real photographs: THESISRECON_DATA, else ../shared/data beside the repository, None when absent."""
+    named = os.environ.get("THESISRECON_DATA")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    return folder if folder.is_dir() else None
+
+
+def read_scene(folder: Path, name: str) -> Scene:
+    """A folder with images/ and perhaps cameras.json.
+
+    Raises ``ValueError`` where there are no images, or cameras.json lacks one of them.
+    """
+    images = folder / "images"
+    found = sorted(images.iterdir(), key=lambda p: p.name) if images.is_dir() else []
+    paths = tuple(p for p in found if p.suffix.lower() in SUFFIXES)
+    if not paths:
+        raise ValueError(f"a scene needs photographs in images/; {folder} has none")
+    truth = folder / "cameras.json"
+    if not truth.is_file():
+        return Scene(name, paths)
+    cameras = json.loads(truth.read_text(encoding="utf-8"))["cameras"]
+    missing = [p.name for p in paths if p.name not in cameras]
+    if missing:
+        raise ValueError(f"cameras.json must name every photograph; it lacks {missing} of {folder}")
+    K, R, C = (np.array([cameras[p.name][key] for p in paths], dtype=np.float64) for key in ("K", "R", "C"))
+    return Scene(name, paths, K, R, C)
+
+
+def load_real_scene(name: str) -> Scene | None:
+    """One of ``REAL_SCENES``, or None where the photographs are not on this machine.
+
+    Raises ``ValueError`` for a name that is none of them.
+    """
+    if name not in REAL_SCENES:
+        raise ValueError(f"a real scene is one of {sorted(REAL_SCENES)}; got {name!r}")
+    root = data_root()
+    if root is None or not (root / REAL_SCENES[name]).is_dir():
+        return None
+    return read_scene(root / REAL_SCENES[name], name)
+
+
+def load_fixture_scene(name: str = "courtyard") -> Scene:
+    """A scene of fixtures/, always there. Raises ``ValueError`` for a name that does not exist."""
+    return read_scene(ROOT / "fixtures" / name, name)
+
+
+def load_fixture_depth(view: int, name: str = "courtyard") -> tuple[F64, int]:
+    """True depth (H / stride, W / stride) of one view in metres, NaN where nothing was hit, and the stride.
+
+    Sample (r, c) is the depth (z in the camera frame) at pixel (x, y) = (stride c, stride r).
+    """
+    from PIL import Image as PillowImage
+
+    folder = ROOT / "fixtures" / name
+    told = json.loads((folder / "cameras.json").read_text(encoding="utf-8"))["depth"]
+    with PillowImage.open(folder / "depth" / f"{view:04d}.png") as image:
+        steps = np.asarray(image, dtype=np.float64)
+    return np.where(steps == told["none"], np.nan, steps * told["unit_m"]), int(told["stride"])
