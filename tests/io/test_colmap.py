@@ -223,6 +223,21 @@ def test_views_of_a_group_share_a_camera_only_where_their_intrinsics_agree() -> 
     assert [image.camera_id for image in model.images] == [1, 2, 1, 1]
 
 
+def test_cameras_carry_the_sizes_of_the_photographs() -> None:
+    ours, scales = _scene(), np.full(V, 3.001)
+    guessed = _export(ours, scales=scales).cameras[0]
+    assert (guessed.width, guessed.height) == (1537, 1152)
+    model = colmap_from_reconstruction(
+        ours,
+        NAMES,
+        colors=np.zeros((N, 3), np.uint8),
+        groups=np.zeros(V, dtype=np.int64),
+        scales=scales,
+        original_sizes=np.tile((1537, 1155), (V, 1)),
+    )
+    assert (model.cameras[0].width, model.cameras[0].height) == (1537, 1155)
+
+
 def test_a_point_seen_twice_in_an_image_keeps_its_first_observation() -> None:
     model = _export(_scene())
     image, points = model.images[0], model.points

@@ -41,6 +41,7 @@ def colmap_from_reconstruction(
     colors: NDArray[np.uint8],
     groups: I64,
     scales: F64,
+    original_sizes: I64 | None = None,
 ) -> ColmapModel:
     """The metric reconstruction as a COLMAP model in the pixels of the original photographs.
 
@@ -54,6 +55,8 @@ def colmap_from_reconstruction(
     colors : (N, 3) uint8 RGB of the points.
     groups : (V,) views of one group share a camera, as far as their intrinsics and sizes are the same.
     scales : (V,) or (V, 2) for x and y apart: original over working size.
+    original_sizes : (V, 2) width and height of the photographs; without it, working size times scale, which
+        can miss the last row where a resize cut it off.
 
     Raises
     ------
@@ -63,7 +66,10 @@ def colmap_from_reconstruction(
     _check_export(reconstruction, names, colors, groups, scales)
     scales = np.broadcast_to(scales.reshape(len(names), -1), (len(names), 2))
     view, point, xy = _kept_observations(reconstruction)
-    cameras, camera_ids = _cameras(reconstruction, groups, scales)
+    sizes = (
+        np.rint(reconstruction.sizes * scales).astype(np.int64) if original_sizes is None else original_sizes
+    )
+    cameras, camera_ids = _cameras(reconstruction, groups, scales, sizes)
     poses = {int(i): _pose(reconstruction, int(i)) for i in np.flatnonzero(reconstruction.registered)}
     seen = _reproject(reconstruction, poses, view, point)
     distance = np.linalg.norm((seen - xy) * scales[view], axis=1)
@@ -126,14 +132,14 @@ def _k1(reconstruction: Reconstruction, i: int) -> float:
 
 
 def _cameras(
-    reconstruction: Reconstruction, groups: I64, scales: F64
+    reconstruction: Reconstruction, groups: I64, scales: F64, sizes: I64
 ) -> tuple[tuple[ColmapCamera, ...], dict[int, int]]:
     """One camera for each group and set of intrinsics in it, and the camera's number of each view."""
     assert reconstruction.K is not None
     cameras: dict[tuple[object, ...], ColmapCamera] = {}
     numbers = {}
     for i in np.flatnonzero(reconstruction.registered).tolist():
-        width, height = (int(size) for size in np.rint(reconstruction.sizes[i] * scales[i]))
+        width, height = (int(size) for size in sizes[i])
         model, params = _camera_params(reconstruction.K[i], _k1(reconstruction, i), scales[i])
         key = (int(groups[i]), width, height, params)
         camera = cameras.setdefault(key, ColmapCamera(len(cameras) + 1, model, width, height, params))

@@ -1,4 +1,4 @@
-"""How far cameras are from the truth, and points from their images: geometry after alignment, never raw matrices."""
+"""How far cameras are from the truth and points from their images: geometry after alignment."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class CameraErrors:
 
     ``focal_error_pct``: median over views of |f / f_true - 1|, f the geometric mean of fx and fy.
     ``principal_point_error_px``: median distance. ``centre_error``: mean distance after the least-squares
-    similarity, in the truth's unit. ``rotation_error_deg``: median angle after the common rotation is taken off.
+    similarity, in the truth's unit. ``rotation_error_deg``: median angle after the common rotation is off.
     """
 
     focal_error_pct: float
@@ -37,7 +37,7 @@ class CameraErrors:
 
 @dataclass(frozen=True)
 class Reprojection:
-    """Distances of inlier observations from their projected points, px, recomputed from cameras and points."""
+    """Distances of inlier observations from their projected points, recomputed from cameras and points."""
 
     median_px: float
     mean_px: float
@@ -55,7 +55,8 @@ def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> Camer
     if reconstruction.stratum != "metric" or reconstruction.K is None or len(views) == 0:
         raise ValueError("measure_cameras needs a metric reconstruction with at least one registered camera")
     if len(truth.K) != len(reconstruction.P):
-        raise ValueError(f"measure_cameras needs one truth per view; got {len(truth.K)} for {len(reconstruction.P)}")
+        counts = f"{len(truth.K)} for {len(reconstruction.P)}"
+        raise ValueError(f"measure_cameras needs one truth per view; got {counts}")
     K, K_true = reconstruction.K[views], truth.K[views]
     focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1] / (K_true[:, 0, 0] * K_true[:, 1, 1]))
     principal_point = np.linalg.norm(K[:, :2, 2] - K_true[:, :2, 2], axis=1)
@@ -75,7 +76,8 @@ def rotation_errors_deg(R: F64, R_true: F64) -> F64:
     difference = np.einsum("vij,jk,vlk->vil", R_true, common, R)
     # The chord keeps its digits at small angles, where arccos of the trace loses half of them.
     chord = np.linalg.norm(difference - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
-    return np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0)))
+    angles: F64 = np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0)))
+    return angles
 
 
 def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:
@@ -104,7 +106,7 @@ def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:
 def _rotations_translations(reconstruction: Reconstruction) -> tuple[F64, F64]:
     views = np.flatnonzero(reconstruction.registered)
     assert reconstruction.K is not None
-    pose = np.linalg.solve(reconstruction.K[views], reconstruction.P[views])
+    pose = np.linalg.solve(reconstruction.K[views], reconstruction.P[views]).astype(np.float64)
     pose /= np.cbrt(np.linalg.det(pose[:, :, :3]))[:, None, None]
     return pose[:, :, :3], pose[:, :, 3]
 

@@ -1,11 +1,13 @@
 """COLMAP's incremental reconstruction (Schönberger and Frahm, CVPR 2016) through pycolmap, in our types.
 
-Prior-free: the focal length in a photograph's EXIF is forgotten and COLMAP's default guess, 1.2 times the long
-side, takes its place, to be refined freely.
+Prior-free: the focal length in a photograph's EXIF is forgotten and COLMAP's default guess, 1.2 times the
+long side, takes its place, to be refined freely.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import shutil
 import time
 from collections.abc import Mapping
@@ -23,8 +25,8 @@ _DEFAULT_FOCAL_REL = 1.2
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """What COLMAP made of a folder of photographs: ``names[i]`` is view i of ``reconstruction`` (its largest model,
-    in our pixel convention), ``seconds`` of "extract", "match" and "map"."""
+    """What COLMAP made of a folder of photographs: ``names[i]`` is view i of ``reconstruction`` (its largest
+    model, in our pixel convention), ``seconds`` of "extract", "match" and "map"."""
 
     names: tuple[str, ...]
     reconstruction: Reconstruction
@@ -32,12 +34,17 @@ class ReferenceRun:
 
 
 def reconstruct_with_pycolmap(
-    images: Path, out: Path, *, shared_camera: bool = True, refine_principal_point: bool = False, threads: int = 2
+    images: Path,
+    out: Path,
+    *,
+    shared_camera: bool = True,
+    refine_principal_point: bool = False,
+    threads: int = 2,
 ) -> ReferenceRun:
     """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
 
-    ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database and the
-    models. Raises :class:`StageFailure` where COLMAP makes no model.
+    ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database, the
+    models and the times. Raises :class:`StageFailure` where COLMAP makes no model.
     """
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
@@ -61,15 +68,21 @@ def reconstruct_with_pycolmap(
         num_threads=threads, ba_refine_principal_point=refine_principal_point
     )
     options.mapper.num_threads = threads
-    models = pycolmap.incremental_mapping(database, images, out / "sparse", options)
+    pycolmap.incremental_mapping(database, images, out / "sparse", options)
     seconds["map"] = time.perf_counter() - start
+    (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    return read_run(images, out)
 
-    if not models:
+
+def read_run(images: Path, out: Path) -> ReferenceRun:
+    """What :func:`reconstruct_with_pycolmap` left in ``out``; :class:`StageFailure` without a model."""
+    folders = sorted(path for path in (out / "sparse").glob("*") if path.is_dir())
+    if not folders:
         raise StageFailure("COLMAP made no model of these photographs")
-    largest = max(models, key=lambda number: int(models[number].num_reg_images()))
+    largest = max((read_colmap_model(path) for path in folders), key=lambda model: len(model.images))
     names = tuple(sorted(path.name for path in images.iterdir() if path.is_file()))
-    model = read_colmap_model(out / "sparse" / str(largest))
-    return ReferenceRun(names, reconstruction_from_colmap(model, names=names), seconds)
+    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
+    return ReferenceRun(names, reconstruction_from_colmap(largest, names=names), seconds)
 
 
 def _forget_focal_priors(database: Path) -> None:
@@ -81,3 +94,23 @@ def _forget_focal_priors(database: Path) -> None:
         camera.has_prior_focal_length = False
         store.update_camera(camera)
     store.close()
+
+
+def main() -> None:
+    """``python -m validation.references.pycolmap_reference IMAGES OUT``: one run as a process of its own."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("images", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--refine-principal-point", action="store_true")
+    parser.add_argument("--threads", type=int, default=2)
+    wishes = parser.parse_args()
+    reconstruct_with_pycolmap(
+        wishes.images,
+        wishes.out,
+        refine_principal_point=wishes.refine_principal_point,
+        threads=wishes.threads,
+    )
+
+
+if __name__ == "__main__":
+    main()

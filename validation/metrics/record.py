@@ -1,0 +1,59 @@
+"""One measured number beside its reference, its target and the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+Verdict = Literal["reached", "missed", "reported"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One row of a table: what was measured on which scene, by ours and the reference, and what was wanted.
+
+    ``values`` maps the name of a method to its number, None where it has none. ``target`` is the bound for
+    the method ``judged``; ``at_most`` says on which side of it the good lies. Without a target the row is
+    only reported.
+    """
+
+    scene: str
+    name: str
+    unit: str
+    values: Mapping[str, float | None]
+    judged: str
+    target: float | None = None
+    at_most: bool = True
+    note: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the judged method reached the target; a number that is missing has not."""
+        if self.target is None:
+            return "reported"
+        value = self.values.get(self.judged)
+        if value is None:
+            return "missed"
+        return "reached" if (value <= self.target if self.at_most else value >= self.target) else "missed"
+
+
+def markdown_table(metrics: list[Metric]) -> str:
+    """The rows of one scene as a Markdown table, one column per method."""
+    methods = list(dict.fromkeys(method for metric in metrics for method in metric.values))
+    lines = [f"| | {' | '.join(methods)} | target | verdict |", f"| --- |{' --- |' * (len(methods) + 2)}"]
+    for metric in metrics:
+        numbers = " | ".join(_number(metric.values.get(method)) for method in methods)
+        target = (
+            "" if metric.target is None else f"{'<=' if metric.at_most else '>='} {_number(metric.target)}"
+        )
+        name = f"{metric.name}, {metric.unit}" if metric.unit else metric.name
+        verdict = f"{metric.verdict} ({metric.note})" if metric.note else metric.verdict
+        lines.append(f"| {name} | {numbers} | {target} | {verdict} |")
+    return "\n".join(lines)
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1e9 else f"{value:.3g}"
