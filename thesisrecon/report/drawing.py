@@ -39,12 +39,16 @@ def thumbnail(photograph: Photograph, how_many: int) -> EmbeddedPicture | None:
     """
     if photograph.rgb is None or 0 in photograph.rgb.shape:
         return None
-    # A JPEG of this quality spends about a quarter byte on a pixel, a third more in base64.
-    area = THUMBNAIL_BYTES / max(how_many, 1) / 0.33
-    side = int(np.clip(np.sqrt(1.5 * area), 64, 360))
-    picture = PillowImage.fromarray(photograph.rgb)
-    picture.thumbnail((side, side), PillowImage.Resampling.LANCZOS)
-    return embed_jpeg(picture, quality=80)
+    share = THUMBNAIL_BYTES / max(how_many, 1)
+    # A JPEG of this quality spends about a quarter byte on a pixel, a third more in base64, noise more.
+    side = float(np.clip(np.sqrt(1.5 * share / 0.33), 64, 360))
+    while True:
+        picture = PillowImage.fromarray(photograph.rgb)
+        picture.thumbnail((round(side), round(side)), PillowImage.Resampling.LANCZOS)
+        embedded = embed_jpeg(picture, quality=80)
+        if len(embedded.uri) <= 1.5 * share or side < 64:
+            return embedded
+        side *= 0.75
 
 
 def embed_jpeg(picture: PillowImage.Image, *, quality: int) -> EmbeddedPicture:

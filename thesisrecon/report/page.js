@@ -19,8 +19,8 @@
 
   Object.keys(figures).forEach(function (id) {
     const element = document.getElementById(id);
-    if (id === "scene") { figures[id].layout.scene.camera = camera(element, START); }
-    const options = Object.assign({}, bar, id === "matrix" ? { displayModeBar: false } : {});
+    if (id === "scene-figure") { figures[id].layout.scene.camera = camera(element, START); }
+    const options = Object.assign({}, bar, id === "matrix-figure" ? { displayModeBar: false } : {});
     try {
       Plotly.newPlot(element, figures[id].data, figures[id].layout, options).then(
         function () { element.dataset.drawn = "yes"; },
@@ -30,7 +30,7 @@
     }
   });
 
-  const scene = document.getElementById("scene");
+  const scene = document.getElementById("scene-figure");
   if (scene === null) { return; }
 
   // A wheel over the picture scrolls the page until the picture was clicked.

@@ -152,14 +152,17 @@ def _hash(script: str) -> str:
 
 
 def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
-    """The interactive figures by the id of their element, and how many points the 3D one shows."""
+    """The interactive figures by the id of their element, and how many points the 3D one shows.
+
+    The ids are longer than the words "scene" and "matrix" because plotly.js makes elements called "scene".
+    """
     names = [photograph.name for photograph in data.photographs]
     figures: dict[str, Any] = {}
     scene = build_scene(data.metric.reconstruction) if data.metric is not None else None
     if scene is not None:
-        figures["scene"] = scene_figure(scene, names, data.colours)
+        figures["scene-figure"] = scene_figure(scene, names, data.colours)
     if data.pairs:
-        figures["matrix"] = pair_matrix_figure(data.pairs, names)
+        figures["matrix-figure"] = pair_matrix_figure(data.pairs, names)
     return figures, len(scene.points) if scene is not None else 0
 
 

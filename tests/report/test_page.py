@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import dataclasses
+import html
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.report.synthetic import made_up_run, projective_run
+from thesisrecon.errors import StageFailure
+from thesisrecon.report import Photograph, ReportData, write_report
+from thesisrecon.report.page import render_report
+
+EVIL = [
+    "<img src=x onerror=alert(1)>.jpg",
+    "\"quote'&.png",
+    "</script><script>alert(2)</script>.jpg",
+    "{{ 7*7 }}.jpg",
+]
+
+
+class Structure(HTMLParser):
+    """Tags, attributes that fetch, and the text of the data block of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.handlers: list[str] = []
+        self.ids: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name in {"src", "href"}:
+                self.addresses.append(value or "")
+            if name == "id":
+                self.ids.append(value or "")
+            if name.startswith("on"):
+                self.handlers.append(name)
+
+
+def structure_of(page: str) -> Structure:
+    parser = Structure()
+    parser.feed(page)
+    return parser
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return render_report(made_up_run())
+
+
+def test_the_page_fetches_nothing_and_is_small(page: str) -> None:
+    structure = structure_of(page)
+    assert all(address.startswith(("data:", "#")) for address in structure.addresses)
+    assert len(page.encode()) < 10_000_000
+    assert page.count("plotly.js v") == 1
+
+
+def test_the_page_holds_every_section_and_its_links_lead_somewhere(page: str) -> None:
+    structure = structure_of(page)
+    wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
+    assert wanted == {"main", "view", "photographs", "pairs", "stages", "warnings", "config"}
+    assert wanted <= set(structure.ids)
+    assert structure.tags.count("svg") == 8  # a histogram of each registered view
+    assert structure.tags.count("img") == 9 + 2  # thumbnails, best and weakest pair
+    for text in ("520.3 ± 0.4", "Trusted, but incomplete", "2 pairs lie on one plane", "peak_memory_mb"):
+        assert text in page
+
+
+def test_the_same_data_gives_the_same_page(page: str) -> None:
+    assert render_report(made_up_run()) == page
+
+
+def test_names_are_text_everywhere() -> None:
+    page = render_report(dataclasses.replace(made_up_run(names=EVIL, points=200), title=EVIL[2]))
+    structure = structure_of(page)
+    assert structure.handlers == []
+    assert structure.tags.count("script") == 3
+    for name in EVIL:
+        assert html.escape(name, quote=True).replace("&quot;", "&#34;").replace("&#x27;", "&#39;") in page
+    block = re.search(r'<script type="application/json" id="figures">(.*?)</script>', page, re.S)
+    assert block is not None
+    figures = json.loads(block.group(1))
+    assert figures["matrix-figure"]["data"][0]["x"][0] == "1 · " + html.escape(EVIL[0])
+
+
+def test_runs_that_ended_early_say_how_far_they_got() -> None:
+    early = projective_run()
+    page = render_report(early)
+    assert "Ended early" in page
+    assert 'id="scene-figure"' not in page
+    assert structure_of(page).tags.count("svg") == 8
+    only_features = dataclasses.replace(early, reconstruction=None, pairs=(), until="features")
+    page = render_report(only_features)
+    assert "corners were found" in page
+    assert "plotly.js v" not in page  # nothing to draw, nothing to carry
+
+
+def test_a_failed_run_without_anything_has_a_page() -> None:
+    failure = StageFailure("no photograph was found", "", "put JPEG files in the folder")
+    page = render_report(ReportData("empty", (), (), "", {}, "0.1.0", failure=failure))
+    for text in ("No photograph was found.", "No stage finished.", "Put JPEG files in the folder."):
+        assert text in page
+
+
+def test_three_hundred_photographs_stay_under_the_limit() -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
+    photographs = tuple(Photograph(f"{n}.jpg", (240, 160), (240, 160), noise) for n in range(300))
+    template = made_up_run(points=100).pairs[0]
+    pairs = [dataclasses.replace(template, i=i, j=j) for i in range(300) for j in range(i + 1, 300)]
+    data = ReportData("many", photographs, (), "", {}, "0.1.0", pairs=pairs)
+    assert len(render_report(data).encode()) < 10_000_000
+
+
+def test_writing_is_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = dataclasses.replace(projective_run(), reconstruction=None, pairs=())
+    target = tmp_path / "report.html"
+    write_report(target, data)
+    before = target.read_text(encoding="utf-8")
+    assert before.endswith("</html>")
+
+    def refuse(self: Path, other: Path) -> Path:
+        raise OSError(f"{self.name} cannot become {other}")
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(OSError, match="cannot become"):
+        write_report(target, dataclasses.replace(data, title="other"))
+    assert target.read_text(encoding="utf-8") == before
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from tests.report.synthetic import made_up_run, projective_run
+from thesisrecon.errors import StageFailure
+from thesisrecon.report.wording import (
+    duration,
+    first_glance,
+    grouped,
+    interval_of,
+    judge,
+    named_number,
+    plus_minus,
+)
+from thesisrecon.types import IntrinsicInterval
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (1520.34, 1.84, "1520.3 ± 1.8"),
+        (1520.34, 4.2, "1520 ± 4"),
+        (1520.34, 0.42, "1520.3 ± 0.4"),
+        (-0.03012, 0.00042, "-0.0301 ± 0.0004"),
+        (512.0, 0.0, "512 (fixed)"),
+        (1520.34, float("inf"), "1520 (not determined)"),
+    ],
+)
+def test_numbers_carry_as_many_digits_as_they_deserve(value: float, std: float, text: str) -> None:
+    assert plus_minus(value, std) == text
+
+
+def test_shared_values_are_one_and_varying_ones_a_range() -> None:
+    same = [IntrinsicInterval(800.0, 1.5, "a")] * 3
+    assert interval_of(same, "px") == "800.0 ± 1.5\u202fpx"
+    varying = [*same, IntrinsicInterval(900.0, 1.5, "a")]
+    assert interval_of(varying, "px") == "800.0 to 900.0\u202fpx (± 1.5)"
+
+
+def test_words_for_numbers() -> None:
+    assert grouped(1234567) == "1\u202f234\u202f567"
+    assert duration(3.04) == "3.0\u202fs"
+    assert duration(125) == "2\u202fmin 05\u202fs"
+    assert duration(7325) == "2\u202fh 02\u202fmin"
+    assert named_number("sigma_px", 0.19) == ("sigma", "0.19\u202fpx")
+    assert named_number("focal_spread_rel", 0.0008) == ("focal spread", "0.08\u202f%")
+    assert named_number("accepted", 26) == ("accepted", "26")
+    assert named_number("score", float("nan")) == ("score", "nan")
+
+
+def test_the_verdict_is_honest() -> None:
+    data = made_up_run(points=100)
+    assert data.metric is not None
+    assert judge(data).word == "Trusted, but incomplete"
+    doubt = dataclasses.replace(data.metric, trusted=False, doubts=("pure rotation",))
+    verdict = judge(dataclasses.replace(data, metric=doubt))
+    assert (verdict.level, verdict.reasons) == ("doubt", ("Pure rotation.",))
+    early = judge(projective_run())
+    assert early.level == "open"
+    assert "projective reconstruction" in early.sentence
+
+
+def test_a_failure_says_what_how_far_and_what_to_try() -> None:
+    failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
+    data = dataclasses.replace(projective_run(), reconstruction=None, until=None, failure=failure)
+    verdict = judge(dataclasses.replace(data, reports=data.reports[:2]))
+    assert verdict.level == "bad"
+    assert verdict.sentence == "No pair overlaps."
+    assert verdict.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
+    assert verdict.advice == "Take more photographs."
+
+
+def test_the_first_glance_tells_what_there_is() -> None:
+    labels = [fact.label for fact in first_glance(made_up_run(points=100), None)]
+    assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", "Time"]
+    early = dataclasses.replace(projective_run(), reconstruction=None)
+    assert [fact.label for fact in first_glance(early, None)] == ["Photographs", "Pairs accepted", "Time"]
