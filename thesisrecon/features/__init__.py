@@ -2,18 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.types import Features, Image
 
-__all__ = ["Detector", "HarrisCorners", "MultiScaleCorners"]
-
-
-class Detector(Protocol):
-    """What a variant of this stage does."""
-
-    def detect(self, image: Image) -> Features:
-        """Corners of one photograph."""
-        ...
+__all__ = ["HarrisCorners", "MultiScaleCorners"]

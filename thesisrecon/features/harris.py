@@ -1,4 +1,5 @@
-"""Section 4.2.1: the corner detector of Harris and Stephens with a surface fit and a selection that covers the image.
+"""Section 4.2.1: the corner detector of Harris and Stephens with a surface fit and a selection that covers
+the image.
 
 C. Harris, M. Stephens, A combined corner and edge detector, Alvey Vision Conference 1988.
 """
@@ -19,7 +20,8 @@ NOISE_RESPONSE = 0.05
 
 @dataclass(frozen=True)
 class HarrisCorners:
-    """The thesis' detector: one scale, a threshold on R, the strongest corners that are not in each other's way.
+    """The thesis' detector: one scale, a threshold on R, the strongest corners that are not in each other's
+    way.
 
     Parameters
     ----------
@@ -52,8 +54,9 @@ def find_corners(
 ) -> tuple[F64, F32]:
     """All corners of (H, W) above the noise, strongest first: ``xy`` (N, 2) px and response (N,).
 
-    R = det M / trace M (the thesis' measure; its two lost signs restored), maxima of 3 x 3 neighbourhoods refined
-    by a quadratic surface. Equal responses are ordered as they are read, so the result is reproducible.
+    R = det M / trace M (the thesis' measure; its two lost signs restored), maxima of 3 x 3 neighbourhoods
+    refined by a quadratic surface. Equal responses are ordered as they are read, so the result is
+    reproducible.
     """
     taps = gaussian_taps(integration_sigma_px)
     if min(gray.shape) < 2 * len(taps):
@@ -67,8 +70,9 @@ def find_corners(
 def select_spread(xy: F64, response: F32, count: int, *, pool: int, robustness: float = 0.9) -> I64:
     """Indices of ``count`` corners that cover the image, strongest first (adaptive non-maximal suppression).
 
-    Among the ``pool`` strongest, those with the largest distance to a corner that is stronger by 1 / robustness.
-    M. Brown, R. Szeliski, S. Winder, Multi-image matching using multi-scale oriented patches, CVPR 2005, section 3.
+    Among the ``pool`` strongest, those with the largest distance to a corner that is stronger by 1 /
+    robustness. M. Brown, R. Szeliski, S. Winder, Multi-image matching using multi-scale oriented patches,
+    CVPR 2005, section 3.
     """
     pool = min(pool, len(xy))
     if pool <= count:

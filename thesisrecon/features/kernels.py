@@ -10,7 +10,8 @@ from thesisrecon.types import F32, F64, I64
 
 @njit(cache=True, nogil=True, fastmath=True)
 def corner_response(blurred: F32, taps: F32) -> F32:
-    """R = det M / (M11 + M22) of section 4.2.1, M the products of the gradient of ``blurred`` smoothed by ``taps``.
+    """R = det M / (M11 + M22) of section 4.2.1, M the products of the gradient of ``blurred`` smoothed by
+    ``taps``.
 
     One sweep down the image keeps the last 2 r + 1 rows of products only, so that they stay in the cache.
     Rows and columns closer than r + 1 pixels to the border are zero.
@@ -60,8 +61,8 @@ def corner_response(blurred: F32, taps: F32) -> F32:
 def fit_maxima(response: F32, threshold: float) -> tuple[F64, F32]:
     """Maxima of the quadratic surfaces fitted by least squares to the 3 x 3 neighbourhoods of local maxima.
 
-    Returns ``xy`` (N, 2) px and the response (N,) at the pixel. A fit without a maximum within one pixel keeps
-    the pixel itself.
+    Returns ``xy`` (N, 2) px and the response (N,) at the pixel. A fit without a maximum within one pixel
+    keeps the pixel itself.
     """
     height, width = response.shape
     count = 0
@@ -125,7 +126,8 @@ def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
 def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
     """(N,) squared distance of each corner to the nearest one that is clearly stronger; inf where none is.
 
-    ``xy`` and ``response`` are sorted strongest first; clearly stronger: robustness x its response > this one's.
+    ``xy`` and ``response`` are sorted strongest first; clearly stronger: robustness x its response > this
+    one's.
     """
     n = len(xy)
     x, y = xy[:, 0].copy(), xy[:, 1].copy()
@@ -145,7 +147,7 @@ def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
 
 @njit(cache=True, nogil=True, fastmath=True)
 def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
-    """(N, side^2) bilinear samples on a ``side`` x ``side`` grid turned by ``angle``, clamped at the border."""
+    """(N, side^2) bilinear samples on a ``side`` x ``side`` grid turned by ``angle``, clamped."""
     height, width = image.shape
     out = np.empty((len(xy), side * side), np.float32)
     centre = 0.5 * (side - 1)

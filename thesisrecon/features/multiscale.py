@@ -9,12 +9,13 @@ import numpy as np
 from thesisrecon.features.harris import find_corners, select_spread
 from thesisrecon.features.kernels import sample_patches
 from thesisrecon.geometry.raster import halve, resample, smooth
-from thesisrecon.types import F32, F64, Features, Image, Seeds
+from thesisrecon.types import B8, F32, F64, Features, Image, Seeds
 
 
 @dataclass(frozen=True)
 class Level:
-    """One size of the photograph: ``gray`` (h, w) and how many pixels of the photograph one of its pixels spans."""
+    """One size of the photograph: ``gray`` (h, w) and how many pixels of the photograph one of its pixels
+    spans."""
 
     gray: F32
     scale_x: float
@@ -23,16 +24,18 @@ class Level:
     def to_image(self, xy: F64) -> F64:
         """Pixels of this level -> pixels of the photograph."""
         scale = np.array([self.scale_x, self.scale_y])
-        return (xy + 0.5) * scale - 0.5
+        inside: F64 = (xy + 0.5) * scale - 0.5
+        return inside
 
 
 @dataclass(frozen=True)
 class MultiScaleCorners:
-    """Harris corners at full and half size, spread over the image, with seed patches at five levels of 1/sqrt(2).
+    """Harris corners at full and half size, spread over the image, with seed patches at five levels of
+    1/sqrt(2).
 
-    Seeds are the multi-scale oriented patches of Brown, Szeliski and Winder (CVPR 2005), each twice: upright and
-    turned to the dominant gradient. Photographs whose long side is under ``upsample_below_px`` are doubled first;
-    all coordinates are in the pixels of the photograph that was given.
+    Seeds are the multi-scale oriented patches of Brown, Szeliski and Winder (CVPR 2005), each twice: upright
+    and turned to the dominant gradient. Photographs whose long side is under ``upsample_below_px`` are
+    doubled first; all coordinates are in the pixels of the photograph that was given.
 
     Parameters
     ----------
@@ -51,7 +54,7 @@ class MultiScaleCorners:
     upsample_below_px: int = 1000
 
     def detect(self, image: Image) -> Features:
-        """Corners (scale 1 and 2, or 0.5 and 1 where the photograph was doubled), strongest first, and seeds."""
+        """Corners, strongest first (scale 1 and 2, or 0.5 and 1 where doubled), and seeds."""
         levels = self._pyramid(image.gray)
         found = [find_corners(level.gray) for level in levels]
         parts = []
@@ -112,7 +115,8 @@ class MultiScaleCorners:
 def dominant_direction(blurred: F32, xy: F64) -> F32:
     """Direction (N,) rad of the gradient at ``xy``, averaged over about nine pixels; never exactly 0.
 
-    The image is already smooth by sigma 2; the mean over a 5 x 5 grid of spacing 2 brings it to about sigma 4.
+    The image is already smooth by sigma 2; the mean over a 5 x 5 grid of spacing 2 brings it to about sigma
+    4.
     """
     around = sample_patches(blurred, xy, np.zeros(len(xy), np.float32), 7, 2.0).reshape(-1, 7, 7)
     gx = (around[:, 1:-1, 2:] - around[:, 1:-1, :-2]).sum(axis=(1, 2))
@@ -121,8 +125,8 @@ def dominant_direction(blurred: F32, xy: F64) -> F32:
     return np.where(angle == 0.0, np.float32(1e-6), angle)
 
 
-def normalize_patches(patches: F32) -> tuple[F32, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-    """Rows of zero mean and unit norm, and whether each had structure (more than a grey level of contrast)."""
+def normalize_patches(patches: F32) -> tuple[F32, B8]:
+    """Rows of zero mean and unit norm, and whether each had structure (over a grey level)."""
     centred = patches - patches.mean(axis=1, keepdims=True)
     norm = np.linalg.norm(centred, axis=1, keepdims=True)
     structured = norm[:, 0] > np.sqrt(patches.shape[1])

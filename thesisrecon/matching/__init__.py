@@ -5,6 +5,14 @@ from __future__ import annotations
 from thesisrecon.matching.prepared import PreparedView
 from thesisrecon.matching.records import FundamentalEstimator
 from thesisrecon.matching.seeds_and_growth import SeedsAndGrowth
+from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 
-__all__ = ["AlignedTracks", "FundamentalEstimator", "PlainTracks", "PreparedView", "SeedsAndGrowth"]
+__all__ = [
+    "AlignedTracks",
+    "FundamentalEstimator",
+    "PlainTracks",
+    "PreparedView",
+    "SeedsAndGrowth",
+    "StrengthOfMatch",
+]

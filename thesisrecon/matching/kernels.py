@@ -11,6 +11,8 @@ from numba import njit
 
 from thesisrecon.types import F32, F64, I64
 
+# Sums may be reordered; assuming that no NaN exists would undo the bounds checks.
+FAST = {"contract", "reassoc", "nsz", "arcp"}
 SIDE = 15
 SAMPLES = SIDE * SIDE
 
@@ -19,8 +21,8 @@ SAMPLES = SIDE * SIDE
 def scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
     """Best column of each row, its value, and the best value of a rival that lies elsewhere.
 
-    ``correlation`` (B, N); ``xy2`` (N, 2) px; ``apart2`` (N,) squared distance within which a rival of column n
-    counts as the same place. Returns index (B,), value (B,), rival (B,); -1 where there is no rival.
+    ``correlation`` (B, N); ``xy2`` (N, 2) px; ``apart2`` (N,) squared distance within which a rival of column
+    n counts as the same place. Returns index (B,), value (B,), rival (B,); -1 where there is no rival.
     """
     rows, columns = correlation.shape
     index = np.zeros(rows, np.int64)
@@ -56,11 +58,12 @@ def update_column_best(correlation: F32, first_row: int, value: F32, index: I64)
 
 @njit(cache=True, nogil=True)
 def fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
-    """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its ``neighbours`` (N, K) among matches.
+    """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its ``neighbours`` (N, K) among
+    matches.
 
-    Weighted least squares, weights 1 / (d^2 + d_mean^2), one round of Cauchy re-weighting against neighbours on
-    another surface, held to ``prior`` (M, 2, 2), the mean of the neighbours' own maps, where they are in line.
-    Returns the map (N, 2, 2), the place in image 2 (N, 2) and its uncertainty (N,) px.
+    Weighted least squares, weights 1 / (d^2 + d_mean^2), one round of Cauchy re-weighting against neighbours
+    on another surface, held to ``prior`` (M, 2, 2), the mean of the neighbours' own maps, where they are in
+    line. Returns the map (N, 2, 2), the place in image 2 (N, 2) and its uncertainty (N,) px.
     """
     count, k = neighbours.shape
     affine = np.empty((count, 2, 2))
@@ -135,12 +138,13 @@ def level_of(scale: float, base: float, count: int) -> int:
     return min(max(k, 0), count - 1)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, side: int, out: F32) -> bool:
-    """Bilinear samples of a ``side`` x ``side`` window around ``xy`` px into ``out`` (side^2,), False where it leaves.
+    """Bilinear samples of a ``side`` x ``side`` window around ``xy`` px into ``out`` (side^2,), False where
+    it leaves.
 
-    Sample (column a, row b), counted from the centre, is at ``xy + step @ (a, b)``; ``level`` is (offset, height,
-    width) and ``to_level`` its pixels per pixel of the photograph.
+    Sample (column a, row b), counted from the centre, is at ``xy + step @ (a, b)``; ``level`` is (offset,
+    height, width) and ``to_level`` its pixels per pixel of the photograph.
     """
     offset, height, width = level[0], level[1], level[2]
     x0 = (xy[0] + 0.5) * to_level - 0.5
@@ -168,9 +172,10 @@ def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, 
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def normalize_window(window: F32) -> float:
-    """Subtract the mean and divide by the norm, in place; returns the norm before (0: no structure, left zero)."""
+    """Subtract the mean and divide by the norm, in place; returns the norm before (0: no structure, left
+    zero)."""
     total = np.float32(0.0)
     for n in range(len(window)):
         total += window[n]
@@ -205,13 +210,13 @@ def corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32) -
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def dot(a: F32, b: F32) -> float:
     """Inner product of two float32 vectors."""
     total = np.float32(0.0)
     for n in range(len(a)):
         total += a[n] * b[n]
-    return total
+    return float(total)
 
 
 @njit(cache=True, nogil=True)
@@ -223,12 +228,13 @@ def grow_corners(
     grid2: tuple[float, I64, I64, I64],
     gate: tuple[F64, float, float],
 ) -> tuple[I64, F32]:
-    """The corner of image 2 that looks most like each corner of image 1, near its predicted place and epipolar line.
+    """The corner of image 2 that looks most like each corner of image 1, near its predicted place and
+    epipolar line.
 
-    ``view1`` = pixels, levels, base; ``corners1`` = xy (N, 2), scale (N,); ``predicted`` = affine (N, 2, 2), place
-    (N, 2), radius (N,) px; ``corners2`` = xy, scale, patches (C, 225); ``grid2`` = cell size, shape (2,), start,
-    order of the corners of image 2 in cells; ``gate`` = F, half width of the epipolar band px, least correlation.
-    Returns the corner of image 2 (-1: none) and the correlation.
+    ``view1`` = pixels, levels, base; ``corners1`` = xy (N, 2), scale (N,); ``predicted`` = affine (N, 2, 2),
+    place (N, 2), radius (N,) px; ``corners2`` = xy, scale, patches (C, 225); ``grid2`` = cell size, shape
+    (2,), start, order of the corners of image 2 in cells; ``gate`` = F, half width of the epipolar band px,
+    least correlation. Returns the corner of image 2 (-1: none) and the correlation.
     """
     pixels, levels, base = view1
     xy1, scale1 = corners1
@@ -313,10 +319,10 @@ def align_windows(
     """Least-squares matching of the window around each ``xy1`` with image 2, gain and bias free.
 
     ``view*`` = pixels, levels, base; ``matches`` = xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
-    ``limits`` = iterations, prior standard deviation of an affine coefficient (0: translation only), largest shift
-    in pixels of the corner's scale. Inverse compositional: the template's gradients, cleared of its mean and of
-    itself (bias and gain), serve every iteration. Returns ``xy2`` (M, 2), affine (M, 2, 2) and the final
-    correlation (M,), 0 where it failed.
+    ``limits`` = iterations, prior standard deviation of an affine coefficient (0: translation only), largest
+    shift in pixels of the corner's scale. Inverse compositional: the template's gradients, cleared of its
+    mean and of itself (bias and gain), serve every iteration. Returns ``xy2`` (M, 2), affine (M, 2, 2) and
+    the final correlation (M,), 0 where it failed.
 
     S. Baker, I. Matthews, Lucas-Kanade 20 years on: a unifying framework, IJCV 56, 2004, section 3.2.
     """
@@ -434,7 +440,7 @@ def align_windows(
     return xy2, affine, score
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _clear(gradient: F32, template: F32, norm: float) -> None:
     """Scale a gradient as the template was and remove its parts along a constant and along the template."""
     total = np.float32(0.0)
@@ -555,3 +561,67 @@ def chain_maps(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64
             queue[tail] = other
             tail += 1
     return place, maps
+
+
+@njit(cache=True, nogil=True)
+def displacement_weight(a: F64, b: F64, closeness: float) -> float:
+    """lambda of figure 4.4: direction x length x distance of two displacement vectors, in [0, 1].
+
+    Displacements under one pixel have no direction worth the name; their lengths are taken as one pixel.
+    """
+    na, nb = np.hypot(a[0], a[1]), np.hypot(b[0], b[1])
+    if na < 1.0 and nb < 1.0:
+        return closeness
+    cosine = (a[0] * b[0] + a[1] * b[1]) / max(na * nb, 1e-12)
+    shorter, longer = max(min(na, nb), 1.0), max(na, nb)
+    return float(max(cosine, 0.0) * (shorter / longer) * closeness)
+
+
+@njit(cache=True, nogil=True)
+def strength_of_match(
+    correlation: F32, xy: tuple[F64, F64], near: tuple[I64, I64], radius: float, candidates: int
+) -> tuple[I64, F32]:
+    """Equation 4.1: for each corner of image 1 the candidate of largest SM_k = c_k sum_m max_n (c_mn
+    lambda_n).
+
+    ``correlation`` (N1, N2); ``xy`` the corners of both images; ``near`` the neighbours (N1, M) and (N2, N)
+    of each corner in its own image, -1 where there are fewer. Returns the corner of image 2 (N1,), -1 where
+    no candidate with positive correlation lies within ``radius`` px, and the strength (N1,).
+    """
+    xy1, xy2 = xy
+    near1, near2 = near
+    index = np.full(len(xy1), -1, np.int64)
+    strength = np.zeros(len(xy1), np.float32)
+    held = np.empty(candidates, np.int64)
+    moved, other = np.empty(2), np.empty(2)
+    for u in range(len(xy1)):
+        count = 0
+        for v in range(len(xy2)):
+            c = correlation[u, v]
+            if c <= 0.0 or (count == candidates and c <= correlation[u, held[count - 1]]):
+                continue
+            if (xy2[v, 0] - xy1[u, 0]) ** 2 + (xy2[v, 1] - xy1[u, 1]) ** 2 > radius * radius:
+                continue
+            count = min(count + 1, candidates)
+            at = count - 1
+            while at > 0 and correlation[u, held[at - 1]] < c:
+                held[at] = held[at - 1]
+                at -= 1
+            held[at] = v
+        for k in range(count):
+            v = held[k]
+            moved[0], moved[1] = xy2[v, 0] - xy1[u, 0], xy2[v, 1] - xy1[u, 1]
+            total = 0.0
+            for m in near1[u]:
+                if m < 0:
+                    continue
+                closeness = 1.0 - np.hypot(xy1[m, 0] - xy1[u, 0], xy1[m, 1] - xy1[u, 1]) / radius
+                best = 0.0
+                for n in near2[v]:
+                    if n >= 0 and correlation[m, n] > best:
+                        other[0], other[1] = xy2[n, 0] - xy1[m, 0], xy2[n, 1] - xy1[m, 1]
+                        best = max(best, correlation[m, n] * displacement_weight(moved, other, closeness))
+                total += best
+            if correlation[u, v] * total > strength[u]:
+                index[u], strength[u] = v, correlation[u, v] * total
+    return index, strength

@@ -13,7 +13,8 @@ from thesisrecon.types import F64, I64, TwoView
 
 @dataclass(frozen=True)
 class Chains:
-    """Corners that belong together: ``view, corner, track`` (K,), sorted by track, then view; ``count`` tracks.
+    """Corners that belong together: ``view, corner, track`` (K,), sorted by track, then view; ``count``
+    tracks.
 
     ``node`` (K,) the corner's number when all corners of all views are counted through.
     """
@@ -26,8 +27,8 @@ class Chains:
 
 
 def link_matches(corners: Sequence[int], pairs: Sequence[TwoView]) -> Chains:
-    """Unite the matches of all pairs, the best pairs first; a union that would put two corners of one view into one
-    track is refused, so the weaker link breaks and the track splits."""
+    """Unite the matches of all pairs, the best pairs first; a union that would put two corners of one view
+    into one track is refused, so the weaker link breaks and the track splits."""
     first = np.concatenate([[0], np.cumsum(corners)]).astype(np.int64)
     view_of = np.repeat(np.arange(len(corners)), corners).astype(np.int64)
     edges = _edges(first, pairs)
@@ -42,7 +43,8 @@ def link_matches(corners: Sequence[int], pairs: Sequence[TwoView]) -> Chains:
 
 
 def _edges(first: I64, pairs: Sequence[TwoView]) -> I64:
-    """(E, 2) corner numbers of all matches; pairs with more verified matches, the more certain ones, come first."""
+    """(E, 2) corner numbers of all matches; pairs with more verified matches, the more certain ones, come
+    first."""
     order = sorted(range(len(pairs)), key=lambda n: (-pairs[n].inliers, pairs[n].i, pairs[n].j))
     if not order:
         return np.empty((0, 2), np.int64)
@@ -55,10 +57,11 @@ def _edges(first: I64, pairs: Sequence[TwoView]) -> I64:
 
 
 def maps_to_views(chains: Chains, corners: Sequence[F64], pairs: Sequence[TwoView]) -> tuple[F64, F64, I64]:
-    """Where the corner of each track's middle view lies in the other views, by chaining the matches' local maps.
+    """Where the corner of each track's middle view lies in the other views, by chaining the matches' local
+    maps.
 
-    Returns the place (K, 2) px, the map from the middle view (K, 2, 2) and the observation (K,) that is the middle
-    of its track: the one with most matches in the track, the first of equals.
+    Returns the place (K, 2) px, the map from the middle view (K, 2, 2) and the observation (K,) that is the
+    middle of its track: the one with most matches in the track, the first of equals.
     """
     counts = [len(c) for c in corners]
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)

@@ -17,10 +17,10 @@ PYRAMID_LEVELS = 4
 class PreparedView:
     """A photograph ready to be matched.
 
-    ``size`` (width, height) px; ``features`` as detected. The grey pyramid is ``pixels`` (all levels one after the
-    other), ``levels`` (L, 3) offset, height, width, level k spanning ``base 2^k`` px per pixel. ``patches``
-    (N, 225): the normalised 15 x 15 window of each corner at its scale (zero where it leaves the image).
-    ``cell_px, cell_shape, cell_start, cell_order``: the corners sorted into square cells.
+    ``size`` (width, height) px; ``features`` as detected. The grey pyramid is ``pixels`` (all levels one
+    after the other), ``levels`` (L, 3) offset, height, width, level k spanning ``base 2^k`` px per pixel.
+    ``patches`` (N, 225): the normalised 15 x 15 window of each corner at its scale (zero where it leaves the
+    image). ``cell_px, cell_shape, cell_start, cell_order``: the corners sorted into square cells.
     """
 
     size: tuple[int, int]

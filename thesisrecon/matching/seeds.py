@@ -15,7 +15,8 @@ ROWS_AT_ONCE = 256
 
 @dataclass(frozen=True)
 class SeedMatches:
-    """``xy1, xy2`` (M, 2) px, ``affine`` (M, 2, 2) a first guess of the local map, ``score`` (M,) correlation."""
+    """``xy1, xy2`` (M, 2) px, ``affine`` (M, 2, 2) a first guess of the local map, ``score`` (M,)
+    correlation."""
 
     xy1: F64
     xy2: F64
@@ -70,11 +71,13 @@ def _correlate(seeds1: Seeds, use1: I64, seeds2: Seeds, use2: I64) -> tuple[I64,
 def similarity(scale: F64, angle: F64) -> F64:
     """Scaled rotations (M, 2, 2)."""
     c, s = scale * np.cos(angle), scale * np.sin(angle)
-    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    maps: F64 = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    return maps
 
 
 def common_similarity(matches: SeedMatches) -> F64:
-    """(2, 2) the scaled rotation most matches agree on: medians of log scale and of angle (about the mean one)."""
+    """(2, 2) the scaled rotation most matches agree on: medians of log scale and of angle (about the mean
+    one)."""
     a = matches.affine
     scale = np.exp(np.median(np.log(np.hypot(a[:, 0, 0], a[:, 1, 0]))))
     angle = np.arctan2(a[:, 1, 0], a[:, 0, 0])
@@ -84,14 +87,15 @@ def common_similarity(matches: SeedMatches) -> F64:
     mode = edges[np.argmax(counts)] + np.pi / 36
     around = np.angle(np.exp(1j * (angle - mode)))
     near = np.abs(around) < np.pi / 6
-    return similarity(np.array([scale]), np.array([mode + np.median(around[near])]))[0]
+    common: F64 = similarity(np.array([scale]), np.array([mode + np.median(around[near])]))[0]
+    return common
 
 
 def neighbour_support(matches: SeedMatches, *, neighbours: int = 10, tolerance: float = 0.3) -> F64:
     """(M,) strength of each match: how many of its neighbours move as it does (equation 4.1 with c = 1).
 
-    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (tolerance |u_m - u_k|))^2), d the displacement left after
-    the rotation and scale that the two images have in common; both images serve as the first in turn.
+    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (tolerance |u_m - u_k|))^2), d the displacement left
+    after the rotation and scale that the two images have in common; both images serve as the first in turn.
     """
     if len(matches) < 2:
         return np.zeros(len(matches))

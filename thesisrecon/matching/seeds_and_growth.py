@@ -1,4 +1,5 @@
-"""The default matching: seeds without a radius, then growth along the epipolar lines, then sub-pixel alignment."""
+"""The default matching: seeds without a radius, then growth along the epipolar lines, then sub-pixel
+alignment."""
 
 from __future__ import annotations
 
@@ -10,14 +11,15 @@ from scipy.spatial import cKDTree
 from thesisrecon.errors import StageFailure
 from thesisrecon.matching.kernels import align_windows, fit_local_affines, grow_corners
 from thesisrecon.matching.prepared import PreparedView, prepare_view
-from thesisrecon.matching.records import FundamentalEstimator, empty_matches
+from thesisrecon.matching.records import FundamentalEstimator, empty_matches, one_to_one
 from thesisrecon.matching.seeds import SeedMatches, match_seeds, neighbour_support
-from thesisrecon.types import B8, F32, F64, I64, Features, Image, Matches
+from thesisrecon.types import B8, F64, I64, Features, Image, Matches
 
 
 @dataclass(frozen=True)
 class SeedsAndGrowth:
-    """Seeds give F, F and the seeds' local affine maps tell each corner where to look, alignment does the rest.
+    """Seeds give F, F and the seeds' local affine maps tell each corner where to look, alignment does the
+    rest.
 
     Parameters
     ----------
@@ -54,7 +56,7 @@ class SeedsAndGrowth:
         estimate_fundamental: FundamentalEstimator,
         rng: np.random.Generator,
     ) -> Matches:
-        """Corner matches of two photographs, one-to-one, aligned to sub-pixel; empty where nothing is shared."""
+        """Corner matches of two photographs, one-to-one, aligned to sub-pixel; empty if none."""
         if view1.features.seeds is None or view2.features.seeds is None:
             raise ValueError("SeedsAndGrowth needs features with seeds; MultiScaleCorners finds them")
         start = self._verified_seeds(view1, view2, estimate_fundamental, rng)
@@ -145,13 +147,6 @@ class SeedsAndGrowth:
         good = good[_distinct(known.xy1[good], xy2[good])]
         good = good[np.argsort(one[good], kind="stable")]
         return Matches(*pair, one[good], two[good], known.xy1[good], xy2[good], score[good], affine[good])
-
-
-def one_to_one(index: I64, score: F32) -> I64:
-    """Rows that keep their claim: of all rows that claim one corner of image 2 the one with the best score."""
-    rows = np.flatnonzero(index >= 0)
-    rows = rows[np.lexsort((rows, -score[rows]))]
-    return np.sort(rows[np.unique(index[rows], return_index=True)[1]])
 
 
 def _distinct(xy1: F64, xy2: F64, apart_px: float = 1.0) -> B8:

@@ -50,8 +50,8 @@ class AlignedTracks:
     ) -> Tracks:
         """Scene points seen in at least two views, every observation of a track at the same sub-pixel spot.
 
-        The middle view of a track is the one with most direct matches in it; the local maps to the other views
-        are chained along the matches.
+        The middle view of a track is the one with most direct matches in it; the local maps to the other
+        views are chained along the matches.
         """
         del rng
         accepted = [p for p in pairs if p.accepted]

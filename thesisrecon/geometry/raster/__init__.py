@@ -18,7 +18,8 @@ def gaussian_taps(sigma_px: float) -> F32:
     radius = max(1, int(np.ceil(3.0 * sigma_px)))
     x = np.arange(-radius, radius + 1)
     taps = np.exp(-0.5 * (x / sigma_px) ** 2)
-    return (taps / taps.sum()).astype(np.float32)
+    normalized: F32 = (taps / taps.sum()).astype(np.float32)
+    return normalized
 
 
 def smooth(image: F32, sigma_px: float) -> F32:

@@ -10,7 +10,7 @@ from thesisrecon.types import F32
 
 @njit(cache=True, nogil=True, fastmath=True)
 def convolve_separable(image: F32, taps: F32) -> F32:
-    """Convolve (H, W) with the symmetric ``taps`` (2 r + 1,) along both axes; the border pixel is repeated."""
+    """Convolve (H, W) with the symmetric ``taps`` (2 r + 1,) along both axes, the border repeated."""
     height, width = image.shape
     radius = taps.size // 2
     out = np.zeros_like(image)
