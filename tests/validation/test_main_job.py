@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("pycolmap")
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.colmap import colmap_from_reconstruction, write_colmap_model
+from validation import main_job
+from validation.checks.reconstruction import COLMAP, OURS
+from validation.metrics.cameras import TrueCameras, measure_cameras
+from validation.references.pycolmap_reference import read_run, reconstruct_with_pycolmap
+from validation.scenes.real import Scene, load_fixture_scene
+
+from .test_cameras import N, V, _reconstruction, _truth
+
+
+def test_a_process_is_measured_whole(tmp_path: Path) -> None:
+    program = "import os, sys; b = bytearray(200_000_000); print(len(os.sched_getaffinity(0))); sys.exit(3)"
+    log = tmp_path / "log" / "out.txt"
+    done = main_job.run_process([sys.executable, "-c", program], log=log, threads=1, environment={})
+    assert done.code == 3
+    assert done.peak_mb > 150
+    assert done.wall_s > 0
+    assert log.read_text().strip() == "1"
+
+
+def _fake_scene(folder: Path) -> Scene:
+    images = folder / "images"
+    images.mkdir()
+    paths = tuple(images / f"{i}.jpg" for i in range(V))
+    for path in paths:
+        path.touch()
+    truth = _truth()
+    return Scene("fountain-P11", paths, truth.K, truth.R, truth.C)
+
+
+def _save_run(out: Path, scene: Scene) -> None:
+    model = colmap_from_reconstruction(
+        _reconstruction(_truth()),
+        [path.name for path in scene.image_paths],
+        colors=np.zeros((N, 3), np.uint8),
+        groups=np.zeros(V, dtype=np.int64),
+        scales=np.ones(V),
+    )
+    write_colmap_model(out / "sparse" / "0", model)
+    (out / "summary.json").write_text(json.dumps({"reprojection_rms_px": 0.0, "seconds": {"features": 1.5}}))
+    (out / "seconds.json").write_text(json.dumps({"extract": 3.0, "match": 1.0, "map": 2.0}))
+
+
+def test_the_table_is_made_from_what_the_methods_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, saved = _fake_scene(tmp_path), tmp_path / "saved"
+    _save_run(saved, scene)
+    copy = "import shutil, sys; shutil.copytree(sys.argv[1], sys.argv[2])"
+
+    def pretend(method: str, _images: Path, out: Path, _threads: int) -> list[str]:
+        source = saved if method in (OURS, COLMAP) else tmp_path / "nothing"
+        return [sys.executable, "-c", copy, str(source), str(out)]
+
+    monkeypatch.setattr(main_job, "_command", pretend)
+    monkeypatch.setattr(main_job, "find_scenes", lambda _names: [scene])
+    assert main_job.main(["-o", str(tmp_path / "out"), "--scenes", "fountain-P11"]) == 1
+
+    told = json.loads((tmp_path / "out" / "main_job.json").read_text())["scenes"]["fountain-P11"]
+    rows = {row["name"]: row for row in told["rows"]}
+    assert rows["focal error"]["verdict"] == "reached"
+    assert rows["wall time"]["values"][COLMAP] == 6.0
+    assert told["seconds"][OURS] == {"features": 1.5}
+    assert len(told["failures"]) == 2
+    text = (tmp_path / "out" / "main_job.md").read_text()
+    assert "## fountain-P11" in text
+    assert text in capsys.readouterr().out
+
+
+def test_pycolmap_on_small_photographs_comes_back_in_our_types(tmp_path: Path) -> None:
+    scene = load_fixture_scene()
+    images = tmp_path / "images"
+    images.mkdir()
+    views = slice(4, 9)
+    for path in scene.image_paths[views]:
+        with Image.open(path) as photograph:
+            small = photograph.resize((photograph.width // 2, photograph.height // 2))
+        exif = Image.Exif()
+        exif[0x8769] = {0x920A: 5.0, 0xA405: 300}
+        small.save(images / path.name, quality=95, exif=exif)
+    run = reconstruct_with_pycolmap(images, tmp_path / "out")
+    assert run.names == tuple(path.name for path in scene.image_paths[views])
+    assert run.reconstruction.registered.sum() == 5
+    assert set(run.seconds) == {"extract", "match", "map"}
+    assert scene.K is not None
+    assert scene.R is not None
+    assert scene.C is not None
+    K = np.diag([0.5, 0.5, 1.0]) @ scene.K[views]
+    errors = measure_cameras(run.reconstruction, TrueCameras(K, scene.R[views], scene.C[views]))
+    # A focal length of 300 mm in EXIF would have been believed and barely refined.
+    assert errors.focal_error_pct < 5
+    assert errors.rotation_error_deg < 1
+    again = read_run(images, tmp_path / "out")
+    np.testing.assert_array_equal(again.reconstruction.P, run.reconstruction.P)
+
+
+def test_no_model_is_a_failure_with_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "sparse").mkdir()
+    with pytest.raises(StageFailure, match="made no model"):
+        read_run(tmp_path, tmp_path)
