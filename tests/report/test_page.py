@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.report.synthetic import made_up_run, projective_run
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.report import Photograph, ReportData, write_report
 from thesisrecon.report.page import render_report
 
@@ -109,6 +109,39 @@ def test_a_failed_run_without_anything_has_a_page() -> None:
         assert text in page
 
 
+def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn() -> None:
+    data = dataclasses.replace(projective_run(), reconstruction=None, until="matches")
+    nothing = dataclasses.replace(
+        data.pairs[0],
+        F=np.zeros((3, 3)),
+        sigma_px=float("nan"),
+        homography_share=float("nan"),
+        xy1=np.zeros((0, 2)),
+        xy2=np.zeros((0, 2)),
+        accepted=False,
+        reason="too few matches for an F",
+    )
+    page = render_report(dataclasses.replace(data, pairs=[nothing]))
+    assert "too few matches for an F" in page
+    assert "<td>–</td><td>–</td>" in page
+    assert structure_of(page).tags.count("figure") == 1  # the matrix
+
+
+def test_warnings_of_the_run_stand_beside_those_of_its_stages() -> None:
+    data = projective_run()
+    stage_warning = data.reports[1].warnings[0]
+    summary = {"warnings": [stage_warning, "2 initial pairs were tried"]}
+    page = render_report(dataclasses.replace(data, summary=summary))
+    section = page[page.index('id="warnings"') : page.index('id="config"')]
+    assert section.count("<li>") == 2
+    assert "2 initial pairs were tried" in section
+
+
+def test_a_name_that_is_no_unicode_can_be_written(tmp_path: Path) -> None:
+    write_report(tmp_path / "report.html", made_up_run(names=["a\udcff.jpg", "b.jpg", "c.jpg"], points=60))
+    assert "a?.jpg" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
 def test_three_hundred_photographs_stay_under_the_limit() -> None:
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
@@ -127,10 +160,10 @@ def test_writing_is_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert before.endswith("</html>")
 
     def refuse(self: Path, other: Path) -> Path:
-        raise OSError(f"{self.name} cannot become {other}")
+        raise OSError(28, f"no room for {self.name} as {other.name}")
 
     monkeypatch.setattr(Path, "replace", refuse)
-    with pytest.raises(OSError, match="cannot become"):
+    with pytest.raises(UsageError, match="cannot be written"):
         write_report(target, dataclasses.replace(data, title="other"))
     assert target.read_text(encoding="utf-8") == before
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]

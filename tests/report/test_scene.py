@@ -13,7 +13,7 @@ def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
     """Rodrigues' formula."""
     a = axis / np.linalg.norm(axis)
     A = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    return np.eye(3) + np.sin(angle) * A + (1 - np.cos(angle)) * A @ A
+    return np.asarray(np.eye(3) + np.sin(angle) * A + (1 - np.cos(angle)) * A @ A)
 
 
 def test_up_is_found_whatever_the_frame_of_the_reconstruction() -> None:

@@ -7,6 +7,7 @@ import pytest
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure
 from thesisrecon.report.wording import (
+    decimals,
     duration,
     first_glance,
     grouped,
@@ -41,6 +42,8 @@ def test_shared_values_are_one_and_varying_ones_a_range() -> None:
 
 
 def test_words_for_numbers() -> None:
+    assert decimals(0.256, 2) == "0.26"
+    assert decimals(float("nan"), 2) == "–"
     assert grouped(1234567) == "1\u202f234\u202f567"
     assert duration(3.04) == "3.0\u202fs"
     assert duration(125) == "2\u202fmin 05\u202fs"

@@ -11,7 +11,6 @@ import base64
 import hashlib
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -22,6 +21,7 @@ import jinja2
 import numpy as np
 from plotly.offline import get_plotlyjs
 
+from thesisrecon.io.run_directory import write_atomically
 from thesisrecon.report.data import ReportData
 from thesisrecon.report.drawing import EmbeddedPicture, draw_pair, thumbnail
 from thesisrecon.report.figures import histogram_path, pair_matrix_figure, scene_figure
@@ -35,6 +35,7 @@ from thesisrecon.report.residuals import (
 from thesisrecon.report.scene import build_scene
 from thesisrecon.report.wording import (
     count_of,
+    decimals,
     duration,
     first_glance,
     grouped,
@@ -78,20 +79,10 @@ class DrawnPair:
 def write_report(path: str | os.PathLike[str], data: ReportData) -> None:
     """Write the page of a run; the file appears whole or not at all.
 
-    Raises ``OSError`` where the place cannot be written.
+    Raises ``UsageError`` where the place cannot be written.
     """
-    target = Path(path)
-    text = render_report(data)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-        # mkstemp makes private files; a report is for whoever may read the folder.
-        Path(name).chmod(0o644)
-        Path(name).replace(target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    # File names need not be Unicode: what cannot be encoded becomes a question mark.
+    write_atomically(Path(path), render_report(data).encode("utf-8", "replace"))
 
 
 def render_report(data: ReportData) -> str:
@@ -119,7 +110,7 @@ def render_report(data: ReportData) -> str:
             drawn_pairs=_drawn_pairs(data),
             listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:MAX_LISTED_PAIRS],
             stages=_stages(data.reports),
-            warnings=[(report.stage, text) for report in data.reports for text in report.warnings],
+            warnings=_warnings(data),
             self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
             summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
             style=_resource("style.css"),
@@ -135,7 +126,7 @@ def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters.update(grouped=grouped, duration=duration)
+    environment.filters.update(grouped=grouped, decimals=decimals)
     environment.globals.update(count_of=count_of)
     # NaN is no JSON: better an error here than a page whose script cannot read its data.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
@@ -212,7 +203,8 @@ def _size_words(original: tuple[int, int], working: tuple[int, int]) -> str:
 def _drawn_pairs(data: ReportData) -> list[DrawnPair]:
     """The accepted pairs with most and with fewest verified matches; without any, the best of the refused."""
     accepted = [pair for pair in data.pairs if pair.accepted]
-    ranked = sorted(accepted or data.pairs, key=lambda pair: (-pair.inliers, pair.i, pair.j))
+    drawable = accepted or [pair for pair in data.pairs if pair.inliers]
+    ranked = sorted(drawable, key=lambda pair: (-pair.inliers, pair.i, pair.j))
     if not ranked:
         return []
     titles = [("Best pair" if accepted else "Best pair, not accepted", ranked[0])]
@@ -237,6 +229,16 @@ def _pair_words(pair: TwoView) -> str:
     if np.isfinite(pair.homography_share):
         words += f", one plane explains {100 * pair.homography_share:.0f} %"
     return words
+
+
+def _warnings(data: ReportData) -> list[tuple[str, str]]:
+    """(stage, sentence) of every warning; those of the run as a whole stand in its summary only."""
+    found = [(report.stage, text) for report in data.reports for text in report.warnings]
+    of_run = data.summary.get("warnings")
+    if isinstance(of_run, list | tuple):
+        known = {text for _, text in found}
+        found += [("run", str(text)) for text in of_run if str(text) not in known]
+    return found
 
 
 def _stages(reports: tuple[StageReport, ...]) -> list[dict[str, Any]]:

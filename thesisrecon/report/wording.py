@@ -103,11 +103,9 @@ def _registered(data: ReportData) -> Fact:
         return Fact("Photographs", str(total), unread)
     registered = int(best.registered.sum())
     refused = f"{total - registered} refused" if registered < total else "all of them"
-    return Fact(
-        "Cameras registered",
-        f"{registered} of {total}",
-        ", ".join(part for part in (refused, unread) if part),
-    )
+    label = "Cameras registered" if data.metric is not None else "Projective cameras"
+    note = ", ".join(part for part in (refused, unread) if part)
+    return Fact(label, f"{registered} of {total}", note)
 
 
 def _pair_fact(pairs: Sequence[TwoView]) -> Fact:
@@ -186,6 +184,11 @@ def _decimals(std: float) -> int:
 def grouped(number: int) -> str:
     """12345 as 12 345."""
     return f"{number:,}".replace(",", THIN)
+
+
+def decimals(value: float, digits: int) -> str:
+    """A number with so many decimals, a dash where it is not known."""
+    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
 
 
 def duration(seconds: float) -> str:
