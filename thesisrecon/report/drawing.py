@@ -115,8 +115,9 @@ def _draw_half(photograph: Photograph, xy: F64, chosen: I64, lines: F64) -> Pill
     picture, s = _faded(photograph)
     draw = ImageDraw.Draw(picture)
     width, height = photograph.size
+    r = 3 if len(xy) <= 600 else 2
     for x, y in _to_drawing(xy, s):
-        draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill="#ffffff", outline="#1b2733")
+        draw.ellipse((x - r, y - r, x + r, y + r), fill="#ffffff", outline="#1b2733")
     for n, line in enumerate(lines):
         ends = clip_line(line, width, height)
         if ends is not None:

@@ -102,8 +102,10 @@ def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure
     accepted, refused = (_count_matrix(pairs, len(labels), block, wanted) for wanted in (True, False))
     refused[accepted >= 0] = -1
     counts = np.concatenate([accepted[accepted >= 0], refused[refused >= 0]])
-    low = 1.0 if counts.min(initial=10) >= 10 else 0.0
-    scale = {"zmin": low, "zmax": max(low + 1.0, float(np.log10(counts.max(initial=1))))}
+    # At least a factor of ten from the palest to the darkest, so that small differences do not look large.
+    high = max(1.0, float(np.log10(counts.max(initial=10))))
+    low = max(0.0, min(float(np.log10(max(counts.min(initial=10**9), 1))), high - 1.0))
+    scale = {"zmin": low, "zmax": high}
     traces = [
         {
             **_heat(accepted, labels, "", "verified matches"),
@@ -174,7 +176,7 @@ def _matrix_layout(labels: list[str], block: int) -> Figure:
 
 
 def _count_bar() -> Figure:
-    counts = [1, 10, 30, 100, 300, 1000, 3000, 10_000]
+    counts = [1, 3, 10, 30, 100, 200, 300, 500, 1000, 2000, 3000, 5000, 10_000, 30_000]
     return {
         "tickvals": [round(float(np.log10(n)), 3) for n in counts],
         "ticktext": [str(n) for n in counts],

@@ -5,11 +5,56 @@
   const bar = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["resetCameraLastSave3d", "hoverClosest3d", "pan2d", "select2d", "lasso2d", "zoom2d", "zoomIn2d", "zoomOut2d", "autoScale2d", "resetScale2d"] };
 
   const START = [0.35, -1.45, 0.6];
+  const FIELD = 0.9 * Math.tan(Math.PI / 8);  // plotly.js sees 45 degrees from top to bottom; a tenth stays free
 
-  // The angle of view is vertical, so a narrow picture is seen from farther away.
-  function camera(element, eye) {
-    const away = Math.max(1, 1.45 * element.clientHeight / Math.max(element.clientWidth, 1));
-    return { eye: { x: away * eye[0], y: away * eye[1], z: away * eye[2] }, center: { x: 0, y: 0, z: -0.05 }, up: { x: 0, y: 0, z: 1 } };
+  function dot(a, b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+  function cross(a, b) { return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]; }
+  function unit(a) { const n = Math.sqrt(dot(a, a)); return a.map(function (v) { return v / n; }); }
+
+  // Some vertices of a trace along three axes, in the coordinates plotly.js measures the eye in.
+  function vertices(figure, trace, axes) {
+    const box = figure.layout.scene, found = [];
+    const step = Math.max(1, Math.floor(trace.x.length / 1500));
+    for (let n = 0; n < trace.x.length; n += step) {
+      if (trace.x[n] === null) { continue; }
+      const p = ["x", "y", "z"].map(function (name) {
+        const range = box[name + "axis"].range;
+        return ((trace[name][n] - range[0]) / (range[1] - range[0]) - 0.5) * box.aspectratio[name];
+      });
+      found.push(axes.map(function (axis) { return dot(p, axis); }));
+    }
+    return found;
+  }
+
+  // The nearest eye in a direction that still has every camera in the picture and 99 of 100 points.
+  function camera(element, figure, direction) {
+    const back = unit(direction), right = unit(cross([0, 0, 1], back)), up = cross(back, right);
+    const points = vertices(figure, figure.data[0], [right, up, back]);
+    const pyramids = vertices(figure, figure.data[1], [right, up, back]);
+    const fields = [FIELD * element.clientWidth / Math.max(element.clientHeight, 1), FIELD];
+    // Where the eye may stand across the direction d: seen from the distance, all must lie within the field.
+    function bounds(distance, d) {
+      function ends(seen, strays) {
+        const low = seen.map(function (p) { return p[d] - fields[d] * (distance - p[2]); });
+        const high = seen.map(function (p) { return p[d] + fields[d] * (distance - p[2]); });
+        low.sort(function (a, b) { return b - a; });
+        high.sort(function (a, b) { return a - b; });
+        return seen.length > 0 ? [low[strays], high[strays]] : [-Infinity, Infinity];
+      }
+      const a = ends(points, Math.floor(0.01 * points.length)), b = ends(pyramids, 0);
+      return [Math.max(a[0], b[0]), Math.min(a[1], b[1])];
+    }
+    let near = 0, far = 20;
+    for (let n = 0; n < 20; n += 1) {
+      const middle = (near + far) / 2;
+      const fits = [0, 1].every(function (d) { const b = bounds(middle, d); return b[0] <= b[1]; });
+      if (fits) { far = middle; } else { near = middle; }
+    }
+    const across = bounds(far, 0), along = bounds(far, 1);
+    const shift = [(across[0] + across[1]) / 2, (along[0] + along[1]) / 2];
+    const centre = [0, 1, 2].map(function (k) { return shift[0] * right[k] + shift[1] * up[k]; });
+    const eye = centre.map(function (v, k) { return v + far * back[k]; });
+    return { eye: { x: eye[0], y: eye[1], z: eye[2] }, center: { x: centre[0], y: centre[1], z: centre[2] }, up: { x: 0, y: 0, z: 1 } };
   }
 
   function fail(element, error) {
@@ -19,7 +64,14 @@
 
   Object.keys(figures).forEach(function (id) {
     const element = document.getElementById(id);
-    if (id === "scene-figure") { figures[id].layout.scene.camera = camera(element, START); }
+    if (id === "scene-figure") {
+      figures[id].layout.scene.camera = camera(element, figures[id], START);
+      if (element.clientWidth < 600) { figures[id].data[0].marker.size = 1.2; figures[id].data[2].marker.size = 2.5; }
+    }
+    const cells = figures[id].data[0];
+    if (id === "matrix-figure" && element.clientWidth < 36 * cells.x.length) {
+      figures[id].data.forEach(function (trace) { delete trace.texttemplate; });
+    }
     const options = Object.assign({}, bar, id === "matrix-figure" ? { displayModeBar: false } : {});
     try {
       Plotly.newPlot(element, figures[id].data, figures[id].layout, options).then(
@@ -42,7 +94,7 @@
   document.querySelectorAll("button[data-eye]").forEach(function (button) {
     button.addEventListener("click", function () {
       const eye = button.dataset.eye.split(",").map(Number);
-      Plotly.relayout(scene, { "scene.camera": camera(scene, eye) });
+      Plotly.relayout(scene, { "scene.camera": camera(scene, figures["scene-figure"], eye) });
     });
   });
 })();
