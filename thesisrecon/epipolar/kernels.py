@@ -17,49 +17,49 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 DIAGONAL = np.sqrt(0.5)
+SUBSET = 300
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always", error_model="numpy", fastmath={"reassoc", "contract"})
+def reflect(v: F64, start: int, scale: float, x: F64) -> None:
+    """x <- (I - scale v v') x, v zero before ``start``."""
+    dot = 0.0
+    for r in range(start, 9):
+        dot += v[r] * x[r]
+    dot *= scale
+    for r in range(start, 9):
+        x[r] -= dot * v[r]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
     """Two orthonormal vectors (``pencil`` (2, 9)) that span the null space of the seven equations (5.1).
 
     Householder QR of A' (9, 7): the last two columns of Q. False where the equations are dependent.
     """
-    A = np.empty((9, 7))
+    A = np.empty((7, 9))
     for k in range(7):
         x1, y1, x2, y2 = points[sample[k]]
-        A[0, k], A[1, k], A[2, k] = x2 * x1, x2 * y1, x2
-        A[3, k], A[4, k], A[5, k] = y2 * x1, y2 * y1, y2
-        A[6, k], A[7, k], A[8, k] = x1, y1, 1.0
+        A[k, 0], A[k, 1], A[k, 2] = x2 * x1, x2 * y1, x2
+        A[k, 3], A[k, 4], A[k, 5] = y2 * x1, y2 * y1, y2
+        A[k, 6], A[k, 7], A[k, 8] = x1, y1, 1.0
+    pencil[:] = 0.0
+    pencil[0, 7] = pencil[1, 8] = 1.0
     scales = np.empty(7)
     for k in range(7):
         norm = 0.0
         for r in range(k, 9):
-            norm += A[r, k] * A[r, k]
+            norm += A[k, r] * A[k, r]
         norm = np.sqrt(norm)
         if norm < 1e-9:
             return False
-        head = A[k, k] + (norm if A[k, k] >= 0.0 else -norm)
-        A[k, k] = head
-        scales[k] = 1.0 / (norm * abs(head))
+        A[k, k] += norm if A[k, k] >= 0.0 else -norm
+        scales[k] = 1.0 / (norm * abs(A[k, k]))
         for c in range(k + 1, 7):
-            dot = 0.0
-            for r in range(k, 9):
-                dot += A[r, k] * A[r, c]
-            dot *= scales[k]
-            for r in range(k, 9):
-                A[r, c] -= dot * A[r, k]
-    for m in range(2):
-        q = pencil[m]
-        q[:] = 0.0
-        q[7 + m] = 1.0
-        for k in range(6, -1, -1):
-            dot = 0.0
-            for r in range(k, 9):
-                dot += A[r, k] * q[r]
-            dot *= scales[k]
-            for r in range(k, 9):
-                q[r] -= dot * A[r, k]
+            reflect(A[k], k, scales[k], A[c])
+    for k in range(6, -1, -1):
+        reflect(A[k], k, scales[k], pencil[0])
+        reflect(A[k], k, scales[k], pencil[1])
     return True
 
 
@@ -195,7 +195,7 @@ def oriented(f: F64, points: F64, sample: I64) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared Sampson distance, the summand of (5.4)."""
     a0 = f[0] * x1 + f[1] * y1 + f[2]
@@ -207,7 +207,16 @@ def squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float
     return squared
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def sampson_distances(f: F64, points: F64) -> F64:
+    """Sampson distances (N,) >= 0 of all points, in their units."""
+    r = np.empty(len(points))
+    for k in range(len(points)):
+        r[k] = np.sqrt(squared_sampson(f, points[k, 0], points[k, 1], points[k, 2], points[k, 3]))
+    return r
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def truncated_score(f: F64, points: F64, gate: float, give_up: float) -> tuple[float, int]:
     """Mean of min(r^2 / gate^2, 1) over all points and the number of points with r < gate.
 
@@ -234,22 +243,24 @@ def truncated_score(f: F64, points: F64, gate: float, give_up: float) -> tuple[f
 
 @njit(cache=True, nogil=True)
 def search(
-    points: F64, uniforms: F64, gate: float, confidence: float, done: int, state: F64, F: F64
+    points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64
 ) -> int:
     """Draw one sample per row of ``uniforms`` (B, 7) until enough were drawn; number of samples drawn in all.
 
-    ``done`` samples went before; ``state`` (2,) holds the best score and its share of inliers, ``F`` (9,) the
-    best matrix: both are read and updated. Each new best is refined a little (Huber, gate twice as wide)
-    before it sets the number of samples still needed, since a minimal sample spreads its noise over the
-    image.
+    ``stop`` are the samples drawn before, the least number to draw and the probability of one free of
+    outliers that is enough. ``state`` (2,) holds the best score and its share of inliers, ``F`` (9,) the best
+    matrix: both are read and updated. Each new best is refined a little (on at most 300 points, with a gate
+    twice as wide) before it sets the number of samples still needed, since a minimal sample spreads its noise
+    over the image.
     """
     n = len(points)
+    done, least, confidence = stop
     sample = np.empty(7, np.int64)
     solutions = np.empty((3, 9))
     refined = np.empty(9)
     largest = 1 << 40
     for row in range(len(uniforms)):
-        if done >= required_samples(state[1], 7, confidence, largest):
+        if done >= least and done >= required_samples(state[1], 7, confidence, largest):
             break
         done += 1
         draw_sample(uniforms[row], n, sample)
@@ -263,7 +274,7 @@ def search(
             state[0], state[1] = score, inliers / n
             F[:] = f
             refined[:] = f
-            refine(refined, points, GRADIENT, 2.0 * gate, gate, 4)
+            refine(refined, points[:SUBSET], GRADIENT, 2.0 * gate, gate, 4)
             score, inliers = truncated_score(refined, points, gate, state[0])
             if score < state[0]:
                 state[0], state[1] = score, inliers / n

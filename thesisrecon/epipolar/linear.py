@@ -58,7 +58,7 @@ def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
     """
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
     if xy1.shape != (7, 2) or xy2.shape != (7, 2):
-        raise ValueError(f"the seven-point algorithm needs two (7, 2) arrays; got {xy1.shape} and {xy2.shape}")
+        raise ValueError(f"the seven-point algorithm needs two (7, 2) arrays; got {xy1.shape}, {xy2.shape}")
     if not (np.isfinite(xy1).all() and np.isfinite(xy2).all()):
         raise ValueError("the seven-point algorithm needs finite pixel coordinates; some are NaN or infinite")
     if not (np.ptp(xy1, axis=0).any() and np.ptp(xy2, axis=0).any()):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.epipolar.covariance import fundamental_covariance
 from thesisrecon.epipolar.frame import PairFrame, check_matches
-from thesisrecon.epipolar.kernels import search, truncated_score
+from thesisrecon.epipolar.kernels import sampson_distances, search, truncated_score
 from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.multiview import sampson_residuals
@@ -19,8 +19,14 @@ from thesisrecon.types import FundamentalFit
 
 F64 = NDArray[np.float64]
 
-BATCH = 256
+BATCH = 512
 MINIMUM = 8
+REFINEMENT_STEPS = 15
+SHARPENINGS = 2
+KNEE = 0.25
+"""Where Huber's loss turns linear, in widths of the gate: wrong matches within the gate are not rare."""
+EXACT = 1e-9
+"""Smallest width of the loss (in units of the spread of the points), for matches without noise."""
 
 
 @dataclass(frozen=True)
@@ -29,16 +35,18 @@ class LocallyOptimisedRansac:
 
     Each of ``starts`` searches draws until a sample free of outliers was seen with the probability that makes
     ``confidence`` over all starts; its best matrix is refined by Levenberg-Marquardt on the gradient
-    criterion (5.4) under Huber's loss at the ``gates`` (times the threshold), and the best of the starts is
-    kept. Torr and Zisserman, MLESAC, CVIU 2000 (score); Chum, Matas and Kittler, DAGM 2003 (local
-    optimisation). Fitting the points of a shrinking gate alone gets stuck where the scene is nearly a plane;
-    the several starts and the soft loss do not.
+    criterion (5.4) under Huber's loss at the ``gates`` (times the threshold), and the best of the starts once
+    more with the loss as wide as the noise. Torr and Zisserman, MLESAC, CVIU 2000 (score); Chum, Matas and
+    Kittler, DAGM 2003 (local optimisation). Fitting the points of a shrinking gate alone gets stuck where the
+    scene is nearly a plane; the several starts and the soft loss do not.
 
     Parameters
     ----------
     threshold_px : Sampson distance beyond which a match counts as wrong during the search.
     confidence : probability that at least one start saw a sample free of outliers.
     starts : independent searches.
+    min_samples : samples of all starts together, however many inliers were found: where most of the scene is
+        one plane, a wrong F has many too.
     max_samples : samples of all starts together, whatever the confidence.
     gates : widths of the loss in thresholds, one refinement each, in this order.
     inlier_sigmas, inlier_floor_px : a match is an inlier within max(inlier_sigmas sigma, inlier_floor_px).
@@ -47,6 +55,7 @@ class LocallyOptimisedRansac:
     threshold_px: float = 1.0
     confidence: float = 0.9999
     starts: int = 4
+    min_samples: int = 4000
     max_samples: int = 50000
     gates: tuple[float, ...] = (2.0, 1.5, 1.0)
     inlier_sigmas: float = 2.5
@@ -57,8 +66,8 @@ class LocallyOptimisedRansac:
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence must lie between 0 and 1; got {self.confidence}")
-        if self.starts < 1 or self.max_samples < self.starts or not self.gates:
-            raise ValueError("a search needs at least one start, one sample per start and one gate")
+        if self.starts < 1 or self.max_samples < self.starts or min(self.gates, default=0.0) <= 0.0:
+            raise ValueError("a search needs at least one start, one sample per start and gates above 0")
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """F of matches (N >= 8, 2) px with its inliers, noise and covariance.
@@ -69,35 +78,48 @@ class LocallyOptimisedRansac:
         xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
         frame = PairFrame.of(xy1, xy2)
         points = frame.points(xy1, xy2)
-        f, samples = self._best_of_starts(points, self.threshold_px * frame.scale, rng)
+        gate = self.threshold_px * frame.scale
+        f, samples = self._best_of_starts(points, gate, rng)
+        if f.any():
+            self._sharpen(f, points, gate)
         return self._finish(frame, f, xy1, xy2, samples)
 
     def _best_of_starts(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
-        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / self.starts)
         best, best_score, samples = np.zeros(9), np.inf, 0
         for _ in range(self.starts):
             shuffled = points[rng.permutation(len(points))]
-            f, drawn = self._search(shuffled, gate, confidence, rng)
+            f, drawn = self._search(shuffled, gate, rng)
             samples += drawn
             if not f.any():
                 continue
             for width in self.gates:
-                refine(f, shuffled, GRADIENT, width * gate, width * gate, 15)
+                refine(f, shuffled, GRADIENT, width * gate, KNEE * width * gate, REFINEMENT_STEPS)
             score, _ = truncated_score(f, shuffled, gate, 1.0)
             if score < best_score:
                 best, best_score = f, score
         return best, samples
 
-    def _search(self, points: F64, gate: float, confidence: float, rng: Generator) -> tuple[F64, int]:
+    def _search(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0])
-        drawn, largest = 0, self.max_samples // self.starts
-        while drawn < largest:
-            before = drawn
-            uniforms = rng.random((min(BATCH, largest - drawn), 7))
-            drawn = search(points, uniforms, gate, confidence, drawn, state, f)
+        least, most = self.min_samples // self.starts, self.max_samples // self.starts
+        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / self.starts)
+        drawn = 0
+        while drawn < most:
+            uniforms = rng.random((min(BATCH, most - drawn), 7))
+            before, drawn = drawn, search(points, uniforms, gate, (drawn, least, confidence), state, f)
             if drawn < before + len(uniforms):
                 break
         return f, drawn
+
+    def _sharpen(self, f: F64, points: F64, gate: float) -> None:
+        """Refine once more with the width of the loss at the noise that the inliers show (in place)."""
+        for _ in range(SHARPENINGS):
+            r = np.array(sampson_distances(f, points))
+            near = r < gate
+            if near.sum() < MINIMUM:
+                return
+            width = min(max(noise_scale(r[near]), EXACT), gate)
+            refine(f, points, GRADIENT, gate, width, REFINEMENT_STEPS)
 
     def _finish(self, frame: PairFrame, f: F64, xy1: F64, xy2: F64, samples: int) -> FundamentalFit:
         F = frame.matrix_in_pixels(f)

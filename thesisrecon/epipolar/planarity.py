@@ -13,7 +13,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 SAMPLES, SUBSET = 200, 200
-"""Homographies tried and matches they are judged on: a plane of a quarter of the matches is found with 96 %."""
+"""Homographies tried, and matches they are judged on: a plane of a quarter of them is found with 96 %."""
 
 
 def plane_homographies(F: F64, xy1: F64, xy2: F64, triples: I64) -> F64:

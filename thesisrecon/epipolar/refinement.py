@@ -14,7 +14,9 @@ UNBOUNDED = 1e150
 """Stands for an infinite width of the loss: its square is still a number."""
 
 
-def refine_gradient(F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50) -> F64:
+def refine_gradient(
+    F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50
+) -> F64:
     """F (3, 3), unit norm, rank 2, that minimises the Sampson distances of (5.4) from the start ``F``.
 
     Levenberg-Marquardt on the orthonormal representation (Bartoli and Sturm, 2004) in place of the thesis'

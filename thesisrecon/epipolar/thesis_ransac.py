@@ -86,7 +86,7 @@ class ThesisRansac:
         if found is None or found.inliers.sum() < MINIMUM:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
-                f"none of {self.samples} samples has {MINIMUM} of {len(xy1)} matches within {self.threshold_px:g} px",
+                f"{self.samples} samples, none with {MINIMUM} of {len(xy1)} matches close enough",
                 "The photographs may not overlap, or the matches are wrong",
             )
         sigma, inliers = self._discard(found.model, xy1, xy2, found.inliers)

@@ -34,13 +34,15 @@ class PairVerification:
 
     def __post_init__(self) -> None:
         if self.min_inliers < 8:
-            raise ValueError(f"min_inliers must be at least 8 (any 7 agree with an F); got {self.min_inliers}")
+            raise ValueError(f"min_inliers must be at least 8; got {self.min_inliers}")
         if not 0.0 <= self.min_share <= 1.0 or not self.homography_px > 0.0:
             raise ValueError("min_share must lie in [0, 1] and homography_px be positive")
 
     def verify(self, matches: Matches, fit: FundamentalFit) -> TwoView:
-        """The pair with its verified matches and the decision; raises ``ValueError`` where the two do not belong
-        together (another number of matches)."""
+        """The pair with its verified matches and the decision.
+
+        Raises ``ValueError`` where ``matches`` and ``fit`` do not have the same number of matches.
+        """
         kept = fit.inliers
         if kept.shape != (len(matches.xy1),):
             raise ValueError(f"the fit has {kept.shape} inlier flags for {len(matches.xy1)} matches")

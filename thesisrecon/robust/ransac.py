@@ -53,7 +53,10 @@ class SampleConsensus:
     enough_share: float = 1.0
 
     def search(self, problem: SampledProblem[Model], n: int, rng: Generator) -> Consensus[Model] | None:
-        """The best model of ``n`` data, None where no sample gave one; ``ValueError`` for less than a sample."""
+        """The best model of ``n`` data, or None where no sample gave one.
+
+        Raises ``ValueError`` for fewer data than a sample has.
+        """
         if n < problem.sample_size:
             raise ValueError(f"sampling needs at least {problem.sample_size} data; got {n}")
         best: Consensus[Model] | None = None

@@ -15,10 +15,10 @@ F64 = NDArray[np.float64]
 GRADIENT, DISTANCE = 0, 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(
     f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64
-) -> tuple[float, int]:
+) -> float:
     """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by the entries of F.
 
     rho is Huber's loss of width ``delta``, constant beyond ``gate``; r the Sampson distance (5.4) or the root
@@ -28,7 +28,7 @@ def normal_equations(
     G[:] = 0.0
     h[:] = 0.0
     outside = delta * (gate - 0.5 * delta)
-    cost, inside = 0.0, 0
+    cost = 0.0
     d = np.empty(9)
     for k in range(len(points)):
         x1, y1, x2, y2 = points[k]
@@ -50,7 +50,6 @@ def normal_equations(
         if not r < gate:
             cost += outside
             continue
-        inside += 1
         w = 1.0
         if r <= delta:
             cost += 0.5 * r * r
@@ -76,7 +75,7 @@ def normal_equations(
     for i in range(9):
         for j in range(i):
             G[i, j] = G[j, i]
-    return cost, inside
+    return cost
 
 
 @njit(cache=True, nogil=True)
@@ -180,7 +179,7 @@ def refine(
     G, h, Gn, hn = np.empty((9, 9)), np.empty(9), np.empty((9, 9)), np.empty(9)
     B, step, trial = np.empty((9, 7)), np.empty(7), np.empty(9)
     compose(U, V, phi, f)
-    cost, _ = normal_equations(f, points, criterion, gate, delta, G, h)
+    cost = normal_equations(f, points, criterion, gate, delta, G, h)
     exact = 1e-26 * len(points)
     damping, steps = 1e-3, 0
     while steps < iterations and cost > exact:
@@ -194,7 +193,7 @@ def refine(
                 rotate_columns(U, step[0:3], Un)
                 rotate_columns(V, step[3:6], Vn)
                 compose(Un, Vn, phi + step[6], trial)
-                new_cost, _ = normal_equations(trial, points, criterion, gate, delta, Gn, hn)
+                new_cost = normal_equations(trial, points, criterion, gate, delta, Gn, hn)
                 accepted = new_cost < cost
             damping = max(1e-9, 0.1 * damping) if accepted else 10.0 * damping
             if damping > 1e8:
@@ -205,6 +204,6 @@ def refine(
         U, Un, V, Vn, phi = Un, U, Vn, V, phi + step[6]
         G, Gn, h, hn, cost = Gn, G, hn, h, new_cost
         f[:] = trial
-        if gain <= 1e-8 * cost:
+        if gain <= 1e-6 * cost:
             break
     return cost, steps
