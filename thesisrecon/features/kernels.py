@@ -7,8 +7,11 @@ from numba import njit
 
 from thesisrecon.types import F32, F64, I64
 
+# Sums may be reordered; assuming that no NaN exists would undo the bounds checks.
+FAST = {"contract", "reassoc", "nsz", "arcp"}
 
-@njit(cache=True, nogil=True, fastmath=True)
+
+@njit(cache=True, nogil=True, fastmath=FAST)
 def corner_response(blurred: F32, taps: F32) -> F32:
     """R = det M / (M11 + M22) of section 4.2.1, M the products of the gradient of ``blurred`` smoothed by
     ``taps``.
@@ -122,7 +125,7 @@ def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
     return dx, dy
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
     """(N,) squared distance of each corner to the nearest one that is clearly stronger; inf where none is.
 
@@ -145,7 +148,7 @@ def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
     """(N, side^2) bilinear samples on a ``side`` x ``side`` grid turned by ``angle``, clamped."""
     height, width = image.shape

@@ -153,9 +153,9 @@ def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, 
     c, d = step[1, 0] * to_level, step[1, 1] * to_level
     half = side // 2
     reach_x, reach_y = half * (abs(a) + abs(b)), half * (abs(c) + abs(d))
-    if not (x0 - reach_x >= 0.0 and x0 + reach_x < width - 1.0):
+    if not (x0 - reach_x >= 0.0 and x0 + reach_x < width - 1.001):
         return False
-    if not (y0 - reach_y >= 0.0 and y0 + reach_y < height - 1.0):
+    if not (y0 - reach_y >= 0.0 and y0 + reach_y < height - 1.001):
         return False
     n = 0
     for row in range(-half, half + 1):
@@ -271,10 +271,11 @@ def grow_corners(
         last_x = min(int((place[n, 0] + radius[n]) / cell), shape[1] - 1)
         first_y = max(int((place[n, 1] - radius[n]) / cell), 0)
         last_y = min(int((place[n, 1] + radius[n]) / cell), shape[0] - 1)
+        if last_x < first_x:
+            continue
         for cy in range(first_y, last_y + 1):
-            for at in range(
-                start[cy * shape[1] + first_x], start[cy * shape[1] + last_x + 1] if last_x >= first_x else 0
-            ):
+            row = cy * shape[1]
+            for at in range(start[row + first_x], start[row + last_x + 1]):
                 c = order[at]
                 dx, dy = xy2[c, 0] - place[n, 0], xy2[c, 1] - place[n, 1]
                 if dx * dx + dy * dy > radius[n] * radius[n]:

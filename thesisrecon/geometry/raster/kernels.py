@@ -7,8 +7,11 @@ from numba import njit
 
 from thesisrecon.types import F32
 
+# Sums may be reordered; assuming that no NaN exists would undo the bounds checks.
+FAST = {"contract", "reassoc", "nsz", "arcp"}
 
-@njit(cache=True, nogil=True, fastmath=True)
+
+@njit(cache=True, nogil=True, fastmath=FAST)
 def convolve_separable(image: F32, taps: F32) -> F32:
     """Convolve (H, W) with the symmetric ``taps`` (2 r + 1,) along both axes, the border repeated."""
     height, width = image.shape
@@ -32,7 +35,7 @@ def convolve_separable(image: F32, taps: F32) -> F32:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def halve_image(image: F32) -> F32:
     """(H, W) -> (H // 2, W // 2) with the taps (1, 3, 3, 1) / 8, centred between the pixels they merge."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
@@ -51,7 +54,7 @@ def halve_image(image: F32) -> F32:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def resample_image(image: F32, width: int, height: int) -> F32:
     """Bilinear samples of (H, W) at the pixel centres of a ``height`` x ``width`` grid over the same area."""
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
