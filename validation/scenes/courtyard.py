@@ -1,9 +1,12 @@
-"""The courtyard: an old yard with peeling walls, repeated windows, columns, a fountain, steps, crates and ivy.
+"""The courtyard: an old yard with peeling walls, repeated windows, columns, a fountain, steps, crates and
+ivy.
 
 World frame in metres: x right along the back wall, y into it (the wall at y = 0, the yard at y < 0), z up.
 """
 
 from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +62,9 @@ def _back_wall() -> Material:
         x = 1.4 + 1.6 * k
         add_window(wall, (x - 0.4, 3.2, x + 0.4, 4.3), 300 + 10 * k)
     door = planks(grid((2.0, 3.0), TEXEL), TEXEL, 190, 0.155)
-    add_recess(wall, (5.6, 0.3, 6.8, 2.5), Material(door.rgb * np.float32(1.25), door.height, TEXEL), depth_m=0.16)
+    add_recess(
+        wall, (5.6, 0.3, 6.8, 2.5), Material(door.rgb * np.float32(1.25), door.height, TEXEL), depth_m=0.16
+    )
     return wall
 
 
@@ -91,15 +96,23 @@ def _ground() -> Material:
     shape = grid((12.6, 10.0), TEXEL)
     paving = rubble(shape, TEXEL, 600, cell_m=0.34, relief_m=0.022)
     earth_grain = fractal(shape, TEXEL, 640, wavelengths_m=(0.09, 2.5 * TEXEL), ratio=0.9)
-    earth = Material(tinted((0.21, 0.165, 0.115), 0.8 + 0.35 * earth_grain), 0.018 + 0.004 * earth_grain, TEXEL)
+    earth = Material(
+        tinted((0.21, 0.165, 0.115), 0.8 + 0.35 * earth_grain), 0.018 + 0.004 * earth_grain, TEXEL
+    )
     where = fractal(shape, TEXEL, 650, wavelengths_m=(1.8, 0.05), ratio=0.65)
     ground = over(paving, earth, smooth(where, 0.35, 0.5))
     ground = spots(ground, 660, share=0.09, cell_m=0.06, colour=(0.42, 0.39, 0.35))
     return spots(ground, 670, share=0.05, cell_m=0.1, colour=(0.36, 0.17, 0.04))
 
 
-def _turned(size: tuple[float, float], profile: list[tuple[float, float]], seed: int, colour: tuple[float, float, float]) -> Material:
-    """A body of revolution for a cylinder chart: ``profile`` lists (v, height); grainy, stained stone closed around."""
+def _turned(
+    size: tuple[float, float],
+    profile: list[tuple[float, float]],
+    seed: int,
+    colour: tuple[float, float, float],
+) -> Material:
+    """A body of revolution for a cylinder chart: ``profile`` lists (v, height); grainy, stained stone closed
+    around."""
     shape = grid(size, TEXEL)
     v = np.arange(shape[0], dtype=np.float64) * TEXEL
     curve = np.interp(v, [p[0] for p in profile], [p[1] for p in profile])[:, None]
@@ -123,39 +136,58 @@ def _barrel() -> Material:
     for centre in (0.1, 0.28, 0.72, 0.9):
         hoop = np.maximum(hoop, smooth(0.03 - np.abs(v - centre) + 0.0 * hoop, 0.0, 0.008))
     rust = fractal(wood.shape, TEXEL, 720, wavelengths_m=(0.1, 2.5 * TEXEL), ratio=0.9, wrap=True)
-    iron = Material(tinted((0.13, 0.09, 0.07), 0.9 + 0.5 * rust), np.full(wood.shape, 0.022, np.float32), TEXEL)
+    iron = Material(
+        tinted((0.13, 0.09, 0.07), 0.9 + 0.5 * rust), np.full(wood.shape, 0.022, np.float32), TEXEL
+    )
     body = over(Material(wood.rgb * np.float32(1.3), wood.height, TEXEL), iron, hoop)
     calm = smooth(np.minimum(v, 1.0 - v) + 0.0 * hoop, 0.0, 0.03)
     return Material(body.rgb, (body.height * calm + bulge).astype(np.float32), TEXEL)
 
 
-def build_materials() -> list[Material]:
-    """The ten maps, in the order of the constants above."""
-    column = rubble(grid((2 * PI * 0.22, 2.6), TEXEL), TEXEL, 700, cell_m=0.2, relief_m=0.02, wrap=True)
-    v = np.minimum(np.arange(column.shape[0]), column.shape[0] - 1 - np.arange(column.shape[0])) * TEXEL
-    column = Material(column.rgb * np.float32(1.5), column.height * smooth(v.astype(np.float32), 0.0, 0.03)[:, None], TEXEL)
+def _column() -> Material:
+    """A drum of field stones whose ends are round, so that they stand well on their feet."""
+    stones = rubble(grid((2 * PI * 0.22, 2.6), TEXEL), TEXEL, 700, cell_m=0.2, relief_m=0.02, wrap=True)
+    row = np.arange(stones.shape[0])
+    calm = smooth((np.minimum(row, row[-1] - row) * TEXEL).astype(np.float32), 0.0, 0.03)[:, None]
+    return Material(stones.rgb * np.float32(1.5), stones.height * calm, TEXEL)
+
+
+def _basin() -> Material:
+    """Field stones under a moulded rim."""
+    size = (2 * PI * 0.85, 0.7)
     rim = [(0.0, 0.0), (0.5, 0.0), (0.54, 0.1), (0.66, 0.1), (0.7, 0.07)]
-    basin = rubble(grid((2 * PI * 0.85, 0.7), TEXEL), TEXEL, 730, cell_m=0.17, relief_m=0.03, wrap=True)
-    ring = _turned((2 * PI * 0.85, 0.7), rim, 740, (0.5, 0.46, 0.39))
-    height = (np.arange(basin.shape[0], dtype=np.float32) * np.float32(TEXEL))[:, None] + 0.0 * basin.height
-    basin = over(basin, ring, smooth(height, 0.49, 0.51))
-    urn = [(0.0, 0.16), (0.12, 0.16), (0.16, 0.08), (0.3, 0.05), (0.36, 0.1), (0.42, 0.06), (0.6, 0.2), (0.8, 0.25)]
-    urn += [(0.92, 0.21), (0.98, 0.12), (1.04, 0.12), (1.08, 0.2), (1.14, 0.2)]
-    return [
-        _back_wall(),
-        _left_wall(),
-        _right_wall(),
-        _ground(),
-        column,
-        basin,
-        _turned((2 * PI * 0.2, 1.14), urn, 750, (0.5, 0.47, 0.42)),
-        _barrel(),
-        cut_stone(grid((7.5, 2.5), TEXEL), TEXEL, 760, (0.7, 0.36), (0.48, 0.44, 0.37)),
-        planks(grid((2.4, 2.4), TEXEL), TEXEL, 770, 0.14),
-    ]
+    stones = rubble(grid(size, TEXEL), TEXEL, 730, cell_m=0.17, relief_m=0.03, wrap=True)
+    ring = _turned(size, rim, 740, (0.5, 0.46, 0.39))
+    z = (np.arange(stones.shape[0], dtype=np.float32) * np.float32(TEXEL))[:, None] + 0.0 * stones.height
+    return over(stones, ring, smooth(z, 0.49, 0.51))
 
 
-def _box(centre: tuple[float, float, float], size: tuple[float, float, float], material: int, turn: float = 0.0) -> list[Surface]:
+def _urn() -> Material:
+    """A stone urn turned on its pedestal."""
+    foot = [(0.0, 0.16), (0.12, 0.16), (0.16, 0.08), (0.3, 0.05), (0.36, 0.1), (0.42, 0.06)]
+    bowl = [(0.6, 0.2), (0.8, 0.25), (0.92, 0.21), (0.98, 0.12), (1.04, 0.12), (1.08, 0.2), (1.14, 0.2)]
+    return _turned((2 * PI * 0.2, 1.14), foot + bowl, 750, (0.5, 0.47, 0.42))
+
+
+def _dressed_stone() -> Material:
+    return cut_stone(grid((7.5, 2.5), TEXEL), TEXEL, 760, (0.7, 0.36), (0.48, 0.44, 0.37))
+
+
+def _crate_wood() -> Material:
+    return planks(grid((2.4, 2.4), TEXEL), TEXEL, 770, 0.14)
+
+
+def build_materials(*, threads: int = 2) -> list[Material]:
+    """The ten maps, in the order of the constants above."""
+    makers = [_back_wall, _left_wall, _right_wall, _ground, _column]
+    makers += [_basin, _urn, _barrel, _dressed_stone, _crate_wood]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(lambda make: make(), makers))
+
+
+def _box(
+    centre: tuple[float, float, float], size: tuple[float, float, float], material: int, turn: float = 0.0
+) -> list[Surface]:
     """Six faces of a box that stands on z = centre[2], turned about z by 2 atan(turn)."""
     cos, sin = (1 - turn * turn) / (1 + turn * turn), 2 * turn / (1 + turn * turn)
     x, y, z = np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -171,7 +203,15 @@ def _box(centre: tuple[float, float, float], size: tuple[float, float, float], m
     ]
     faces = faces if centre[2] > 0 else faces[:5]
     return [
-        Surface(o, u, v, s, material, flat=True, offset=(0.21 * k + at[0] * (material == STONE), 0.13 * k + at[1] * 0.3))
+        Surface(
+            o,
+            u,
+            v,
+            s,
+            material,
+            flat=True,
+            offset=(0.21 * k + at[0] * (material == STONE), 0.13 * k + at[1] * 0.3),
+        )
         for k, (o, u, v, s) in enumerate(faces)
     ]
 
@@ -184,7 +224,16 @@ def _drum(x: float, y: float, z: float, radius: float, size: tuple[float, float]
 def _lid(x: float, y: float, z: float, radius: float, material: int) -> Surface:
     origin = np.array([x - radius, y - radius, z])
     axes = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
-    return Surface(origin, axes[0], axes[1], (2 * radius, 2 * radius), material, disc=radius, flat=True, offset=(0.4, 0.2))
+    return Surface(
+        origin,
+        axes[0],
+        axes[1],
+        (2 * radius, 2 * radius),
+        material,
+        disc=radius,
+        flat=True,
+        offset=(0.4, 0.2),
+    )
 
 
 def build_objects() -> list[list[Surface]]:
@@ -201,7 +250,11 @@ def build_objects() -> list[list[Surface]]:
         drum = _drum(px, -1.75, 0.3, 0.22, (2 * PI * 0.22, 2.6), COLUMN)
         foot, head = (0.62, 0.62, 0.34), (0.56, 0.56, 0.17)
         objects += [_box((px, -1.75, 0.0), foot, STONE), [drum], _box((px, -1.75, 2.88), head, STONE)]
-    for py, rise, size in ((-0.5, 0.0, (2.6, 1.0, 0.12)), (-0.36, 0.12, (2.0, 0.72, 0.12)), (-0.22, 0.24, (1.5, 0.44, 0.1))):
+    for py, rise, size in (
+        (-0.5, 0.0, (2.6, 1.0, 0.12)),
+        (-0.36, 0.12, (2.0, 0.72, 0.12)),
+        (-0.22, 0.24, (1.5, 0.44, 0.1)),
+    ):
         objects.append(_box((0.0, py, rise), size, STONE))
     objects += _fountain(0.75, -3.3)
     objects.append(_box((4.3, -1.3, 0.0), (0.95, 0.95, 0.9), WOOD, 0.17))

@@ -1,4 +1,5 @@
-"""The thesis' cube sequence (5.5, figure 5.7): points on three faces of a cube, 27 cameras, perfect projections."""
+"""The thesis' cube sequence (5.5, figure 5.7): points on three faces of a cube, 27 cameras, perfect
+projections."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ AZIMUTHS_DEG, ELEVATIONS_DEG, DISTANCES = (-6.0, 45.0, 96.0), (4.0, 32.0, 58.0),
 
 @dataclass(frozen=True)
 class CubeSequence:
-    """``K`` (3, 3), ``R`` (27, 3, 3) world-to-camera, ``C`` (27, 3), ``X`` (N, 3), ``face`` (N,) 0 1 2 for x y z, and
-    ``xy`` (27, N, 2) px, NaN where the face is turned away or the point lies outside the image."""
+    """``K`` (3, 3), ``R`` (27, 3, 3) world-to-camera, ``C`` (27, 3), ``X`` (N, 3), ``face`` (N,) 0 1 2 for x
+    y z, and ``xy`` (27, N, 2) px, NaN where the face is turned away or the point lies outside the image."""
 
     K: F64
     R: F64
@@ -37,9 +38,10 @@ class CubeSequence:
         return ~np.isnan(self.xy[..., 0])
 
     def faces_seen(self) -> NDArray[np.int64]:
-        """(27,) number of faces that each view sees: 1 means a plane, which does not determine a projective camera."""
+        """(27,) number of faces that each view sees: 1 means a plane, which does not determine a projective
+        camera."""
         seen = [[bool(v[self.face == f].any()) for f in range(3)] for v in self.visible]
-        return np.array(seen).sum(axis=1)
+        return np.array([sum(faces) for faces in seen], dtype=np.int64)
 
 
 def _points(rng: np.random.Generator) -> tuple[F64, NDArray[np.int64]]:
@@ -75,8 +77,8 @@ def project_exactly(K: F64, R: F64, C: F64, X: F64) -> F64:
 def make_cube() -> CubeSequence:
     """The sequence; always the same numbers.
 
-    The cameras stand on a shaken 3 x 3 x 3 grid of azimuth, elevation and distance. Most see two or three faces, and six
-    (low, at either side) a single one.
+    The cameras stand on a shaken 3 x 3 x 3 grid of azimuth, elevation and distance. Most see two or three
+    faces, and six (low, at either side) a single one.
     """
     rng = np.random.Generator(np.random.PCG64(1900))
     K = np.array([[842.0, 0.0, 411.0], [0.0, 842.0, 290.0], [0.0, 0.0, 1.0]])

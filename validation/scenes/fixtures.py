@@ -34,7 +34,8 @@ DEPTH_STRIDE = 2
 DEPTH_UNIT_M = 0.00025
 GAINS = ((1.0, 1.0, 1.0), (1.02, 1.0, 0.98), (0.99, 1.0, 1.01))
 
-# angle about the yard (deg), distance (m), eye height (m), roll (deg), what it looks at: x, y, z (m), exposure
+# angle about the yard (deg), distance (m), eye height (m), roll (deg), what it looks at: x, y, z (m),
+# exposure
 STANDPOINTS = (
     (-55.0, 5.7, 1.62, 2.1, 0.55, -1.2, 1.62, 1.00),
     (-46.5, 6.3, 1.35, -3.4, 0.20, -1.0, 1.75, 1.08),
@@ -55,7 +56,8 @@ STANDPOINTS = (
 
 @dataclass(frozen=True)
 class Pose:
-    """A true camera: ``K``, ``R`` (world-to-camera) (3, 3), ``C`` (3,) metres, and the ``exposure`` of its photograph."""
+    """A true camera: ``K``, ``R`` (world-to-camera) (3, 3), ``C`` (3,) metres, and the ``exposure`` of its
+    photograph."""
 
     K: F64
     R: F64
@@ -70,7 +72,9 @@ def courtyard_poses() -> list[Pose]:
     for angle, distance, height, roll, x, y, z, exposure in STANDPOINTS:
         a = angle * pi / 180
         C = np.array([round(distance * sin(a), 4), round(-1.4 - distance * cos(a), 4), height])
-        poses.append(Pose(K, look_at(C, np.array([x, y, z]), round(tan(0.5 * roll * pi / 180), 5)), C, exposure))
+        poses.append(
+            Pose(K, look_at(C, np.array([x, y, z]), round(tan(0.5 * roll * pi / 180), 5)), C, exposure)
+        )
     return poses
 
 
@@ -83,7 +87,10 @@ def render_photograph(world: World, pose: Pose, view: int) -> tuple[bytes, U16]:
     gain = [0.82 * pose.exposure * g for g in GAINS[view % len(GAINS)]]
     rng = np.random.Generator(np.random.PCG64([2000, view]))
     rgb = expose(
-        integrate_pixels(light, SAMPLES_PER_PIXEL, sensor.blur_px), sensor, gains=(gain[0], gain[1], gain[2]), rng=rng
+        integrate_pixels(light, SAMPLES_PER_PIXEL, sensor.blur_px),
+        sensor,
+        gains=(gain[0], gain[1], gain[2]),
+        rng=rng,
     )
     depth = trace(world, rays, SIZE, shade=False)[1][::DEPTH_STRIDE, ::DEPTH_STRIDE]
     return encode_jpeg(rgb), np.asarray(np.floor(depth / DEPTH_UNIT_M + 0.5), dtype=np.uint16)
@@ -118,7 +125,13 @@ def write_courtyard(folder: Path, *, threads: int = 2) -> None:
             (folder / "images" / f"{k:04d}.jpg").write_bytes(jpeg)
             (folder / "depth" / f"{k:04d}.png").write_bytes(encode_depth(depth))
     cameras = {
-        f"{k:04d}.jpg": {"width": SIZE[0], "height": SIZE[1], "K": p.K.tolist(), "R": p.R.tolist(), "C": p.C.tolist()}
+        f"{k:04d}.jpg": {
+            "width": SIZE[0],
+            "height": SIZE[1],
+            "K": p.K.tolist(),
+            "R": p.R.tolist(),
+            "C": p.C.tolist(),
+        }
         for k, p in enumerate(poses)
     }
     content = {

@@ -19,7 +19,8 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Material:
-    """``rgb`` (H, W, 3) float32 linear; ``height`` (H, W) float32 metres; sample (row, col) at (col, row) texel_m."""
+    """``rgb`` (H, W, 3) float32 linear; ``height`` (H, W) float32 metres; sample (row, col) at (col, row)
+    texel_m."""
 
     rgb: F32
     height: F32
@@ -34,7 +35,7 @@ class Material:
 def smooth(x: F32, low: float, high: float) -> F32:
     """The cubic step from 0 at ``low`` to 1 at ``high``."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
-    return (t * t * (3.0 - 2.0 * t)).astype(np.float32)
+    return np.asarray(t * t * (3.0 - 2.0 * t), dtype=np.float32)
 
 
 def tinted(colour: Colour, factor: F32) -> F32:
@@ -50,7 +51,9 @@ def blend(a: F32, b: F32, weight: F32) -> F32:
 
 def over(below: Material, above: Material, weight: F32) -> Material:
     """One material laid over another."""
-    return Material(blend(below.rgb, above.rgb, weight), blend(below.height, above.height, weight), below.texel_m)
+    return Material(
+        blend(below.rgb, above.rgb, weight), blend(below.height, above.height, weight), below.texel_m
+    )
 
 
 def grid(size_m: tuple[float, float], texel_m: float) -> tuple[int, int]:
@@ -71,7 +74,11 @@ def bricks(shape: tuple[int, int], texel_m: float, seed: int) -> Material:
 
 
 def cut_stone(
-    shape: tuple[int, int], texel_m: float, seed: int, block_m: tuple[float, float], colour: Colour = (0.44, 0.40, 0.33)
+    shape: tuple[int, int],
+    texel_m: float,
+    seed: int,
+    block_m: tuple[float, float],
+    colour: Colour = (0.44, 0.40, 0.33),
 ) -> Material:
     """Ashlar: large blocks with chiselled faces, lichen and dark joints."""
     edge, label = courses(shape, texel_m, seed, block_m=block_m, wobble_m=0.006)
@@ -96,17 +103,23 @@ def rubble(
     warm = np.mod(label * 7.31, 1.0).astype(np.float32)
     stone = tinted((0.30, 0.28, 0.26), 0.55 + 0.95 * label + 0.3 * grain)
     stone += tinted((0.10, 0.05, 0.0), warm * (0.8 + 0.2 * grain))
-    speck = smooth(fractal(shape, texel_m, seed + 4, wavelengths_m=(0.06, 2.5 * texel_m), ratio=0.9, wrap=wrap), 0.5, 0.7)
+    speck = smooth(
+        fractal(shape, texel_m, seed + 4, wavelengths_m=(0.06, 2.5 * texel_m), ratio=0.9, wrap=wrap), 0.5, 0.7
+    )
     stone = blend(stone, 1.7 * stone, 0.5 * speck)
     joint = tinted((0.17, 0.145, 0.11), 0.75 + 0.45 * grain)
     bulge = inside * (0.55 + 0.3 * label) + 0.15 * smooth(edge, 0.0, 0.4 * cell_m)
-    return Material(blend(joint, stone, inside), (relief_m * (bulge + 0.14 * grain)).astype(np.float32), texel_m)
+    return Material(
+        blend(joint, stone, inside), (relief_m * (bulge + 0.14 * grain)).astype(np.float32), texel_m
+    )
 
 
 def plaster(shape: tuple[int, int], texel_m: float, seed: int) -> Material:
     """Old ochre plaster: stains that ran down, patches, cracks and speckle."""
     u = np.arange(shape[1], dtype=np.float32)[None, :]
-    tall = fractal((shape[0] // 8 + 2, shape[1]), texel_m, seed, wavelengths_m=(0.4, 3.0 * texel_m), ratio=0.8)
+    tall = fractal(
+        (shape[0] // 8 + 2, shape[1]), texel_m, seed, wavelengths_m=(0.4, 3.0 * texel_m), ratio=0.8
+    )
     rows = np.arange(shape[0], dtype=np.float32) / 8.0
     low = rows.astype(np.int64)
     t = (rows - low)[:, None].astype(np.float32)
@@ -129,7 +142,9 @@ def planks(shape: tuple[int, int], texel_m: float, seed: int, width_m: float) ->
     index = np.floor(x / width_m).astype(np.int64)
     place = x - index.astype(np.float32) * np.float32(width_m)
     gap = smooth(np.minimum(place, width_m - place), 0.003, 0.011)
-    across = fractal((shape[0] // 10 + 2, shape[1]), texel_m, seed, wavelengths_m=(0.06, 2.2 * texel_m), ratio=0.95)
+    across = fractal(
+        (shape[0] // 10 + 2, shape[1]), texel_m, seed, wavelengths_m=(0.06, 2.2 * texel_m), ratio=0.95
+    )
     shift = (np.arange(shape[0])[:, None] // 10 + 0 * index) % across.shape[0]
     fibre = across[shift, np.arange(shape[1])[None, :]]
     blotch = fractal(shape, texel_m, seed + 1, wavelengths_m=(0.35, 0.03), ratio=0.8)
@@ -141,18 +156,19 @@ def planks(shape: tuple[int, int], texel_m: float, seed: int, width_m: float) ->
 
 
 def border_distance(material: Material, box: Box, *, arch: bool = False) -> F32:
-    """Signed distance in metres to the border of (left, bottom, right, top), positive inside; ``arch`` rounds the top."""
+    """Signed distance in metres to the border of (left, bottom, right, top), positive inside; ``arch`` rounds
+    the top."""
     shape, texel = material.shape, np.float32(material.texel_m)
     x = (np.arange(shape[1], dtype=np.float32) * texel)[None, :]
     y = (np.arange(shape[0], dtype=np.float32) * texel)[:, None]
     left, bottom, right, top = box
     inside = np.minimum(np.minimum(x - left, right - x), np.minimum(y - bottom, top - y))
     if not arch:
-        return inside.astype(np.float32)
+        return np.asarray(inside, dtype=np.float32)
     radius = 0.5 * (right - left)
     spring = top - radius
     cap = radius - np.sqrt((x - 0.5 * (left + right)) ** 2 + (y - spring) ** 2)
-    return np.where(y > spring, cap, np.minimum(inside, np.minimum(x - left, right - x))).astype(np.float32)
+    return np.asarray(np.where(y > spring, cap, inside), dtype=np.float32)
 
 
 def _region(material: Material, box: Box, margin: float) -> tuple[slice, slice, Box]:
@@ -164,7 +180,8 @@ def _region(material: Material, box: Box, margin: float) -> tuple[slice, slice, 
 
 
 def add_window(material: Material, box: Box, seed: int) -> None:
-    """Cut a window into a wall, in place: stone frame, recess, wooden bars, dark panes with dirt, and a sill."""
+    """Cut a window into a wall, in place: stone frame, recess, wooden bars, dark panes with dirt, and a
+    sill."""
     rows, cols, local = _region(material, box, 0.3)
     part = Material(material.rgb[rows, cols], material.height[rows, cols], material.texel_m)
     shape, texel = part.shape, part.texel_m
@@ -180,7 +197,9 @@ def add_window(material: Material, box: Box, seed: int) -> None:
     bar = np.minimum(np.abs(x - 0.5 * w) - 0.028, np.minimum(np.abs(y - h / 3), np.abs(y - 2 * h / 3)) - 0.02)
     bars = 1.0 - smooth(np.minimum(bar, d - 0.055).astype(np.float32), -0.004, 0.008)
     dirt = fractal(shape, texel, seed + 3, wavelengths_m=(0.5, 0.02), ratio=0.8)
-    pane = tinted((0.035, 0.045, 0.055), 1.0 + 0.5 * np.clip(dirt, -1, 1)) + tinted((0.08, 0.075, 0.065), smooth(dirt, 0.2, 1.0))
+    pane = tinted((0.035, 0.045, 0.055), 1.0 + 0.5 * np.clip(dirt, -1, 1)) + tinted(
+        (0.08, 0.075, 0.065), smooth(dirt, 0.2, 1.0)
+    )
     glass = Material(pane, np.full(shape, -0.15, np.float32), texel)
     wood = Material(tinted((0.20, 0.27, 0.22), 0.9 + 0.35 * grain), np.full(shape, -0.11, np.float32), texel)
     result = over(over(part, stone, frame), slab, smooth(sill, 0.0, 0.012))
@@ -196,7 +215,9 @@ def add_recess(material: Material, box: Box, inner: Material, *, depth_m: float,
     d = border_distance(part, local, arch=arch)
     stone = cut_stone(shape, texel, 900 + int(100 * box[0]), (0.33, 0.24), (0.52, 0.48, 0.40))
     surround = Material(stone.rgb, 0.035 + stone.height * np.float32(0.5), texel)
-    fill = Material(inner.rgb[: shape[0], : shape[1]], inner.height[: shape[0], : shape[1]] - np.float32(depth_m), texel)
+    fill = Material(
+        inner.rgb[: shape[0], : shape[1]], inner.height[: shape[0], : shape[1]] - np.float32(depth_m), texel
+    )
     result = over(over(part, surround, smooth(d, -0.22, -0.205)), fill, smooth(d, 0.0, 0.035))
     material.rgb[rows, cols], material.height[rows, cols] = result.rgb, result.height
 

@@ -1,4 +1,5 @@
-"""From linear light to a photograph: lens blur, vignetting, exposure, photon and read noise, tone curve, JPEG."""
+"""From linear light to a photograph: lens blur, vignetting, exposure, photon and read noise, tone curve,
+JPEG."""
 
 from __future__ import annotations
 
@@ -17,8 +18,8 @@ JPEG_QUALITY = 91
 
 @dataclass(frozen=True)
 class Sensor:
-    """An ordinary camera. ``blur_px`` Gaussian point spread (before the pixel's own square), ``vignetting`` loss of light
-    at the corner, ``full_well`` electrons at white, ``read_noise`` electrons."""
+    """An ordinary camera. ``blur_px`` Gaussian point spread (before the pixel's own square), ``vignetting``
+    loss of light at the corner, ``full_well`` electrons at white, ``read_noise`` electrons."""
 
     blur_px: float = 0.42
     vignetting: float = 0.16
@@ -63,10 +64,13 @@ def expose(light: F32, sensor: Sensor, *, gains: tuple[float, float, float], rng
 
 
 def _develop(linear: NDArray[np.float64]) -> U8:
-    """A tone curve like sRGB with a soft shoulder, from a table (scalar powers: the same on every machine)."""
+    """A tone curve like sRGB with a soft shoulder, from a table (scalar powers: the same on every
+    machine)."""
     knots = np.linspace(0.0, 1.6, 4097)
     bent = [v if v < 0.6 else 0.6 + 0.4 * (1.0 - 1.0 / (1.0 + (v - 0.6) / 0.4)) * 1.3 for v in knots.tolist()]
-    curve = [12.92 * v if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055 for v in (min(b, 1.0) for b in bent)]
+    curve = [
+        12.92 * v if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055 for v in (min(b, 1.0) for b in bent)
+    ]
     levels = 255.0 * np.interp(np.clip(linear, 0.0, 1.6), knots, np.array(curve))
     return np.asarray(np.floor(levels + 0.5), dtype=np.uint8)
 

@@ -9,7 +9,8 @@ F64 = NDArray[np.float64]
 
 
 def look_at(C: F64, target: F64, tan_half_roll: float) -> F64:
-    """R (3, 3) world-to-camera of a camera at C towards a target, z up in the world, turned about its own axis.
+    """R (3, 3) world-to-camera of a camera at C towards a target, z up in the world, turned about its own
+    axis.
 
     The roll is given as the tangent of its half, so that no library's sine decides the last bit.
     """

@@ -1,14 +1,16 @@
-"""Procedural noise and patterns on a plane: band-limited, seeded by integers, the same numbers on every machine.
+"""Procedural noise and patterns on a plane: band-limited, seeded by integers, the same numbers on every
+machine.
 
-Everything is integer hashing and elementwise arithmetic, so no library's random stream or summation order enters.
-Coordinates are metres on the surface; a map of shape (H, W) has its sample (row, column) at (column, row) * texel_m.
+Everything is integer hashing and elementwise arithmetic, so no library's random stream or summation order
+enters. Coordinates are metres on the surface; a map of shape (H, W) has its sample (row, column) at (column,
+row) * texel_m.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import floor, sqrt
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from numba import njit
@@ -21,9 +23,9 @@ Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 
 def compiled(function: Kernel) -> Kernel:
-    """numba's njit with a static type: cached, releasing the GIL, without fast-math (bytes must not depend on it)."""
-    kernel: Kernel = njit(cache=True, nogil=True)(function)
-    return kernel
+    """numba's njit with a static type: cached, releasing the GIL, without fast-math (bytes must not depend on
+    it)."""
+    return cast(Kernel, njit(cache=True, nogil=True)(function))
 
 
 @compiled
@@ -37,7 +39,7 @@ def _hash01(ix: int, iy: int, seed: int) -> float:
 @compiled
 def _value_noise(x: float, y: float, seed: int, period: int) -> float:
     """Value noise in [-1, 1] on the unit lattice; ``period`` > 0 wraps it along x."""
-    ix, iy = int(floor(x)), int(floor(y))
+    ix, iy = floor(x), floor(y)
     fx, fy = x - ix, y - iy
     sx = fx * fx * fx * (fx * (fx * 6.0 - 15.0) + 10.0)
     sy = fy * fy * fy * (fy * (fy * 6.0 - 15.0) + 10.0)
@@ -62,7 +64,9 @@ def _fill_fractal(out: F32, steps: F64, seed: int, wrap_width: float) -> None:
                 if wrap_width > 0.0:
                     period = max(1, int(wrap_width / wavelength + 0.5))
                     scale = period / wrap_width
-                total += weight * _value_noise(col * texel * scale, row * texel / wavelength, seed + 31 * octave, period)
+                total += weight * _value_noise(
+                    col * texel * scale, row * texel / wavelength, seed + 31 * octave, period
+                )
                 norm += weight * weight
                 weight *= ratio
                 wavelength *= 0.5
@@ -79,12 +83,15 @@ def fractal(
     ratio: float = 0.6,
     wrap: bool = False,
 ) -> F32:
-    """Multi-octave noise (H, W), zero mean, about 0.5 RMS, between two wavelengths; ``wrap`` closes it along x.
+    """Multi-octave noise (H, W), zero mean, about 0.5 RMS, between two wavelengths; ``wrap`` closes it along
+    x.
 
     Raises ``ValueError`` where the shortest wavelength is under two texels (the map would be aliased).
     """
     if wavelengths_m[1] < 2.0 * texel_m:
-        raise ValueError(f"fractal needs wavelengths of at least two texels; got {wavelengths_m[1]} on {texel_m}")
+        raise ValueError(
+            f"fractal needs wavelengths of at least two texels; got {wavelengths_m[1]} on {texel_m}"
+        )
     out = np.empty(shape, np.float32)
     steps = np.array([texel_m, *wavelengths_m, ratio])
     _fill_fractal(out, steps, seed, shape[1] * texel_m if wrap else 0.0)
@@ -97,7 +104,7 @@ def _fill_cells(edge: F32, label: F32, warp: F32, texel: float, cell: float, see
         for col in range(edge.shape[1]):
             x = (col * texel + warp[row, col]) / cell
             y = (row * texel + 0.7 * warp[row, col]) / cell
-            ix, iy = int(floor(x)), int(floor(y))
+            ix, iy = floor(x), floor(y)
             first, second, best = 1e9, 1e9, 0.0
             for jy in range(iy - 2, iy + 3):
                 for jx in range(ix - 2, ix + 3):
@@ -113,12 +120,17 @@ def _fill_cells(edge: F32, label: F32, warp: F32, texel: float, cell: float, see
             label[row, col] = best
 
 
-def cells(shape: tuple[int, int], texel_m: float, seed: int, *, cell_m: float, wrap: bool = False) -> tuple[F32, F32]:
-    """Irregular stones (Worley's cells): distance to the joint in metres and a label in [0, 1) of each stone."""
+def cells(
+    shape: tuple[int, int], texel_m: float, seed: int, *, cell_m: float, wrap: bool = False
+) -> tuple[F32, F32]:
+    """Irregular stones (Worley's cells): distance to the joint in metres and a label in [0, 1) of each
+    stone."""
     edge, label = np.empty(shape, np.float32), np.empty(shape, np.float32)
     period = round(shape[1] * texel_m / cell_m) if wrap else 0
     cell = shape[1] * texel_m / period if wrap else cell_m
-    warp = fractal(shape, texel_m, seed + 7, wavelengths_m=(0.5 * cell, max(0.12 * cell, 2.5 * texel_m)), wrap=wrap)
+    warp = fractal(
+        shape, texel_m, seed + 7, wavelengths_m=(0.5 * cell, max(0.12 * cell, 2.5 * texel_m)), wrap=wrap
+    )
     _fill_cells(edge, label, (0.09 * cell * warp).astype(np.float32), texel_m, cell, seed, period)
     return edge, label
 
@@ -129,10 +141,10 @@ def _fill_courses(edge: F32, label: F32, warp: F32, steps: F64, seed: int) -> No
     for row in range(edge.shape[0]):
         for col in range(edge.shape[1]):
             y = row * texel + warp[row, col]
-            course = int(floor(y / rise))
+            course = floor(y / rise)
             shift = (0.5 * (course % 2) + 0.16 * _hash01(course, 3, seed)) * length
             x = col * texel + warp[row, col] + shift
-            block = int(floor(x / length))
+            block = floor(x / length)
             left = (block + 0.12 * (_hash01(block, course, seed) - 0.5)) * length
             right = (block + 1 + 0.12 * (_hash01(block + 1, course, seed) - 0.5)) * length
             if x < left:
@@ -146,9 +158,15 @@ def _fill_courses(edge: F32, label: F32, warp: F32, steps: F64, seed: int) -> No
 
 
 def courses(
-    shape: tuple[int, int], texel_m: float, seed: int, *, block_m: tuple[float, float], wobble_m: float = 0.003
+    shape: tuple[int, int],
+    texel_m: float,
+    seed: int,
+    *,
+    block_m: tuple[float, float],
+    wobble_m: float = 0.003,
 ) -> tuple[F32, F32]:
-    """Bricks or cut stones (length, rise) in running bond: distance to the joint in metres and a label per block."""
+    """Bricks or cut stones (length, rise) in running bond: distance to the joint in metres and a label per
+    block."""
     edge, label = np.empty(shape, np.float32), np.empty(shape, np.float32)
     warp = fractal(shape, texel_m, seed + 11, wavelengths_m=(0.5 * block_m[0], 4.0 * texel_m))
     steps = np.array([texel_m, *block_m])
@@ -182,7 +200,8 @@ def _stamp_leaves(height: F32, tint: F32, leaves: F64, texel: float) -> None:
 def ivy(
     shape: tuple[int, int], texel_m: float, seed: int, *, density: F32, depth_m: float = 0.05
 ) -> tuple[F32, F32]:
-    """Overlapping leaves where ``density`` (H, W) in [0, 1] allows: height in metres (0 = none) and tint about 0.5."""
+    """Overlapping leaves where ``density`` (H, W) in [0, 1] allows: height in metres (0 = none) and tint
+    about 0.5."""
     rng = np.random.Generator(np.random.PCG64(seed))
     n = int(shape[0] * shape[1] * texel_m**2 * 900)
     raw = rng.random((n, 7))

@@ -25,7 +25,8 @@ SUFFIXES = {".jpg", ".jpeg", ".png"}
 class Scene:
     """A set of photographs, sorted by name, and its truth where there is one.
 
-    ``K``, ``R`` (world-to-camera) (V, 3, 3) and ``C`` (V, 3) camera centres in metres, all None without truth.
+    ``K``, ``R`` (world-to-camera) (V, 3, 3) and ``C`` (V, 3) camera centres in metres, all None without
+    truth.
     """
 
     name: str
@@ -41,7 +42,8 @@ class Scene:
 
 
 def data_root() -> Path | None:
-    """The folder of real photographs: THESISRECON_DATA, else ../shared/data beside the repository, None when absent."""
+    """The folder of real photographs: THESISRECON_DATA, else ../shared/data beside the repository, None when
+    absent."""
     named = os.environ.get("THESISRECON_DATA")
     folder = Path(named) if named else ROOT.parent / "shared" / "data"
     return folder if folder.is_dir() else None
