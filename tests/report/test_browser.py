@@ -137,4 +137,4 @@ def test_the_numbers_of_the_cameras_unfold(witness: Witness) -> None:
     table = witness.page.locator("#view details").first
     table.locator("summary").click()
     assert table.locator("tbody tr").count() == 3
-    assert "520.3 ± 0.4" in table.inner_text()
+    assert "2081.4 ± 1.7" in table.inner_text()

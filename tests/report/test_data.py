@@ -25,3 +25,18 @@ def test_records_that_disagree_are_refused() -> None:
     wrong = dataclasses.replace(data.pairs[0], j=99)
     with pytest.raises(ValueError, match="pairs must name views"):
         dataclasses.replace(data, pairs=[wrong])
+
+
+def test_intrinsics_are_told_in_pixels_of_the_file() -> None:
+    data = made_up_run(points=100)  # worked at a quarter of the size
+    assert data.metric is not None
+    working, original = data.metric.intrinsics[0], data.original_intrinsics[0]
+    assert original["focal_px"].value == pytest.approx(4 * working["focal_px"].value)
+    assert original["focal_px"].std == pytest.approx(4 * working["focal_px"].std)
+    # The middle of the file stays the middle: (x + 0.5) / s - 0.5.
+    assert original["principal_x_px"].value == pytest.approx(
+        4 * (working["principal_x_px"].value + 0.5) - 0.5
+    )
+    assert original["k1"] == working["k1"]
+    assert data.original_intrinsics[-1] == {}
+    assert dataclasses.replace(data, metric=None, colours=None).original_intrinsics == ({},) * 9

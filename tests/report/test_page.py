@@ -69,7 +69,7 @@ def test_the_page_holds_every_section_and_its_links_lead_somewhere(page: str) ->
     assert wanted <= set(structure.ids)
     assert structure.tags.count("svg") == 8  # a histogram of each registered view
     assert structure.tags.count("img") == 9 + 2  # thumbnails, best and weakest pair
-    for text in ("520.3 ± 0.4", "Trusted, but incomplete", "2 pairs lie on one plane", "peak_memory_mb"):
+    for text in ("2081.4 ± 1.7", "Trusted, but incomplete", "2 pairs lie on one plane", "peak_memory_mb"):
         assert text in page
 
 

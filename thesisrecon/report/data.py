@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.types import MetricResult, Reconstruction, StageReport, TwoView
+from thesisrecon.types import IntrinsicInterval, MetricResult, Reconstruction, StageReport, TwoView
 
 U8 = NDArray[np.uint8]
 
@@ -29,6 +29,11 @@ class Photograph:
     original_size: tuple[int, int]
     rgb: U8 | None = None
     reason: str = ""
+
+    @property
+    def scale(self) -> float:
+        """Working pixels per original pixel."""
+        return max(self.size) / max(self.original_size)
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,25 @@ class ReportData:
                 raise ValueError(f"colours must be ({points}, 3), one per point; got {self.colours.shape}")
 
     @property
+    def original_intrinsics(self) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+        """Intrinsics of every view in pixels of the original file; empty mappings where there are none."""
+        if self.metric is None:
+            return tuple({} for _ in self.photographs)
+        views = zip(self.metric.intrinsics, self.photographs, strict=True)
+        return tuple(
+            {name: _in_original_pixels(name, interval, photograph.scale) for name, interval in view.items()}
+            for view, photograph in views
+        )
+
+    @property
     def best_reconstruction(self) -> Reconstruction | None:
         """The metric reconstruction, else the projective one, else None."""
         return self.metric.reconstruction if self.metric is not None else self.reconstruction
+
+
+def _in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> IntrinsicInterval:
+    """Undo the resizing (x + 0.5) scale - 0.5 of an intrinsic in pixels; pure numbers stay."""
+    if not name.endswith("_px"):
+        return interval
+    shift = 0.5 / scale - 0.5 if name.startswith("principal") else 0.0
+    return replace(interval, value=interval.value / scale + shift, std=interval.std / scale)

@@ -88,7 +88,8 @@ def write_report(path: str | os.PathLike[str], data: ReportData) -> None:
 def render_report(data: ReportData) -> str:
     """The page as text; the same data gives the same text."""
     best = data.best_reconstruction
-    distances = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.photographs)
+    working = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.photographs)
+    distances = [d / photo.scale for d, photo in zip(working, data.photographs, strict=True)]
     everything = np.concatenate([np.zeros(0), *distances])
     overall = summarize_distances(everything)
     limit_px = common_limit_px(everything)
@@ -160,10 +161,10 @@ def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
 def _cards(data: ReportData, distances: list[F64], limit_px: float) -> list[Card]:
     shares = [histogram_shares(d, limit_px) for d in distances]
     tallest = max((float(s.max()) for s in shares if len(s)), default=1.0)
+    intrinsics = data.original_intrinsics
     cards = []
     for i, photograph in enumerate(data.photographs):
         state, level, reason = _state(data, i)
-        intrinsics = data.metric.intrinsics[i] if data.metric is not None else {}
         cards.append(
             Card(
                 number=i + 1,
@@ -175,7 +176,7 @@ def _cards(data: ReportData, distances: list[F64], limit_px: float) -> list[Card
                 picture=thumbnail(photograph, len(data.photographs)),
                 residuals=summarize_distances(distances[i]),
                 bars=histogram_path(shares[i], tallest, width=HISTOGRAM_WIDTH, height=HISTOGRAM_HEIGHT),
-                intrinsics={name: _interval_words(interval) for name, interval in intrinsics.items()},
+                intrinsics={name: _interval_words(interval) for name, interval in intrinsics[i].items()},
             )
         )
     return cards

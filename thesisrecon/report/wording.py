@@ -122,23 +122,26 @@ def _point_fact(points: int, overall: ResidualSummary | None) -> Fact:
 
 
 def _intrinsic_facts(data: ReportData) -> list[Fact]:
-    assert data.metric is not None
     known = [
-        (view, photo) for view, photo in zip(data.metric.intrinsics, data.photographs, strict=True) if view
+        (view, photo) for view, photo in zip(data.original_intrinsics, data.photographs, strict=True) if view
     ]
     focal = [view["focal_px"] for view, _ in known if "focal_px" in view]
     facts = []
     if focal:
-        widths = np.array([photo.size[0] for view, photo in known if "focal_px" in view], dtype=float)
+        widths = np.array(
+            [photo.original_size[0] for view, photo in known if "focal_px" in view], dtype=float
+        )
         angle = np.degrees(2 * np.arctan(widths / (2 * np.array([f.value for f in focal]))))
-        sizes = {photo.size for _, photo in known}
+        sizes = {photo.original_size for _, photo in known}
         where = "×".join(str(n) for n in sizes.pop()) + " px" if len(sizes) == 1 else "each its own size"
         note = f"{np.median(angle):.1f}° wide, at {where}. {source_of(focal)}"
         facts.append(Fact("Focal length", interval_of(focal, "px"), note))
     centre_x = [view["principal_x_px"] for view, _ in known if "principal_x_px" in view]
     centre_y = [view["principal_y_px"] for view, _ in known if "principal_y_px" in view]
     if centre_x and centre_y:
-        middles = (np.array([photo.size for view, photo in known if "principal_x_px" in view]) - 1.0) / 2
+        middles = (
+            np.array([photo.original_size for view, photo in known if "principal_x_px" in view]) - 1.0
+        ) / 2
         offset = np.stack([[p.value for p in centre_x], [p.value for p in centre_y]], axis=1) - middles
         away = float(np.median(np.linalg.norm(offset, axis=1)))
         note = f"x, y; {away:.1f} px off the middle of the photograph. {source_of([*centre_x, *centre_y])}"
@@ -203,12 +206,17 @@ def duration(seconds: float) -> str:
 def named_number(name: str, value: float) -> tuple[str, str]:
     """A key as words and its value with the unit of its suffix: ``sigma_px`` -> ("sigma", "0.31 px")."""
     stem, _, suffix = name.rpartition("_")
-    text = grouped(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.4g}"
+    text = grouped(int(value)) if float(value).is_integer() and abs(value) < 1e15 else _short(value)
     if stem and suffix in UNITS:
         return stem.replace("_", " "), f"{text}{THIN}{UNITS[suffix]}"
     if stem and suffix == "rel":
         return stem.replace("_", " "), f"{100 * value:.3g}{THIN}%"
     return name.replace("_", " "), text
+
+
+def _short(value: float) -> str:
+    """Three digits, more only where they stand before the point."""
+    return f"{value:.3g}" if not abs(value) >= 1000 else f"{value:.0f}"
 
 
 def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tuple[str, str]]:
