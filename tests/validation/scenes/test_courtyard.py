@@ -53,8 +53,11 @@ def seen_in(scene: Scene, X: np.ndarray, view: int) -> tuple[np.ndarray, np.ndar
 def test_the_set_is_what_was_promised(scene: Scene) -> None:
     assert len(scene.image_paths) >= 12
     assert sum(p.stat().st_size for p in FOLDER.rglob("*") if p.is_file()) < 8e6
-    assert all(Image.open(p).size == SIZE and max(SIZE) == 1024 for p in scene.image_paths)
-    assert not any(Image.open(p).getexif() for p in scene.image_paths)
+    assert max(SIZE) == 1024
+    for path in scene.image_paths:
+        with Image.open(path) as image:
+            assert image.size == SIZE
+            assert not image.getexif()
     assert (scene.K[0] == scene.K).all()
     off = scene.K[0, :2, 2] - (np.array(SIZE) - 1) / 2
     assert (np.abs(off) > 12).all()
@@ -74,7 +77,7 @@ def test_the_motion_is_general(scene: Scene) -> None:
     turns = [b @ a.T for a, b in zip(scene.R[:-1], scene.R[1:], strict=True)]
     degrees = np.degrees([np.arccos((np.trace(T) - 1) / 2) for T in turns])
     assert degrees.min() > 7
-    assert degrees.max() < 16
+    assert degrees.max() < 20
     axes = np.array([[T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]] for T in turns])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     # Turned about several axes (in the camera's frame), and no plane holds the centres.
@@ -87,14 +90,18 @@ def test_depth_of_one_view_agrees_with_that_of_another(scene: Scene, i: int, j: 
     X = lift(scene, i)[1]
     depth, stride = load_fixture_depth(j)
     xy, z, inside = seen_in(scene, X, j)
-    there = look_up(depth, np.where(inside[:, None], xy, 2.0) / stride)
-    # Nearer surfaces of view j may hide the point; nothing may lie far behind it, save at a depth edge.
-    compared = inside & ~np.isnan(there)
+    xy = np.where(inside[:, None], xy, 2.0) / stride
+    there = look_up(depth, xy)
+    # At a depth edge interpolation means nothing: only where the four samples around lie on one smooth surface.
+    r, c = xy[:, 1].astype(int), xy[:, 0].astype(int)
+    around = np.stack([depth[r, c], depth[r + 1, c], depth[r, c + 1], depth[r + 1, c + 1]])
+    compared = inside & ~np.isnan(there) & (np.ptp(around, axis=0) < 0.04)
     difference = (z - there)[compared]
-    visible = np.abs(difference) < 0.05
+    visible = np.abs(difference) < 0.02
     assert visible.mean() > 0.6
-    assert np.median(np.abs(difference[visible])) < 1e-3
-    assert (difference < -0.05).mean() < 0.01
+    assert np.median(np.abs(difference[visible])) < 3e-4
+    # A nearer surface of view j may hide the point (z > there); a farther one would mean a hole in the scene.
+    assert (difference < -0.02).mean() < 2e-3
 
 
 @pytest.mark.parametrize(("i", "j"), [(2, 3), (6, 7), (10, 11)])
