@@ -92,7 +92,7 @@ def test_depth_of_one_view_agrees_with_that_of_another(scene: Scene, i: int, j: 
     xy, z, inside = seen_in(scene, X, j)
     xy = np.where(inside[:, None], xy, 2.0) / stride
     there = look_up(depth, xy)
-    # At a depth edge interpolation means nothing: only where the four samples around lie on one smooth surface.
+    # At a depth edge interpolation means nothing: compare where the four samples lie on one smooth surface.
     r, c = xy[:, 1].astype(int), xy[:, 0].astype(int)
     around = np.stack([depth[r, c], depth[r + 1, c], depth[r, c + 1], depth[r + 1, c + 1]])
     compared = inside & ~np.isnan(there) & (np.ptp(around, axis=0) < 0.04)
