@@ -29,6 +29,8 @@ B8 = NDArray[np.bool_]
 POSE_DOF, INTRINSIC_DOF = 6, 6
 SIMILARITY_DOF = 7
 MAD_TO_SIGMA = 1.4826
+# Variance of a standard normal variable cut at +-2.5.
+TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,12 @@ class _MetricProblem:
         intrinsics = state.intrinsics + moves
         # A focal can never change sign; the bound only matters for steps that will be refused anyway.
         intrinsics[:, 0] = state.intrinsics[:, 0] * np.exp(np.clip(moves[:, 0], -3.0, 3.0))
-        return _State(turn @ state.R, t, intrinsics, state.X + step.points)
+        R, X = turn @ state.R, state.X + step.points
+        o = self.observations
+        before = np.column_stack([state.R[:, 2], state.t[:, 2]])
+        after = np.column_stack([R[:, 2], t[:, 2]])
+        kernels.hold_flipping_points(o.start, o.view_index, before, after, state.X, X)
+        return _State(R, t, intrinsics, X)
 
     def residual(self, state: _State) -> tuple[F64, F64]:
         """Residuals (K, 2) in px and depths (K,)."""
@@ -321,12 +328,18 @@ def _frame(X: F64) -> tuple[F64, float]:
 
 
 def _robust_sigma(residual: F64, parameters: int) -> float:
-    """Standard deviation of one coordinate from the median absolute residual, corrected for the fitted
+    """Standard deviation of one coordinate: root mean square of the residuals within 2.5 sigma, sigma
+    starting from the median, corrected for the trimming of a normal distribution and for the fitted
     freedoms."""
-    count = residual.size
+    size, count = np.abs(residual).ravel(), residual.size
     if count <= parameters:
         return 0.0
-    return float(MAD_TO_SIGMA * np.median(np.abs(residual)) * np.sqrt(count / (count - parameters)))
+    sigma = MAD_TO_SIGMA * float(np.median(size))
+    for _ in range(5):
+        kept = size[size <= TRIM * sigma]
+        if len(kept):
+            sigma = float(np.sqrt(np.mean(kept**2) / TRIMMED_VARIANCE))
+    return sigma * float(np.sqrt(count / (count - parameters)))
 
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:

@@ -101,6 +101,8 @@ class _ProjectiveProblem:
         P, X = np.empty_like(state.P), np.empty_like(state.X)
         kernels.tangent_step(state.P, state.vP, state.bP, views, P)
         kernels.tangent_step(state.X, state.vX, state.bX, step.points, X)
+        o = self.observations
+        kernels.hold_flipping_points(o.start, o.view_index, state.P[:, 8:], P[:, 8:], state.X, X)
         return _state(P, X)
 
     def residual(self, state: _State) -> tuple[F64, F64]:

@@ -1,0 +1,302 @@
+"""Refinement of one kind of unknown with the rest held: points, one projective camera, one calibrated
+pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.optimize import kernels
+from thesisrecon.optimize.conditioning import pixel_conditioning, whitening_transform
+from thesisrecon.optimize.levenberg_marquardt import (
+    DenseSystem,
+    invert_information,
+    run_levenberg_marquardt,
+)
+from thesisrecon.optimize.losses import loss_code
+from thesisrecon.optimize.schur import sort_observations
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+B8 = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class CameraRefinement:
+    """A refined camera ``P`` (3, 4), at the norm and sign of its start.
+
+    ``covariance`` (12, 12) of P's row-major entries in the caller's frame for noise of 1 px in each image
+    coordinate: multiply by sigma^2. It has no part along P itself (the scale); directions that the points do
+    not determine have huge variances. ``residual_px`` (M, 2) projection minus observation; ``cost`` px^2.
+    """
+
+    P: F64
+    covariance: F64
+    residual_px: F64
+    cost: float
+    iterations: int
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """A refined calibrated camera: ``R`` (3, 3), ``t`` (3,), ``intrinsics`` (6,).
+
+    ``covariance`` (6 + F, 6 + F) for noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x +
+    d in the camera's frame, then the F free intrinsics, the focal as log f. ``residual_px`` (M, 2); ``cost``
+    px^2.
+    """
+
+    R: F64
+    t: F64
+    intrinsics: F64
+    covariance: F64
+    residual_px: F64
+    cost: float
+    iterations: int
+
+
+def refine_points(
+    P: F64,
+    X: F64,
+    view_index: I64,
+    point_index: I64,
+    xy: F64,
+    *,
+    loss_px: float = 1.0,
+    iterations: int = 5,
+) -> F64:
+    """Minimise each point's own sum of rho(|x - P X|^2), cameras held, rho = Huber's loss at ``loss_px``.
+
+    P (V, 3, 4) cameras; X (N, 4) homogeneous starts; view_index, point_index (K,), xy (K, 2) px -> (N, 4)
+    with the norms and signs of the starts. Damped Gauss-Newton in the tangent space of the whitened unit
+    4-vector; no point's cost rises and none crosses the focal plane of a view that sees it. Points that are
+    all zero or not finite, and points with fewer than two observations, come back untouched. Raises
+    ``ValueError`` for wrong shapes.
+    """
+    P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
+    if P.ndim != 3 or P.shape[1:] != (3, 4) or X.ndim != 2 or X.shape[1] != 4:
+        raise ValueError(f"refine_points needs (V, 3, 4) cameras and (N, 4) points; got {P.shape}, {X.shape}")
+    o = sort_observations(view_index, point_index, xy, len(P), len(X))
+    code = loss_code("huber", loss_px)
+    norms = np.linalg.norm(X, axis=1)
+    used = np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2)
+    if not used.any():
+        return X
+    T, M = pixel_conditioning(o.xy), whitening_transform(X[used])
+    # The scale of a camera does not change its projections, but it must not push depths below rounding.
+    cameras = T @ P @ np.linalg.inv(M)
+    sizes = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
+    cameras = np.ascontiguousarray(cameras / np.where(sizes > 0.0, sizes, 1.0))
+    moved = np.where(used[:, None], X, 0.0) @ M.T
+    moved[used] /= np.linalg.norm(moved[used], axis=1, keepdims=True)
+    xy_conditioned = o.xy * T[0, 0] + T[:2, 2]
+    kernels.refine_each_point(
+        cameras, moved, o.start, o.view_index, xy_conditioned, code, loss_px * float(T[0, 0]), iterations
+    )
+    back = moved @ np.linalg.inv(M).T
+    lengths = np.linalg.norm(back, axis=1, keepdims=True)
+    back *= norms[:, None] / np.where(lengths > 0.0, lengths, 1.0)
+    return np.where(used[:, None] & np.isfinite(back).all(axis=1, keepdims=True), back, X)
+
+
+@dataclass(frozen=True)
+class _CameraProblem:
+    """One unit camera (1, 12) against whitened unit points, conditioned pixels."""
+
+    X: F64
+    xy: F64
+    code: int
+    delta: float
+
+    def linearize(self, state: F64) -> DenseSystem:
+        v, beta = np.empty_like(state), np.empty(1)
+        vX, bX = np.zeros_like(self.X), np.zeros(len(self.X))
+        kernels.tangent_reflectors(state, v, beta)
+        n = len(self.X)
+        residual, A, B = np.empty((n, 2)), np.empty((n, 2, 11)), np.empty((n, 2, 3))
+        view, point = np.zeros(n, dtype=np.int64), np.arange(n)
+        cost = kernels.linearize_projective(
+            state, v, beta, self.X, vX, bX, view, point, self.xy, self.code, self.delta, residual, A, B
+        )
+        J, r = A.reshape(-1, 11), residual.ravel()
+        return DenseSystem(cost, J.T @ J, J.T @ r)
+
+    def retract(self, state: F64, step: F64) -> F64:
+        v, beta, moved = np.empty_like(state), np.empty(1), np.empty_like(state)
+        kernels.tangent_reflectors(state, v, beta)
+        kernels.tangent_step(state, v, beta, step[None], moved)
+        return moved
+
+    def residual(self, state: F64) -> F64:
+        n = len(self.X)
+        residual, depth = np.empty((n, 2)), np.empty(n)
+        view, point = np.zeros(n, dtype=np.int64), np.arange(n)
+        kernels.project_projective(state.reshape(1, 3, 4), self.X, view, point, self.xy, residual, depth)
+        return residual
+
+    def cost(self, state: F64) -> float:
+        return float(kernels.robust_cost(self.residual(state), self.code, self.delta))
+
+
+def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> CameraRefinement:
+    """Minimise sum rho(|x - P X|^2) over one camera's 11 freedoms, points held (resection, section 6.4).
+
+    P (3, 4) start; X (M, 4) homogeneous points; xy (M, 2) px; rho = Huber's loss at ``loss_px``. Conditioned
+    and whitened inside. Too few points or points on one plane do not raise: their covariance says so. Raises
+    ``ValueError`` for wrong shapes or zero or infinite values.
+    """
+    P, X, xy = (np.array(a, dtype=np.float64) for a in (P, X, xy))
+    if P.shape != (3, 4) or X.ndim != 2 or X.shape[1] != 4 or xy.shape != (len(X), 2) or len(X) == 0:
+        raise ValueError(
+            f"refine_camera needs (3, 4), (M, 4) and (M, 2); got {P.shape}, {X.shape}, {xy.shape}"
+        )
+    norms, size = np.linalg.norm(X, axis=1), float(np.linalg.norm(P))
+    finite = np.isfinite(norms).all() and np.isfinite(size) and np.isfinite(xy).all()
+    if not finite or not (norms > 0.0).all() or not size > 0.0:
+        raise ValueError("refine_camera needs finite points and a finite camera that are not zero")
+    T, M = pixel_conditioning(xy), whitening_transform(X)
+    points = X @ M.T
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    start = (T @ P @ np.linalg.inv(M)).reshape(1, 12)
+    scale = float(T[0, 0])
+    code = loss_code("huber", loss_px)
+    problem = _CameraProblem(points, xy * scale + T[:2, 2], code, loss_px * scale)
+    solution = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations)
+    # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
+    back = np.kron(np.linalg.inv(T), M.T)
+    raw = back @ solution.state[0]
+    back *= size / np.linalg.norm(raw)
+    raw *= size / np.linalg.norm(raw)
+    # The norm is held at that of the start, so the part of an error along P is only a change of scale.
+    back -= np.outer(raw, raw @ back) / size**2
+    covariance = back @ _camera_covariance(problem, solution.state) @ back.T * scale**2
+    return CameraRefinement(
+        raw.reshape(3, 4),
+        covariance,
+        problem.residual(solution.state) / scale,
+        solution.cost / scale**2,
+        solution.iterations,
+    )
+
+
+def _camera_covariance(problem: _CameraProblem, state: F64) -> F64:
+    """(12, 12) covariance of the unit camera for unit noise in conditioned pixels."""
+    v, beta = np.empty_like(state), np.empty(1)
+    kernels.tangent_reflectors(state, v, beta)
+    basis = (np.eye(12) - beta[0] * np.outer(v[0], v[0]))[:, 1:]
+    return np.asarray(basis @ invert_information(problem.linearize(state).hessian) @ basis.T)
+
+
+@dataclass(frozen=True)
+class _Pose:
+    R: F64
+    t: F64
+    intrinsics: F64
+
+
+@dataclass(frozen=True)
+class _PoseProblem:
+    X: F64
+    xy: F64
+    free: I64
+    code: int
+    delta: float
+
+    def _indices(self) -> tuple[I64, I64, I64]:
+        return np.zeros(1, dtype=np.int64), np.zeros(len(self.X), dtype=np.int64), np.arange(len(self.X))
+
+    def linearize(self, state: _Pose) -> DenseSystem:
+        n, F = len(self.X), len(self.free)
+        group, view, point = self._indices()
+        residual, A, G, B = (np.empty((n, *shape)) for shape in [(2,), (2, 6), (2, F), (2, 3)])
+        cost = kernels.linearize_metric(
+            state.R[None],
+            state.t[None],
+            state.intrinsics[None],
+            group,
+            self.X,
+            view,
+            point,
+            self.xy,
+            self.free,
+            1.0,
+            self.code,
+            self.delta,
+            residual,
+            A,
+            G,
+            B,
+        )
+        J, r = np.concatenate([A, G], axis=2).reshape(2 * n, 6 + F), residual.ravel()
+        return DenseSystem(cost, J.T @ J, J.T @ r)
+
+    def retract(self, state: _Pose, step: F64) -> _Pose:
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        moves = np.zeros(6)
+        moves[self.free] = step[6:]
+        intrinsics = state.intrinsics + moves
+        intrinsics[0] = state.intrinsics[0] * np.exp(np.clip(moves[0], -3.0, 3.0))
+        return _Pose(turn @ state.R, turn @ state.t + step[3:6], intrinsics)
+
+    def residual(self, state: _Pose) -> F64:
+        group, view, point = self._indices()
+        residual, depth = np.empty_like(self.xy), np.empty(len(self.xy))
+        kernels.project_metric(
+            state.R[None], state.t[None], state.intrinsics[None], group, self.X, view, point, self.xy,
+            residual, depth,
+        )  # fmt: skip
+        return residual
+
+    def cost(self, state: _Pose) -> float:
+        return float(kernels.robust_cost(self.residual(state), self.code, self.delta))
+
+
+def refine_pose(
+    R: F64,
+    t: F64,
+    intrinsics: F64,
+    X: F64,
+    xy: F64,
+    *,
+    free: B8 | None = None,
+    loss_px: float = 1.0,
+    iterations: int = 20,
+) -> PoseRefinement:
+    """Minimise sum rho(|x - project(X)|^2) over one pose and the free intrinsics, points held.
+
+    R (3, 3) world-to-camera, t (3,), intrinsics (6,) [focal_px, aspect, skew, cx, cy, k1] as in
+    ``MetricCameras``; X (M, 3); xy (M, 2) px; free (6,) which intrinsics move (none by default); rho =
+    Huber's loss at ``loss_px``. Raises ``ValueError`` for wrong shapes, values that are not finite or a focal
+    that is not positive.
+    """
+    R, t, q, X, xy = (np.array(a, dtype=np.float64) for a in (R, t, intrinsics, X, xy))
+    if R.shape != (3, 3) or t.shape != (3,) or q.shape != (6,) or X.shape != (len(xy), 3) or len(X) == 0:
+        raise ValueError(f"refine_pose got R {R.shape}, t {t.shape}, intrinsics {q.shape}, X {X.shape}")
+    if xy.shape != (len(X), 2) or not all(np.isfinite(a).all() for a in (R, t, q, X, xy)) or not q[0] > 0.0:
+        raise ValueError(
+            f"refine_pose needs finite (M, 2) pixels and a positive focal; got {xy.shape}, {q[0]}"
+        )
+    columns = np.flatnonzero(np.zeros(6, bool) if free is None else free)
+    # Centred and scaled points: turning about the middle hardly moves them, so the freedoms are well separated.
+    origin = X.mean(axis=0)
+    size = float(np.linalg.norm(X - origin, axis=1).mean())
+    scale = 1.0 / size if size > 0.0 else 1.0
+    problem = _PoseProblem(scale * (X - origin), xy, columns, loss_code("huber", loss_px), loss_px)
+    start = _Pose(R, scale * (t + R @ origin), q)
+    solution = run_levenberg_marquardt(problem, start, max_iterations=iterations)
+    end = solution.state
+    units = np.ones(6 + len(columns))
+    units[3:6] = 1.0 / scale
+    covariance = invert_information(problem.linearize(end).hessian) * units * units[:, None]
+    return PoseRefinement(
+        end.R,
+        end.t / scale - end.R @ origin,
+        end.intrinsics,
+        covariance,
+        problem.residual(end),
+        solution.cost,
+        solution.iterations,
+    )
