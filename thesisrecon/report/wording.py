@@ -84,6 +84,9 @@ def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact
         facts.append(_pair_fact(data.pairs))
     if overall is not None:
         note = f"{overall.rms_px:.2f} px RMS over {grouped(overall.count)} observations"
+        scales = {photograph.scale for photograph in data.photographs}
+        if len(scales) == 1 and scales != {1.0}:
+            note += f"; at working size {overall.median_px * scales.pop():.2f} px median"
         facts.append(Fact("Reprojection error", f"{overall.median_px:.2f} px median", note))
     best = data.best_reconstruction
     if best is not None:
