@@ -1,4 +1,308 @@
 """What the pipeline runs: one field per stage, each holding the variant that does its work.
 
 The presets are ``default`` (the best path we have) and ``thesis`` (the pipeline as the thesis describes it).
+In text (TOML, ``--set``) a stage is a table; its ``kind`` picks the variant, the rest are the variant's
+fields.
 """
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification, ThesisRansac
+from thesisrecon.errors import UsageError
+from thesisrecon.features import HarrisCorners, MultiScaleCorners
+from thesisrecon.matching import AlignedTracks, PlainTracks, SeedsAndGrowth, StrengthOfMatch
+from thesisrecon.metric import UpgradeAndBundle
+from thesisrecon.projective import GatedIncremental, SequentialProjective
+from thesisrecon.selfcalibration import HartleySearch, HypothesesAndRefinement
+from thesisrecon.settings import (
+    Table,
+    dataclass_from_table,
+    parse_word,
+    table_from_dataclass,
+    toml_from_tables,
+    unknown_word,
+)
+from thesisrecon.types import (
+    F64,
+    I64,
+    Features,
+    FocalPrior,
+    FundamentalFit,
+    Image,
+    Matches,
+    MetricResult,
+    Reconstruction,
+    SelfCalibration,
+    Tracks,
+    TwoView,
+)
+
+EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
+
+
+class Detector(Protocol):
+    """Section 4.2.1: corners of one photograph."""
+
+    def detect(self, image: Image) -> Features: ...
+
+
+class Matcher(Protocol):
+    """Section 4.2.2: corners of two photographs that show the same scene point."""
+
+    def prepare(self, image: Image, features: Features) -> Any: ...
+
+    def match(
+        self,
+        view1: Any,
+        view2: Any,
+        *,
+        pair: tuple[int, int],
+        estimate_fundamental: EstimateFundamental,
+        rng: np.random.Generator,
+    ) -> Matches: ...
+
+
+class FundamentalEstimator(Protocol):
+    """Chapter 5: F from matches of which some are wrong."""
+
+    def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit: ...
+
+
+class Verifier(Protocol):
+    """Whether a pair and its F enter the tracks."""
+
+    def verify(self, matches: Matches, fit: FundamentalFit) -> TwoView: ...
+
+
+class TrackBuilder(Protocol):
+    """Matches of pairs joined into observations of scene points."""
+
+    def build(
+        self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator
+    ) -> Tracks: ...
+
+
+class ProjectiveReconstructor(Protocol):
+    """Chapter 6: cameras and points up to a projective transform; ``attempt`` picks the initial pair."""
+
+    def reconstruct(
+        self,
+        tracks: Tracks,
+        pairs: Sequence[TwoView],
+        sizes: I64,
+        *,
+        rng: np.random.Generator,
+        attempt: int = 0,
+    ) -> Reconstruction: ...
+
+
+class SelfCalibrator(Protocol):
+    """Chapter 7: the transform that makes a projective reconstruction metric."""
+
+    def calibrate(
+        self,
+        reconstruction: Reconstruction,
+        *,
+        groups: I64,
+        focal_prior: FocalPrior | None,
+        rng: np.random.Generator,
+    ) -> SelfCalibration: ...
+
+
+class MetricRefiner(Protocol):
+    """After chapter 7: the postponed cameras, bundle adjustment, intervals and the self-check."""
+
+    def refine(
+        self,
+        reconstruction: Reconstruction,
+        calibration: SelfCalibration,
+        *,
+        groups: I64,
+        focal_prior: FocalPrior | None,
+        rng: np.random.Generator,
+    ) -> MetricResult: ...
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """How photographs are read: a long side above ``max_size_px`` is reduced to it."""
+
+    max_size_px: int = 1600
+
+    def __post_init__(self) -> None:
+        if self.max_size_px < 64:
+            raise ValueError(f"max_size_px must be at least 64; got {self.max_size_px}")
+
+
+@dataclass(frozen=True)
+class IntrinsicsAssumption:
+    """What the user lets the pipeline assume of the cameras. Nothing of the focal length, unless it has a
+    weight.
+
+    Parameters
+    ----------
+    cameras : "shared": all photographs of one size come from one camera; "per-image": each has its own.
+    focal_px : the user's focal length in pixels of the original photographs, or None.
+    exif : whether the focal length of the EXIF header (35 mm equivalent) is taken where there is one and
+        ``focal_px`` is not given.
+    focal_std_rel : the weight of either: its relative standard deviation. Must be given with them.
+    """
+
+    cameras: Literal["shared", "per-image"] = "shared"
+    focal_px: float | None = None
+    exif: bool = False
+    focal_std_rel: float | None = None
+
+    def __post_init__(self) -> None:
+        wanted = self.exif or self.focal_px is not None
+        if wanted and self.focal_std_rel is None:
+            raise ValueError(
+                "a focal prior needs its weight: set focal_std_rel (0.1 means 'within about 10 %')"
+            )
+        if self.focal_std_rel is not None and not self.focal_std_rel > 0:
+            raise ValueError(f"focal_std_rel must be above 0; got {self.focal_std_rel}")
+        if self.focal_px is not None and not self.focal_px > 0:
+            raise ValueError(f"focal_px must be above 0; got {self.focal_px}")
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """The whole pipeline as values; the defaults are the preset ``default``."""
+
+    images: ImageOptions = ImageOptions()
+    intrinsics: IntrinsicsAssumption = IntrinsicsAssumption()
+    features: Detector = field(default_factory=MultiScaleCorners)
+    matching: Matcher = field(default_factory=SeedsAndGrowth)
+    epipolar: FundamentalEstimator = field(default_factory=LocallyOptimisedRansac)
+    verification: Verifier = field(default_factory=PairVerification)
+    tracks: TrackBuilder = field(default_factory=AlignedTracks)
+    projective: ProjectiveReconstructor = field(default_factory=GatedIncremental)
+    selfcalibration: SelfCalibrator = field(default_factory=HypothesesAndRefinement)
+    metric: MetricRefiner = field(default_factory=UpgradeAndBundle)
+
+
+# One table per stage: the word of the text and the class it means. A new variant is one line here.
+KINDS: Mapping[str, Mapping[str, type[Any]]] = {
+    "features": {"multi-scale-corners": MultiScaleCorners, "harris-corners": HarrisCorners},
+    "matching": {"seeds-and-growth": SeedsAndGrowth, "strength-of-match": StrengthOfMatch},
+    "epipolar": {"locally-optimised-ransac": LocallyOptimisedRansac, "thesis-ransac": ThesisRansac},
+    "verification": {"pair-verification": PairVerification},
+    "tracks": {"aligned-tracks": AlignedTracks, "plain-tracks": PlainTracks},
+    "projective": {"gated-incremental": GatedIncremental, "sequential-projective": SequentialProjective},
+    "selfcalibration": {
+        "hypotheses-and-refinement": HypothesesAndRefinement,
+        "hartley-search": HartleySearch,
+    },
+    "metric": {"upgrade-and-bundle": UpgradeAndBundle},
+}
+
+PRESETS: Mapping[str, PipelineConfig] = {
+    "default": PipelineConfig(),
+    "thesis": PipelineConfig(
+        features=HarrisCorners(),
+        matching=StrengthOfMatch(),
+        epipolar=ThesisRansac(),
+        tracks=PlainTracks(),
+        projective=SequentialProjective(),
+        selfcalibration=HartleySearch(),
+        metric=UpgradeAndBundle(),
+    ),
+}
+
+
+def preset(name: str) -> PipelineConfig:
+    """The configuration of that name; :class:`UsageError` names the known ones."""
+    if name not in PRESETS:
+        raise UsageError(unknown_word("preset", name, PRESETS))
+    return PRESETS[name]
+
+
+def kind_of(stage: str, variant: Any) -> str:
+    """The word that means this variant; its class name where the table has none (a variant of the
+    caller).
+    """
+    return next((k for k, cls in KINDS[stage].items() if cls is type(variant)), type(variant).__name__)
+
+
+def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
+    """The configuration as plain tables, stage -> field -> value, complete."""
+    tables = {}
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        head = {"kind": kind_of(item.name, value)} if item.name in KINDS else {}
+        tables[item.name] = head | table_from_dataclass(value)
+    return tables
+
+
+def toml_from_config(config: PipelineConfig) -> str:
+    """The configuration as TOML; :func:`config_from_toml` reads back an equal one."""
+    return toml_from_tables(tables_from_config(config))
+
+
+def config_from_toml(
+    text: str, base: PipelineConfig | None = None, *, fixed_preset: bool = False
+) -> PipelineConfig:
+    """``base`` (else the preset ``default``) changed by the tables of the text.
+
+    A line ``preset = "thesis"`` at its top takes that preset for the base, unless ``fixed_preset``. Raises
+    :class:`UsageError` for text that is no TOML, unknown stages, kinds and settings (naming the nearest
+    known), and values of another type.
+    """
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"the configuration is not TOML: {error}") from None
+    name = tables.pop("preset", None)
+    if name is not None and not fixed_preset:
+        base = preset(str(name))
+    return config_from_tables(tables, base)
+
+
+def config_from_tables(tables: Mapping[str, Any], base: PipelineConfig | None = None) -> PipelineConfig:
+    """``base`` (else the preset ``default``) changed by plain tables; refuses as :func:`config_from_toml`
+    does.
+    """
+    config = base or PipelineConfig()
+    stages = [item.name for item in dataclasses.fields(config)]
+    for stage, table in tables.items():
+        if stage not in stages:
+            raise UsageError(unknown_word("stage", stage, ["preset", *stages]))
+        if not isinstance(table, Mapping):
+            raise UsageError(f"{stage} takes a table of settings; got {table!r}")
+        config = dataclasses.replace(
+            config, **{stage: _stage_from_table(stage, table, getattr(config, stage))}
+        )
+    return config
+
+
+def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any:
+    if stage not in KINDS:
+        return dataclass_from_table(type(current), table, stage, current)
+    fields = {key: value for key, value in table.items() if key != "kind"}
+    kind = table.get("kind", kind_of(stage, current))
+    if kind not in KINDS[stage] and type(current).__name__ != kind:
+        raise UsageError(unknown_word(f"kind of {stage}", str(kind), KINDS[stage]))
+    variant = KINDS[stage].get(kind, type(current))
+    return dataclass_from_table(variant, fields, stage, current if type(current) is variant else None)
+
+
+def apply_setting(config: PipelineConfig, setting: str) -> PipelineConfig:
+    """``config`` with one ``stage.field=value`` (``stage.field.field=value`` for a nested one) changed."""
+    place, equals, text = setting.partition("=")
+    path = place.strip().split(".")
+    if not equals or len(path) < 2 or not all(path):
+        raise UsageError(
+            f"--set takes stage.field=value, as in features.kind=harris-corners; got {setting!r}"
+        )
+    value = parse_word(text)
+    for key in reversed(path):
+        value = {key: value}
+    return config_from_tables(value, config)

@@ -1,0 +1,296 @@
+"""The command line: parse, call, print.
+
+NumPy is imported only inside the commands, after the number of its threads is set: linear algebra on one
+thread gives the same bytes however many workers there are, and the workers are the parallelism.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from thesisrecon import __version__
+from thesisrecon.errors import StageFailure, UsageError
+
+if TYPE_CHECKING:
+    from thesisrecon.config import PipelineConfig
+    from thesisrecon.types import RunResult
+
+DONE, INTERNAL, USAGE, IMPOSSIBLE, INTERRUPTED = 0, 1, 2, 3, 130
+DEBUG_VARIABLE = "THESISRECON_DEBUG"
+DEMO_SCENE = Path("fixtures") / "courtyard"
+STAGE_WORDS = {
+    "features": "corners",
+    "matches": "pairs of photographs",
+    "projective": "projective cameras",
+    "selfcalibration": "self-calibration",
+    "metric": "metric refinement",
+}
+
+app = typer.Typer(
+    name="thesisrecon",
+    help="From uncalibrated photographs to metric cameras and points.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+class Preset(StrEnum):
+    """Configurations by name."""
+
+    default = "default"
+    thesis = "thesis"
+
+
+class Cameras(StrEnum):
+    """What is assumed of the cameras."""
+
+    shared = "shared"
+    per_image = "per-image"
+
+
+Threads = Annotated[int, typer.Option("--threads", min=0, help="Workers; 0 = one per processor.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Take over an output folder that holds another run.")
+]
+
+
+class _Interrupted(Exception):
+    """Ctrl-C during a run."""
+
+
+@app.command()
+def reconstruct(
+    images: Annotated[Path, typer.Argument(help="The folder of photographs.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The output folder.")],
+    preset: Annotated[
+        Preset | None, typer.Option("--preset", help="The pipeline to start from (default: default).")
+    ] = None,
+    cameras: Annotated[
+        Cameras | None,
+        typer.Option("--cameras", help="One camera for all photographs of a size, or one per image."),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="A TOML file of settings, applied to the preset.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting as stage.field=value; may be repeated.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all random steps.")] = 0,
+    threads: Threads = 0,
+    max_size: Annotated[
+        int | None,
+        typer.Option("--max-size", help="Long side (px) photographs are reduced to (default: 1600)."),
+    ] = None,
+    until: Annotated[
+        str, typer.Option("--until", help="The last stage: features, matches, projective or metric.")
+    ] = "metric",
+    executor: Annotated[
+        str, typer.Option("--executor", help="Workers are threads (local) or processes.")
+    ] = "local",
+    overwrite: Overwrite = False,
+) -> None:
+    """Reconstruct metric cameras and points from a folder of photographs."""
+    _cap_threads(threads)
+    chosen = _config(preset.value if preset else None, config, cameras, max_size, settings or [])
+    options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
+    _run(images, out, chosen, seed, options)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("-o", "--out", help="The output folder.")] = Path("out/demo"),
+    threads: Threads = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Reconstruct the courtyard that comes with the source of the project."""
+    _cap_threads(threads)
+    scene = Path(__file__).resolve().parent.parent / DEMO_SCENE / "images"
+    if not scene.is_dir():
+        raise UsageError(
+            f"the demo needs the photographs of {DEMO_SCENE}, which come with the source of the project, not "
+            "with the installed package; run scripts/demo there, or reconstruct a folder of your own"
+        )
+    _run(
+        scene,
+        out,
+        _config(None, None, None, None, []),
+        0,
+        {"threads": threads or None, "overwrite": overwrite},
+    )
+
+
+@app.command()
+def inspect(out: Annotated[Path, typer.Argument(help="The output folder of a run.")]) -> None:
+    """Print what a run found."""
+    from thesisrecon.io.run_directory import read_json
+
+    summary = read_json(out / "summary.json")
+    if not isinstance(summary, dict):
+        raise UsageError(f"{out} holds no summary of a run (summary.json); has a run ended there?")
+    try:
+        _print_summary(summary, out)
+    except (KeyError, TypeError, AttributeError):
+        raise UsageError(f"{out / 'summary.json'} is not a summary of this program") from None
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"thesisrecon {__version__}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+        raise typer.Exit
+
+
+def _cap_threads(threads: int) -> None:
+    """The one setting that caps every kind of thread; must run before NumPy is imported."""
+    count = str(threads or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else threads or 1)
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+        os.environ[name] = "1"
+    os.environ["NUMBA_NUM_THREADS"] = count
+
+
+def _config(
+    preset: str | None,
+    file: Path | None,
+    cameras: Cameras | None,
+    max_size: int | None,
+    settings: list[str],
+) -> PipelineConfig:
+    """The preset (of the command, else of the file, else default), then the file, then the options, then
+    --set.
+    """
+    from thesisrecon import config as configs
+    from thesisrecon.io.text import read_text
+
+    chosen = configs.preset(preset or "default")
+    if file is not None:
+        chosen = configs.config_from_toml(read_text(file), chosen, fixed_preset=preset is not None)
+    options: dict[str, dict[str, Any]] = {}
+    if cameras is not None:
+        options["intrinsics"] = {"cameras": cameras.value}
+    if max_size is not None:
+        options["images"] = {"max_size_px": max_size}
+    chosen = configs.config_from_tables(options, chosen)
+    for setting in settings:
+        chosen = configs.apply_setting(chosen, setting)
+    return chosen
+
+
+def _run(images: Path, out: Path, config: PipelineConfig, seed: int, options: Mapping[str, Any]) -> None:
+    from thesisrecon.pipeline import reconstruct as run_pipeline
+
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    try:
+        with _progress_bars() as progress:
+            result: RunResult = run_pipeline(
+                images, out, config=config, seed=seed, progress=progress, **options
+            )
+    except KeyboardInterrupt:
+        raise _Interrupted(
+            f"interrupted; the same command goes on where it stopped (kept in {out})"
+        ) from None
+    _print_summary(result.summary, out)
+
+
+@contextmanager
+def _progress_bars() -> Iterator[Any]:
+    """A bar per stage on a terminal; silence elsewhere."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:>22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    tasks: dict[str, Any] = {}
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def hear(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(STAGE_WORDS.get(stage, stage), total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield hear
+
+
+def _print_summary(summary: Mapping[str, Any], out: Path) -> None:
+    lines = [
+        f"{summary['registered']} of {summary['images']} photographs registered, {summary['points']} points"
+    ]
+    if summary["reprojection_rms_px"] is not None:
+        lines.append(
+            f"reprojection residual {summary['reprojection_rms_px']:.3f} px RMS, "
+            f"{summary['reprojection_median_px']:.3f} px median"
+        )
+    lines += _intrinsic_lines(summary["cameras"])
+    lines += [f"refused: {refused['name']}: {refused['reason']}" for refused in summary["refused"]]
+    lines += [f"warning: {warning}" for warning in summary["warnings"]]
+    if summary["failure"]:
+        lines.append(f"failed: {summary['failure']}")
+    lines.append(f"{summary['seconds']['total']:.1f} s; the page is {out / 'report.html'}")
+    typer.echo("\n".join(lines))
+
+
+def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
+    """One line per camera: focal length and principal point with their standard deviations."""
+    lines: dict[tuple[int, float], str] = {}
+    for view in views:
+        if "focal_px" not in view:
+            continue
+        focal, x, y = (view[name] for name in ("focal_px", "principal_x_px", "principal_y_px"))
+        lines.setdefault(
+            (view["camera"], focal["value"]),
+            f"camera {view['camera']}: focal {focal['value']:.1f} +- {focal['std']:.1f} px ({focal['source']}), "
+            f"principal point ({x['value']:.1f} +- {x['std']:.1f}, {y['value']:.1f} +- {y['std']:.1f}) px",
+        )
+    return list(lines.values())
+
+
+def run_command(arguments: list[str]) -> int:
+    """Run one command line; errors become one sentence on stderr and an exit code."""
+    try:
+        code = app(arguments, standalone_mode=False)
+        return code if isinstance(code, int) else DONE
+    except UsageError as error:
+        return _say(str(error), USAGE)
+    except StageFailure as failure:
+        return _say(str(failure), IMPOSSIBLE)
+    except (_Interrupted, KeyboardInterrupt) as stop:
+        return _say(str(stop) or "interrupted", INTERRUPTED)
+    except MemoryError:
+        return _say("out of memory; try a smaller --max-size or fewer --threads", IMPOSSIBLE)
+    except Exception as error:
+        # The parser's own errors carry their sentence; its classes differ between its versions.
+        if hasattr(error, "format_message"):
+            return _say(f"{error.format_message()} (see thesisrecon --help)", USAGE)
+        if os.environ.get(DEBUG_VARIABLE):
+            raise
+        return _say(
+            f"an error in the program: {type(error).__name__}: {error}; {DEBUG_VARIABLE}=1 shows where",
+            INTERNAL,
+        )
+
+
+def _say(sentence: str, code: int) -> int:
+    typer.echo(f"thesisrecon: {' '.join(sentence.split())}", err=True)
+    return code
+
+
+def main() -> None:
+    """The entry point of the command."""
+    sys.exit(run_command(sys.argv[1:]))

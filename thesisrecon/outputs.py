@@ -1,0 +1,135 @@
+"""What a run leaves for its user: the COLMAP model, points, cameras, summary and page."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon import __version__
+from thesisrecon.config import toml_from_config
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io.colmap import colmap_from_reconstruction, write_colmap_model
+from thesisrecon.io.pointcloud import write_point_cloud
+from thesisrecon.io.run_directory import write_atomically, write_json
+from thesisrecon.report import Photograph, ReportData, write_report
+from thesisrecon.report.summary import cameras_table, point_colours, summarize
+from thesisrecon.run import Run
+from thesisrecon.types import Image, Reconstruction, RunResult
+
+THUMBNAIL_PX = 800
+U8 = NDArray[np.uint8]
+
+
+def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFailure | None) -> RunResult:
+    """Write whatever was found, and return it with its summary.
+
+    Raises :class:`UsageError` where the output folder cannot be written.
+    """
+    try:
+        return _write(run, result, until, failure)
+    except OSError as error:
+        raise UsageError(
+            f"the output folder {run.directory.path} cannot be written: {error.strerror}"
+        ) from None
+
+
+def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
+    out, colours = run.directory.path, None
+    with run.clock("outputs"):
+        if result.metric is not None:
+            colours = point_colours(result.metric.reconstruction, result.images)
+            write_model(out, result, result.metric.reconstruction, colours)
+    result = replace(
+        result,
+        warnings=(*run.warnings, *_doubts(result)),
+        reports=tuple(run.reports.values()),
+        failure=str(failure) if failure is not None else "",
+    )
+    found = summarize(result)
+    with run.clock("outputs"):
+        write_atomically(out / "config.toml", toml_from_config(run.config).encode())
+        page = _report_data(run, replace(result, summary=found | _run_facts(run, until)), colours, failure)
+        write_report(out / "report.html", replace(page, until=None if until == "metric" else until))
+    run.finish("outputs", counts={})
+    result = replace(result, reports=tuple(run.reports.values()), summary=found | _run_facts(run, until))
+    write_json(out / "summary.json", result.summary)
+    return result
+
+
+def _doubts(result: RunResult) -> list[str]:
+    """The sentences nobody may overlook."""
+    doubts = []
+    if result.metric is not None and not result.metric.trusted:
+        why = "; ".join(result.metric.doubts)
+        doubts.append(f"the result failed its self-check and is not to be trusted: {why}")
+    if result.calibration is not None and not result.calibration.identifiable:
+        why = "; ".join(result.calibration.reasons)
+        doubts.append(f"these views do not determine the calibration: {why}")
+    return doubts
+
+
+def write_model(out: Path, result: RunResult, reconstruction: Reconstruction, colours: U8) -> None:
+    """``sparse/0``, ``points.ply`` and ``cameras.json`` of a metric reconstruction, in original pixels."""
+    model = colmap_from_reconstruction(
+        reconstruction,
+        [image.name for image in result.images],
+        colors=colours,
+        groups=result.groups,
+        scales=np.array([1 / image.scale for image in result.images]),
+    )
+    write_colmap_model(out / "sparse" / "0", model)
+    X = reconstruction.X[reconstruction.valid]
+    write_point_cloud(out / "points.ply", X[:, :3] / X[:, 3:], colours[reconstruction.valid])
+    write_json(out / "cameras.json", cameras_table(reconstruction, result.images))
+
+
+def _run_facts(run: Run, until: str) -> dict[str, Any]:
+    """What the summary says of the run itself."""
+    seconds = {stage: round(report.seconds, 3) for stage, report in run.reports.items()}
+    return {
+        "version": __version__,
+        "seed": run.seed,
+        "until": until,
+        "threads": run.workers.threads,
+        "executor": run.workers.executor,
+        "seconds": seconds | {"total": round(sum(seconds.values()), 3)},
+        "resumed": list(run.resumed),
+        "peak_memory_mb": round(_peak_memory_mb(), 1),
+    }
+
+
+def _peak_memory_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: StageFailure | None) -> ReportData:
+    photographs = tuple(
+        Photograph(image.name, image.size, image.original_size, _thumbnail(image)) for image in result.images
+    )
+    return ReportData(
+        title=run.directory.path.resolve().name,
+        photographs=photographs,
+        reports=result.reports,
+        config_text=toml_from_config(run.config),
+        summary=result.summary,
+        version=__version__,
+        unread=tuple(result.refused.items()),
+        pairs=result.pairs,
+        reconstruction=result.projective,
+        metric=result.metric,
+        colours=colours,
+        failure=failure,
+    )
+
+
+def _thumbnail(image: Image) -> U8:
+    """Every n-th pixel; the page shrinks it further, with care."""
+    step = max(1, max(image.size) // THUMBNAIL_PX)
+    return image.rgb[::step, ::step]

@@ -1,0 +1,504 @@
+"""Algorithm 1 of the thesis, from photographs to metric cameras: the only place that composes stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Literal, TypedDict, Unpack, get_args
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig, tables_from_config
+from thesisrecon.epipolar import estimate_fundamental as estimate_fundamental
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io.images import ImageSource, PhotographSet, read_photographs
+from thesisrecon.io.run_directory import RunDirectory
+from thesisrecon.outputs import write_outputs
+from thesisrecon.run import Progress, Run, stream
+from thesisrecon.settings import unknown_word
+from thesisrecon.types import (
+    F64,
+    I64,
+    Features,
+    FocalPrior,
+    Image,
+    Reconstruction,
+    RunResult,
+    SelfCalibration,
+    TwoView,
+)
+from thesisrecon.workers import Workers, available_threads
+
+Until = Literal["features", "matches", "projective", "metric"]
+LATER_STAGES = ("dense", "model")
+ATTEMPTS = 3
+MIN_CORNERS = 16
+
+
+class RunOptions(TypedDict, total=False):
+    """How a run is carried out, none of which changes what it finds.
+
+    ``until`` : the last stage ("metric"). ``threads`` : workers (all processors). ``executor`` : "local"
+    threads or "processes". ``overwrite`` : take over a folder that holds another run (False).
+    """
+
+    until: Until
+    threads: int | None
+    executor: str
+    overwrite: bool
+
+
+def reconstruct(
+    images: ImageSource,
+    out: str | Path,
+    *,
+    config: PipelineConfig | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    **options: Unpack[RunOptions],
+) -> RunResult:
+    """Reconstruct metric cameras and points from photographs of one scene.
+
+    Parameters
+    ----------
+    images : a folder, or a sequence of files, uint8 arrays (H, W) or (H, W, 3), or :class:`Image` records.
+    out : the output folder; made where absent, resumed where it holds the same run.
+    config : what runs; the preset ``default`` where None.
+    seed : of all random steps, at least 0. The same photographs, config and seed give the same bytes,
+        whatever the number of workers.
+    progress : hears (stage, done, total) as parts of stages are done.
+    **options : see :class:`RunOptions`.
+
+    Returns
+    -------
+    RunResult : everything that was found, as it also stands in ``out``. The length unit of a reconstruction
+        is free: photographs do not tell it.
+
+    Raises
+    ------
+    UsageError : no such folder of photographs, no photographs in it, an output folder that cannot be
+        written or holds another run.
+    StageFailure : these photographs cannot be reconstructed. What was computed, the summary and the page are
+        in ``out`` all the same.
+    """
+    until, run, overwrite = _start(out, config or PipelineConfig(), seed, progress, options)
+    photographs = _read(run, images)
+    identity = _identity(run, photographs)
+    with run.directory.claimed(identity, overwrite=overwrite):
+        work = _Work(run, photographs, _empty_result(run, photographs), until)
+        try:
+            work.check_photographs()
+            for step in STEPS[until]:
+                step(work)
+        except StageFailure as failure:
+            write_outputs(run, work.result, until=until, failure=failure)
+            raise
+        return write_outputs(run, work.result, until=until, failure=None)
+
+
+@dataclass
+class _Work:
+    """What the steps of one run hand on: ``result`` grows, the rest is what they need beside it."""
+
+    run: Run
+    photographs: PhotographSet
+    result: RunResult
+    until: str
+    prepared: dict[int, Any] | None = None
+
+    @property
+    def config(self) -> PipelineConfig:
+        return self.run.config
+
+    def check_photographs(self) -> None:
+        """Refuse what is too little before anything is computed."""
+        found, needed = len(self.result.images), 1 if self.until == "features" else 2
+        if found < needed:
+            why = "; ".join(f"{name} {reason}" for name, reason in list(self.result.refused.items())[:3])
+            raise StageFailure(
+                f"{found or 'no'} usable photograph{'s' if found != 1 else ''}",
+                f"at least {needed} different ones are needed{'; ' + why if why else ''}",
+                "take more photographs of the scene from other places",
+            )
+
+
+def _start(
+    out: str | Path, config: PipelineConfig, seed: int, progress: Progress | None, options: Mapping[str, Any]
+) -> tuple[Until, Run, bool]:
+    unknown = sorted(set(options) - set(RunOptions.__annotations__))
+    if unknown:
+        raise TypeError(unknown_word("option of reconstruct", unknown[0], RunOptions.__annotations__))
+    until = options.get("until", "metric")
+    if until in LATER_STAGES:
+        raise UsageError(f"the stage {until} does not exist yet; --until metric is the end for now")
+    if until not in get_args(Until):
+        raise UsageError(unknown_word("stage", str(until), get_args(Until)))
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
+    threads = options.get("threads") or available_threads()
+    workers = Workers(threads, options.get("executor", "local"))
+    run = Run(config, seed, workers, RunDirectory(Path(out)), progress or (lambda *_: None))
+    return until, run, bool(options.get("overwrite", False))
+
+
+def _read(run: Run, images: ImageSource) -> PhotographSet:
+    with run.clock("images"):
+        size = run.config.images.max_size_px
+        photographs = read_photographs(images, max_size_px=size, map_all=run.workers.map_all)
+    found, refused = len(photographs.photographs), len(photographs.refused)
+    if found + refused == 0:
+        raise UsageError(
+            f"there are no photographs in {images}" if isinstance(images, str | Path) else "no images"
+        )
+    notes = [f"{p.image.name}: {p.note}" for p in photographs.photographs if p.note]
+    refusals = [f"{name} is left out: it {reason}" for name, reason in photographs.refused.items()]
+    run.finish("images", counts={"read": found, "refused": refused}, warnings=notes + refusals)
+    return photographs
+
+
+def _identity(run: Run, photographs: PhotographSet) -> dict[str, Any]:
+    """What makes two runs the same: settings, seed and the content of the photographs."""
+    digests = {p.image.name: p.digest for p in photographs.photographs}
+    refused = {name: f"refused: {reason}" for name, reason in photographs.refused.items()}
+    settings = tables_from_config(run.config)
+    return {"version": 1, "seed": run.seed, "settings": settings, "photographs": digests | refused}
+
+
+def _empty_result(run: Run, photographs: PhotographSet) -> RunResult:
+    groups = camera_groups(photographs.images, run.config.intrinsics.cameras)
+    return RunResult(
+        out=run.directory.path,
+        images=photographs.images,
+        refused=photographs.refused,
+        features=(),
+        pairs=(),
+        groups=groups,
+        settings=tables_from_config(run.config),
+    )
+
+
+def camera_groups(images: Sequence[Image], cameras: str) -> I64:
+    """(V,) camera numbers: one per distinct size of the originals ("shared"), or one per image
+    ("per-image").
+    """
+    if cameras == "per-image":
+        return np.arange(len(images), dtype=np.int64)
+    sizes = list(dict.fromkeys(image.original_size for image in images))
+    return np.array([sizes.index(image.original_size) for image in images], dtype=np.int64)
+
+
+def focal_prior(config: PipelineConfig, photographs: PhotographSet) -> FocalPrior | None:
+    """What the user allows to assume of the focal lengths, at working size; None where nothing."""
+    wish = config.intrinsics
+    if wish.focal_std_rel is None or not (wish.exif or wish.focal_px is not None):
+        return None
+    scales = np.array([image.scale for image in photographs.images])
+    focal = photographs.exif_focal_px if wish.focal_px is None else np.full(len(scales), wish.focal_px)
+    return FocalPrior(focal * scales, wish.focal_std_rel) if np.isfinite(focal).any() else None
+
+
+# ---------------------------------------------------------------- 4.2.1: features
+
+
+def _detect_features(work: _Work) -> None:
+    run, images = work.run, work.result.images
+    variant = run.variant_key("features")
+    keys = {
+        f"{i:05d}": run.key("features", variant, photograph.digest)
+        for i, photograph in enumerate(work.photographs.photographs)
+    }
+    features = run.kept_all(
+        "features", keys, _detect, lambda missing: [(work.config, images[i]) for i in missing]
+    )
+    work.result = replace(work.result, features=tuple(features))
+    counts = [len(f.xy) for f in features]
+    poor = [
+        f"{image.name} has only {n} corners"
+        for image, n in zip(images, counts, strict=True)
+        if n < MIN_CORNERS
+    ]
+    run.finish(
+        "features",
+        counts={"images": len(images), "corners": sum(counts), "fewest_in_one_image": min(counts)},
+        warnings=poor,
+    )
+
+
+def _detect(config: PipelineConfig, image: Image) -> Features:
+    return config.features.detect(image)
+
+
+# ---------------------------------------------------------------- 4.2.2 and chapter 5: pairs of views
+
+
+def _match_pairs(work: _Work) -> None:
+    run, result = work.run, work.result
+    pairs = list(combinations(range(len(result.images)), 2))
+    variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
+    features = list(run.logs["features"].keys.values())
+    keys = {
+        f"{i:05d}-{j:05d}": run.key("matches", variants, features[i], features[j], run.seed, i, j)
+        for i, j in pairs
+    }
+
+    def arguments(missing: Sequence[int]) -> list[tuple[Any, ...]]:
+        prepared = _prepared(work, "matches")
+        return [
+            (work.config, prepared[i], prepared[j], (i, j), run.seed) for i, j in (pairs[n] for n in missing)
+        ]
+
+    two_views: list[TwoView] = run.kept_all("matches", keys, _match, arguments)
+    work.result = replace(result, pairs=tuple(two_views))
+    accepted = [pair for pair in two_views if pair.accepted]
+    counts = {"pairs": len(pairs), "accepted": len(accepted), "verified": sum(p.inliers for p in accepted)}
+    metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
+    run.finish("matches", counts=counts, metrics=metrics)
+
+
+def _prepared(work: _Work, stage: str) -> dict[int, Any]:
+    """What matching needs of each view, made once; None for a view with too few corners to match."""
+    if work.prepared is None:
+        result = work.result
+        with work.run.clock(stage):
+            views = work.run.workers.map_all(
+                lambda given: _prepare(work.config, *given),
+                list(zip(result.images, result.features, strict=True)),
+            )
+        work.prepared = dict(enumerate(views))
+    return work.prepared
+
+
+def _prepare(config: PipelineConfig, image: Image, features: Features) -> Any:
+    return config.matching.prepare(image, features)
+
+
+def _match(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
+    """Match, estimate F, verify; a pair that cannot give an F is a refused pair, not an end of the run."""
+    rng = stream(seed, "matches", *pair)
+    candidates = 0
+    try:
+        matches = config.matching.match(
+            view1, view2, pair=pair, estimate_fundamental=config.epipolar.estimate, rng=rng
+        )
+        candidates = len(matches.xy1)
+        fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
+        return config.verification.verify(matches, fit)
+    except StageFailure as failure:
+        return _refused_pair(pair, candidates, str(failure))
+
+
+def _refused_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:
+    nothing = np.zeros(0, dtype=np.int64)
+    return TwoView(
+        i=pair[0],
+        j=pair[1],
+        F=np.zeros((3, 3)),
+        sigma_px=float("nan"),
+        index1=nothing,
+        index2=nothing,
+        xy1=np.zeros((0, 2)),
+        xy2=np.zeros((0, 2)),
+        affine=np.zeros((0, 2, 2)),
+        candidates=candidates,
+        homography_share=float("nan"),
+        accepted=False,
+        reason=reason,
+    )
+
+
+def _build_tracks(work: _Work) -> None:
+    run, result = work.run, work.result
+    accepted = [pair for pair in result.pairs if pair.accepted]
+    if not accepted:
+        best = max(result.pairs, key=lambda pair: pair.inliers)
+        raise StageFailure(
+            "no two photographs could be matched",
+            f"the best of {len(result.pairs)} pairs has {best.inliers} verified matches: {best.reason}",
+            "take photographs with more overlap of a scene with texture, all of the same scene",
+        )
+    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
+    tracks = run.kept(
+        "tracks",
+        "tracks",
+        key,
+        lambda: work.config.tracks.build(
+            [_prepared(work, "matches")[i] for i in range(len(result.images))],
+            result.pairs,
+            stream(run.seed, "tracks"),
+        ),
+    )
+    work.result = replace(result, tracks=tracks)
+    seen = np.bincount(tracks.point_index, minlength=tracks.n_points)
+    counts = {
+        "points": tracks.n_points,
+        "observations": len(tracks.xy),
+        "seen_3_times": int((seen >= 3).sum()),
+    }
+    run.finish("tracks", counts=counts)
+
+
+# ---------------------------------------------------------------- chapters 6 and 7, and the metric stage
+
+
+def _reconstruct_projective(work: _Work, attempt: int = 0) -> None:
+    run, result = work.run, work.result
+    assert result.tracks is not None
+    tracks, sizes = result.tracks, np.array([image.size for image in result.images], dtype=np.int64)
+    key = run.key("projective", run.variant_key("projective"), run.logs["tracks"].keys, run.seed, attempt)
+    run.progress("projective", 0, 1)
+    projective = run.kept(
+        "projective",
+        f"attempt-{attempt}",
+        key,
+        lambda: work.config.projective.reconstruct(
+            tracks, result.pairs, sizes, rng=stream(run.seed, "projective", attempt), attempt=attempt
+        ),
+    )
+    work.result = replace(result, projective=projective)
+    counts = {"registered": int(projective.registered.sum()), "points": int(projective.valid.sum())}
+    run.finish("projective", counts=counts, metrics={"sigma_px": projective.sigma_px})
+    run.progress("projective", 1, 1)
+
+
+def _calibrate(work: _Work, attempt: int) -> None:
+    run, prior = work.run, focal_prior(work.config, work.photographs)
+    projective, groups = work.result.projective, work.result.groups
+    assert projective is not None
+    upstream = run.logs["projective"].keys[f"attempt-{attempt}"]
+    assumed = [groups, [prior.focal_px, prior.std_rel] if prior else None]
+    key = run.key("selfcalibration", run.variant_key("selfcalibration"), upstream, assumed, run.seed)
+    run.progress("selfcalibration", 0, 1)
+    calibration = run.kept(
+        "selfcalibration",
+        f"attempt-{attempt}",
+        key,
+        lambda: work.config.selfcalibration.calibrate(
+            projective,
+            groups=groups,
+            focal_prior=prior,
+            rng=stream(run.seed, "selfcalibration", attempt),
+        ),
+    )
+    work.result = replace(work.result, calibration=calibration)
+    counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
+    run.finish("selfcalibration", counts=counts)
+    run.progress("selfcalibration", 1, 1)
+
+
+def _refine(work: _Work, attempt: int) -> None:
+    run, prior = work.run, focal_prior(work.config, work.photographs)
+    projective, calibration = work.result.projective, work.result.calibration
+    assert projective is not None
+    assert calibration is not None
+    upstream = run.logs["selfcalibration"].keys[f"attempt-{attempt}"]
+    key = run.key("metric", run.variant_key("metric"), upstream, run.seed)
+    run.progress("metric", 0, 1)
+    metric = run.kept(
+        "metric",
+        f"attempt-{attempt}",
+        key,
+        lambda: work.config.metric.refine(
+            projective,
+            calibration,
+            groups=work.result.groups,
+            focal_prior=prior,
+            rng=stream(run.seed, "metric", attempt),
+        ),
+    )
+    work.result = replace(work.result, metric=metric)
+    best = metric.reconstruction
+    counts = {"registered": int(best.registered.sum()), "points": int(best.valid.sum())}
+    run.finish("metric", counts=counts, metrics={"sigma_px": best.sigma_px})
+    run.progress("metric", 1, 1)
+
+
+def _reconstruct_metric(work: _Work) -> None:
+    """Projective, self-calibration, metric; where the self-check fails, again from another initial pair.
+
+    Kept is the first result that is trusted; else the one with most cameras, then most points.
+    """
+    tried: list[RunResult] = []
+    failures: list[StageFailure] = []
+    start = work.result
+    for attempt in range(ATTEMPTS):
+        work.result = start
+        try:
+            _reconstruct_projective(work, attempt)
+            _calibrate(work, attempt)
+            _refine(work, attempt)
+        except StageFailure as failure:
+            failures.append(failure)
+            tried.append(work.result)
+            continue
+        tried.append(work.result)
+        if work.result.metric is not None and work.result.metric.trusted:
+            break
+    work.result = max(tried, key=_quality)
+    if work.result.metric is None:
+        raise failures[0]
+    if len(tried) > 1:
+        work.run.warnings.append(f"{len(tried)} initial pairs were tried; the best result was kept")
+
+
+def _quality(result: RunResult) -> tuple[bool, bool, int, int]:
+    best = result.metric.reconstruction if result.metric is not None else result.projective
+    if best is None:
+        return False, False, 0, 0
+    trusted = result.metric is not None and result.metric.trusted
+    return result.metric is not None, trusted, int(best.registered.sum()), int(best.valid.sum())
+
+
+STEPS = {
+    "features": (_detect_features,),
+    "matches": (_detect_features, _match_pairs),
+    "projective": (_detect_features, _match_pairs, _build_tracks, _reconstruct_projective),
+    "metric": (_detect_features, _match_pairs, _build_tracks, _reconstruct_metric),
+}
+
+
+# ---------------------------------------------------------------- one stage at a time
+
+
+def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0) -> TwoView:
+    """Verified matches and F of two photographs (files or uint8 arrays), in pixels at working size.
+
+    Raises :class:`StageFailure` where one of them cannot be read or they do not match.
+    """
+    config = config or PipelineConfig()
+    photographs = [_read_one(image, config) for image in (image1, image2)]
+    views = [_prepare(config, image, _detect(config, image)) for image in photographs]
+    pair = _match(config, views[0], views[1], (0, 1), seed)
+    if not pair.accepted:
+        raise StageFailure("the two photographs do not match", pair.reason)
+    return pair
+
+
+def _read_one(image: Any, config: PipelineConfig) -> Image:
+    photographs = read_photographs([image], max_size_px=config.images.max_size_px)
+    for name, reason in photographs.refused.items():
+        raise StageFailure(f"{name} {reason}")
+    return photographs.images[0]
+
+
+def self_calibrate(
+    reconstruction: Reconstruction, *, config: PipelineConfig | None = None, seed: int = 0
+) -> SelfCalibration:
+    """The metric frame and the intrinsics of a projective reconstruction (chapter 7).
+
+    Cameras of one image size are taken for one camera, unless ``config.intrinsics.cameras`` says otherwise.
+    """
+    config = config or PipelineConfig()
+    sizes = [tuple(size) for size in reconstruction.sizes.tolist()]
+    if config.intrinsics.cameras == "per-image":
+        groups = np.arange(len(sizes), dtype=np.int64)
+    else:
+        groups = np.array([sizes.index(size) for size in sizes], dtype=np.int64)
+    focal: F64 | None = None
+    if config.intrinsics.focal_px is not None:
+        focal = np.full(len(sizes), config.intrinsics.focal_px)
+    weight = config.intrinsics.focal_std_rel
+    prior = FocalPrior(focal, weight) if focal is not None and weight is not None else None
+    rng = stream(seed, "selfcalibration")
+    return config.selfcalibration.calibrate(reconstruction, groups=groups, focal_prior=prior, rng=rng)

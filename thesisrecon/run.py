@@ -1,0 +1,158 @@
+"""One run while it goes on: its settings, workers and folder, and the clock, cache and reports of its
+stages.
+"""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig, kind_of, tables_from_config
+from thesisrecon.io.run_directory import RunDirectory, code_key, key_of
+from thesisrecon.settings import table_from_dataclass
+from thesisrecon.types import StageReport
+from thesisrecon.workers import Workers
+
+Progress = Callable[[str, int, int], None]
+"""Hears (stage, done, total) whenever a part of a stage is done; called from the thread of the caller."""
+
+FOLDERS: Mapping[str, str] = {
+    "features": "01-features",
+    "matches": "02-matches",
+    "tracks": "03-tracks",
+    "projective": "04-projective",
+    "selfcalibration": "05-selfcalibration",
+    "metric": "06-metric",
+}
+
+
+def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
+    """The random numbers of one task: they depend on (seed, stage, ids) and on nothing that ran before."""
+    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(stage.encode()), *ids]))
+
+
+@dataclass
+class StageLog:
+    """What is known of a stage so far."""
+
+    seconds: float = 0.0
+    keys: dict[str, str] = field(default_factory=dict)
+    computed: int = 0
+
+
+@dataclass
+class Run:
+    """The settings and the state of one run; the only thing here that changes."""
+
+    config: PipelineConfig
+    seed: int
+    workers: Workers
+    directory: RunDirectory
+    progress: Progress
+    logs: dict[str, StageLog] = field(default_factory=dict)
+    reports: dict[str, StageReport] = field(default_factory=dict)
+    resumed: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def clock(self, stage: str) -> Iterator[StageLog]:
+        """Count the time of the block to the stage."""
+        log = self.logs.setdefault(stage, StageLog())
+        start = time.perf_counter()
+        try:
+            yield log
+        finally:
+            log.seconds += time.perf_counter() - start
+
+    def variant_key(self, stage: str) -> list[Any]:
+        """What names the variant of a stage in a key: its kind, its parameters and its code."""
+        variant = getattr(self.config, stage)
+        module = type(variant).__module__
+        return [module, type(variant).__qualname__, table_from_dataclass(variant), code_key(module)]
+
+    def kept(self, stage: str, item: str, key: str, compute: Callable[[], Any]) -> Any:
+        """The record of one item of a stage: read where it was kept under this key, else computed and
+        kept.
+        """
+        with self.clock(stage) as log:
+            log.keys[item] = key
+            folder = self.directory.stage(FOLDERS[stage])
+            record = folder.load(item, key)
+            if record is None:
+                record = compute()
+                log.computed += 1
+                folder.save(item, key, record)
+            return record
+
+    def kept_all(
+        self,
+        stage: str,
+        keys: Mapping[str, str],
+        function: Callable[..., Any],
+        arguments: Callable[[Sequence[int]], Sequence[tuple[Any, ...]]],
+    ) -> list[Any]:
+        """The records of all items of a stage, in order; those that were not kept are computed by the
+        workers.
+
+        ``arguments`` is given the numbers of the missing items and returns what ``function`` takes for each.
+        """
+        with self.clock(stage) as log:
+            log.keys.update(keys)
+            folder = self.directory.stage(FOLDERS[stage])
+            names = list(keys)
+            records = [folder.load(name, keys[name]) for name in names]
+            missing = [n for n, record in enumerate(records) if record is None]
+            done = len(names) - len(missing)
+            self.progress(stage, done, len(names))
+
+            def finished(k: int, record: Any) -> None:
+                nonlocal done
+                n = missing[k]
+                records[n] = record
+                folder.save(names[n], keys[names[n]], record)
+                done, log.computed = done + 1, log.computed + 1
+                self.progress(stage, done, len(names))
+
+            if missing:
+                self.workers.run(function, arguments(missing), finished)
+            return records
+
+    def finish(
+        self,
+        stage: str,
+        *,
+        counts: Mapping[str, int],
+        metrics: Mapping[str, float] | None = None,
+        warnings: Sequence[str] = (),
+    ) -> None:
+        """End a stage: its report, and in its folder the manifest. A stage that was only read keeps its old
+        report.
+        """
+        log = self.logs.setdefault(stage, StageLog())
+        report = StageReport(stage, log.seconds, dict(counts), dict(metrics or {}), tuple(warnings))
+        if stage in FOLDERS:
+            folder = self.directory.stage(FOLDERS[stage])
+            old = None if log.computed else folder.finished(log.keys)
+            if old is not None:
+                self.resumed.append(stage)
+                report = old
+            else:
+                folder.finish(report, self._settings_of(stage), log.keys)
+        self.reports[stage] = report
+        self.warnings.extend(w for w in warnings if w not in self.warnings)
+
+    def _settings_of(self, stage: str) -> dict[str, Any]:
+        """The tables a stage runs by."""
+        stages = ("matching", "epipolar", "verification") if stage == "matches" else (stage,)
+        tables = tables_from_config(self.config)
+        return {s: {"kind": kind_of(s, getattr(self.config, s))} | tables[s] for s in stages}
+
+    def key(self, stage: str, *parts: Any) -> str:
+        """The key of an item of this stage made from these parts."""
+        return key_of(FOLDERS[stage], *parts)
