@@ -101,7 +101,7 @@ def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure
     labels = [_block_label(first, block, names) for first in range(0, len(names), block)]
     accepted, refused = (_count_matrix(pairs, len(labels), block, wanted) for wanted in (True, False))
     refused[accepted >= 0] = -1
-    counts = np.concatenate([accepted[accepted >= 0], refused[refused >= 0]])
+    counts = accepted[accepted >= 0] if (accepted >= 0).any() else refused[refused >= 0]
     # At least a factor of ten from the palest to the darkest, so that small differences do not look large.
     high = max(1.0, float(np.log10(counts.max(initial=10))))
     low = max(0.0, min(float(np.log10(max(counts.min(initial=10**9), 1))), high - 1.0))
