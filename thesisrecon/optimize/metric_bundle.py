@@ -332,7 +332,7 @@ def _robust_sigma(residual: F64, parameters: int) -> float:
     starting from the median, corrected for the trimming of a normal distribution and for the fitted
     freedoms."""
     size, count = np.abs(residual).ravel(), residual.size
-    if count <= parameters:
+    if count <= max(parameters, 0):
         return 0.0
     sigma = MAD_TO_SIGMA * float(np.median(size))
     for _ in range(5):
@@ -354,8 +354,8 @@ def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale:
     S = np.triu(S) + np.triu(S, 1).T
     views, n_free = np.flatnonzero(problem.free_views), len(problem.free)
     covariance = np.zeros_like(S)
-    if len(views) == len(state.t):
-        N = _gauge_directions(state, len(S))
+    if problem.free_views[problem.observations.view_index].all():
+        N = _gauge_directions(state, views, len(S))
         weight = float(np.median(np.diag(S))) if len(S) else 1.0
         covariance = invert_information(S + weight * N @ N.T)
         covariance = covariance - N @ (N.T @ covariance @ N) @ N.T
@@ -376,13 +376,14 @@ def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale:
     return intrinsics, poses
 
 
-def _gauge_directions(state: _State, size: int) -> F64:
+def _gauge_directions(state: _State, views: I64, size: int) -> F64:
     """Orthonormal (D, 7): how the poses move when the world is shifted, turned and scaled."""
-    directions = np.zeros((len(state.t), POSE_DOF, SIMILARITY_DOF))
-    directions[:, 3:, 0:3] = -state.R
-    directions[:, :3, 3:6] = -state.R
-    directions[:, 3:, 3:6] = -cross_matrix(state.t) @ state.R
-    directions[:, 3:, 6] = state.t
+    R, t = state.R[views], state.t[views]
+    directions = np.zeros((len(views), POSE_DOF, SIMILARITY_DOF))
+    directions[:, 3:, 0:3] = -R
+    directions[:, :3, 3:6] = -R
+    directions[:, 3:, 3:6] = -cross_matrix(t) @ R
+    directions[:, 3:, 6] = t
     N = np.zeros((size, SIMILARITY_DOF))
     N[: directions.shape[0] * POSE_DOF] = directions.reshape(-1, SIMILARITY_DOF)
     return np.asarray(np.linalg.qr(N)[0])

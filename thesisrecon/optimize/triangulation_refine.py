@@ -280,7 +280,7 @@ def refine_pose(
             f"refine_pose needs finite (M, 2) pixels and a positive focal; got {xy.shape}, {q[0]}"
         )
     columns = np.flatnonzero(np.zeros(6, bool) if free is None else free)
-    # Centred and scaled points: turning about the middle hardly moves them, so the freedoms are well separated.
+    # Centred and scaled points: the pose's freedoms are of one size and well separated.
     origin = X.mean(axis=0)
     size = float(np.linalg.norm(X - origin, axis=1).mean())
     scale = 1.0 / size if size > 0.0 else 1.0

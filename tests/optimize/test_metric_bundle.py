@@ -1,0 +1,197 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.optimize.bundle_scenes import make_block, perturbed, project_block
+from thesisrecon.geometry.alignment import estimate_similarity
+from thesisrecon.optimize.metric_bundle import IntrinsicsPrior, MetricCameras, refine_metric_bundle
+
+FOCAL = np.array([True, False, False, False, False, False])
+FOCAL_CENTRE_RADIAL = np.array([True, False, False, True, True, True])
+
+
+@pytest.mark.parametrize("groups", [1, 6])
+def test_exact_observations_give_the_true_calibration_and_shape(groups):
+    block = make_block(k1=0.03, groups=groups)
+    cameras, X = perturbed(block)
+    result = refine_metric_bundle(
+        cameras, X, block.view, block.point, block.xy, free=FOCAL_CENTRE_RADIAL, max_iterations=100
+    )
+    assert np.abs(result.residual_px).max() < 1e-3
+    np.testing.assert_allclose(result.cameras.intrinsics, block.cameras.intrinsics, rtol=1e-3, atol=2e-3)
+    aligned = estimate_similarity(result.X, block.X).apply(result.X)
+    np.testing.assert_allclose(aligned, block.X, atol=2e-3)
+    seen = project_block(result.cameras, result.X, block.view, block.point)
+    np.testing.assert_allclose(seen - block.xy, result.residual_px, atol=1e-6)
+
+
+def test_cost_does_not_depend_on_the_frame():
+    block = make_block()
+    cameras, X = perturbed(block)
+    xy = block.xy + 0.5 * np.random.default_rng(0).normal(size=block.xy.shape)
+    first = refine_metric_bundle(cameras, X, block.view, block.point, xy, free=FOCAL, max_iterations=60)
+    s, shift, Q = 250.0, np.array([1e4, -3e3, 8e3]), block.cameras.R[2]
+    moved = MetricCameras(
+        cameras.R @ Q.T, s * cameras.t - cameras.R @ Q.T @ shift, cameras.intrinsics, cameras.group
+    )
+    second = refine_metric_bundle(
+        moved, s * X @ Q.T + shift, block.view, block.point, xy, free=FOCAL, max_iterations=60
+    )
+    assert second.initial_cost == pytest.approx(first.initial_cost, rel=1e-6)
+    assert second.cost == pytest.approx(first.cost, rel=1e-5)
+    np.testing.assert_allclose(second.cameras.intrinsics, first.cameras.intrinsics, rtol=1e-4)
+
+
+def _noisy_fits(block, count, sigma, **options):
+    rng = np.random.default_rng(11)
+    for _ in range(count):
+        xy = block.xy + sigma * rng.normal(size=block.xy.shape)
+        yield refine_metric_bundle(
+            block.cameras, block.X, block.view, block.point, xy, free=FOCAL_CENTRE_RADIAL, loss_px=100.0,
+            sigma_px=sigma, max_iterations=10, covariance=True, **options,
+        )  # fmt: skip
+
+
+def test_covariance_and_sigma_agree_with_monte_carlo():
+    block = make_block(points=60)
+    fits = list(_noisy_fits(block, 150, 0.4))
+    q = np.array([fit.cameras.intrinsics[0] for fit in fits])[:, FOCAL_CENTRE_RADIAL]
+    predicted = np.array([np.diag(fit.intrinsics_covariance[0]) for fit in fits])[:, FOCAL_CENTRE_RADIAL]
+    ratio = q.std(axis=0) / np.sqrt(predicted.mean(axis=0))
+    # A standard deviation from 150 samples is itself known to 6 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.25)
+    assert np.mean([fit.sigma_px for fit in fits]) == pytest.approx(0.4, rel=0.05)
+
+
+def test_views_without_observations_do_not_change_the_covariance():
+    block = make_block(views=5, points=40)
+    c = block.cameras
+    extra = MetricCameras(
+        np.concatenate([c.R, np.eye(3)[None]]),
+        np.concatenate([c.t, np.ones((1, 3))]),
+        c.intrinsics,
+        np.zeros(6, int),
+    )
+    xy = block.xy + 0.2 * np.random.default_rng(3).normal(size=block.xy.shape)
+    fits = [
+        refine_metric_bundle(start, block.X, block.view, block.point, xy, free=FOCAL, covariance=True)
+        for start in (c, extra)
+    ]
+    np.testing.assert_allclose(fits[1].intrinsics_covariance, fits[0].intrinsics_covariance, rtol=1e-9)
+    np.testing.assert_allclose(fits[1].pose_covariance[:5], fits[0].pose_covariance, rtol=1e-9)
+    assert not fits[1].pose_covariance[5].any()
+
+
+def test_intrinsics_covariance_is_that_of_the_dense_normal_matrix_in_another_gauge():
+    block = make_block(views=4, points=25)
+    xy = block.xy + 0.2 * np.random.default_rng(3).normal(size=block.xy.shape)
+    fit = refine_metric_bundle(
+        block.cameras, block.X, block.view, block.point, xy, free=FOCAL, loss_px=100.0, covariance=True
+    )
+    c, h = fit.cameras, 1e-6
+    n_pose, n_points = 6 * 3, 3 * len(fit.X)
+
+    def project(x):
+        # The first camera stays, and so does one coordinate of the second one's position (the scale).
+        pose = np.zeros((4, 6))
+        pose[1:] = x[:n_pose].reshape(3, 6)
+        turn = Rotation.from_rotvec(pose[:, :3]).as_matrix()
+        q = c.intrinsics.copy()
+        q[0, 0] *= np.exp(x[-1])
+        t = np.einsum("vab,vb->va", turn, c.t) + pose[:, 3:]
+        moved = MetricCameras(turn @ c.R, t, q, c.group)
+        return project_block(moved, fit.X + x[n_pose:-1].reshape(-1, 3), block.view, block.point).ravel()
+
+    size = n_pose + n_points + 1
+    J = np.column_stack([(project(h * e) - project(-h * e)) / (2 * h) for e in np.eye(size)])
+    J = np.delete(J, 3, axis=1)
+    expected = fit.sigma_px**2 * np.linalg.inv(J.T @ J)[-1, -1] * c.intrinsics[0, 0] ** 2
+    assert fit.intrinsics_covariance[0, 0, 0] == pytest.approx(expected, rel=1e-3)
+    assert np.count_nonzero(fit.intrinsics_covariance) == 1
+    assert fit.pose_covariance.shape == (4, 6, 6)
+    assert (np.linalg.eigvalsh(fit.pose_covariance) > -1e-12).all()
+
+
+def test_a_tight_prior_holds_and_a_loose_one_yields():
+    block = make_block()
+    mean = block.cameras.intrinsics.copy()
+    mean[:, 0] *= 1.1
+
+    def focal(std_rel):
+        std = np.full((1, 6), np.inf)
+        std[0, 0] = std_rel
+        return refine_metric_bundle(
+            block.cameras, block.X, block.view, block.point, block.xy, free=FOCAL, max_iterations=50,
+            prior=IntrinsicsPrior(mean, std), sigma_px=0.3,
+        ).cameras.intrinsics[0, 0]  # fmt: skip
+
+    assert focal(1e-7) == pytest.approx(mean[0, 0], rel=1e-3)
+    assert focal(1.0) == pytest.approx(1200.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "soft_l1"])
+def test_outliers_hardly_move_the_focal_under_a_robust_loss(loss):
+    block = make_block(points=150)
+    rng = np.random.default_rng(9)
+    xy = block.xy + 0.2 * rng.normal(size=block.xy.shape)
+    wrong = rng.choice(len(xy), 20, replace=False)
+    xy[wrong] += rng.uniform(15.0, 40.0, size=(20, 2))
+    result = refine_metric_bundle(
+        block.cameras,
+        block.X,
+        block.view,
+        block.point,
+        xy,
+        free=FOCAL,
+        loss=loss,
+        loss_px=0.5,
+        max_iterations=60,
+    )
+    assert result.cameras.intrinsics[0, 0] == pytest.approx(1200.0, rel=5e-3)
+    assert result.sigma_px < 0.35
+
+
+def test_fixed_and_unseen_parts_come_back_untouched():
+    block = make_block()
+    cameras, X = perturbed(block)
+    X = np.concatenate([X, [[9.0, 9.0, 9.0]]])
+    fixed = np.array([True, False, False, False, False, True])
+    result = refine_metric_bundle(
+        cameras,
+        X,
+        block.view,
+        block.point,
+        block.xy,
+        free=np.zeros(6, bool),
+        fixed_views=fixed,
+        covariance=True,
+    )
+    np.testing.assert_array_equal(result.cameras.R[fixed], cameras.R[fixed])
+    np.testing.assert_array_equal(result.cameras.t[fixed], cameras.t[fixed])
+    np.testing.assert_array_equal(result.cameras.intrinsics, cameras.intrinsics)
+    np.testing.assert_array_equal(result.X[-1], X[-1])
+    assert result.cost < result.initial_cost
+    assert not result.pose_covariance[fixed].any()
+
+
+def test_degenerate_and_wrong_input_is_guarded():
+    block = make_block()
+    c = block.cameras
+    empty = np.zeros(0, dtype=np.int64)
+    nothing = refine_metric_bundle(c, block.X, empty, empty, np.zeros((0, 2)), free=FOCAL, covariance=True)
+    assert nothing.cost == 0.0
+    # All cameras at one place: depths are free, nothing may raise.
+    same = MetricCameras(c.R, np.zeros_like(c.t), c.intrinsics, c.group)
+    far = np.tile([0.0, 0.0, 5.0], (len(block.X), 1))
+    turned = refine_metric_bundle(
+        same, far + 0.1 * block.X, block.view, block.point, block.xy, free=FOCAL, covariance=True
+    )
+    assert turned.cost <= turned.initial_cost
+    assert np.isfinite(turned.X).all()
+    with pytest.raises(ValueError, match="6 intrinsics"):
+        refine_metric_bundle(c, block.X, block.view, block.point, block.xy, free=np.ones(3, bool))
+    negative = MetricCameras(c.R, c.t, -c.intrinsics, c.group)
+    with pytest.raises(ValueError, match="positive"):
+        refine_metric_bundle(negative, block.X, block.view, block.point, block.xy, free=FOCAL)
+    with pytest.raises(ValueError, match="sigma_px"):
+        refine_metric_bundle(c, block.X, block.view, block.point, block.xy, free=FOCAL, sigma_px=0.0)
