@@ -97,7 +97,9 @@ def monic_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     Q = (a * a - 3.0 * b) / 9.0
     R = (2.0 * a * a * a - 9.0 * a * b + 27.0 * c) / 54.0
     gap = R * R - Q * Q * Q
+    # What the rounding of a, b and c leaves of R^2 - Q^3: within it a double root is a double root.
     small = 1e-12 * (R * R + abs(Q * Q * Q))
+    small += 4e-15 * (Q * Q * (a * a + abs(b)) + abs(R) * (abs(a * a * a) + abs(a * b) + abs(c)))
     count = 1
     if gap < -small:
         theta = np.arccos(min(1.0, max(-1.0, R / np.sqrt(Q * Q * Q))))

@@ -25,6 +25,8 @@ B8 = NDArray[np.bool_]
 CHI2_1_95 = 3.841458820694124
 """95 % of a chi-square variable with one degree of freedom lies below."""
 MINIMUM = 8
+EXACT_PX = 1e-6
+"""Residuals below are rounding, not noise."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,9 @@ class ThesisRansac:
     """Section 5.4 as it stands, its slips corrected.
 
     Draw ``samples`` samples of seven, or stop once a share ``enough_share`` of the matches are inliers; keep
-    the F with the most; estimate sigma by the median (1.4826 (1 + 5 / (n - 7)) median |d|; the text divides
-    by Phi(0.75) where Phi^-1(0.75) is meant), discard the outliers, minimise the gradient criterion (5.4), or
-    the distances to the epipolar lines (5.6) with ``epipolar_distance``, and discard once more.
+    the F with the most; estimate sigma by the median (1.4826 (1 + 5 / (n - 7)) median |d|; the text divides by
+    Phi(0.75) where Phi^-1(0.75) is meant) and discard the outliers; then ``rounds`` times minimise the gradient
+    criterion (5.4), or the distances to the epipolar lines (5.6) with ``epipolar_distance``, and discard again.
 
     Departures: a match is tested by its Sampson distance against the chi-square of one degree of freedom (the
     two epipolar distances are multiples of one residual, so their sum is not a chi-square of two); the search
@@ -68,12 +70,13 @@ class ThesisRansac:
     samples: int = 1000
     enough_share: float = 0.95
     epipolar_distance: bool = False
+    rounds: int = 2
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
-        if self.samples < 1 or not 0.0 < self.enough_share <= 1.0:
-            raise ValueError("a search needs samples >= 1 and 0 < enough_share <= 1")
+        if min(self.samples, self.rounds) < 1 or not 0.0 < self.enough_share <= 1.0:
+            raise ValueError("a search needs samples >= 1, rounds >= 1 and 0 < enough_share <= 1")
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """F of matches (N >= 8, 2) px; raises as
@@ -89,18 +92,20 @@ class ThesisRansac:
                 f"{self.samples} samples, none with {MINIMUM} of {len(xy1)} matches close enough",
                 "The photographs may not overlap, or the matches are wrong",
             )
-        sigma, inliers = self._discard(found.model, xy1, xy2, found.inliers)
+        _, inliers = self._discard(found.model, xy1, xy2)
         refine = refine_epipolar_distance if self.epipolar_distance else refine_gradient
-        F = refine(found.model, xy1[inliers], xy2[inliers])
-        sigma, inliers = self._discard(F, xy1, xy2, inliers)
+        F, sigma = found.model, 0.0
+        for _ in range(self.rounds):
+            F = refine(F, xy1[inliers], xy2[inliers])
+            sigma, inliers = self._discard(F, xy1, xy2)
         f = frame.matrix_in_frame(F)
         covariance = fundamental_covariance(frame, f, problem.points[inliers], sigma * frame.scale)
         return FundamentalFit(F, inliers, sigma, covariance, found.samples)
 
-    @staticmethod
-    def _discard(F: F64, xy1: F64, xy2: F64, among: B8) -> tuple[float, B8]:
-        """sigma of the matches believed so far, and which matches pass the test with it."""
+    def _discard(self, F: F64, xy1: F64, xy2: F64) -> tuple[float, B8]:
+        """sigma by the matches near the epipolar lines of F, and which matches pass the test with it."""
         residuals = np.abs(sampson_residuals(F, xy1, xy2))
-        sigma = noise_scale(residuals[among])
-        inliers = residuals**2 <= max(CHI2_1_95 * sigma**2, 1e-12)
-        return sigma, inliers if inliers.sum() >= MINIMUM else among
+        limit = max(self.threshold_px, float(np.partition(residuals, MINIMUM - 1)[MINIMUM - 1]))
+        sigma = noise_scale(residuals[residuals <= limit])
+        inliers = residuals**2 <= max(CHI2_1_95 * sigma**2, EXACT_PX**2)
+        return sigma, inliers if inliers.sum() >= MINIMUM else residuals <= limit

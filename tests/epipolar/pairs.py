@@ -1,0 +1,53 @@
+"""Two views of synthetic scenes with known geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.geometry.camera import compose_camera, project
+from thesisrecon.geometry.multiview import fundamental_from_cameras
+
+F64 = NDArray[np.float64]
+SIZE = (1280.0, 960.0)
+K = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 480.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Exact matches xy1, xy2 of cameras P1, P2 with F."""
+
+    xy1: F64
+    xy2: F64
+    F: F64
+    P1: F64
+    P2: F64
+
+
+def make_pair(n: int, rng: np.random.Generator, *, planar: bool = False) -> Pair:
+    """n points about 5 units in front of two cameras one unit apart, turned by about 10 degrees."""
+    X = rng.uniform(-1.2, 1.2, (n, 3))
+    if planar:
+        X[:, 2] = 0.3 * X[:, 0] - 0.2 * X[:, 1]
+    X += [0.0, 0.0, 5.0]
+    R = Rotation.from_rotvec(rng.normal((0.0, 0.15, 0.0), 0.05)).as_matrix()
+    centre = np.array([1.0, 0.0, 0.0]) + rng.normal(0.0, 0.1, 3)
+    P1, P2 = compose_camera(K, np.eye(3), np.zeros(3)), compose_camera(K, R, -R @ centre)
+    return Pair(project(P1, X), project(P2, X), fundamental_from_cameras(P1, P2), P1, P2)
+
+
+def spoil(pair: Pair, rng: np.random.Generator, *, sigma: float, outliers: float) -> tuple[F64, F64, F64]:
+    """Noise on every coordinate, a share of image 2's points anywhere; xy1, xy2 and which are wrong (N,)."""
+    xy1 = pair.xy1 + rng.normal(0.0, sigma, pair.xy1.shape)
+    xy2 = pair.xy2 + rng.normal(0.0, sigma, pair.xy2.shape)
+    wrong = rng.random(len(xy1)) < outliers
+    xy2[wrong] = rng.uniform((0.0, 0.0), SIZE, (int(wrong.sum()), 2))
+    return xy1, xy2, wrong
+
+
+def angle_between(F1: F64, F2: F64) -> float:
+    """Angle of two unit matrices up to sign, rad."""
+    return float(min(np.linalg.norm(F1 - F2), np.linalg.norm(F1 + F2)))

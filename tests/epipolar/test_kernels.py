@@ -1,0 +1,222 @@
+"""The compiled loops against plain NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.epipolar.pairs import make_pair
+from thesisrecon.epipolar import kernels
+from thesisrecon.epipolar.frame import PairFrame
+from thesisrecon.epipolar.rank2 import kernels as rank2
+from thesisrecon.geometry.multiview import algebraic_residuals, sampson_residuals, symmetric_residuals
+
+seeds = st.integers(0, 2**31)
+
+
+def noisy_points(seed, n=60):
+    rng = np.random.default_rng(seed)
+    pair = make_pair(n, rng)
+    frame = PairFrame.of(pair.xy1, pair.xy2)
+    points = frame.points(pair.xy1, pair.xy2)
+    return points + rng.normal(0.0, 1e-3, points.shape), frame.matrix_in_frame(pair.F)
+
+
+def equations(points):
+    x1, x2 = np.c_[points[:, :2], np.ones(len(points))], np.c_[points[:, 2:], np.ones(len(points))]
+    return (x2[:, :, None] * x1[:, None, :]).reshape(-1, 9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_pencil_spans_the_null_space(seed):
+    points, _ = noisy_points(seed)
+    pencil = np.empty((2, 9))
+    sample = np.arange(10, 17)
+    assert kernels.null_pencil(points, sample, pencil)
+    np.testing.assert_allclose(pencil @ pencil.T, np.eye(2), atol=1e-12)
+    assert np.abs(equations(points[sample]) @ pencil.T).max() < 1e-12
+
+
+def test_dependent_equations_have_no_pencil():
+    points, _ = noisy_points(0)
+    points[16] = points[15]
+    assert not kernels.null_pencil(points, np.arange(10, 17), np.empty((2, 9)))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seeds)
+def test_determinants(seed):
+    f, g = np.random.default_rng(seed).normal(size=(2, 9))
+    assert kernels.det3(f) == pytest.approx(np.linalg.det(f.reshape(3, 3)), abs=1e-12)
+    h = 1e-5
+    slope = (kernels.det3(f + h * g) - kernels.det3(f - h * g)) / (2 * h)
+    assert kernels.mixed_det3(f, g) == pytest.approx(slope, abs=1e-7)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.floats(-5, 5), min_size=3, max_size=3))
+def test_cubic_with_three_real_roots(expected):
+    expected = np.unique(np.round(expected, 2))
+    roots = np.empty(3)
+    full = np.concatenate([expected, np.repeat(expected[-1:], 3 - len(expected))])
+    _, a, b, c = np.poly(full)
+    found = np.sort(roots[: kernels.monic_cubic_roots(a, b, c, roots)])
+    for x in expected:
+        assert np.abs(found - x).min() < 1e-3
+    if len(expected) == 3:
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 5))
+def test_cubic_with_one_real_root(x, re, im):
+    _, a, b, c = np.real(np.poly([x, re + 1j * im, re - 1j * im]))
+    roots = np.empty(3)
+    assert kernels.monic_cubic_roots(a, b, c, roots) == 1
+    assert roots[0] == pytest.approx(x, abs=1e-6)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4, np.pi / 2])
+def test_no_singular_member_is_lost_at_infinity(turn):
+    """The pencil F2 + a (F1 - F2) holds F1 - F2 only at infinity: any basis must find the same members."""
+    first = np.diag([1.0, 2.0, 0.0]).ravel()
+    second = np.diag([1.0, -1.0, 1.0]).ravel()
+    basis = np.linalg.qr(np.stack([first, second]).T)[0].T
+    c, s = np.cos(turn), np.sin(turn)
+    F = np.empty((3, 9))
+    count = kernels.singular_members(np.array([[c, s], [-s, c]]) @ basis, F)
+    found = [np.diag(f.reshape(3, 3)) for f in F[:count]]
+    assert count == 3
+    for expected in (np.array([1.0, 2.0, 0.0]), np.array([0.0, 3.0, -1.0]), np.array([3.0, 0.0, 2.0])):
+        unit = expected / np.linalg.norm(expected)
+        assert min(min(np.linalg.norm(f - unit), np.linalg.norm(f + unit)) for f in found) < 1e-6
+
+
+def test_a_pencil_of_singular_matrices_has_no_answer():
+    pencil = np.zeros((2, 9))
+    pencil[0, 0] = pencil[1, 4] = 1.0
+    assert kernels.singular_members(pencil, np.empty((3, 9))) == 0
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_distances_and_score_equal_numpy(seed):
+    points, f = noisy_points(seed)
+    r = np.abs(sampson_residuals(f.reshape(3, 3), points[:, :2], points[:, 2:]))
+    np.testing.assert_allclose(kernels.sampson_distances(f, points), r, rtol=1e-9)
+    gate = float(np.quantile(r, 0.7))
+    score, inliers = kernels.truncated_score(f, points, gate, 1.0)
+    assert score == pytest.approx(np.minimum((r / gate) ** 2, 1.0).mean())
+    assert inliers == (r < gate).sum()
+    assert kernels.truncated_score(f, points, gate, 0.5 * score) == (1.0, 0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_true_geometry_keeps_the_orientation_and_a_point_behind_breaks_it(seed):
+    points, f = noisy_points(seed)
+    sample = np.arange(7)
+    assert kernels.oriented(f, points, sample)
+    assert kernels.oriented(-f, points, sample)
+    F = f.reshape(3, 3)
+    e2 = np.linalg.svd(F)[0][:, 2]
+    far = e2[:2] / e2[2]
+    if np.linalg.norm(far - points[3, 2:]) > 0.5:
+        points[3, 2:] = far + (far - points[3, 2:])
+        assert not kernels.oriented(f, points, sample)
+
+
+def robust_cost(f, points, criterion, gate, delta):
+    residuals = (sampson_residuals, symmetric_residuals)[criterion]
+    r = np.minimum(np.abs(residuals(f.reshape(3, 3), points[:, :2], points[:, 2:])), gate)
+    return float(np.where(r <= delta, 0.5 * r**2, delta * (r - 0.5 * delta)).sum())
+
+
+@pytest.mark.parametrize("criterion", [rank2.GRADIENT, rank2.DISTANCE])
+@pytest.mark.parametrize(("gate", "delta"), [(1.0, 0.7), (2e-3, 1e-3)])
+def test_normal_equations_are_the_derivatives_of_the_cost(criterion, gate, delta):
+    points, f = noisy_points(4)
+    G, h, scratch = np.empty((9, 9)), np.empty(9), (np.empty((9, 9)), np.empty(9))
+    settings = (criterion, gate, delta)
+    cost = rank2.normal_equations(f, points, *settings, G, h)
+    assert cost == pytest.approx(robust_cost(f, points, criterion, gate, delta))
+    numeric = [
+        (robust_cost(f + d, points, *settings) - robust_cost(f - d, points, *settings)) / 2e-8
+        for d in 1e-8 * np.eye(9)
+    ]
+    np.testing.assert_allclose(h, numeric, atol=1e-5 * np.abs(h).max())
+    np.testing.assert_allclose(G, G.T)
+    halved = rank2.normal_equations(f, points[:30], criterion, gate, delta, *scratch)
+    rest = rank2.normal_equations(f, points[30:], criterion, gate, delta, *scratch)
+    assert halved + rest == pytest.approx(cost)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_tangent_is_the_derivative_of_the_representation(seed):
+    rng = np.random.default_rng(seed)
+    U, V = np.linalg.qr(rng.normal(size=(3, 3)))[0], np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    phi = rng.uniform(0.1, 0.7)
+    B = np.empty((9, 7))
+    rank2.tangent(U, V, phi, B)
+    for j, step in enumerate(1e-6 * np.eye(7)):
+        ends = []
+        for sign in (1.0, -1.0):
+            Un, Vn, f = np.empty((3, 3)), np.empty((3, 3)), np.empty(9)
+            rank2.rotate_columns(U, sign * step[:3], Un)
+            rank2.rotate_columns(V, sign * step[3:6], Vn)
+            rank2.compose(Un, Vn, phi + sign * step[6], f)
+            ends.append(f)
+            np.testing.assert_allclose(Un.T @ Un, np.eye(3), atol=1e-12)
+            assert np.linalg.norm(f) == pytest.approx(1.0)
+        np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, B[:, j], atol=1e-8)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.floats(1e-9, 10.0))
+def test_damped_solve_equals_numpy(seed, damping):
+    rng = np.random.default_rng(seed)
+    J, g = rng.normal(size=(20, 7)), rng.normal(size=7)
+    H = J.T @ J
+    step = np.empty(7)
+    assert rank2.solve_damped(H, g, damping, step)
+    expected = np.linalg.solve(H + damping * np.diag(np.diag(H)), -g)
+    np.testing.assert_allclose(step, expected, rtol=1e-7)
+
+
+def test_damped_solve_refuses_what_is_not_positive():
+    assert not rank2.solve_damped(-np.eye(7), np.ones(7), 1e-3, np.empty(7))
+    assert not rank2.solve_damped(np.full((7, 7), np.nan), np.ones(7), 1e-3, np.empty(7))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds, st.sampled_from([rank2.GRADIENT, rank2.DISTANCE]))
+def test_refinement_never_raises_the_cost_and_keeps_rank_two(seed, criterion):
+    points, f = noisy_points(seed)
+    start = f + np.random.default_rng(seed).normal(0.0, 0.02, 9)
+    U, s, Vt = np.linalg.svd(start.reshape(3, 3))
+    nearest = (U[:, :2] * s[:2]) @ Vt[:2]
+    before = robust_cost(nearest.ravel(), points, criterion, 1.0, 0.5)
+    cost, steps = rank2.refine(start, points, criterion, 1.0, 0.5, 50)
+    assert cost <= before * (1 + 1e-12)
+    assert 0 < steps <= 50
+    assert cost == pytest.approx(robust_cost(start, points, criterion, 1.0, 0.5))
+    assert np.linalg.svd(start.reshape(3, 3), compute_uv=False)[2] < 1e-15
+
+
+def test_frame_keeps_sampson_distances_up_to_its_scale():
+    rng = np.random.default_rng(2)
+    pair = make_pair(30, rng)
+    xy1, xy2 = pair.xy1 + rng.normal(size=(30, 2)), 3.0 * pair.xy2 + 100.0
+    F = rng.normal(size=(3, 3))
+    frame = PairFrame.of(xy1, xy2)
+    f = frame.matrix_in_frame(F)
+    in_frame = kernels.sampson_distances(f, frame.points(xy1, xy2))
+    np.testing.assert_allclose(in_frame, frame.scale * np.abs(sampson_residuals(F, xy1, xy2)), rtol=1e-8)
+    again = frame.matrix_in_pixels(f)
+    np.testing.assert_allclose(
+        algebraic_residuals(again, xy1, xy2) * np.linalg.norm(F), algebraic_residuals(F, xy1, xy2), rtol=1e-6
+    )
