@@ -16,6 +16,8 @@ from thesisrecon.types import F32, F64, I64, Features, Image
 
 # Below this response (grey levels squared) the corners are those of quantisation and compression noise.
 NOISE_RESPONSE = 0.05
+# How many times its share one part of the image may fill of the pool of strong corners.
+SHARE = 1.5
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,29 @@ def find_corners(
 def select_spread(xy: F64, response: F32, count: int, *, pool: int, robustness: float = 0.9) -> I64:
     """Indices of ``count`` corners that cover the image, strongest first (adaptive non-maximal suppression).
 
-    Among the ``pool`` strongest, those with the largest distance to a corner that is stronger by 1 /
-    robustness. M. Brown, R. Szeliski, S. Winder, Multi-image matching using multi-scale oriented patches,
-    CVPR 2005, section 3.
+    Among a pool of strong ones, those farthest from any that is stronger by 1 / robustness.
+    No part of the image, of a sixth of its long side, fills the pool beyond ``SHARE`` times its share: else
+    a shaded half gets no corner at all.
+
+    M. Brown, R. Szeliski, S. Winder, Multi-image matching using multi-scale oriented patches, CVPR 2005,
+    section 3.
     """
-    pool = min(pool, len(xy))
-    if pool <= count:
-        return np.arange(pool, dtype=np.int64)
-    radii = squared_suppression_radii(xy[:pool].astype(np.float32), response[:pool], robustness)
-    return np.sort(np.argsort(-radii, kind="stable")[:count]).astype(np.int64)
+    members = _shared_pool(xy, pool)
+    if len(members) <= count:
+        return members
+    radii = squared_suppression_radii(xy[members].astype(np.float32), response[members], robustness)
+    return members[np.sort(np.argsort(-radii, kind="stable")[:count])]
+
+
+def _shared_pool(xy: F64, pool: int) -> I64:
+    """The first ``pool`` of the corners, no part of the image giving more than its limit."""
+    if len(xy) <= pool:
+        return np.arange(len(xy), dtype=np.int64)
+    part = np.floor(6.0 * (xy - xy.min(axis=0)) / (float(np.ptp(xy, axis=0).max()) + 1.0)).astype(np.int64)
+    cell = 6 * part[:, 1] + part[:, 0]
+    by_cell = np.argsort(cell, kind="stable")
+    cells, start, size = np.unique(cell[by_cell], return_index=True, return_counts=True)
+    rank = np.empty(len(xy), np.int64)
+    rank[by_cell] = np.arange(len(xy)) - np.repeat(start, size)
+    allowed = np.flatnonzero(rank < max(1, int(SHARE * pool / len(cells))))
+    return allowed[:pool].astype(np.int64)

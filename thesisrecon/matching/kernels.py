@@ -197,7 +197,7 @@ def normalize_window(window: F32) -> float:
 
 @njit(cache=True, nogil=True)
 def corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32) -> F32:
-    """(N, 225) normalised upright 15 x 15 windows of the corners at their own scale; zero where they leave."""
+    """(N, 225) normalised upright 15 x 15 windows of the corners at their scale; zero where they leave."""
     out = np.zeros((len(xy), SAMPLES), np.float32)
     step = np.zeros((2, 2))
     for n in range(len(xy)):

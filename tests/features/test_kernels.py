@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates, maximum_filter
+
+from tests.textures import texture
+from thesisrecon.features.kernels import (
+    corner_response,
+    fit_maxima,
+    keep_apart,
+    sample_patches,
+    squared_suppression_radii,
+)
+from thesisrecon.geometry.raster import gaussian_taps
+from thesisrecon.types import F32, F64
+
+
+def response_twin(blurred: F32, taps: F32) -> F64:
+    b = blurred.astype(np.float64)
+    gx, gy = np.zeros_like(b), np.zeros_like(b)
+    gx[:, 1:-1] = 0.5 * (b[:, 2:] - b[:, :-2])
+    gy[1:-1] = 0.5 * (b[2:] - b[:-2])
+    a, m, c = (convolve1d(convolve1d(p, taps, axis=0), taps, axis=1) for p in (gx * gx, gx * gy, gy * gy))
+    return np.asarray((a * c - m * m) / (a + c + 1e-6))
+
+
+def test_corner_response_equals_its_numpy_twin() -> None:
+    blurred = texture(60, 83, 1).astype(np.float32)
+    taps = gaussian_taps(1.5)
+    found, twin = corner_response(blurred, taps), response_twin(blurred, taps)
+    border = len(taps) // 2 + 1
+    inside = (slice(border, -border), slice(border, -border))
+    assert np.abs(found[inside] - twin[inside]).max() < 1e-4 * twin.max()
+    assert not found[:border].any()
+    assert not found[:, -border:].any()
+
+
+def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there() -> None:
+    # Without clipping at 255 no two neighbours are equal, so that every maximum is one.
+    response = (
+        gaussian_filter(np.random.default_rng(2).normal(size=(50, 70)), 1.5).astype(np.float32) * 500 + 130
+    )
+    xy, value = fit_maxima(response, 130.0)
+    top = (maximum_filter(response, 3) == response) & (response > 130.0)
+    top[0] = top[-1] = top[:, 0] = top[:, -1] = False
+    assert len(xy) == top.sum()
+    assert np.abs(xy[:, ::-1] - np.argwhere(top)).max() <= 1.0
+    assert np.array_equal(value, response[top])
+    b, a = np.mgrid[-1:2, -1:2]
+    design = np.stack([a * a, a * b, b * b, a, b, np.ones((3, 3))], -1).reshape(9, 6)
+    for (x, y), (row, column) in zip(xy, np.argwhere(top), strict=True):
+        around = response[row - 1 : row + 2, column - 1 : column + 2].ravel()
+        q = np.linalg.lstsq(design, around, rcond=None)[0]
+        step = -np.linalg.solve([[2 * q[0], q[1]], [q[1], 2 * q[2]]], q[3:5])
+        inside = q[0] < 0 and 4 * q[0] * q[2] > q[1] ** 2 and np.abs(step).max() <= 1.0
+        assert np.abs(step * inside - (x - column, y - row)).max() < 1e-3
+
+
+def test_suppression_radii_equal_their_numpy_twin() -> None:
+    rng = np.random.default_rng(4)
+    xy = rng.uniform(0, 500, (300, 2)).astype(np.float32)
+    response = np.sort(rng.exponential(size=300).astype(np.float32))[::-1].copy()
+    distance2 = ((xy[:, None] - xy[None]) ** 2).sum(-1)
+    stronger = np.float32(0.9) * response[None] > response[:, None]
+    twin = np.where(stronger, distance2, np.inf).min(axis=1)
+    assert np.allclose(squared_suppression_radii(xy, response, 0.9), twin, rtol=1e-5)
+
+
+def test_patches_equal_their_numpy_twin() -> None:
+    image = texture(80, 90, 5).astype(np.float32)
+    xy = np.array([[40.3, 35.7], [3.0, 4.0], [86.5, 77.0]])
+    angle = np.array([0.0, 0.7, -2.0], np.float32)
+    b, a = np.mgrid[0:8, 0:8] - 3.5
+    for n, patch in enumerate(sample_patches(image, xy, angle, 8, 4.0)):
+        c, s = 4.0 * np.cos(angle[n]), 4.0 * np.sin(angle[n])
+        u = np.clip(xy[n, 0] + c * a - s * b, 0, 88.999)
+        v = np.clip(xy[n, 1] + s * a + c * b, 0, 78.999)
+        twin = map_coordinates(image, [v, u], order=1)
+        assert np.abs(patch.reshape(8, 8) - twin).max() < 1e-2
+
+
+def test_kept_corners_are_apart_and_nobody_is_dropped_without_reason() -> None:
+    xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
+    kept = keep_apart(xy, np.arange(400), 6.0)
+    distance = np.linalg.norm(xy[:, None] - xy[kept][None], axis=2)
+    assert (np.sort(distance[kept], axis=1)[:, 1] >= 6.0).all()
+    for dropped in np.setdiff1d(np.arange(400), kept):
+        assert (distance[dropped, kept < dropped] < 6.0).any()

@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from tests.textures import photograph, sideways_fundamental, texture
+from thesisrecon.features import MultiScaleCorners
+from thesisrecon.matching import AlignedTracks, PlainTracks, PreparedView, SeedsAndGrowth
+from thesisrecon.types import F64, TwoView
+
+SHIFTS = np.array([[0.0, 0.0], [7.3, 0.0], [15.6, 0.0], [24.1, 0.0]])
+
+
+def panorama() -> tuple[list[PreparedView], list[TwoView]]:
+    """Four views of one plane: view i shows the scene point u at u - SHIFTS[i]."""
+    wide = texture(200, 330, 9)
+    y, x = np.mgrid[0:200, 0:280].astype(np.float64)
+    matcher, prepared = SeedsAndGrowth(), []
+    for dx, _ in SHIFTS:
+        image = photograph(map_coordinates(wide, [y, x + dx], order=3))
+        prepared.append(matcher.prepare(image, MultiScaleCorners().detect(image)))
+    pairs = []
+    for i in range(4):
+        for j in range(i + 1, 4):
+            m = matcher.match(
+                prepared[i],
+                prepared[j],
+                pair=(i, j),
+                estimate_fundamental=sideways_fundamental,
+                rng=np.random.default_rng(0),
+            )
+            fit = sideways_fundamental(m.xy1, m.xy2, np.random.default_rng(0))
+            pairs.append(
+                TwoView(
+                    i,
+                    j,
+                    fit.F,
+                    0.1,
+                    m.index1,
+                    m.index2,
+                    m.xy1,
+                    m.xy2,
+                    m.affine,
+                    len(m.xy1),
+                    0.0,
+                    accepted=True,
+                )
+            )
+    return prepared, pairs
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[list[PreparedView], list[TwoView]]:
+    return panorama()
+
+
+def spread(view_index: F64, point_index: F64, xy: F64) -> F64:
+    """(K,) distance of each observation, brought to the scene, from the mean of its track."""
+    placed = xy + SHIFTS[view_index]
+    total = np.zeros((point_index.max() + 1, 2))
+    np.add.at(total, point_index, placed)
+    mean = total / np.bincount(point_index)[:, None]
+    return np.linalg.norm(placed - mean[point_index], axis=1)
+
+
+@pytest.mark.parametrize("variant", [PlainTracks(), AlignedTracks()])
+def test_tracks_are_sorted_and_seen_once_in_at_least_two_views(
+    scene: tuple[list[PreparedView], list[TwoView]], variant: PlainTracks | AlignedTracks
+) -> None:
+    tracks = variant.build(*scene, np.random.default_rng(0))
+    key = tracks.point_index * 4 + tracks.view_index
+    assert (np.diff(key) > 0).all()
+    assert (np.bincount(tracks.point_index) >= 2).all()
+    assert tracks.n_points == tracks.point_index.max() + 1 > 300
+    assert tracks.n_views == 4
+    assert (np.bincount(tracks.point_index) == 4).sum() > 50
+    assert (spread(tracks.view_index, tracks.point_index, tracks.xy) < 3.0).mean() > 0.98
+
+
+def test_alignment_brings_the_observations_of_a_track_to_one_spot(
+    scene: tuple[list[PreparedView], list[TwoView]],
+) -> None:
+    plain, aligned = (v.build(*scene, np.random.default_rng(0)) for v in (PlainTracks(), AlignedTracks()))
+    before = np.median(spread(plain.view_index, plain.point_index, plain.xy))
+    after = np.median(spread(aligned.view_index, aligned.point_index, aligned.xy))
+    assert after < 0.03
+    assert after < 0.3 * before
+
+
+@pytest.mark.parametrize("variant", [PlainTracks(), AlignedTracks()])
+def test_no_accepted_pair_gives_no_tracks(
+    scene: tuple[list[PreparedView], list[TwoView]], variant: PlainTracks | AlignedTracks
+) -> None:
+    tracks = variant.build(scene[0], [], np.random.default_rng(0))
+    assert (tracks.n_points, len(tracks.xy), tracks.n_views) == (0, 0, 4)
+
+
+def test_a_false_link_does_not_join_two_corners_of_one_view(
+    scene: tuple[list[PreparedView], list[TwoView]],
+) -> None:
+    prepared, pairs = scene
+    good = pairs[0]
+    crossed = np.roll(good.index2, 1)
+    wrong = TwoView(
+        0,
+        1,
+        good.F,
+        9.0,
+        good.index1[:50],
+        crossed[:50],
+        good.xy1[:50],
+        good.xy2[:50],
+        good.affine[:50],
+        50,
+        0.0,
+        True,
+    )
+    with_it = PlainTracks().build(prepared, [*pairs, wrong], np.random.default_rng(0))
+    without = PlainTracks().build(prepared, pairs, np.random.default_rng(0))
+    assert np.array_equal(np.unique(with_it.point_index, return_counts=True)[1].max(), 4)
+    assert abs(with_it.n_points - without.n_points) <= 50
