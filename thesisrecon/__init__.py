@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from thesisrecon.config import PipelineConfig
-    from thesisrecon.pipeline import estimate_fundamental, match_pair, reconstruct, self_calibrate
+    from thesisrecon.doors import estimate_fundamental, match_pair, self_calibrate
+    from thesisrecon.geometry.triangulation import triangulate
+    from thesisrecon.pipeline import reconstruct
 
 __version__ = "0.1.0"
 
 _HOME_OF = {
     "PipelineConfig": "config",
-    "estimate_fundamental": "pipeline",
-    "match_pair": "pipeline",
+    "estimate_fundamental": "doors",
+    "match_pair": "doors",
     "reconstruct": "pipeline",
-    "self_calibrate": "pipeline",
+    "self_calibrate": "doors",
+    "triangulate": "geometry.triangulation",
 }
 
 __all__ = [
@@ -29,6 +32,7 @@ __all__ = [
     "match_pair",
     "reconstruct",
     "self_calibrate",
+    "triangulate",
 ]
 
 

@@ -255,7 +255,8 @@ def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
         focal, x, y = (view[name] for name in ("focal_px", "principal_x_px", "principal_y_px"))
         lines.setdefault(
             (view["camera"], focal["value"]),
-            f"camera {view['camera']}: focal {focal['value']:.1f} +- {focal['std']:.1f} px ({focal['source']}), "
+            f"camera {view['camera']}: "
+            f"focal {focal['value']:.1f} +- {focal['std']:.1f} px ({focal['source']}), "
             f"principal point ({x['value']:.1f} +- {x['std']:.1f}, {y['value']:.1f} +- {y['std']:.1f}) px",
         )
     return list(lines.values())

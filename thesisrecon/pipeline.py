@@ -10,8 +10,8 @@ from typing import Any, Literal, TypedDict, Unpack, get_args
 
 import numpy as np
 
+from thesisrecon.assumptions import camera_groups, focal_prior
 from thesisrecon.config import PipelineConfig, tables_from_config
-from thesisrecon.epipolar import estimate_fundamental as estimate_fundamental
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.images import ImageSource, PhotographSet, read_photographs
 from thesisrecon.io.run_directory import RunDirectory
@@ -19,14 +19,10 @@ from thesisrecon.outputs import write_outputs
 from thesisrecon.run import Progress, Run, stream
 from thesisrecon.settings import unknown_word
 from thesisrecon.types import (
-    F64,
-    I64,
     Features,
     FocalPrior,
     Image,
-    Reconstruction,
     RunResult,
-    SelfCalibration,
     TwoView,
 )
 from thesisrecon.workers import Workers, available_threads
@@ -112,6 +108,12 @@ class _Work:
     def config(self) -> PipelineConfig:
         return self.run.config
 
+    @property
+    def focal_prior(self) -> FocalPrior | None:
+        """What the user lets us assume of the focal lengths."""
+        scales = np.array([image.scale for image in self.result.images])
+        return focal_prior(self.config.intrinsics, self.photographs.exif_focal_px, scales)
+
     def check_photographs(self) -> None:
         """Refuse what is too little before anything is computed."""
         found, needed = len(self.result.images), 1 if self.until == "features" else 2
@@ -167,7 +169,8 @@ def _identity(run: Run, photographs: PhotographSet) -> dict[str, Any]:
 
 
 def _empty_result(run: Run, photographs: PhotographSet) -> RunResult:
-    groups = camera_groups(photographs.images, run.config.intrinsics.cameras)
+    sizes = [image.original_size for image in photographs.images]
+    groups = camera_groups(sizes, run.config.intrinsics.cameras)
     return RunResult(
         out=run.directory.path,
         images=photographs.images,
@@ -179,30 +182,10 @@ def _empty_result(run: Run, photographs: PhotographSet) -> RunResult:
     )
 
 
-def camera_groups(images: Sequence[Image], cameras: str) -> I64:
-    """(V,) camera numbers: one per distinct size of the originals ("shared"), or one per image
-    ("per-image").
-    """
-    if cameras == "per-image":
-        return np.arange(len(images), dtype=np.int64)
-    sizes = list(dict.fromkeys(image.original_size for image in images))
-    return np.array([sizes.index(image.original_size) for image in images], dtype=np.int64)
-
-
-def focal_prior(config: PipelineConfig, photographs: PhotographSet) -> FocalPrior | None:
-    """What the user allows to assume of the focal lengths, at working size; None where nothing."""
-    wish = config.intrinsics
-    if wish.focal_std_rel is None or not (wish.exif or wish.focal_px is not None):
-        return None
-    scales = np.array([image.scale for image in photographs.images])
-    focal = photographs.exif_focal_px if wish.focal_px is None else np.full(len(scales), wish.focal_px)
-    return FocalPrior(focal * scales, wish.focal_std_rel) if np.isfinite(focal).any() else None
-
-
 # ---------------------------------------------------------------- 4.2.1: features
 
 
-def _detect_features(work: _Work) -> None:
+def _find_features(work: _Work) -> None:
     run, images = work.run, work.result.images
     variant = run.variant_key("features")
     keys = {
@@ -210,7 +193,7 @@ def _detect_features(work: _Work) -> None:
         for i, photograph in enumerate(work.photographs.photographs)
     }
     features = run.kept_all(
-        "features", keys, _detect, lambda missing: [(work.config, images[i]) for i in missing]
+        "features", keys, detect_features, lambda missing: [(work.config, images[i]) for i in missing]
     )
     work.result = replace(work.result, features=tuple(features))
     counts = [len(f.xy) for f in features]
@@ -226,7 +209,7 @@ def _detect_features(work: _Work) -> None:
     )
 
 
-def _detect(config: PipelineConfig, image: Image) -> Features:
+def detect_features(config: PipelineConfig, image: Image) -> Features:
     return config.features.detect(image)
 
 
@@ -249,7 +232,7 @@ def _match_pairs(work: _Work) -> None:
             (work.config, prepared[i], prepared[j], (i, j), run.seed) for i, j in (pairs[n] for n in missing)
         ]
 
-    two_views: list[TwoView] = run.kept_all("matches", keys, _match, arguments)
+    two_views: list[TwoView] = run.kept_all("matches", keys, match_views, arguments)
     work.result = replace(result, pairs=tuple(two_views))
     accepted = [pair for pair in two_views if pair.accepted]
     counts = {"pairs": len(pairs), "accepted": len(accepted), "verified": sum(p.inliers for p in accepted)}
@@ -274,7 +257,7 @@ def _prepare(config: PipelineConfig, image: Image, features: Features) -> Any:
     return config.matching.prepare(image, features)
 
 
-def _match(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
+def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
     """Match, estimate F, verify; a pair that cannot give an F is a refused pair, not an end of the run."""
     rng = stream(seed, "matches", *pair)
     candidates = 0
@@ -363,7 +346,7 @@ def _reconstruct_projective(work: _Work, attempt: int = 0) -> None:
 
 
 def _calibrate(work: _Work, attempt: int) -> None:
-    run, prior = work.run, focal_prior(work.config, work.photographs)
+    run, prior = work.run, work.focal_prior
     projective, groups = work.result.projective, work.result.groups
     assert projective is not None
     upstream = run.logs["projective"].keys[f"attempt-{attempt}"]
@@ -388,7 +371,7 @@ def _calibrate(work: _Work, attempt: int) -> None:
 
 
 def _refine(work: _Work, attempt: int) -> None:
-    run, prior = work.run, focal_prior(work.config, work.photographs)
+    run, prior = work.run, work.focal_prior
     projective, calibration = work.result.projective, work.result.calibration
     assert projective is not None
     assert calibration is not None
@@ -451,54 +434,8 @@ def _quality(result: RunResult) -> tuple[bool, bool, int, int]:
 
 
 STEPS = {
-    "features": (_detect_features,),
-    "matches": (_detect_features, _match_pairs),
-    "projective": (_detect_features, _match_pairs, _build_tracks, _reconstruct_projective),
-    "metric": (_detect_features, _match_pairs, _build_tracks, _reconstruct_metric),
+    "features": (_find_features,),
+    "matches": (_find_features, _match_pairs),
+    "projective": (_find_features, _match_pairs, _build_tracks, _reconstruct_projective),
+    "metric": (_find_features, _match_pairs, _build_tracks, _reconstruct_metric),
 }
-
-
-# ---------------------------------------------------------------- one stage at a time
-
-
-def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0) -> TwoView:
-    """Verified matches and F of two photographs (files or uint8 arrays), in pixels at working size.
-
-    Raises :class:`StageFailure` where one of them cannot be read or they do not match.
-    """
-    config = config or PipelineConfig()
-    photographs = [_read_one(image, config) for image in (image1, image2)]
-    views = [_prepare(config, image, _detect(config, image)) for image in photographs]
-    pair = _match(config, views[0], views[1], (0, 1), seed)
-    if not pair.accepted:
-        raise StageFailure("the two photographs do not match", pair.reason)
-    return pair
-
-
-def _read_one(image: Any, config: PipelineConfig) -> Image:
-    photographs = read_photographs([image], max_size_px=config.images.max_size_px)
-    for name, reason in photographs.refused.items():
-        raise StageFailure(f"{name} {reason}")
-    return photographs.images[0]
-
-
-def self_calibrate(
-    reconstruction: Reconstruction, *, config: PipelineConfig | None = None, seed: int = 0
-) -> SelfCalibration:
-    """The metric frame and the intrinsics of a projective reconstruction (chapter 7).
-
-    Cameras of one image size are taken for one camera, unless ``config.intrinsics.cameras`` says otherwise.
-    """
-    config = config or PipelineConfig()
-    sizes = [tuple(size) for size in reconstruction.sizes.tolist()]
-    if config.intrinsics.cameras == "per-image":
-        groups = np.arange(len(sizes), dtype=np.int64)
-    else:
-        groups = np.array([sizes.index(size) for size in sizes], dtype=np.int64)
-    focal: F64 | None = None
-    if config.intrinsics.focal_px is not None:
-        focal = np.full(len(sizes), config.intrinsics.focal_px)
-    weight = config.intrinsics.focal_std_rel
-    prior = FocalPrior(focal, weight) if focal is not None and weight is not None else None
-    rng = stream(seed, "selfcalibration")
-    return config.selfcalibration.calibrate(reconstruction, groups=groups, focal_prior=prior, rng=rng)

@@ -122,7 +122,8 @@ def bytes_from_record(record: Any, key: str) -> bytes:
     arrays: dict[str, np.ndarray[Any, Any]] = {}
     description = json.dumps({"key": key, "record": _describe(record, arrays)}, sort_keys=True)
     stream = io.BytesIO()
-    np.savez(stream, **{_DESCRIPTION: np.frombuffer(description.encode(), dtype=np.uint8)}, **arrays)
+    named: dict[str, Any] = {_DESCRIPTION: np.frombuffer(description.encode(), dtype=np.uint8), **arrays}
+    np.savez(stream, **named)
     return stream.getvalue()
 
 

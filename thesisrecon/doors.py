@@ -1,0 +1,55 @@
+"""One stage at a time: the front doors beside :func:`thesisrecon.reconstruct`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.assumptions import camera_groups, focal_prior
+from thesisrecon.config import PipelineConfig
+from thesisrecon.epipolar import estimate_fundamental
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.images import read_photographs
+from thesisrecon.pipeline import detect_features, match_views
+from thesisrecon.run import stream
+from thesisrecon.types import Image, Reconstruction, SelfCalibration, TwoView
+
+__all__ = ["estimate_fundamental", "match_pair", "self_calibrate"]
+
+
+def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0) -> TwoView:
+    """Verified matches and F of two photographs (files or uint8 arrays), in pixels at working size.
+
+    Raises :class:`StageFailure` where one of them cannot be read or they do not match.
+    """
+    config = config or PipelineConfig()
+    photographs = [_read_one(image, config) for image in (image1, image2)]
+    views = [config.matching.prepare(image, detect_features(config, image)) for image in photographs]
+    pair = match_views(config, views[0], views[1], (0, 1), seed)
+    if not pair.accepted:
+        raise StageFailure("the two photographs do not match", pair.reason)
+    return pair
+
+
+def _read_one(image: Any, config: PipelineConfig) -> Image:
+    photographs = read_photographs([image], max_size_px=config.images.max_size_px)
+    for name, reason in photographs.refused.items():
+        raise StageFailure(f"{name} {reason}")
+    return photographs.images[0]
+
+
+def self_calibrate(
+    reconstruction: Reconstruction, *, config: PipelineConfig | None = None, seed: int = 0
+) -> SelfCalibration:
+    """The metric frame and the intrinsics of a projective reconstruction (chapter 7).
+
+    Cameras of one image size are taken for one camera, unless ``config.intrinsics.cameras`` says otherwise.
+    """
+    config = config or PipelineConfig()
+    sizes = [(int(width), int(height)) for width, height in reconstruction.sizes]
+    groups = camera_groups(sizes, config.intrinsics.cameras)
+    # A reconstruction knows one size, and no header: the focal length is meant in its own pixels.
+    prior = focal_prior(config.intrinsics, np.full(len(sizes), np.nan), np.ones(len(sizes)))
+    rng = stream(seed, "selfcalibration")
+    return config.selfcalibration.calibrate(reconstruction, groups=groups, focal_prior=prior, rng=rng)
