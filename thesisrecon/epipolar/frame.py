@@ -85,3 +85,17 @@ class PairFrame:
     def _transform(self, centroid: F64) -> F64:
         s = self.scale
         return np.array([[s, 0.0, -s * centroid[0]], [0.0, s, -s * centroid[1]], [0.0, 0.0, 1.0]])
+
+
+def check_start(F: F64, frame: PairFrame) -> F64:
+    """Flat unit vector (9,) in ``frame`` of an F (3, 3) in pixels that a refinement can start from.
+
+    Raises ``ValueError`` for another shape, entries that are not finite and rank below 2.
+    """
+    F = np.asarray(F, dtype=np.float64)
+    if F.shape != (3, 3) or not np.isfinite(F).all():
+        raise ValueError(f"the refinement starts from a finite (3, 3) matrix of rank 2 or 3; got shape {F.shape}")
+    f = frame.matrix_in_frame(F)
+    if np.linalg.matrix_rank(f.reshape(3, 3)) < 2:
+        raise ValueError("the refinement starts from a finite (3, 3) matrix of rank 2 or 3; got a lower rank")
+    return f

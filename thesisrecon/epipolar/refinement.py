@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar.frame import PairFrame, check_matches
+from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
 from thesisrecon.epipolar.rank2.kernels import DISTANCE, GRADIENT, refine
 
 F64 = NDArray[np.float64]
@@ -37,13 +37,10 @@ def refine_epipolar_distance(
 
 def _refine(F: F64, xy1: F64, xy2: F64, criterion: int, loss_px: float, max_iterations: int) -> F64:
     xy1, xy2 = check_matches(xy1, xy2, needed=7)
-    F = np.asarray(F, dtype=np.float64)
-    if F.shape != (3, 3) or not np.isfinite(F).all() or np.linalg.matrix_rank(F) < 2:
-        raise ValueError("the refinement starts from a finite (3, 3) matrix of rank 2 or 3")
     if not loss_px > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
     frame = PairFrame.of(xy1, xy2)
-    f = frame.matrix_in_frame(F)
+    f = check_start(F, frame)
     delta = min(loss_px * frame.scale, UNBOUNDED)
     refine(f, frame.points(xy1, xy2), criterion, np.inf, delta, max_iterations)
     return frame.matrix_in_pixels(f)

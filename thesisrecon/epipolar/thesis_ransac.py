@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.epipolar.covariance import fundamental_covariance
 from thesisrecon.epipolar.frame import PairFrame, check_matches
-from thesisrecon.epipolar.kernels import seven_point
+from thesisrecon.epipolar.kernels import sampson_distances, seven_point
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_gradient
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.multiview import sampson_residuals
@@ -31,23 +31,19 @@ EXACT_PX = 1e-6
 
 @dataclass(frozen=True)
 class SevenPointProblem:
-    """Minimal samples of matches: ``points`` (N, 4) in ``frame``, distances in px."""
+    """Minimal samples of matches: rows (x1, y1, x2, y2) of ``points`` (N, 4), in one frame."""
 
-    frame: PairFrame
     points: F64
-    xy1: F64
-    xy2: F64
     sample_size: int = 7
 
     def solve(self, sample: I64) -> list[F64]:
-        """The one to three matrices through seven matches, in pixels."""
+        """The one to three matrices through seven matches, as vectors (9,)."""
         solutions = np.empty((3, 9))
-        count = seven_point(self.points, sample, solutions)
-        return [self.frame.matrix_in_pixels(f) for f in solutions[:count]]
+        return list(solutions[: seven_point(self.points, sample, solutions)])
 
     def residuals(self, model: F64) -> F64:
-        """Sampson distances, px."""
-        return sampson_residuals(model, self.xy1, self.xy2)
+        """Sampson distances (N,) in the units of the points."""
+        return np.asarray(sampson_distances(model, self.points))
 
 
 @dataclass(frozen=True)
@@ -55,9 +51,10 @@ class ThesisRansac:
     """Section 5.4 as it stands, its slips corrected.
 
     Draw ``samples`` samples of seven, or stop once a share ``enough_share`` of the matches are inliers; keep
-    the F with the most; estimate sigma by the median (1.4826 (1 + 5 / (n - 7)) median |d|; the text divides by
-    Phi(0.75) where Phi^-1(0.75) is meant) and discard the outliers; then ``rounds`` times minimise the gradient
-    criterion (5.4), or the distances to the epipolar lines (5.6) with ``epipolar_distance``, and discard again.
+    the F with the most; estimate sigma by the median (1.4826 (1 + 5 / (n - 7)) median |d|; the text divides
+    by Phi(0.75) where Phi^-1(0.75) is meant) and discard the outliers; then ``rounds`` times minimise the
+    gradient criterion (5.4), or the distances to the epipolar lines (5.6) with ``epipolar_distance``, and
+    discard again.
 
     Departures: a match is tested by its Sampson distance against the chi-square of one degree of freedom (the
     two epipolar distances are multiples of one residual, so their sum is not a chi-square of two); the search
@@ -83,23 +80,24 @@ class ThesisRansac:
         :meth:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac.estimate`."""
         xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
         frame = PairFrame.of(xy1, xy2)
-        problem = SevenPointProblem(frame, frame.points(xy1, xy2), xy1, xy2)
-        loop = SampleConsensus(self.threshold_px, max_samples=self.samples, enough_share=self.enough_share)
-        found = loop.search(problem, len(xy1), rng)
+        points = frame.points(xy1, xy2)
+        gate = self.threshold_px * frame.scale
+        loop = SampleConsensus(gate, max_samples=self.samples, enough_share=self.enough_share)
+        found = loop.search(SevenPointProblem(points), len(points), rng)
         if found is None or found.inliers.sum() < MINIMUM:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
                 f"{self.samples} samples, none with {MINIMUM} of {len(xy1)} matches close enough",
                 "The photographs may not overlap, or the matches are wrong",
             )
-        _, inliers = self._discard(found.model, xy1, xy2)
+        F, sigma = frame.matrix_in_pixels(found.model), 0.0
+        _, inliers = self._discard(F, xy1, xy2)
         refine = refine_epipolar_distance if self.epipolar_distance else refine_gradient
-        F, sigma = found.model, 0.0
         for _ in range(self.rounds):
             F = refine(F, xy1[inliers], xy2[inliers])
             sigma, inliers = self._discard(F, xy1, xy2)
         f = frame.matrix_in_frame(F)
-        covariance = fundamental_covariance(frame, f, problem.points[inliers], sigma * frame.scale)
+        covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
         return FundamentalFit(F, inliers, sigma, covariance, found.samples)
 
     def _discard(self, F: F64, xy1: F64, xy2: F64) -> tuple[float, B8]:
