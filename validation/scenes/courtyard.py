@@ -7,6 +7,7 @@ World frame in metres: x right along the back wall, y into it (the wall at y = 0
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,8 @@ TEXEL = 0.005
 WALL_HEIGHT = 4.9
 SUN = np.array([-0.42, -0.62, 0.72])
 PI = 3.141592653589793
-BACK, LEFT, RIGHT, GROUND, COLUMN, BASIN, URN, BARREL, STONE, WOOD = range(10)
+BACK, LEFT, RIGHT, GROUND, BASIN, URN, BARREL, STONE, WOOD, COLUMN = range(10)
+COLUMN_SEEDS = (700, 705, 710)
 
 
 def _back_wall() -> Material:
@@ -144,9 +146,10 @@ def _barrel() -> Material:
     return Material(body.rgb, (body.height * calm + bulge).astype(np.float32), TEXEL)
 
 
-def _column() -> Material:
-    """A drum of field stones whose ends are round, so that they stand well on their feet."""
-    stones = rubble(grid((2 * PI * 0.22, 2.6), TEXEL), TEXEL, 700, cell_m=0.2, relief_m=0.02, wrap=True)
+def _column(seed: int) -> Material:
+    """A drum of field stones whose ends are round, so that they stand well on their feet; no mason lays the
+    same stones twice, so each column has a ``seed`` of its own."""
+    stones = rubble(grid((2 * PI * 0.22, 2.6), TEXEL), TEXEL, seed, cell_m=0.2, relief_m=0.02, wrap=True)
     row = np.arange(stones.shape[0])
     calm = smooth((np.minimum(row, row[-1] - row) * TEXEL).astype(np.float32), 0.0, 0.03)[:, None]
     return Material(stones.rgb * np.float32(1.5), stones.height * calm, TEXEL)
@@ -178,9 +181,10 @@ def _crate_wood() -> Material:
 
 
 def build_materials(*, threads: int = 2) -> list[Material]:
-    """The ten maps, in the order of the constants above."""
-    makers = [_back_wall, _left_wall, _right_wall, _ground, _column]
+    """The maps in the order of the constants above; the columns', one each, are the last."""
+    makers = [_back_wall, _left_wall, _right_wall, _ground]
     makers += [_basin, _urn, _barrel, _dressed_stone, _crate_wood]
+    makers += [partial(_column, seed) for seed in COLUMN_SEEDS]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(lambda make: make(), makers))
 
@@ -246,8 +250,8 @@ def build_objects() -> list[list[Surface]]:
         Surface(np.array([-6.3, -10.0, 0.0]), x, y, (12.6, 10.0), GROUND),
     ]
     objects = [_box((-0.6, -1.75, 3.05), (6.3, 0.4, 0.36), STONE)]
-    for px in (-3.3, -0.95, 2.1):
-        drum = _drum(px, -1.75, 0.3, 0.22, (2 * PI * 0.22, 2.6), COLUMN)
+    for n, px in enumerate((-3.3, -0.95, 2.1)):
+        drum = _drum(px, -1.75, 0.3, 0.22, (2 * PI * 0.22, 2.6), COLUMN + n)
         foot, head = (0.62, 0.62, 0.34), (0.56, 0.56, 0.17)
         objects += [_box((px, -1.75, 0.0), foot, STONE), [drum], _box((px, -1.75, 2.88), head, STONE)]
     for py, rise, size in (
