@@ -65,7 +65,7 @@ def test_a_small_share_is_refused_with_numbers():
     assert pair.inliers >= 60
     assert not pair.accepted
     assert "of 400 matches agree" in pair.reason
-    assert "30 % are needed" in pair.reason
+    assert "25 % are needed" in pair.reason
 
 
 def test_unrelated_matches_are_refused():

@@ -94,7 +94,7 @@ def check_start(F: F64, frame: PairFrame) -> F64:
     """
     F = np.asarray(F, dtype=np.float64)
     if F.shape != (3, 3) or not np.isfinite(F).all():
-        raise ValueError(f"the refinement starts from a finite (3, 3) matrix of rank 2 or 3; got shape {F.shape}")
+        raise ValueError(f"the refinement starts from a finite (3, 3) matrix of rank 2 or 3; got {F.shape}")
     f = frame.matrix_in_frame(F)
     if np.linalg.matrix_rank(f.reshape(3, 3)) < 2:
         raise ValueError("the refinement starts from a finite (3, 3) matrix of rank 2 or 3; got a lower rank")

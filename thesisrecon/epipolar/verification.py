@@ -29,7 +29,7 @@ class PairVerification:
     """
 
     min_inliers: int = 60
-    min_share: float = 0.3
+    min_share: float = 0.25
     homography_px: float = 2.0
 
     def __post_init__(self) -> None:
