@@ -88,10 +88,7 @@ def test_sampson_distance_is_the_distance_to_the_nearest_exact_match_to_first_or
     xy1, xy2 = pair.xy1 + noise[:, :2], pair.xy2 + noise[:, 2:]
     h, residuals = 1e-4, algebraic_residuals(pair.F, xy1, xy2)
     gradient = np.stack(
-        [
-            (algebraic_residuals(pair.F, xy1 + d[:2], xy2 + d[2:]) - residuals) / h
-            for d in h * np.eye(4)
-        ],
+        [(algebraic_residuals(pair.F, xy1 + d[:2], xy2 + d[2:]) - residuals) / h for d in h * np.eye(4)],
         axis=1,
     )
     normal = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
@@ -156,11 +153,7 @@ def test_canonical_cameras_project_what_the_true_cameras_see():
     pair = make_pair(30, np.random.default_rng(5))
     P1, P2 = canonical_cameras(pair.F)
     A = np.concatenate(
-        [
-            xy[:, i, None] * P[2] - P[i]
-            for P, xy in ((P1, pair.xy1), (P2, pair.xy2))
-            for i in (0, 1)
-        ]
+        [xy[:, i, None] * P[2] - P[i] for P, xy in ((P1, pair.xy1), (P2, pair.xy2)) for i in (0, 1)]
     ).reshape(4, 30, 4)
     X = np.linalg.svd(np.moveaxis(A, 0, 1))[2][:, 3]
     assert np.abs(project(P2, X) - pair.xy2).max() < 1e-5

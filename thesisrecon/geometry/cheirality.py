@@ -18,13 +18,13 @@ def cheirality(X: F64, P: F64) -> F64:
     X (N, 4), P (3, 4) -> (N,); does not change when X or P is scaled, by a negative number either.
     """
     t = X @ P[2]
-    return np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / t
+    return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / t)
 
 
 def depth(X: F64, P: F64) -> F64:
     """Signed distance of X (N, 4) from the principal plane of P (3, 4), in units of space (HZ 6.15)."""
     M = P[:, :3]
-    return np.sign(np.linalg.det(M)) * (X @ P[2]) / (X[:, 3] * np.linalg.norm(M[2]))
+    return np.asarray(np.sign(np.linalg.det(M)) * (X @ P[2]) / (X[:, 3] * np.linalg.norm(M[2])))
 
 
 def orient_signs(P: F64, X: F64, view: I64, point: I64, *, sweeps: int = 20) -> tuple[F64, F64, float]:

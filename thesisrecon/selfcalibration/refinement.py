@@ -113,7 +113,7 @@ def refine_hypotheses(
 
 def solve_guarded(N: F64, g: F64) -> F64:
     """Solve symmetric positive systems N x = g (B, n, n), (B, n); singular or non-finite ones give 0."""
-    bad = ~(np.isfinite(N).all(axis=(1, 2)) & np.isfinite(g).all(axis=1))
+    bad = np.asarray(~(np.isfinite(N).all(axis=(1, 2)) & np.isfinite(g).all(axis=1)))
     N = np.where(bad[:, None, None], np.eye(N.shape[1]), N)
     g = np.where(bad[:, None], 0.0, g)
     scale = np.maximum(np.abs(np.einsum("bii->bi", N)), 1e-300) ** -0.5
