@@ -64,10 +64,11 @@ def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: 
 
 
 def triangulate_midpoint(P: F64, xy: F64) -> F64:
-    """Point nearest to all rays in the least-squares sense (6.3.2); P (V, 3, 4), xy (V, N, 2), NaN = not seen.
+    """Point nearest to all rays in the least-squares sense (6.3.2); P (V, 3, 4), xy (V, N, 2), NaN = not
+    seen.
 
-    Meaningful in a metric frame only: distances do not exist in a projective one, and the answer changes with it.
-    Returns X (N, 4) with X4 = 1; parallel rays and points seen once come out as zeros.
+    Meaningful in a metric frame only: distances do not exist in a projective one, and the answer changes
+    with it. Returns X (N, 4) with X4 = 1; parallel rays and points seen once come out as zeros.
     """
     M_inverse = np.linalg.inv(P[:, :, :3])
     centres = -np.einsum("vab,vb->va", M_inverse, P[:, :, 3])
@@ -88,8 +89,8 @@ def triangulate_midpoint(P: F64, xy: F64) -> F64:
 def triangulate_polynomial(P: F64, xy: F64) -> F64:
     """Optimal triangulation from two views (6.3.3): P (2, 3, 4), xy (2, N, 2); -> X (N, 4) unit norm.
 
-    The matches are moved to the nearest pair that satisfies the epipolar constraint, after which the rays meet and the
-    linear method is exact. Points not seen in both views come out as zeros.
+    The matches are moved to the nearest pair that satisfies the epipolar constraint, after which the rays
+    meet and the linear method is exact. Points not seen in both views come out as zeros.
     """
     if P.shape != (2, 3, 4):
         raise ValueError(f"the polynomial method needs exactly two cameras; got P of shape {P.shape}")
@@ -108,8 +109,8 @@ def triangulate(
 ) -> F64:
     """Space points X (N, 4) from their images by one of the three methods of section 6.3.
 
-    P (V, 3, 4) cameras; xy (V, N, 2) px, NaN = not seen. ``polynomial`` is optimal and takes two views. Raises
-    ``ValueError`` for wrong shapes or an unknown method.
+    P (V, 3, 4) cameras; xy (V, N, 2) px, NaN = not seen. ``polynomial`` is optimal and takes two views.
+    Raises ``ValueError`` for wrong shapes or an unknown method.
     """
     methods = {
         "polynomial": triangulate_polynomial,
