@@ -33,11 +33,12 @@ METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colm
 
 @dataclass(frozen=True)
 class Process:
-    """How a child ended: exit ``code``, ``wall_s`` of its whole life, peak resident memory."""
+    """How a child ended: exit ``code``, wall and processor seconds of its whole life, peak resident memory."""
 
     code: int
     wall_s: float
     peak_mb: float
+    cpu_s: float
 
 
 def run_process(command: list[str], *, log: Path, threads: int, environment: dict[str, str]) -> Process:
@@ -56,7 +57,8 @@ def run_process(command: list[str], *, log: Path, threads: int, environment: dic
         )
         _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
-    return Process(child.returncode, time.perf_counter() - start, usage.ru_maxrss / 1024.0)
+    wall_s, cpu_s = time.perf_counter() - start, usage.ru_utime + usage.ru_stime
+    return Process(child.returncode, wall_s, usage.ru_maxrss / 1024.0, cpu_s)
 
 
 _PIN = (
@@ -80,7 +82,7 @@ def run_method(method: str, scene: Scene, out: Path, *, threads: int, environmen
         return read(scene, out, process)
     except (StageFailure, OSError) as error:
         failure = f"exit code {process.code}: {error}"
-        return Outcome(None, process.wall_s, process.peak_mb, failure=failure)
+        return Outcome(None, process.wall_s, process.peak_mb, process.cpu_s, failure=failure)
 
 
 def _command(method: str, images: Path, out: Path, threads: int) -> list[str]:
@@ -107,6 +109,7 @@ def _read_ours(scene: Scene, out: Path, process: Process) -> Outcome:
         model,
         process.wall_s,
         process.peak_mb,
+        process.cpu_s,
         seconds=_stage_seconds(summary),
         failure=failure,
         reasons=reasons,
@@ -121,7 +124,8 @@ def _stage_seconds(summary: dict[str, Any]) -> dict[str, float]:
 
 def _read_colmap(scene: Scene, out: Path, process: Process) -> Outcome:
     run = read_run(scene.image_paths[0].parent, out)
-    return Outcome(run.reconstruction, sum(run.seconds.values()), process.peak_mb, seconds=run.seconds)
+    wall_s = sum(run.seconds.values())
+    return Outcome(run.reconstruction, wall_s, process.peak_mb, process.cpu_s, seconds=run.seconds)
 
 
 def find_scenes(names: list[str]) -> list[Scene]:

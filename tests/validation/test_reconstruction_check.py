@@ -15,7 +15,7 @@ def _rows(scene: str, outcomes: dict[str, Outcome], *, n_views: int = V) -> dict
 
 def test_rows_hold_both_methods_and_judge_ours() -> None:
     model = _reconstruction(_truth())
-    ours, colmap = Outcome(model, 9.0, 500.0, claimed_rms_px=1.0), Outcome(model, 10.0, 300.0)
+    ours, colmap = Outcome(model, 9.0, 500.0, 12.0, claimed_rms_px=1.0), Outcome(model, 10.0, 300.0, 15.0)
     rows = _rows("fountain-P11", {OURS: ours, COLMAP: colmap})
     assert rows[f"cameras registered of {V}"].verdict == "reached"
     assert rows["focal error"].verdict == "reached"
@@ -28,8 +28,10 @@ def test_rows_hold_both_methods_and_judge_ours() -> None:
 
 
 def test_a_failure_misses_its_targets_and_breaks_nothing() -> None:
-    failed = Outcome(None, 3.0, 100.0, failure="no pair was found")
-    rows = _rows("fountain-P11", {OURS: failed, COLMAP: Outcome(_reconstruction(_truth()), 10.0, 300.0)})
+    failed = Outcome(None, 3.0, 100.0, 5.0, failure="no pair was found")
+    rows = _rows(
+        "fountain-P11", {OURS: failed, COLMAP: Outcome(_reconstruction(_truth()), 10.0, 300.0, 15.0)}
+    )
     assert rows["focal error"].verdict == "missed"
     assert rows["focal error"].values[OURS] is None
     assert rows[f"cameras registered of {V}"].values[OURS] == 0
@@ -37,7 +39,7 @@ def test_a_failure_misses_its_targets_and_breaks_nothing() -> None:
 
 
 def test_kermit_may_miss_cameras_only_with_reasons() -> None:
-    ours = Outcome(_reconstruction(_truth()), 3.0, 100.0)
+    ours = Outcome(_reconstruction(_truth()), 3.0, 100.0, 5.0)
     few = {f"{n}.jpg": "too few points in common" for n in range(11 - V)}
     name = "cameras registered of 11"
     silent = check_reconstruction("kermit", 11, None, {OURS: ours})
