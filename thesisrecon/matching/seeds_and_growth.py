@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.matching.kernels import align_windows, fit_local_affines, grow_corners
+from thesisrecon.matching.alignment import align_corners
+from thesisrecon.matching.kernels import fit_local_affines, grow_corners
 from thesisrecon.matching.prepared import PreparedView, prepare_view
 from thesisrecon.matching.records import FundamentalEstimator, empty_matches, one_to_one
 from thesisrecon.matching.seeds import SeedMatches, match_seeds, neighbour_support
@@ -41,7 +42,7 @@ class SeedsAndGrowth:
     least_correlation: float = 0.7
     aligned_correlation: float = 0.8
     neighbours: int = 10
-    affine_std: float = 0.1
+    affine_std: float = 0.02
 
     def prepare(self, image: Image, features: Features) -> PreparedView:
         """What is computed once for a photograph."""
@@ -135,12 +136,12 @@ class SeedsAndGrowth:
         grown: tuple[I64, I64, SeedMatches],
     ) -> Matches:
         one, two, known = grown
-        scale1 = view1.features.scale[one]
-        xy2, affine, score = align_windows(
-            view1.pyramid,
-            view2.pyramid,
-            (known.xy1, scale1, known.xy2, known.affine),
-            (12, self.affine_std, 3.0),
+        xy2, affine, score = align_corners(
+            view1,
+            view2,
+            (known.xy1, view1.features.scale[one], known.xy2, known.affine),
+            affine_std=self.affine_std,
+            largest_shift=3.0,
         )
         good = np.flatnonzero(score >= self.aligned_correlation)
         good = good[np.argsort(-score[good], kind="stable")]

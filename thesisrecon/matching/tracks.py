@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.matching.kernels import align_windows
+from thesisrecon.matching.alignment import align_corners
 from thesisrecon.matching.linking import Chains, link_matches, maps_to_views
 from thesisrecon.matching.prepared import PreparedView
 from thesisrecon.types import B8, F64, Tracks, TwoView
@@ -41,8 +41,8 @@ class AlignedTracks:
     largest_shift : in pixels of the corner's scale.
     """
 
-    least_correlation: float = 0.75
-    affine_std: float = 0.1
+    least_correlation: float = 0.8
+    affine_std: float = 0.02
     largest_shift: float = 3.0
 
     def build(
@@ -64,11 +64,12 @@ class AlignedTracks:
                 if i == j or not len(group):
                     continue
                 corner = chains.corner[middle[group]]
-                found, _, score = align_windows(
-                    view1.pyramid,
-                    view2.pyramid,
+                found, _, score = align_corners(
+                    view1,
+                    view2,
                     (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group]),
-                    (12, self.affine_std, self.largest_shift),
+                    affine_std=self.affine_std,
+                    largest_shift=self.largest_shift,
                 )
                 xy[group], kept[group] = found, score >= self.least_correlation
         return _tracks(chains, xy, kept, len(prepared))
