@@ -33,7 +33,7 @@ METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colm
 
 @dataclass(frozen=True)
 class Process:
-    """How a child ended: exit ``code``, wall and processor seconds of its whole life, peak resident memory."""
+    """How a child ended: exit ``code``, seconds and processor seconds of its life, peak memory."""
 
     code: int
     wall_s: float
