@@ -227,7 +227,7 @@ def _match_pairs(work: _Work) -> None:
     }
 
     def arguments(missing: Sequence[int]) -> list[tuple[Any, ...]]:
-        prepared = _prepared(work, "matches")
+        prepared = _prepared(work)
         return [
             (work.config, prepared[i], prepared[j], (i, j), run.seed) for i, j in (pairs[n] for n in missing)
         ]
@@ -240,21 +240,13 @@ def _match_pairs(work: _Work) -> None:
     run.finish("matches", counts=counts, metrics=metrics)
 
 
-def _prepared(work: _Work, stage: str) -> dict[int, Any]:
-    """What matching needs of each view, made once; None for a view with too few corners to match."""
+def _prepared(work: _Work) -> dict[int, Any]:
+    """What matching needs of each view, made once and only when something must be computed from it."""
     if work.prepared is None:
-        result = work.result
-        with work.run.clock(stage):
-            views = work.run.workers.map_all(
-                lambda given: _prepare(work.config, *given),
-                list(zip(result.images, result.features, strict=True)),
-            )
-        work.prepared = dict(enumerate(views))
+        given = list(zip(work.result.images, work.result.features, strict=True))
+        matching = work.config.matching
+        work.prepared = dict(enumerate(work.run.workers.map_all(lambda view: matching.prepare(*view), given)))
     return work.prepared
-
-
-def _prepare(config: PipelineConfig, image: Image, features: Features) -> Any:
-    return config.matching.prepare(image, features)
 
 
 def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
@@ -307,7 +299,7 @@ def _build_tracks(work: _Work) -> None:
         "tracks",
         key,
         lambda: work.config.tracks.build(
-            [_prepared(work, "matches")[i] for i in range(len(result.images))],
+            [_prepared(work)[i] for i in range(len(result.images))],
             result.pairs,
             stream(run.seed, "tracks"),
         ),

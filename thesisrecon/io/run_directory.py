@@ -14,7 +14,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -82,7 +82,8 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
         raise UsageError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
@@ -164,7 +165,8 @@ def read_record(path: Path, key: str) -> Any:
     else.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # np.load would leave a file it cannot understand open.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             description = json.loads(bytes(file[_DESCRIPTION]).decode())
             if description["key"] != key:
                 return None

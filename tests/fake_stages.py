@@ -1,0 +1,225 @@
+"""Small stages that know the truth of a small scene: for testing what stands around the real ones.
+
+Every call that computes something is written to ``CALLS``.
+"""
+
+# ruff: noqa: ARG002 (a fake takes what the real stage takes, and ignores most of it)
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import count
+from typing import Any
+
+import numpy as np
+import PIL.Image
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import compose_camera, project
+from thesisrecon.types import (
+    Features,
+    FundamentalFit,
+    Image,
+    IntrinsicInterval,
+    Matches,
+    MetricResult,
+    Reconstruction,
+    SelfCalibration,
+    Tracks,
+    TwoView,
+    Upgrade,
+)
+
+CALLS: list[str] = []
+WIDTH, HEIGHT, POINTS = 96, 80, 30
+K = np.array([[100.0, 0.0, 47.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])
+
+
+def photographs(n: int) -> list[Image]:
+    """n different pictures named 00.png, 01.png, ..."""
+    rng = np.random.default_rng(5)
+    pictures = []
+    for i in range(n):
+        coarse = PIL.Image.fromarray(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8))
+        rgb = np.array(coarse.resize((WIDTH, HEIGHT), PIL.Image.Resampling.BICUBIC))
+        pictures.append(Image(f"{i:02d}.png", rgb, (WIDTH, HEIGHT)))
+    return pictures
+
+
+def scene_points() -> np.ndarray:
+    X = np.random.default_rng(1).uniform(-1.0, 1.0, (POINTS, 3)) + np.array([0.0, 0.0, 5.0])
+    return np.column_stack([X, np.ones(POINTS)])
+
+
+def scene_camera(i: int) -> np.ndarray:
+    angle = 0.1 * i
+    R = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]], dtype=np.float64
+    )
+    return compose_camera(K, R, -R @ np.array([0.5 * i, 0.02 * i, 0.0]))
+
+
+def view_of(image: Image) -> int:
+    return int(image.name[:2])
+
+
+@dataclass(frozen=True)
+class FakeDetector:
+    version: int = 0
+
+    def detect(self, image: Image) -> Features:
+        CALLS.append(f"detect {image.name}")
+        xy = project(scene_camera(view_of(image)), scene_points())
+        return Features(xy, np.ones(POINTS, np.float32), np.ones(POINTS, np.float32))
+
+
+@dataclass(frozen=True)
+class FakeMatcher:
+    fail_pair: tuple[int, int] = (-1, -1)
+    interrupt_after: int = -1
+
+    def prepare(self, image: Image, features: Features) -> Features:
+        CALLS.append(f"prepare {image.name}")
+        return features
+
+    def match(self, view1: Any, view2: Any, *, pair: Any, estimate_fundamental: Any, rng: Any) -> Matches:
+        CALLS.append(f"match {pair}")
+        assert callable(estimate_fundamental)
+        if pair == self.fail_pair:
+            raise StageFailure("only 3 matches", "8 are needed")
+        xy1 = view1.xy + 0.01 * rng.standard_normal(view1.xy.shape)
+        every = np.arange(POINTS)
+        affine = np.broadcast_to(np.eye(2), (POINTS, 2, 2)).copy()
+        score = np.ones(POINTS, np.float32)
+        return Matches(pair[0], pair[1], every, every, xy1, view2.xy.copy(), score, affine)
+
+
+@dataclass(frozen=True)
+class FakeEstimator:
+    def estimate(self, xy1: Any, xy2: Any, rng: Any) -> FundamentalFit:
+        assert xy1.shape == xy2.shape
+        rng.standard_normal()
+        F = np.eye(3) / np.sqrt(3.0)
+        return FundamentalFit(F, np.ones(len(xy1), np.bool_), 0.1, np.eye(9))
+
+
+@dataclass(frozen=True)
+class FakeVerifier:
+    accept: bool = True
+
+    def verify(self, matches: Matches, fit: FundamentalFit) -> TwoView:
+        return TwoView(
+            i=matches.i,
+            j=matches.j,
+            F=fit.F,
+            sigma_px=fit.sigma_px,
+            index1=matches.index1,
+            index2=matches.index2,
+            xy1=matches.xy1,
+            xy2=matches.xy2,
+            affine=matches.affine,
+            candidates=len(matches.xy1),
+            homography_share=0.1,
+            accepted=self.accept,
+            reason="" if self.accept else "too few verified matches",
+        )
+
+
+@dataclass(frozen=True)
+class FakeTracks:
+    def build(self, prepared: Any, pairs: Any, rng: Any) -> Tracks:
+        CALLS.append("tracks")
+        views = len(prepared)
+        point, view = (a.ravel() for a in np.meshgrid(np.arange(POINTS), np.arange(views), indexing="ij"))
+        xy = np.stack([prepared[i].xy for i in range(views)], axis=1).reshape(-1, 2)
+        return Tracks(view, point, xy + 0.01 * rng.standard_normal(xy.shape), views, POINTS)
+
+
+@dataclass(frozen=True)
+class FakeProjective:
+    fail_below: int = 0
+
+    def reconstruct(
+        self, tracks: Tracks, pairs: Any, sizes: Any, *, rng: Any, attempt: int = 0
+    ) -> Reconstruction:
+        CALLS.append(f"projective {attempt}")
+        assert sizes.shape == (tracks.n_views, 2)
+        if attempt < self.fail_below:
+            raise StageFailure("the initial pair is bad", f"attempt {attempt}")
+        return Reconstruction(
+            stratum="projective",
+            P=np.stack([scene_camera(i) for i in range(tracks.n_views)]),
+            X=scene_points(),
+            registered=np.ones(tracks.n_views, np.bool_),
+            valid=np.ones(POINTS, np.bool_),
+            inlier=np.ones(len(tracks.xy), np.bool_),
+            tracks=tracks,
+            sizes=sizes,
+            sigma_px=0.1,
+            reasons=("",) * tracks.n_views,
+        )
+
+
+@dataclass(frozen=True)
+class FakeCalibrator:
+    identifiable: bool = True
+
+    def calibrate(
+        self, reconstruction: Reconstruction, *, groups: Any, focal_prior: Any, rng: Any
+    ) -> SelfCalibration:
+        CALLS.append(f"calibrate prior={focal_prior is not None}")
+        Ks = np.broadcast_to(K, (len(groups), 3, 3)).copy()
+        upgrade = Upgrade(np.eye(4), Ks, 0.0, "fake")
+        why = () if self.identifiable else ("the camera only rotates",)
+        return SelfCalibration(np.eye(4), Ks, np.zeros_like(Ks), self.identifiable, why, (upgrade,))
+
+
+@dataclass(frozen=True)
+class FakeMetric:
+    trusted_from: int = 0
+
+    def refine(
+        self, reconstruction: Reconstruction, calibration: Any, *, groups: Any, focal_prior: Any, rng: Any
+    ) -> MetricResult:
+        attempt = sum(call.startswith("metric") for call in CALLS)
+        CALLS.append(f"metric {attempt}")
+        views = len(groups)
+        intervals = {
+            "focal_px": IntrinsicInterval(100.0, 1.0, "fake"),
+            "principal_x_px": IntrinsicInterval(47.0, 0.5, "fake"),
+            "principal_y_px": IntrinsicInterval(40.0, 0.5, "fake"),
+            "k1": IntrinsicInterval(0.0, 0.0, "fake"),
+        }
+        metric = replace(reconstruction, stratum="metric", K=calibration.K, k1=np.zeros(views))
+        trusted = attempt >= self.trusted_from
+        return MetricResult(
+            metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else ("odd focal",)
+        )
+
+
+def fake_config(**changes: Any) -> PipelineConfig:
+    """A pipeline of fakes."""
+    config = PipelineConfig(
+        features=FakeDetector(),
+        matching=FakeMatcher(),
+        epipolar=FakeEstimator(),
+        verification=FakeVerifier(),
+        tracks=FakeTracks(),
+        projective=FakeProjective(),
+        selfcalibration=FakeCalibrator(),
+        metric=FakeMetric(),
+    )
+    return replace(config, **changes)
+
+
+def interrupt_at(stage: str, done: int) -> Any:
+    """A progress listener that presses Ctrl-C when so much of a stage is done."""
+    heard = count()
+
+    def hear(name: str, finished: int, _total: int) -> None:
+        next(heard)
+        if name == stage and finished == done:
+            raise KeyboardInterrupt
+
+    return hear

@@ -1,0 +1,214 @@
+"""Photographs in: every mode and oddity becomes 8-bit RGB, or a reason."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from thesisrecon.errors import UsageError
+from thesisrecon.io.images import list_images, read_photographs
+from thesisrecon.types import Image
+
+
+def picture(seed: int = 0, size: tuple[int, int] = (96, 80)) -> np.ndarray:
+    """A colourful (H, W, 3) picture without two equal corners."""
+    rng = np.random.default_rng(seed)
+    coarse = PIL.Image.fromarray(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8))
+    return np.array(coarse.resize(size, PIL.Image.Resampling.BICUBIC))
+
+
+def read_one(path: Path, max_size_px: int = 1600) -> Image:
+    photographs = read_photographs([path], max_size_px=max_size_px)
+    assert not photographs.refused
+    return photographs.images[0]
+
+
+def reason(path: Path) -> str:
+    photographs = read_photographs([path], max_size_px=1600)
+    assert not photographs.images
+    return photographs.refused[path.name]
+
+
+def save(path: Path, array: np.ndarray, mode: str | None = None, **options: object) -> Path:
+    image = PIL.Image.fromarray(array)
+    (image.convert(mode) if mode else image).save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", ".webp", ".ppm"])
+def test_lossless_formats_give_the_pixels(tmp_path: Path, suffix: str) -> None:
+    options = {"lossless": True} if suffix == ".webp" else {}
+    image = read_one(save(tmp_path / f"a{suffix}", picture(), **options))
+    np.testing.assert_array_equal(image.rgb, picture())
+    assert image.size == image.original_size == (96, 80)
+    assert image.scale == 1.0
+
+
+@pytest.mark.parametrize(
+    ("mode", "suffix"),
+    [("L", ".png"), ("CMYK", ".tif"), ("CMYK", ".jpg"), ("P", ".png"), ("YCbCr", ".jpg"), ("1", ".png")],
+)
+def test_other_colour_modes_become_rgb(tmp_path: Path, mode: str, suffix: str) -> None:
+    image = read_one(save(tmp_path / f"a{suffix}", picture(), mode))
+    assert image.rgb.shape == (80, 96, 3)
+    assert image.rgb.dtype == np.uint8
+    if mode in ("CMYK", "YCbCr"):
+        assert np.abs(image.rgb.astype(int) - picture().astype(int)).mean() < 12
+
+
+@pytest.mark.parametrize("bits", [12, 16])
+def test_deep_grey_keeps_its_contrast(tmp_path: Path, bits: int) -> None:
+    deep = (picture()[..., 0].astype(np.uint16) << (bits - 8)) + 3
+    image = read_one(save(tmp_path / "a.png", deep))
+    expected = np.rint(deep * (255 / (2**bits - 1)))
+    assert np.abs(image.rgb[..., 0] - expected).max() <= 1
+
+
+def test_real_numbers_are_stretched_over_their_range(tmp_path: Path) -> None:
+    image = read_one(save(tmp_path / "a.tif", picture()[..., 0].astype(np.float32) / 1000 + 5))
+    assert image.rgb.min() == 0
+    assert image.rgb.max() == 255
+
+
+def test_what_is_transparent_becomes_grey(tmp_path: Path) -> None:
+    rgba = np.dstack([picture(), np.full((80, 96), 255, np.uint8)])
+    rgba[:40, :, 3] = 0
+    image = read_one(save(tmp_path / "a.png", rgba))
+    assert (image.rgb[:40] == 128).all()
+    np.testing.assert_array_equal(image.rgb[40:], picture()[40:])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_rotation_is_applied(tmp_path: Path, orientation: int) -> None:
+    upright = PIL.Image.fromarray(picture())
+    # The stored pixels are those that the orientation turns back into the upright picture.
+    turns = PIL.Image.Transpose
+    stored = {
+        1: None,
+        2: turns.FLIP_LEFT_RIGHT,
+        3: turns.ROTATE_180,
+        4: turns.FLIP_TOP_BOTTOM,
+        5: turns.TRANSPOSE,
+        6: turns.ROTATE_90,
+        7: turns.TRANSVERSE,
+        8: turns.ROTATE_270,
+    }[orientation]
+    exif = PIL.Image.Exif()
+    exif[0x0112] = orientation
+    (upright if stored is None else upright.transpose(stored)).save(tmp_path / "a.png", exif=exif)
+    image = read_one(tmp_path / "a.png")
+    np.testing.assert_array_equal(image.rgb, picture())
+    assert image.original_size == (96, 80)
+
+
+def test_the_focal_length_of_exif_is_read_but_only_offered(tmp_path: Path) -> None:
+    exif = PIL.Image.Exif()
+    exif[0x8769] = {0xA405: 36}
+    PIL.Image.fromarray(picture()).save(tmp_path / "a.jpg", exif=exif)
+    save(tmp_path / "b.jpg", picture(1))
+    focal = read_photographs(tmp_path, max_size_px=1600).exif_focal_px
+    assert focal[0] == pytest.approx(96.0)
+    assert np.isnan(focal[1])
+
+
+def test_a_large_photograph_is_reduced_at_one_exact_scale(tmp_path: Path) -> None:
+    """A ramp tells where each pixel went: (x + 0.5) s - 0.5 along both axes."""
+    width, height = 1000, 667
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    rgb = np.stack([x % 256, y % 256, x * 0], axis=-1)
+    rgb[..., 0], rgb[..., 1] = x * 0.25, y * 0.25
+    image = read_one(save(tmp_path / "a.png", rgb.astype(np.uint8)), max_size_px=300)
+    assert image.size == (300, 200)
+    assert image.scale == 0.3
+    original_x = (np.arange(300) + 0.5) / image.scale - 0.5
+    original_y = (np.arange(200) + 0.5) / image.scale - 0.5
+    inner = slice(5, -5)
+    assert np.abs(image.rgb[100, inner, 0] - (original_x * 0.25 - 0.375)[inner]).max() < 1.0
+    assert np.abs(image.rgb[inner, 100, 1] - (original_y * 0.25 - 0.375)[inner]).max() < 1.0
+    # Averaged over the ramp, rounding to whole grey levels leaves far less than a pixel.
+    assert np.mean(image.rgb[100, inner, 0] - (original_x * 0.25 - 0.375)[inner]) == pytest.approx(
+        0, abs=0.05
+    )
+
+
+def test_the_first_frame_of_an_animation_is_used_and_said(tmp_path: Path) -> None:
+    frames = [PIL.Image.fromarray(picture(n)) for n in range(2)]
+    frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:])
+    photographs = read_photographs(tmp_path, max_size_px=1600)
+    assert photographs.photographs[0].note == "only its first frame is used"
+
+
+def test_what_cannot_be_read_gets_its_reason_and_the_others_go_on(tmp_path: Path) -> None:
+    save(tmp_path / "good one ü.jpg", picture())
+    (tmp_path / "text.jpg").write_text("dear reader")
+    whole = save(tmp_path / "cut.jpg", picture(1), quality=95).read_bytes()
+    (tmp_path / "cut.jpg").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "empty.png").write_bytes(b"")
+    (tmp_path / "raw.heic").write_bytes(b"\0\0\0\x18ftypheic" + b"\0" * 64)
+    save(tmp_path / "tiny.png", picture(2, (20, 10)))
+    save(tmp_path / "blank.png", np.full((80, 96, 3), 200, np.uint8))
+    (tmp_path / "notes.txt").write_text("not listed")
+    (tmp_path / ".hidden.jpg").write_text("not listed")
+    (tmp_path / "folder.jpg").mkdir()
+    photographs = read_photographs(tmp_path, max_size_px=1600)
+    assert [image.name for image in photographs.images] == ["good one ü.jpg"]
+    expected = {
+        "text.jpg": "not an image",
+        "cut.jpg": "truncated",
+        "empty.png": "not an image",
+        "raw.heic": "",
+        "tiny.png": "only 20 x 10 pixels",
+        "blank.png": "blank",
+    }
+    assert set(photographs.refused) == set(expected)
+    for name, words in expected.items():
+        assert words in photographs.refused[name]
+
+
+def test_a_decompression_bomb_is_refused(tmp_path: Path) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", 50000, 50000, 8, 2, 0, 0, 0)
+    png = (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0"))
+        + chunk(b"IEND", b"")
+    )
+    (tmp_path / "bomb.png").write_bytes(png)
+    assert "megapixels" in reason(tmp_path / "bomb.png")
+
+
+def test_the_same_pixels_twice_are_one_photograph(tmp_path: Path) -> None:
+    save(tmp_path / "a.png", picture())
+    save(tmp_path / "b.bmp", picture())
+    photographs = read_photographs(tmp_path, max_size_px=1600)
+    assert photographs.refused == {"b.bmp": "has the same pixels as a.png"}
+
+
+def test_arrays_and_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "x").mkdir()
+    first, second = save(tmp_path / "a.png", picture(0)), save(tmp_path / "x" / "a.png", picture(1))
+    names = [image.name for image in read_photographs([second, first], max_size_px=1600).images]
+    assert names == sorted([str(first), str(second)])
+    arrays = read_photographs([picture(0), picture(1)[..., 0]], max_size_px=48)
+    assert [image.name for image in arrays.images] == []
+    arrays = read_photographs([picture(0), picture(1)[..., 0]], max_size_px=90)
+    assert [image.name for image in arrays.images] == ["image-0", "image-1"]
+    assert arrays.images[0].size == (90, 75)
+    with pytest.raises(ValueError, match=r"uint8; got \(3,\)"):
+        read_photographs([np.zeros(3)], max_size_px=90)
+
+
+def test_a_folder_that_is_none_gets_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no folder"):
+        list_images(tmp_path / "absent")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="not a folder"):
+        list_images(tmp_path / "file")

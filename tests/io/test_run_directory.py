@@ -1,0 +1,183 @@
+"""The run directory: records survive, damage is noticed, another run's folder is left alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thesisrecon.errors import UsageError
+from thesisrecon.io.run_directory import (
+    RunDirectory,
+    StageFolder,
+    bytes_from_record,
+    code_key,
+    key_of,
+    read_json,
+    write_atomically,
+    write_json,
+)
+from thesisrecon.types import (
+    Features,
+    IntrinsicInterval,
+    MetricResult,
+    Reconstruction,
+    Seeds,
+    StageReport,
+    Tracks,
+)
+
+
+def some_features(value: float = 1.0) -> Features:
+    seeds = Seeds(
+        np.full((2, 2), value), np.ones(2, np.float32), np.zeros(2, np.float32), np.eye(2, dtype=np.float32)
+    )
+    return Features(np.arange(6.0).reshape(3, 2), np.ones(3, np.float32), np.zeros(3, np.float32), seeds)
+
+
+def some_metric() -> MetricResult:
+    tracks = Tracks(np.zeros(1, np.int64), np.zeros(1, np.int64), np.ones((1, 2)), 2, 1)
+    reconstruction = Reconstruction(
+        stratum="metric",
+        P=np.ones((2, 3, 4)),
+        X=np.ones((1, 4)),
+        registered=np.array([True, False]),
+        valid=np.array([True]),
+        inlier=np.array([True]),
+        tracks=tracks,
+        sizes=np.array([[4, 3], [4, 3]]),
+        sigma_px=0.5,
+        reasons=("", "ünsüitable"),
+    )
+    intervals = ({"focal_px": IntrinsicInterval(100.0, 1.0, "data")}, {})
+    return MetricResult(reconstruction, intervals, {"checked": 1.0}, False, ("a doubt",))
+
+
+def test_records_survive_the_disk(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path / "01")
+    folder.save("a", "key", some_features())
+    folder.save("b", "key", some_metric())
+    features, metric = folder.load("a", "key"), folder.load("b", "key")
+    np.testing.assert_array_equal(features.seeds.patches, np.eye(2, dtype=np.float32))
+    assert features.seeds.patches.dtype == np.float32
+    assert metric.reconstruction.reasons == ("", "ünsüitable")
+    assert metric.reconstruction.K is None
+    assert metric.intrinsics[0]["focal_px"] == IntrinsicInterval(100.0, 1.0, "data")
+    assert metric.doubts == ("a doubt",)
+    assert metric.reconstruction.registered.dtype == np.bool_
+
+
+def test_equal_records_give_equal_bytes() -> None:
+    assert bytes_from_record(some_metric(), "k") == bytes_from_record(some_metric(), "k")
+    assert bytes_from_record(some_features(1.0), "k") != bytes_from_record(some_features(2.0), "k")
+
+
+def test_another_key_damage_and_absence_all_mean_compute_again(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path)
+    assert folder.load("a", "key") is None
+    folder.save("a", "key", some_features())
+    assert folder.load("a", "other") is None
+    good = (tmp_path / "a.npz").read_bytes()
+    for bad in (b"", b"text", good[: len(good) // 2], good[:300] + b"\0" * 40 + good[340:]):
+        (tmp_path / "a.npz").write_bytes(bad)
+        assert folder.load("a", "key") is None
+
+
+def test_a_pickle_is_never_loaded(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", description=np.array([{"key": "key"}], dtype=object))
+    assert StageFolder(tmp_path).load("a", "key") is None
+
+
+def test_the_manifest_ends_a_stage_and_sweeps_what_is_no_longer_part_of_it(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path)
+    folder.save("old", "1", some_features())
+    folder.save("new", "2", some_features())
+    report = StageReport("features", 1.5, {"images": 1}, {"x": 0.5}, ("a warning",))
+    folder.finish(report, {"kind": "k"}, {"new": "2"})
+    assert not (tmp_path / "old.npz").exists()
+    assert folder.finished({"new": "2"}) == report
+    assert folder.finished({"new": "3"}) is None
+    (tmp_path / "manifest.json").write_text("{")
+    assert folder.finished({"new": "2"}) is None
+
+
+def test_keys_tell_values_types_and_arrays_apart() -> None:
+    keys = [key_of(1), key_of("1"), key_of(1, 1), key_of(np.arange(3)), key_of(np.arange(3.0)), key_of(None)]
+    assert len(set(keys)) == len(keys)
+    assert key_of({"a": 1, "b": 2}) == key_of({"b": 2, "a": 1})
+    with pytest.raises(TypeError, match="plain values"):
+        key_of(object())
+
+
+def test_stages_have_different_code() -> None:
+    assert code_key("thesisrecon.features.harris") != code_key("thesisrecon.matching.strength")
+
+
+IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "photographs": {"a.jpg": "1", "b.jpg": "2"}}
+
+
+def test_the_same_run_is_resumed_and_another_is_refused_with_what_differs(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "new" / "out")
+    with directory.claimed(IDENTITY, overwrite=False):
+        directory.stage("01").save("a", "key", some_features())
+    with directory.claimed(IDENTITY, overwrite=False):
+        pass
+    changed = [
+        ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 there and is 6 here"),
+        ({**IDENTITY, "seed": 1}, "seed was 0 there and is 1"),
+        ({**IDENTITY, "photographs": {"a.jpg": "1"}}, "without 'b.jpg'"),
+        ({**IDENTITY, "photographs": {"a.jpg": "1", "b.jpg": "3"}}, "a changed 'b.jpg'"),
+        (
+            {**IDENTITY, "photographs": {"a.jpg": "1", "b.jpg": "2", "c.jpg": "4", "d.jpg": "5"}},
+            "new 'c.jpg' and 1 more",
+        ),
+    ]
+    for identity, words in changed:
+        with pytest.raises(UsageError, match=words), directory.claimed(identity, overwrite=False):
+            pass
+    assert read_json(directory.path / "run.json") == IDENTITY
+    assert directory.stage("01").load("a", "key") is not None
+    with directory.claimed(changed[0][0], overwrite=True):
+        assert directory.stage("01").load("a", "key") is not None
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("dear")
+    with (
+        pytest.raises(UsageError, match=r"holds 'letter\.txt', which is of no run"),
+        RunDirectory(tmp_path).claimed(IDENTITY, overwrite=True),
+    ):
+        pass
+    assert not (tmp_path / "run.json").exists()
+
+
+def test_two_runs_cannot_share_a_folder(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "out")
+    with (
+        directory.claimed(IDENTITY, overwrite=False),
+        pytest.raises(UsageError, match="another run is writing"),
+        directory.claimed(IDENTITY, overwrite=False),
+    ):
+        pass
+    with directory.claimed(IDENTITY, overwrite=False):
+        pass
+
+
+def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(UsageError, match="cannot be written"),
+        RunDirectory(tmp_path / "file" / "out").claimed(IDENTITY, overwrite=False),
+    ):
+        pass
+    with pytest.raises(UsageError, match="cannot be written"):
+        write_atomically(tmp_path / "file" / "x", b"")
+
+
+def test_json_has_no_nan(tmp_path: Path) -> None:
+    write_json(
+        tmp_path / "a.json",
+        {"a": float("nan"), "b": [np.float64(1.5), np.int64(2)], "c": np.array([np.inf, 1])},
+    )
+    assert read_json(tmp_path / "a.json") == {"a": None, "b": [1.5, 2], "c": [None, 1.0]}

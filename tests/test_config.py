@@ -1,0 +1,118 @@
+"""Settings as text: what is refused, and that everything written is read back."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+
+import pytest
+
+from thesisrecon.config import (
+    KINDS,
+    PRESETS,
+    PipelineConfig,
+    apply_setting,
+    config_from_toml,
+    preset,
+    tables_from_config,
+    toml_from_config,
+)
+from thesisrecon.errors import UsageError
+from thesisrecon.settings import parse_word, toml_from_tables
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_survives_toml(name: str) -> None:
+    config = preset(name)
+    assert config_from_toml(toml_from_config(config), preset("default")) == config
+    assert tomllib.loads(toml_from_config(config)) == tables_from_config(config)
+
+
+@pytest.mark.parametrize(("stage", "kind"), [(s, k) for s, kinds in KINDS.items() for k in kinds])
+def test_every_kind_can_be_chosen_by_its_word(stage: str, kind: str) -> None:
+    config = apply_setting(PipelineConfig(), f"{stage}.kind={kind}")
+    variant = getattr(config, stage)
+    assert type(variant) is KINDS[stage][kind]
+    assert dataclasses.is_dataclass(variant)
+    assert type(variant).__dataclass_params__.frozen  # type: ignore[attr-defined]
+
+
+def test_the_file_names_its_preset_unless_the_command_did() -> None:
+    text = 'preset = "thesis"\n[images]\nmax_size_px = 900\n'
+    assert config_from_toml(text) == dataclasses.replace(
+        preset("thesis"), images=dataclasses.replace(preset("thesis").images, max_size_px=900)
+    )
+    assert config_from_toml(text, preset("default"), fixed_preset=True).features == preset("default").features
+
+
+def test_a_setting_keeps_the_others_of_its_stage() -> None:
+    config = apply_setting(
+        apply_setting(PipelineConfig(), "features.kind=harris-corners"), "features.max_corners=7"
+    )
+    config = apply_setting(config, "features.threshold_rel=0.5")
+    assert config.features.max_corners == 7  # type: ignore[attr-defined]
+    assert config.features.threshold_rel == 0.5  # type: ignore[attr-defined]
+
+
+def test_a_nested_setting_and_none() -> None:
+    config = apply_setting(PipelineConfig(), "selfcalibration.search.steps=5")
+    assert config.selfcalibration.search.steps == 5  # type: ignore[attr-defined]
+    config = apply_setting(config, "selfcalibration.search=none")
+    assert config.selfcalibration.search is None  # type: ignore[attr-defined]
+    assert config_from_toml(toml_from_config(config)) == config
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("featurs.kind=harris-corners", "did you mean features"),
+        ("features.kind=haris-corners", "did you mean harris-corners"),
+        ("images.max_size=900", "did you mean images.max_size_px"),
+        ("images.max_size_px=large", "takes a whole number"),
+        ("images.max_size_px=900.5", "takes a whole number"),
+        ("images.max_size_px=true", "takes a whole number"),
+        ("images.max_size_px=3", "at least 64"),
+        ("intrinsics.cameras=each", "unknown value of intrinsics.cameras"),
+        ("intrinsics.focal_px=1000", "needs its weight"),
+        ("intrinsics.exif=true", "needs its weight"),
+        ("selfcalibration.focal_range=[1]", "list of 2"),
+        ("selfcalibration.search=7", "takes a table"),
+        ("images", "stage.field=value"),
+        ("=3", "stage.field=value"),
+        ("images.=3", "stage.field=value"),
+        ("images=3", "stage.field=value"),
+    ],
+)
+def test_a_wrong_setting_gets_a_sentence(setting: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words.replace(".", r"\.")):
+        apply_setting(PipelineConfig(), setting)
+
+
+def test_text_that_is_no_toml_and_stages_that_are_no_tables_are_refused() -> None:
+    with pytest.raises(UsageError, match="not TOML"):
+        config_from_toml("features: harris")
+    with pytest.raises(UsageError, match="takes a table"):
+        config_from_toml("features = 3")
+    with pytest.raises(UsageError, match="unknown preset"):
+        config_from_toml('preset = "best"')
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("true", True), ("3", 3), ("-2.5e3", -2500.0), ("[1, 2.5]", [1, 2.5]), ("word", "word"), ("'3'", "3")],
+)
+def test_words_of_the_command_line(text: str, value: object) -> None:
+    parsed = parse_word(text)
+    assert parsed == value
+    assert type(parsed) is type(value)
+
+
+def test_toml_keeps_awkward_text() -> None:
+    tables = {
+        "a": {
+            "text": 'quote " backslash \\ newline \n tab \t ünï',
+            "list": [1, 2.5, True],
+            "b": {"c": 1e-300},
+        }
+    }
+    assert tomllib.loads(toml_from_tables(tables)) == tables

@@ -1,0 +1,303 @@
+"""The composer: resuming, determinism, second attempts, and what it leaves behind, around stages that are
+fakes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests import fake_stages as fakes
+from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
+from thesisrecon.assumptions import camera_groups
+from thesisrecon.config import ImageOptions, IntrinsicsAssumption
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.pipeline import reconstruct
+from thesisrecon.run import stream
+from thesisrecon.types import Image, RunResult
+from thesisrecon.workers import Workers
+
+
+@pytest.fixture(autouse=True)
+def _forget_calls() -> None:
+    CALLS.clear()
+
+
+def run(out: Path, n: int = 4, **given: Any) -> RunResult:
+    given.setdefault("config", fake_config())
+    given.setdefault("threads", 2)
+    return reconstruct(photographs(n), out, **given)
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def kept_bytes(out: Path) -> dict[str, str]:
+    """Every result file of a run and its hash."""
+    files = [
+        *out.glob("0*/*.npz"),
+        *(out / "sparse" / "0").iterdir(),
+        out / "points.ply",
+        out / "cameras.json",
+    ]
+    return {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
+
+
+def test_a_run_leaves_everything_it_promises(tmp_path: Path) -> None:
+    result = run(tmp_path / "out")
+    out = tmp_path / "out"
+    assert result.metric is not None
+    assert result.metric.trusted
+    names = {p.name for p in out.iterdir()}
+    stages = {"01-features", "02-matches", "03-tracks", "04-projective", "05-selfcalibration", "06-metric"}
+    assert (
+        stages | {"sparse", "points.ply", "cameras.json", "report.html", "summary.json", "config.toml"}
+        <= names
+    )
+    assert {p.name for p in (out / "sparse" / "0").iterdir()} >= {"cameras.bin", "images.bin", "points3D.bin"}
+    assert struct.unpack("<Q", (out / "sparse" / "0" / "images.bin").read_bytes()[:8]) == (4,)
+    summary = read(out / "summary.json")
+    assert summary == json.loads(json.dumps(result.summary))
+    assert (summary["images"], summary["registered"], summary["points"]) == (4, 4, fakes.POINTS)
+    assert summary["reprojection_rms_px"] < 0.1
+    assert summary["cameras"][0]["focal_px"] == {"value": 100.0, "std": 1.0, "source": "fake"}
+    assert summary["failure"] is None
+    assert set(summary["seconds"]) >= {
+        "images",
+        "features",
+        "matches",
+        "tracks",
+        "metric",
+        "outputs",
+        "total",
+    }
+    manifest = read(out / "02-matches" / "manifest.json")
+    assert set(manifest["keys"]) == {f"{i:05d}-{j:05d}" for i in range(4) for j in range(i + 1, 4)}
+    assert manifest["report"]["counts"]["accepted"] == 6
+
+
+def test_summary_and_cameras_are_in_original_pixels(tmp_path: Path) -> None:
+    """Photographs at half size: (x + 0.5) / s - 0.5, focal and residuals by 1 / s."""
+    images = [Image(i.name, i.rgb, (2 * fakes.WIDTH, 2 * fakes.HEIGHT)) for i in photographs(3)]
+    result = reconstruct(images, tmp_path, config=fake_config())
+    camera = result.summary["cameras"][0]
+    assert camera["focal_px"]["value"] == pytest.approx(200.0)
+    assert camera["focal_px"]["std"] == pytest.approx(2.0)
+    assert camera["principal_x_px"]["value"] == pytest.approx(94.5)
+    assert result.summary["reprojection_median_px"] == pytest.approx(
+        2 * result.summary["reprojection_median_working_px"]
+    )
+    table = read(tmp_path / "cameras.json")["cameras"][1]
+    np.testing.assert_allclose(table["K"], [[200, 0, 94.5], [0, 200, 80.5], [0, 0, 1]])
+    np.testing.assert_allclose(table["centre"], [0.5, 0.02, 0.0], atol=1e-12)
+
+
+def test_a_second_run_computes_nothing(tmp_path: Path) -> None:
+    first = run(tmp_path)
+    before = kept_bytes(tmp_path)
+    CALLS.clear()
+    second = run(tmp_path)
+    assert CALLS == []
+    assert kept_bytes(tmp_path) == before
+    assert second.summary["resumed"] == list(read(tmp_path / "summary.json")["resumed"])
+    assert set(second.summary["resumed"]) == set(first.summary["seconds"]) - {"images", "outputs", "total"}
+    assert second.summary["seconds"]["matches"] == first.summary["seconds"]["matches"]
+
+
+@pytest.mark.parametrize(
+    ("stage", "done"),
+    [("features", 2), ("matches", 0), ("matches", 3), ("projective", 0), ("projective", 1), ("metric", 0)],
+)
+def test_a_run_stopped_anywhere_goes_on_and_ends_the_same(tmp_path: Path, stage: str, done: int) -> None:
+    run(tmp_path / "whole", threads=1)
+    whole = list(CALLS)
+    CALLS.clear()
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "cut", threads=1, progress=interrupt_at(stage, done))
+    run(tmp_path / "cut", threads=1)
+    assert kept_bytes(tmp_path / "cut") == kept_bytes(tmp_path / "whole")
+    computed = [call for call in CALLS if not call.startswith(("prepare", "metric"))]
+    assert sorted(computed) == sorted(call for call in whole if not call.startswith(("prepare", "metric")))
+
+
+def test_a_damaged_result_is_computed_again(tmp_path: Path) -> None:
+    run(tmp_path)
+    before = kept_bytes(tmp_path)
+    CALLS.clear()
+    (tmp_path / "02-matches" / "00001-00002.npz").write_bytes(b"damaged")
+    (tmp_path / "01-features" / "00003.npz").unlink()
+    run(tmp_path)
+    assert [c for c in CALLS if not c.startswith("prepare")] == ["detect 03.png", "match (1, 2)"]
+    assert kept_bytes(tmp_path) == before
+
+
+@pytest.mark.parametrize("options", [{"threads": 1}, {"threads": 3}, {"threads": 2, "executor": "processes"}])
+def test_workers_change_no_byte(tmp_path: Path, options: Any) -> None:
+    run(tmp_path / "a", threads=2)
+    run(tmp_path / "b", **options)
+    assert kept_bytes(tmp_path / "a") == kept_bytes(tmp_path / "b")
+
+
+def test_the_seed_matters_and_streams_are_apart(tmp_path: Path) -> None:
+    run(tmp_path / "a")
+    run(tmp_path / "b", seed=1)
+    a, b = kept_bytes(tmp_path / "a"), kept_bytes(tmp_path / "b")
+    assert a["02-matches/00000-00001.npz"] != b["02-matches/00000-00001.npz"]
+    assert a["01-features/00000.npz"] == b["01-features/00000.npz"]
+    draws = {
+        stream(s, name, *ids).random() for s in (0, 1) for name in ("a", "b") for ids in ((), (0, 1), (1, 0))
+    }
+    assert len(draws) == 12
+
+
+def test_another_run_is_refused_and_overwrite_keeps_what_is_the_same(tmp_path: Path) -> None:
+    run(tmp_path)
+    CALLS.clear()
+    changed = fake_config(
+        projective=fakes.FakeProjective(), selfcalibration=fakes.FakeCalibrator(identifiable=False)
+    )
+    with pytest.raises(UsageError, match=r"selfcalibration\.identifiable was true there and is false here"):
+        run(tmp_path, config=changed)
+    assert CALLS == []
+    result = run(tmp_path, config=changed, overwrite=True)
+    assert CALLS == ["calibrate prior=False", "metric 0"]
+    assert any("only rotates" in warning for warning in result.warnings)
+
+
+def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path: Path) -> None:
+    run(tmp_path, 3)
+    CALLS.clear()
+    run(tmp_path, 4, overwrite=True)
+    assert [c for c in CALLS if c.startswith("detect")] == ["detect 03.png"]
+    assert sorted(c for c in CALLS if c.startswith("match")) == [
+        "match (0, 3)",
+        "match (1, 3)",
+        "match (2, 3)",
+    ]
+
+
+def test_until_ends_early_and_a_longer_run_goes_on(tmp_path: Path) -> None:
+    assert run(tmp_path, until="features").pairs == ()
+    assert run(tmp_path, until="matches").tracks is None
+    projective = run(tmp_path, until="projective")
+    assert projective.projective is not None
+    assert projective.calibration is None
+    assert (tmp_path / "report.html").exists()
+    CALLS.clear()
+    assert run(tmp_path).metric is not None
+    assert CALLS == ["calibrate prior=False", "metric 0"]
+
+
+def test_a_distrusted_result_is_tried_from_other_pairs(tmp_path: Path) -> None:
+    result = run(tmp_path, config=fake_config(metric=fakes.FakeMetric(trusted_from=1)))
+    assert [c for c in CALLS if c.startswith("projective")] == ["projective 0", "projective 1"]
+    assert result.metric is not None
+    assert result.metric.trusted
+    assert any("2 initial pairs" in warning for warning in result.warnings)
+
+
+def test_a_result_that_nobody_trusts_is_written_with_its_warning(tmp_path: Path) -> None:
+    result = run(tmp_path, config=fake_config(metric=fakes.FakeMetric(trusted_from=9)))
+    assert sum(c.startswith("projective") for c in CALLS) == 3
+    assert any("not to be trusted: odd focal" in warning for warning in result.warnings)
+    assert read(tmp_path / "summary.json")["trusted"] is False
+    assert (tmp_path / "sparse" / "0" / "images.bin").exists()
+    assert "odd focal" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_failed_attempt_is_followed_by_another(tmp_path: Path) -> None:
+    result = run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=2)))
+    assert result.metric is not None
+
+
+def test_a_failure_keeps_what_was_computed_and_says_why(tmp_path: Path) -> None:
+    config = fake_config(projective=fakes.FakeProjective(fail_below=9))
+    with pytest.raises(StageFailure, match=r"the initial pair is bad\. attempt 0"):
+        run(tmp_path, config=config)
+    summary = read(tmp_path / "summary.json")
+    assert "the initial pair is bad" in summary["failure"]
+    assert summary["pairs"]["accepted"] == 6
+    assert "the initial pair is bad" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_pair_that_fails_is_a_refused_pair(tmp_path: Path) -> None:
+    result = run(tmp_path, config=fake_config(matching=fakes.FakeMatcher(fail_pair=(0, 2))))
+    refused = [pair for pair in result.pairs if not pair.accepted]
+    assert [(pair.i, pair.j) for pair in refused] == [(0, 2)]
+    assert refused[0].reason.startswith("only 3 matches")
+
+
+def test_no_accepted_pair_is_a_failure_with_the_best_pair_named(tmp_path: Path) -> None:
+    with pytest.raises(StageFailure, match=r"best of 6 pairs has 30 verified matches: too few verified"):
+        run(tmp_path, config=fake_config(verification=fakes.FakeVerifier(accept=False)))
+
+
+def test_cameras_are_shared_by_size_or_not_at_all() -> None:
+    sizes = [(4, 3), (3, 4), (4, 3)]
+    assert camera_groups(sizes, "shared").tolist() == [0, 1, 0]
+    assert camera_groups(sizes, "per-image").tolist() == [0, 1, 2]
+
+
+def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path: Path) -> None:
+    wish = IntrinsicsAssumption(focal_px=100.0, focal_std_rel=0.1)
+    run(tmp_path, config=fake_config(intrinsics=wish))
+    assert "calibrate prior=True" in CALLS
+
+
+def test_photographs_are_reduced_to_the_size_of_the_config(tmp_path: Path) -> None:
+    big = [np.array(i.rgb).repeat(3, 0).repeat(3, 1) for i in photographs(2)]
+    config = replace(fake_config(), images=ImageOptions(max_size_px=144), features=NamelessDetector())
+    result = reconstruct(big, tmp_path, config=config, until="features")
+    assert [image.size for image in result.images] == [(144, 120)] * 2
+    assert result.images[0].scale == 0.5
+
+
+class NamelessDetector(fakes.FakeDetector):
+    """Images given as arrays have no number in their names."""
+
+    def detect(self, image: Image) -> Any:
+        return super().detect(replace(image, name="00"))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"until": "dense"}, "does not exist yet"),
+        ({"until": "metrik"}, "did you mean metric"),
+        ({"threads": -1}, "at least 1"),
+        ({"executor": "dask://there"}, "does not exist yet"),
+        ({"executor": "proceses"}, "did you mean processes"),
+        ({"seed": -1}, "at least 0"),
+    ],
+)
+def test_wrong_wishes_get_a_sentence_before_anything_is_made(
+    tmp_path: Path, options: Any, words: str
+) -> None:
+    with pytest.raises(UsageError, match=words):
+        run(tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_option_is_a_wrong_call(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="did you mean threads"):
+        run(tmp_path / "out", thread=3)
+
+
+def test_the_first_error_of_a_worker_ends_the_rest() -> None:
+    def fail(n: int) -> int:
+        if n == 3:
+            raise StageFailure("three")
+        return n
+
+    heard: list[int] = []
+    with pytest.raises(StageFailure, match="three"):
+        Workers(2).run(fail, [(n,) for n in range(1000)], lambda n, _: heard.append(n))
+    assert len(heard) < 1000
