@@ -28,6 +28,7 @@ from thesisrecon.settings import (
     parse_word,
     table_from_dataclass,
     toml_from_tables,
+    unknown_setting,
     unknown_word,
 )
 from thesisrecon.types import (
@@ -292,6 +293,10 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
     if kind not in KINDS[stage] and type(current).__name__ != kind:
         raise UsageError(unknown_word(f"kind of {stage}", str(kind), KINDS[stage]))
     variant = KINDS[stage].get(kind, type(current))
+    names = [item.name for item in dataclasses.fields(variant)]
+    for key in fields:
+        if key not in names:
+            raise unknown_setting(stage, key, ["kind", *names])
     return dataclass_from_table(variant, fields, stage, current if type(current) is variant else None)
 
 

@@ -44,9 +44,9 @@ def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, ba
     names = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
     changes = {}
     for key, value in table.items():
-        place = f"{where}.{key}" if where else key
+        place = f"{where}.{key}"
         if key not in names:
-            raise UsageError(unknown_word("setting", place, [f"{where}.{n}" if where else n for n in names]))
+            raise unknown_setting(where, key, names)
         changes[key] = coerce(value, hints[key], place, None if base is None else getattr(base, key))
     try:
         return kind(**changes) if base is None else dataclasses.replace(base, **changes)  # type: ignore[type-var]
@@ -102,6 +102,14 @@ def _type_words(annotation: Any) -> str:
     if annotation in words:
         return words[annotation]
     return "a list" if typing.get_origin(annotation) is tuple else "a table of settings"
+
+
+def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
+    """The refusal of a key that the table at ``where`` does not have; it names the nearest of ``names``."""
+    near = difflib.get_close_matches(key, names := list(names), n=3, cutoff=0.6)
+    known = " or ".join(f"{where}.{name}" for name in near)
+    hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names)}"
+    return UsageError(f"unknown setting '{where}.{key}'; {hint}")
 
 
 def unknown_word(what: str, word: str, known: Iterable[str]) -> str:

@@ -175,7 +175,7 @@ def _finish(photograph: Photograph) -> Photograph:
         raise _Refused(
             f"is only {rgb.shape[1]} x {rgb.shape[0]} pixels; {MIN_SIDE} x {MIN_SIDE} are the least"
         )
-    if int(rgb.max()) - int(rgb.min()) < BLANK_RANGE:
+    if np.ptp(rgb.reshape(-1, 3), axis=0).max() < BLANK_RANGE:
         raise _Refused("is blank: all its pixels have nearly the same colour")
     content = hashlib.sha256(repr((rgb.shape, photograph.image.original_size)).encode())
     content.update(np.ascontiguousarray(rgb).data)

@@ -1,0 +1,197 @@
+"""The command line on the project's own photographs: one whole run, killed once, and what it prints."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import thesisrecon.cli as cli
+from thesisrecon.cli import run_command
+
+ROOT = Path(__file__).parent.parent
+COURTYARD = ROOT / "fixtures" / "courtyard"
+VIEWS = 6
+SMALL = ["--max-size", "640", "--threads", "2"]
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few neighbouring views of the courtyard, in a folder whose name has a space and a letter beyond
+    ASCII.
+    """
+    folder = tmp_path_factory.mktemp("cli") / "my phötographs"
+    folder.mkdir()
+    for path in sorted((COURTYARD / "images").iterdir())[:VIEWS]:
+        shutil.copy(path, folder)
+    return folder
+
+
+def command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-m", "thesisrecon", *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def killed_and_resumed(photographs: Path) -> tuple[Path, int]:
+    """The output of a run that was killed while it matched and then started again; and how many pairs were
+    kept.
+    """
+    out = photographs.parent / "out"
+    arguments = command("reconstruct", photographs, "-o", out, *SMALL)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 300
+    while len(list((out / "02-matches").glob("*.npz"))) < 2:
+        assert process.poll() is None, "the run ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    kept = len(list((out / "02-matches").glob("*.npz")))
+    assert not (out / "summary.json").exists()
+    run = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr == ""
+    assert f"{VIEWS} of {VIEWS} photographs registered" in run.stdout
+    return out, kept
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed: tuple[Path, int]) -> None:
+    out, kept = killed_and_resumed
+    assert kept >= 2
+    summary = read(out / "summary.json")
+    assert summary["registered"] == VIEWS
+    assert summary["trusted"]
+    truth = read(COURTYARD / "cameras.json")
+    focal = truth_focal(truth)
+    assert summary["cameras"][0]["focal_px"]["value"] == pytest.approx(focal, rel=0.02)
+    assert summary["points"] > 300
+
+
+def truth_focal(truth: Any) -> float:
+    """The true focal length (px) of the courtyard's one camera."""
+    cameras = truth["cameras"] if "cameras" in truth else truth["images"]
+    first = next(iter(cameras.values())) if isinstance(cameras, dict) else cameras[0]
+    return float(np.array(first["K"] if "K" in first else truth["K"])[0][0])
+
+
+def test_inspect_prints_what_was_found(
+    killed_and_resumed: tuple[Path, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["inspect", str(killed_and_resumed[0])]) == 0
+    printed = capsys.readouterr().out
+    assert f"{VIEWS} of {VIEWS} photographs registered" in printed
+    assert "camera 0: focal" in printed
+
+
+def test_a_finished_run_is_not_touched_by_another_config(
+    killed_and_resumed: tuple[Path, int], photographs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, _ = killed_and_resumed
+    before = (out / "summary.json").read_bytes()
+    arguments = ["reconstruct", str(photographs), "-o", str(out), "--max-size", "700"]
+    assert run_command(arguments) == 2
+    assert "images.max_size_px was 640 there and is 700 here" in capsys.readouterr().err
+    assert (out / "summary.json").read_bytes() == before
+
+
+def test_the_written_config_runs_again(
+    killed_and_resumed: tuple[Path, int], photographs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, _ = killed_and_resumed
+    arguments = ["reconstruct", str(photographs), "-o", str(out), "--config", str(out / "config.toml")]
+    assert run_command([*arguments, "--threads", "2"]) == 0
+    assert "registered" in capsys.readouterr().out
+    assert set(read(out / "summary.json")["resumed"]) >= {"features", "matches", "tracks", "metric"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["reconstruct"], "Missing"),
+        (["reconstruct", "nowhere", "-o", "out"], "there is no folder nowhere"),
+        (["reconstruct", ".", "-o", "out", "--preset", "best"], "--preset"),
+        (["reconstruct", ".", "-o", "out", "--cameras", "two"], "--cameras"),
+        (["reconstruct", ".", "-o", "out", "--no-such-option"], "--no-such-option"),
+        (["reconstruct", ".", "-o", "out", "--seed", "many"], "--seed"),
+        (["reconstruct", ".", "-o", "out", "--set", "features.kin=x"], "did you mean features.kind"),
+        (["reconstruct", ".", "-o", "out", "--config", "nowhere.toml"], "nowhere.toml cannot be read"),
+        (["reconstruct", ".", "-o", "out", "--until", "dense"], "does not exist yet"),
+        (["reconstruct", ".", "-o", "out", "--executor", "dask://x"], "does not exist yet"),
+        (["reconstruct", ".", "-o", "out", "--max-size", "5"], "at least 64"),
+        (["inspect", "nowhere"], "no summary"),
+        (["rebuild"], "rebuild"),
+    ],
+)
+def test_a_wrong_command_gets_one_sentence_and_exit_2(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_command(arguments) == 2
+    printed = capsys.readouterr()
+    assert words in printed.err
+    assert printed.err.count("\n") == 1
+    assert "Traceback" not in printed.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_says_how_to_go_on(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("thesisrecon.pipeline.reconstruct", interrupt)
+    assert run_command(["reconstruct", str(photographs), "-o", str(tmp_path / "out")]) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_an_error_in_the_program_is_a_sentence_too(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise IndexError("index 3 is out of bounds")
+
+    monkeypatch.delenv(cli.DEBUG_VARIABLE, raising=False)
+    monkeypatch.setattr("thesisrecon.pipeline.reconstruct", fail)
+    arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out")]
+    assert run_command(arguments) == 1
+    assert "IndexError: index 3" in capsys.readouterr().err
+    monkeypatch.setenv(cli.DEBUG_VARIABLE, "1")
+    with pytest.raises(IndexError):
+        run_command(arguments)
+
+
+def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["--version"]) == 0
+    assert run_command([]) == 0
+    assert run_command(["reconstruct", "--help"]) == 0
+    printed = capsys.readouterr().out
+    options = ["--preset", "--cameras", "--config", "--set", "--seed", "--threads", "--max-size", "--until"]
+    for option in [*options, "--executor", "--overwrite"]:
+        assert option in printed
+
+
+def test_the_demo_without_its_photographs_says_where_they_are(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "DEMO_SCENE", Path("fixtures") / "absent")
+    assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
+    assert "come with the source" in capsys.readouterr().err
