@@ -61,7 +61,7 @@ need_package() {
     "$python" -m venv "$VENV" || fail "no virtual environment could be made in $VENV (Debian: python3-venv)"
   fi
   echo "installing thesisrecon${extras:+ [$extras]} into $VENV"
-  "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -e "$ROOT${extras:+[$extras]}" </dev/null ||
+  "$VENV/bin/python" -m pip install -qq --disable-pip-version-check -e "$ROOT${extras:+[$extras]}" </dev/null ||
     fail "pip could not install the package; its message stands above"
   echo "$wanted" >"$stamp"
 }
