@@ -107,7 +107,7 @@ def test_growth_equals_its_numpy_twin() -> None:
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     affine, radius = np.tile(np.eye(2), (len(xy1), 1, 1)), np.full(len(xy1), 12.0)
     place = xy1 - (14.0, 0.0)
-    index, score = grow_corners(
+    index, score, rival = grow_corners(
         one.pyramid,
         (xy1, one.features.scale),
         (affine, place, radius),
@@ -125,6 +125,9 @@ def test_growth_equals_its_numpy_twin() -> None:
     assert (expected >= 0).sum() > 50
     assert np.array_equal(index[inside], expected[inside])
     assert np.abs(score[inside] - np.where(expected >= 0, twin.max(axis=1), 0.0)[inside]).max() < 1e-4
+    elsewhere = allowed & (np.linalg.norm(xy2[expected][:, None] - xy2[None], axis=2) > 3.0)
+    second = np.where(elsewhere & (expected >= 0)[:, None], correlation, -1.0).max(axis=1)
+    assert np.abs(rival[inside] - second[inside]).max() < 1e-4
 
 
 @pytest.mark.parametrize("affine_std", [0.0, 0.1])
@@ -139,7 +142,10 @@ def test_alignment_finds_the_true_place_under_gain_and_bias(affine_std: float) -
     affine = np.zeros((len(xy2), 2, 2))
     affine[:, 0, 0], affine[:, 0, 1], affine[:, 1, 1] = slope, shear * slope, 1.0
     found, maps, score = align_windows(
-        one.pyramid, two.pyramid, (xy1, np.ones(len(xy1), np.float32), start, affine), (12, affine_std, 3.0)
+        one.pyramid,
+        two.pyramid,
+        (xy1, np.ones(len(xy1), np.float32), start, affine),
+        (12, affine_std, 3.0, 1.0),
     )
     error = np.linalg.norm(found - xy2, axis=1)
     assert (score > 0.9).mean() > 0.95
@@ -160,7 +166,7 @@ def test_alignment_recovers_an_affine_map_it_was_not_told() -> None:
     xy2 = (xy1 - 120) @ truth.T + 120
     start = np.tile(np.eye(2), (len(xy1), 1, 1))
     found, maps, score = align_windows(
-        one.pyramid, two.pyramid, (xy1, np.ones(len(xy1), np.float32), xy2 + 0.4, start), (20, 0.1, 3.0)
+        one.pyramid, two.pyramid, (xy1, np.ones(len(xy1), np.float32), xy2 + 0.4, start), (20, 0.1, 3.0, 1.0)
     )
     assert (score > 0.95).mean() > 0.9
     assert np.median(np.linalg.norm(found - xy2, axis=1)) < 0.05
@@ -172,12 +178,24 @@ def test_alignment_gives_up_on_blank_windows_and_outside() -> None:
     xy = np.array([[50.0, 50.0], [2.0, 50.0], [np.nan, 50.0]])
     args = (xy, np.ones(3, np.float32), xy, np.tile(np.eye(2), (3, 1, 1)))
     for one, two in ((blank, rich), (rich, blank)):
-        assert not align_windows(one.pyramid, two.pyramid, args, (5, 0.1, 3.0))[2].any()
-    assert (align_windows(rich.pyramid, rich.pyramid, args, (5, 0.1, 3.0))[2] > 0.99).tolist() == [
+        assert not align_windows(one.pyramid, two.pyramid, args, (5, 0.1, 3.0, 1.0))[2].any()
+    assert (align_windows(rich.pyramid, rich.pyramid, args, (5, 0.1, 3.0, 1.0))[2] > 0.99).tolist() == [
         True,
         False,
         False,
     ]
+
+
+def test_alignment_drops_what_its_gradients_cannot_place() -> None:
+    rich, straight = texture(100, 100, 3), np.repeat(texture(1, 100, 3), 100, axis=0)
+    noise = RNG.normal(scale=2.0, size=(2, 100, 100))
+    xy = np.array([[50.0, 50.0]])
+    args = (xy, np.ones(1, np.float32), xy, np.eye(2)[None])
+    kept = []
+    for gray in (rich, 128 + 0.05 * (straight - 128)):
+        one, two = prepared(gray + noise[0]), prepared(gray + noise[1])
+        kept.append(align_windows(one.pyramid, two.pyramid, args, (12, 0.0, 3.0, 0.12))[2][0] > 0.0)
+    assert kept == [True, False]
 
 
 def test_strength_of_match_equals_its_numpy_twin() -> None:

@@ -12,6 +12,9 @@ ITERATIONS = 12
 # A window of half the width sees less: it must fit better, and not wander from what the wider one found.
 FINE_CORRELATION = 0.85
 FINE_SHIFT = 1.0
+# Smooth shading correlates with anything and holds no place: what its own gradients cannot place to this many
+# pixels of its scale is dropped. It removes the false matches that a correlation threshold lets through.
+LARGEST_STD = 0.12
 
 
 def align_corners(
@@ -37,11 +40,15 @@ def align_corners(
 
     Returns
     -------
-    xy2 (M, 2), affine (M, 2, 2), correlation (M,), 0 where the alignment failed and the start was kept.
+    xy2 (M, 2), affine (M, 2, 2), correlation (M,), 0 where the alignment failed or its expected error
+    exceeds ``LARGEST_STD`` px of the scale, and the start was kept.
     """
     xy1, scale1, start, maps = matches
     xy2, affine, score = align_windows(
-        view1.pyramid, view2.pyramid, (xy1, scale1, start, maps), (ITERATIONS, affine_std, largest_shift)
+        view1.pyramid,
+        view2.pyramid,
+        (xy1, scale1, start, maps),
+        (ITERATIONS, affine_std, largest_shift, LARGEST_STD),
     )
     coarse = np.flatnonzero((scale1 > 1.5 * view1.base) & (score > 0.0))
     if not len(coarse):
@@ -51,7 +58,7 @@ def align_corners(
         view1.pyramid,
         view2.pyramid,
         (xy1[coarse], finest, xy2[coarse], affine[coarse]),
-        (ITERATIONS, affine_std, FINE_SHIFT),
+        (ITERATIONS, affine_std, FINE_SHIFT, LARGEST_STD),
     )
     fits = fine_score >= FINE_CORRELATION
     xy2[coarse[fits]] = fine_xy2[fits]

@@ -15,6 +15,8 @@ from thesisrecon.types import F32, F64, I64
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 SIDE = 15
 SAMPLES = SIDE * SIDE
+# Two corners of an image closer than this, in pixels of their scale, may be one scene point.
+APART = 3.0
 
 
 @njit(cache=True, nogil=True)
@@ -227,14 +229,15 @@ def grow_corners(
     corners2: tuple[F64, F32, F32],
     grid2: tuple[float, I64, I64, I64],
     gate: tuple[F64, float, float],
-) -> tuple[I64, F32]:
+) -> tuple[I64, F32, F32]:
     """The corner of image 2 that looks most like each corner of image 1, near its predicted place and
     epipolar line.
 
     ``view1`` = pixels, levels, base; ``corners1`` = xy (N, 2), scale (N,); ``predicted`` = affine (N, 2, 2),
     place (N, 2), radius (N,) px; ``corners2`` = xy, scale, patches (C, 225); ``grid2`` = cell size, shape
     (2,), start, order of the corners of image 2 in cells; ``gate`` = F, half width of the epipolar band px,
-    least correlation. Returns the corner of image 2 (-1: none) and the correlation.
+    least correlation. Returns the corner of image 2 (-1: none), the correlation, and that of the best rival
+    that lies elsewhere (-1: none).
     """
     pixels, levels, base = view1
     xy1, scale1 = corners1
@@ -245,6 +248,8 @@ def grow_corners(
     count = len(xy1)
     index = np.full(count, -1, np.int64)
     score = np.zeros(count, np.float32)
+    rival = np.full(count, -1.0, np.float32)
+    tried, seen = np.empty(len(xy2), np.int64), np.empty(len(xy2), np.float32)
     window = np.empty((2, SAMPLES), np.float32)
     ready = np.zeros(2, np.int64)
     sizes = np.zeros(2)
@@ -266,7 +271,7 @@ def grow_corners(
         if abs(l0 * place[n, 0] + l1 * place[n, 1] + l2) > (radius[n] + band) * length:
             continue
         ready[:] = 0
-        best, top = -1, least
+        best, top, tries = -1, least, 0
         first_x = max(int((place[n, 0] - radius[n]) / cell), 0)
         last_x = min(int((place[n, 0] + radius[n]) / cell), shape[1] - 1)
         first_y = max(int((place[n, 1] - radius[n]) / cell), 0)
@@ -303,11 +308,19 @@ def grow_corners(
                 if ready[t] < 0:
                     continue
                 value = dot(window[t], patches2[c])
+                tried[tries], seen[tries] = c, value
+                tries += 1
                 if value > top:
                     best, top = c, value
-        index[n] = best
-        score[n] = top if best >= 0 else 0.0
-    return index, score
+        if best < 0:
+            continue
+        index[n], score[n] = best, top
+        for t in range(tries):
+            c = tried[t]
+            dx, dy = xy2[c, 0] - xy2[best, 0], xy2[c, 1] - xy2[best, 1]
+            if dx * dx + dy * dy > (APART * scale2[best]) ** 2:
+                rival[n] = max(rival[n], seen[t])
+    return index, score, rival
 
 
 @njit(cache=True, nogil=True)
@@ -315,22 +328,22 @@ def align_windows(
     view1: tuple[F32, I64, float],
     view2: tuple[F32, I64, float],
     matches: tuple[F64, F32, F64, F64],
-    limits: tuple[int, float, float],
+    limits: tuple[int, float, float, float],
 ) -> tuple[F64, F64, F32]:
     """Least-squares matching of the window around each ``xy1`` with image 2, gain and bias free.
 
     ``view*`` = pixels, levels, base; ``matches`` = xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
     ``limits`` = iterations, prior standard deviation of an affine coefficient (0: translation only), largest
-    shift in pixels of the corner's scale. Inverse compositional: the template's gradients, cleared of its
-    mean and of itself (bias and gain), serve every iteration. Returns ``xy2`` (M, 2), affine (M, 2, 2) and
-    the final correlation (M,), 0 where it failed.
+    shift and largest expected error of the place, both in pixels of the corner's scale. Inverse
+    compositional: the template's gradients, cleared of its mean and of itself (bias and gain), serve every
+    iteration. Returns ``xy2`` (M, 2), affine (M, 2, 2) and the final correlation (M,), 0 where it failed.
 
     S. Baker, I. Matthews, Lucas-Kanade 20 years on: a unifying framework, IJCV 56, 2004, section 3.2.
     """
     pixels1, levels1, base1 = view1
     pixels2, levels2, base2 = view2
     xy1, scale1, xy2_start, affine_start = matches
-    iterations, affine_std, largest_shift = limits
+    iterations, affine_std, largest_shift, largest_std = limits
     count = len(xy1)
     xy2, affine = xy2_start.copy(), affine_start.copy()
     score = np.zeros(count, np.float32)
@@ -433,6 +446,10 @@ def align_windows(
             if turn < iterations - 1 and delta[0] ** 2 + delta[1] ** 2 < 1e-6:
                 # One more look at the correlation would cost a window and change nothing.
                 break
+        if not lost:
+            # Variance of the place: that of a sample times the trace of the inverse normal matrix.
+            trace = (hessian[0, 0] + hessian[1, 1]) / (hessian[0, 0] * hessian[1, 1] - hessian[0, 1] ** 2)
+            lost = (1.0 - value * value) / SAMPLES * trace > largest_std * largest_std
         if lost:
             xy2[n, 0], xy2[n, 1] = x, y
             affine[n] = affine_start[n]

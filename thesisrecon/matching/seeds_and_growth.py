@@ -30,6 +30,7 @@ class SeedsAndGrowth:
     band_rel : half width of the epipolar band, share of the long side.
     radius_rel : largest search radius around the predicted place, share of the long side.
     least_correlation : of a grown match at its corner; ``aligned_correlation`` after alignment.
+    grown_ratio : as ``ratio``, for a grown match and the rivals in its part of the epipolar band.
     neighbours : matches that define a local affine map.
     affine_std : prior standard deviation of an affine coefficient in the alignment.
     """
@@ -41,6 +42,7 @@ class SeedsAndGrowth:
     radius_rel: float = 0.025
     least_correlation: float = 0.7
     aligned_correlation: float = 0.8
+    grown_ratio: float = 0.8
     neighbours: int = 10
     affine_std: float = 0.02
 
@@ -116,7 +118,7 @@ class SeedsAndGrowth:
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, self.radius_rel * long_side)
         corners2 = (view2.features.xy, view2.features.scale, view2.patches)
-        index, score = grow_corners(
+        index, score, rival = grow_corners(
             view1.pyramid,
             (xy1, scale1),
             (affine, place, radius),
@@ -124,6 +126,7 @@ class SeedsAndGrowth:
             view2.cells,
             (F, self.band_rel * long_side, self.least_correlation),
         )
+        index[1.0 - score > self.grown_ratio**2 * (1.0 - rival)] = -1
         rows = one_to_one(index, score)
         one, two = chosen[rows], index[rows]
         return one, two, SeedMatches(xy1[rows], view2.features.xy[two], affine[rows], score[rows])
