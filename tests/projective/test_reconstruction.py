@@ -100,6 +100,14 @@ def test_without_accepted_pairs_there_is_one_clear_sentence() -> None:
             variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
 
 
+def test_pairs_that_homographies_explain_are_refused_as_a_turning_camera_or_a_plane() -> None:
+    scene = make_scene()
+    pairs = [replace(p, homography_share=0.99) for p in true_pairs(scene)]
+    for variant in (GatedIncremental(), SequentialProjective()):
+        with pytest.raises(StageFailure, match="no parallax"):
+            variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
+
+
 def test_initial_cameras_have_the_fundamental_matrix_they_came_from() -> None:
     scene = make_scene()
     pair = true_pairs(scene)[0]

@@ -20,7 +20,11 @@ from thesisrecon.optimize.conditioning import whitening_transform
 from thesisrecon.optimize.projective_bundle import refine_projective_bundle
 from thesisrecon.optimize.triangulation_refine import refine_camera, refine_points
 from thesisrecon.projective.gate import predicted_spread_px
-from thesisrecon.projective.initial_pair import cameras_from_fundamental, rank_initial_pairs
+from thesisrecon.projective.initial_pair import (
+    cameras_from_fundamental,
+    rank_initial_pairs,
+    require_parallax,
+)
 from thesisrecon.projective.resection import resect_robust
 from thesisrecon.projective.selection import onto_all_tracks, select_tracks, subset_tracks
 from thesisrecon.types import B8, I64, Reconstruction, Tracks, TwoView
@@ -99,6 +103,7 @@ class GatedIncremental:
                 f"{len(pairs)} pairs were compared and none was accepted",
                 "take photographs that overlap by more than half and show texture",
             )
+        require_parallax(pairs)
         keep = select_tracks(tracks, points_per_view=self.points_per_view)
         selected = subset_tracks(tracks, keep)
         best: Reconstruction | None = None

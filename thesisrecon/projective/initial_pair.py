@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.types import I64, Tracks, TwoView
 
@@ -33,6 +34,21 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 
     usable = [pair for pair in pairs if pair.accepted]
     return sorted(usable, key=lambda pair: (-score(pair), pair.i, pair.j))
+
+
+def require_parallax(pairs: Sequence[TwoView], *, most: float = 0.95) -> None:
+    """``StageFailure`` where one homography explains at least the share ``most`` of every accepted pair.
+
+    Then the cameras turned about one point, hardly moved, or see a single plane: no F is determined, and whatever
+    is reconstructed from one is arbitrary, however small its residuals.
+    """
+    shares = [pair.homography_share for pair in pairs if pair.accepted]
+    if shares and min(shares) >= most:
+        raise StageFailure(
+            "the photographs show no parallax: a camera that only turns, hardly moves, or sees a single plane",
+            f"one homography explains {min(shares):.0%} or more of the matches of each of {len(shares)} pairs",
+            "walk around the scene between photographs, and have things at different depths in the picture",
+        )
 
 
 def cameras_from_fundamental(F: F64, sizes: I64) -> tuple[F64, F64]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.projective.incremental import GatedIncremental, finish
+from thesisrecon.projective.initial_pair import require_parallax
 from thesisrecon.types import I64, Reconstruction, Tracks, TwoView
 
 
@@ -34,6 +35,7 @@ class SequentialProjective:
         attempt: int = 0,
     ) -> Reconstruction:
         """As :meth:`GatedIncremental.reconstruct`; ``attempt`` takes the next best pair of neighbours."""
+        require_parallax(pairs)
         neighbours = [p for p in pairs if p.accepted and p.j == p.i + 1]
         candidates = neighbours or [p for p in pairs if p.accepted]
         candidates = sorted(candidates, key=lambda p: (-p.inliers, p.i, p.j))
