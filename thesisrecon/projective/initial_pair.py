@@ -39,14 +39,14 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 def require_parallax(pairs: Sequence[TwoView], *, most: float = 0.95) -> None:
     """``StageFailure`` where one homography explains at least the share ``most`` of every accepted pair.
 
-    Then the cameras turned about one point, hardly moved, or see a single plane: no F is determined, and whatever
-    is reconstructed from one is arbitrary, however small its residuals.
+    Then the cameras turned about one point, hardly moved, or see a single plane: no F is determined, and
+    whatever is reconstructed from one is arbitrary, however small its residuals.
     """
     shares = [pair.homography_share for pair in pairs if pair.accepted]
     if shares and min(shares) >= most:
         raise StageFailure(
-            "the photographs show no parallax: a camera that only turns, hardly moves, or sees a single plane",
-            f"one homography explains {min(shares):.0%} or more of the matches of each of {len(shares)} pairs",
+            "the photographs show no parallax: the camera only turns, hardly moves, or sees one plane",
+            f"a homography explains at least {min(shares):.0%} of the matches in each of {len(shares)} pairs",
             "walk around the scene between photographs, and have things at different depths in the picture",
         )
 
