@@ -68,22 +68,22 @@ def fit_maxima(response: F32, threshold: float) -> tuple[F64, F32]:
     keeps the pixel itself.
     """
     height, width = response.shape
-    count = 0
-    for y in range(1, height - 1):
-        for x in range(1, width - 1):
-            if response[y, x] > threshold and _is_maximum(response, x, y):
-                count += 1
-    xy = np.empty((count, 2), np.float64)
-    value = np.empty(count, np.float32)
+    # No two maxima touch, so that there is at most one in four pixels.
+    most = (height // 2 + 1) * (width // 2 + 1)
+    xy = np.empty((most, 2), np.float64)
+    value = np.empty(most, np.float32)
+    limit = np.float32(threshold)
     n = 0
     for y in range(1, height - 1):
+        row = response[y]
         for x in range(1, width - 1):
-            if response[y, x] > threshold and _is_maximum(response, x, y):
+            v = row[x]
+            if v > limit and v > row[x - 1] and v >= row[x + 1] and _is_maximum(response, x, y):
                 dx, dy = _surface_maximum(response, x, y)
                 xy[n, 0], xy[n, 1] = x + dx, y + dy
-                value[n] = response[y, x]
+                value[n] = v
                 n += 1
-    return xy, value
+    return xy[:n].copy(), value[:n].copy()
 
 
 @njit(cache=True, nogil=True)
