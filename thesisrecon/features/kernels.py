@@ -27,36 +27,39 @@ def corner_response(blurred: F32, taps: F32) -> F32:
     moment = np.empty((3, width), np.float32)
     half = np.float32(0.5)
     for y in range(1, height - 1):
-        above, here, below = blurred[y - 1], blurred[y], blurred[y + 1]
+        # Slices that start where they are read keep the checks for negative indices out of the loops.
+        above, below = blurred[y - 1, 1:], blurred[y + 1, 1:]
+        left, right = blurred[y], blurred[y, 2:]
         slot = ring[y % taps.size]
-        for x in range(1, width - 1):
-            gx = half * (here[x + 1] - here[x - 1])
+        xx, xy, yy = slot[0, 1:], slot[1, 1:], slot[2, 1:]
+        for x in range(width - 2):
+            gx = half * (right[x] - left[x])
             gy = half * (below[x] - above[x])
-            slot[0, x] = gx * gx
-            slot[1, x] = gx * gy
-            slot[2, x] = gy * gy
+            xx[x] = gx * gx
+            xy[x] = gx * gy
+            yy[x] = gy * gy
         if y < taps.size:
             continue
         column[:] = np.float32(0.0)
         for k in range(taps.size):
             products = ring[(y - taps.size + 1 + k) % taps.size]
             weight = taps[k]
-            for c in range(3):
-                source, target = products[c], column[c]
+            for m in range(3):
+                source, target = products[m], column[m]
                 for x in range(width):
                     target[x] += weight * source[x]
         moment[:] = np.float32(0.0)
-        for c in range(3):
-            source, target = column[c], moment[c]
+        for m in range(3):
+            target = moment[m, r + 1 :]
             for k in range(taps.size):
                 weight = taps[k]
-                for x in range(r + 1, width - r - 1):
-                    target[x] += weight * source[x + k - r]
-        row = out[y - r]
-        for x in range(r + 1, width - r - 1):
-            trace = moment[0, x] + moment[2, x]
-            determinant = moment[0, x] * moment[2, x] - moment[1, x] * moment[1, x]
-            row[x] = determinant / (trace + np.float32(1e-6))
+                source = column[m, k + 1 :]
+                for x in range(width - 2 * r - 2):
+                    target[x] += weight * source[x]
+        row = out[y - r, r + 1 :]
+        a, b, c = moment[0, r + 1 :], moment[1, r + 1 :], moment[2, r + 1 :]
+        for x in range(width - 2 * r - 2):
+            row[x] = (a[x] * c[x] - b[x] * b[x]) / (a[x] + c[x] + np.float32(1e-6))
     return out
 
 
