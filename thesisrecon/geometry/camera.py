@@ -24,14 +24,80 @@ def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
     P (3, 4) may have any scale and sign. Raises ``ValueError`` where the left 3x3 part is singular (a camera
     at infinity has no K).
     """
-    M = P[:, :3]
-    det = np.linalg.det(M)
-    if not np.isfinite(P).all() or abs(det) < 1e-14 * np.linalg.norm(M) ** 3:
-        raise ValueError("decompose_camera needs a finite camera; the left 3x3 part of P is singular")
-    P = P * np.sign(det)
+    P = P * np.sign(_left_determinant(P, "decompose_camera"))
     K, R = rq(P[:, :3])
     t = np.linalg.solve(K, P[:, 3])
     return K / K[2, 2], R, np.asarray(t, dtype=np.float64)
+
+
+def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: float = 0.0) -> F64:
+    """K (3, 3) of (3.17): [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]], all in px.
+
+    f_u and f_v are the focal length over the pixel's width and height (the text of 3.5.1 multiplies where it
+    must divide), skew = f_v tan of the angle between the pixel's sides and a right
+    one. Raises ``ValueError`` for a focal that is not positive.
+    """
+    if not (f_u > 0.0 and f_v > 0.0):
+        raise ValueError(f"calibration_matrix needs positive focals; got {f_u} and {f_v}")
+    return np.array([[f_u, skew, u_0], [0.0, f_v, v_0], [0.0, 0.0, 1.0]])
+
+
+def camera_from_centre(K: F64, R: F64, centre: F64) -> F64:
+    """P = K [R, -R centre] (3.21), the thesis' K [R' | -R' C]; K, R (..., 3, 3), centre (..., 3)."""
+    return compose_camera(K, R, -np.einsum("...ij,...j->...i", R, centre))
+
+
+def normalize_camera(P: F64) -> F64:
+    """P scaled such that det M = 1 (definition 3.5.1): then the centre of (3.24) has the last entry 1.
+
+    P (..., 3, 4) of any scale and sign; points in front have t > 0 in P X (proposition 3.5.1). The thesis
+    divides by det M^(1/3), whose real value also turns the sign. Raises ``ValueError`` for a camera at
+    infinity, det M = 0.
+    """
+    det = _left_determinant(P, "normalize_camera")
+    return np.asarray(P / np.cbrt(det)[..., None, None])
+
+
+def _left_determinant(P: F64, caller: str) -> F64:
+    """det M (...) of cameras (..., 3, 4), refused where it is 0 to rounding."""
+    if not np.isfinite(P).all():
+        raise ValueError(f"{caller} needs finite cameras; some entries are NaN or infinite")
+    det = np.linalg.det(P[..., :3])
+    if (np.abs(det) < 1e-14 * np.linalg.norm(P[..., :3], axis=(-2, -1)) ** 3).any():
+        raise ValueError(f"{caller} needs a finite camera; the left 3x3 part of P is singular")
+    return np.asarray(det)
+
+
+def principal_plane(P: F64) -> F64:
+    """The last row of P, the plane of the centre that is parallel to the image (3.23); (..., 4).
+
+    Its points project to (u, v, 0) (3.22).
+    """
+    return P[..., 2, :]
+
+
+def principal_ray(P: F64) -> F64:
+    """Unit direction (..., 3) of the optical axis, pointing to the front: det(M) m_3, normalised (3.23).
+
+    Without det M the last row's sign depends on that of P. Meaningful in a metric frame.
+    """
+    axis = np.linalg.det(P[..., :3])[..., None] * P[..., 2, :3]
+    return np.asarray(axis / np.linalg.norm(axis, axis=-1, keepdims=True))
+
+
+def principal_point(P: F64) -> F64:
+    """Pixel (..., 2) where the principal ray meets the image, M m_3 in a metric frame (HZ 6.2)."""
+    return dehomogenize(np.einsum("...ij,...j->...i", P[..., :3], P[..., 2, :3]))
+
+
+def back_project(P: F64, xy: F64) -> F64:
+    """Points at infinity (..., 4) on the rays of pixels (..., 2): (M^-1 (u, v, 1), 0), the ray's direction.
+
+    With the centre they span the ray. P (3, 4) finite. In a projective frame they are points of the plane
+    W = 0, which is no special one.
+    """
+    direction = np.linalg.solve(P[:, :3], homogenize(xy)[..., None])[..., 0]
+    return np.concatenate([direction, np.zeros((*direction.shape[:-1], 1))], axis=-1)
 
 
 def rq(M: F64) -> tuple[F64, F64]:

@@ -1,0 +1,219 @@
+"""Section 3.4.6: conics, dual conics, quadrics, dual quadrics and the absolute ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from tests.geometry.properties import gap, holds_for_every, random_camera, random_points
+from thesisrecon.geometry.absolute_conic import (
+    ABSOLUTE_CONIC,
+    ABSOLUTE_DUAL_QUADRIC,
+    angle_between_pixels,
+    angle_between_planes,
+    calibration_from_dual_image,
+    calibration_from_image,
+    dual_image_of_absolute_conic,
+    dual_quadric_of_plane,
+    image_of_absolute_conic,
+    image_of_infinity,
+    plane_at_infinity,
+)
+from thesisrecon.geometry.conics import (
+    conic_through,
+    dual,
+    form,
+    incidence_residual,
+    meet_line,
+    project_dual_quadric,
+    tangency_discriminant,
+    tangent,
+    tangents_from,
+)
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.lines_and_planes import back_project_lines, incidence_sine, line_through
+from thesisrecon.geometry.strata import (
+    affine_transform,
+    random_transform,
+    transform_cameras,
+    transform_conics,
+    transform_dual_conics,
+    transform_planes,
+)
+
+dimensions = st.sampled_from([3, 4])
+
+
+def _round(rng: np.random.Generator, d: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """An ellipse or ellipsoid (d, d) about the origin and n of its points (n, d)."""
+    T = np.eye(d)
+    T[:-1] += 0.3 * rng.uniform(-1.0, 1.0, (d - 1, d))
+    unit = rng.normal(size=(n, d - 1))
+    x = homogenize(unit / np.linalg.norm(unit, axis=1, keepdims=True)) @ T.T
+    return transform_conics(T, np.diag([1.0] * (d - 1) + [-1.0])), x
+
+
+@holds_for_every()
+def test_3_1_five_points_determine_a_conic(rng):
+    C, x = _round(rng, 3, 9)
+    found = conic_through(x[:5])
+    assert incidence_residual(C, x).max() < 1e-14
+    assert incidence_residual(found, x[:5]).max() < 1e-12
+    assert gap(conic_through(x), C) < 1e-5
+
+
+def test_3_1_points_that_leave_a_conic_free_are_refused() -> None:
+    on_line = homogenize(np.column_stack([np.arange(5.0), np.arange(5.0)]))
+    with pytest.raises(ValueError, match="determine one conic"):
+        conic_through(on_line)
+    with pytest.raises(ValueError, match="N >= 5"):
+        conic_through(on_line[:4])
+
+
+@holds_for_every()
+def test_3_2_absolute_conic_has_no_real_points(rng):
+    x = rng.normal(size=(20, 3))
+    assert (form(ABSOLUTE_CONIC, x, x) > 0.0).all()
+    imaginary = np.array([1.0, 1j, 0.0])
+    assert imaginary @ ABSOLUTE_CONIC @ imaginary == 0.0
+
+
+@holds_for_every(dimensions)
+def test_3_4_and_3_10_tangents_belong_to_the_inverse(rng, d):
+    C, x = _round(rng, d, 6)
+    assert gap(dual(C), np.linalg.inv(C)) < 1e-9
+    assert incidence_residual(dual(C), tangent(C, x)).max() < 1e-12
+    assert incidence_residual(dual(C), rng.normal(size=(6, d))).max() > 1e-6
+    assert gap(dual(dual(C)), C) < 1e-9
+
+
+def test_3_4_the_dual_of_two_lines_is_their_point() -> None:
+    l, m = np.array([1.0, 0.0, -2.0]), np.array([0.0, 1.0, 3.0])
+    meet = np.cross(l, m)
+    assert gap(dual(np.outer(l, m) + np.outer(m, l)), np.outer(meet, meet)) < 1e-12
+
+
+@holds_for_every(dimensions)
+def test_3_5_and_3_6_lines_meet_in_two_points_or_touch_or_miss(rng, d):
+    C, x = _round(rng, d, 2)
+    inside, far = np.zeros(d), 50.0 * rng.normal(size=d)
+    inside[-1] = far[-1] = 1.0
+    inside[:-1] = (x[0] + x[1])[:-1] / 2.0
+    other = far.copy()
+    other[:-1] += np.linalg.svd(far[None, :-1])[2][1]
+    assert tangency_discriminant(C, inside, far) > 0.0
+    found = meet_line(C, inside, far)
+    assert found.shape == (2, d)
+    assert incidence_residual(C, found).max() < 1e-10
+    assert tangency_discriminant(C, far, other) < 0.0
+    assert meet_line(C, far, other).shape == (0, d)
+    through_both = meet_line(C, x[0], x[1])
+    assert min(gap(through_both[0], x[0]), gap(through_both[0], x[1])) < 1e-7
+
+
+@holds_for_every(dimensions)
+def test_3_7_the_tangent_touches_in_its_point_alone(rng, d):
+    C, x = _round(rng, d, 1)
+    t = tangent(C, x[0])
+    assert incidence_sine(t, x[0]) < 1e-12
+    along = np.cross(t, rng.normal(size=3)) if d == 3 else np.linalg.svd(t[None])[2][1]
+    assert abs(tangency_discriminant(C, x[0], along)) < 1e-9 * (along @ along)
+    touching = meet_line(C, x[0] / np.linalg.norm(x[0]), along / np.linalg.norm(along))
+    assert len(touching) >= 1
+    assert max(gap(point, x[0]) for point in touching) < 1e-5
+
+
+@holds_for_every()
+def test_3_7_two_tangents_run_through_a_point_outside_and_none_inside(rng):
+    C, _ = _round(rng, 3, 1)
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    outside = np.array([4.0 * np.cos(angle), 4.0 * np.sin(angle), 1.0])
+    lines = tangents_from(C, outside)
+    assert len(lines) == 2
+    assert incidence_sine(lines, outside).max() < 1e-10
+    assert incidence_residual(dual(C), lines).max() < 1e-10
+    centre = np.linalg.inv(C)[:, 2]
+    assert len(tangents_from(C, centre)) == 0
+
+
+@holds_for_every()
+def test_3_9_planes_of_outline_tangents_touch_the_quadric(rng):
+    Q, _ = _round(rng, 4, 1)
+    P, *_ = random_camera(rng)
+    outline = dual(project_dual_quadric(P, dual(Q)))
+    inside = np.linalg.inv(outline)[:, 2]
+    on_outline = meet_line(outline, inside, inside + inside[2] * np.array([50.0, 80.0, 0.0]))
+    assert len(on_outline) == 2
+    planes = back_project_lines(P, tangent(outline, on_outline))
+    scaled = planes / np.linalg.norm(planes, axis=1, keepdims=True)
+    assert np.abs(form(dual(Q), scaled, scaled)).max() < 1e-6 * np.linalg.norm(dual(Q))
+
+
+@holds_for_every()
+def test_3_11_infinity_is_imaged_without_regard_to_the_centre(rng):
+    P, K, R, _ = random_camera(rng)
+    np.testing.assert_allclose(image_of_infinity(P), K @ R)
+    shifted = transform_cameras(affine_transform(np.eye(3), rng.normal(size=3)), P)
+    np.testing.assert_allclose(image_of_infinity(shifted), image_of_infinity(P), rtol=1e-9)
+    x = rng.normal(size=3)
+    np.testing.assert_allclose(P @ np.append(x, 0.0), image_of_infinity(P) @ x, rtol=1e-9)
+
+
+@holds_for_every()
+def test_3_12_to_3_15_images_of_the_absolute_conic_are_those_of_the_calibration(rng):
+    P, K, _, _ = random_camera(rng)
+    H = image_of_infinity(P)
+    scale = rng.choice([-3.0, 3.0])
+    assert gap(transform_conics(H, ABSOLUTE_CONIC), image_of_absolute_conic(K)) < 1e-7
+    assert gap(transform_dual_conics(H, ABSOLUTE_CONIC), dual_image_of_absolute_conic(K)) < 1e-12
+    assert gap(project_dual_quadric(P, ABSOLUTE_DUAL_QUADRIC), dual_image_of_absolute_conic(K)) < 1e-12
+    assert gap(np.linalg.inv(image_of_absolute_conic(K)), dual_image_of_absolute_conic(K)) < 1e-7
+    np.testing.assert_allclose(
+        calibration_from_dual_image(scale * dual_image_of_absolute_conic(K)), K, atol=1e-6
+    )
+    np.testing.assert_allclose(calibration_from_image(scale * image_of_absolute_conic(K)), K, atol=1e-3)
+
+
+def test_3_14_conics_of_no_camera_are_refused() -> None:
+    for wrong in (np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, 0.0]), np.full((3, 3), np.nan)):
+        with pytest.raises(ValueError, match="definite"):
+            calibration_from_dual_image(wrong)
+        with pytest.raises(ValueError, match="conic"):
+            calibration_from_image(wrong)
+
+
+@holds_for_every()
+def test_3_14_the_dual_quadric_of_a_projective_frame_projects_to_every_calibration(rng):
+    P1, K1, *_ = random_camera(rng)
+    P2, K2, *_ = random_camera(rng)
+    G = np.vstack([P1 / 1000.0, rng.normal(size=4)])
+    first, second = transform_cameras(G, P1 / 1000.0), transform_cameras(G, P2)
+    np.testing.assert_allclose(first, np.eye(3, 4), atol=1e-9)
+    plane = transform_planes(G, np.array([0.0, 0.0, 0.0, 1.0]))
+    Q = dual_quadric_of_plane(K1, plane[:3] / plane[3])
+    assert gap(Q, transform_dual_conics(G, ABSOLUTE_DUAL_QUADRIC)) < 1e-6
+    assert gap(project_dual_quadric(second, Q), dual_image_of_absolute_conic(K2)) < 1e-6
+
+
+@holds_for_every()
+def test_3_9_the_absolute_dual_quadric_knows_its_plane_and_angles_in_any_frame(rng):
+    G = random_transform("projective", rng)
+    Q = transform_dual_conics(G, ABSOLUTE_DUAL_QUADRIC)
+    infinity = transform_planes(G, np.array([0.0, 0.0, 0.0, 1.0]))
+    assert gap(plane_at_infinity(Q), infinity) < 1e-7
+    planes = random_points(rng, 2)
+    a, b = planes[:, :3] / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+    true = np.arccos(np.clip(a @ b, -1.0, 1.0))
+    assert angle_between_planes(-2.0 * Q, *transform_planes(G, planes)) == pytest.approx(true, abs=1e-6)
+
+
+@holds_for_every()
+def test_3_13_the_image_of_the_absolute_conic_measures_angles_of_rays(rng):
+    P, K, R, _ = random_camera(rng)
+    directions = rng.normal(size=(2, 3))
+    x, y = directions @ R.T @ K.T
+    a, b = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    assert angle_between_pixels(image_of_absolute_conic(K), x, y) == pytest.approx(np.arccos(a @ b), abs=1e-6)
+    assert incidence_sine(line_through(x, y), x) < 1e-9
+    assert gap(P[:, :3] @ directions[0], x) < 1e-9

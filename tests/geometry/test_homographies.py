@@ -1,0 +1,194 @@
+"""Sections 3.6.1 and 3.6.4: homographies of planes, their epipoles, fundamental matrices and cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.geometry.properties import gap, holds_for_every, random_camera, random_points
+from thesisrecon.geometry.camera import camera_centre, project
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homographies import (
+    compatibility_residual,
+    fundamental_from_homography,
+    homographies_of_fundamental,
+    homography_through_line,
+    image_from_plane,
+    infinite_homography,
+    plane_homography,
+    plane_of_homography,
+    second_camera,
+)
+from thesisrecon.geometry.lines_and_planes import incidence_sine, plane_through
+from thesisrecon.geometry.multiview import (
+    canonical_cameras,
+    epipolar_lines,
+    epipoles,
+    fundamental_from_cameras,
+    homography_residuals,
+    symmetric_residuals,
+)
+from thesisrecon.geometry.strata import random_transform, transform_cameras, transform_planes
+
+
+def _canonical(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """[I 0] and another camera of a projective frame, entries of size one."""
+    scale = np.diag([1e-3, 1e-3, 1.0])
+    P1, P2 = (scale @ random_camera(rng)[0] for _ in range(2))
+    G = np.vstack([P1, rng.normal(size=4)])
+    return np.eye(3, 4), transform_cameras(G, P2)
+
+
+@holds_for_every()
+def test_theorem_3_6_1_and_3_28_the_plane_at_infinity_is_seen_alike_from_every_place(rng):
+    (P1, K1, R1, _), (P2, K2, R2, _) = random_camera(rng), random_camera(rng)
+    H = infinite_homography(P1, P2)
+    # The thesis' R_ij' = R_j' R_i is R2 R1' with world-to-camera rotations.
+    assert gap(H, K2 @ R2 @ R1.T @ np.linalg.inv(K1)) < 1e-9
+    X = np.column_stack([rng.normal(size=(8, 3)), np.zeros(8)])
+    assert max(gap(H @ P1 @ x, P2 @ x) for x in X) < 1e-9
+    assert gap(H, plane_homography(P1, P2, np.array([0.0, 0.0, 0.0, 1.0]))) < 1e-7
+    with pytest.raises(ValueError, match="finite first camera"):
+        infinite_homography(np.diag([1.0, 1.0, 0.0]) @ P1, P2)
+
+
+@holds_for_every()
+def test_3_29_to_3_31_homographies_of_a_plane(rng):
+    (P1, *_), (P2, *_) = random_camera(rng), random_camera(rng)
+    plane = random_points(rng, 1)[0]
+    x = rng.normal(size=(8, 3))
+    X = np.column_stack([x, -x @ plane[:3] / plane[3]])
+    assert incidence_sine(plane, X).max() < 1e-12
+    H1, H2 = image_from_plane(P1, plane), image_from_plane(P2, plane)
+    np.testing.assert_allclose(x @ H1.T, X @ P1.T, rtol=1e-8, atol=1e-8)
+    H = plane_homography(P1, P2, plane)
+    assert gap(H, H2 @ np.linalg.inv(H1)) < 1e-6
+    assert homography_residuals(H, project(P1, X), project(P2, X)).max() < 1e-5
+    # In another frame the same plane has the same homography.
+    G = random_transform("projective", rng)
+    moved = plane_homography(transform_cameras(G, P1), transform_cameras(G, P2), transform_planes(G, plane))
+    assert gap(moved, H) < 1e-6
+
+
+def test_3_29_planes_through_the_origin_and_through_centres() -> None:
+    rng = np.random.default_rng(3)
+    (P1, *_), (P2, *_) = random_camera(rng), random_camera(rng)
+    X, Y = random_points(rng, 2)
+    plane = plane_through(X, Y, np.array([0.0, 0.0, 0.0, 1.0]))
+    plane[3] = 0.0
+    H = plane_homography(P1, P2, plane)
+    points = np.array([X + l * Y for l in (-1.0, 0.5, 2.0, 3.0)])
+    assert homography_residuals(H, project(P1, points), project(P2, points)).max() < 1e-6
+    with pytest.raises(ValueError, match="origin"):
+        image_from_plane(P1, plane)
+    with pytest.raises(ValueError, match="first camera"):
+        plane_homography(P1, P2, plane_through(camera_centre(P1), X, Y))
+    through_second = plane_homography(P1, P2, plane_through(camera_centre(P2), X, Y))
+    assert np.linalg.cond(through_second) > 1e9
+
+
+@holds_for_every()
+def test_3_32_the_first_of_canonical_cameras_sees_every_plane_as_it_is(rng):
+    P1, P2 = _canonical(rng)
+    plane = random_points(rng, 1)[0]
+    np.testing.assert_allclose(image_from_plane(P1, plane), np.eye(3))
+    assert gap(plane_homography(P1, P2, plane), image_from_plane(P2, plane)) < 1e-9
+
+
+@holds_for_every()
+def test_3_33_to_3_35_epipoles_lines_and_rank(rng):
+    (P1, *_), (P2, *_) = random_camera(rng), random_camera(rng)
+    F = fundamental_from_cameras(P1, P2)
+    X = rng.normal(size=(10, 3))
+    xy1, xy2 = project(P1, X), project(P2, X)
+    e1, e2 = epipoles(F)
+    assert gap(e2, P2 @ camera_centre(P1)) < 1e-7
+    assert gap(e1, P1 @ camera_centre(P2)) < 1e-7
+    assert np.abs(np.sum(epipolar_lines(F, xy1) * homogenize(xy2), axis=1)).max() < 1e-5
+    assert incidence_sine(epipolar_lines(F, xy1), e2).max() < 1e-7
+    assert np.abs(F.T @ e2).max() < 1e-12
+    assert abs(np.linalg.det(F)) < 1e-15
+    # The pair in the other order has the transposed matrix.
+    assert gap(fundamental_from_cameras(P2, P1), F.T) < 1e-7
+
+
+@holds_for_every()
+def test_3_37_f_is_the_epipole_with_the_homography_of_any_plane(rng):
+    (P1, *_), (P2, *_) = random_camera(rng), random_camera(rng)
+    F = fundamental_from_cameras(P1, P2)
+    e2 = P2 @ camera_centre(P1)
+    X = rng.normal(size=(10, 3))
+    for plane in random_points(rng, 3):
+        H = plane_homography(P1, P2, plane)
+        found = fundamental_from_homography(H, e2)
+        assert symmetric_residuals(found, project(P1, X), project(P2, X)).max() < 1e-4
+        assert gap(found, F) < 1e-6
+        assert compatibility_residual(H, F) < 1e-6
+    assert compatibility_residual(rng.normal(size=(3, 3)), rng.normal(size=(3, 3))) > 1e-3
+    with pytest.raises(ValueError, match="equal centres"):
+        fundamental_from_homography(np.eye(3), np.zeros(3))
+
+
+@holds_for_every()
+def test_3_37_to_3_40_homographies_of_planes_make_the_second_camera(rng):
+    _, P2 = _canonical(rng)
+    plane = random_points(rng, 1)[0]
+    M, m, pi = P2[:, :3], P2[:, 3], plane[:3] / plane[3]
+    at_origin, of_plane = M, image_from_plane(P2, plane)
+    np.testing.assert_allclose(of_plane, at_origin - np.outer(m, pi), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(second_camera(at_origin, m), P2)
+    np.testing.assert_allclose(second_camera(of_plane, m, plane=pi), P2, rtol=1e-9, atol=1e-9)
+    found, residual = plane_of_homography(-3.0 * of_plane, P2)
+    assert residual < 1e-9
+    assert gap(found, plane) < 1e-6
+    assert plane_of_homography(rng.normal(size=(3, 3)), P2)[1] > 1e-3
+    with pytest.raises(ValueError, match="different centres"):
+        plane_of_homography(M, np.column_stack([M, np.zeros(3)]))
+
+
+@holds_for_every()
+def test_theorem_3_6_2_and_3_41_every_member_is_a_homography_of_the_pair(rng):
+    P1, P2 = _canonical(rng)
+    F = fundamental_from_cameras(P1, P2)
+    _, e2 = epipoles(F)
+    x = homogenize(rng.normal(size=(8, 2)))
+    for plane in (None, rng.normal(size=3)):
+        H = homographies_of_fundamental(F, plane=plane)
+        assert compatibility_residual(H, F) < 1e-9
+        np.testing.assert_allclose(np.cross(e2, x @ H.T), x @ F.T, atol=1e-9)
+        assert plane_of_homography(H, P2)[1] < 1e-6
+    # The member of (3.41) is singular: its plane holds the second centre.
+    singular = homographies_of_fundamental(F)
+    assert np.linalg.svd(singular, compute_uv=False)[2] < 1e-12
+    plane, _ = plane_of_homography(singular, P2)
+    assert incidence_sine(plane, camera_centre(P2)) < 1e-6
+    assert gap(homography_through_line(F, e2), singular) < 1e-12
+
+
+@holds_for_every()
+def test_3_41_points_of_a_line_in_the_second_view_are_transferred_to_it(rng):
+    P1, P2 = _canonical(rng)
+    F = fundamental_from_cameras(P1, P2)
+    line = rng.normal(size=3)
+    H = homography_through_line(F, line)
+    plane = line @ P2
+    basis = np.linalg.svd(plane[None])[2][1:]
+    X = rng.normal(size=(8, 3)) @ basis
+    assert max(gap(H @ (P1 @ p), P2 @ p) for p in X) < 1e-6
+
+
+@holds_for_every()
+def test_3_42_every_pair_of_the_family_has_the_fundamental_matrix(rng):
+    P1, P2 = _canonical(rng)
+    F = fundamental_from_cameras(P1, P2)
+    for plane in (None, np.zeros(3), rng.normal(size=3)):
+        A, B = canonical_cameras(F, plane=plane, scale=rng.choice([-2.0, 0.7]))
+        np.testing.assert_array_equal(A, np.eye(3, 4))
+        assert gap(fundamental_from_cameras(A, B), F) < 1e-7
+    # The true second camera is a member as well: its reconstruction differs by a projective transform only.
+    _, e2 = epipoles(F)
+    scale = float(e2 @ P2[:, 3])
+    s = float(np.sum(np.cross(e2, P2[:, :3].T).T * F) / np.sum(F * F))
+    member = canonical_cameras(F, plane=P2[:, :3].T @ e2 / s, scale=scale / s)[1]
+    assert gap(member, P2) < 1e-7
+    assert np.isfinite(dehomogenize(camera_centre(member))).all()

@@ -1,0 +1,151 @@
+"""Sections 3.3 and 3.4: how each entity is transformed, and the four strata with their groups of transforms.
+
+A transform G (4, 4) acts on points as X -> G X. The matrices printed in 3.4.2 to 3.4.5 of the thesis have
+their zeros in the fourth column: they act on rows, X' -> X' G, and are the transposes of the ones here, which
+follow its table in 3.3.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+F64 = NDArray[np.float64]
+Group = Literal["projective", "affine", "metric", "euclidean"]
+
+DEGREES_OF_FREEDOM: dict[Group, int] = {"projective": 15, "affine": 12, "metric": 7, "euclidean": 6}
+"""From the largest set of transforms, with the fewest invariants, to the smallest."""
+
+PLANE_AT_INFINITY = np.array([0.0, 0.0, 0.0, 1.0])
+"""Its canonical position in the affine and all later strata (3.4.3)."""
+
+
+def transform_points(G: F64, X: F64) -> F64:
+    """X -> G X; (4, 4), (..., 4), and image points (..., 3) under a homography (3, 3)."""
+    return np.asarray(X @ G.T)
+
+
+def transform_cameras(G: F64, P: F64) -> F64:
+    """P -> P G^-1; (4, 4), (..., 3, 4). The images P X stay what they are."""
+    return np.asarray(P @ np.linalg.inv(G))
+
+
+def transform_planes(G: F64, plane: F64) -> F64:
+    """Pi' -> Pi' G^-1; (4, 4), (..., 4), and image lines (..., 3) under a homography (3, 3)."""
+    return np.asarray(plane @ np.linalg.inv(G))
+
+
+def transform_conics(G: F64, C: F64) -> F64:
+    """C -> G^-T C G^-1 and Q -> G^-T Q G^-1: conics (3, 3), (..., 3, 3) and quadrics (4, 4), (..., 4, 4)."""
+    inverse = np.linalg.inv(G)
+    return np.asarray(inverse.T @ C @ inverse)
+
+
+def transform_dual_conics(G: F64, C: F64) -> F64:
+    """C* -> G C* G' and Q* -> G Q* G': dual conics (3, 3), (..., 3, 3) and dual quadrics (4, 4), (..., 4, 4).
+
+    Also the rule of a Pluecker matrix L of points; that of planes L* follows :func:`transform_conics`.
+    """
+    return np.asarray(G @ C @ G.T)
+
+
+def affine_transform(A: F64, t: F64) -> F64:
+    """The (4, 4) transform X -> A X + t of 12 degrees of freedom; A (3, 3) invertible, t (3,).
+
+    With A = s R it is metric (7), with A = R Euclidean (6). Raises ``ValueError`` for a singular A.
+    """
+    if not np.linalg.cond(A) < 1e14:
+        raise ValueError("affine_transform needs an invertible matrix")
+    G = np.eye(4)
+    G[:3, :3], G[:3, 3] = A, t
+    return G
+
+
+def random_transform(group: Group, rng: np.random.Generator) -> F64:
+    """A well-conditioned (4, 4) member of a group that belongs to no smaller one."""
+    if group == "projective":
+        return np.eye(4) + _shift_of_norm(rng, (4, 4), 0.5)
+    t, scale = rng.normal(size=3), float(np.exp(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 1.0)))
+    if group == "affine":
+        return affine_transform(scale * (np.eye(3) + _shift_of_norm(rng, (3, 3), 0.5)), t)
+    R = Rotation.random(random_state=rng).as_matrix()
+    return affine_transform(scale * R if group == "metric" else R, t)
+
+
+def _shift_of_norm(rng: np.random.Generator, shape: tuple[int, int], norm: float) -> F64:
+    """Noise whose norm below 1 keeps the identity plus it invertible."""
+    noise = rng.normal(size=shape)
+    return np.asarray(norm * noise / np.linalg.norm(noise))
+
+
+def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
+    """The smallest group that a transform (4, 4) of any scale belongs to.
+
+    Affine: the last row is a multiple of (0, 0, 0, 1), so the plane at infinity is fixed; metric: A'A is also
+    a multiple of I and det A > 0 after W is set to 1, so the absolute conic is fixed (a reflection is only
+    affine here); Euclidean: the multiple is 1. ``tolerance`` is relative. Raises ``ValueError`` for a matrix
+    that is not finite, (4, 4) and invertible.
+    """
+    if G.shape != (4, 4) or not np.isfinite(G).all() or not np.linalg.cond(G) < 1e14:
+        raise ValueError(f"group_of needs a finite invertible (4, 4) matrix; got shape {G.shape}")
+    if np.linalg.norm(G[3, :3]) > tolerance * np.linalg.norm(G):
+        return "projective"
+    A = G[:3, :3] / G[3, 3]
+    gram = A.T @ A
+    squared_scale = float(np.trace(gram)) / 3.0
+    if np.linalg.norm(gram - squared_scale * np.eye(3)) > tolerance * squared_scale or np.linalg.det(A) < 0.0:
+        return "affine"
+    return "euclidean" if abs(squared_scale - 1.0) <= tolerance else "metric"
+
+
+def affine_from_projective(plane: F64) -> F64:
+    """G_PA (4, 4), which takes the plane at infinity (4,) of a projective frame to (0, 0, 0, 1) (3.4.3).
+
+    The identity with the last row (Pi1/Pi4, Pi2/Pi4, Pi3/Pi4, 1). That row does not exist for a plane through
+    the origin; where Pi4 is below 1e-6 of the plane's norm the smallest rotation that takes the plane there
+    stands in its place. Raises ``ValueError`` for a zero plane.
+    """
+    norm = float(np.linalg.norm(plane))
+    if plane.shape != (4,) or not np.isfinite(norm) or norm == 0.0:
+        raise ValueError("affine_from_projective needs a finite plane (4,) that is not zero")
+    unit = plane / norm if plane[3] >= 0.0 else -plane / norm
+    G = np.eye(4)
+    if unit[3] > 1e-6:
+        G[3] = unit / unit[3]
+        return G
+    last = PLANE_AT_INFINITY
+    middle = unit + last
+    return np.asarray(G - np.outer(middle, middle) / (1.0 + unit[3]) + 2.0 * np.outer(last, unit))
+
+
+def metric_from_affine(absolute_conic: F64) -> F64:
+    """G_AM (4, 4), which takes the absolute conic (3, 3) of an affine frame to the identity (3.4.4).
+
+    With Omega = A'A (Cholesky) the points of the plane at infinity move by A. Determined up to a similarity.
+    Raises ``ValueError`` for a conic that is not definite.
+    """
+    sign = 1.0 if np.trace(absolute_conic) > 0.0 else -1.0
+    try:
+        lower = np.linalg.cholesky(sign * (absolute_conic + absolute_conic.T) / 2.0)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("metric_from_affine needs a definite absolute conic") from error
+    return affine_transform(lower.T / np.cbrt(np.linalg.det(lower)), np.zeros(3))
+
+
+def metric_from_projective(dual_quadric: F64) -> F64:
+    """G_PM (4, 4), which takes the absolute dual quadric (4, 4) to diag(1, 1, 1, 0), det G_PM > 0.
+
+    Q* = V diag(s1, s2, s3, s4) V' with |s4| least, which is taken for 0; G_PM^-1 = V diag(root s1, root s2,
+    root s3, 1). Raises ``ValueError`` where the other three do not have one sign.
+    """
+    s, V = np.linalg.eigh((dual_quadric + dual_quadric.T) / 2.0)
+    order = np.argsort(-np.abs(s))
+    s, V = s[order] * np.sign(s[order[0]]), V[:, order]
+    if not (s[:3] > 1e-14 * s[0]).all():
+        raise ValueError("metric_from_projective needs a semi-definite dual quadric of rank 3")
+    size = np.append(np.sqrt(s[:3]), np.sqrt(s[0]))
+    size[3] *= np.sign(np.linalg.det(V))
+    return np.asarray(np.linalg.inv(V * size))
