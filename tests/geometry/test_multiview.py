@@ -27,7 +27,7 @@ from thesisrecon.geometry.multiview import (
 seeds = st.integers(0, 2**31)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(seeds)
 def test_matches_satisfy_the_epipolar_constraint_of_their_cameras(seed):
     pair = make_pair(20, np.random.default_rng(seed))
@@ -39,7 +39,7 @@ def test_matches_satisfy_the_epipolar_constraint_of_their_cameras(seed):
     assert np.abs(distance).max() < 1e-8
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(seeds)
 def test_epipoles_are_images_of_the_other_centre(seed):
     pair = make_pair(8, np.random.default_rng(seed))
@@ -49,7 +49,7 @@ def test_epipoles_are_images_of_the_other_centre(seed):
         assert min(np.linalg.norm(e - image), np.linalg.norm(e + image)) < 1e-7
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(seeds, st.booleans())
 def test_canonical_cameras_have_the_given_fundamental_matrix(seed, with_plane):
     rng = np.random.default_rng(seed)
@@ -79,7 +79,7 @@ def test_cameras_with_one_centre_have_no_fundamental_matrix():
         canonical_cameras(pair.F, scale=0.0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(seeds)
 def test_sampson_distance_is_the_distance_to_the_nearest_exact_match_to_first_order(seed):
     rng = np.random.default_rng(seed)
@@ -96,7 +96,7 @@ def test_sampson_distance_is_the_distance_to_the_nearest_exact_match_to_first_or
     np.testing.assert_allclose(sampson_residuals(pair.F, xy1, xy2), expected, atol=1e-7)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(seeds, st.floats(1e-3, 1e3), st.booleans())
 def test_residuals_depend_neither_on_the_scale_of_f_nor_on_the_order_of_the_images(seed, scale, negative):
     rng = np.random.default_rng(seed)
@@ -105,8 +105,8 @@ def test_residuals_depend_neither_on_the_scale_of_f_nor_on_the_order_of_the_imag
     G = (-scale if negative else scale) * pair.F
     for residuals in (sampson_residuals, symmetric_residuals):
         direct = np.abs(residuals(pair.F, xy1, xy2))
-        np.testing.assert_allclose(np.abs(residuals(G, xy1, xy2)), direct, rtol=1e-9)
-        np.testing.assert_allclose(np.abs(residuals(pair.F.T, xy2, xy1)), direct, rtol=1e-9)
+        np.testing.assert_allclose(np.abs(residuals(G, xy1, xy2)), direct, rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(np.abs(residuals(pair.F.T, xy2, xy1)), direct, rtol=1e-9, atol=1e-10)
 
 
 def test_symmetric_residual_is_the_root_of_the_two_squared_line_distances():
@@ -118,7 +118,7 @@ def test_symmetric_residual_is_the_root_of_the_two_squared_line_distances():
     np.testing.assert_allclose(symmetric_residuals(pair.F, xy1, xy2), np.hypot(in1, in2), rtol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(seeds, st.integers(4, 30))
 def test_a_plane_is_seen_through_one_homography(seed, n):
     pair = make_pair(n, np.random.default_rng(seed), planar=True)
