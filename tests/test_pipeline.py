@@ -220,7 +220,7 @@ def test_a_failed_attempt_is_followed_by_another(tmp_path: Path) -> None:
 
 def test_a_failure_keeps_what_was_computed_and_says_why(tmp_path: Path) -> None:
     config = fake_config(projective=fakes.FakeProjective(fail_below=9))
-    with pytest.raises(StageFailure, match=r"the initial pair is bad\. attempt 0"):
+    with pytest.raises(StageFailure, match=r"the initial pair is bad; attempt 0"):
         run(tmp_path, config=config)
     summary = read(tmp_path / "summary.json")
     assert "the initial pair is bad" in summary["failure"]

@@ -20,7 +20,8 @@ class StageFailure(Exception):
         self.reason = reason
         self.evidence = evidence
         self.advice = advice
-        super().__init__(". ".join(part.rstrip(".") for part in (reason, evidence, advice) if part) + ".")
+        parts = [part.rstrip(".") for part in (reason, evidence, advice) if part]
+        super().__init__("; ".join(parts) + ".")
 
 
 class UsageError(ValueError):
