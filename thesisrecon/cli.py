@@ -19,6 +19,7 @@ import typer
 
 from thesisrecon import __version__
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.workers import available_threads
 
 if TYPE_CHECKING:
     from thesisrecon.config import PipelineConfig
@@ -158,10 +159,9 @@ def _root(
 
 def _cap_threads(threads: int) -> None:
     """The one setting that caps every kind of thread; must run before NumPy is imported."""
-    count = str(threads or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else threads or 1)
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
         os.environ[name] = "1"
-    os.environ["NUMBA_NUM_THREADS"] = count
+    os.environ["NUMBA_NUM_THREADS"] = str(threads or available_threads())
 
 
 def _config(

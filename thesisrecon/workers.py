@@ -9,6 +9,7 @@ from __future__ import annotations
 import concurrent.futures as futures
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -72,5 +73,11 @@ class Workers:
         if self.executor == "processes":
             # Forking a process that runs threads can deadlock.
             context = multiprocessing.get_context("spawn")
-            return futures.ProcessPoolExecutor(max(1, min(self.threads, tasks)), mp_context=context)
+            return futures.ProcessPoolExecutor(
+                max(1, min(self.threads, tasks)),
+                mp_context=context,
+                # Ctrl-C is for the process that hands out the tasks.
+                initializer=signal.signal,
+                initargs=(signal.SIGINT, signal.SIG_IGN),
+            )
         return futures.ThreadPoolExecutor(self.threads)
