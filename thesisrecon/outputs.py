@@ -82,6 +82,7 @@ def write_model(out: Path, result: RunResult, reconstruction: Reconstruction, co
         colors=colours,
         groups=result.groups,
         scales=np.array([1 / image.scale for image in result.images]),
+        original_sizes=np.array([image.original_size for image in result.images]),
     )
     write_colmap_model(out / "sparse" / "0", model)
     X = reconstruction.X[reconstruction.valid]
