@@ -1,0 +1,195 @@
+"""The tensor of least reprojection error: its steps, its noise, what it refuses, and real photographs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.epipolar.trifocal_estimation import (
+    NO_POINTS,
+    NO_SEGMENTS,
+    _Reprojection,
+    _Step,
+    estimate_trifocal,
+    minimize_algebraic_error,
+    refine_trifocal,
+)
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import calibration_matrix, camera_from_centre, project
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
+from thesisrecon.geometry.trifocal import (
+    cameras_from_tensor,
+    tensor_from_cameras,
+    transfer_lines,
+    transfer_points,
+)
+from thesisrecon.geometry.trifocal_linear import estimate_tensor_linear, tensor_equations
+
+F64 = NDArray[np.float64]
+DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).resolve().parents[2] / "../shared/data"))
+
+
+def three_cameras(rng: np.random.Generator) -> F64:
+    """Cameras 8 units from the origin, some 20 degrees apart."""
+    K = calibration_matrix(1200.0, 1180.0, 640.0, 480.0, skew=3.0)
+    cameras = []
+    for turn in (-0.3, 0.1, 0.35):
+        R = Rotation.from_rotvec([rng.normal(0.0, 0.1), turn, rng.normal(0.0, 0.1)]).as_matrix()
+        cameras.append(camera_from_centre(K, R, rng.normal(0.0, 0.3, 3) - 8.0 * R[2]))
+    return np.stack(cameras)
+
+
+def matches(P: F64, rng: np.random.Generator, n: int, m: int, sigma: float) -> tuple[F64, F64]:
+    X, A, B = (rng.uniform(-2.0, 2.0, (k, 3)) for k in (n, m, m))
+    points = np.stack([project(camera, X) for camera in P])
+    segments = np.stack([np.stack([project(camera, A), project(camera, B)], axis=1) for camera in P])
+    return (
+        points + rng.normal(0.0, sigma, points.shape) if sigma else points,
+        segments + rng.normal(0.0, sigma, segments.shape) if sigma else segments,
+    )
+
+
+def point_transfer_px(T: F64, points: F64) -> F64:
+    return np.linalg.norm(transfer_points(T, points[0], points[1]) - points[2], axis=1)
+
+
+def line_transfer_px(T: F64, segments: F64) -> F64:
+    """RMS distance of the third segment's ends to the transferred line; (M,)."""
+    ends = homogenize(segments)
+    l1, l2 = line_through(ends[:2, :, 0], ends[:2, :, 1])
+    found = unit_normals(transfer_lines(T, l1, l2))
+    return np.sqrt(np.mean(np.einsum("na,nea->ne", found, ends[2]) ** 2, axis=1))
+
+
+@pytest.mark.parametrize(("n", "m"), [(7, 0), (0, 13), (4, 5), (40, 0), (0, 40), (20, 20)])
+def test_exact_matches_give_the_tensor_of_their_cameras(n, m):
+    rng = np.random.default_rng(n + m)
+    P = three_cameras(rng)
+    points, segments = matches(P, rng, n, m, 0.0)
+    fit = estimate_trifocal(points, segments)
+    T = tensor_from_cameras(*P)
+    assert min(np.linalg.norm(fit.T - T), np.linalg.norm(fit.T + T)) < 1e-6
+    assert fit.point_residuals_px.shape == (3, n)
+    assert fit.line_residuals_px.shape == (3, m, 2)
+    assert max(fit.point_residuals_px.max(initial=0.0), fit.line_residuals_px.max(initial=0.0)) < 1e-5
+    for v in range(3):
+        if n:
+            np.testing.assert_allclose(project(fit.P[v], fit.X), points[v], atol=1e-4)
+
+
+@pytest.mark.parametrize(("n", "m"), [(50, 0), (0, 50), (30, 30)])
+def test_each_step_comes_nearer_to_the_truth_and_the_noise_is_told(n, m):
+    errors, sigmas = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        P = three_cameras(rng)
+        points, segments = matches(P, rng, n, m, 0.5)
+        exact, _ = matches(P, rng, 100, 0, 0.0)
+        equations = tensor_equations(points, segments)
+        algebraic = minimize_algebraic_error(equations, equations.solve())
+        np.testing.assert_allclose(
+            abs(np.sum(algebraic * tensor_from_cameras(*cameras_from_tensor(algebraic)))), 1.0, atol=1e-9
+        )
+        fit = estimate_trifocal(points, segments, loss_px=5.0)
+        sigmas.append(fit.sigma_px)
+        steps = (estimate_tensor_linear(points, segments), equations.in_pixels(algebraic), fit.T)
+        errors.append([np.median(point_transfer_px(T, exact)) for T in steps])
+    linear, constrained, refined = np.median(errors, axis=0)
+    assert refined < 1.05 * constrained < 0.6 * linear
+    assert refined < 1.0
+    assert 0.44 < np.mean(sigmas) < 0.56
+
+
+def test_the_refinement_is_at_a_minimum_and_its_gradient_is_right():
+    rng = np.random.default_rng(3)
+    points, segments = matches(three_cameras(rng), rng, 9, 8, 1.0)
+    equations = tensor_equations(points, segments)
+    problem = _Reprojection.of(points, segments, equations.transforms, 1.0)
+    state = problem.start(equations.solve())
+    system, h = problem.linearize(state), 1e-7
+    for step, slope in _single_steps(system, h):
+        ahead, behind = (problem.cost(problem.retract(state, _scaled(step, sign))) for sign in (1.0, -1.0))
+        assert (ahead - behind) / (2.0 * h) == pytest.approx(slope, rel=1e-3, abs=1e-4 * abs(system.g).max())
+    fit = refine_trifocal(equations.in_pixels(equations.solve()), points, segments, max_iterations=200)
+    again = refine_trifocal(fit.T, points, segments, max_iterations=200)
+    assert again.sigma_px == pytest.approx(fit.sigma_px, rel=1e-3)
+
+
+def _single_steps(system, h):
+    """Moves of single parameters of each kind with the cost's slope along them."""
+    points, lines = system.blocks
+    for k in range(24):
+        yield _Step(h * np.eye(24)[k], np.zeros_like(points.h), np.zeros_like(lines.h)), system.g[k]
+    for k in range(3):
+        move = np.zeros_like(points.h)
+        move[2, k] = h
+        yield _Step(np.zeros(24), move, np.zeros_like(lines.h)), points.h[2, k]
+    for k in range(4):
+        move = np.zeros_like(lines.h)
+        move[5, k] = h
+        yield _Step(np.zeros(24), np.zeros_like(points.h), move), lines.h[5, k]
+
+
+def _scaled(step: _Step, by: float) -> _Step:
+    return _Step(by * step.cameras, by * step.points, by * step.lines)
+
+
+def test_a_few_wrong_matches_do_not_spoil_the_tensor():
+    rng = np.random.default_rng(5)
+    P = three_cameras(rng)
+    points, segments = matches(P, rng, 100, 40, 0.3)
+    points[2, :5] += rng.uniform(5.0, 15.0, (5, 2))
+    exact, _ = matches(P, rng, 100, 0, 0.0)
+    robust = estimate_trifocal(points, segments, loss_px=1.0)
+    assert np.median(point_transfer_px(robust.T, exact)) < 0.5
+    assert robust.point_residuals_px[:, :5].max(axis=0).min() > 1.0
+
+
+def test_matches_that_cannot_work_are_named():
+    rng = np.random.default_rng(0)
+    points, segments = matches(three_cameras(rng), rng, 6, 0, 0.0)
+    with pytest.raises(StageFailure, match="too few matches"):
+        estimate_trifocal(points, segments)
+    with pytest.raises(StageFailure, match="too few matches"):
+        estimate_trifocal(NO_POINTS, NO_SEGMENTS)
+    flat = np.column_stack([rng.uniform(-2.0, 2.0, (20, 2)), np.zeros(20)])
+    with pytest.raises(StageFailure, match="do not determine"):
+        estimate_trifocal(np.stack([project(camera, flat) for camera in three_cameras(rng)]))
+    for wrong, text in ((np.ones((3, 8, 2)), "equal points"), (np.full((3, 8, 2), np.nan), "finite")):
+        with pytest.raises(ValueError, match=text):
+            estimate_trifocal(wrong)
+    with pytest.raises(ValueError, match="loss_px"):
+        estimate_trifocal(points, segments, loss_px=0.0)
+
+
+def _read(kind: str) -> F64:
+    """Corners (3, N, 2) or segments (3, M, 4) that are matched in all three views of merton1."""
+    folder = DATA / "merton1" / "2D"
+    rows = [line.split() for line in (folder / f"nview-{kind}").read_text().splitlines()]
+    index = np.array([[int(entry) for entry in row] for row in rows if "*" not in row])
+    return np.stack([np.loadtxt(folder / f"{v + 1:03d}.{kind}")[index[:, v]] for v in range(3)])
+
+
+@pytest.mark.real
+@pytest.mark.skipif(not (DATA / "merton1").is_dir(), reason="the photographs of merton1 are not here")
+@pytest.mark.parametrize("source", ["points", "lines", "both"])
+def test_merton_college_is_transferred_into_the_third_view(source):
+    points, segments = _read("corners"), _read("lines").reshape(3, -1, 2, 2)
+    of_points, of_lines = [], []
+    for fold in range(2):
+        p, s = (np.arange(a.shape[1]) % 2 == fold for a in (points, segments))
+        # Estimated from one half, measured on the other.
+        fit = estimate_trifocal(
+            NO_POINTS if source == "lines" else points[:, p],
+            NO_SEGMENTS if source == "points" else segments[:, s],
+        )
+        of_points.append(point_transfer_px(fit.T, points[:, ~p]))
+        of_lines.append(line_transfer_px(fit.T, segments[:, ~s]))
+    assert np.median(np.concatenate(of_points)) <= 1.0
+    assert np.median(np.concatenate(of_lines)) <= 1.0

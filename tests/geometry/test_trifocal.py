@@ -1,0 +1,238 @@
+"""Section 3.6.3: the trifocal tensor of cameras, its constraints, transfers and linear estimate."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from tests.geometry.properties import gap, holds_for_every, random_camera
+from thesisrecon.geometry.camera import camera_centre, project
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
+from thesisrecon.geometry.multiview import fundamental_from_cameras, symmetric_residuals
+from thesisrecon.geometry.strata import random_transform, transform_cameras
+from thesisrecon.geometry.trifocal import (
+    cameras_from_tensor,
+    fundamentals_from_tensor,
+    incidences,
+    line_residuals,
+    point_residuals,
+    point_transfer_homography,
+    reordered_tensor,
+    tensor_epipoles,
+    tensor_from_cameras,
+    transfer_by_epipolar_lines,
+    transfer_lines,
+    transfer_lines_to_first,
+    transfer_points,
+    transform_tensor,
+    unit_tensor,
+)
+from thesisrecon.geometry.trifocal_linear import estimate_tensor_linear, tensor_equations
+
+NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
+
+
+def three_cameras(rng: np.random.Generator) -> np.ndarray:
+    return np.stack([random_camera(rng)[0] for _ in range(3)])
+
+
+def seen_points(P: np.ndarray, rng: np.random.Generator, n: int) -> np.ndarray:
+    X = rng.uniform(-1.5, 1.5, (n, 3))
+    return np.stack([project(camera, X) for camera in P])
+
+
+def seen_segments(P: np.ndarray, rng: np.random.Generator, m: int) -> np.ndarray:
+    """Pieces of lines of space, other pieces in every view."""
+    A, B = rng.uniform(-1.5, 1.5, (2, m, 3))
+    share = rng.uniform((-0.2, 0.7), (0.3, 1.2), (3, m, 2))[..., None]
+    ends = A[:, None] + share * (B - A)[:, None]
+    return np.stack(
+        [project(camera, e.reshape(-1, 3)).reshape(m, 2, 2) for camera, e in zip(P, ends, strict=True)]
+    )
+
+
+def lines_of(segments: np.ndarray) -> np.ndarray:
+    return unit_normals(line_through(homogenize(segments[..., 0, :]), homogenize(segments[..., 1, :])))
+
+
+@holds_for_every()
+def test_tensor_of_canonical_cameras(rng):
+    P2, P3 = rng.normal(size=(2, 3, 4))
+    T = np.einsum("ji,k->ijk", P2[:, :3], P3[:, 3]) - np.einsum("j,ki->ijk", P2[:, 3], P3[:, :3])
+    np.testing.assert_allclose(tensor_from_cameras(np.eye(3, 4), P2, P3), T / np.linalg.norm(T), atol=1e-12)
+
+
+@holds_for_every()
+def test_tensor_is_the_same_in_every_projective_frame(rng):
+    P = three_cameras(rng)
+    G = random_transform("projective", rng)
+    scales = rng.uniform(0.5, 2.0, 3) * rng.choice([-1.0, 1.0], 3)
+    assert (
+        gap(tensor_from_cameras(*(scales[:, None, None] * transform_cameras(G, P))), tensor_from_cameras(*P))
+        < 1e-6
+    )
+    assert not unit_tensor(np.zeros((3, 3, 3))).any()
+
+
+@holds_for_every()
+def test_trifocal_constraint_of_points(rng):
+    P = three_cameras(rng)
+    X = homogenize(rng.uniform(-1.5, 1.5, (6, 3)))
+    x = np.einsum("vab,nb->vna", P, X)
+    x /= np.linalg.norm(x, axis=2, keepdims=True)
+    T = tensor_from_cameras(*P)
+    residual = point_residuals(T, *x)
+    assert np.abs(residual).max() < 1e-9
+    wrong = point_residuals(T, x[0], x[1], np.roll(x[2], 1, axis=0))
+    assert np.abs(wrong).max() > 1e5 * np.abs(residual).max()
+    # Four of the nine equations are independent.
+    rows = np.einsum("i,aj,bk->abijk", x[0, 0], *(np.linalg.svd(x[v, 0][None])[2][1:] for v in (1, 2)))
+    nine = [point_residuals(basis.reshape(3, 3, 3), *x[:, 0]).ravel() for basis in np.eye(27)]
+    assert np.linalg.matrix_rank(np.array(nine)) == 4
+    assert np.linalg.matrix_rank(rows.reshape(4, 27)) == 4
+    through = [np.cross(x[v], rng.normal(size=(6, 3))) for v in (1, 2)]
+    assert np.abs(incidences(T, x[0], *through)).max() < 1e-9
+
+
+@holds_for_every()
+def test_trifocal_constraint_of_lines(rng):
+    P = three_cameras(rng)
+    l = lines_of(seen_segments(P, rng, 6))
+    l /= np.linalg.norm(l, axis=2, keepdims=True)
+    T = tensor_from_cameras(*P)
+    back = transfer_lines_to_first(T, l[1], l[2])
+    assert max(gap(a, b) for a, b in zip(back, l[0], strict=True)) < 1e-6
+    assert np.abs(line_residuals(T, *l)).max() < 1e-6 * np.linalg.norm(back, axis=1).max() + 1e-12
+
+
+@holds_for_every()
+def test_figure_3_14_points_are_transferred_to_the_third_view(rng):
+    P = three_cameras(rng)
+    xy = seen_points(P, rng, 12)
+    T = tensor_from_cameras(*P)
+    assert np.abs(transfer_points(T, xy[0], xy[1]) - xy[2]).max() < 1e-3
+    F31, F32 = fundamental_from_cameras(P[0], P[2]), fundamental_from_cameras(P[1], P[2])
+    assert np.median(np.abs(transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]) - xy[2])) < 1e-5
+
+
+@holds_for_every()
+def test_figure_3_14_the_tensor_serves_the_trifocal_plane_where_epipolar_lines_do_not(rng):
+    P = three_cameras(rng)
+    centres = np.stack([dehomogenize(camera_centre(camera)) for camera in P])
+    X = rng.dirichlet(np.ones(3), 8) @ centres
+    xy = np.stack([project(camera, X) for camera in P])
+    F31, F32 = fundamental_from_cameras(P[0], P[2]), fundamental_from_cameras(P[1], P[2])
+    size = np.abs(xy).max(axis=(0, 2))
+    by_tensor = np.abs(transfer_points(tensor_from_cameras(*P), xy[0], xy[1]) - xy[2]).max(axis=1) / size
+    by_lines = np.abs(transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]) - xy[2]).max(axis=1) / size
+    assert np.median(by_tensor) < 1e-6
+    assert np.nanmedian(by_lines) > 1e-4
+
+
+@holds_for_every()
+def test_figure_3_15_lines_are_transferred_to_the_third_view(rng):
+    P = three_cameras(rng)
+    l = lines_of(seen_segments(P, rng, 6))
+    found = unit_normals(transfer_lines(tensor_from_cameras(*P), l[0], l[1]))
+    assert max(gap(a, b) for a, b in zip(found, l[2], strict=True)) < 1e-5
+
+
+@holds_for_every()
+def test_a_line_of_the_second_view_is_a_plane_and_a_homography(rng):
+    P = three_cameras(rng)
+    line = lines_of(seen_segments(P, rng, 1))[1, 0]
+    basis = np.linalg.svd((line @ P[1])[None])[2][1:]
+    X = rng.normal(size=(8, 3)) @ basis
+    H = point_transfer_homography(tensor_from_cameras(*P), line)
+    assert max(gap(H @ (P[0] @ x), P[2] @ x) for x in X) < 1e-6
+
+
+@holds_for_every()
+def test_epipoles_and_fundamental_matrices_from_the_tensor(rng):
+    P = three_cameras(rng)
+    T, xy = tensor_from_cameras(*P), seen_points(P, rng, 10)
+    centre = camera_centre(P[0])
+    e2, e3 = tensor_epipoles(T)
+    assert gap(e2, P[1] @ centre) < 1e-6
+    assert gap(e3, P[2] @ centre) < 1e-6
+    F21, F31 = fundamentals_from_tensor(T)
+    assert symmetric_residuals(F21, xy[0], xy[1]).max() < 1e-3
+    assert symmetric_residuals(F31, xy[0], xy[2]).max() < 1e-3
+
+
+@holds_for_every()
+def test_cameras_from_the_tensor_have_the_tensor(rng):
+    T = tensor_from_cameras(*three_cameras(rng))
+    P = cameras_from_tensor(T)
+    np.testing.assert_array_equal(P[0], np.eye(3, 4))
+    assert gap(tensor_from_cameras(*P), T) < 1e-6
+
+
+@holds_for_every(st.sampled_from(list(itertools.permutations(range(3)))))
+def test_the_tensor_of_the_views_in_another_order(rng, order):
+    P = three_cameras(rng)
+    found = reordered_tensor(tensor_from_cameras(*P), order)
+    assert gap(found, tensor_from_cameras(*P[list(order)])) < 1e-5
+    with pytest.raises(ValueError, match="order of 0, 1, 2"):
+        reordered_tensor(found, (0, 1, 1))
+
+
+@holds_for_every()
+def test_the_tensor_in_other_image_coordinates(rng):
+    P = three_cameras(rng)
+    H = np.eye(3) + 0.2 * rng.uniform(-1.0, 1.0, (3, 3, 3)) * np.array(
+        [[1.0, 1, 100], [1, 1, 100], [1e-3, 1e-3, 1]]
+    )
+    moved = transform_tensor(tensor_from_cameras(*P), *H)
+    assert gap(moved, tensor_from_cameras(*(H @ P))) < 1e-6
+
+
+@holds_for_every(st.sampled_from([(7, 0), (0, 13), (4, 5), (20, 0), (0, 30), (10, 10)]))
+def test_linear_estimate_is_exact_on_exact_points_and_lines(rng, counts):
+    P = three_cameras(rng)
+    points, segments = seen_points(P, rng, counts[0]), seen_segments(P, rng, counts[1])
+    T = estimate_tensor_linear(points, segments)
+    assert gap(T, tensor_from_cameras(*P)) < 1e-5
+
+
+@holds_for_every(examples=10)
+def test_given_epipoles_the_constrained_solution_is_the_tensor_of_the_cameras(rng):
+    P = three_cameras(rng)
+    equations = tensor_equations(seen_points(P, rng, 10), NO_SEGMENTS)
+    e2, e3 = tensor_epipoles(equations.solve())
+    T = equations.solve_with_epipoles(e2, e3)
+    assert gap(equations.in_pixels(T), tensor_from_cameras(*P)) < 1e-6
+    noisy = equations.solve_with_epipoles(*np.linalg.qr(rng.normal(size=(3, 3)))[0][:2])
+    conditioned = tensor_from_cameras(*cameras_from_tensor(noisy))
+    assert gap(conditioned, noisy) < 1e-6
+
+
+def test_wrong_triplets_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    P = three_cameras(rng)
+    points, segments = seen_points(P, rng, 6), seen_segments(P, rng, 3)
+    with pytest.raises(ValueError, match="26 equations"):
+        estimate_tensor_linear(points, NO_SEGMENTS)
+    with pytest.raises(ValueError, match="needed points"):
+        estimate_tensor_linear(points[:2], segments)
+    with pytest.raises(ValueError, match="needed points"):
+        estimate_tensor_linear(points, segments[:, :, 0])
+    with pytest.raises(ValueError, match="finite"):
+        estimate_tensor_linear(np.where(points > points[0, 0, 0], np.nan, points), segments)
+    segments[1, 0, 1] = segments[1, 0, 0]
+    with pytest.raises(ValueError, match="no length"):
+        estimate_tensor_linear(points, segments)
+
+
+def test_coplanar_and_equal_points_are_refused() -> None:
+    rng = np.random.default_rng(1)
+    P = three_cameras(rng)
+    X = np.column_stack([rng.uniform(-1.5, 1.5, (20, 2)), np.zeros(20)])
+    with pytest.raises(ValueError, match="general position"):
+        estimate_tensor_linear(np.stack([project(camera, X) for camera in P]), NO_SEGMENTS)
+    with pytest.raises(ValueError, match="equal points"):
+        estimate_tensor_linear(np.ones((3, 8, 2)), NO_SEGMENTS)
