@@ -111,7 +111,6 @@ def reconstruct(
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="The output folder.")] = Path("out/demo"),
     threads: Threads = 0,
-    overwrite: Overwrite = False,
 ) -> None:
     """Reconstruct the courtyard that comes with the source of the project."""
     _cap_threads(threads)
@@ -121,13 +120,9 @@ def demo(
             f"the demo needs the photographs of {DEMO_SCENE}, which come with the source of the project, not "
             "with the installed package; run scripts/demo there, or reconstruct a folder of your own"
         )
-    _run(
-        scene,
-        out,
-        _config(None, None, None, None, []),
-        0,
-        {"threads": threads or None, "overwrite": overwrite},
-    )
+    # The folder of an older demo may hold other settings: the demo is always that of today.
+    options = {"threads": threads or None, "overwrite": True}
+    _run(scene, out, _config(None, None, None, None, []), 0, options)
 
 
 @app.command()

@@ -279,7 +279,7 @@ def _photograph_difference(there: dict[str, str], here: dict[str, str]) -> Itera
 
 
 def _short(value: Any) -> str:
-    text = json.dumps(value)
+    text = "not set" if value is None else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
