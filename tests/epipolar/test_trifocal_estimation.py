@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
     NO_SEGMENTS,
-    _Reprojection,
-    _Step,
     estimate_trifocal,
     minimize_algebraic_error,
     refine_trifocal,
 )
+from thesisrecon.epipolar.trifocal_reprojection import TrifocalReprojection, TrifocalStep
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import calibration_matrix, camera_from_centre, project
 from thesisrecon.geometry.homogeneous import homogenize
@@ -77,6 +76,9 @@ def test_exact_matches_give_the_tensor_of_their_cameras(n, m):
     assert min(np.linalg.norm(fit.T - T), np.linalg.norm(fit.T + T)) < 1e-6
     assert fit.point_residuals_px.shape == (3, n)
     assert fit.line_residuals_px.shape == (3, m, 2)
+    np.testing.assert_allclose(fit.P[0], np.eye(3, 4), atol=1e-9)
+    cameras = tensor_from_cameras(*fit.P)
+    assert min(np.linalg.norm(fit.T - cameras), np.linalg.norm(fit.T + cameras)) < 1e-9
     assert max(fit.point_residuals_px.max(initial=0.0), fit.line_residuals_px.max(initial=0.0)) < 1e-5
     for v in range(3):
         if n:
@@ -106,11 +108,43 @@ def test_each_step_comes_nearer_to_the_truth_and_the_noise_is_told(n, m):
     assert 0.44 < np.mean(sigmas) < 0.56
 
 
+@pytest.mark.parametrize(("n", "m"), [(40, 0), (20, 20)])
+def test_the_covariance_is_that_of_the_errors(n, m):
+    rng = np.random.default_rng(n)
+    P = three_cameras(rng)
+    points, segments = matches(P, rng, n, m, 0.0)
+    exact, _ = matches(P, rng, 30, 0, 0.0)
+    # The transfer of fixed points by fixed lines through their matches is linear in T, before the division.
+    x1, x2 = homogenize(exact[:2])
+    l2 = unit_normals(np.cross(x2, rng.normal(size=x2.shape)))
+    ratios = []
+    for _ in range(40):
+        fit = estimate_trifocal(*(a + rng.normal(0.0, 0.3, a.shape) for a in (points, segments)), loss_px=5.0)
+        x3 = np.einsum("ni,nj,ijk->nk", x1, l2, fit.T)
+        by_T = np.einsum("ni,nj,kl->nlijk", x1, l2, np.eye(3)).reshape(30, 3, 27) / x3[:, 2, None, None]
+        by_T = by_T[:, :2] - (x3[:, :2] / x3[:, 2:])[:, :, None] * by_T[:, 2:]
+        variance = np.einsum("nca,ab,ncb->nc", by_T, fit.covariance, by_T)
+        ratios.append((x3[:, :2] / x3[:, 2:] - exact[2]) ** 2 / variance)
+    assert 0.85 < np.mean(ratios) < 1.2
+
+
+def test_the_covariance_tells_of_points_near_a_plane():
+    spreads = []
+    for depth in (1.0, 0.003):
+        rng = np.random.default_rng(1)
+        P = three_cameras(rng)
+        X = rng.uniform(-2.0, 2.0, (60, 3)) * [1.0, 1.0, depth]
+        points = np.stack([project(camera, X) for camera in P])
+        fit = estimate_trifocal(points + rng.normal(0.0, 0.3, points.shape))
+        spreads.append(np.sqrt(np.trace(fit.covariance)))
+    assert spreads[1] > 20.0 * spreads[0]
+
+
 def test_the_refinement_is_at_a_minimum_and_its_gradient_is_right():
     rng = np.random.default_rng(3)
     points, segments = matches(three_cameras(rng), rng, 9, 8, 1.0)
     equations = tensor_equations(points, segments)
-    problem = _Reprojection.of(points, segments, equations.transforms, 1.0)
+    problem = TrifocalReprojection.of(points, segments, equations.transforms, 1.0)
     state = problem.start(equations.solve())
     system, h = problem.linearize(state), 1e-7
     for step, slope in _single_steps(system, h):
@@ -125,19 +159,19 @@ def _single_steps(system, h):
     """Moves of single parameters of each kind with the cost's slope along them."""
     points, lines = system.blocks
     for k in range(24):
-        yield _Step(h * np.eye(24)[k], np.zeros_like(points.h), np.zeros_like(lines.h)), system.g[k]
+        yield TrifocalStep(h * np.eye(24)[k], np.zeros_like(points.h), np.zeros_like(lines.h)), system.g[k]
     for k in range(3):
         move = np.zeros_like(points.h)
         move[2, k] = h
-        yield _Step(np.zeros(24), move, np.zeros_like(lines.h)), points.h[2, k]
+        yield TrifocalStep(np.zeros(24), move, np.zeros_like(lines.h)), points.h[2, k]
     for k in range(4):
         move = np.zeros_like(lines.h)
         move[5, k] = h
-        yield _Step(np.zeros(24), np.zeros_like(points.h), move), lines.h[5, k]
+        yield TrifocalStep(np.zeros(24), np.zeros_like(points.h), move), lines.h[5, k]
 
 
-def _scaled(step: _Step, by: float) -> _Step:
-    return _Step(by * step.cameras, by * step.points, by * step.lines)
+def _scaled(step: TrifocalStep, by: float) -> TrifocalStep:
+    return TrifocalStep(by * step.cameras, by * step.points, by * step.lines)
 
 
 def test_a_few_wrong_matches_do_not_spoil_the_tensor():
@@ -159,9 +193,17 @@ def test_matches_that_cannot_work_are_named():
     with pytest.raises(StageFailure, match="too few matches"):
         estimate_trifocal(NO_POINTS, NO_SEGMENTS)
     flat = np.column_stack([rng.uniform(-2.0, 2.0, (20, 2)), np.zeros(20)])
-    with pytest.raises(StageFailure, match="do not determine"):
-        estimate_trifocal(np.stack([project(camera, flat) for camera in three_cameras(rng)]))
-    for wrong, text in ((np.ones((3, 8, 2)), "equal points"), (np.full((3, 8, 2), np.nan), "finite")):
+    line = np.outer(np.linspace(-1.0, 1.0, 20), [1.0, 0.5, 0.2])
+    twice = np.tile(rng.uniform(-1.0, 1.0, (5, 3)), (4, 1))
+    for special in (flat, line, twice):
+        with pytest.raises(StageFailure, match="do not determine"):
+            estimate_trifocal(np.stack([project(camera, special) for camera in three_cameras(rng)]))
+    for wrong, text in (
+        (np.ones((3, 8, 2)), "equal points"),
+        (np.full((3, 8, 2), np.nan), "finite"),
+        (np.ones((8, 2)), "needed points"),
+        (np.ones(5), "needed points"),
+    ):
         with pytest.raises(ValueError, match=text):
             estimate_trifocal(wrong)
     with pytest.raises(ValueError, match="loss_px"):

@@ -12,25 +12,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.epipolar.trifocal_reprojection import TrifocalReprojection, TrifocalState
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
-from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.geometry.trifocal import (
-    cameras_from_tensor,
     tensor_epipoles,
-    tensor_from_cameras,
     transform_tensor,
     unit_tensor,
 )
-from thesisrecon.geometry.trifocal_linear import TensorEquations, tensor_equations
+from thesisrecon.geometry.trifocal_linear import (
+    NEEDED_EQUATIONS,
+    TensorEquations,
+    check_triplets,
+    tensor_equations,
+)
 from thesisrecon.optimize.levenberg_marquardt import (
     floored_diagonal,
     minimize_residuals,
     run_levenberg_marquardt,
-    solve_positive,
 )
-from thesisrecon.optimize.losses import LOSSES
 
 F64 = NDArray[np.float64]
 
@@ -44,7 +43,9 @@ class TrifocalFit:
     ``T`` (3, 3, 3) unit norm and ``P`` (3, 3, 4), P[0] = [I 0], in pixels; ``X`` (N, 4) points; ``lines`` (M,
     2, 4) two points of each line; ``point_residuals_px`` (3, N) distances of the images to the reprojected
     points, ``line_residuals_px`` (3, M, 2) of the segments' ends to the reprojected lines; ``sigma_px`` the
-    noise of one coordinate, from all residuals and the freedoms left.
+    noise of one coordinate, from all residuals and the freedoms left; ``covariance`` (27, 27) of T,
+    row-major, to first order for that noise, of rank 18. It is large in some direction where the matches
+    leave T nearly free, as points near a plane do.
     """
 
     T: F64
@@ -54,6 +55,7 @@ class TrifocalFit:
     point_residuals_px: F64
     line_residuals_px: F64
     sigma_px: float
+    covariance: F64
     iterations: int
 
 
@@ -90,8 +92,9 @@ def estimate_trifocal(
     """
     if not loss_px > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
-    n, m = np.shape(points)[1], np.shape(segments)[1]
-    if 4 * n + 2 * m < 26:
+    points, segments = check_triplets(points, segments)
+    n, m = points.shape[1], segments.shape[1]
+    if 4 * n + 2 * m < NEEDED_EQUATIONS:
         raise StageFailure(
             "too few matches for the geometry of three views",
             f"found {n} points and {m} lines, needed 7 points, 13 lines or a mixture",
@@ -117,7 +120,7 @@ def refine_trifocal(
 ) -> TrifocalFit:
     """The fit of least reprojection error near a tensor (3, 3, 3) in px, as :func:`estimate_trifocal`."""
     transforms = tensor_equations(points, segments).transforms
-    problem = _Reprojection.of(points, segments, transforms, loss_px)
+    problem = TrifocalReprojection.of(points, segments, transforms, loss_px)
     solution = run_levenberg_marquardt(
         problem,
         problem.start(transform_tensor(T, *transforms)),
@@ -129,15 +132,18 @@ def refine_trifocal(
     residual = problem.residual(state)
     n = points.shape[1]
     freedom = max(3 * n + 2 * segments.shape[1] - 18, 1)
+    sigma = float(np.sqrt(np.sum(residual**2) / freedom))
     P, G = _pixel_cameras(state.P, transforms)
+    T, covariance = _tensor_and_covariance(problem, state, transforms)
     return TrifocalFit(
-        tensor_from_cameras(*P),
+        T,
         P,
         state.X @ G.T,
         state.lines @ G.T,
         np.linalg.norm(residual[:n], axis=2).T,
         np.abs(residual[n:]).transpose(1, 0, 2),
-        float(np.sqrt(np.sum(residual**2) / freedom)),
+        sigma,
+        sigma**2 * covariance,
         solution.iterations,
     )
 
@@ -149,185 +155,33 @@ def _pixel_cameras(P: F64, transforms: F64) -> tuple[F64, F64]:
     return np.asarray(np.linalg.inv(transforms) @ P @ np.linalg.inv(G)), G
 
 
-@dataclass(frozen=True)
-class _State:
-    """Conditioned cameras (3, 3, 4), unit points (N, 4), lines (M, 2, 4) by two orthonormal points."""
-
-    P: F64
-    X: F64
-    lines: F64
-
-
-@dataclass(frozen=True)
-class _Step:
-    """Moves of P2 and P3 (24,), of points (N, 3) and lines (M, 4) in their tangent spaces."""
-
-    cameras: F64
-    points: F64
-    lines: F64
-
-
-@dataclass(frozen=True)
-class _Block:
-    """Normal equations of one kind of feature: with the cameras W (n, 24, f), alone V (n, f, f), h (n, f)."""
-
-    W: F64
-    V: F64
-    h: F64
-
-    def damped(self, damping: float) -> tuple[F64, F64]:
-        """V^-1 W' (n, f, 24) and V^-1 h (n, f) with the damped V."""
-        V = self.V.copy()
-        f = V.shape[1]
-        V[:, range(f), range(f)] += self.diagonal(damping)
-        solved = np.linalg.solve(V, np.concatenate([self.W.swapaxes(1, 2), self.h[:, :, None]], axis=2))
-        return solved[:, :, :-1], solved[:, :, -1]
-
-    def diagonal(self, damping: float) -> F64:
-        """What the damping adds to the diagonals of V; (n, f)."""
-        diagonal = np.diagonal(self.V, axis1=1, axis2=2)
-        return damping * np.asarray(floored_diagonal(diagonal))
+def _tensor_and_covariance(
+    problem: TrifocalReprojection, state: TrifocalState, transforms: F64
+) -> tuple[F64, F64]:
+    """T (3, 3, 3) in pixels, unit norm, and its covariance (27, 27) for unit noise in pixels."""
+    P2, P3 = state.P[1:]
+    inverse = np.linalg.inv(transforms)
+    to_pixels = np.einsum("ri,js,kt->ijkrst", transforms[0], inverse[1], inverse[2]).reshape(27, 27)
+    # T is linear in either camera, so its derivatives are the tensors of single entries.
+    entries = np.eye(12).reshape(12, 3, 4)
+    J = to_pixels @ np.stack(
+        [_canonical_tensor(E, P3).ravel() for E in entries]
+        + [_canonical_tensor(P2, E).ravel() for E in entries],
+        axis=1,
+    )
+    T = to_pixels @ _canonical_tensor(P2, P3).ravel()
+    size = float(np.linalg.norm(T))
+    T /= size
+    J = (J - np.outer(T, T @ J)) / size
+    information = problem.linearize(state).reduced(1e-12)[0]
+    scale = 1.0 / np.sqrt(floored_diagonal(np.diag(information)))
+    values, vectors = np.linalg.eigh(information * scale * scale[:, None])
+    # 6 of the 24 freedoms are the cameras' scales and the frame of space, which T does not feel.
+    root = J @ (scale[:, None] * vectors[:, 6:] / np.sqrt(np.maximum(values[6:], 1e-14 * values[-1])))
+    return T.reshape(3, 3, 3), root @ root.T
 
 
-@dataclass(frozen=True)
-class _System:
-    """[[H, W], [W', V]] of the cameras and both kinds of features, which are eliminated."""
-
-    cost: float
-    H: F64
-    g: F64
-    blocks: tuple[_Block, _Block]
-
-    def solve(self, damping: float) -> tuple[_Step, float] | None:
-        """The damped step and the gain it promises."""
-        diagonal = damping * floored_diagonal(np.diag(self.H))
-        S, b = self.H + np.diag(diagonal), -self.g
-        solved = [block.damped(damping) for block in self.blocks]
-        for block, (Y, z) in zip(self.blocks, solved, strict=True):
-            S = S - np.einsum("nif,nfj->ij", block.W, Y)
-            b = b + np.einsum("nif,nf->i", block.W, z)
-        cameras = solve_positive(S, b)
-        if cameras is None:
-            return None
-        promised = float(cameras @ (diagonal * cameras - self.g))
-        moves = [-(z + Y @ cameras) for Y, z in solved]
-        for block, move in zip(self.blocks, moves, strict=True):
-            promised += float(np.sum(move * (block.diagonal(damping) * move - block.h)))
-        return _Step(cameras, moves[0], moves[1]), 0.5 * promised
-
-
-@dataclass(frozen=True)
-class _Reprojection:
-    """points (N, 3, 2) and ends (M, 3, 2, 3), conditioned; ``scale`` (3,) conditioned units per pixel."""
-
-    points: F64
-    ends: F64
-    scale: F64
-    loss_px: float
-
-    @classmethod
-    def of(cls, points: F64, segments: F64, transforms: F64, loss_px: float) -> _Reprojection:
-        x = homogenize(points) @ transforms.swapaxes(1, 2)
-        y = homogenize(segments) @ transforms.swapaxes(1, 2)[:, None]
-        return cls(x[:, :, :2].swapaxes(0, 1), y.swapaxes(0, 1), transforms[:, 0, 0], loss_px)
-
-    def start(self, T: F64) -> _State:
-        """Cameras of a conditioned tensor, points by triangulation, lines as the meet of their planes."""
-        P = np.stack(cameras_from_tensor(T))
-        P /= np.linalg.norm(P, axis=(1, 2), keepdims=True)
-        X = triangulate_linear(P, self.points.swapaxes(0, 1))
-        seen = unit_normals(line_through(self.ends[:, :, 0], self.ends[:, :, 1]))
-        planes = np.einsum("mva,vab->mvb", seen, P)
-        return _State(P, X, np.linalg.svd(planes)[2][:, 2:])
-
-    def linearize(self, state: _State) -> _System:
-        """Normal equations with Huber's weights, in pixels."""
-        residual = self.residual(state)
-        rho, weight = LOSSES["huber"](np.sum(residual**2, axis=2), self.loss_px)
-        root = np.sqrt(weight)[:, :, None]
-        H, g, blocks, first = np.zeros((24, 24)), np.zeros(24), [], 0
-        for cameras, features in (self._point_jacobian(state), self._line_jacobian(state)):
-            n = len(cameras)
-            w = root[first : first + n]
-            r = (w * residual[first : first + n]).reshape(n, 6)
-            A, B = ((w[..., None] * J).reshape(n, 6, J.shape[3]) for J in (cameras, features))
-            H += np.einsum("nri,nrj->ij", A, A)
-            g += np.einsum("nri,nr->i", A, r)
-            At, Bt = A.swapaxes(1, 2), B.swapaxes(1, 2)
-            blocks.append(_Block(At @ B, Bt @ B, (Bt @ r[:, :, None])[:, :, 0]))
-            first += n
-        return _System(0.5 * float(rho.sum()), H, g, (blocks[0], blocks[1]))
-
-    def retract(self, state: _State, step: _Step) -> _State:
-        """Cameras and points of unit norm, lines orthonormal again."""
-        P = state.P.copy()
-        P[1:] += step.cameras.reshape(2, 3, 4)
-        P[1:] /= np.linalg.norm(P[1:], axis=(1, 2), keepdims=True)
-        X = state.X + np.einsum("nf,nfa->na", step.points, _complement(state.X[:, None]))
-        X /= np.linalg.norm(X, axis=1, keepdims=True)
-        lines = state.lines + step.lines.reshape(-1, 2, 2) @ _complement(state.lines)
-        return _State(P, X, np.linalg.qr(lines.swapaxes(1, 2))[0].swapaxes(1, 2))
-
-    def cost(self, state: _State) -> float:
-        """1/2 sum rho, px^2; inf where a point falls on a principal plane."""
-        residual = self.residual(state)
-        if not np.isfinite(residual).all():
-            return np.inf
-        return 0.5 * float(LOSSES["huber"](np.sum(residual**2, axis=2), self.loss_px)[0].sum())
-
-    def residual(self, state: _State) -> F64:
-        """Offsets of the points, then distances of the segments' ends; (N + M, 3 views, 2) px."""
-        p = np.einsum("vab,nb->nva", state.P, state.X)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            offset = p[:, :, :2] / p[:, :, 2:] - self.points
-            distance = self._line_distances(*self._line_images(state))
-        return np.concatenate([offset, distance]) / self.scale[:, None]
-
-    def _line_images(self, state: _State) -> tuple[F64, F64]:
-        """Images (M, 3, 3) of the two points that stand for each line."""
-        ends = np.einsum("vab,meb->mvea", state.P, state.lines)
-        return ends[:, :, 0], ends[:, :, 1]
-
-    def _line_distances(self, p: F64, q: F64) -> F64:
-        """Signed distances (M, 3, 2) of the segments' ends to the lines through p and q, conditioned."""
-        return np.asarray(np.einsum("mvea,mva->mve", self.ends, unit_normals(line_through(p, q))))
-
-    def _point_jacobian(self, state: _State) -> tuple[F64, F64]:
-        """By the cameras (N, 3, 2, 24) and the points (N, 3, 2, 3), px."""
-        p = np.einsum("vab,nb->nva", state.P, state.X)
-        by_image = np.zeros((*p.shape[:2], 2, 3))
-        by_image[:, :, 0, 0] = by_image[:, :, 1, 1] = 1.0 / p[:, :, 2]
-        by_image[:, :, :, 2] = -p[:, :, :2] / p[:, :, 2:] ** 2
-        by_image /= self.scale[:, None, None]
-        by_point = np.einsum("nvra,vab,nfb->nvrf", by_image, state.P, _complement(state.X[:, None]))
-        return _camera_columns(np.einsum("nvra,nb->nvrab", by_image, state.X)), by_point
-
-    def _line_jacobian(self, state: _State) -> tuple[F64, F64]:
-        """By the cameras (M, 3, 2, 24) and the lines (M, 3, 2, 4), px: d = l.y / |(l_1, l_2)|, l = p x q."""
-        p, q = self._line_images(state)
-        l = line_through(p, q)
-        size = np.linalg.norm(l[:, :, :2], axis=2)[:, :, None]
-        unit = l / size
-        distance = self._line_distances(p, q)
-        normal = np.concatenate([unit[:, :, :2], np.zeros_like(unit[:, :, 2:])], axis=2)
-        by_line = self.ends - distance[..., None] * normal[:, :, None]
-        by_line /= (size * self.scale[:, None])[..., None]
-        by_p, by_q = np.cross(q[:, :, None], by_line), np.cross(by_line, p[:, :, None])
-        by_camera = np.einsum("mvra,mb->mvrab", by_p, state.lines[:, 0])
-        by_camera += np.einsum("mvra,mb->mvrab", by_q, state.lines[:, 1])
-        across = np.einsum("vab,mfb->mvaf", state.P, _complement(state.lines))
-        return _camera_columns(by_camera), np.concatenate([by_p @ across, by_q @ across], axis=3)
-
-
-def _complement(subspace: F64) -> F64:
-    """Orthonormal rows (n, 4 - k, 4) orthogonal to those of (n, k, 4)."""
-    return np.linalg.svd(subspace)[2][:, subspace.shape[1] :]
-
-
-def _camera_columns(by_camera: F64) -> F64:
-    """Derivatives (n, 3, 2, 3, 4) by the camera of each view as columns (n, 3, 2, 24) of P2 and P3."""
-    n = len(by_camera)
-    columns = np.zeros((n, 3, 2, 2, 12))
-    for view in (1, 2):
-        columns[:, view, :, view - 1] = by_camera[:, view].reshape(n, 2, 12)
-    return columns.reshape(n, 3, 2, 24)
+def _canonical_tensor(P2: F64, P3: F64) -> F64:
+    """T_i^jk = a_i^j b_4^k - a_4^j b_i^k of cameras beside [I 0], not normalised (HZ 15.1)."""
+    of_first = np.einsum("ji,k->ijk", P2[:, :3], P3[:, 3])
+    return np.asarray(of_first - np.einsum("j,ki->ijk", P2[:, 3], P3[:, :3]))

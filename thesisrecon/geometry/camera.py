@@ -33,9 +33,9 @@ def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
 def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: float = 0.0) -> F64:
     """K (3, 3) of (3.17): [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]], all in px.
 
-    f_u and f_v are the focal length over the pixel's width and height (the text of 3.5.1 multiplies where it
-    must divide), skew = f_v tan of the angle between the pixel's sides and a right
-    one. Raises ``ValueError`` for a focal that is not positive.
+    f_u = f / p_x and f_v = f / p_y, the focal length over the pixel's width and height; skew = f_v tan(alpha)
+    with the angle alpha by which the pixel's sides differ from a right one (table 3.1). Raises ``ValueError``
+    for a focal that is not positive.
     """
     if not (f_u > 0.0 and f_v > 0.0):
         raise ValueError(f"calibration_matrix needs positive focals; got {f_u} and {f_v}")

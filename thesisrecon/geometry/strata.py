@@ -1,6 +1,6 @@
 """Sections 3.3 and 3.4: how each entity is transformed, and the four strata with their groups of transforms.
 
-A transform G (4, 4) acts on points as X -> G X. The matrices printed in 3.4.2 to 3.4.5 of the thesis have
+A transform G (4, 4) acts on points as X -> G X. The matrices of 3.4.2 to 3.4.5 in the thesis' text have
 their zeros in the fourth column: they act on rows, X' -> X' G, and are the transposes of the ones here, which
 follow its table in 3.3.
 """

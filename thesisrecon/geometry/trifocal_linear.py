@@ -70,10 +70,15 @@ class TensorEquations:
 def tensor_equations(points: F64, segments: F64) -> TensorEquations:
     """Equations of N points (3, N, 2) px and M line segments (3, M, 2, 2) px, by their ends, in three views.
 
-    The ends of a line's segments need not match each other. Raises ``ValueError`` for other shapes, values
-    that are not finite, segments of no length, and fewer than 26 equations, 4 N + 2 M.
+    The ends of a line's segments need not match each other. Raises ``ValueError`` for fewer than 26
+    equations, 4 N + 2 M, and as :func:`check_triplets`.
     """
     points, segments = check_triplets(points, segments)
+    count = 4 * points.shape[1] + 2 * segments.shape[1]
+    if count < NEEDED_EQUATIONS:
+        raise ValueError(
+            f"a trifocal tensor needs {NEEDED_EQUATIONS} equations, 4 a point and 2 a line; got {count}"
+        )
     ends = segments.reshape(3, -1, 2)
     transforms = np.stack([normalizing_transform(xy) for xy in np.concatenate([points, ends], axis=1)])
     x = homogenize(points) @ transforms.swapaxes(1, 2)
@@ -87,7 +92,10 @@ def tensor_equations(points: F64, segments: F64) -> TensorEquations:
 
 
 def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
-    """Matches of three views as float64 arrays; refused as :func:`tensor_equations` says."""
+    """Matches of three views as float64 arrays, points (3, N, 2) and segments (3, M, 2, 2) by their ends.
+
+    Raises ``ValueError`` for other shapes, values that are not finite and segments of no length.
+    """
     points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
     right = points.ndim == 3 and points.shape[::2] == (3, 2)
     if not right or segments.ndim != 4 or (segments.shape[0], *segments.shape[2:]) != (3, 2, 2):
@@ -98,11 +106,6 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
         raise ValueError("points and segments must be finite; some are NaN or infinite")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
-    count = 4 * points.shape[1] + 2 * segments.shape[1]
-    if count < NEEDED_EQUATIONS:
-        raise ValueError(
-            f"a trifocal tensor needs {NEEDED_EQUATIONS} equations, 4 a point and 2 a line; got {count}"
-        )
     return points, segments
 
 
