@@ -81,6 +81,38 @@ def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed:
     assert summary["points"] > 300
 
 
+def test_a_kill_and_the_number_of_threads_change_no_byte(
+    killed_and_resumed: tuple[Path, int], photographs: Path, tmp_path: Path
+) -> None:
+    out, _ = killed_and_resumed
+    # A process of its own: the command caps the threads of linear algebra before NumPy is imported.
+    arguments = command("reconstruct", photographs, "-o", tmp_path / "out", *SMALL, "--threads", "1")
+    subprocess.run(arguments, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, capture_output=True)
+    assert kept_bytes(tmp_path / "out") == kept_bytes(out)
+
+
+def kept_bytes(out: Path) -> dict[str, bytes]:
+    """Every result file of a run."""
+    files = [
+        *out.glob("0*/*.npz"),
+        *(out / "sparse" / "0").iterdir(),
+        out / "points.ply",
+        out / "cameras.json",
+    ]
+    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(files)}
+
+
+def test_the_preset_of_the_thesis_runs_to_the_end(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run_command(["reconstruct", str(photographs), "-o", str(out), "--preset", "thesis", *SMALL]) == 0
+    assert "photographs registered" in capsys.readouterr().out
+    summary = read(out / "summary.json")
+    assert summary["registered"] >= 4
+    assert summary["registered"] + len(summary["refused"]) == VIEWS
+
+
 def truth_focal(truth: Any) -> float:
     """The true focal length (px) of the courtyard's one camera."""
     cameras = truth["cameras"] if "cameras" in truth else truth["images"]

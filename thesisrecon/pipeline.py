@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack, get_args
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -14,10 +14,8 @@ from thesisrecon.assumptions import camera_groups, focal_prior
 from thesisrecon.config import PipelineConfig, tables_from_config
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.images import ImageSource, PhotographSet, read_photographs
-from thesisrecon.io.run_directory import RunDirectory
 from thesisrecon.outputs import write_outputs
-from thesisrecon.run import Progress, Run, stream
-from thesisrecon.settings import unknown_word
+from thesisrecon.run import Progress, Run, RunOptions, start_run, stream
 from thesisrecon.types import (
     Features,
     FocalPrior,
@@ -25,25 +23,9 @@ from thesisrecon.types import (
     RunResult,
     TwoView,
 )
-from thesisrecon.workers import Workers, available_threads
 
-Until = Literal["features", "matches", "projective", "metric"]
-LATER_STAGES = ("dense", "model")
 ATTEMPTS = 3
 MIN_CORNERS = 16
-
-
-class RunOptions(TypedDict, total=False):
-    """How a run is carried out, none of which changes what it finds.
-
-    ``until`` : the last stage ("metric"). ``threads`` : workers (all processors). ``executor`` : "local"
-    threads or "processes". ``overwrite`` : take over a folder that holds another run (False).
-    """
-
-    until: Until
-    threads: int | None
-    executor: str
-    overwrite: bool
 
 
 def reconstruct(
@@ -79,7 +61,7 @@ def reconstruct(
     StageFailure : these photographs cannot be reconstructed. What was computed, the summary and the page are
         in ``out`` all the same.
     """
-    until, run, overwrite = _start(out, config or PipelineConfig(), seed, progress, options)
+    until, run, overwrite = start_run(out, config or PipelineConfig(), seed, progress, options)
     photographs = _read(run, images)
     identity = _identity(run, photographs)
     with run.directory.claimed(identity, overwrite=overwrite):
@@ -124,25 +106,6 @@ class _Work:
                 f"at least {needed} different ones are needed{'; ' + why if why else ''}",
                 "take more photographs of the scene from other places",
             )
-
-
-def _start(
-    out: str | Path, config: PipelineConfig, seed: int, progress: Progress | None, options: Mapping[str, Any]
-) -> tuple[Until, Run, bool]:
-    unknown = sorted(set(options) - set(RunOptions.__annotations__))
-    if unknown:
-        raise TypeError(unknown_word("option of reconstruct", unknown[0], RunOptions.__annotations__))
-    until = options.get("until", "metric")
-    if until in LATER_STAGES:
-        raise UsageError(f"the stage {until} does not exist yet; --until metric is the end for now")
-    if until not in get_args(Until):
-        raise UsageError(unknown_word("stage", str(until), get_args(Until)))
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
-    threads = options.get("threads") or available_threads()
-    workers = Workers(threads, options.get("executor", "local"))
-    run = Run(config, seed, workers, RunDirectory(Path(out)), progress or (lambda *_: None))
-    return until, run, bool(options.get("overwrite", False))
 
 
 def _read(run: Run, images: ImageSource) -> PhotographSet:

@@ -9,15 +9,17 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 
 from thesisrecon.config import PipelineConfig, kind_of, tables_from_config
+from thesisrecon.errors import UsageError
 from thesisrecon.io.run_directory import RunDirectory, code_key, key_of
-from thesisrecon.settings import table_from_dataclass
+from thesisrecon.settings import table_from_dataclass, unknown_word
 from thesisrecon.types import StageReport
-from thesisrecon.workers import Workers
+from thesisrecon.workers import Workers, available_threads
 
 Progress = Callable[[str, int, int], None]
 """Hears (stage, done, total) whenever a part of a stage is done; called from the thread of the caller."""
@@ -30,6 +32,23 @@ FOLDERS: Mapping[str, str] = {
     "selfcalibration": "05-selfcalibration",
     "metric": "06-metric",
 }
+
+
+Until = Literal["features", "matches", "projective", "metric"]
+LATER_STAGES = ("dense", "model")
+
+
+class RunOptions(TypedDict, total=False):
+    """How a run is carried out, none of which changes what it finds.
+
+    ``until`` : the last stage ("metric"). ``threads`` : workers (all processors). ``executor`` : "local"
+    threads or "processes". ``overwrite`` : take over a folder that holds another run (False).
+    """
+
+    until: Until
+    threads: int | None
+    executor: str
+    overwrite: bool
 
 
 def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
@@ -156,3 +175,25 @@ class Run:
     def key(self, stage: str, *parts: Any) -> str:
         """The key of an item of this stage made from these parts."""
         return key_of(FOLDERS[stage], *parts)
+
+
+def start_run(
+    out: str | Path, config: PipelineConfig, seed: int, progress: Progress | None, options: Mapping[str, Any]
+) -> tuple[Until, Run, bool]:
+    """The checked wishes of a call as (last stage, run, overwrite); :class:`UsageError` names a wrong
+    one.
+    """
+    unknown = sorted(set(options) - set(RunOptions.__annotations__))
+    if unknown:
+        raise TypeError(unknown_word("option of reconstruct", unknown[0], RunOptions.__annotations__))
+    until = options.get("until", "metric")
+    if until in LATER_STAGES:
+        raise UsageError(f"the stage {until} does not exist yet; --until metric is the end for now")
+    if until not in get_args(Until):
+        raise UsageError(unknown_word("stage", str(until), get_args(Until)))
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
+    threads = options.get("threads") or available_threads()
+    workers = Workers(threads, options.get("executor", "local"))
+    run = Run(config, seed, workers, RunDirectory(Path(out)), progress or (lambda *_: None))
+    return until, run, bool(options.get("overwrite", False))
