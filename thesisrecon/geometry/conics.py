@@ -56,18 +56,18 @@ def meet_line(C: F64, x: F64, y: F64) -> F64:
     """The real points (0, 1 or 2; d) where the line of points x, y (d,) meets a conic or quadric (3.5).
 
     Roots (a, b) of a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y: in homogeneous form, so
-    that x and y themselves are found. A discriminant of 0 to rounding (1e-14 relative) is one point. Empty as
-    well where the line lies on the quadric altogether.
+    that x and y themselves are found. A discriminant of 0 to rounding is one point. Empty as well where the
+    line lies on the quadric altogether.
     """
+    x, y, C = x / np.linalg.norm(x), y / np.linalg.norm(y), C / np.linalg.norm(C)
     sxx, sxy, syy = float(form(C, x, x)), float(form(C, x, y)), float(form(C, y, y))
     size = max(abs(sxx), abs(sxy), abs(syy))
-    if size <= 1e-15 * np.linalg.norm(C) * np.linalg.norm(x) * np.linalg.norm(y):
+    # Each of the three forms is known to some 1e-15, being of unit vectors.
+    discriminant, rounding = sxy**2 - sxx * syy, 1e-14 * size
+    if size <= 1e-15 or discriminant < -rounding:
         return np.zeros((0, len(x)))
-    discriminant = (sxy**2 - sxx * syy) / size**2
-    if discriminant < -1e-14:
-        return np.zeros((0, len(x)))
-    touches = discriminant <= 1e-14
-    q = -(sxy + np.copysign(0.0 if touches else size * np.sqrt(discriminant), sxy))
+    touches = discriminant <= rounding
+    q = -(sxy + np.copysign(0.0 if touches else np.sqrt(discriminant), sxy))
     if abs(q) <= 1e-7 * size:
         return (x if abs(sxx) < abs(syy) else y)[None]
     first, second = q * x + sxx * y, syy * x + q * y
