@@ -37,3 +37,16 @@ def normalizing_transform(xy: F64) -> F64:
         raise ValueError(f"normalizing_transform needs points that differ; got {len(xy)} equal points")
     s = np.sqrt(2.0) / distance
     return np.array([[s, 0.0, -s * centroid[0]], [0.0, s, -s * centroid[1]], [0.0, 0.0, 1.0]])
+
+
+def pixel_from_unit(sizes: NDArray[np.int64]) -> F64:
+    """Transforms (V, 3, 3) from unit-free to pixel coordinates of images of ``sizes`` (V, 2) width, height.
+
+    The origin of unit-free coordinates is the image centre, their unit the long side.
+    """
+    scale = sizes.max(axis=1).astype(np.float64)
+    T = np.zeros((len(sizes), 3, 3))
+    T[:, 0, 0] = T[:, 1, 1] = scale
+    T[:, :2, 2] = (sizes - 1.0) / 2.0
+    T[:, 2, 2] = 1.0
+    return T

@@ -51,13 +51,13 @@ def triangulate_linear(P: F64, xy: F64) -> F64:
 def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: int) -> F64:
     """Largest angle (rad) between a point's rays, against the ray of its first observation; -> (n_points,).
 
-    centres (V, 3), X (n_points, 3); observations sorted by point.
+    centres (V, 3), X (n_points, 3); a point without observations gets 0.
     """
     rays = X[point] - centres[view]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
-    first = np.searchsorted(point, np.arange(n_points))
-    reference = rays[np.minimum(first, len(point) - 1)][point]
-    cosine = np.clip(np.einsum("ka,ka->k", rays, reference), -1.0, 1.0)
+    first = np.zeros((n_points, 3))
+    first[point[::-1]] = rays[::-1]
+    cosine = np.clip(np.einsum("ka,ka->k", rays, first[point]), -1.0, 1.0)
     angles = np.zeros(n_points)
     np.maximum.at(angles, point, np.arccos(cosine))
     return angles

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.geometry.triangulation import triangulate_observations
+from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.optimize.metric_bundle import MetricCameras
 from thesisrecon.optimize.triangulation_refine import refine_points
 from thesisrecon.types import B8, I64, Tracks
@@ -116,18 +116,9 @@ def mark(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
 
 
 def _largest_angle(model: MetricModel, ok: B8) -> F64:
-    """Largest angle (rad) of each point's rays against its first explained one."""
     t = model.tracks
-    view, point = t.view_index[ok], t.point_index[ok]
     centres = -np.einsum("vba,vb->va", model.cameras.R, model.cameras.t)
-    rays = model.X[point] - centres[view]
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
-    first = np.zeros((t.n_points, 3))
-    first[point[::-1]] = rays[::-1]
-    cosine = np.clip(np.einsum("ka,ka->k", rays, first[point]), -1.0, 1.0)
-    angle = np.zeros(t.n_points)
-    np.maximum.at(angle, point, np.arccos(cosine))
-    return angle
+    return triangulation_angles(centres, t.view_index[ok], t.point_index[ok], model.X, t.n_points)
 
 
 def residual_norms(model: MetricModel) -> F64:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.geometry.multiview import canonical_cameras
 from thesisrecon.types import I64, Tracks, TwoView
 
 F64 = NDArray[np.float64]
@@ -54,23 +55,9 @@ def require_parallax(pairs: Sequence[TwoView], *, most: float = 0.95) -> None:
 def cameras_from_fundamental(F: F64, sizes: I64) -> tuple[F64, F64]:
     """Initial cameras (3.42), P1 = [I | 0] and P2 = [[e]x F + e pi' | e], in pixels.
 
-    ``sizes`` (2, 2) width and height of the two images. The plane pi (and the scale of F) is the one that
-    brings the left part of P2 closest to the identity in unit-free pixels: a pair of similar photographs
-    then starts near a metric frame, and the left part is not singular although [e]x F alone is.
+    ``sizes`` (2, 2) width and height of the two images. The plane pi is chosen in unit-free pixels, such that
+    the left part of P2 comes near the identity: a pair of similar photographs then starts near a metric frame.
     """
-    T1, T2 = (_pixel_from_unit(size) for size in sizes)
-    Fu = T2.T @ F @ T1
-    Fu = Fu / np.linalg.norm(Fu)
-    e = np.linalg.svd(Fu)[0][:, 2]
-    H = cross_matrix(e) @ Fu
-    design = np.column_stack([H.ravel(), np.kron(e[:, None], np.eye(3))])
-    solution = np.linalg.lstsq(design, np.eye(3).ravel(), rcond=None)[0]
-    scale = solution[0] if abs(solution[0]) > 1e-3 else 1e-3
-    M = scale * H + np.outer(e, solution[1:])
-    P1 = T1 @ np.eye(3, 4)
-    return P1, T2 @ np.column_stack([M, e])
-
-
-def _pixel_from_unit(size: I64) -> F64:
-    s = float(max(size))
-    return np.array([[s, 0.0, (size[0] - 1) / 2], [0.0, s, (size[1] - 1) / 2], [0.0, 0.0, 1.0]])
+    T1, T2 = pixel_from_unit(sizes)
+    P1, P2 = canonical_cameras(T2.T @ F @ T1)
+    return T1 @ P1, T2 @ P2

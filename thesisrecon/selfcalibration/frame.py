@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.types import I64, Reconstruction
 
 F64 = NDArray[np.float64]
@@ -49,16 +50,6 @@ class ReferenceFrame:
         )  # fmt: skip
 
 
-def unit_pixels(sizes: I64) -> F64:
-    """Transforms (V, 3, 3) from unit-free to pixel coordinates: origin in the image centre, long side 1."""
-    scale = sizes.max(axis=1).astype(np.float64)
-    T = np.zeros((len(sizes), 3, 3))
-    T[:, 0, 0] = T[:, 1, 1] = scale
-    T[:, :2, 2] = (sizes - 1.0) / 2.0
-    T[:, 2, 2] = 1.0
-    return T
-
-
 def build_frame(
     reconstruction: Reconstruction, groups: I64, *, reference: int | None = None
 ) -> ReferenceFrame:
@@ -68,11 +59,11 @@ def build_frame(
     most observations).
     """
     views = np.flatnonzero(reconstruction.registered)
-    pixel_from_unit = unit_pixels(reconstruction.sizes)
-    P = np.linalg.inv(pixel_from_unit[views]) @ reconstruction.P[views]
+    unit = pixel_from_unit(reconstruction.sizes)
+    P = np.linalg.inv(unit[views]) @ reconstruction.P[views]
     if reference is None:
         seen = reconstruction.tracks.view_index[reconstruction.inlier]
-        reference = int(views[np.bincount(seen, minlength=len(pixel_from_unit))[views].argmax()])
+        reference = int(views[np.bincount(seen, minlength=len(unit))[views].argmax()])
     place = int(np.flatnonzero(views == reference)[0])
     U, S, Vt = np.linalg.svd(P[place])
     projective_from_reference = np.column_stack([Vt[:3].T @ np.diag(1.0 / S) @ U.T, Vt[3]])
@@ -89,7 +80,7 @@ def build_frame(
         views,
         place,
         dense_group,
-        pixel_from_unit,
+        unit,
         np.linalg.inv(projective_from_reference),
     )
 
