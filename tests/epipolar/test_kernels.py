@@ -108,10 +108,33 @@ def test_distances_and_score_equal_numpy(seed):
     r = np.abs(sampson_residuals(f.reshape(3, 3), points[:, :2], points[:, 2:]))
     np.testing.assert_allclose(kernels.sampson_distances(f, points), r, rtol=1e-9)
     gate = float(np.quantile(r, 0.7))
-    score, inliers = kernels.truncated_score(f, points, gate, 1.0)
+    columns = np.ascontiguousarray(points.T)
+    score, inliers, seen = kernels.truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
     assert score == pytest.approx(np.minimum((r / gate) ** 2, 1.0).mean())
     assert inliers == (r < gate).sum()
-    assert kernels.truncated_score(f, points, gate, 0.5 * score) == (1.0, 0)
+    assert seen == len(points)
+    assert kernels.truncated_score(f, columns, gate, 0.5 * score, (0.0, 0.0))[0] == 1.0
+
+
+def test_sequential_test_gives_up_wrong_matrices_early_and_keeps_right_ones():
+    rng = np.random.default_rng(0)
+    n, right, wrong, kept, seen = 2000, 0.4, 0.05, 0, []
+    evidence = kernels.log_ratios(right, wrong)
+    np.testing.assert_allclose(evidence, [np.log(wrong / right), np.log((1 - wrong) / (1 - right))])
+    assert kernels.log_ratios(0.06, 0.05) == (0.0, 0.0)
+    f = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0])  # y1 - y2
+    for _ in range(200):
+        for share in (right, wrong):
+            columns = rng.uniform(-1.0, 1.0, (4, n))
+            columns[3] = columns[1] + np.where(rng.random(n) < share, 0.0, 1.0)
+            score, _, count = kernels.truncated_score(f, columns, 0.1, 1.0, evidence)
+            if share == right:
+                kept += score < 1.0
+            else:
+                assert score == 1.0
+                seen.append(count)
+    assert kept >= 198
+    assert np.mean(seen) < 48
 
 
 @settings(max_examples=30, deadline=None)
@@ -138,7 +161,7 @@ def robust_cost(f, points, criterion, gate, delta):
 @pytest.mark.parametrize("criterion", [rank2.GRADIENT, rank2.DISTANCE])
 @pytest.mark.parametrize(("gate", "delta"), [(1.0, 0.7), (2e-3, 1e-3)])
 def test_normal_equations_are_the_derivatives_of_the_cost(criterion, gate, delta):
-    points, f = noisy_points(4)
+    points, f = noisy_points(4, n=300)
     G, h, scratch = np.empty((9, 9)), np.empty(9), (np.empty((9, 9)), np.empty(9))
     settings = (criterion, gate, delta)
     cost = rank2.normal_equations(f, points, *settings, G, h)
@@ -149,8 +172,8 @@ def test_normal_equations_are_the_derivatives_of_the_cost(criterion, gate, delta
     ]
     np.testing.assert_allclose(h, numeric, atol=1e-5 * np.abs(h).max())
     np.testing.assert_allclose(G, G.T)
-    halved = rank2.normal_equations(f, points[:30], criterion, gate, delta, *scratch)
-    rest = rank2.normal_equations(f, points[30:], criterion, gate, delta, *scratch)
+    halved = rank2.normal_equations(f, points[:150], criterion, gate, delta, *scratch)
+    rest = rank2.normal_equations(f, points[150:], criterion, gate, delta, *scratch)
     assert halved + rest == pytest.approx(cost)
 
 

@@ -34,6 +34,8 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
             "Use photographs that overlap more",
         )
     for name, xy in (("first", xy1), ("second", xy2)):
+        if _clearly_spread(xy):
+            continue
         spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
         if not spread[1] > COLLINEAR * max(spread[0], float(np.abs(xy).max()) * 1e-3, 1e-300):
             raise StageFailure(
@@ -42,6 +44,13 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
                 "Such points leave the geometry of the pair free",
             )
     return xy1, xy2
+
+
+def _clearly_spread(xy: F64) -> bool:
+    """Whether the points are far from lying on one line, so far that squares cannot hide it."""
+    centred = xy - xy.sum(axis=0) / len(xy)
+    (a, b), (_, d) = centred.T @ centred
+    return bool(a * d - b * b > 1e-6 * (a + d) ** 2 and a + d > 1e-6 * len(xy) * float(xy[0] @ xy[0]))
 
 
 @dataclass(frozen=True)
@@ -59,13 +68,17 @@ class PairFrame:
     @classmethod
     def of(cls, xy1: F64, xy2: F64) -> PairFrame:
         """The frame in which the mean squared coordinate over both images is 1."""
-        c1, c2 = xy1.mean(axis=0), xy2.mean(axis=0)
-        spread = np.sqrt(0.5 * (np.var(xy1, axis=0).mean() + np.var(xy2, axis=0).mean()))
-        return cls(c1, c2, 1.0 / float(spread))
+        c1, c2 = xy1.sum(axis=0) / len(xy1), xy2.sum(axis=0) / len(xy2)
+        d1, d2 = (xy1 - c1).ravel(), (xy2 - c2).ravel()
+        return cls(c1, c2, 1.0 / float(np.sqrt((d1 @ d1 + d2 @ d2) / (4.0 * len(xy1)))))
 
     def points(self, xy1: F64, xy2: F64) -> F64:
         """Rows (x1, y1, x2, y2) in the frame; (N, 4)."""
-        return np.ascontiguousarray(np.hstack([xy1 - self.centroid1, xy2 - self.centroid2]) * self.scale)
+        points = np.empty((len(xy1), 4))
+        points[:, :2] = xy1 - self.centroid1
+        points[:, 2:] = xy2 - self.centroid2
+        points *= self.scale
+        return points
 
     @property
     def to_pixels(self) -> F64:

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from thesisrecon.epipolar.minimal.kernels import LANES, ROWS, lane_solutions, solve_batch
 from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
 from thesisrecon.robust.kernels import draw_sample, required_samples
 
@@ -18,6 +19,10 @@ I64 = NDArray[np.int64]
 
 DIAGONAL = np.sqrt(0.5)
 SUBSET = 300
+STRIDE = 16
+DOUBT = np.log(1e3)
+"""The sequential test calls at most one right matrix in a thousand wrong."""
+LARGEST = 1 << 40
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy", fastmath={"reassoc", "contract"})
@@ -173,8 +178,7 @@ def oriented(f: F64, points: F64, sample: I64) -> bool:
 
     The oriented epipolar constraint (Chum, Werner and Matas, ICPR 2004).
     """
-    e = np.empty(3)
-    largest = 0.0
+    e0, e1, e2, largest = 0.0, 0.0, 0.0, 0.0
     for a, b in ((0, 1), (0, 2), (1, 2)):
         x = f[3 + a] * f[6 + b] - f[6 + a] * f[3 + b]
         y = f[6 + a] * f[b] - f[a] * f[6 + b]
@@ -182,14 +186,14 @@ def oriented(f: F64, points: F64, sample: I64) -> bool:
         size = x * x + y * y + z * z
         if size > largest:
             largest = size
-            e[0], e[1], e[2] = x, y, z
+            e0, e1, e2 = x, y, z
     side = 0.0
     for k in range(len(sample)):
         x1, y1, x2, y2 = points[sample[k]]
         l0 = f[0] * x1 + f[1] * y1 + f[2]
         l1 = f[3] * x1 + f[4] * y1 + f[5]
         l2 = f[6] * x1 + f[7] * y1 + f[8]
-        dot = l0 * (e[1] - e[2] * y2) + l1 * (e[2] * x2 - e[0]) + l2 * (e[0] * y2 - e[1] * x2)
+        dot = l0 * (e1 - e2 * y2) + l1 * (e2 * x2 - e0) + l2 * (e0 * y2 - e1 * x2)
         if dot * side < 0.0:
             return False
         if dot != 0.0:
@@ -218,67 +222,121 @@ def sampson_distances(f: F64, points: F64) -> F64:
     return r
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def truncated_score(f: F64, points: F64, gate: float, give_up: float) -> tuple[float, int]:
-    """Mean of min(r^2 / gate^2, 1) over all points and the number of points with r < gate.
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
+    """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and how many have r < gate.
 
-    Given up (score 1) as soon as the sum passes ``give_up`` times the number of points, or the running mean
-    is three standard errors above it (the order of the points must be random): it cannot win, or very likely
-    cannot.
+    Without branches and over contiguous rows, so that the compiler makes vector instructions of it.
     """
-    total, inliers, n = 0.0, 0, len(points)
-    inverse = 1.0 / (gate * gate)
+    total, inside, wide = 0.0, 0.0, gate * gate
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    for k in range(start, end):
+        x1, y1, x2, y2 = columns[0, k], columns[1, k], columns[2, k], columns[3, k]
+        a0 = f0 * x1 + f1 * y1 + f2
+        a1 = f3 * x1 + f4 * y1 + f5
+        b0 = f0 * x2 + f3 * y2 + f6
+        b1 = f1 * x2 + f4 * y2 + f7
+        e = a0 * x2 + a1 * y2 + f6 * x1 + f7 * y1 + f8
+        r2 = e * e / (wide * (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1) + 1e-300)
+        total += r2 if r2 < 1.0 else 1.0
+        inside += 1.0 if r2 < 1.0 else 0.0
+    return total, inside
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def truncated_score(
+    f: F64, columns: F64, gate: float, give_up: float, evidence: tuple[float, float]
+) -> tuple[float, int, int]:
+    """Mean of min(r^2 / gate^2, 1) over all columns (4, N), how many have r < gate, and how many were seen.
+
+    Given up (score 1) as soon as the sum passes ``give_up`` times the number of points, since it cannot win,
+    as the running mean is three standard errors above it, or as Wald's sequential test says so (Matas and
+    Chum, ICCV 2005): ``evidence`` are the logarithms of the ratio of the likelihoods of "wrong" and "right"
+    for a point within the gate and for one beyond. The order of the points must be random.
+    """
+    n = columns.shape[1]
+    total, inliers = 0.0, 0.0
     spread = 3.0 * np.sqrt(give_up * max(1.0 - give_up, 0.01))
-    for block in range(0, n, 32):
-        end = min(block + 32, n)
-        for k in range(block, end):
-            r2 = inverse * squared_sampson(f, points[k, 0], points[k, 1], points[k, 2], points[k, 3])
-            if r2 < 1.0:
-                total += r2
-                inliers += 1
-            else:
-                total += 1.0
-        if total > give_up * n or total > give_up * end + spread * np.sqrt(end):
-            return 1.0, 0
-    return total / n, inliers
+    for start in range(0, n, STRIDE):
+        end = min(start + STRIDE, n)
+        part, inside = block_score(f, columns, start, end, gate)
+        total += part
+        inliers += inside
+        doubt = inliers * evidence[0] + (end - inliers) * evidence[1]
+        if total > min(give_up * n, give_up * end + spread * np.sqrt(end)) or doubt > DOUBT:
+            return 1.0, int(inliers), end
+    return total / n, int(inliers), n
 
 
 @njit(cache=True, nogil=True)
-def search(
-    points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64
-) -> int:
+def log_ratios(right: float, wrong: float) -> tuple[float, float]:
+    """Logarithms of the likelihood ratios wrong : right for a point inside and outside the gate.
+
+    ``right`` and ``wrong`` are the shares of points within the gate of a right and of a wrong matrix. Zeros
+    (never give up) where the two are too near to be told apart.
+    """
+    right = min(right, 0.99)
+    if not right > 1.5 * wrong:
+        return 0.0, 0.0
+    return np.log(wrong / right), np.log((1.0 - wrong) / (1.0 - right))
+
+
+@njit(cache=True, nogil=True)
+def draw_batch(points: F64, uniforms: F64, X: F64) -> None:
+    """Samples of the rows of ``uniforms`` (B <= LANES, 7) as columns of ``X`` (28, LANES)."""
+    sample = np.empty(7, np.int64)
+    for lane in range(len(uniforms)):
+        draw_sample(uniforms[lane], len(points), sample)
+        for m in range(7):
+            for c in range(4):
+                X[4 * m + c, lane] = points[sample[m], c]
+
+
+@njit(cache=True, nogil=True)
+def improve(points: F64, columns: F64, gate: float, state: F64, F: F64) -> None:
+    """Refine the best matrix a little (on at most 300 points, with a gate twice as wide) and keep the better.
+
+    A minimal sample spreads its noise over the image. ``state`` and ``F`` as in :func:`search`.
+    """
+    f = F.copy()
+    refine(f, points[:SUBSET], GRADIENT, 2.0 * gate, gate, 4)
+    score, inliers, _ = truncated_score(f, columns, gate, state[0], (0.0, 0.0))
+    if score < state[0]:
+        state[0], state[1] = score, inliers / len(points)
+        F[:] = f
+
+
+@njit(cache=True, nogil=True)
+def search(points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64) -> int:
     """Draw one sample per row of ``uniforms`` (B, 7) until enough were drawn; number of samples drawn in all.
 
     ``stop`` are the samples drawn before, the least number to draw and the probability of one free of
-    outliers that is enough. ``state`` (2,) holds the best score and its share of inliers, ``F`` (9,) the best
-    matrix: both are read and updated. Each new best is refined a little (on at most 300 points, with a gate
-    twice as wide) before it sets the number of samples still needed, since a minimal sample spreads its noise
-    over the image.
+    outliers that is enough. ``state`` (4,) holds the best score, its share of inliers, and of all matrices
+    given up the points seen and those of them within the gate; ``F`` (9,) is the best matrix: both are read
+    and updated. A new best of a batch is improved before it sets the number of samples still needed.
     """
-    n = len(points)
+    columns = np.ascontiguousarray(points.T)
     done, least, confidence = stop
-    sample = np.empty(7, np.int64)
-    solutions = np.empty((3, 9))
-    refined = np.empty(9)
-    largest = 1 << 40
-    for row in range(len(uniforms)):
-        if done >= least and done >= required_samples(state[1], 7, confidence, largest):
+    X, Y = np.ones((28, LANES)), np.empty((ROWS, LANES))
+    solutions, work = np.empty((3, 9)), np.empty(9)
+    for start in range(0, len(uniforms), LANES):
+        if done >= least and done >= required_samples(state[1], 7, confidence, LARGEST):
             break
-        done += 1
-        draw_sample(uniforms[row], n, sample)
-        for k in range(seven_point(points, sample, solutions)):
-            f = solutions[k]
-            if not oriented(f, points, sample):
-                continue
-            score, inliers = truncated_score(f, points, gate, state[0])
-            if score >= state[0]:
-                continue
-            state[0], state[1] = score, inliers / n
-            F[:] = f
-            refined[:] = f
-            refine(refined, points[:SUBSET], GRADIENT, 2.0 * gate, gate, 4)
-            score, inliers = truncated_score(refined, points, gate, state[0])
-            if score < state[0]:
-                state[0], state[1] = score, inliers / n
-                F[:] = refined
+        batch = uniforms[start : start + LANES]
+        done += len(batch)
+        draw_batch(points, batch, X)
+        solve_batch(X, Y)
+        evidence = log_ratios(state[1], state[3] / state[2])
+        before = state[0]
+        for lane in range(len(batch)):
+            for k in range(lane_solutions(Y, lane, work, solutions)):
+                score, inliers, seen = truncated_score(solutions[k], columns, gate, state[0], evidence)
+                if score < state[0]:
+                    state[0], state[1] = score, inliers / len(points)
+                    F[:] = solutions[k]
+                else:
+                    state[2] += seen
+                    state[3] += inliers
+        if state[0] < before:
+            improve(points, columns, gate, state, F)
     return done

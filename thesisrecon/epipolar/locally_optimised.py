@@ -13,7 +13,6 @@ from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.kernels import sampson_distances, search, truncated_score
 from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.multiview import sampson_residuals
 from thesisrecon.robust.noise import noise_scale
 from thesisrecon.types import FundamentalFit
 
@@ -21,10 +20,14 @@ F64 = NDArray[np.float64]
 
 BATCH = 512
 MINIMUM = 8
+START_STEPS, START_POINTS = 5, 500
+"""Solves of each refinement of a start, and the points that all but its last refinement are on."""
 REFINEMENT_STEPS = 15
 SHARPENINGS = 2
 KNEE = 0.25
 """Where Huber's loss turns linear, in widths of the gate: wrong matches within the gate are not rare."""
+PRIOR = (100.0, 5.0)
+"""What is thought of wrong matrices before the first was seen: of 100 points 5 lie within the gate."""
 EXACT = 1e-9
 """Smallest width of the loss (in units of the spread of the points), for matches without noise."""
 
@@ -82,7 +85,7 @@ class LocallyOptimisedRansac:
         f, samples = self._best_of_starts(points, gate, rng)
         if f.any():
             self._sharpen(f, points, gate)
-        return self._finish(frame, f, xy1, xy2, samples)
+        return self._finish(frame, f, points, samples)
 
     def _best_of_starts(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         best, best_score, samples = np.zeros(9), np.inf, 0
@@ -92,15 +95,16 @@ class LocallyOptimisedRansac:
             samples += drawn
             if not f.any():
                 continue
-            for width in self.gates:
-                refine(f, shuffled, GRADIENT, width * gate, KNEE * width * gate, REFINEMENT_STEPS)
-            score, _ = truncated_score(f, shuffled, gate, 1.0)
+            for k, width in enumerate(self.gates, start=1):
+                some = shuffled if k == len(self.gates) else shuffled[:START_POINTS]
+                refine(f, some, GRADIENT, width * gate, KNEE * width * gate, START_STEPS)
+            score, _, _ = truncated_score(f, np.ascontiguousarray(shuffled.T), gate, 1.0, (0.0, 0.0))
             if score < best_score:
                 best, best_score = f, score
         return best, samples
 
     def _search(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
-        f, state = np.zeros(9), np.array([1.0, 0.0])
+        f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
         least, most = self.min_samples // self.starts, self.max_samples // self.starts
         confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / self.starts)
         drawn = 0
@@ -121,18 +125,17 @@ class LocallyOptimisedRansac:
             width = min(max(noise_scale(r[near]), EXACT), gate)
             refine(f, points, GRADIENT, gate, width, REFINEMENT_STEPS)
 
-    def _finish(self, frame: PairFrame, f: F64, xy1: F64, xy2: F64, samples: int) -> FundamentalFit:
-        F = frame.matrix_in_pixels(f)
-        residuals = np.abs(sampson_residuals(F, xy1, xy2))
+    def _finish(self, frame: PairFrame, f: F64, points: F64, samples: int) -> FundamentalFit:
+        residuals = np.asarray(sampson_distances(f, points)) / frame.scale
         near = residuals < self.threshold_px
         if not f.any() or near.sum() < MINIMUM:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
-                f"the best of {samples} samples has {near.sum() * f.any()} of {len(xy1)} matches within "
+                f"the best of {samples} samples has {near.sum() * f.any()} of {len(points)} matches within "
                 f"{self.threshold_px:g} px, needed at least {MINIMUM}",
                 "The photographs may not overlap, or the matches are wrong",
             )
         sigma = noise_scale(residuals[near])
         inliers = residuals < max(self.inlier_sigmas * sigma, self.inlier_floor_px)
-        covariance = fundamental_covariance(frame, f, frame.points(xy1, xy2)[inliers], sigma * frame.scale)
-        return FundamentalFit(F, inliers, sigma, covariance, samples)
+        covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
+        return FundamentalFit(frame.matrix_in_pixels(f), inliers, sigma, covariance, samples)

@@ -13,32 +13,32 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 GRADIENT, DISTANCE = 0, 1
+BLOCK = 128
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations(
-    f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64
-) -> float:
-    """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by the entries of F.
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta: float, D: F64) -> float:
+    """Derivatives of the residuals of at most BLOCK points by the entries of F: columns of ``D`` (11, BLOCK).
 
-    rho is Huber's loss of width ``delta``, constant beyond ``gate``; r the Sampson distance (5.4) or the root
-    of the sum of the two squared epipolar distances (5.6). Returns the cost and the number of points inside
-    the gate.
+    Row 9 is the residual with its sign, row 10 the weight rho'(r) / r, 0 beyond the gate. Returns the cost.
+    One loop without branches over contiguous rows, which the compiler turns into vector instructions.
     """
-    G[:] = 0.0
-    h[:] = 0.0
+    X = np.empty((4, BLOCK))
+    for k in range(len(points)):
+        for c in range(4):
+            X[c, k] = points[k, c]
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f
     outside = delta * (gate - 0.5 * delta)
     cost = 0.0
-    d = np.empty(9)
     for k in range(len(points)):
-        x1, y1, x2, y2 = points[k]
-        a0 = f[0] * x1 + f[1] * y1 + f[2]
-        a1 = f[3] * x1 + f[4] * y1 + f[5]
-        b0 = f[0] * x2 + f[3] * y2 + f[6]
-        b1 = f[1] * x2 + f[4] * y2 + f[7]
-        e = a0 * x2 + a1 * y2 + f[6] * x1 + f[7] * y1 + f[8]
-        g1 = a0 * a0 + a1 * a1 + 1e-300
-        g2 = b0 * b0 + b1 * b1 + 1e-300
+        x1, y1, x2, y2 = X[0, k], X[1, k], X[2, k], X[3, k]
+        a0 = f0 * x1 + f1 * y1 + f2
+        a1 = f3 * x1 + f4 * y1 + f5
+        b0 = f0 * x2 + f3 * y2 + f6
+        b1 = f1 * x2 + f4 * y2 + f7
+        e = a0 * x2 + a1 * y2 + f6 * x1 + f7 * y1 + f8
+        g1 = a0 * a0 + a1 * a1 + 1e-60
+        g2 = b0 * b0 + b1 * b1 + 1e-60
         if criterion == GRADIENT:
             s = 1.0 / np.sqrt(g1 + g2)
             p = q = -e * s * s * s
@@ -47,31 +47,53 @@ def normal_equations(
             p = -e / (s * g1 * g1)
             q = -e / (s * g2 * g2)
         r = abs(e * s)
-        if not r < gate:
-            cost += outside
-            continue
-        w = 1.0
-        if r <= delta:
-            cost += 0.5 * r * r
-        else:
-            cost += delta * (r - 0.5 * delta)
-            w = delta / r
+        inside = r < gate
+        bend = delta / max(r, delta)
+        w = bend if inside else 0.0
+        cost += bend * r * (r - 0.5 * bend * r) if inside else outside
         # dr = s de + p (a0 da0 + a1 da1) + q (b0 db0 + b1 db1)
         u0, u1, v0, v1 = p * a0, p * a1, q * b0, q * b1
-        d[0] = s * x2 * x1 + u0 * x1 + v0 * x2
-        d[1] = s * x2 * y1 + u0 * y1 + v1 * x2
-        d[2] = s * x2 + u0
-        d[3] = s * y2 * x1 + u1 * x1 + v0 * y2
-        d[4] = s * y2 * y1 + u1 * y1 + v1 * y2
-        d[5] = s * y2 + u1
-        d[6] = s * x1 + v0
-        d[7] = s * y1 + v1
-        d[8] = s
+        s2, t2 = s * x2 + u0, s * y2 + u1
+        D[0, k] = s2 * x1 + v0 * x2
+        D[1, k] = s2 * y1 + v1 * x2
+        D[2, k] = s2
+        D[3, k] = t2 * x1 + v0 * y2
+        D[4, k] = t2 * y1 + v1 * y2
+        D[5, k] = t2
+        D[6, k] = s * x1 + v0
+        D[7, k] = s * y1 + v1
+        D[8, k] = s
+        D[9, k] = e * s
+        D[10, k] = w
+    return cost
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64) -> float:
+    """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by the entries of F.
+
+    rho is Huber's loss of width ``delta``, constant beyond ``gate``; r the Sampson distance (5.4) or the root
+    of the sum of the two squared epipolar distances (5.6). Returns the cost.
+    """
+    G[:] = 0.0
+    h[:] = 0.0
+    cost = 0.0
+    D, wd = np.empty((11, BLOCK)), np.empty(BLOCK)
+    for start in range(0, len(points), BLOCK):
+        m = min(BLOCK, len(points) - start)
+        cost += weighted_derivatives(f, points[start : start + m], criterion, gate, delta, D)
         for i in range(9):
-            wd = w * d[i]
-            h[i] += wd * e * s
+            for k in range(m):
+                wd[k] = D[10, k] * D[i, k]
             for j in range(i, 9):
-                G[i, j] += wd * d[j]
+                total = 0.0
+                for k in range(m):
+                    total += wd[k] * D[j, k]
+                G[i, j] += total
+            total = 0.0
+            for k in range(m):
+                total += wd[k] * D[9, k]
+            h[i] += total
     for i in range(9):
         for j in range(i):
             G[i, j] = G[j, i]
