@@ -10,9 +10,10 @@ import pytest
 from tests.synthetic import TrueScene, make_scene, true_pairs
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import project
+from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.projective import GatedIncremental, SequentialProjective
 from thesisrecon.projective.gate import predicted_spread_px
-from thesisrecon.projective.initial_pair import cameras_from_fundamental, rank_initial_pairs
+from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs
 from thesisrecon.projective.resection import resect_robust
 from thesisrecon.projective.selection import select_tracks
 from thesisrecon.types import Reconstruction, Tracks
@@ -111,7 +112,11 @@ def test_pairs_that_homographies_explain_are_refused_as_a_turning_camera_or_a_pl
 def test_initial_cameras_have_the_fundamental_matrix_they_came_from() -> None:
     scene = make_scene()
     pair = true_pairs(scene)[0]
-    P1, P2 = cameras_from_fundamental(pair.F, scene.sizes[:2])
+    for sign in (1.0, -1.0):
+        P = np.stack(initial_cameras(replace(pair, F=sign * pair.F), scene.sizes[:2]))
+        X = triangulate_linear(P, np.stack([pair.xy1, pair.xy2]))
+        assert (np.sign(X @ P[0, 2]) == np.sign(X @ P[1, 2])).all()
+    P1, P2 = initial_cameras(pair, scene.sizes[:2])
     M = P2[:, :3] @ np.linalg.inv(P1[:, :3])
     e = P2[:, 3] - M @ P1[:, 3]
     cross = np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])

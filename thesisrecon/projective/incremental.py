@@ -21,7 +21,7 @@ from thesisrecon.optimize.projective_bundle import refine_projective_bundle
 from thesisrecon.optimize.triangulation_refine import refine_camera, refine_points
 from thesisrecon.projective.gate import predicted_spread_px
 from thesisrecon.projective.initial_pair import (
-    cameras_from_fundamental,
+    initial_cameras,
     rank_initial_pairs,
     require_parallax,
 )
@@ -133,7 +133,7 @@ class GatedIncremental:
     def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> GrowingModel:
         """Cameras (3.42) and points of the first two views."""
         P = np.zeros((tracks.n_views, 3, 4))
-        P[pair.i], P[pair.j] = cameras_from_fundamental(pair.F, sizes[[pair.i, pair.j]])
+        P[pair.i], P[pair.j] = initial_cameras(pair, sizes[[pair.i, pair.j]])
         registered = np.zeros(tracks.n_views, dtype=bool)
         registered[[pair.i, pair.j]] = True
         state = GrowingModel(
