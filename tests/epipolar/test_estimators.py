@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from tests.epipolar.pairs import Pair, angle_between, make_pair, spoil
 from thesisrecon.epipolar import (
+    LeastMedianOfSquares,
     LocallyOptimisedRansac,
     ThesisRansac,
     estimate_eight_point,
@@ -16,7 +17,9 @@ from thesisrecon.epipolar import (
     estimate_seven_point,
     refine_epipolar_distance,
     refine_gradient,
+    refine_reprojection,
 )
+from thesisrecon.epipolar.outliers import discard_outliers
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.multiview import sampson_residuals, symmetric_residuals
 
@@ -25,6 +28,7 @@ ROBUST = [
     LocallyOptimisedRansac(),
     ThesisRansac(samples=300),
     ThesisRansac(samples=300, epipolar_distance=True),
+    LeastMedianOfSquares(samples=300),
 ]
 
 
@@ -74,7 +78,7 @@ def test_seven_point_of_degenerate_matches_is_empty():
     assert estimate_seven_point(np.ones((7, 2)), pair.xy2).shape == (0, 3, 3)
 
 
-@pytest.mark.parametrize("refine", [refine_gradient, refine_epipolar_distance])
+@pytest.mark.parametrize("refine", [refine_gradient, refine_epipolar_distance, refine_reprojection])
 def test_refinement_reaches_the_bound_of_the_noise(refine):
     """Sampson distances of a fit with 7 parameters have mean square sigma^2 (n - 7) / n (HZ 5.1)."""
     n, sigma, ratios = 60, 0.4, []
@@ -259,6 +263,8 @@ def test_hard_data_give_finite_numbers_or_a_stage_failure(estimator, kind):
         lambda: LocallyOptimisedRansac(gates=()),
         lambda: ThesisRansac(threshold_px=np.nan),
         lambda: ThesisRansac(samples=0),
+        lambda: LeastMedianOfSquares(samples=0),
+        lambda: discard_outliers(np.eye(3), np.ones((7, 2)), np.ones((7, 2))),
         lambda: estimate_eight_point(np.ones((7, 2)), np.ones((7, 2))),
         lambda: estimate_seven_point(np.ones((8, 2)), np.ones((8, 2))),
         lambda: estimate_seven_point(np.full((7, 2), np.nan), np.ones((7, 2))),

@@ -12,6 +12,7 @@ from thesisrecon.epipolar import kernels
 from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.epipolar.rank2 import kernels as rank2
 from thesisrecon.geometry.multiview import algebraic_residuals, sampson_residuals, symmetric_residuals
+from thesisrecon.geometry.optimal_triangulation import correct_matches
 
 seeds = st.integers(0, 2**31)
 
@@ -243,3 +244,17 @@ def test_frame_keeps_sampson_distances_up_to_its_scale():
     np.testing.assert_allclose(
         algebraic_residuals(again, xy1, xy2) * np.linalg.norm(F), algebraic_residuals(F, xy1, xy2), rtol=1e-6
     )
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds)
+def test_reprojection_distances_are_those_of_the_optimal_correction(seed):
+    points, f = noisy_points(seed)
+    F = f.reshape(3, 3)
+    r, J = rank2.residuals_and_derivatives(f, points, rank2.REPROJECTION)
+    nearest = np.hstack(correct_matches(F, points[:, :2], points[:, 2:]))
+    np.testing.assert_allclose(np.abs(r), np.linalg.norm(points - nearest, axis=1), rtol=1e-5, atol=1e-9)
+    np.testing.assert_array_equal(np.sign(r), np.sign(algebraic_residuals(F, points[:, :2], points[:, 2:])))
+    for m, d in enumerate(1e-7 * np.eye(9)):
+        ends = [rank2.residuals_and_derivatives(f + s * d, points, rank2.REPROJECTION)[0] for s in (1, -1)]
+        np.testing.assert_allclose((ends[0] - ends[1]) / 2e-7, J[:, m], atol=1e-5 * np.abs(J).max())

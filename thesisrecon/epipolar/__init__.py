@@ -5,14 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.epipolar.least_median import LeastMedianOfSquares
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_gradient
+from thesisrecon.epipolar.refinement import (
+    refine_epipolar_distance,
+    refine_gradient,
+    refine_reprojection,
+)
 from thesisrecon.epipolar.thesis_ransac import ThesisRansac
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.types import FundamentalFit
 
 __all__ = [
+    "LeastMedianOfSquares",
     "LocallyOptimisedRansac",
     "PairVerification",
     "ThesisRansac",
@@ -21,6 +27,7 @@ __all__ = [
     "estimate_seven_point",
     "refine_epipolar_distance",
     "refine_gradient",
+    "refine_reprojection",
 ]
 
 

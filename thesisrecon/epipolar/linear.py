@@ -17,9 +17,7 @@ UNDETERMINED_REL = 1e-12
 """Ratio of the eighth to the first singular value below which the matches leave F free."""
 
 
-def estimate_eight_point(
-    xy1: F64, xy2: F64, *, normalized: bool = True, rank_two: bool = True
-) -> F64:
+def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_two: bool = True) -> F64:
     """F (3, 3), unit norm, that minimises the algebraic residuals (5.2) over matches (N >= 8, 2) px.
 
     ``normalized`` conditions the pixels first (Hartley, "In defence of the eight-point algorithm", PAMI

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar.rank2.kernels import DISTANCE, GRADIENT, refine
+from thesisrecon.epipolar.rank2.kernels import DISTANCE, GRADIENT, REPROJECTION, refine
 
 F64 = NDArray[np.float64]
 
@@ -33,6 +33,17 @@ def refine_epipolar_distance(
 ) -> F64:
     """As :func:`refine_gradient`, but for the squared distances to both epipolar lines (5.6)."""
     return _refine(F, xy1, xy2, DISTANCE, loss_px, max_iterations)
+
+
+def refine_reprojection(
+    F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50
+) -> F64:
+    """As :func:`refine_gradient`, but for the distances of the matches to the nearest exact ones.
+
+    The gold standard (HZ, algorithm 11.3): the maximum likelihood of F and of all points under Gaussian
+    noise. Each point is eliminated by its optimal correction, so that seven parameters are left.
+    """
+    return _refine(F, xy1, xy2, REPROJECTION, loss_px, max_iterations)
 
 
 def _refine(F: F64, xy1: F64, xy2: F64, criterion: int, loss_px: float, max_iterations: int) -> F64:

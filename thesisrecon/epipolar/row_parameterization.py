@@ -14,10 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.geometry.multiview import epipoles, sampson_residuals, unit_norm
+from thesisrecon.epipolar.rank2.kernels import (
+    DISTANCE,
+    GRADIENT,
+    REPROJECTION,
+    residuals_and_derivatives,
+)
+from thesisrecon.geometry.multiview import epipoles, unit_norm
 from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
 
 F64 = NDArray[np.float64]
+
+MAPS_TRIED = 4
 
 
 @dataclass(frozen=True)
@@ -50,19 +58,58 @@ class RowParameterization:
         free = np.insert(parameters[:5], self.fixed, 1.0).reshape(2, 3)
         return unit_norm(np.insert(free, self.dependent, parameters[5:] @ free, axis=0))
 
+    def tangent(self, parameters: F64) -> F64:
+        """Derivatives (9, 7) of the unit vec(F) by the parameters (7,)."""
+        free = np.insert(parameters[:5], self.fixed, 1.0).reshape(2, 3)
+        F = np.insert(free, self.dependent, parameters[5:] @ free, axis=0)
+        moves = np.zeros((7, 2, 3))
+        moves.reshape(7, 6)[np.arange(5), np.delete(np.arange(6), self.fixed)] = 1.0
+        rows = parameters[5:] @ moves
+        rows[5:] = free
+        T = np.insert(moves, self.dependent, rows, axis=1).reshape(7, 9).T
+        unit, norm = F.ravel() / np.linalg.norm(F), np.linalg.norm(F)
+        return np.asarray((T - np.outer(unit, unit @ T)) / norm)
+
 
 def refine_gradient_by_rows(F: F64, xy1: F64, xy2: F64) -> F64:
     """Least squares of :func:`~thesisrecon.epipolar.refinement.refine_gradient` in the thesis' parameters.
 
-    Reaches the same minimum, more slowly: the derivatives are differences and the map stays the one of the
-    start.
+    Reaches the same minimum, more slowly; the map is chosen again where the estimate has left it. Raises as
+    the other.
     """
+    return _refine_by_rows(F, xy1, xy2, GRADIENT)
+
+
+def refine_epipolar_distance_by_rows(F: F64, xy1: F64, xy2: F64) -> F64:
+    """As :func:`refine_gradient_by_rows`, for the squared distances to both epipolar lines (5.6)."""
+    return _refine_by_rows(F, xy1, xy2, DISTANCE)
+
+
+def refine_reprojection_by_rows(F: F64, xy1: F64, xy2: F64) -> F64:
+    """As :func:`refine_gradient_by_rows`, for the distances to the nearest exact matches."""
+    return _refine_by_rows(F, xy1, xy2, REPROJECTION)
+
+
+def _refine_by_rows(F: F64, xy1: F64, xy2: F64, criterion: int) -> F64:
     xy1, xy2 = check_matches(xy1, xy2, needed=7)
     frame = PairFrame.of(xy1, xy2)
     points = frame.points(xy1, xy2)
-    start = check_start(F, frame).reshape(3, 3)
-    chart = RowParameterization.best_for(start)
-    found = minimize_residuals(
-        lambda p: sampson_residuals(chart.matrix(p), points[:, :2], points[:, 2:]), chart.parameters(start)
-    )
-    return frame.matrix_in_pixels(chart.matrix(found.x).ravel())
+    current = check_start(F, frame).reshape(3, 3)
+    for _ in range(MAPS_TRIED):
+        chart = RowParameterization.best_for(current)
+        current = _minimize_in(chart, current, points, criterion)
+        if RowParameterization.best_for(current) == chart:
+            break
+    return frame.matrix_in_pixels(current.ravel())
+
+
+def _minimize_in(chart: RowParameterization, start: F64, points: F64, criterion: int) -> F64:
+    def residuals(p: F64) -> F64:
+        r: F64 = residuals_and_derivatives(chart.matrix(p).ravel(), points, criterion)[0]
+        return r
+
+    def jacobian(p: F64) -> F64:
+        J: F64 = residuals_and_derivatives(chart.matrix(p).ravel(), points, criterion)[1]
+        return J @ chart.tangent(p)
+
+    return chart.matrix(minimize_residuals(residuals, chart.parameters(start), jacobian=jacobian).x)

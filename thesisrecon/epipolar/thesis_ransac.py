@@ -11,22 +11,15 @@ from numpy.typing import NDArray
 from thesisrecon.epipolar.covariance import fundamental_covariance
 from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.kernels import sampson_distances, seven_point
+from thesisrecon.epipolar.outliers import MINIMUM, discard_outliers
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_gradient
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.multiview import sampson_residuals
-from thesisrecon.robust.noise import noise_scale
 from thesisrecon.robust.ransac import SampleConsensus
 from thesisrecon.types import FundamentalFit
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 B8 = NDArray[np.bool_]
-
-CHI2_1_95 = 3.841458820694124
-"""95 % of a chi-square variable with one degree of freedom lies below."""
-MINIMUM = 8
-EXACT_PX = 1e-6
-"""Residuals below are rounding, not noise."""
 
 
 @dataclass(frozen=True)
@@ -91,19 +84,11 @@ class ThesisRansac:
                 "The photographs may not overlap, or the matches are wrong",
             )
         F, sigma = frame.matrix_in_pixels(found.model), 0.0
-        _, inliers = self._discard(F, xy1, xy2)
+        _, inliers = discard_outliers(F, xy1, xy2, limit_px=self.threshold_px)
         refine = refine_epipolar_distance if self.epipolar_distance else refine_gradient
         for _ in range(self.rounds):
             F = refine(F, xy1[inliers], xy2[inliers])
-            sigma, inliers = self._discard(F, xy1, xy2)
+            sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=self.threshold_px)
         f = frame.matrix_in_frame(F)
         covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
         return FundamentalFit(F, inliers, sigma, covariance, found.samples)
-
-    def _discard(self, F: F64, xy1: F64, xy2: F64) -> tuple[float, B8]:
-        """sigma by the matches near the epipolar lines of F, and which matches pass the test with it."""
-        residuals = np.abs(sampson_residuals(F, xy1, xy2))
-        limit = max(self.threshold_px, float(np.partition(residuals, MINIMUM - 1)[MINIMUM - 1]))
-        sigma = noise_scale(residuals[residuals <= limit])
-        inliers = residuals**2 <= max(CHI2_1_95 * sigma**2, EXACT_PX**2)
-        return sigma, inliers if inliers.sum() >= MINIMUM else residuals <= limit
