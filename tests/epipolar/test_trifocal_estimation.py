@@ -19,7 +19,7 @@ from thesisrecon.epipolar.trifocal_estimation import (
 )
 from thesisrecon.epipolar.trifocal_reprojection import TrifocalReprojection, TrifocalStep
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import calibration_matrix, camera_from_centre, project
+from thesisrecon.geometry.camera import calibration_matrix, camera_from_centre, decompose_camera, project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
 from thesisrecon.geometry.trifocal import (
@@ -129,15 +129,38 @@ def test_the_covariance_is_that_of_the_errors(n, m):
 
 
 def test_the_covariance_tells_of_points_near_a_plane():
-    spreads = []
-    for depth in (1.0, 0.003):
+    spreads, weaknesses = [], []
+    for depth in (1.0, 0.03):
         rng = np.random.default_rng(1)
         P = three_cameras(rng)
         X = rng.uniform(-2.0, 2.0, (60, 3)) * [1.0, 1.0, depth]
         points = np.stack([project(camera, X) for camera in P])
-        fit = estimate_trifocal(points + rng.normal(0.0, 0.3, points.shape))
+        fit = estimate_trifocal(points + rng.normal(0.0, 0.2, points.shape))
         spreads.append(np.sqrt(np.trace(fit.covariance)))
-    assert spreads[1] > 20.0 * spreads[0]
+        weaknesses.append(fit.weakness)
+    assert spreads[1] > 10.0 * spreads[0]
+    assert weaknesses[0] < 0.01 < weaknesses[1] < 0.4
+
+
+@pytest.mark.parametrize("sigma", [0.2, 1.0, 2.0])
+@pytest.mark.parametrize("kind", ["plane", "rotation", "line", "chance"])
+def test_noisy_matches_that_cannot_work_are_named(kind, sigma):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        P, X = three_cameras(rng), rng.uniform(-2.0, 2.0, (40, 3))
+        if kind == "plane":
+            X[:, 2] = 0.3 * X[:, 0]
+        if kind == "line":
+            X = np.outer(np.linspace(-2.0, 2.0, 40), [1.0, 0.3, 0.2])
+        if kind == "rotation":
+            P = np.stack(
+                [camera_from_centre(*decompose_camera(p)[:2], np.array([0.0, 0.0, -8.0])) for p in P]
+            )
+        points = np.stack([project(camera, X) for camera in P])
+        if kind == "chance":
+            points = rng.uniform(0.0, 1000.0, points.shape)
+        with pytest.raises(StageFailure, match="do not determine"):
+            estimate_trifocal(points + rng.normal(0.0, sigma, points.shape))
 
 
 def test_the_refinement_is_at_a_minimum_and_its_gradient_is_right():

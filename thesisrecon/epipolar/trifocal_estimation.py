@@ -33,6 +33,10 @@ from thesisrecon.optimize.levenberg_marquardt import (
 
 F64 = NDArray[np.float64]
 
+WEAK = 0.4
+"""Weakness beyond which a fit is refused. Planes, rotations and chance matches come out between 0.5 and 1.5
+at any noise; scenes with depth, noise being a hundredth of the parallax, below 0.1."""
+
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 
 
@@ -44,8 +48,10 @@ class TrifocalFit:
     2, 4) two points of each line; ``point_residuals_px`` (3, N) distances of the images to the reprojected
     points, ``line_residuals_px`` (3, M, 2) of the segments' ends to the reprojected lines; ``sigma_px`` the
     noise of one coordinate, from all residuals and the freedoms left; ``covariance`` (27, 27) of T,
-    row-major, to first order for that noise, of rank 18. It is large in some direction where the matches
-    leave T nearly free, as points near a plane do.
+    row-major, to first order for that noise, of rank 18. ``weakness`` is the
+    standard deviation of T in its least certain direction, in coordinates conditioned as for the linear
+    equations and relative to T, times the root of the number of matches: near 1, a change of T by its own
+    size moves the images no more than their noise.
     """
 
     T: F64
@@ -56,6 +62,7 @@ class TrifocalFit:
     line_residuals_px: F64
     sigma_px: float
     covariance: F64
+    weakness: float
     iterations: int
 
 
@@ -87,8 +94,8 @@ def estimate_trifocal(
     reprojection and of the two squared distances of a segment's ends to its reprojected line, rho = Huber's
     loss at ``loss_px``: optimal for Gaussian noise of the points and ends, tolerant of a few wrong matches.
     Raises ``ValueError`` for wrong shapes and values that are not finite, ``StageFailure`` for too few
-    matches or a position that leaves the tensor free. Not degenerate for points of the trifocal plane; a pure
-    rotation or coplanar points are.
+    matches and where they leave the tensor free, exactly or up to their noise: points of one plane or line, a
+    pure rotation, matches by chance. Points of the plane of the three centres are no exception.
     """
     if not loss_px > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
@@ -109,10 +116,23 @@ def estimate_trifocal(
             f"{n} points and {m} lines in a special position",
             "Use matches that do not lie on one plane",
         ) from error
-    T = minimize_algebraic_error(equations, start)
-    return refine_trifocal(
-        equations.in_pixels(T), points, segments, loss_px=loss_px, max_iterations=max_iterations
-    )
+    T = equations.in_pixels(minimize_algebraic_error(equations, start))
+    fit = refine_trifocal(T, points, segments, loss_px=loss_px, max_iterations=max_iterations)
+    _refuse_weak(fit, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
+    return fit
+
+
+def _refuse_weak(fit: TrifocalFit, xy: F64) -> None:
+    """``StageFailure`` where the noise alone decides the fit; xy (3, K, 2) all points and ends."""
+    across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
+    narrowest = float(across.min()) / np.sqrt(xy.shape[1])
+    if fit.weakness > WEAK or not narrowest > 3.0 * fit.sigma_px:
+        raise StageFailure(
+            "the matches do not determine the geometry of three views",
+            f"noise {fit.sigma_px:.2g} px, narrowest spread of the matches {narrowest:.3g} px, "
+            f"weakness {fit.weakness:.2g} where {WEAK:.2g} is the most",
+            "Use matches of more than one plane from three places; wrong matches look like this, too",
+        )
 
 
 def refine_trifocal(
@@ -134,16 +154,20 @@ def refine_trifocal(
     freedom = max(3 * n + 2 * segments.shape[1] - 18, 1)
     sigma = float(np.sqrt(np.sum(residual**2) / freedom))
     P, G = _pixel_cameras(state.P, transforms)
-    T, covariance = _tensor_and_covariance(problem, state, transforms)
+    conditioned, root = _tensor_and_root(problem, state)
+    to_pixels = _in_pixels(transforms)
+    T, pixel_root = _normalized(to_pixels @ conditioned, to_pixels @ root)
+    spread = sigma * float(np.linalg.norm(root, ord=2))
     return TrifocalFit(
-        T,
+        T.reshape(3, 3, 3),
         P,
         state.X @ G.T,
         state.lines @ G.T,
         np.linalg.norm(residual[:n], axis=2).T,
         np.abs(residual[n:]).transpose(1, 0, 2),
         sigma,
-        sigma**2 * covariance,
+        sigma**2 * pixel_root @ pixel_root.T,
+        spread * float(np.sqrt(n + segments.shape[1])),
         solution.iterations,
     )
 
@@ -155,30 +179,33 @@ def _pixel_cameras(P: F64, transforms: F64) -> tuple[F64, F64]:
     return np.asarray(np.linalg.inv(transforms) @ P @ np.linalg.inv(G)), G
 
 
-def _tensor_and_covariance(
-    problem: TrifocalReprojection, state: TrifocalState, transforms: F64
-) -> tuple[F64, F64]:
-    """T (3, 3, 3) in pixels, unit norm, and its covariance (27, 27) for unit noise in pixels."""
+def _tensor_and_root(problem: TrifocalReprojection, state: TrifocalState) -> tuple[F64, F64]:
+    """Flat T (27,), unit norm, conditioned, and a root (27, 18) of its covariance for unit noise in px."""
     P2, P3 = state.P[1:]
-    inverse = np.linalg.inv(transforms)
-    to_pixels = np.einsum("ri,js,kt->ijkrst", transforms[0], inverse[1], inverse[2]).reshape(27, 27)
     # T is linear in either camera, so its derivatives are the tensors of single entries.
     entries = np.eye(12).reshape(12, 3, 4)
-    J = to_pixels @ np.stack(
-        [_canonical_tensor(E, P3).ravel() for E in entries]
-        + [_canonical_tensor(P2, E).ravel() for E in entries],
-        axis=1,
-    )
-    T = to_pixels @ _canonical_tensor(P2, P3).ravel()
-    size = float(np.linalg.norm(T))
-    T /= size
-    J = (J - np.outer(T, T @ J)) / size
+    columns = [_canonical_tensor(E, P3) for E in entries] + [_canonical_tensor(P2, E) for E in entries]
+    T, J = _canonical_tensor(P2, P3).ravel(), np.stack(columns, axis=-1).reshape(27, 24)
     information = problem.linearize(state).reduced(1e-12)[0]
     scale = 1.0 / np.sqrt(floored_diagonal(np.diag(information)))
     values, vectors = np.linalg.eigh(information * scale * scale[:, None])
     # 6 of the 24 freedoms are the cameras' scales and the frame of space, which T does not feel.
-    root = J @ (scale[:, None] * vectors[:, 6:] / np.sqrt(np.maximum(values[6:], 1e-14 * values[-1])))
-    return T.reshape(3, 3, 3), root @ root.T
+    root = scale[:, None] * vectors[:, 6:] / np.sqrt(np.maximum(values[6:], 1e-14 * values[-1]))
+    return _normalized(T, J @ root)
+
+
+def _normalized(T: F64, root: F64) -> tuple[F64, F64]:
+    """T / |T| and the root (27, 18) of the covariance of that unit vector."""
+    size = float(np.linalg.norm(T))
+    T = T / size
+    return T, (root - np.outer(T, T @ root)) / size
+
+
+def _in_pixels(transforms: F64) -> F64:
+    """(27, 27) matrix that takes flat conditioned tensors to pixels."""
+    inverse = np.linalg.inv(transforms)
+    by_index = np.einsum("ri,js,kt->ijkrst", transforms[0], inverse[1], inverse[2])
+    return np.asarray(by_index.reshape(27, 27))
 
 
 def _canonical_tensor(P2: F64, P3: F64) -> F64:
