@@ -97,8 +97,8 @@ def test_3_4_the_dual_of_two_lines_is_their_point() -> None:
 @holds_for_every(dimensions)
 def test_3_5_and_3_6_lines_meet_in_two_points_or_touch_or_miss(rng, d):
     C, x = _round(rng, d, 2)
-    inside, far = np.zeros(d), 50.0 * rng.normal(size=d)
-    inside[-1] = far[-1] = 1.0
+    inside, away = np.ones(d), rng.normal(size=d - 1)
+    far = np.append(50.0 * away / np.linalg.norm(away), 1.0)
     inside[:-1] = (x[0] + x[1])[:-1] / 2.0
     other = far.copy()
     other[:-1] += np.linalg.svd(far[None, :-1])[2][1]
