@@ -184,6 +184,23 @@ def test_a_wrong_command_gets_one_sentence_and_exit_2(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_focal_length_is_given_as_the_readme_says(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = "--set intrinsics.focal_px=1200 --set intrinsics.focal_std_rel=0.05"
+    assert f"`{words}`" in (ROOT / "README.md").read_text(encoding="utf-8")
+    asked: list[Any] = []
+
+    def listen(*_: Any, config: Any, **__: Any) -> None:
+        asked.append(config.intrinsics)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("thesisrecon.pipeline.reconstruct", listen)
+    arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out"), *words.split()]
+    assert run_command(arguments) == 130
+    assert (asked[0].focal_px, asked[0].focal_std_rel) == (1200.0, 0.05)
+
+
 def test_ctrl_c_says_how_to_go_on(
     photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

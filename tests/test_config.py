@@ -11,14 +11,19 @@ from thesisrecon.config import (
     KINDS,
     PRESETS,
     PipelineConfig,
-    apply_setting,
+    config_from_tables,
     config_from_toml,
     preset,
     tables_from_config,
+    tables_from_settings,
     toml_from_config,
 )
 from thesisrecon.errors import UsageError
 from thesisrecon.settings import parse_word, toml_from_tables
+
+
+def apply_settings(*settings: str) -> PipelineConfig:
+    return config_from_tables(tables_from_settings(settings))
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -30,7 +35,7 @@ def test_a_preset_survives_toml(name: str) -> None:
 
 @pytest.mark.parametrize(("stage", "kind"), [(s, k) for s, kinds in KINDS.items() for k in kinds])
 def test_every_kind_can_be_chosen_by_its_word(stage: str, kind: str) -> None:
-    config = apply_setting(PipelineConfig(), f"{stage}.kind={kind}")
+    config = apply_settings(f"{stage}.kind={kind}")
     variant = getattr(config, stage)
     assert type(variant) is KINDS[stage][kind]
     assert dataclasses.is_dataclass(variant)
@@ -46,18 +51,17 @@ def test_the_file_names_its_preset_unless_the_command_did() -> None:
 
 
 def test_a_setting_keeps_the_others_of_its_stage() -> None:
-    config = apply_setting(
-        apply_setting(PipelineConfig(), "features.kind=harris-corners"), "features.max_corners=7"
+    config = apply_settings(
+        "features.max_corners=7", "features.kind=harris-corners", "features.threshold_rel=0.5"
     )
-    config = apply_setting(config, "features.threshold_rel=0.5")
     assert config.features.max_corners == 7  # type: ignore[attr-defined]
     assert config.features.threshold_rel == 0.5  # type: ignore[attr-defined]
 
 
 def test_a_nested_setting_and_none() -> None:
-    config = apply_setting(PipelineConfig(), "selfcalibration.search.steps=5")
+    config = apply_settings("selfcalibration.search.steps=5")
     assert config.selfcalibration.search.steps == 5  # type: ignore[attr-defined]
-    config = apply_setting(config, "selfcalibration.search=none")
+    config = apply_settings("selfcalibration.search.steps=5", "selfcalibration.search=none")
     assert config.selfcalibration.search is None  # type: ignore[attr-defined]
     assert config_from_toml(toml_from_config(config)) == config
 
@@ -85,7 +89,23 @@ def test_a_nested_setting_and_none() -> None:
 )
 def test_a_wrong_setting_gets_a_sentence(setting: str, words: str) -> None:
     with pytest.raises(UsageError, match=words.replace(".", r"\.")):
-        apply_setting(PipelineConfig(), setting)
+        apply_settings(setting)
+
+
+def test_settings_that_need_each_other_may_come_one_by_one_and_from_file_and_command() -> None:
+    config = apply_settings("intrinsics.focal_px=700", "intrinsics.focal_std_rel=0.05")
+    assert (config.intrinsics.focal_px, config.intrinsics.focal_std_rel) == (700.0, 0.05)
+    over = [tables_from_settings(["intrinsics.focal_std_rel=0.2"])]
+    assert config_from_toml("[intrinsics]\nexif = true\n", changes=over).intrinsics.focal_std_rel == 0.2
+
+
+def test_another_kind_on_the_command_line_drops_the_settings_of_the_kind_in_the_file() -> None:
+    over = [tables_from_settings(["features.kind=harris-corners"])]
+    config = config_from_toml("[features]\nlevels = 4\n", changes=over)
+    assert config == apply_settings("features.kind=harris-corners")
+    same = [tables_from_settings(["features.kind=multi-scale-corners"])]
+    kept = config_from_toml("[features]\nlevels = 4\n", changes=same)
+    assert kept.features.levels == 4  # type: ignore[attr-defined]
 
 
 def test_text_that_is_no_toml_and_stages_that_are_no_tables_are_refused() -> None:

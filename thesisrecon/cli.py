@@ -172,18 +172,18 @@ def _config(
     from thesisrecon import config as configs
     from thesisrecon.io.text import read_text
 
-    chosen = configs.preset(preset or "default")
-    if file is not None:
-        chosen = configs.config_from_toml(read_text(file), chosen, fixed_preset=preset is not None)
+    text = "" if file is None else read_text(file)
     options: dict[str, dict[str, Any]] = {}
     if cameras is not None:
         options["intrinsics"] = {"cameras": cameras.value}
     if max_size is not None:
         options["images"] = {"max_size_px": max_size}
-    chosen = configs.config_from_tables(options, chosen)
-    for setting in settings:
-        chosen = configs.apply_setting(chosen, setting)
-    return chosen
+    return configs.config_from_toml(
+        text,
+        configs.preset(preset or "default"),
+        fixed_preset=preset is not None,
+        changes=(options, configs.tables_from_settings(settings)),
+    )
 
 
 def _run(images: Path, out: Path, config: PipelineConfig, seed: int, options: Mapping[str, Any]) -> None:

@@ -250,13 +250,18 @@ def toml_from_config(config: PipelineConfig) -> str:
 
 
 def config_from_toml(
-    text: str, base: PipelineConfig | None = None, *, fixed_preset: bool = False
+    text: str,
+    base: PipelineConfig | None = None,
+    *,
+    fixed_preset: bool = False,
+    changes: Sequence[Mapping[str, Any]] = (),
 ) -> PipelineConfig:
-    """``base`` (else the preset ``default``) changed by the tables of the text.
+    """``base`` (else the preset ``default``) changed by the tables of the text, then by ``changes``.
 
-    A line ``preset = "thesis"`` at its top takes that preset for the base, unless ``fixed_preset``. Raises
-    :class:`UsageError` for text that is no TOML, unknown stages, kinds and settings (naming the nearest
-    known), and values of another type.
+    A line ``preset = "thesis"`` at its top takes that preset for the base, unless ``fixed_preset``. All
+    tables are merged before a value is checked, so settings that need each other may come from different
+    ones. Raises :class:`UsageError` for text that is no TOML, unknown stages, kinds and settings (naming the
+    nearest known), and values of another type.
     """
     try:
         tables = tomllib.loads(text)
@@ -265,7 +270,34 @@ def config_from_toml(
     name = tables.pop("preset", None)
     if name is not None and not fixed_preset:
         base = preset(str(name))
-    return config_from_tables(tables, base)
+    base = base or PipelineConfig()
+    merged: dict[str, Any] = {}
+    for change in (tables, *changes):
+        merged = _merged_stages(merged, change, base)
+    return config_from_tables(merged, base)
+
+
+def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: PipelineConfig) -> dict[str, Any]:
+    """``over`` laid on ``under``; a table that picks another kind drops the settings of the kind before."""
+    merged = dict(under)
+    for stage, table in over.items():
+        old = under.get(stage)
+        if isinstance(old, Mapping) and isinstance(table, Mapping):
+            kind = old.get("kind", kind_of(stage, getattr(base, stage))) if stage in KINDS else None
+            merged[stage] = table if table.get("kind", kind) != kind else _merged(old, table)
+        else:
+            merged[stage] = table
+    return merged
+
+
+def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """``over`` laid on ``under``, table by table."""
+    merged = dict(under)
+    for key, value in over.items():
+        old = merged.get(key)
+        both = isinstance(old, Mapping) and isinstance(value, Mapping)
+        merged[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return merged
 
 
 def config_from_tables(tables: Mapping[str, Any], base: PipelineConfig | None = None) -> PipelineConfig:
@@ -300,15 +332,20 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
     return dataclass_from_table(variant, fields, stage, current if type(current) is variant else None)
 
 
-def apply_setting(config: PipelineConfig, setting: str) -> PipelineConfig:
-    """``config`` with one ``stage.field=value`` (``stage.field.field=value`` for a nested one) changed."""
-    place, equals, text = setting.partition("=")
-    path = place.strip().split(".")
-    if not equals or len(path) < 2 or not all(path):
-        raise UsageError(
-            f"--set takes stage.field=value, as in features.kind=harris-corners; got {setting!r}"
-        )
-    value = parse_word(text)
-    for key in reversed(path):
-        value = {key: value}
-    return config_from_tables(value, config)
+def tables_from_settings(settings: Sequence[str]) -> dict[str, Any]:
+    """The tables that ``stage.field=value`` texts (``stage.field.field=value`` for a nested one) mean
+    together; of two values of one field the later one counts.
+    """
+    tables: dict[str, Any] = {}
+    for setting in settings:
+        place, equals, text = setting.partition("=")
+        path = place.strip().split(".")
+        if not equals or len(path) < 2 or not all(path):
+            raise UsageError(
+                f"--set takes stage.field=value, as in features.kind=harris-corners; got {setting!r}"
+            )
+        value = parse_word(text)
+        for key in reversed(path):
+            value = {key: value}
+        tables = _merged(tables, value)
+    return tables
