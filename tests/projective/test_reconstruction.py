@@ -15,7 +15,7 @@ from thesisrecon.projective import GatedIncremental, SequentialProjective
 from thesisrecon.projective.gate import predicted_spread_px
 from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs
 from thesisrecon.projective.resection import resect_robust
-from thesisrecon.projective.selection import select_tracks
+from thesisrecon.projective.selection import select_tracks, tracks_with_parallax
 from thesisrecon.types import Reconstruction, Tracks
 
 
@@ -174,9 +174,45 @@ def test_spread_of_the_gate_is_the_spread_of_perturbed_cameras() -> None:
 
 def test_selection_keeps_the_longest_tracks_of_every_view() -> None:
     scene = make_scene(points=2000)
-    keep = select_tracks(scene.tracks, points_per_view=100)
+    keep = select_tracks(scene.tracks, np.ones(2000, dtype=bool), points_per_view=100)
     seen = np.bincount(scene.tracks.view_index[keep[scene.tracks.point_index]], minlength=8)
     length = np.bincount(scene.tracks.point_index)
     assert seen.min() >= 100
     assert keep.sum() < 800
     assert length[keep].mean() > length.mean()
+
+
+def test_points_of_one_standpoint_do_not_take_part() -> None:
+    scene = make_scene(points=200)
+    pairs = [replace(p, homography_share=1.0 if (p.i, p.j) == (0, 1) else 0.3) for p in true_pairs(scene)]
+    t = scene.tracks
+    only = np.bincount(t.point_index[t.view_index >= 2], minlength=200) == 0
+    np.testing.assert_array_equal(tracks_with_parallax(t, pairs), ~only)
+    assert tracks_with_parallax(t, [replace(p, homography_share=0.3) for p in pairs]).all()
+
+
+def test_every_photograph_twice_is_no_harder_than_once() -> None:
+    scene = make_scene(points=300, sigma_px=0.3, seed=11)
+    t = scene.tracks
+    rng = np.random.default_rng(0)
+    # Each view has a twin from the same standpoint; most points are seen by one pair of twins only.
+    lonely = np.arange(300) < 200
+    home = rng.integers(0, 8, 300)
+    keep = ~lonely[t.point_index] | (t.view_index == home[t.point_index])
+    view = np.concatenate([2 * t.view_index[keep], 2 * t.view_index[keep] + 1])
+    point = np.tile(t.point_index[keep], 2)
+    xy = np.tile(t.xy[keep], (2, 1)) + rng.normal(0, 0.3, (2 * int(keep.sum()), 2))
+    order = np.lexsort((view, point))
+    seen = np.unique(point, return_inverse=True)
+    tracks = Tracks(view[order], seen[1][order], xy[order], 16, len(seen[0]))
+    twins = replace(
+        scene,
+        K=np.repeat(scene.K, 2, axis=0),
+        R=np.repeat(scene.R, 2, axis=0),
+        t=np.repeat(scene.t, 2, axis=0) + rng.normal(0, 1e-4, (16, 3)),
+        tracks=tracks,
+        sizes=np.repeat(scene.sizes, 2, axis=0),
+    )
+    pairs = [replace(p, homography_share=1.0 if p.i // 2 == p.j // 2 else 0.3) for p in true_pairs(twins)]
+    found = GatedIncremental().reconstruct(tracks, pairs, twins.sizes, rng=rng)
+    assert found.registered.all(), found.reasons

@@ -95,10 +95,7 @@ def test_pure_translation_is_called_unidentifiable() -> None:
     still = replace(
         scene, R=np.tile(scene.R[0], (8, 1, 1)), t=-np.einsum("ab,vb->va", scene.R[0], scene.centres)
     )
-    try:
-        answer = calibrate(HypothesesAndRefinement(), still)
-    except StageFailure:
-        return
+    answer = calibrate(HypothesesAndRefinement(), still)
     assert not answer.identifiable
     assert any("translation" in reason for reason in answer.reasons)
 

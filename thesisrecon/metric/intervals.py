@@ -25,7 +25,10 @@ from thesisrecon.types import I64, IntrinsicInterval
 
 F64 = NDArray[np.float64]
 
+# What photographs are known to need (covariances 4 to 10 times too small), and how many degrees of freedom
+# that knowledge is worth beside the scatter that a set of photographs shows itself.
 DEFAULT_INFLATION = 4.0
+DEFAULT_WEIGHT = 4.0
 _COLUMNS = {"focal_px": 0, "principal_x_px": 3, "principal_y_px": 4, "k1": 5}
 
 
@@ -66,8 +69,10 @@ def measured_inflation(
     """How many times too small the covariance is, and how that is known.
 
     Adjusts once more with a focal of its own for every view of the largest camera group and compares the
-    scatter of those focals with their standard deviations: rms of (f_i - weighted mean) / std_i, at least 1.
-    With fewer than four views in the group nothing can be measured and ``DEFAULT_INFLATION`` is taken.
+    scatter of those focals with their standard deviations: z_i = (f_i - weighted mean) / std_i. A few views
+    say little of a spread, hence the factor is sqrt((n0 a^2 + sum z^2) / (n0 + n - 1)) with the known a =
+    ``DEFAULT_INFLATION`` counting as n0 = ``DEFAULT_WEIGHT`` degrees of freedom. With fewer than four views
+    nothing is measured and a is taken.
     """
     registered = np.flatnonzero(model.registered)
     group = model.cameras.group
@@ -94,8 +99,9 @@ def measured_inflation(
         return DEFAULT_INFLATION, f"covariance x {DEFAULT_INFLATION:.0f}"
     weight = 1.0 / std**2
     mean = np.sum(weight * log_f) / weight.sum()
-    factor = float(np.sqrt(np.sum(weight * (log_f - mean) ** 2) / (len(views) - 1)))
-    factor = max(factor, 1.0)
+    squares = float(np.sum(weight * (log_f - mean) ** 2))
+    known = DEFAULT_WEIGHT * DEFAULT_INFLATION**2
+    factor = float(np.sqrt((known + squares) / (DEFAULT_WEIGHT + len(views) - 1)))
     return factor, f"covariance x {factor:.1f} from the scatter between views"
 
 

@@ -100,16 +100,23 @@ def _triangulate(poses: F64, xy: F64, view: I64, point: I64, n_points: int, loss
     return np.where(np.isfinite(X).all(axis=1, keepdims=True), X, 0.0)
 
 
-def mark(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
-    """Mark the observations in front of their camera and within the gate, and the points that keep two of
-    them."""
+def agreeing_observations(model: MetricModel, *, sigmas: float) -> B8:
+    """(K,) observations of registered views in front of their camera and within the gate, at any angle."""
     t = model.tracks
     k = np.flatnonzero(model.registered[t.view_index])
     view, point = t.view_index[k], t.point_index[k]
     xy, depth = project_observations(model.cameras, model.X, view, point)
     residual = np.nan_to_num(np.linalg.norm(xy - t.xy[k], axis=1), nan=np.inf)
+    known = np.abs(model.X[point]).sum(axis=1) > 0
     ok = np.zeros(len(t.xy), dtype=bool)
-    ok[k] = (residual < sigmas * model.sigma_px) & (depth > 0) & (np.abs(model.X[point]).sum(axis=1) > 0)
+    ok[k] = (residual < sigmas * model.sigma_px) & (depth > 0) & known
+    return ok
+
+
+def mark(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
+    """Mark the observations that agree, and the points that keep two of them at ``min_angle`` (rad) or more."""
+    t = model.tracks
+    ok = agreeing_observations(model, sigmas=sigmas)
     angle = _largest_angle(model, ok)
     valid = (np.bincount(t.point_index[ok], minlength=t.n_points) >= 2) & (angle > min_angle)
     return replace(model, ok=ok & valid[t.point_index], valid=valid)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thesisrecon.metric.model import MetricModel, residual_norms
+from thesisrecon.metric.model import MetricModel, agreeing_observations, residual_norms
 from thesisrecon.types import IntrinsicInterval, SelfCalibration
 
 _FOCAL_RANGE = (0.2, 20.0)
@@ -18,7 +18,11 @@ _MAX_FOCAL_CHANGE = 0.25
 
 
 def self_check(
-    model: MetricModel, calibration: SelfCalibration, intervals: Sequence[Mapping[str, IntrinsicInterval]]
+    model: MetricModel,
+    calibration: SelfCalibration,
+    intervals: Sequence[Mapping[str, IntrinsicInterval]],
+    *,
+    sigmas: float,
 ) -> tuple[dict[str, float], list[str]]:
     """Measured numbers by name, and the doubts they raise (none: the answer is trusted)."""
     views = [int(v) for v in np.flatnonzero(model.registered)]
@@ -33,7 +37,7 @@ def self_check(
         "focal_std_rel_max": max(
             intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views
         ),
-        "explained_share": float(model.ok[near].mean()),
+        "explained_share": float(agreeing_observations(model, sigmas=sigmas)[near].mean()),
         "sigma_rel": float(np.median(residual_norms(model)) / 1.1774 / np.median(longest))
         if model.ok.any()
         else np.inf,

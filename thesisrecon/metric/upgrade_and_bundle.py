@@ -43,6 +43,7 @@ from thesisrecon.types import (
 
 F64 = NDArray[np.float64]
 
+MIN_OBSERVATIONS = 40
 FOCAL_ONLY = np.array([True, False, False, False, False, False])
 
 
@@ -88,6 +89,12 @@ class UpgradeAndBundle:
         """The final model of one projective reconstruction; ``StageFailure`` where no candidate survives."""
         trials = [self._start(reconstruction, u, groups, focal_prior) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
+        if not models and focal_prior is not None:
+            raise StageFailure(
+                "the photographs contradict the focal length that was given",
+                f"none of {len(trials)} calibrations near it (+- {focal_prior.std_rel:.1%}) explains them",
+                "leave the prior out, or give it a larger focal_std_rel",
+            )
         if not models:
             raise StageFailure(
                 "no candidate calibration survives metric bundle adjustment",
@@ -106,7 +113,7 @@ class UpgradeAndBundle:
             floor_rel=self.model_floor_rel,
             indices=bundle_index,
         )
-        check, doubts = self_check(model, calibration, intervals)
+        check, doubts = self_check(model, calibration, intervals, sigmas=self.outlier_sigmas[1])
         final = _as_reconstruction(model, reasons)
         return MetricResult(final, intervals, check, not doubts, tuple(doubts))
 
@@ -179,6 +186,12 @@ class UpgradeAndBundle:
     ) -> tuple[MetricModel, MetricBundleResult, I64]:
         t = model.tracks
         k = np.flatnonzero(model.ok)
+        if len(k) < MIN_OBSERVATIONS:
+            raise StageFailure(
+                "hardly any point survives the metric upgrade",
+                f"{len(k)} observations fit the cameras at angles of {self.min_angle_deg} deg or more",
+                "walk further around the scene between photographs",
+            )
         result = refine_metric_bundle(
             model.cameras, model.X, t.view_index[k], t.point_index[k], t.xy[k], free=free,
             prior=self._prior(model, focal_prior), sigma_px=model.sigma_px, loss_px=2.0 * model.sigma_px,

@@ -26,7 +26,12 @@ from thesisrecon.projective.initial_pair import (
     require_parallax,
 )
 from thesisrecon.projective.resection import resect_robust
-from thesisrecon.projective.selection import onto_all_tracks, select_tracks, subset_tracks
+from thesisrecon.projective.selection import (
+    onto_all_tracks,
+    select_tracks,
+    subset_tracks,
+    tracks_with_parallax,
+)
 from thesisrecon.types import B8, I64, Reconstruction, Tracks, TwoView
 
 F64 = NDArray[np.float64]
@@ -104,7 +109,8 @@ class GatedIncremental:
                 "take photographs that overlap by more than half and show texture",
             )
         require_parallax(pairs)
-        keep = select_tracks(tracks, points_per_view=self.points_per_view)
+        usable = tracks_with_parallax(tracks, pairs)
+        keep = select_tracks(tracks, usable, points_per_view=self.points_per_view)
         selected = subset_tracks(tracks, keep)
         best: Reconstruction | None = None
         for pair in ranked[attempt : attempt + self.restarts]:

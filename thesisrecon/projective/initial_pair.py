@@ -19,6 +19,10 @@ from thesisrecon.types import I64, Tracks, TwoView
 
 F64 = NDArray[np.float64]
 
+# Share of a pair's matches that one homography explains beyond which the pair shows no parallax: what is left
+# is of the size of the wrong matches that verification lets through.
+NO_PARALLAX = 0.95
+
 
 def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView]:
     """Accepted pairs, best beginning first.
@@ -38,7 +42,7 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
     return sorted(usable, key=lambda pair: (-score(pair), pair.i, pair.j))
 
 
-def require_parallax(pairs: Sequence[TwoView], *, most: float = 0.95) -> None:
+def require_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> None:
     """``StageFailure`` where one homography explains at least the share ``most`` of every accepted pair.
 
     Then the cameras turned about one point, hardly moved, or see a single plane: no F is determined, and
@@ -48,7 +52,7 @@ def require_parallax(pairs: Sequence[TwoView], *, most: float = 0.95) -> None:
     if shares and min(shares) >= most:
         raise StageFailure(
             "the photographs show no parallax: the camera only turns, hardly moves, or sees one plane",
-            f"a homography explains at least {min(shares):.0%} of the matches in each of {len(shares)} pairs",
+            f"in the least planar of {len(shares)} pairs a homography explains {min(shares):.0%} of all",
             "walk around the scene between photographs, and have things at different depths in the picture",
         )
 

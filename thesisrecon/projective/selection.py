@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from thesisrecon.types import B8, I64, Reconstruction, Tracks
+from thesisrecon.projective.initial_pair import NO_PARALLAX
+from thesisrecon.types import B8, I64, Reconstruction, Tracks, TwoView
 
 
-def select_tracks(tracks: Tracks, *, points_per_view: int, cells: int = 8) -> B8:
-    """The longest tracks, taken until each view has about ``points_per_view``; -> (n_points,) bool.
+def tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> B8:
+    """Tracks that are not seen from one standpoint only; -> (n_points,) bool.
+
+    Two views whose matches one homography explains to the share ``most`` show a point without parallax, or on
+    one plane: it may lie anywhere along its ray, and a crowd of such points bends the frame in which cameras
+    are judged. They come back in the metric stage where a ray of another view fixes them.
+    """
+    apart = np.ones((tracks.n_views, tracks.n_views), dtype=np.float32)
+    np.fill_diagonal(apart, 0.0)
+    for pair in pairs:
+        if pair.accepted and pair.homography_share >= most:
+            apart[pair.i, pair.j] = apart[pair.j, pair.i] = 0.0
+    seen = np.zeros((tracks.n_views, tracks.n_points), dtype=np.float32)
+    seen[tracks.view_index, tracks.point_index] = 1.0
+    return np.asarray(((apart @ seen) * seen).any(axis=0))
+
+
+def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int, cells: int = 8) -> B8:
+    """The longest ``usable`` tracks, until each view has about ``points_per_view``; -> (n_points,) bool.
 
     Every view's points are spread over a grid of ``cells`` x ``cells`` of its own extent: within a cell the
     longest tracks come first, and all cells get their turn before a cell gets its next, so that detail in a
@@ -19,7 +38,7 @@ def select_tracks(tracks: Tracks, *, points_per_view: int, cells: int = 8) -> B8
     length = np.bincount(tracks.point_index, minlength=tracks.n_points)
     keep = np.zeros(tracks.n_points, dtype=bool)
     for view in range(tracks.n_views):
-        k = np.flatnonzero(tracks.view_index == view)
+        k = np.flatnonzero((tracks.view_index == view) & usable[tracks.point_index])
         keep[tracks.point_index[k][_first_in_turn(tracks, k, length, cells)[:points_per_view]]] = True
     return keep
 

@@ -53,18 +53,19 @@ def identifiability(
     """Verdict and its reasons for a refined answer theta (3 + G,)."""
     angle, spread = rotation_spread(upgraded_rotations(frame, theta))
     worst = float(std_log_f.max())
-    if worst < _MAX_FOCAL_STD and angle >= _MIN_ROTATION_DEG:
-        return True, ()
-    reasons = [
-        f"the cameras fix the focal length only to {min(worst, 9.99):.0%} (residual noise {noise:.3f}); "
-        "turn the camera more between photographs, or give a focal prior"
-    ]
+    reasons = []
+    if not worst < _MAX_FOCAL_STD:
+        reasons.append(
+            f"the cameras fix the focal length only to {min(worst, 9.99):.0%} (residual noise {noise:.3f}); "
+            "turn the camera more between photographs, or give a focal prior"
+        )
     if angle < _MIN_ROTATION_DEG:
         reasons.append(
-            f"the cameras hardly turn (largest rotation {angle:.1f} deg): close to a pure translation"
+            f"the cameras hardly turn (largest rotation {angle:.1f} deg): close to a pure translation, "
+            "which leaves the calibration undetermined"
         )
-    elif spread < _MIN_AXIS_SPREAD_DEG:
+    elif reasons and spread < _MIN_AXIS_SPREAD_DEG:
         reasons.append(
             f"all rotations share one axis to within {spread:.1f} deg: close to a planar or turntable motion"
         )
-    return False, tuple(reasons)
+    return not reasons, tuple(reasons)
