@@ -231,6 +231,9 @@ def test_matches_that_cannot_work_are_named():
             estimate_trifocal(wrong)
     with pytest.raises(ValueError, match="loss_px"):
         estimate_trifocal(points, segments, loss_px=0.0)
+    for start in (np.zeros((3, 3, 3)), np.full((3, 3, 3), np.nan), np.eye(3)):
+        with pytest.raises(ValueError, match="finite tensor"):
+            refine_trifocal(start, points, segments)
 
 
 def _read(kind: str) -> F64:

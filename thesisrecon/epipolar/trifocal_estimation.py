@@ -138,7 +138,15 @@ def _refuse_weak(fit: TrifocalFit, xy: F64) -> None:
 def refine_trifocal(
     T: F64, points: F64, segments: F64, *, loss_px: float = 1.0, max_iterations: int = 50
 ) -> TrifocalFit:
-    """The fit of least reprojection error near a tensor (3, 3, 3) in px, as :func:`estimate_trifocal`."""
+    """The fit of least reprojection error near a tensor T (3, 3, 3) in px, as :func:`estimate_trifocal`.
+
+    Nothing is refused for what the fit turns out to be. Raises ``ValueError`` as
+    :func:`~thesisrecon.geometry.trifocal_linear.tensor_equations` and for a T that is not finite or zero.
+    """
+    points, segments = check_triplets(points, segments)
+    T = np.asarray(T, dtype=np.float64)
+    if T.shape != (3, 3, 3) or not np.isfinite(T).all() or not T.any():
+        raise ValueError(f"the refinement starts from a finite tensor (3, 3, 3) that is not 0; got {T.shape}")
     transforms = tensor_equations(points, segments).transforms
     problem = TrifocalReprojection.of(points, segments, transforms, loss_px)
     solution = run_levenberg_marquardt(
