@@ -114,7 +114,7 @@ def agreeing_observations(model: MetricModel, *, sigmas: float) -> B8:
 
 
 def mark(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
-    """Mark the observations that agree, and the points that keep two of them at ``min_angle`` (rad) or more."""
+    """Mark the observations that agree, and the points with two of them at ``min_angle`` (rad) or more."""
     t = model.tracks
     ok = agreeing_observations(model, sigmas=sigmas)
     angle = _largest_angle(model, ok)
