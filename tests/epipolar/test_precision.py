@@ -1,0 +1,87 @@
+"""The bound, the intervals of epipolar distances and of epipoles, and who reaches them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.epipolar.pairs import make_pair
+from thesisrecon.epipolar.degeneracy import Configuration
+from thesisrecon.epipolar.precision import (
+    epipolar_distance_std,
+    epipoles_with_covariance,
+    fundamental_bound,
+)
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.multiview import enforce_rank_two, epipolar_lines, epipoles
+from validation.checks.epipolar import GOLD, check_precision
+from validation.scenes.two_views import make_two_views
+
+
+def bound_of(seed: int, n: int = 40, sigma: float = 0.5):
+    scene = make_two_views(Configuration.GENERAL, n, np.random.default_rng(seed))
+    return scene, fundamental_bound(scene.P1, scene.P2, scene.X, sigma_px=sigma)
+
+
+def test_gold_standard_reaches_the_bound_and_its_intervals_hold_the_truth():
+    values = {row.name: row.values[GOLD] for row in check_precision(1.0, 60, 150)}
+    assert values["RMS distance over bound"] == pytest.approx(1.0, abs=0.05)
+    assert values["coverage of distances"] == pytest.approx(0.95, abs=0.03)
+    assert values["coverage of epipoles"] == pytest.approx(0.95, abs=0.03)
+
+
+def test_bound_grows_with_the_noise_and_falls_with_the_points():
+    scene, bound = bound_of(0)
+    assert np.linalg.matrix_rank(bound.covariance, tol=1e-9 * np.linalg.norm(bound.covariance, 2)) <= 7
+    np.testing.assert_allclose(bound.covariance @ bound.F.ravel(), 0.0, atol=1e-9 * bound.covariance.max())
+    twice = fundamental_bound(scene.P1, scene.P2, scene.X, sigma_px=1.0)
+    np.testing.assert_allclose(twice.covariance, 4.0 * bound.covariance)
+    assert twice.rms_distance_px == pytest.approx(2.0 * bound.rms_distance_px)
+    doubled = fundamental_bound(scene.P1, scene.P2, np.r_[scene.X, scene.X], sigma_px=0.5)
+    np.testing.assert_allclose(doubled.covariance, bound.covariance / 2.0, rtol=1e-6)
+    # Seven parameters, each of n residuals: the mean squared Sampson distance is 7 sigma^2 / n.
+    assert bound.rms_distance_px == pytest.approx(0.5 * np.sqrt(2.0 * 7.0 / 40.0), rel=0.1)
+
+
+def test_distances_and_epipoles_move_as_their_derivatives_say():
+    scene, bound = bound_of(1)
+    direction = np.linalg.eigh(bound.covariance)[1][:, -1]
+    step = 1e-7
+    moved = enforce_rank_two(bound.F + step * direction.reshape(3, 3))
+    covariance = np.outer(direction, direction)
+    lines = epipolar_lines(moved, scene.xy1)
+    change = np.abs(np.sum(homogenize(scene.xy2) * lines, axis=1)) / step
+    std = epipolar_distance_std(bound.F, covariance, scene.xy1, scene.xy2)
+    np.testing.assert_allclose(change, std, rtol=1e-2, atol=2e-3 * std.max())
+    for found, e, after in zip(
+        epipoles_with_covariance(bound.F, covariance), epipoles(bound.F), epipoles(moved), strict=True
+    ):
+        difference = (after * np.sign(after @ e) - e) / step
+        np.testing.assert_allclose(
+            np.outer(difference, difference), found.covariance, atol=1e-2 * np.abs(found.covariance).max()
+        )
+        np.testing.assert_allclose(found.xy, e[:2] / e[2])
+        pixels = (after[:2] / after[2] - found.xy) / step
+        np.testing.assert_allclose(np.diag(found.xy_covariance), pixels**2, atol=1e-2 * np.max(pixels**2))
+        low, high = found.interval_95
+        np.testing.assert_allclose(0.5 * (low + high), found.xy)
+
+
+def test_an_epipole_at_infinity_has_no_pixels():
+    F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) / np.sqrt(2.0)
+    for epipole in epipoles_with_covariance(F, np.eye(9)):
+        assert np.isnan(epipole.xy).all()
+        assert np.isfinite(epipole.covariance).all()
+
+
+def test_wrong_calls():
+    pair = make_pair(20, np.random.default_rng(0))
+    X = np.random.default_rng(1).uniform((-1.0, -1.0, 4.0), (1.0, 1.0, 6.0), (20, 3))
+    with pytest.raises(ValueError, match="positive"):
+        fundamental_bound(pair.P1, pair.P2, X, sigma_px=0.0)
+    with pytest.raises(ValueError, match="different centres"):
+        fundamental_bound(pair.P1, pair.P1, X, sigma_px=1.0)
+    with pytest.raises(ValueError, match=r"\(9, 9\)"):
+        epipoles_with_covariance(pair.F, np.eye(3))
+    with pytest.raises(ValueError, match="unit norm"):
+        epipoles_with_covariance(2.0 * pair.F, np.eye(9))
