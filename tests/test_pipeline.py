@@ -172,6 +172,22 @@ def test_another_run_is_refused_and_overwrite_keeps_what_is_the_same(tmp_path: P
     assert any("only rotates" in warning for warning in result.warnings)
 
 
+def test_the_folder_is_judged_before_any_photograph_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path / "out")
+    (tmp_path / "file").write_text("in the way")
+
+    def read_nothing(*_: Any, **__: Any) -> None:
+        raise AssertionError("photographs were read")
+
+    monkeypatch.setattr("thesisrecon.pipeline.read_photographs", read_nothing)
+    with pytest.raises(UsageError, match="seed was 0 there and is 1 here"):
+        run(tmp_path / "out", seed=1)
+    with pytest.raises(UsageError, match="cannot be written"):
+        run(tmp_path / "file" / "out")
+
+
 def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path: Path) -> None:
     run(tmp_path, 3)
     CALLS.clear()

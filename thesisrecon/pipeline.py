@@ -13,7 +13,7 @@ import numpy as np
 from thesisrecon.assumptions import camera_groups, focal_prior
 from thesisrecon.config import PipelineConfig, tables_from_config
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.images import ImageSource, PhotographSet, read_photographs
+from thesisrecon.io.images import ImageSource, PhotographSet, list_images, read_photographs
 from thesisrecon.outputs import write_outputs
 from thesisrecon.run import Progress, Run, RunOptions, start_run, stream
 from thesisrecon.types import (
@@ -62,9 +62,12 @@ def reconstruct(
         in ``out`` all the same.
     """
     until, run, overwrite = start_run(out, config or PipelineConfig(), seed, progress, options)
-    photographs = _read(run, images)
-    identity = _identity(run, photographs)
-    with run.directory.claimed(identity, overwrite=overwrite):
+    if isinstance(images, str | Path) and not list_images(Path(images)):
+        raise UsageError(f"there are no photographs in {images}")
+    # Reading photographs takes long: whether the folder is free for this run is asked before.
+    with run.directory.claimed(_wishes(run), overwrite=overwrite):
+        photographs = _read(run, images)
+        run.directory.adopt(_identity(run, photographs), overwrite=overwrite)
         work = _Work(run, photographs, _empty_result(run, photographs), until)
         try:
             work.check_photographs()
@@ -114,21 +117,23 @@ def _read(run: Run, images: ImageSource) -> PhotographSet:
         photographs = read_photographs(images, max_size_px=size, map_all=run.workers.map_all)
     found, refused = len(photographs.photographs), len(photographs.refused)
     if found + refused == 0:
-        raise UsageError(
-            f"there are no photographs in {images}" if isinstance(images, str | Path) else "no images"
-        )
+        raise UsageError("no images")
     notes = [f"{p.image.name}: {p.note}" for p in photographs.photographs if p.note]
     refusals = [f"{name} is left out: it {reason}" for name, reason in photographs.refused.items()]
     run.finish("images", counts={"read": found, "refused": refused}, warnings=notes + refusals)
     return photographs
 
 
+def _wishes(run: Run) -> dict[str, Any]:
+    """What of a run's identity is known before its photographs are read."""
+    return {"version": 1, "seed": run.seed, "settings": tables_from_config(run.config)}
+
+
 def _identity(run: Run, photographs: PhotographSet) -> dict[str, Any]:
     """What makes two runs the same: settings, seed and the content of the photographs."""
     digests = {p.image.name: p.digest for p in photographs.photographs}
     refused = {name: f"refused: {reason}" for name, reason in photographs.refused.items()}
-    settings = tables_from_config(run.config)
-    return {"version": 1, "seed": run.seed, "settings": settings, "photographs": digests | refused}
+    return _wishes(run) | {"photographs": digests | refused}
 
 
 def _empty_result(run: Run, photographs: PhotographSet) -> RunResult:

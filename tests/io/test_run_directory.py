@@ -120,9 +120,10 @@ IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "photographs": {"a.
 def test_the_same_run_is_resumed_and_another_is_refused_with_what_differs(tmp_path: Path) -> None:
     directory = RunDirectory(tmp_path / "new" / "out")
     with directory.claimed(IDENTITY, overwrite=False):
+        directory.adopt(IDENTITY, overwrite=False)
         directory.stage("01").save("a", "key", some_features())
     with directory.claimed(IDENTITY, overwrite=False):
-        pass
+        directory.adopt(IDENTITY, overwrite=False)
     changed = [
         ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 there and is 6 here"),
         ({**IDENTITY, "seed": 1}, "seed was 0 there and is 1"),
@@ -140,6 +141,41 @@ def test_the_same_run_is_resumed_and_another_is_refused_with_what_differs(tmp_pa
     assert directory.stage("01").load("a", "key") is not None
     with directory.claimed(changed[0][0], overwrite=True):
         assert directory.stage("01").load("a", "key") is not None
+
+
+def test_settings_are_judged_before_the_photographs_are_known(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path)
+    with directory.claimed(IDENTITY, overwrite=False):
+        directory.adopt(IDENTITY, overwrite=False)
+    wishes = {name: value for name, value in IDENTITY.items() if name != "photographs"}
+    with directory.claimed(wishes, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
+        directory.adopt({**IDENTITY, "photographs": {"a.jpg": "1"}}, overwrite=False)
+    with (
+        pytest.raises(UsageError, match="seed was 0"),
+        directory.claimed({**wishes, "seed": 2}, overwrite=False),
+    ):
+        pass
+
+
+def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "out")
+    results = ["summary.json", "sparse/0/cameras.bin", "absent.txt"]
+
+    def adopt(seed: int) -> None:
+        identity = {**IDENTITY, "seed": seed}
+        with directory.claimed(identity, overwrite=True):
+            directory.adopt(identity, overwrite=True, results=results)
+
+    adopt(0)
+    write_atomically(directory.path / "summary.json", b"{}")
+    write_atomically(directory.path / "sparse" / "0" / "cameras.bin", b"")
+    write_atomically(directory.path / "sparse" / "note.txt", b"of the user")
+    adopt(0)
+    assert (directory.path / "sparse" / "0" / "cameras.bin").exists()
+    adopt(1)
+    assert not (directory.path / "summary.json").exists()
+    assert not (directory.path / "sparse" / "0").exists()
+    assert (directory.path / "sparse" / "note.txt").exists()
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:

@@ -223,19 +223,42 @@ class RunDirectory:
         return StageFolder(self.path / folder)
 
     @contextmanager
-    def claimed(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
-        """Hold the folder for a run of this ``identity`` (settings, seed, photographs).
+    def claimed(self, wishes: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
+        """Hold the folder for a run of these ``wishes``: as much of its identity as is known before its
+        photographs are read.
 
-        A folder of the same run is resumed. Raises :class:`UsageError` where the folder cannot be written,
-        is in use, holds things of no run, or holds another run, unless ``overwrite``; nothing in it is
-        changed then.
+        Raises :class:`UsageError` where the folder cannot be written, is in use, holds things of no run, or
+        holds another run, unless ``overwrite``; nothing in it is changed then.
         """
         with _locked(self.path):
-            self._check(identity, overwrite)
-            write_json(self.path / RUN_FILE, identity)
+            self._check(wishes, overwrite)
             yield
 
-    def _check(self, identity: Mapping[str, Any], overwrite: bool) -> None:
+    def adopt(self, identity: Mapping[str, Any], *, overwrite: bool, results: Sequence[str] = ()) -> None:
+        """Make the claimed folder that of the run of this ``identity`` (settings, seed, photographs).
+
+        A folder of the same run is resumed. Where another run is replaced, its ``results`` (paths in the
+        folder) are removed: they must not stand beside those of this one. Raises as :meth:`claimed` does.
+        """
+        if self._check(identity, overwrite):
+            self.remove(results)
+        write_json(self.path / RUN_FILE, identity)
+
+    def remove(self, names: Sequence[str]) -> None:
+        """Remove these files of the folder, where they are there, and the folders that are empty then."""
+        try:
+            for path in (self.path / name for name in names):
+                path.unlink(missing_ok=True)
+                for parent in path.parents[: len(path.relative_to(self.path).parents) - 1]:
+                    if parent.is_dir() and not any(parent.iterdir()):
+                        parent.rmdir()
+        except OSError as error:
+            raise UsageError(
+                f"old results in the output folder {self.path} cannot be removed: {error.strerror}"
+            ) from None
+
+    def _check(self, identity: Mapping[str, Any], overwrite: bool) -> bool:
+        """Whether the folder holds a run that differs in what ``identity`` tells."""
         there = read_json(self.path / RUN_FILE)
         if there is None:
             strange = sorted(p.name for p in self.path.iterdir() if p.name != LOCK_FILE)
@@ -244,13 +267,17 @@ class RunDirectory:
                     f"the output folder {self.path} holds {strange[0]!r}, which is of no run; "
                     "choose an empty or a new folder"
                 )
-            return
+            # A damaged run file names no run, so whatever stands beside it is another one's.
+            return bool(strange)
+        if isinstance(there, dict):
+            there = {name: value for name, value in there.items() if name in identity}
         difference = next(_differences(there, _finite(json.loads(json.dumps(identity, default=_number)))), "")
         if difference and not overwrite:
             raise UsageError(
                 f"the output folder {self.path} holds another run ({difference}); choose another folder, or "
                 "--overwrite to replace what differs and keep the rest"
             )
+        return bool(difference)
 
 
 def _only_unfinished(names: list[str]) -> bool:
