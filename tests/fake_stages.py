@@ -178,6 +178,7 @@ class FakeCalibrator:
 @dataclass(frozen=True)
 class FakeMetric:
     trusted_from: int = 0
+    doubts: tuple[str, ...] = ("odd focal",)
 
     def refine(
         self, reconstruction: Reconstruction, calibration: Any, *, groups: Any, focal_prior: Any, rng: Any
@@ -193,9 +194,7 @@ class FakeMetric:
         }
         metric = replace(reconstruction, stratum="metric", K=calibration.K, k1=np.zeros(views))
         trusted = attempt >= self.trusted_from
-        return MetricResult(
-            metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else ("odd focal",)
-        )
+        return MetricResult(metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else self.doubts)
 
 
 def fake_config(**changes: Any) -> PipelineConfig:

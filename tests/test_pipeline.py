@@ -16,7 +16,7 @@ import pytest
 
 from tests import fake_stages as fakes
 from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
-from thesisrecon.assumptions import camera_groups
+from thesisrecon.assumptions import camera_groups, prior_warnings
 from thesisrecon.config import ImageOptions, IntrinsicsAssumption
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.pipeline import reconstruct
@@ -200,6 +200,41 @@ def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path
     ]
 
 
+MODEL = ("points.ply", "cameras.json", "sparse")
+
+
+def test_an_earlier_end_leaves_the_finished_result(tmp_path: Path) -> None:
+    run(tmp_path)
+    before = {name: (tmp_path / name).read_bytes() for name in ("summary.json", "report.html", "points.ply")}
+    early = run(tmp_path, until="features")
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
+    assert early.summary["until"] == "features"
+    assert any("up to metric: its summary and page are kept" in warning for warning in early.warnings)
+
+
+def test_an_earlier_end_of_another_run_replaces_the_finished_result(tmp_path: Path) -> None:
+    run(tmp_path)
+    run(tmp_path, until="features", seed=1, overwrite=True)
+    assert read(tmp_path / "summary.json")["until"] == "features"
+    assert not any((tmp_path / name).exists() for name in MODEL)
+
+
+def test_a_failure_leaves_no_model_of_the_run_before(tmp_path: Path) -> None:
+    run(tmp_path)
+    assert all((tmp_path / name).exists() for name in MODEL)
+    with pytest.raises(StageFailure):
+        run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=9)), overwrite=True)
+    assert not any((tmp_path / name).exists() for name in MODEL)
+    assert "the initial pair is bad" in read(tmp_path / "summary.json")["failure"]
+
+
+def test_a_replaced_run_leaves_no_result_even_if_the_new_one_is_interrupted(tmp_path: Path) -> None:
+    run(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, seed=1, overwrite=True, threads=1, progress=interrupt_at("matches", 1))
+    assert not any((tmp_path / name).exists() for name in (*MODEL, "summary.json", "report.html"))
+
+
 def test_until_ends_early_and_a_longer_run_goes_on(tmp_path: Path) -> None:
     assert run(tmp_path, until="features").pairs == ()
     assert run(tmp_path, until="matches").tracks is None
@@ -227,6 +262,16 @@ def test_a_result_that_nobody_trusts_is_written_with_its_warning(tmp_path: Path)
     assert read(tmp_path / "summary.json")["trusted"] is False
     assert (tmp_path / "sparse" / "0" / "images.bin").exists()
     assert "odd focal" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_every_doubt_is_said_once(tmp_path: Path) -> None:
+    doubted = fake_config(
+        metric=fakes.FakeMetric(trusted_from=9, doubts=("odd focal", "the camera only rotates")),
+        selfcalibration=fakes.FakeCalibrator(identifiable=False),
+    )
+    warnings = run(tmp_path, config=doubted).warnings
+    assert sum(warning.count("only rotates") for warning in warnings) == 1
+    assert sum(warning.count("odd focal") for warning in warnings) == 1
 
 
 def test_a_failed_attempt_is_followed_by_another(tmp_path: Path) -> None:
@@ -266,6 +311,31 @@ def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path: Path) -> None
     wish = IntrinsicsAssumption(focal_px=100.0, focal_std_rel=0.1)
     run(tmp_path, config=fake_config(intrinsics=wish))
     assert "calibrate prior=True" in CALLS
+
+
+def test_a_wish_for_exif_that_no_photograph_grants_is_answered(tmp_path: Path) -> None:
+    wish = IntrinsicsAssumption(exif=True, focal_std_rel=0.1)
+    result = run(tmp_path, config=fake_config(intrinsics=wish))
+    assert "calibrate prior=False" in CALLS
+    sentence = "none of the 4 photographs names its focal length; no prior was used"
+    assert sentence in result.summary["warnings"]
+    assert sentence in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("wish", "focal_px", "words"),
+    [
+        (IntrinsicsAssumption(exif=True, focal_std_rel=0.1), [800.0, np.nan], "1 of the 2 photographs"),
+        (IntrinsicsAssumption(exif=True, focal_std_rel=0.1), [800.0, 900.0], None),
+        (IntrinsicsAssumption(exif=True, focal_px=9.0, focal_std_rel=0.1), [np.nan, np.nan], None),
+        (IntrinsicsAssumption(), [np.nan, np.nan], None),
+    ],
+)
+def test_only_an_unanswered_wish_is_worth_a_warning(
+    wish: IntrinsicsAssumption, focal_px: list[float], words: str | None
+) -> None:
+    warnings = prior_warnings(wish, np.array(focal_px))
+    assert [words in warning for warning in warnings] == ([True] if words else [])
 
 
 def test_photographs_are_reduced_to_the_size_of_the_config(tmp_path: Path) -> None:

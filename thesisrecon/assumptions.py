@@ -29,3 +29,15 @@ def focal_prior(wish: IntrinsicsAssumption, exif_focal_px: F64, scales: F64) -> 
         return None
     focal = exif_focal_px if wish.focal_px is None else np.full(len(scales), wish.focal_px)
     return FocalPrior(focal * scales, wish.focal_std_rel) if np.isfinite(focal).any() else None
+
+
+def prior_warnings(wish: IntrinsicsAssumption, exif_focal_px: F64) -> list[str]:
+    """What the user must hear of a wish for EXIF focal lengths (V,) that the photographs cannot grant."""
+    if not wish.exif or wish.focal_px is not None or not len(exif_focal_px):
+        return []
+    silent, total = int((~np.isfinite(exif_focal_px)).sum()), len(exif_focal_px)
+    if silent == total:
+        return [f"none of the {total} photographs names its focal length; no prior was used"]
+    if silent:
+        return [f"{silent} of the {total} photographs name no focal length and have no prior"]
+    return []

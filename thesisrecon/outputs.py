@@ -6,7 +6,7 @@ import resource
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,27 +16,61 @@ from thesisrecon.config import toml_from_config
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.colmap import colmap_from_reconstruction, write_colmap_model
 from thesisrecon.io.pointcloud import write_point_cloud
-from thesisrecon.io.run_directory import write_atomically, write_json
+from thesisrecon.io.run_directory import read_json, write_atomically, write_json
 from thesisrecon.report import Photograph, ReportData, write_report
 from thesisrecon.report.summary import cameras_table, point_colours, summarize
-from thesisrecon.run import Run
+from thesisrecon.run import Run, Until
 from thesisrecon.types import Image, Reconstruction, RunResult
 
 THUMBNAIL_PX = 800
+SUMMARY, PAGE = "summary.json", "report.html"
+MODEL_FILES = (
+    *(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D")),
+    *("points.ply", "cameras.json"),
+)
+RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 U8 = NDArray[np.uint8]
 
 
 def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFailure | None) -> RunResult:
     """Write whatever was found, and return it with its summary.
 
-    Raises :class:`UsageError` where the output folder cannot be written.
+    A run that ends early, as asked, leaves the files of a longer one that has ended in this folder; files of
+    a model are removed where there is none. Raises :class:`UsageError` where the output folder cannot be
+    written.
     """
+    later = _later_end(run.directory.path, until) if failure is None else None
     try:
+        if later is not None:
+            run.warnings.append(
+                f"the folder holds the result of this run up to {later}: its summary and page are kept"
+            )
+            return _described(run, result, until, failure)
         return _write(run, result, until, failure)
     except OSError as error:
         raise UsageError(
             f"the output folder {run.directory.path} cannot be written: {error.strerror}"
         ) from None
+
+
+def _later_end(out: Path, until: str) -> str | None:
+    """The stage up to which this run has already ended well here, where that is a later one."""
+    summary = read_json(out / SUMMARY)
+    if not isinstance(summary, dict) or summary.get("failure"):
+        return None
+    stages, there = get_args(Until), summary.get("until")
+    return there if there in stages[stages.index(until) + 1 :] else None
+
+
+def _described(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
+    """The result with its warnings, reports and summary."""
+    result = replace(
+        result,
+        warnings=(*run.warnings, *_doubts(result)),
+        reports=tuple(run.reports.values()),
+        failure=str(failure) if failure is not None else "",
+    )
+    return replace(result, summary=summarize(result) | _run_facts(run, until))
 
 
 def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
@@ -45,32 +79,32 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         if result.metric is not None:
             colours = point_colours(result.metric.reconstruction, result.images)
             write_model(out, result, result.metric.reconstruction, colours)
-    result = replace(
-        result,
-        warnings=(*run.warnings, *_doubts(result)),
-        reports=tuple(run.reports.values()),
-        failure=str(failure) if failure is not None else "",
-    )
-    found = summarize(result)
-    with run.clock("outputs"):
+        else:
+            run.directory.remove(MODEL_FILES)
+        result = _described(run, result, until, failure)
         write_atomically(out / "config.toml", toml_from_config(run.config).encode())
-        page = _report_data(run, replace(result, summary=found | _run_facts(run, until)), colours, failure)
-        write_report(out / "report.html", replace(page, until=None if until == "metric" else until))
+        page = _report_data(run, result, colours, failure)
+        write_report(out / PAGE, replace(page, until=None if until == "metric" else until))
     run.finish("outputs", counts={})
-    result = replace(result, reports=tuple(run.reports.values()), summary=found | _run_facts(run, until))
-    write_json(out / "summary.json", result.summary)
+    result = replace(
+        result, reports=tuple(run.reports.values()), summary=result.summary | _run_facts(run, until)
+    )
+    write_json(out / SUMMARY, result.summary)
     return result
 
 
 def _doubts(result: RunResult) -> list[str]:
     """The sentences nobody may overlook."""
-    doubts = []
+    doubts: list[str] = []
+    own: tuple[str, ...] = ()
     if result.metric is not None and not result.metric.trusted:
-        why = "; ".join(result.metric.doubts)
-        doubts.append(f"the result failed its self-check and is not to be trusted: {why}")
+        own = tuple(dict.fromkeys(result.metric.doubts))
+        doubts.append(f"the result failed its self-check and is not to be trusted: {'; '.join(own)}")
     if result.calibration is not None and not result.calibration.identifiable:
-        why = "; ".join(result.calibration.reasons)
-        doubts.append(f"these views do not determine the calibration: {why}")
+        # The self-check repeats the reasons of the calibration it was given.
+        rest = [reason for reason in dict.fromkeys(result.calibration.reasons) if reason not in own]
+        if rest or not own:
+            doubts.append(f"these views do not determine the calibration: {'; '.join(rest)}")
     return doubts
 
 

@@ -10,11 +10,11 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from thesisrecon.assumptions import camera_groups, focal_prior
+from thesisrecon.assumptions import camera_groups, focal_prior, prior_warnings
 from thesisrecon.config import PipelineConfig, tables_from_config
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.images import ImageSource, PhotographSet, list_images, read_photographs
-from thesisrecon.outputs import write_outputs
+from thesisrecon.outputs import RESULT_FILES, write_outputs
 from thesisrecon.run import Progress, Run, RunOptions, start_run, stream
 from thesisrecon.types import (
     Features,
@@ -67,7 +67,7 @@ def reconstruct(
     # Reading photographs takes long: whether the folder is free for this run is asked before.
     with run.directory.claimed(_wishes(run), overwrite=overwrite):
         photographs = _read(run, images)
-        run.directory.adopt(_identity(run, photographs), overwrite=overwrite)
+        run.directory.adopt(_identity(run, photographs), overwrite=overwrite, results=RESULT_FILES)
         work = _Work(run, photographs, _empty_result(run, photographs), until)
         try:
             work.check_photographs()
@@ -120,7 +120,8 @@ def _read(run: Run, images: ImageSource) -> PhotographSet:
         raise UsageError("no images")
     notes = [f"{p.image.name}: {p.note}" for p in photographs.photographs if p.note]
     refusals = [f"{name} is left out: it {reason}" for name, reason in photographs.refused.items()]
-    run.finish("images", counts={"read": found, "refused": refused}, warnings=notes + refusals)
+    warnings = [*notes, *refusals, *prior_warnings(run.config.intrinsics, photographs.exif_focal_px)]
+    run.finish("images", counts={"read": found, "refused": refused}, warnings=warnings)
     return photographs
 
 
