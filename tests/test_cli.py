@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -129,6 +130,25 @@ def test_inspect_prints_what_was_found(
     assert "camera 0: focal" in printed
 
 
+def test_an_early_end_prints_what_its_stage_found(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few, out = tmp_path / "few", tmp_path / "out"
+    few.mkdir()
+    for path in sorted(photographs.iterdir())[:2]:
+        shutil.copy(path, few)
+    wanted = {
+        "features": r"^\d{3,} corners in 2 photographs\n",
+        "matches": r"^1 of 1 pairs .*, \d\d+ verified",
+    }
+    for until, words in wanted.items():
+        arguments = ["reconstruct", str(few), "-o", str(out), "--until", until, "--max-size", "480"]
+        assert run_command(arguments) == 0
+        assert re.match(words, capsys.readouterr().out)
+        assert run_command(["inspect", str(out)]) == 0
+        assert re.match(words, capsys.readouterr().out)
+
+
 def test_a_finished_run_is_not_touched_by_another_config(
     killed_and_resumed: tuple[Path, int], photographs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,6 +185,9 @@ def test_the_written_config_runs_again(
         (["reconstruct", ".", "-o", "out", "--executor", "dask://x"], "does not exist yet"),
         (["reconstruct", ".", "-o", "out", "--max-size", "5"], "at least 64"),
         (["inspect", "nowhere"], "no summary"),
+        (["reconstruct", ".", "-o", ""], "the folder has no name"),
+        (["reconstruct", "", "-o", "out"], "the folder has no name"),
+        (["demo", "-o", " "], "the folder has no name"),
         (["rebuild"], "rebuild"),
     ],
 )

@@ -65,14 +65,25 @@ Overwrite = Annotated[
 ]
 
 
+def _folder(text: str | Path) -> Path:
+    """A folder as the user names it: an empty name would silently mean the current folder."""
+    if not str(text).strip():
+        raise typer.BadParameter("the folder has no name; write . for the current one")
+    return Path(text)
+
+
 class _Interrupted(Exception):
     """Ctrl-C during a run."""
 
 
 @app.command()
 def reconstruct(
-    images: Annotated[Path, typer.Argument(help="The folder of photographs.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The output folder.")],
+    images: Annotated[
+        Path, typer.Argument(parser=_folder, metavar="IMAGES", help="The folder of photographs.")
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", parser=_folder, metavar="FOLDER", help="The output folder.")
+    ],
     preset: Annotated[
         Preset | None, typer.Option("--preset", help="The pipeline to start from (default: default).")
     ] = None,
@@ -109,7 +120,9 @@ def reconstruct(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", help="The output folder.")] = Path("out/demo"),
+    out: Annotated[
+        Path, typer.Option("-o", "--out", parser=_folder, metavar="FOLDER", help="The output folder.")
+    ] = Path("out/demo"),
     threads: Threads = 0,
 ) -> None:
     """Reconstruct the courtyard that comes with the source of the project."""
@@ -126,7 +139,9 @@ def demo(
 
 
 @app.command()
-def inspect(out: Annotated[Path, typer.Argument(help="The output folder of a run.")]) -> None:
+def inspect(
+    out: Annotated[Path, typer.Argument(parser=_folder, metavar="OUT", help="The output folder of a run.")],
+) -> None:
     """Print what a run found."""
     from thesisrecon.io.run_directory import read_json
 
@@ -224,9 +239,7 @@ def _progress_bars() -> Iterator[Any]:
 
 
 def _print_summary(summary: Mapping[str, Any], out: Path) -> None:
-    lines = [
-        f"{summary['registered']} of {summary['images']} photographs registered, {summary['points']} points"
-    ]
+    lines = [_found(summary)]
     if summary["reprojection_rms_px"] is not None:
         lines.append(
             f"reprojection residual {summary['reprojection_rms_px']:.3f} px RMS, "
@@ -239,6 +252,23 @@ def _print_summary(summary: Mapping[str, Any], out: Path) -> None:
         lines.append(f"failed: {summary['failure']}")
     lines.append(f"{summary['seconds']['total']:.1f} s; the page is {out / 'report.html'}")
     typer.echo("\n".join(lines))
+
+
+def _found(summary: Mapping[str, Any]) -> str:
+    """What the last stage that found something found."""
+    images, pairs = summary["images"], summary["pairs"]
+    if summary["stratum"] is not None:
+        kind = " in projective cameras" if summary["stratum"] == "projective" else ""
+        return f"{summary['registered']} of {images} photographs registered{kind}, {summary['points']} points"
+    if pairs["matched"]:
+        return (
+            f"{pairs['accepted']} of {pairs['matched']} pairs of photographs accepted, "
+            f"{pairs['verified_matches']} verified matches"
+        )
+    corners = [view["corners"] for view in summary["cameras"] if view["corners"] is not None]
+    if corners:
+        return f"{sum(corners)} corners in {len(corners)} photographs"
+    return f"{len(summary['cameras'])} of {images} photographs read"
 
 
 def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
