@@ -14,7 +14,7 @@ from thesisrecon.epipolar.precision import (
 )
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.multiview import enforce_rank_two, epipolar_lines, epipoles
-from validation.checks.epipolar import GOLD, check_precision
+from validation.checks.epipolar import DEFAULT, GOLD, check_precision
 from validation.scenes.two_views import make_two_views
 
 
@@ -28,6 +28,13 @@ def test_gold_standard_reaches_the_bound_and_its_intervals_hold_the_truth():
     assert values["RMS distance over bound"] == pytest.approx(1.0, abs=0.05)
     assert values["coverage of distances"] == pytest.approx(0.95, abs=0.03)
     assert values["coverage of epipoles"] == pytest.approx(0.95, abs=0.03)
+
+
+@pytest.mark.parametrize(("sigma", "n"), [(0.25, 100), (0.5, 300), (2.0, 1000)])
+def test_the_default_comes_near_the_bound_at_its_default_threshold(sigma, n):
+    values = {row.name: row.values[DEFAULT] for row in check_precision(sigma, n, 30)}
+    assert values["RMS distance over bound"] < 1.1
+    assert values["coverage of distances"] > 0.92
 
 
 def test_bound_grows_with_the_noise_and_falls_with_the_points():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from thesisrecon.robust.kernels import draw_sample, required_samples
-from thesisrecon.robust.noise import noise_scale
+from thesisrecon.robust.noise import noise_scale, noise_width, trimmed_noise_scale
 from thesisrecon.robust.ransac import SampleConsensus
 
 
@@ -124,3 +124,22 @@ def test_consensus_without_a_model_is_none_and_too_few_data_are_refused():
     assert SampleConsensus(1.0, max_samples=10).search(problem, 5, np.random.default_rng(0)) is None
     with pytest.raises(ValueError, match="at least 2"):
         SampleConsensus(1.0).search(problem, 1, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.5, 1.0, 2.0])
+def test_the_noise_is_seen_to_its_end(sigma):
+    rng = np.random.default_rng(0)
+    wrong = rng.uniform(0.0, 300.0, 500)
+    r = np.abs(np.concatenate([rng.normal(0.0, sigma, 1000), wrong]))
+    width = noise_width(r, 1.0)
+    assert max(1.0, 2.2 * sigma) <= width <= max(1.0, 5.0 * sigma)
+    found = trimmed_noise_scale(r, noise_scale(r[r < width]))
+    assert found == pytest.approx(sigma, rel=0.1)
+
+
+def test_wrong_matches_do_not_widen_the_noise():
+    r = np.random.default_rng(1).uniform(0.0, 300.0, 20000)
+    assert noise_width(r, 1.0) == 1.0
+    assert noise_width(r[:5], 1.0) == 1.0
+    assert trimmed_noise_scale(r[:10], 0.5) == 0.5
+    assert trimmed_noise_scale(np.zeros(50), 0.5) == 0.0

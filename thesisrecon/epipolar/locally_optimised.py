@@ -13,7 +13,7 @@ from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.kernels import sampson_distances, search, truncated_score
 from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
 from thesisrecon.errors import StageFailure
-from thesisrecon.robust.noise import noise_scale
+from thesisrecon.robust.noise import noise_scale, noise_width, trimmed_noise_scale
 from thesisrecon.types import FundamentalFit
 
 F64 = NDArray[np.float64]
@@ -23,7 +23,7 @@ MINIMUM = 8
 START_STEPS, START_POINTS = 5, 500
 """Solves of each refinement of a start, and the points that all but its last refinement are on."""
 REFINEMENT_STEPS = 15
-SHARPENINGS = 2
+SHARPENINGS, MORE_SHARPENINGS = 2, 5
 KNEE = 0.25
 """Where Huber's loss turns linear, in widths of the gate: wrong matches within the gate are not rare."""
 PRIOR = (100.0, 5.0)
@@ -39,9 +39,10 @@ class LocallyOptimisedRansac:
     Each of ``starts`` searches draws until a sample free of outliers was seen with the probability that makes
     ``confidence`` over all starts; its best matrix is refined by Levenberg-Marquardt on the gradient
     criterion (5.4) under Huber's loss at the ``gates`` (times the threshold), and the best of the starts once
-    more with the loss as wide as the noise. Torr and Zisserman, MLESAC, CVIU 2000 (score); Chum, Matas and
-    Kittler, DAGM 2003 (local optimisation). Fitting the points of a shrinking gate alone gets stuck where the
-    scene is nearly a plane; the several starts and the soft loss do not.
+    more with the loss as wide as the noise, beyond the threshold too where the noise goes on. Torr and
+    Zisserman, MLESAC, CVIU 2000 (score); Chum, Matas and Kittler, DAGM 2003 (local optimisation). Fitting the
+    points of a shrinking gate alone gets stuck where the scene is nearly a plane; the several starts and the
+    soft loss do not.
 
     Parameters
     ----------
@@ -117,17 +118,22 @@ class LocallyOptimisedRansac:
 
     def _sharpen(self, f: F64, points: F64, gate: float) -> None:
         """Refine once more with the width of the loss at the noise that the inliers show (in place)."""
-        for _ in range(SHARPENINGS):
-            r = np.array(sampson_distances(f, points))
-            near = r < gate
-            if near.sum() < MINIMUM:
+        before = gate
+        for k in range(MORE_SHARPENINGS):
+            r = np.asarray(sampson_distances(f, points))
+            width = noise_width(r, gate)
+            if k >= SHARPENINGS and width == before:
                 return
-            width = min(max(noise_scale(r[near]), EXACT), gate)
-            refine(f, points, GRADIENT, gate, width, REFINEMENT_STEPS)
+            before = width
+            near = r[r < width]
+            if len(near) < MINIMUM:
+                return
+            knee = min(max(noise_scale(near), EXACT), width)
+            refine(f, points, GRADIENT, width, knee, REFINEMENT_STEPS)
 
     def _finish(self, frame: PairFrame, f: F64, points: F64, samples: int) -> FundamentalFit:
         residuals = np.asarray(sampson_distances(f, points)) / frame.scale
-        near = residuals < self.threshold_px
+        near = residuals < noise_width(residuals, self.threshold_px)
         if not f.any() or near.sum() < MINIMUM:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
@@ -135,7 +141,7 @@ class LocallyOptimisedRansac:
                 f"{self.threshold_px:g} px, needed at least {MINIMUM}",
                 "The photographs may not overlap, or the matches are wrong",
             )
-        sigma = noise_scale(residuals[near])
+        sigma = trimmed_noise_scale(residuals, noise_scale(residuals[near]))
         inliers = residuals < max(self.inlier_sigmas * sigma, self.inlier_floor_px)
         covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
         return FundamentalFit(frame.matrix_in_pixels(f), inliers, sigma, covariance, samples)
