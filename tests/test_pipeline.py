@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from tests import fake_stages as fakes
@@ -200,6 +201,15 @@ def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path
     ]
 
 
+def test_the_page_is_called_after_the_photographs(tmp_path: Path) -> None:
+    (tmp_path / "castle").mkdir()
+    for image in photographs(2):
+        PIL.Image.fromarray(image.rgb).save(tmp_path / "castle" / image.name)
+    for images, title in ((tmp_path / "castle", "castle"), (photographs(2), "out")):
+        reconstruct(images, tmp_path / "out", config=fake_config(), until="features")
+        assert f"<h1>{title}</h1>" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
 MODEL = ("points.ply", "cameras.json", "sparse")
 
 
@@ -370,6 +380,11 @@ def test_wrong_wishes_get_a_sentence_before_anything_is_made(
     with pytest.raises(UsageError, match=words):
         run(tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
+
+
+def test_an_output_folder_without_a_name_is_refused() -> None:
+    with pytest.raises(UsageError, match="has no name"):
+        reconstruct(photographs(2), "", config=fake_config())
 
 
 def test_an_unknown_option_is_a_wrong_call(tmp_path: Path) -> None:

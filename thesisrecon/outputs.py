@@ -149,7 +149,7 @@ def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: Stage
         Photograph(image.name, image.size, image.original_size, _thumbnail(image)) for image in result.images
     )
     return ReportData(
-        title=run.directory.path.resolve().name,
+        title=run.title,
         photographs=photographs,
         reports=result.reports,
         config_text=toml_from_config(run.config),

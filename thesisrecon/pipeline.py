@@ -13,7 +13,7 @@ import numpy as np
 from thesisrecon.assumptions import camera_groups, focal_prior, prior_warnings
 from thesisrecon.config import PipelineConfig, tables_from_config
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.images import ImageSource, PhotographSet, list_images, read_photographs
+from thesisrecon.io.images import ImageSource, PhotographSet, list_images, read_photographs, scene_name
 from thesisrecon.outputs import RESULT_FILES, write_outputs
 from thesisrecon.run import Progress, Run, RunOptions, start_run, stream
 from thesisrecon.types import (
@@ -62,8 +62,10 @@ def reconstruct(
         in ``out`` all the same.
     """
     until, run, overwrite = start_run(out, config or PipelineConfig(), seed, progress, options)
-    if isinstance(images, str | Path) and not list_images(Path(images)):
-        raise UsageError(f"there are no photographs in {images}")
+    if isinstance(images, str | Path):
+        if not list_images(Path(images)):
+            raise UsageError(f"there are no photographs in {images}")
+        run.title = scene_name(Path(images)) or run.title
     # Reading photographs takes long: whether the folder is free for this run is asked before.
     with run.directory.claimed(_wishes(run), overwrite=overwrite):
         photographs = _read(run, images)

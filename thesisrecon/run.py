@@ -74,6 +74,7 @@ class Run:
     workers: Workers
     directory: RunDirectory
     progress: Progress
+    title: str
     logs: dict[str, StageLog] = field(default_factory=dict)
     reports: dict[str, StageReport] = field(default_factory=dict)
     resumed: list[str] = field(default_factory=list)
@@ -195,5 +196,8 @@ def start_run(
         raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
     threads = options.get("threads") or available_threads()
     workers = Workers(threads, options.get("executor", "local"))
-    run = Run(config, seed, workers, RunDirectory(Path(out)), progress or (lambda *_: None))
+    if not str(out).strip():
+        raise UsageError("the output folder has no name; write . for the current one")
+    directory, hear = RunDirectory(Path(out)), progress or (lambda *_: None)
+    run = Run(config, seed, workers, directory, hear, directory.path.resolve().name)
     return until, run, bool(options.get("overwrite", False))

@@ -11,7 +11,7 @@ import PIL.Image
 import pytest
 
 from thesisrecon.errors import UsageError
-from thesisrecon.io.images import list_images, read_photographs
+from thesisrecon.io.images import list_images, read_photographs, scene_name
 from thesisrecon.types import Image
 
 
@@ -212,3 +212,10 @@ def test_a_folder_that_is_none_gets_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="not a folder"):
         list_images(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("folder", "name"), [("castle", "castle"), ("castle/images", "castle"), ("castle/DCIM", "castle")]
+)
+def test_a_scene_is_called_after_its_folder(tmp_path: Path, folder: str, name: str) -> None:
+    assert scene_name(tmp_path / folder) == name

@@ -69,7 +69,13 @@ def test_the_page_holds_every_section_and_its_links_lead_somewhere(page: str) ->
     assert wanted <= set(structure.ids)
     assert structure.tags.count("svg") == 8  # a histogram of each registered view
     assert structure.tags.count("img") == 9 + 2  # thumbnails, best and weakest pair
-    for text in ("2081.4 ± 1.7", "Trusted, but incomplete", "2 pairs lie on one plane", "peak_memory_mb"):
+    for text in (
+        "Computing time of this result",
+        "2081.4 ± 1.7",
+        "Trusted, but incomplete",
+        "2 pairs lie on one plane",
+        "peak_memory_mb",
+    ):
         assert text in page
 
 
@@ -100,6 +106,27 @@ def test_runs_that_ended_early_say_how_far_they_got() -> None:
     page = render_report(only_features)
     assert "corners were found" in page
     assert "plotly.js v" not in page  # nothing to draw, nothing to carry
+
+
+def test_a_projective_camera_is_not_called_registered(page: str) -> None:
+    projective = render_report(projective_run())
+    assert projective.count('<span class="state open">projective camera</span>') == 8
+    assert ">registered<" not in projective
+    assert page.count('<span class="state good">registered</span>') == 8
+
+
+def test_the_caption_says_whether_points_are_left_out() -> None:
+    data = made_up_run(points=200)
+    assert data.metric is not None
+    assert "All 200 points are drawn;" in render_report(data)
+    X = data.metric.reconstruction.X.copy()
+    X[0, :3] = 1e6
+    metric = dataclasses.replace(
+        data.metric, reconstruction=dataclasses.replace(data.metric.reconstruction, X=X)
+    )
+    assert "199 of 200 points are drawn, strays left out;" in render_report(
+        dataclasses.replace(data, metric=metric)
+    )
 
 
 def test_a_failed_run_without_anything_has_a_page() -> None:

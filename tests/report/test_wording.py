@@ -19,6 +19,8 @@ from thesisrecon.report.wording import (
 )
 from thesisrecon.types import IntrinsicInterval
 
+TIME = "Computing time of this result"
+
 
 @pytest.mark.parametrize(
     ("value", "std", "text"),
@@ -79,9 +81,9 @@ def test_a_failure_says_what_how_far_and_what_to_try() -> None:
 
 def test_the_first_glance_tells_what_there_is() -> None:
     labels = [fact.label for fact in first_glance(made_up_run(points=100), None)]
-    assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", "Time"]
+    assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", TIME]
     facts = first_glance(made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
     assert facts[3].value == "0.80 px median"
     assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
     early = dataclasses.replace(projective_run(), reconstruction=None)
-    assert [fact.label for fact in first_glance(early, None)] == ["Photographs", "Pairs accepted", "Time"]
+    assert [fact.label for fact in first_glance(early, None)] == ["Photographs", "Pairs accepted", TIME]

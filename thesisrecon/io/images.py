@@ -30,6 +30,7 @@ SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".jp2", ".avif"),
     *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2"),
 )
+COMMON_NAMES = ("images", "photographs", "photos", "pictures", "dcim")
 MIN_SIDE = 64
 BLANK_RANGE = 8
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
@@ -86,6 +87,14 @@ def list_images(folder: Path) -> list[Path]:
     return [
         p for p in entries if p.suffix.lower() in SUFFIXES and not p.name.startswith(".") and not p.is_dir()
     ]
+
+
+def scene_name(folder: Path) -> str:
+    """What to call the scene of a folder of photographs: its name, or that of the folder above it where its
+    own says only what it holds.
+    """
+    folder = folder.resolve()
+    return printable(folder.parent.name if folder.name.lower() in COMMON_NAMES else folder.name)
 
 
 def read_photographs(

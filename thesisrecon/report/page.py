@@ -32,7 +32,7 @@ from thesisrecon.report.residuals import (
     reprojection_distances,
     summarize_distances,
 )
-from thesisrecon.report.scene import build_scene
+from thesisrecon.report.scene import MAX_POINTS, build_scene
 from thesisrecon.report.wording import (
     count_of,
     decimals,
@@ -107,6 +107,7 @@ def render_report(data: ReportData) -> str:
             limit_px=limit_px,
             figures=figures,
             shown_points=shown,
+            most_points=MAX_POINTS,
             all_points=int(best.valid.sum()) if best is not None else 0,
             drawn_pairs=_drawn_pairs(data),
             listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:MAX_LISTED_PAIRS],
@@ -188,7 +189,8 @@ def _state(data: ReportData, i: int) -> tuple[str, str, str]:
     if best is None:
         return ("refused", "bad", own) if own else ("read", "open", "")
     if best.registered[i]:
-        return "registered", "good", ""
+        # Without a metric camera nothing is known of the view but its rays up to perspective.
+        return ("registered", "good", "") if data.metric is not None else ("projective camera", "open", "")
     return "refused", "bad", own or best.reasons[i] or "no reason was recorded"
 
 

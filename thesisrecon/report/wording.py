@@ -95,7 +95,13 @@ def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact
     if data.reports:
         slowest = max(data.reports, key=lambda report: report.seconds)
         share = round(100 * slowest.seconds / seconds) if seconds > 0 else 0
-        facts.append(Fact("Time", duration(seconds), f"longest stage: {slowest.stage}, {share} %"))
+        facts.append(
+            Fact(
+                "Computing time of this result",
+                duration(seconds),
+                f"longest stage: {slowest.stage}, {share} %",
+            )
+        )
     return facts
 
 
