@@ -9,7 +9,7 @@ F64 = NDArray[np.float64]
 
 MAD_FACTOR = 1.4826022185056018
 """1 / Phi^-1(0.75): the thesis' text divides by Phi(0.75), which is not consistent."""
-ENDED, WIDENINGS = 0.27, 5
+ENDED, WIDENINGS = 0.22, 6
 CUT, CUT_VARIANCE, TRIMMINGS = 2.5, 0.91125, 5
 """Where the noise is cut, and the variance of a standard normal variable cut there."""
 
@@ -33,10 +33,10 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
 def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
     """The width within which residuals (N,) >= 0 are of the noise: ``threshold``, or more if they go on.
 
-    Normal noise has its median at no more than 0.27 of a width of 2.5 standard deviations or more; a higher
+    Normal noise has its median at no more than 0.22 of a width of 3 standard deviations or more; a higher
     one (the ``parameters`` that were fitted allowed for) says that the width cuts the noise off, or that the
     residuals are of wrong matches and spread evenly.
-    The width grows, by 1.5 a step, until the noise ends; where it does not end within 8 thresholds they are
+    The width grows, by 1.5 a step, until the noise ends; where it does not end within 11 thresholds they are
     wrong matches, and the threshold stands.
     """
     width = threshold
