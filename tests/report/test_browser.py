@@ -124,6 +124,13 @@ def test_the_page_is_no_wider_than_the_screen(witness: Witness) -> None:
     assert width <= witness.page.viewport_size["width"]
 
 
+def test_the_table_of_pairs_shows_its_last_column(witness: Witness) -> None:
+    overhang = witness.page.evaluate(
+        "(() => { const t = document.querySelector('.listing'); return t.scrollWidth - t.clientWidth; })()"
+    )
+    assert overhang <= 0
+
+
 def test_the_point_of_view_can_be_chosen(witness: Witness) -> None:
     before = witness.pixels("#scene-figure")
     witness.page.get_by_role("button", name="From above").click()
