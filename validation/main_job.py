@@ -24,7 +24,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
 from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS, THESIS, Outcome, check_reconstruction
 from validation.metrics.cameras import TrueCameras
-from validation.metrics.record import Metric, markdown_table
+from validation.metrics.record import Metric, markdown_table, summary_table
 from validation.references.pycolmap_reference import read_run
 from validation.scenes.real import REAL_SCENES, ROOT, Scene, load_fixture_scene, load_real_scene
 
@@ -60,6 +60,19 @@ def run_process(command: list[str], *, log: Path, threads: int, environment: dic
     wall_s, cpu_s = time.perf_counter() - start, usage.ru_utime + usage.ru_stime
     return Process(child.returncode, wall_s, usage.ru_maxrss / 1024.0, cpu_s)
 
+
+README_BEGIN, README_END = "<!-- measured: begin -->", "<!-- measured: end -->"
+README_ROWS = (
+    "cameras registered",
+    "focal error",
+    "principal point error",
+    "mean camera-centre error",
+    "median rotation error",
+    "median reprojection",
+    "points",
+    "wall time",
+    "peak memory",
+)
 
 _PIN = (
     "import os, sys; os.sched_setaffinity(0, {int(c) for c in sys.argv[1].split(',')}); "
@@ -197,6 +210,17 @@ def write_results(
     (out / "main_job.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
 
 
+def write_readme(readme: Path, rows: dict[str, list[Metric]], facts: dict[str, Any]) -> None:
+    """The summary of all scenes between the markers of a README."""
+    text = readme.read_text(encoding="utf-8")
+    before, rest = text.split(README_BEGIN)
+    _, after = rest.split(README_END)
+    table = summary_table([metric for metrics in rows.values() for metric in metrics], README_ROWS)
+    told = "; ".join(f"{name}: {value}" for name, value in facts.items())
+    measured = f"{README_BEGIN}\n{table}\n\n{told}.\n{README_END}"
+    readme.write_text(before + measured + after, encoding="utf-8")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Measure, write, and say whether every target was reached."""
     parser = argparse.ArgumentParser(prog="python -m validation.main_job", description=__doc__)
@@ -204,6 +228,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--scenes", nargs="+", default=["courtyard", *REAL_SCENES])
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--readme", type=Path, help="a README whose table of measurements is to be replaced")
     wishes = parser.parse_args(arguments)
     out = wishes.out.resolve()
     scenes = find_scenes(wishes.scenes)
@@ -227,6 +252,8 @@ def main(arguments: list[str] | None = None) -> int:
         )
         # Written after each scene, so that a run cut short keeps what it has.
         write_results(out, rows, outcomes, facts)
+    if wishes.readme is not None:
+        write_readme(wishes.readme, rows, facts)
     print((out / "main_job.md").read_text(encoding="utf-8"))
     return int(any(metric.verdict == "missed" for metrics in rows.values() for metric in metrics))
 

@@ -15,6 +15,7 @@ from thesisrecon.io.colmap import colmap_from_reconstruction, write_colmap_model
 from validation import main_job
 from validation.checks.reconstruction import COLMAP, OURS
 from validation.metrics.cameras import TrueCameras, measure_cameras
+from validation.metrics.record import Metric
 from validation.references.pycolmap_reference import read_run, reconstruct_with_pycolmap
 from validation.scenes.real import Scene, load_fixture_scene
 
@@ -111,3 +112,19 @@ def test_no_model_is_a_failure_with_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "sparse").mkdir()
     with pytest.raises(StageFailure, match="made no model"):
         read_run(tmp_path, tmp_path)
+
+
+def test_the_readme_gets_the_rows_between_its_markers(tmp_path: Path) -> None:
+    readme = tmp_path / "README.md"
+    readme.write_text(
+        f"before\n{main_job.README_BEGIN}\nold\n{main_job.README_END}\nafter\n", encoding="utf-8"
+    )
+    row = Metric(
+        "fountain-P11", "focal error", "%", {"ours (default)": 0.15, "COLMAP": None}, "ours (default)", 0.5
+    )
+    main_job.write_readme(readme, {"fountain-P11": [row]}, {"threads": 2})
+    text = readme.read_text(encoding="utf-8")
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert "old" not in text
+    assert "| focal error, % | fountain-P11 | 0.15 | - | <= 0.5 reached |" in text
