@@ -87,7 +87,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         write_report(out / PAGE, replace(page, until=None if until == "metric" else until))
     run.finish("outputs", counts={})
     result = replace(
-        result, reports=tuple(run.reports.values()), summary=result.summary | _run_facts(run, until)
+        result, reports=tuple(run.reports.values()), summary={**result.summary, **_run_facts(run, until)}
     )
     write_json(out / SUMMARY, result.summary)
     return result
