@@ -76,4 +76,3 @@ class SampleConsensus:
         inliers = np.abs(residuals) < self.threshold
         spread = float(np.sqrt(np.mean(residuals[inliers] ** 2))) if inliers.any() else 0.0
         return (int(inliers.sum()), -spread), inliers
-
