@@ -108,7 +108,7 @@ class FakeEstimator:
 class FakeVerifier:
     accept: bool = True
 
-    def verify(self, matches: Matches, fit: FundamentalFit) -> TwoView:
+    def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
         return TwoView(
             i=matches.i,
             j=matches.j,

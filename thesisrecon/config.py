@@ -80,7 +80,7 @@ class FundamentalEstimator(Protocol):
 class Verifier(Protocol):
     """Whether a pair and its F enter the tracks."""
 
-    def verify(self, matches: Matches, fit: FundamentalFit) -> TwoView: ...
+    def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView: ...
 
 
 class TrackBuilder(Protocol):

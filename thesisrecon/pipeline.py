@@ -230,7 +230,7 @@ def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int,
         )
         candidates = len(matches.xy1)
         fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
-        return config.verification.verify(matches, fit)
+        return config.verification.verify(matches, fit, rng)
     except StageFailure as failure:
         return _refused_pair(pair, candidates, str(failure))
 

@@ -22,7 +22,11 @@ def as_matches(xy1, xy2) -> Matches:
 def verified(pair: Pair, *, outliers: float, seed: int = 0, variant: PairVerification | None = None):
     xy1, xy2, wrong = spoil(pair, np.random.default_rng(seed), sigma=0.3, outliers=outliers)
     fit = estimate_fundamental(xy1, xy2)
-    return (variant or PairVerification()).verify(as_matches(xy1, xy2), fit), fit, wrong
+    return (
+        (variant or PairVerification()).verify(as_matches(xy1, xy2), fit, np.random.default_rng(0)),
+        fit,
+        wrong,
+    )
 
 
 def test_a_good_pair_keeps_its_inliers_and_is_accepted():
@@ -71,7 +75,9 @@ def test_a_small_share_is_refused_with_numbers():
 def test_unrelated_matches_are_refused():
     rng = np.random.default_rng(5)
     xy1, xy2 = rng.uniform((0, 0), SIZE, (300, 2)), rng.uniform((0, 0), SIZE, (300, 2))
-    pair = PairVerification().verify(as_matches(xy1, xy2), estimate_fundamental(xy1, xy2))
+    pair = PairVerification().verify(
+        as_matches(xy1, xy2), estimate_fundamental(xy1, xy2), np.random.default_rng(0)
+    )
     assert not pair.accepted
     assert pair.reason
 
@@ -99,7 +105,9 @@ def test_verification_is_the_same_every_time_and_safe_on_nothing():
     xy = np.random.default_rng(0).uniform(0, 100, (12, 2))
     for inliers in (np.zeros(12, bool), np.arange(12) < 4, np.ones(12, bool)):
         fit = FundamentalFit(np.diag([1.0, 1.0, 0.0]) / np.sqrt(2), inliers, 0.1, np.zeros((9, 9)))
-        first, second = (PairVerification().verify(as_matches(xy, xy), fit) for _ in range(2))
+        first, second = (
+            PairVerification().verify(as_matches(xy, xy), fit, np.random.default_rng(0)) for _ in range(2)
+        )
         assert first.homography_share == second.homography_share
         assert np.isfinite(first.homography_share)
         assert not first.accepted
@@ -109,7 +117,7 @@ def test_wrong_calls():
     xy = np.random.default_rng(0).uniform(0, 100, (12, 2))
     fit = FundamentalFit(np.eye(3), np.ones(11, bool), 0.1, np.zeros((9, 9)))
     with pytest.raises(ValueError, match="11"):
-        PairVerification().verify(as_matches(xy, xy), fit)
+        PairVerification().verify(as_matches(xy, xy), fit, np.random.default_rng(0))
     with pytest.raises(ValueError, match="min_inliers"):
         PairVerification(min_inliers=3)
     with pytest.raises(ValueError, match="min_share"):

@@ -38,7 +38,7 @@ class PairVerification:
         if not 0.0 <= self.min_share <= 1.0 or not self.homography_px > 0.0:
             raise ValueError("min_share must lie in [0, 1] and homography_px be positive")
 
-    def verify(self, matches: Matches, fit: FundamentalFit) -> TwoView:
+    def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
         """The pair with its verified matches and the decision.
 
         Raises ``ValueError`` where ``matches`` and ``fit`` do not have the same number of matches.
@@ -48,7 +48,6 @@ class PairVerification:
             raise ValueError(f"the fit has {kept.shape} inlier flags for {len(matches.xy1)} matches")
         xy1, xy2 = matches.xy1[kept], matches.xy2[kept]
         tolerance = max(self.homography_px, HOMOGRAPHY_SIGMAS * fit.sigma_px)
-        rng = np.random.default_rng((matches.i, matches.j))
         share = homography_share(fit.F, xy1, xy2, tolerance_px=tolerance, rng=rng)
         reason = self._objection(len(xy1), len(kept))
         return TwoView(
