@@ -64,7 +64,8 @@ class UpgradeAndBundle:
         3 C C' / tr - I) was made wrong by bad matches and is postponed too.
     rounds : final rounds of triangulation and adjustment of everything.
     model_floor_rel : floor of every stated standard deviation, relative to the focal: what the pinhole model
-        with one radial coefficient leaves unexplained in real lenses.
+        with one radial coefficient leaves unexplained in real lenses, and the pixels that are taken to be
+        square and are so only to one or two parts in a thousand.
     """
 
     principal_point_std: float = 0.01
@@ -75,7 +76,7 @@ class UpgradeAndBundle:
     min_points: int = 15
     max_rotation_residual: float = 0.3
     rounds: int = 2
-    model_floor_rel: float = 5e-4
+    model_floor_rel: float = 1e-3
 
     def refine(
         self,
