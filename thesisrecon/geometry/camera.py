@@ -123,13 +123,13 @@ def project(P: F64, X: F64) -> F64:
     return dehomogenize(Xh @ P.T)
 
 
-def distort(xy_normalized: F64, k1: float) -> F64:
-    """(x, y) (1 + k1 r^2): the one-parameter radial model on normalised image points (N, 2)."""
+def distort(xy_normalized: F64, k1: float | F64) -> F64:
+    """(x, y) (1 + k1 r^2): the one-parameter radial model on normalised image points (N, 2); k1 or (N, 1)."""
     r2 = np.sum(xy_normalized**2, axis=-1, keepdims=True)
     return np.asarray(xy_normalized * (1.0 + k1 * r2))
 
 
-def undistort(xy_normalized: F64, k1: float, *, iterations: int = 30) -> F64:
+def undistort(xy_normalized: F64, k1: float | F64, *, iterations: int = 30) -> F64:
     """Inverse of :func:`distort` by fixed-point iteration; exact to rounding for |k1| r^2 < 0.3."""
     undistorted = xy_normalized
     for _ in range(iterations):

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.geometry.camera import distort, undistort
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.optimize.metric_bundle import MetricCameras
 from thesisrecon.optimize.triangulation_refine import refine_points
 from thesisrecon.types import B8, I64, Tracks
 
 F64 = NDArray[np.float64]
-
-RAYLEIGH_MEDIAN = 1.1774
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,7 @@ def project_observations(cameras: MetricCameras, X: F64, view: I64, point: I64) 
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         xy = Y[:, :2] / Y[:, 2:]
         k1 = cameras.intrinsics[cameras.group, 5][view]
-        xy = xy * (1.0 + k1 * np.sum(xy**2, axis=1))[:, None]
-        return apply_calibration(cameras, view, xy), Y[:, 2]
+        return apply_calibration(cameras, view, distort(xy, k1[:, None])), Y[:, 2]
 
 
 def apply_calibration(cameras: MetricCameras, view: I64, xy: F64) -> F64:
@@ -60,11 +58,7 @@ def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     f, aspect, skew, cx, cy, k1 = cameras.intrinsics[cameras.group[view]].T
     y = (xy[:, 1] - cy) / (aspect * f)
     distorted = np.column_stack([(xy[:, 0] - cx - skew * y) / f, y])
-    result = distorted
-    if np.any(k1 != 0.0):
-        for _ in range(10):
-            result = distorted / (1.0 + k1 * np.sum(result**2, axis=1))[:, None]
-    return result
+    return undistort(distorted, k1[:, None], iterations=10) if np.any(k1 != 0.0) else distorted
 
 
 def retriangulate(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:

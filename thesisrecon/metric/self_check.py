@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from thesisrecon.metric.model import MetricModel, agreeing_observations, residual_norms
+from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.types import IntrinsicInterval, SelfCalibration
 
 _FOCAL_RANGE = (0.2, 20.0)
@@ -38,7 +39,7 @@ def self_check(
             intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views
         ),
         "explained_share": float(agreeing_observations(model, sigmas=sigmas)[near].mean()),
-        "sigma_rel": float(np.median(residual_norms(model)) / 1.1774 / np.median(longest))
+        "sigma_rel": float(noise_from_distances(residual_norms(model)) / np.median(longest))
         if model.ok.any()
         else np.inf,
         "principal_shift_max_long_sides": float(

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from thesisrecon.errors import StageFailure
 from thesisrecon.metric.intervals import intrinsic_intervals
 from thesisrecon.metric.model import (
-    RAYLEIGH_MEDIAN,
     MetricModel,
     mark,
     residual_norms,
@@ -31,6 +30,7 @@ from thesisrecon.optimize.metric_bundle import (
     MetricCameras,
     refine_metric_bundle,
 )
+from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.types import (
     B8,
     I64,
@@ -198,8 +198,8 @@ class UpgradeAndBundle:
             prior=self._prior(model, focal_prior), sigma_px=model.sigma_px, loss_px=2.0 * model.sigma_px,
             max_iterations=iterations, covariance=covariance,
         )  # fmt: skip
-        median = float(np.median(np.linalg.norm(result.residual_px, axis=1)))
-        sigma = max(median / RAYLEIGH_MEDIAN, self.noise_floor_px)
+        norms = np.asarray(np.linalg.norm(result.residual_px, axis=1))
+        sigma = max(noise_from_distances(norms), self.noise_floor_px)
         return replace(model, cameras=result.cameras, X=result.X, sigma_px=sigma), result, k
 
     def _prior(self, model: MetricModel, focal_prior: FocalPrior | None) -> IntrinsicsPrior:
@@ -282,7 +282,7 @@ def _as_reconstruction(model: MetricModel, reasons: list[str]) -> Reconstruction
     k1 = np.where(registered, model.cameras.intrinsics[model.cameras.group, 5], 0.0)
     X = np.where(model.valid[:, None], np.column_stack([model.X, np.ones(len(model.X))]), 0.0)
     norms = residual_norms(model)
-    sigma = float(np.median(norms)) / RAYLEIGH_MEDIAN if len(norms) else model.sigma_px
+    sigma = noise_from_distances(norms) if len(norms) else model.sigma_px
     return Reconstruction(
         "metric",
         P,

@@ -32,6 +32,7 @@ from thesisrecon.projective.selection import (
     subset_tracks,
     tracks_with_parallax,
 )
+from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.types import B8, I64, Reconstruction, Tracks, TwoView
 
 F64 = NDArray[np.float64]
@@ -201,8 +202,8 @@ class GatedIncremental:
         )  # fmt: skip
         state.P, state.X = _whitened(result.P, result.X, state)
         norm = np.linalg.norm(result.residual_px, axis=1)
-        # Median of a Rayleigh variable is 1.1774 sigma; two-view points carry less residual than noise.
-        state.sigma_px = max(float(np.median(norm)) / 1.1774, self.noise_floor_px)
+        # Two-view points carry less residual than noise: hence the floor.
+        state.sigma_px = max(noise_from_distances(norm), self.noise_floor_px)
         self._retriangulate(state, sigmas)
 
     def add_next_camera(self, state: GrowingModel, rng: np.random.Generator) -> bool:

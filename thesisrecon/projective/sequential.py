@@ -53,6 +53,5 @@ class SequentialProjective:
         state = engine.begin(tracks, candidates[attempt], sizes)
         while engine.add_next_camera(state, rng):
             pass
-        finished = GatedIncremental(outlier_sigmas=engine.outlier_sigmas, final_rounds=1)
-        finished.adjust(state, 10, self.outlier_sigmas)
+        engine.adjust(state, 10, self.outlier_sigmas)
         return finish(state)

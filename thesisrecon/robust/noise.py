@@ -10,6 +10,7 @@ F64 = NDArray[np.float64]
 MAD_FACTOR = 1.4826022185056018
 """1 / Phi^-1(0.75): the thesis' text divides by Phi(0.75), which is not consistent."""
 ENDED, WIDENINGS = 0.22, 6
+RAYLEIGH_MEDIAN = 1.1774
 CUT, CUT_VARIANCE, TRIMMINGS = 2.5, 0.91125, 5
 """Where the noise is cut, and the variance of a standard normal variable cut there."""
 
@@ -63,3 +64,11 @@ def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) ->
             return start
         sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / CUT_VARIANCE))
     return sigma
+
+
+def noise_from_distances(distances: F64) -> float:
+    """Standard deviation of one coordinate from the lengths (N,) of two-dimensional residuals, N > 0.
+
+    The median of a Rayleigh variable is 1.1774 sigma.
+    """
+    return float(np.median(distances)) / RAYLEIGH_MEDIAN
