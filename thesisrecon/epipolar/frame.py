@@ -31,7 +31,7 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
         raise StageFailure(
             "too few matches for the geometry of the pair",
             f"found {len(xy1)}, needed at least {needed}",
-            "Use photographs that overlap more",
+            "use photographs that overlap more",
         )
     for name, xy in (("first", xy1), ("second", xy2)):
         if _clearly_spread(xy):
@@ -41,7 +41,7 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
             raise StageFailure(
                 f"the matched points lie on one line in the {name} image",
                 f"{len(xy)} points, spread across the line {spread[1] / np.sqrt(len(xy)):.3g} px",
-                "Such points leave the geometry of the pair free",
+                "such points leave the geometry of the pair free",
             )
     return xy1, xy2
 

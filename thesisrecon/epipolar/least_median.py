@@ -51,7 +51,7 @@ class LeastMedianOfSquares:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
                 f"none of {self.samples} samples of seven of {len(xy1)} matches determines one",
-                "The matches may be repeated or lie on few points",
+                "the matches may be repeated or lie on few points",
             )
         F = frame.matrix_in_pixels(found)
         sigma, inliers = discard_outliers(F, xy1, xy2)

@@ -40,7 +40,7 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
         raise StageFailure(
             "the matches leave the fundamental matrix free",
             f"the equations of {len(xy1)} matches have rank below 8",
-            "Matches on one plane do that; some off the plane are needed",
+            "matches on one plane do that; some off the plane are needed",
         )
     F = Vt[8].reshape(3, 3)
     return unit_norm(T2.T @ (enforce_rank_two(F) if rank_two else F) @ T1)

@@ -81,7 +81,7 @@ class ThesisRansac:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
                 f"{self.samples} samples, none with {MINIMUM} of {len(xy1)} matches close enough",
-                "The photographs may not overlap, or the matches are wrong",
+                "the photographs may not overlap, or the matches are wrong",
             )
         F, sigma = frame.matrix_in_pixels(found.model), 0.0
         _, inliers = discard_outliers(F, xy1, xy2, limit_px=self.threshold_px)

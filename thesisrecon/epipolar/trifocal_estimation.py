@@ -105,7 +105,7 @@ def estimate_trifocal(
         raise StageFailure(
             "too few matches for the geometry of three views",
             f"found {n} points and {m} lines, needed 7 points, 13 lines or a mixture",
-            "Use photographs that overlap more",
+            "use photographs that overlap more",
         )
     equations = tensor_equations(points, segments)
     try:
@@ -114,7 +114,7 @@ def estimate_trifocal(
         raise StageFailure(
             "the matches do not determine the geometry of three views",
             f"{n} points and {m} lines in a special position",
-            "Use matches that do not lie on one plane",
+            "use matches that do not lie on one plane",
         ) from error
     T = equations.in_pixels(minimize_algebraic_error(equations, start))
     fit = refine_trifocal(T, points, segments, loss_px=loss_px, max_iterations=max_iterations)
@@ -131,7 +131,7 @@ def _refuse_weak(fit: TrifocalFit, xy: F64) -> None:
             "the matches do not determine the geometry of three views",
             f"noise {fit.sigma_px:.2g} px, narrowest spread of the matches {narrowest:.3g} px, "
             f"weakness {fit.weakness:.2g} where {WEAK:.2g} is the most",
-            "Use matches of more than one plane from three places; wrong matches look like this, too",
+            "use matches of more than one plane from three places; wrong matches look like this, too",
         )
 
 
