@@ -12,8 +12,8 @@ from thesisrecon.epipolar.covariance import fundamental_covariance
 from thesisrecon.epipolar.degeneracy import Configuration, classify_configuration
 from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.epipolar.precision import (
-    epipolar_distance_std,
-    epipoles_with_covariance,
+    epipolar_distance_interval,
+    epipoles_of,
     fundamental_bound,
 )
 from thesisrecon.geometry.homogeneous import homogenize
@@ -24,7 +24,7 @@ from validation.scenes.two_views import make_two_views
 
 F64 = NDArray[np.float64]
 GOLD, DEFAULT = "gold standard", "default"
-CHI2_2_95 = 5.991464547107979
+DISTANCES, EPIPOLES, PIXELS = INTERVALS = ("distances", "epipoles", "epipoles in pixels")
 NOISES_PX = (0.1, 0.25, 0.5, 1.0, 2.0)
 
 
@@ -42,8 +42,7 @@ def gold_standard(xy1: F64, xy2: F64) -> FundamentalFit:
 def check_precision(sigma_px: float, n: int, trials: int) -> list[Metric]:
     """RMS distance over the bound, and coverage of the 95 % intervals of distances and of epipoles."""
     ratios: dict[str, list[float]] = {GOLD: [], DEFAULT: []}
-    distances: dict[str, list[float]] = {GOLD: [], DEFAULT: []}
-    poles: dict[str, list[float]] = {GOLD: [], DEFAULT: []}
+    held: dict[str, dict[str, list[float]]] = {w: {GOLD: [], DEFAULT: []} for w in INTERVALS}
     for seed in range(trials):
         rng = np.random.default_rng(seed)
         scene = make_two_views(Configuration.GENERAL, n, rng)
@@ -53,27 +52,20 @@ def check_precision(sigma_px: float, n: int, trials: int) -> list[Metric]:
             squared = np.mean(symmetric_residuals(fit.F, scene.xy1, scene.xy2) ** 2) / 2.0
             ratios[name].append(float(squared) / bound.rms_distance_px**2)
             off = np.abs(np.sum(homogenize(scene.xy2) * epipolar_lines(fit.F, scene.xy1), axis=1))
-            std = epipolar_distance_std(fit.F, fit.covariance, scene.xy1, scene.xy2)
-            distances[name].append(float(np.mean(off <= 1.96 * std)))
-            poles[name].append(_epipoles_inside(fit, bound.F))
+            half = epipolar_distance_interval(fit, scene.xy1, scene.xy2)
+            truths = list(zip(epipoles_of(fit), epipoles(bound.F), strict=True))
+            held[DISTANCES][name].append(float(np.mean(off <= half)))
+            held[EPIPOLES][name].append(float(np.mean([e.contains(t) for e, t in truths])))
+            held[PIXELS][name].append(float(np.mean([e.contains_xy(t[:2] / t[2]) for e, t in truths])))
     scene_name = f"sigma {sigma_px:g} px, n = {n}"
     rms = {name: float(np.sqrt(np.mean(values))) for name, values in ratios.items()}
     rows = [Metric(scene_name, "RMS distance over bound", "", rms, name, 1.05) for name in rms]
-    for what, values in (("distances", distances), ("epipoles", poles)):
+    for what, values in held.items():
         mean = {name: float(np.mean(v)) for name, v in values.items()}
         for name in mean:
             rows.append(Metric(scene_name, f"coverage of {what}", "", mean, name, 0.93, at_most=False))
             rows.append(Metric(scene_name, f"coverage of {what}", "", mean, name, 0.97))
     return rows
-
-
-def _epipoles_inside(fit: FundamentalFit, truth: F64) -> float:
-    inside = []
-    for found, true in zip(epipoles_with_covariance(fit.F, fit.covariance), epipoles(truth), strict=True):
-        values, vectors = np.linalg.eigh(found.covariance)
-        z = (true * np.sign(true @ found.direction) - found.direction) @ vectors[:, 1:]
-        inside.append(float(np.sum(z**2 / values[1:]) <= CHI2_2_95))
-    return float(np.mean(inside))
 
 
 def check_degeneracy(sigma_px: float, n: int, trials: int) -> list[Metric]:
