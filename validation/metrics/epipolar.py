@@ -1,0 +1,41 @@
+"""How far an estimate of F is from the truth, and how well its inliers are told from the wrong matches."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.multiview import sampson_residuals, symmetric_residuals
+
+F64 = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+NONE_PX = 99.0
+"""The error of a method that gave no F, and the largest that is told."""
+
+
+def rms_epipolar_distance(F: F64 | None, truth: F64) -> float:
+    """RMS distance, px, of right correspondences (M, 4) to their epipolar lines over both images (5.6).
+
+    At most ``NONE_PX``, which stands for no F too.
+    """
+    if F is None:
+        return NONE_PX
+    d = symmetric_residuals(F, truth[:, :2], truth[:, 2:])
+    return float(min(np.sqrt(np.mean(d**2) / 2.0), NONE_PX))
+
+
+def rms_sampson_distance(F: F64 | None, truth: F64) -> float:
+    """RMS Sampson distance (5.4), px, of right correspondences (M, 4); at most ``NONE_PX``."""
+    if F is None:
+        return NONE_PX
+    return float(min(np.sqrt(np.mean(sampson_residuals(F, truth[:, :2], truth[:, 2:]) ** 2)), NONE_PX))
+
+
+def precision_recall(inliers: BoolArray, right: BoolArray) -> tuple[float, float]:
+    """Share of the inliers (N,) that are right, and of the right matches (N,) that are inliers.
+
+    Without inliers both are 0.
+    """
+    both = float(np.sum(inliers & right))
+    return both / max(float(inliers.sum()), 1.0), both / max(float(right.sum()), 1.0)

@@ -1,0 +1,113 @@
+"""F of matches by OpenCV, COLMAP and PoseLib beside ours, behind one signature.
+
+Every method is given the matches in an order that the seed draws: OpenCV's generators start from a fixed
+state, so only the order makes its runs differ. Libraries with a seed get it too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import poselib
+import pycolmap
+from numpy.typing import NDArray
+
+from thesisrecon.epipolar import estimate_fundamental
+from thesisrecon.errors import StageFailure
+
+F64 = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Answer = tuple[Any, Any, F64 | None]
+
+OURS = "ours"
+CONFIDENCE, ITERATIONS = 0.9999, 20000
+"""What OpenCV is given beyond its defaults (0.99 and 1000)."""
+MIN_ITERATIONS = 10000
+"""What COLMAP and PoseLib are given beyond their defaults (1000; both end at 0.9999 or 100000 anyway)."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """``F`` (3, 3), None where the method gave none, ``inliers`` (N,) as the method tells them, and where
+    there is one the ``covariance`` (9, 9)."""
+
+    F: F64 | None
+    inliers: BoolArray
+    covariance: F64 | None = None
+
+
+Solver = Callable[[F64, F64, float, int], Answer]
+
+
+def _ours(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+    try:
+        fit = estimate_fundamental(xy1, xy2, threshold_px=threshold_px, seed=seed)
+    except StageFailure:
+        return None, None, None
+    return fit.F, fit.inliers, fit.covariance
+
+
+def _opencv(method: int, confidence: float = 0.99, iterations: int = 1000) -> Solver:
+    def solve(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
+        F, told = cv2.findFundamentalMat(xy1, xy2, method, threshold_px, confidence, iterations)
+        return F, told, None
+
+    return solve
+
+
+def _colmap(**options: int) -> Solver:
+    def solve(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+        settings = pycolmap.RANSACOptions(max_error=threshold_px, random_seed=seed, **options)
+        found = pycolmap.estimate_fundamental_matrix(xy1, xy2, settings)
+        return (None, None, None) if found is None else (found["F"], found["inlier_mask"], None)
+
+    return solve
+
+
+def _poselib(**options: int) -> Solver:
+    def solve(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+        settings = {"max_epipolar_error": threshold_px, "seed": seed, **options}
+        F, told = poselib.estimate_fundamental(xy1, xy2, settings, {})
+        return F, told["inliers"], None
+
+    return solve
+
+
+_LONG: tuple[float, int] = (CONFIDENCE, ITERATIONS)
+SOLVERS: dict[str, Solver] = {
+    OURS: _ours,
+    "USAC_ACCURATE": _opencv(cv2.USAC_ACCURATE, *_LONG),
+    "USAC_ACCURATE default": _opencv(cv2.USAC_ACCURATE),
+    "USAC_MAGSAC": _opencv(cv2.USAC_MAGSAC, *_LONG),
+    "USAC_MAGSAC default": _opencv(cv2.USAC_MAGSAC),
+    "FM_RANSAC": _opencv(cv2.FM_RANSAC, *_LONG),
+    "FM_RANSAC default": _opencv(cv2.FM_RANSAC),
+    "FM_LMEDS": _opencv(cv2.FM_LMEDS, *_LONG),
+    "COLMAP": _colmap(),
+    "COLMAP long": _colmap(min_num_trials=MIN_ITERATIONS),
+    "PoseLib": _poselib(),
+    "PoseLib long": _poselib(min_iterations=MIN_ITERATIONS),
+}
+"""All methods by name: OpenCV's with ``CONFIDENCE`` and ``ITERATIONS``, or as it comes ("default"); COLMAP
+and PoseLib as they come, or with ``MIN_ITERATIONS`` ("long")."""
+
+
+def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed: int) -> Estimate:
+    """F and inliers of matches (N, 2) px by one of ``SOLVERS``; never raises for hard data.
+
+    The inliers are in the order of the matches, whatever order the method saw.
+    """
+    order = np.random.default_rng(seed).permutation(len(xy1))
+    some1, some2 = np.ascontiguousarray(xy1[order]), np.ascontiguousarray(xy2[order])
+    F, told, covariance = SOLVERS[method](some1, some2, threshold_px, seed)
+    inliers = np.zeros(len(xy1), dtype=bool)
+    F = None if F is None else np.asarray(F, dtype=np.float64)
+    # OpenCV answers with nothing, zeros or three stacked matrices where it failed.
+    if F is None or F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
+        return Estimate(None, inliers)
+    inliers[order] = np.asarray(told).ravel() > 0
+    return Estimate(F, inliers, covariance)

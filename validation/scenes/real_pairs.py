@@ -1,0 +1,143 @@
+"""Pairs of real photographs with matches and their truth: what estimates of F are held against.
+
+SIFT matches are OpenCV's and kept in a folder, so that they are found once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from thesisrecon.geometry.camera import compose_camera
+from thesisrecon.geometry.multiview import fundamental_from_cameras, sampson_residuals
+from thesisrecon.geometry.optimal_triangulation import correct_matches
+from thesisrecon.geometry.triangulation import triangulate_linear
+from validation.scenes.real import data_root, load_real_scene
+
+F64 = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+HAND_MADE_RATIO, CAMERA_RATIO = 0.85, 0.8
+CONSISTENT_PX = 1.5
+"""Sampson distance to the true F within which a match of a scene with cameras counts as right."""
+FARTHEST = 3.0
+"""Depth in medians beyond which such a match is a wrong one that happens to lie on its line."""
+ADELAIDE = ("biscuit", "book")
+SCENES_WITH_CAMERAS = ("fountain-P11", "Herz-Jesus-P8")
+
+
+@dataclass(frozen=True)
+class RealPair:
+    """Matches ``xy1``, ``xy2`` (N, 2) px, and what is known: ``truth`` (M, 4) right correspondences that no
+    method is given, ``right`` (N,) whether each match is right, ``F`` (3, 3) of the true cameras."""
+
+    name: str
+    xy1: F64
+    xy2: F64
+    truth: F64 | None = None
+    right: BoolArray | None = None
+    F: F64 | None = None
+
+
+def match_photographs(
+    paths: tuple[Path, Path], cache: Path, *, ratio: float, mutual: bool
+) -> tuple[F64, F64]:
+    """OpenCV's SIFT matches (N, 2), (N, 2) with the nearest descriptor below ``ratio`` times the second;
+    with ``mutual`` each must be the other's nearest."""
+    name = "-".join([paths[0].parent.parent.name, *(f"{p.parent.name}-{p.stem}" for p in paths)])
+    kept = cache / f"{name}-{ratio:g}-{'mutual' if mutual else 'one-way'}.npy"
+    if kept.is_file():
+        found = np.load(kept)
+        return found[:, :2].copy(), found[:, 2:].copy()
+    (xy1, d1), (xy2, d2) = (_sift(path) for path in paths)
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    # One feature of the second image may be the nearest of many in the first: a fact of plain ratio matching.
+    pairs = [
+        (m.queryIdx, m.trainIdx)
+        for m, second in matcher.knnMatch(d1, d2, k=2)
+        if m.distance < ratio * second.distance
+    ]
+    if mutual:
+        back = {m.queryIdx: m.trainIdx for m in matcher.match(d2, d1)}
+        pairs = [(a, b) for a, b in pairs if back[b] == a]
+    index = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    found = np.hstack([xy1[index[:, 0]], xy2[index[:, 1]]])
+    cache.mkdir(parents=True, exist_ok=True)
+    np.save(kept, found)
+    return found[:, :2].copy(), found[:, 2:].copy()
+
+
+@lru_cache(maxsize=16)
+def _sift(path: Path) -> tuple[F64, NDArray[np.float32]]:
+    with Image.open(path) as photograph:
+        grey = np.asarray(photograph.convert("L"))
+    keypoints, descriptors = cv2.SIFT.create().detectAndCompute(grey, None)
+    return np.array([k.pt for k in keypoints], dtype=np.float64), np.asarray(descriptors, dtype=np.float32)
+
+
+def kusvod2_pairs(cache: Path, names: tuple[str, ...] | None = None) -> Iterator[RealPair]:
+    """The pairs of Lebeda, Matas and Chum (BMVC 2012) with their hand-made correspondences as ``truth``.
+
+    Nothing where the photographs are not on this machine; ``names`` picks some.
+    """
+    root = data_root()
+    for folder in sorted((root / "kusvod2").iterdir()) if root and (root / "kusvod2").is_dir() else []:
+        if folder.is_dir() and (names is None or folder.name in names):
+            paths = (folder / "A.jpg", folder / "B.jpg")
+            xy1, xy2 = match_photographs(paths, cache, ratio=HAND_MADE_RATIO, mutual=False)
+            yield RealPair(folder.name, xy1, xy2, truth=np.loadtxt(folder / "validation.txt", ndmin=2)[:, :4])
+
+
+def camera_pairs(scene_name: str, cache: Path, gaps: tuple[int, ...] = (1, 2)) -> Iterator[RealPair]:
+    """Pairs (i, i + gap) of a scene with known cameras; ``truth`` is free of noise.
+
+    Its points are the matches that agree with the cameras, moved to where they agree exactly, so they lie
+    where the scene has texture. Nothing where the photographs are not on this machine.
+    """
+    scene = load_real_scene(scene_name)
+    if scene is None or scene.K is None or scene.R is None or scene.C is None:
+        return
+    cameras = [compose_camera(K, R, -R @ C) for K, R, C in zip(scene.K, scene.R, scene.C, strict=True)]
+    for gap in gaps:
+        for i in range(len(cameras) - gap):
+            paths = (scene.image_paths[i], scene.image_paths[i + gap])
+            xy1, xy2 = match_photographs(paths, cache, ratio=CAMERA_RATIO, mutual=True)
+            F = fundamental_from_cameras(cameras[i], cameras[i + gap])
+            truth = exact_correspondences(cameras[i], cameras[i + gap], xy1, xy2)
+            yield RealPair(f"{scene_name} {i}-{i + gap}", xy1, xy2, truth=truth, F=F)
+
+
+def exact_correspondences(P1: F64, P2: F64, xy1: F64, xy2: F64) -> F64:
+    """The matches (N, 2) that agree with the cameras (3, 4), corrected to agree exactly; (M, 4).
+
+    They lie within ``CONSISTENT_PX`` of the epipolar constraint, before both cameras and no farther than
+    ``FARTHEST`` median depths. Both cameras need to be [K R, K t] with det K > 0.
+    """
+    F = fundamental_from_cameras(P1, P2)
+    near = np.abs(sampson_residuals(F, xy1, xy2)) < CONSISTENT_PX
+    exact1, exact2 = correct_matches(F, xy1[near], xy2[near])
+    Xh = triangulate_linear(np.stack([P1, P2]), np.stack([exact1, exact2]))
+    depths = np.stack([Xh @ P1[2], Xh @ P2[2]]) / Xh[:, 3]
+    typical = np.median(depths, axis=1, keepdims=True)
+    seen = np.all((depths > 0.0) & (depths < FARTHEST * typical), axis=0)
+    return np.hstack([exact1, exact2])[seen]
+
+
+def adelaide_pairs() -> Iterator[RealPair]:
+    """The matches of AdelaideRMF (Wong et al., ICCV 2011) with their labels as ``right``.
+
+    Nothing where they are not on this machine.
+    """
+    root = data_root()
+    for name in ADELAIDE:
+        path = root / "adelaide" / name / "matches.txt" if root else None
+        if path is not None and path.is_file():
+            rows = np.loadtxt(path, skiprows=1)
+            yield RealPair(name, rows[:, :2].copy(), rows[:, 2:4].copy(), right=rows[:, 4] > 0)
