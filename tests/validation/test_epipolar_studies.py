@@ -1,0 +1,175 @@
+"""The studies of chapter 5 in small: what they claim of the methods holds, and their tables are whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+pytest.importorskip("poselib")
+pytest.importorskip("pycolmap")
+
+from thesisrecon.errors import StageFailure
+from validation.checks import epipolar_cube, epipolar_methods
+from validation.checks.epipolar_catalogue import (
+    DEFAULT,
+    GOLD,
+    GOLD_FROM_DEFAULT,
+    METHODS,
+    NORMALISED,
+    OURS,
+    RAW,
+    Method,
+)
+from validation.checks.epipolar_cube import BOUND, CubeRow, cube_pairs, run_cube
+from validation.checks.epipolar_methods import (
+    Result,
+    Setting,
+    make_trial,
+    measure,
+    merged,
+    read_results,
+    run_study,
+    write_results,
+)
+from validation.scenes.cube import make_cube
+
+BY_NAME = {m.name: m for m in METHODS}
+CRITERIA = ("gradient (5.4)", "epipolar distance (5.6)", "gold standard")
+
+
+@pytest.fixture(scope="module")
+def clean() -> dict[str, Result]:
+    """Every method at 1 px and 60 matches, 40 trials, by its label."""
+    return {r.label: r for r in run_study([Setting(1.0, 60)], METHODS, 40)}
+
+
+@pytest.fixture(scope="module")
+def cube() -> dict[tuple[str, float], CubeRow]:
+    """The methods of the cube study on 12 of its pairs."""
+    methods = [BY_NAME[name] for name in epipolar_cube.CUBE_METHODS]
+    rows = run_cube(cube_pairs(make_cube())[::12], methods, (0.0, 0.5, 2.0))
+    return {(r.method, r.sigma_px): r for r in rows}
+
+
+def test_the_gold_standard_is_at_the_bound_and_nothing_is_far_below_it(clean: dict[str, Result]) -> None:
+    assert clean[GOLD].rms_ratio < 1.15
+    assert clean[f"{DEFAULT}, 3 sigma"].rms_ratio < 1.15
+    assert min(r.rms_ratio for r in clean.values()) > 0.85
+    assert all(r.failures == 0 and r.time_ms > 0.0 for r in clean.values())
+
+
+def test_normalised_pixels_are_better_than_raw_ones_and_a_criterion_better_than_both(
+    clean: dict[str, Result],
+) -> None:
+    assert clean[GOLD].rms_ratio < clean[NORMALISED].rms_ratio < 0.5 * clean[RAW].rms_ratio
+    assert clean[NORMALISED].rms_ratio == pytest.approx(clean["OpenCV FM_8POINT"].rms_ratio, rel=1e-3)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_both_parameterisations_reach_one_minimum(criterion: str) -> None:
+    for seed in range(10):
+        trial = make_trial(Setting(0.5, 50), seed)
+        rows, orthonormal = (
+            BY_NAME[f"{criterion}, {kind}"].fundamental(trial.xy1, trial.xy2, threshold_px=1.0, seed=0)
+            for kind in ("thesis' rows", "orthonormal")
+        )
+        assert rows is not None
+        assert orthonormal is not None
+        assert min(np.linalg.norm(rows - s * orthonormal) for s in (1.0, -1.0)) < 1e-6
+
+
+def test_wrong_matches_are_for_robust_methods_alone() -> None:
+    setting = Setting(0.5, 100, 0.2)
+    trial = make_trial(setting, 0)
+    assert len(trial.xy1) == 100
+    assert len(trial.exact1) == 80
+    some = [BY_NAME[name] for name in (GOLD, "Algorithm 2, gradient", "least median of squares", DEFAULT)]
+    results = {r.label: r for r in run_study([setting], some, 8)}
+    assert GOLD not in results
+    assert results[f"{DEFAULT}, 3 sigma"].rms_ratio < 1.4
+    assert results["least median of squares"].rms_ratio < 2.5
+    assert BY_NAME[GOLD].fundamental(trial.xy1, trial.xy2, threshold_px=1.0, seed=0) is not None
+    assert measure(BY_NAME[GOLD], [trial], setting).rms_ratio > 5.0
+
+
+def test_a_method_without_an_answer_is_counted() -> None:
+    def refuse(*_: object) -> None:
+        raise StageFailure("no")
+
+    result = measure(Method("none", refuse), [make_trial(Setting(1.0, 20), 0)], Setting(1.0, 20))
+    assert (result.failures, result.trials) == (1, 1)
+    assert np.isinf(result.rms_ratio)
+    assert "1 none" in epipolar_methods.report([result])
+
+
+def test_results_are_kept_and_renewed(tmp_path: Path, clean: dict[str, Result]) -> None:
+    path = tmp_path / "new" / "results.json"
+    write_results(path, list(clean.values()))
+    assert read_results(path) == list(clean.values())
+    newer = Result(GOLD, Setting(1.0, 60), False, 1.0, 1.0, 1.0, 0, 1)
+    other = Result(GOLD, Setting(1.0, 70), False, 1.0, 1.0, 1.0, 0, 1)
+    together = merged(read_results(path), [newer, other])
+    assert len(together) == len(clean) + 1
+    assert newer in together
+    assert together[-1] == other
+    table = epipolar_methods.report(together)
+    assert all(f"| {label} |" in table for label in clean)
+
+
+def test_pairs_of_the_cube_share_more_than_a_face() -> None:
+    sequence = make_cube()
+    pairs = cube_pairs(sequence)
+    assert 100 < len(pairs) < 27 * 26 / 2
+    for pair in pairs:
+        assert min(np.ptp(pair.X, axis=0)) > 0.5
+
+
+def test_perfect_projections_give_perfect_epipolar_lines(cube: dict[tuple[str, float], CubeRow]) -> None:
+    for name in epipolar_cube.CUBE_METHODS:
+        assert cube[name, 0.0].worst_px < 1e-8
+        assert cube[name, 0.0].failures == 0
+
+
+def test_the_cube_orders_the_methods(cube: dict[tuple[str, float], CubeRow]) -> None:
+    for sigma in (0.5, 2.0):
+        gold, linear, raw = (cube[m, sigma] for m in (GOLD_FROM_DEFAULT, NORMALISED, RAW))
+        assert gold.ratio < 1.25
+        assert gold.ratio < linear.ratio < raw.ratio
+        assert gold.epipole_deg < raw.epipole_deg
+        assert cube[BOUND, sigma].within == 1.0
+        assert 1.25 * cube[BOUND, sigma].distance_px > gold.distance_px
+        assert gold.residual_px == pytest.approx(1.4142 * sigma, rel=0.1)
+    assert cube["Algorithm 2, seven-point search alone", 2.0].ratio > 2.0
+
+
+def test_tables_and_plot_of_the_cube(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    some = ["--methods", NORMALISED, GOLD, "--every", "40", "--noise", "0", "1"]
+    monkeypatch.setattr("sys.argv", ["epipolar_cube", *some, "-o", str(tmp_path)])
+    assert epipolar_cube.main() == 0
+    text = (tmp_path / "cube.md").read_text(encoding="utf-8")
+    assert text in capsys.readouterr().out
+    assert text.count(f"| {GOLD} |") == len(epipolar_cube.MEASURES)
+    page = (tmp_path / "cube.html").read_text(encoding="utf-8")
+    assert "noise of each coordinate" in page
+    assert 'src="http' not in page
+
+
+def test_the_command_says_whether_the_bound_was_reached(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = ["epipolar_methods", "--trials", "30", "--points", "100", "--noise", "0.5", "--wrong", "0"]
+    out = tmp_path / "r.json"
+    monkeypatch.setattr("sys.argv", [*base, "--methods", NORMALISED, "-o", str(out)])
+    assert epipolar_methods.main() == 0
+    monkeypatch.setattr("sys.argv", [*base, "--methods", GOLD, "-o", str(out)])
+    code = epipolar_methods.main()
+    normalised, gold = read_results(out)
+    assert (normalised.method, gold.method) == (NORMALISED, GOLD)
+    assert code == (gold.rms_ratio > epipolar_methods.ALLOWED)
+    assert "RMS (median)" in capsys.readouterr().out
+    assert set(epipolar_cube.CUBE_METHODS) <= {m.name for m in OURS}
