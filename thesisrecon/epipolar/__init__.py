@@ -14,6 +14,8 @@ from thesisrecon.epipolar.refinement import (
     refine_reprojection,
 )
 from thesisrecon.epipolar.thesis_ransac import ThesisRansac
+from thesisrecon.epipolar.trifocal_estimation import TrifocalFit, estimate_trifocal, refine_trifocal
+from thesisrecon.epipolar.trifocal_ransac import RobustTrifocal, TrifocalRansac
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.types import FundamentalFit
 
@@ -21,13 +23,18 @@ __all__ = [
     "LeastMedianOfSquares",
     "LocallyOptimisedRansac",
     "PairVerification",
+    "RobustTrifocal",
     "ThesisRansac",
+    "TrifocalFit",
+    "TrifocalRansac",
     "estimate_eight_point",
     "estimate_fundamental",
     "estimate_seven_point",
+    "estimate_trifocal",
     "refine_epipolar_distance",
     "refine_gradient",
     "refine_reprojection",
+    "refine_trifocal",
 ]
 
 

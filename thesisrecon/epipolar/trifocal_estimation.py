@@ -37,6 +37,11 @@ WEAK = 0.4
 """Weakness beyond which a fit is refused. Planes, rotations and chance matches come out between 0.5 and 1.5
 at any noise; scenes with depth, noise being a hundredth of the parallax, below 0.1."""
 
+SAME_NOISE, FAMILY = 1.25, 6
+"""A fit is refused where noise up to 1.25 that of the fit explains a family of six tensors by the linear
+equations. Points or lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls 5 at
+most: what the linear equations leave free there, the constraints of the cameras determine."""
+
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 
 
@@ -118,19 +123,25 @@ def estimate_trifocal(
         ) from error
     T = equations.in_pixels(minimize_algebraic_error(equations, start))
     fit = refine_trifocal(T, points, segments, loss_px=loss_px, max_iterations=max_iterations)
-    _refuse_weak(fit, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
+    refuse_undetermined(fit, equations, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
     return fit
 
 
-def _refuse_weak(fit: TrifocalFit, xy: F64) -> None:
-    """``StageFailure`` where the noise alone decides the fit; xy (3, K, 2) all points and ends."""
+def refuse_undetermined(fit: TrifocalFit, equations: TensorEquations, xy: F64) -> None:
+    """``StageFailure`` where the noise alone decides the fit; xy (3, K, 2) all points and ends, in px.
+
+    Three kinds of evidence: noise like that of the fit explains many solutions of the linear equations; the
+    covariance of the fit; the matches are of one line of an image.
+    """
+    family = int(np.sum(equations.explained_px() <= SAME_NOISE * fit.sigma_px))
     across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
-    if fit.weakness > WEAK or not narrowest > 3.0 * fit.sigma_px:
+    if not (family < FAMILY and fit.weakness <= WEAK and narrowest > 3.0 * fit.sigma_px):
         raise StageFailure(
             "the matches do not determine the geometry of three views",
-            f"noise {fit.sigma_px:.2g} px, narrowest spread of the matches {narrowest:.3g} px, "
-            f"weakness {fit.weakness:.2g} where {WEAK:.2g} is the most",
+            f"noise {fit.sigma_px:.2g} px, which explains {family} independent tensors where {FAMILY - 1} "
+            f"is the most, narrowest spread of the matches {narrowest:.3g} px, weakness {fit.weakness:.2g} "
+            f"where {WEAK:.2g} is the most",
             "use matches of more than one plane from three places; wrong matches look like this, too",
         )
 

@@ -29,11 +29,13 @@ NEEDED_EQUATIONS = 26
 class TensorEquations:
     """A t = 0 for the entries t of the tensor, in conditioned coordinates of each image.
 
-    ``A`` (27, 27) is the triangular factor of all equations, with the same |A t|; ``transforms`` (3, 3, 3)
-    take pixels to the conditioned coordinates.
+    ``A`` (27, 27) is the triangular factor of all equations, with the same |A t|; ``noise`` (27, 27) that of
+    their derivatives by the pixels: |noise t|^2 is the mean of |A t|^2 for the true t and noise of 1 px;
+    ``transforms`` (3, 3, 3) take pixels to the conditioned coordinates.
     """
 
     A: F64
+    noise: F64
     transforms: F64
 
     def solve(self) -> F64:
@@ -47,6 +49,17 @@ class TensorEquations:
                 "the matches leave the trifocal tensor free; they need to be in general position"
             )
         return np.asarray(Vt[26].reshape(3, 3, 3))
+
+    def explained_px(self) -> F64:
+        """The noise that would explain each of 27 solutions of the equations, px, the best one first; (27,).
+
+        Roots of the eigenvalues of A'A relative to those of unit noise (renormalisation: Kanatani 1996).
+        Where the matches leave a family of tensors, as those of a plane, a rotation or parallel lines, as
+        many as the family has dimensions are their noise or less, at any noise.
+        """
+        values, vectors = np.linalg.eigh(self.noise.T @ self.noise)
+        whitening = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+        return np.asarray(np.linalg.svd(self.A @ whitening, compute_uv=False)[::-1])
 
     def solve_with_epipoles(self, e2: F64, e3: F64) -> F64:
         """T (3, 3, 3), unit norm, of cameras with given epipoles (3,) and least |A t| (HZ 16.3).
@@ -85,10 +98,45 @@ def tensor_equations(points: F64, segments: F64) -> TensorEquations:
     y = homogenize(segments) @ transforms.swapaxes(1, 2)[:, None]
     lines = unit_normals(np.cross(y[:, :, 0], y[:, :, 1]))
     axes2, axes3 = (_axis_parallel_lines(x[v]) for v in (1, 2))
-    of_points = np.einsum("ni,naj,nbk->nabijk", x[0], axes2, axes3).reshape(-1, 27)
-    of_lines = np.einsum("nei,nj,nk->neijk", y[0], lines[1], lines[2]).reshape(-1, 27)
-    rows = np.concatenate([of_points, of_lines, np.zeros((1, 27))])
-    return TensorEquations(np.asarray(np.linalg.qr(rows, mode="r")), transforms)
+    scales = transforms[:, 0, 0]
+    moves = np.eye(3)[:2], -np.eye(3)[2:], -np.eye(3)[2:]
+    of_points = [
+        _products(x[0][:, None], axes2, axes3),
+        _products(moves[0] * scales[0], axes2, axes3),
+        _products(x[0][:, None], moves[1] * scales[1], axes3, times=2),
+        _products(x[0][:, None], axes2, moves[2] * scales[2], times=2),
+    ]
+    of_lines = [
+        _products(y[0], lines[1][:, None], lines[2][:, None]),
+        _products(moves[0] * scales[0], lines[1][:, None], lines[2][:, None], times=2),
+        _products(y[0], _line_moves(y[1]) * scales[1], lines[2][:, None]),
+        _products(y[0], lines[1][:, None], _line_moves(y[2]) * scales[2]),
+    ]
+    return TensorEquations(
+        _triangular([of_points[0], of_lines[0]]), _triangular(of_points[1:] + of_lines[1:]), transforms
+    )
+
+
+def _products(x: F64, l2: F64, l3: F64, *, times: int = 1) -> F64:
+    """Rows x^i l2_j l3_k of every choice of one of (n or 1, a, 3), (n or 1, b, 3), (n or 1, c, 3)."""
+    n = max(len(l2), len(l3)) if l2.ndim == 3 and l3.ndim == 3 else len(l2 if l2.ndim == 3 else l3)
+    x, l2, l3 = (np.broadcast_to(a, (n, *a.shape[-2:])) for a in (x, l2, l3))
+    rows = np.einsum("nai,nbj,nck->nabcijk", x, l2, l3).reshape(-1, 27)
+    return np.asarray(np.sqrt(times) * rows)
+
+
+def _triangular(rows: list[F64]) -> F64:
+    """The triangular factor (27, 27) of the stacked rows."""
+    return np.asarray(np.linalg.qr(np.concatenate([*rows, np.zeros((27, 27))]), mode="r"))
+
+
+def _line_moves(ends: F64) -> F64:
+    """Derivatives (M, 2, 3) of the unit-normal lines through ends (M, 2, 3) by a move of each across them."""
+    along = (ends[:, 1] - ends[:, 0])[:, :2]
+    along = along / np.sum(along**2, axis=1, keepdims=True)
+    # The share of the other end in a point of the line, as a function of the point.
+    share = np.column_stack([along, -np.sum(along * ends[:, 0, :2], axis=1)])
+    return np.stack([np.eye(3)[2] - share, share], axis=1)
 
 
 def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
