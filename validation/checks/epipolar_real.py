@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -92,12 +92,12 @@ def error_rows(
     return rows
 
 
-def check_kusvod2(cache: Path, methods: list[str], seeds: int, names: tuple[str, ...] | None) -> list[Metric]:
-    """Errors on the hand-made correspondences."""
+def check_kusvod2(pairs: Iterable[RealPair], methods: list[str], seeds: int) -> list[Metric]:
+    """Errors on the hand-made correspondences of the pairs."""
     labels: list[str] = []
     errors: list[dict[str, F64]] = []
     sampson: list[dict[str, F64]] = []
-    for pair in kusvod2_pairs(cache, names):
+    for pair in pairs:
         runs = run_pair(pair, methods, seeds=seeds, threshold_px=THRESHOLD_PX)
         labels.append(f"{pair.name} ({len(pair.xy1)} matches)")
         errors.append(errors_of(runs, pair, rms_epipolar_distance))
@@ -123,13 +123,17 @@ def called_sure(estimate: Estimate, truth: F64, limit_px: float) -> bool:
     return bool(error > SURE * np.sqrt(np.mean(told**2)))
 
 
-def check_cameras(scene: str, cache: Path, methods: list[str], seeds: int, verbose: bool) -> list[Metric]:
-    """Errors on noise-free correspondences of the true cameras."""
+def check_cameras(
+    pairs: Iterable[RealPair], methods: list[str], seeds: int, *, verbose: bool
+) -> list[Metric]:
+    """Errors on noise-free correspondences of the true cameras, of the pairs of one scene."""
     labels: list[str] = []
     errors: list[dict[str, F64]] = []
     sure = 0
-    for pair in camera_pairs(scene, cache):
+    scene = ""
+    for pair in pairs:
         assert pair.truth is not None
+        scene = pair.name.split()[0]
         runs = run_pair(pair, methods, seeds=seeds, threshold_px=THRESHOLD_PX)
         labels.append(f"{pair.name.split()[1]} ({len(pair.xy1)} matches)")
         errors.append(errors_of(runs, pair, rms_epipolar_distance))
@@ -174,6 +178,17 @@ def check_adelaide(methods: list[str], seeds: int) -> list[Metric]:
     return rows
 
 
+def blocks(a: argparse.Namespace) -> Iterator[list[Metric]]:
+    """The rows of each set asked for, empty where its photographs are not on this machine."""
+    if a.only in (None, "kusvod2"):
+        names = tuple(a.pairs) if a.pairs else None
+        yield check_kusvod2(kusvod2_pairs(a.cache, names, mutual=a.mutual), a.methods, a.seeds)
+    for scene in SCENES_WITH_CAMERAS if a.only in (None, "strecha") else ():
+        yield check_cameras(camera_pairs(scene, a.cache), a.methods, a.seeds, verbose=a.verbose)
+    if a.only in (None, "adelaide"):
+        yield check_adelaide(a.methods, a.seeds)
+
+
 def main() -> int:
     """Print the tables; 1 where a target is missed, 3 where there are no photographs."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -181,32 +196,18 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--methods", nargs="+", choices=list(SOLVERS), default=list(SOLVERS))
     parser.add_argument("--pairs", nargs="+", help="some pairs of kusvod2 by name")
+    parser.add_argument("--mutual", action="store_true", help="kusvod2: matches nearest to each other")
     parser.add_argument("--verbose", action="store_true", help="every pair of the scenes with cameras")
-    parser.add_argument(
-        "--cache",
-        type=Path,
-        default=Path(tempfile.gettempdir()) / "thesisrecon-matches",
-        help="folder that keeps the SIFT matches",
-    )
-    a = parser.parse_args()
+    default = Path(tempfile.gettempdir()) / "thesisrecon-matches"
+    parser.add_argument("--cache", type=Path, default=default, help="folder that keeps the SIFT matches")
+    arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    blocks: list[Callable[[], list[Metric]]] = []
-    if a.only in (None, "kusvod2"):
-        names = tuple(a.pairs) if a.pairs else None
-        blocks.append(lambda: check_kusvod2(a.cache, a.methods, a.seeds, names))
-    if a.only in (None, "strecha"):
-        for scene in SCENES_WITH_CAMERAS:
-            blocks.append(
-                lambda scene=scene: check_cameras(scene, a.cache, a.methods, a.seeds, a.verbose)  # type: ignore[misc]
-            )
-    if a.only in (None, "adelaide"):
-        blocks.append(lambda: check_adelaide(a.methods, a.seeds))
     rows: list[Metric] = []
-    for block in blocks:
-        found = block()
+    for found in blocks(arguments):
         rows += found
         if found:
-            print(f"## {found[0].scene}, {a.seeds} seeds", markdown_table(found), "", sep="\n\n", flush=True)
+            title = f"## {found[0].scene}, {arguments.seeds} seeds"
+            print(title, markdown_table(found), "", sep="\n\n", flush=True)
     if not rows:
         print("the photographs are not on this machine (THESISRECON_DATA)", file=sys.stderr)
         return 3

@@ -82,16 +82,19 @@ def _sift(path: Path) -> tuple[F64, NDArray[np.float32]]:
     return np.array([k.pt for k in keypoints], dtype=np.float64), np.asarray(descriptors, dtype=np.float32)
 
 
-def kusvod2_pairs(cache: Path, names: tuple[str, ...] | None = None) -> Iterator[RealPair]:
+def kusvod2_pairs(
+    cache: Path, names: tuple[str, ...] | None = None, *, mutual: bool = False
+) -> Iterator[RealPair]:
     """The pairs of Lebeda, Matas and Chum (BMVC 2012) with their hand-made correspondences as ``truth``.
 
-    Nothing where the photographs are not on this machine; ``names`` picks some.
+    Nothing where the photographs are not on this machine; ``names`` picks some; with ``mutual`` the matches
+    must be each other's nearest.
     """
     root = data_root()
     for folder in sorted((root / "kusvod2").iterdir()) if root and (root / "kusvod2").is_dir() else []:
         if folder.is_dir() and (names is None or folder.name in names):
             paths = (folder / "A.jpg", folder / "B.jpg")
-            xy1, xy2 = match_photographs(paths, cache, ratio=HAND_MADE_RATIO, mutual=False)
+            xy1, xy2 = match_photographs(paths, cache, ratio=HAND_MADE_RATIO, mutual=mutual)
             yield RealPair(folder.name, xy1, xy2, truth=np.loadtxt(folder / "validation.txt", ndmin=2)[:, :4])
 
 
