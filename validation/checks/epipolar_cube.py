@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
+from plotly.colors import qualitative
 
 from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.geometry.camera import compose_camera
@@ -201,21 +202,24 @@ def report(rows: Sequence[CubeRow]) -> str:
 
 
 def draw(rows: Sequence[CubeRow]) -> go.Figure:
-    """Median distance of the exact points against the noise, a line for each method, on logarithms."""
+    """RMS over the pairs of the distance over the bound against the noise, on logarithms."""
     figure = go.Figure()
-    for name in dict.fromkeys(r.method for r in rows):
+    for k, name in enumerate(dict.fromkeys(r.method for r in rows)):
         some = [r for r in rows if r.method == name and r.sigma_px > 0.0]
-        dash = "dash" if name == BOUND else "solid"
         figure.add_scatter(
             x=[r.sigma_px for r in some],
-            y=[r.distance_px for r in some],
+            y=[r.ratio for r in some],
             name=name,
-            mode="lines+markers",
-            line={"dash": dash},
+            mode="lines" if name == BOUND else "lines+markers",
+            line={"color": "black", "dash": "dash"}
+            if name == BOUND
+            else {"color": qualitative.Dark24[k % 24]},
+            marker={"symbol": k % 8, "size": 9},
         )
-    figure.update_xaxes(type="log", title="noise of each coordinate, px")
-    figure.update_yaxes(type="log", title="RMS distance to the epipolar lines, px (median of the pairs)")
-    figure.update_layout(title="The cube sequence: exact points, F estimated from noisy ones")
+    ticks = sorted({r.sigma_px for r in rows if r.sigma_px > 0.0})
+    figure.update_xaxes(type="log", title="noise of each coordinate, px", tickvals=ticks)
+    figure.update_yaxes(type="log", title="RMS distance of the exact points over the bound", dtick="D2")
+    figure.update_layout(title="The cube sequence: how far each method is from the bound")
     return figure
 
 
