@@ -15,7 +15,9 @@ I64 = NDArray[np.int64]
 def cheirality(X: F64, P: F64) -> F64:
     """chi(X, P) = det(M)^(1/3) W / t (3.27): positive in front of the camera, 0 on the plane at infinity.
 
-    X (N, 4), P (3, 4) -> (N,); does not change when X or P is scaled, by a negative number either.
+    X (N, 4), P (3, 4) -> (N,); does not change when X or P is scaled, by a negative number either. Only its
+    sign is that of the depth: its magnitude is an inverse depth, which for a camera not normalised has no
+    unit; :func:`depth` measures.
     """
     t = X @ P[2]
     return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / t)

@@ -27,7 +27,9 @@ def enforce_rank_two(F: F64) -> F64:
 
 
 def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
-    """F = [e2]x P2 P1^+ (3.35) of two cameras (3, 4) with different centres, unit norm.
+    """F = [e2]x P2 P1^+ of two cameras (3, 4) with different centres, unit norm; e2 = P2 C1 (3.33).
+
+    The line of x joins e2 and the image of P1^+ x, another point of its ray; F has rank 2 (3.35).
 
     Raises ``ValueError`` where the centres coincide: the views are then related by a homography, not by an F.
     """
@@ -40,7 +42,10 @@ def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
 
 
 def epipoles(F: F64) -> tuple[F64, F64]:
-    """Unit vectors e1, e2 (3,) with F e1 = 0 and F' e2 = 0, of the nearest matrix of rank 2."""
+    """Unit vectors e1, e2 (3,) with F e1 = 0 and F' e2 = 0, of the nearest matrix of rank 2 (3.34, 3.35).
+
+    e2 is the thesis' e_ij, the image of the first centre, e1 its e_ji (section 5.3 exchanges the two).
+    """
     U, _, Vt = np.linalg.svd(F)
     return Vt[2], U[:, 2]
 
@@ -53,6 +58,16 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     lines = homogenize(xy1) @ F.T
     norm = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
     return lines / np.where(norm > 0.0, norm, 1.0)
+
+
+def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
+    """Distances (N, 2) in px of x1 to the epipolar line F' x2 and of x2 to F x1 (5.5).
+
+    Both are multiples of the one residual x2' F x1: small together, large together.
+    """
+    of_first = np.sum(homogenize(xy1) * epipolar_lines(F.T, xy2), axis=1)
+    of_second = np.sum(homogenize(xy2) * epipolar_lines(F, xy1), axis=1)
+    return np.asarray(np.abs(np.column_stack([of_first, of_second])))
 
 
 def algebraic_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
@@ -71,7 +86,7 @@ def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
     """Signed Sampson distances in px (5.4); (N,).
 
     To first order the distance of (x1, y1, x2, y2) to the nearest exact match; its standard deviation is that
-    of one image coordinate.
+    of one image coordinate: the residual's own, sigma |grad r| (5.3), divides it.
     """
     g2, g1 = _gradients(F, xy1, xy2)
     return algebraic_residuals(F, xy1, xy2) / np.sqrt(g1 + g2)

@@ -19,9 +19,9 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
     """Robust standard deviation 1.4826 (1 + 5 / (n - p)) median |r| of residuals with mean 0.
 
     ``residuals`` (N,), of any sign, ``parameters`` the p degrees of freedom that were fitted to them
-    (Rousseeuw and Leroy 1987; Torr and Murray, IJCV 1997). Breaks down where half of the residuals are wrong.
-    Raises ``ValueError`` where N <= p, since nothing is left to estimate from, and for residuals that are not
-    finite.
+    (Rousseeuw and Leroy 1987; Torr and Murray, IJCV 1997). The factor is 1 / Phi^-1(0.75), where the thesis'
+    text has 1 / Phi(0.75). Breaks down where half of the residuals are wrong. Raises ``ValueError`` where
+    N <= p, since nothing is left to estimate from, and for residuals that are not finite.
     """
     n = len(residuals)
     if n <= parameters:

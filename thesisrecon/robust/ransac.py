@@ -45,7 +45,8 @@ class SampleConsensus:
     """Algorithm 2: draw ``max_samples`` samples, or stop once the share of inliers is above ``enough_share``.
 
     The model with the most data within ``threshold`` wins; of two with as many, the one whose inliers have
-    the lower standard deviation (Fischler and Bolles, 1981).
+    the lower standard deviation (Fischler and Bolles, 1981). Trying every sample instead would take
+    n! / (s! (n - s)!) of them, s being its size (the thesis' text has n! / s!).
     """
 
     threshold: float
