@@ -98,6 +98,27 @@ class Matches:
 
 
 @dataclass(frozen=True)
+class Certainty:
+    """Whether the matches of a pair determine its F, with the evidence; ``reasons`` say why not.
+
+    ``off_plane`` is the number of inliers off the dominant plane (matches that share a place count as one),
+    ``contradicted`` how many of these lie amid matches of the plane where no surface could;
+    ``log10_false_alarms`` of how often chance gives as many. ``rival`` (3, 3) is the other F that comes nearest
+    to explaining as many matches, None without one, ``rival_margin`` by how many standard errors it explains
+    fewer; ``expected_error_px`` the RMS distance of exact matches to their lines after the covariance of F.
+    """
+
+    determined: bool
+    reasons: tuple[str, ...] = ()
+    off_plane: float = 0.0
+    contradicted: float = 0.0
+    log10_false_alarms: float = 0.0
+    rival_margin: float = float("inf")
+    rival: F64 | None = None
+    expected_error_px: float = float("inf")
+
+
+@dataclass(frozen=True)
 class FundamentalFit:
     """A robust estimate of F: ``F`` (3, 3) unit Frobenius norm, ``inliers`` (M,) bool, ``sigma_px`` the
     standard deviation of one image coordinate estimated from the inliers, ``covariance`` (9, 9) of vec(F)
