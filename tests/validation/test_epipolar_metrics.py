@@ -1,0 +1,114 @@
+"""The pure parts of the comparison of F on photographs: errors, shares, truth from cameras, and the seeds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.epipolar.pairs import make_pair, spoil
+from thesisrecon.geometry.multiview import symmetric_residuals
+from validation.checks.epipolar_real import called_sure, check_cameras, least
+from validation.metrics.epipolar import (
+    NONE_PX,
+    precision_recall,
+    rms_epipolar_distance,
+    rms_sampson_distance,
+)
+from validation.references.fundamental import OURS, SOLVERS, Estimate, estimate_with
+from validation.scenes.real_pairs import RealPair, exact_correspondences
+
+
+def test_errors_of_a_shifted_rectified_pair() -> None:
+    # The lines of a rectified pair are its rows: a step of 3 px down is 3 px off in either image.
+    F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    xy = np.random.default_rng(0).uniform(0.0, 500.0, (20, 2))
+    truth = np.hstack([xy, xy + np.array([7.0, 3.0])])
+    assert rms_epipolar_distance(F, truth) == pytest.approx(3.0)
+    assert rms_sampson_distance(F, truth) == pytest.approx(3.0 / np.sqrt(2.0))
+
+
+def test_no_matrix_has_the_largest_error() -> None:
+    truth = np.array([[0.0, 0.0, 0.0, 1e6]])
+    F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    for error in (rms_epipolar_distance, rms_sampson_distance):
+        assert error(None, truth) == error(F, truth) == NONE_PX
+
+
+def test_precision_and_recall_by_hand() -> None:
+    right = np.array([True, True, True, False])
+    assert precision_recall(np.array([True, False, False, True]), right) == pytest.approx((0.5, 1.0 / 3.0))
+    assert precision_recall(np.zeros(4, dtype=bool), right) == (0.0, 0.0)
+
+
+def test_correspondences_of_cameras_are_exact_and_leave_out_wrong_matches() -> None:
+    rng = np.random.default_rng(1)
+    pair = make_pair(200, rng)
+    xy1, xy2, wrong = spoil(pair, rng, sigma=0.3, outliers=0.3)
+    truth = exact_correspondences(pair.P1, pair.P2, xy1, xy2)
+    assert symmetric_residuals(pair.F, truth[:, :2], truth[:, 2:]).max() < 1e-6
+    # Every right match is there, and of the wrong ones only the few that happen to lie on their lines.
+    assert (~wrong).sum() <= len(truth) <= (~wrong).sum() + 3
+
+
+@pytest.mark.parametrize("method", SOLVERS)
+def test_every_method_keeps_the_order_of_the_matches(method: str) -> None:
+    rng = np.random.default_rng(2)
+    pair = make_pair(300, rng)
+    xy1, xy2, wrong = spoil(pair, rng, sigma=0.1, outliers=0.2)
+    found = estimate_with(method, xy1, xy2, threshold_px=1.0, seed=3)
+    assert rms_epipolar_distance(found.F, np.hstack([pair.xy1, pair.xy2])) < 1.0
+    precision, recall = precision_recall(found.inliers, ~wrong)
+    assert precision > 0.9
+    assert recall > 0.8
+
+
+@pytest.mark.parametrize("method", [m for m in SOLVERS if "default" not in m and "long" not in m])
+def test_seeds_differ_and_repeat(method: str) -> None:
+    rng = np.random.default_rng(4)
+    pair = make_pair(60, rng)
+    xy1, xy2, _ = spoil(pair, rng, sigma=1.5, outliers=0.4)
+    runs = [estimate_with(method, xy1, xy2, threshold_px=1.0, seed=seed).F for seed in (0, 1, 2, 3, 0)]
+    truth = np.hstack([pair.xy1, pair.xy2])
+    errors = [rms_epipolar_distance(F, truth) for F in runs]
+    assert errors[0] == errors[-1]
+    assert len(set(errors)) > 1
+
+
+def test_hopeless_matches_give_no_matrix_and_no_exception() -> None:
+    same = np.zeros((30, 2))
+    for method in SOLVERS:
+        found = estimate_with(method, same, same, threshold_px=1.0, seed=0)
+        assert found.F is None or np.isfinite(found.F).all()
+        assert found.inliers.shape == (30,)
+
+
+def test_the_target_is_the_best_rival() -> None:
+    values = {OURS: 0.1, "PoseLib": 0.4, "PoseLib long": 0.3, "FM_RANSAC": 0.2}
+    assert least(values, ("PoseLib",)) == 0.3
+    assert least({OURS: 0.1}, ("PoseLib",)) is None
+
+
+def test_a_wrong_matrix_is_sure_only_where_its_covariance_is_small() -> None:
+    F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) / np.sqrt(2.0)
+    xy = np.random.default_rng(0).uniform(0.0, 500.0, (20, 2))
+    truth, inliers = np.hstack([xy, xy + np.array([7.0, 3.0])]), np.ones(20, dtype=bool)
+    assert called_sure(Estimate(F, inliers, np.eye(9) * 1e-18), truth, 1.0)
+    assert not called_sure(Estimate(F, inliers, np.eye(9)), truth, 1.0)
+    assert not called_sure(Estimate(F, inliers, np.eye(9) * 1e-18), truth, 4.0)
+    assert not called_sure(Estimate(None, inliers), truth, 1.0)
+
+
+def test_rows_of_a_scene_judge_ours_against_poselib() -> None:
+    rng = np.random.default_rng(5)
+    pairs = []
+    for k in range(2):
+        pair = make_pair(200, rng)
+        xy1, xy2, _ = spoil(pair, rng, sigma=0.5, outliers=0.2)
+        pairs.append(RealPair(f"scene {k}", xy1, xy2, truth=np.hstack([pair.xy1, pair.xy2])))
+    rows = {row.name: row for row in check_cameras(pairs, [OURS, "PoseLib"], 2, verbose=True)}
+    assert [name for name in rows if "matches" in name] == ["0 (200 matches)", "1 (200 matches)"]
+    median = rows["**median of all runs**"]
+    assert median.target == median.values["PoseLib"]
+    assert rows["**pairs off by > 1 px**, of 2"].verdict == "reached"
+    assert rows["runs > 1 px and called sure"].values[OURS] == 0.0
+    assert check_cameras([], [OURS], 2, verbose=True) == []
