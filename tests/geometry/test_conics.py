@@ -217,3 +217,26 @@ def test_3_13_the_image_of_the_absolute_conic_measures_angles_of_rays(rng):
     assert angle_between_pixels(image_of_absolute_conic(K), x, y) == pytest.approx(np.arccos(a @ b), abs=1e-6)
     assert incidence_sine(line_through(x, y), x) < 1e-9
     assert gap(P[:, :3] @ directions[0], x) < 1e-9
+
+
+@holds_for_every(dimensions)
+def test_3_4_2_intersection_and_tangency_of_surfaces_are_kept_by_projective_transforms(rng, d):
+    C, x = _round(rng, d, 3)
+    # A shear of the last row keeps the surface finite, which a general transform need not.
+    G = np.eye(d)
+    G[:-1] += 0.3 * rng.normal(size=(d - 1, d))
+    G[-1, :-1] = 0.2 * rng.uniform(-1.0, 1.0, d - 1)
+    plane = tangent(C, x[0])
+    touching = C + rng.uniform(0.5, 2.0) * np.outer(plane, plane)
+    moved, moved_touching = transform_conics(G, C), transform_conics(G, touching)
+    y = x @ G.T
+    # The two surfaces share x[0] with its tangent plane, before and after.
+    assert gap(tangent(moved, y[0]), transform_planes(G, plane)) < 1e-9
+    assert gap(tangent(moved_touching, y[0]), transform_planes(G, plane)) < 1e-9
+    assert abs(form(dual(moved), tangent(moved, y[0]), tangent(moved, y[0]))) < 1e-9
+    # A line through two points of the surface meets it in their images, one that misses it still does.
+    assert abs(form(moved, y[1], y[1])) < 1e-9
+    for start, end in ((x[1], x[2]), rng.normal(size=(2, d))):
+        before = tangency_discriminant(C, start, end)
+        after = tangency_discriminant(moved, G @ start, G @ end)
+        assert np.sign(before) == np.sign(after)

@@ -14,6 +14,7 @@ from thesisrecon.geometry.multiview import (
     algebraic_residuals,
     canonical_cameras,
     enforce_rank_two,
+    epipolar_distances,
     epipolar_lines,
     epipoles,
     estimate_homography,
@@ -158,3 +159,16 @@ def test_canonical_cameras_project_what_the_true_cameras_see():
     X = np.linalg.svd(np.moveaxis(A, 0, 1))[2][:, 3]
     assert np.abs(project(P2, X) - pair.xy2).max() < 1e-5
     assert np.abs(dehomogenize(X @ P1.T) - pair.xy1).max() < 1e-5
+
+
+def test_3_34_the_pair_in_the_other_order_has_the_transpose() -> None:
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        P1, P2 = rng.normal(size=(2, 3, 4))
+        F, back = fundamental_from_cameras(P1, P2), fundamental_from_cameras(P2, P1)
+        assert min(np.linalg.norm(F - back.T), np.linalg.norm(F + back.T)) < 1e-9
+        X = rng.normal(size=(10, 3))
+        distances = epipolar_distances(F, project(P1, X), project(P2, X))
+        assert np.abs(distances).max() < 1e-6 * max(
+            1.0, np.abs(project(P2, X)).max(), np.abs(project(P1, X)).max()
+        )

@@ -250,8 +250,9 @@ def noise_of_tracks(distances_px: F64, threshold_px: float, width_px: float) -> 
     """Standard deviation of a coordinate of the right tracks, by expectation and maximisation; px.
 
     distances_px (N,) are roots of sums over three views, those of right tracks sigma times a chi variable of
-    3 freedoms; wrong tracks are even in the space of the three residuals up to ``width_px``. Starts at
-    ``threshold_px`` / 2.5 with half of the tracks right (Torr and Zisserman, MLESAC, 2000).
+    3 freedoms, less the 18 of a tensor fitted to them; wrong tracks are even in the space of the three
+    residuals up to ``width_px``. Starts at ``threshold_px`` / 2.5 with half of the tracks right (Torr and
+    Zisserman, MLESAC, 2000).
     """
     squared = np.minimum(distances_px, width_px) ** 2
     # The densities of the distances are d^2 times these: normal, and even in a ball.
@@ -263,7 +264,8 @@ def noise_of_tracks(distances_px: F64, threshold_px: float, width_px: float) -> 
         if total < 1.0:
             return sigma
         # Below a hundred-thousandth of the threshold the residuals are rounding.
-        now = max(np.sqrt(float(right @ squared) / (3.0 * total)), 1e-5 * threshold_px)
+        freedom = max(3.0 * total - 18.0, total)
+        now = max(np.sqrt(float(right @ squared) / freedom), 1e-5 * threshold_px)
         share = min(max(total / len(squared), 1e-3), 1.0 - 1e-3)
         if abs(now - sigma) < 1e-4 * sigma:
             return float(now)
