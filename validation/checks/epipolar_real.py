@@ -97,11 +97,14 @@ def check_kusvod2(pairs: Iterable[RealPair], methods: list[str], seeds: int) -> 
     labels: list[str] = []
     errors: list[dict[str, F64]] = []
     sampson: list[dict[str, F64]] = []
+    sure = 0
     for pair in pairs:
+        assert pair.truth is not None
         runs = run_pair(pair, methods, seeds=seeds, threshold_px=THRESHOLD_PX)
         labels.append(f"{pair.name} ({len(pair.xy1)} matches)")
         errors.append(errors_of(runs, pair, rms_epipolar_distance))
         sampson.append(errors_of(runs, pair, rms_sampson_distance))
+        sure += sum(called_sure(e, pair.truth, FAILED_PX) for e in runs.get(OURS, []))
     if not labels:
         return []
     rows = error_rows("kusvod2", labels, errors, STRONG, (FAILED_PX,))
@@ -111,6 +114,10 @@ def check_kusvod2(pairs: Iterable[RealPair], methods: list[str], seeds: int) -> 
             rows.append(Metric("kusvod2", f"runs > {FAILED_PX:g} px of {label.split()[0]}", "", failed, OURS))
     middle = {m: float(np.median(np.concatenate([row[m] for row in sampson]))) for m in methods}
     rows.append(Metric("kusvod2", "median Sampson distance of all runs", "px", middle, OURS))
+    if OURS in methods:
+        rows.append(
+            Metric("kusvod2", f"runs > {FAILED_PX:g} px and called sure", "", {OURS: float(sure)}, OURS)
+        )
     return rows
 
 
