@@ -66,9 +66,9 @@ def _linear(*, normalized: bool, rank_two: bool = True) -> Estimate:
     return lambda xy1, xy2, _, __: estimate_eight_point(xy1, xy2, normalized=normalized, rank_two=rank_two)
 
 
-def _thesis(*, epipolar_distance: bool) -> Estimate:
+def _thesis(**variant: bool) -> Estimate:
     def estimate(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64:
-        method = ThesisRansac(threshold_px=threshold_px, epipolar_distance=epipolar_distance)
+        method = ThesisRansac(threshold_px=threshold_px, **variant)
         return method.estimate(xy1, xy2, np.random.default_rng(seed)).F
 
     return estimate
@@ -120,8 +120,15 @@ OURS = (
     Method(GOLD, _refined(refine_reprojection)),
     Method(GOLD_FROM_DEFAULT, _gold_from_default),
     Method("Algorithm 2, seven-point search alone", _search_alone, robust=True, thresholded=True),
-    Method("Algorithm 2, gradient", _thesis(epipolar_distance=False), robust=True, thresholded=True),
-    Method("Algorithm 2, epipolar distance", _thesis(epipolar_distance=True), robust=True, thresholded=True),
+    *(
+        Method(f"Algorithm 2, {label}", _thesis(**variant), robust=True, thresholded=True)
+        for label, variant in (
+            ("gradient", {}),
+            ("epipolar distance", {"epipolar_distance": True}),
+            ("gradient, test of both lines", {"both_lines": True}),
+            ("gradient, test of the sum", {"sum_of_lines": True}),
+        )
+    ),
     Method("least median of squares", _least_median, robust=True),
     Method(DEFAULT, _default, robust=True, thresholded=True),
 )

@@ -44,6 +44,8 @@ CUBE_METHODS = (
     "Algorithm 2, seven-point search alone",
     "Algorithm 2, gradient",
     "Algorithm 2, epipolar distance",
+    "Algorithm 2, gradient, test of both lines",
+    "Algorithm 2, gradient, test of the sum",
     "least median of squares",
     "default",
 )

@@ -198,10 +198,15 @@ def write_results(path: Path, results: Sequence[Result]) -> None:
 
 
 def merged(old: Sequence[Result], new: Sequence[Result]) -> list[Result]:
-    """``old`` with the rows that ``new`` holds too replaced, and its other rows at the end."""
-    fresh = {(r.label, r.setting): r for r in new}
-    kept = [fresh.pop((r.label, r.setting), r) for r in old]
-    return kept + list(fresh.values())
+    """``old`` with ``new`` in the place of the same rows, in the order of the settings and the catalogue."""
+    rows = {(r.label, r.setting): r for r in (*old, *new)}
+    place = {m.name: k for k, m in enumerate(METHODS)}
+
+    def order(r: Result) -> tuple[float, ...]:
+        s = r.setting
+        return s.wrong, s.sigma_px, s.n, place.get(r.method, len(place)), r.told
+
+    return sorted(rows.values(), key=order)
 
 
 def main() -> int:
