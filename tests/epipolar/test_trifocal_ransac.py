@@ -324,3 +324,13 @@ def test_merton_college_with_wrong_tracks(share):
     assert found.inliers[~wrong].mean() > 0.95
     assert np.median(point_transfer_px(found.fit.T, points)) <= 1.0
     assert np.median(line_transfer_px(found.fit.T, segments)) <= 1.0
+
+
+def test_a_start_on_a_principal_plane_is_no_division_by_zero():
+    rng = np.random.default_rng(928)
+    points = rng.integers(0, 4, (200, 3, 8, 2)) * 1.0
+    for few in points:
+        failure, fit = _outcome(lambda few=few: estimate_trifocal(few, max_iterations=5))
+        assert failure is not None or np.isfinite(fit.T).all()
+    with pytest.raises(ValueError, match="beyond"):
+        estimate_trifocal(np.full((3, 8, 2), 1e20) * rng.random((3, 8, 2)))

@@ -114,7 +114,7 @@ class TrifocalReprojection:
         """Cameras of a conditioned tensor, points by triangulation, lines as the meet of their planes."""
         P = np.stack(cameras_from_tensor(T))
         P[1:] /= np.linalg.norm(P[1:], axis=(1, 2), keepdims=True)
-        X = triangulate_linear(P, self.points.swapaxes(0, 1))
+        X = _off_principal_planes(triangulate_linear(P, self.points.swapaxes(0, 1)), P)
         seen = unit_normals(line_through(self.ends[:, :, 0], self.ends[:, :, 1]))
         planes = np.einsum("mva,vab->mvb", seen, P)
         return TrifocalState(P, X, np.linalg.svd(planes)[2][:, 2:])
@@ -196,6 +196,13 @@ class TrifocalReprojection:
         by_camera += np.einsum("mvra,mb->mvrab", by_q, state.lines[:, 1])
         across = np.einsum("vab,mfb->mvaf", state.P, _complement(state.lines))
         return _camera_columns(by_camera), np.concatenate([by_p @ across, by_q @ across], axis=3)
+
+
+def _off_principal_planes(X: F64, P: F64) -> F64:
+    """Unit points X (N, 4), those exactly on a principal plane moved off it, where they have an image."""
+    on = (np.einsum("va,na->nv", P[:, 2], X) == 0.0).any(axis=1)
+    X = X + 1e-9 * on[:, None] * np.array([0.6, -0.5, 0.4, 0.3])
+    return np.asarray(X / np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300))
 
 
 def _complement(subspace: F64) -> F64:

@@ -21,6 +21,9 @@ from thesisrecon.geometry.trifocal import transform_tensor, unit_tensor
 
 F64 = NDArray[np.float64]
 
+LARGEST_PX = 1e15
+"""Beyond, squares of squares overflow, and a double has no fraction of a pixel left."""
+
 NEEDED_EQUATIONS = 26
 """Seven points, thirteen lines, or a mixture (HZ 16.1)."""
 
@@ -142,7 +145,8 @@ def _line_moves(ends: F64) -> F64:
 def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
     """Matches of three views as float64 arrays, points (3, N, 2) and segments (3, M, 2, 2) by their ends.
 
-    Raises ``ValueError`` for other shapes, values that are not finite and segments of no length.
+    Raises ``ValueError`` for other shapes, values that are not finite or beyond 1e15, and segments of no
+    length.
     """
     points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
     right = points.ndim == 3 and points.shape[::2] == (3, 2)
@@ -152,6 +156,10 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
         )
     if not (np.isfinite(points).all() and np.isfinite(segments).all()):
         raise ValueError("points and segments must be finite; some are NaN or infinite")
+    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > LARGEST_PX:
+        raise ValueError(
+            f"points and segments must be pixels of a photograph; some are beyond {LARGEST_PX:g}"
+        )
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
     return points, segments

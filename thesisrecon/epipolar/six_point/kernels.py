@@ -237,11 +237,10 @@ def first_ray(P1: F64, C: F64, D: F64) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def squared_distance(P: F64, C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> float:
-    """Sum over three views of the squared distances of a track to the reprojection of its best point X (4,).
+def start_on_ray(C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> None:
+    """X (4,) on the ray of the first image, where the lines through the others see it best.
 
-    ``A`` (2, 3, 3) = P2 D, P3 D and ``e`` (2, 3) = P2 C, P3 C. X starts on the ray of the first image, where
-    the lines through the others, across their epipolar lines, see it; two steps of Gauss and Newton follow.
+    The lines run across the epipolar lines, so a point of the plane of the three centres is no exception.
     """
     aa, ad, dd = 0.0, 0.0, 0.0
     for v in range(2):
@@ -261,6 +260,16 @@ def squared_distance(P: F64, C: F64, D: F64, A: F64, e: F64, track: F64, X: F64)
     alpha, beta = (dd - least, -ad) if dd > aa else (-ad, aa - least)
     for r in range(4):
         X[r] = alpha * C[r] + beta * (D[r, 0] * track[0] + D[r, 1] * track[1] + D[r, 2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def squared_distance(P: F64, C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> float:
+    """Sum over three views of the squared distances of a track to the reprojection of its best point X (4,).
+
+    ``A`` (2, 3, 3) = P2 D, P3 D and ``e`` (2, 3) = P2 C, P3 C. From :func:`start_on_ray`, two steps of Gauss
+    and Newton.
+    """
+    start_on_ray(C, D, A, e, track, X)
     H, g = np.empty((4, 4)), np.empty(4)
     cost = np.inf
     for step in range(STEPS + 1):
