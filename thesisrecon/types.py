@@ -103,9 +103,10 @@ class Certainty:
 
     ``off_plane`` is the number of inliers off the dominant plane (matches that share a place count as one),
     ``contradicted`` how many of these lie amid matches of the plane where no surface could;
-    ``log10_false_alarms`` of how often chance gives as many. ``rival`` (3, 3) is the other F that comes nearest
-    to explaining as many matches, None without one, ``rival_margin`` by how many standard errors it explains
-    fewer; ``expected_error_px`` the RMS distance of exact matches to their lines after the covariance of F.
+    ``log10_false_alarms`` of how often chance gives as many. ``rival`` (3, 3) is the other F that comes
+    nearest to explaining as many matches, None without one, ``rival_margin`` by how many standard errors it
+    explains fewer; ``expected_error_px`` the RMS distance of exact matches to their lines after the
+    covariance of F.
     """
 
     determined: bool
@@ -122,7 +123,7 @@ class Certainty:
 class FundamentalFit:
     """A robust estimate of F: ``F`` (3, 3) unit Frobenius norm, ``inliers`` (M,) bool, ``sigma_px`` the
     standard deviation of one image coordinate estimated from the inliers, ``covariance`` (9, 9) of vec(F)
-    row-major.
+    row-major. ``certainty`` says whether the matches determine it, None where nobody asked.
     """
 
     F: F64
@@ -130,6 +131,7 @@ class FundamentalFit:
     sigma_px: float
     covariance: F64
     iterations: int = 0
+    certainty: Certainty | None = None
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,9 @@ class TwoView:
 
     ``accepted`` says whether the pair enters the tracks, ``reason`` why not. ``homography_share`` is the
     share of the verified matches that one homography explains (near 1: a plane or a pure rotation).
+    ``configuration`` names what the matches show ("general", "plane", "pure rotation", "pure translation"),
+    empty where they are too few to tell, and ``certainty`` whether they determine F, None where that was not
+    judged. A pair may be accepted with an F that is not determined: its matches are good all the same.
     """
 
     i: int
@@ -153,11 +158,18 @@ class TwoView:
     homography_share: float
     accepted: bool
     reason: str = ""
+    configuration: str = ""
+    certainty: Certainty | None = None
 
     @property
     def inliers(self) -> int:
         """Number of verified matches."""
         return len(self.xy1)
+
+    @property
+    def undetermined(self) -> bool:
+        """Whether F was judged and found open: other epipolar geometries explain the matches as well."""
+        return self.certainty is not None and not self.certainty.determined
 
 
 @dataclass(frozen=True)

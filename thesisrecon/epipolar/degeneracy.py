@@ -2,7 +2,8 @@
 
 Matches of one plane, and of a camera that only turned, are explained by a homography and leave the epipoles
 free; of a camera that moved without turning F is [e]x with two degrees of freedom in place of seven. Every
-test is against the noise: a simpler model is believed unless its residuals are larger than the noise allows.
+test is against the noise: a simpler model is believed unless its residuals are larger than the noise allows,
+or more of the matches that it leaves agree with F than chance would have of the wrong ones.
 """
 
 from __future__ import annotations
@@ -12,26 +13,46 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri, stdtrit
 
-from thesisrecon.epipolar.frame import check_matches
-from thesisrecon.epipolar.refinement import refine_gradient
+from thesisrecon.epipolar.certainty.kernels import geometries_of_plane, refine_plane
+from thesisrecon.epipolar.certainty.plane import (
+    chance_of_agreement,
+    find_dominant_plane,
+    log10_false_alarms,
+    once_each,
+    plane_covariance,
+)
+from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
+from thesisrecon.epipolar.kernels import sampson_distances
+from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
+from thesisrecon.epipolar.refinement import UNBOUNDED
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.geometry.multiview import estimate_homography, sampson_residuals
-from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
+from thesisrecon.robust.noise import noise_scale, trimmed_noise_scale
 
 F64 = NDArray[np.float64]
+B8 = NDArray[np.bool_]
 
 MINIMUM = 12
-TRUNCATION, TRUNCATED_MEAN, TRUNCATED_VARIANCE = 11.0, 1.99183, 3.82
-"""Squared distances from a homography, in sigma^2, count to 11 at most; chi-square(2) so truncated has this
-mean and variance."""
+NEAR = 11.0
+NEAR_MEAN, CHI2_MEDIAN = 0.97743, 1.386294
+"""Squared distances from a homography, in sigma^2, are chi-square(2) with this median; of those below 11
+either half, the one across epipolar lines and the parallax along them, has this mean."""
+TRIMMINGS = 3
 STANDARD_ERRORS = 4.0
-STRAY_SHARE, STRAY_COUNT = 0.03, 3
-"""Matches this many and few may lie off the homography: wrong ones that F happens to fit."""
+"""The F of a plane may choose the epipole toward which the noise is least: 1.5 errors, give or take 1."""
+FAR = 16.0
+"""A match stands off a homography beyond this squared distance: noise does so once in 3000."""
+LARGEST_CHANCE = -3.0
+"""log10 of the false alarms that matches off the simpler model may be."""
+BAND = 2.5
+FLEXIBLE = 2.0
+"""An F is fitted to the wrong matches too, which moves it toward them: they agree so many times as often."""
 RISK = 2e-3
 """Chance to take a pure translation or rotation for more than that, each."""
-TURN_ERRORS = 3.0
+TRANSLATED = 3.3
+"""Matches within so many sigma of a translation are compared with F; more would be cut by what noise does."""
+CORRECTIONS, EXACT = 10, 1e-12
 
 
 class Configuration(Enum):
@@ -51,19 +72,22 @@ class Degeneracy:
     ----------
     kind : what was found.
     sigma_px : standard deviation of one coordinate, from the residuals of the general F.
-    homography_errors : excess of the squared distances from the best homography over those of noise, in
-        standard errors; above 4 no homography explains the matches.
-    off_homography : share of the matches more than 3.3 sigma off it.
+    homography_errors : excess of the squared parallax of the matches within 3.3 sigma of the best homography
+        over their squared distances from F, as a logarithm in its standard errors; above 4 they show relief.
+    off_homography : share of the inliers more than 4 sigma off it.
+    off_homography_chance : log10 of how often chance has as many of the wrong matches agree with F; below -3
+        they show relief.
     turning_errors : |trace H - trace H^-1| (det H = 1), 0 for a rotation, in its standard errors.
     turn_deg : the angle of that rotation, NaN where the eigenvalues are not those of one.
     translation_ratio : increase of the squared residuals from F to [e]x, over its limit; at most 1 where F is
-        that of a translation.
+        that of a translation, inf where more matches leave [e]x than chance would have.
     """
 
     kind: Configuration
     sigma_px: float
     homography_errors: float
     off_homography: float
+    off_homography_chance: float
     turning_errors: float
     turn_deg: float
     translation_ratio: float
@@ -72,37 +96,98 @@ class Degeneracy:
         return (
             f"{self.kind.value}: noise {self.sigma_px:.2g} px, homography off by "
             f"{self.homography_errors:.1f} standard errors with {100.0 * self.off_homography:.0f} % of the "
-            f"matches beyond it, rotation "
+            f"matches beyond it (10^{self.off_homography_chance:.0f} by chance), rotation "
             f"off by {self.turning_errors:.1f}, translation at {self.translation_ratio:.2g} of its limit"
         )
 
 
-def classify_configuration(F: F64, xy1: F64, xy2: F64) -> Degeneracy:
-    """Name what the inlier matches (N >= 12, 2) px of F (3, 3) show.
+def classify_configuration(
+    F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None, seed: int = 0
+) -> Degeneracy:
+    """Name what the matches (N, 2) px that agree with F (3, 3) show.
 
-    Both images are taken to share their intrinsics (else a rotation is named a plane, a translation general);
-    a plane of a camera that moved by it sideways is told from a rotation by its eigenvalues alone. GENERAL
-    where relief and baseline stand out of the noise. Raises as
-    :func:`~thesisrecon.epipolar.frame.check_matches`, and ``ValueError`` for an F below rank 2.
+    ``inliers`` (N,), at least 12, are those that agree, all of them where None. Given the wrong ones too it
+    is known how many could agree by chance: an F fitted to a plane gathers wrong matches at will. Both images
+    are taken to share their intrinsics (else a rotation is named a plane, a translation general); a plane of
+    a camera that moved by it sideways is told from a rotation by its eigenvalues alone. GENERAL where relief
+    and baseline stand out of the noise. ``seed`` draws the planes that are tried. Raises as
+    :func:`~thesisrecon.epipolar.frame.check_matches`, and ``ValueError`` for an F below rank 2 and for flags
+    of another shape.
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
-    centre = 0.5 * (xy1.mean(axis=0) + xy2.mean(axis=0))
-    scale = float(np.sqrt(0.5 * (np.mean((xy1 - centre) ** 2) + np.mean((xy2 - centre) ** 2))))
-    x1, x2 = (xy1 - centre) / scale, (xy2 - centre) / scale
-    residuals = sampson_residuals(refine_gradient(F, xy1, xy2), xy1, xy2) / scale
-    rss = float(residuals @ residuals)
-    sigma = max(float(np.sqrt(rss / (len(x1) - 7))), 1e-12)
-    H, covariance, squared = _fit_homography(x1, x2, sigma)
-    errors = _excess_errors(squared / sigma**2)
-    off = float(np.mean(squared > TRUNCATION * sigma**2))
-    turning, angle = _turning(H, covariance)
-    ratio = _translation_ratio(x1, x2, rss)
+    inliers = np.ones(len(xy1), dtype=bool) if inliers is None else inliers
+    if inliers.shape != (len(xy1),):
+        raise ValueError(f"classify_configuration got {inliers.shape} inlier flags for {len(xy1)} matches")
+    check_matches(xy1[inliers], xy2[inliers], needed=MINIMUM)
+    # One centre for both images: F of a translation is skew in it, H of a rotation keeps its eigenvalues.
+    own = PairFrame.of(xy1[inliers], xy2[inliers])
+    centre = 0.5 * (own.centroid1 + own.centroid2)
+    frame = PairFrame(centre, centre, own.scale)
+    points, f = frame.points(xy1, xy2), check_start(F, frame)
+    refine(f, points[inliers], GRADIENT, np.inf, _scale(f, points[inliers]) * 3.0, 15)
+    sigma = _scale(f, points[inliers])
+    agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
+    chance = FLEXIBLE * chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
+    case = _Case(f, points, agree, once_each(xy1, xy2), sigma, chance)
+    return _classify(case, frame.scale, seed)
+
+
+@dataclass(frozen=True)
+class _Case:
+    """``points`` (N, 4), F and sigma in one frame, which ``agree``, ``weights``, the ``chance`` to agree."""
+
+    f: F64
+    points: F64
+    agree: B8
+    weights: F64
+    sigma: float
+    chance: float
+
+    def false_alarms(self, off: B8, free: int) -> float:
+        """How often, log10, as many of the matches ``off`` a simpler model agree with a better one."""
+        agreeing, tried = self.weights[off & self.agree].sum(), self.weights[off].sum()
+        return log10_false_alarms(float(agreeing), float(tried), chance=self.chance, free=free)
+
+
+def _scale(f: F64, points: F64) -> float:
+    r = np.asarray(sampson_distances(f, points))
+    return max(trimmed_noise_scale(r, noise_scale(r)), 1e-12)
+
+
+def _classify(case: _Case, scale: float, seed: int) -> Degeneracy:
+    sigma = case.sigma
+    errors, off, chance, turning, angle = np.inf, 1.0, -np.inf, np.inf, np.nan
+    plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
+    if plane is not None:
+        squared = plane.squared * case.sigma**2
+        noise = _plane_noise(squared[case.agree])
+        near, far = squared < NEAR * noise**2, squared > FAR * noise**2
+        errors = _excess_errors(case, near, float(squared[near].sum()))
+        off, chance = float(np.mean(far[case.agree])), case.false_alarms(far, 2)
+        # Least squares of all of them, for which the covariance holds.
+        refine_plane(plane.h, case.points[near], 1e6 * noise, 4)
+        turning, angle = _turning(plane.h.reshape(3, 3), plane_covariance(plane.h, case.points[near], noise))
+    ratio = _translation_ratio(case)
     kind = Configuration.GENERAL
-    if errors < STANDARD_ERRORS and off * len(x1) <= STRAY_COUNT + STRAY_SHARE * len(x1):
-        kind = Configuration.ROTATION if turning < TURN_ERRORS and np.isfinite(angle) else Configuration.PLANE
+    if plane is not None and errors < STANDARD_ERRORS and chance > LARGEST_CHANCE:
+        # F has fitted itself to the noise of a plane; the homography could not.
+        sigma = noise
+        turned = turning < _turn_limit(int(near.sum())) and np.isfinite(angle)
+        kind = Configuration.ROTATION if turned else Configuration.PLANE
     elif ratio <= 1.0:
         kind = Configuration.TRANSLATION
-    return Degeneracy(kind, sigma * scale, errors, off, turning, angle, ratio)
+    return Degeneracy(kind, sigma / scale, errors, off, chance, turning, angle, ratio)
+
+
+def _plane_noise(squared: F64) -> float:
+    """Standard deviation of one coordinate from squared distances (N,) to a homography, some off it."""
+    variance = float(np.median(squared)) / CHI2_MEDIAN
+    for _ in range(TRIMMINGS):
+        near = squared[squared < NEAR * variance]
+        if len(near) < MINIMUM:
+            break
+        variance = float(near.sum()) / (2.0 * NEAR_MEAN * (len(near) - 4))
+    return float(np.sqrt(max(variance, 1e-24)))
 
 
 def homography_distances(H: F64, xy1: F64, xy2: F64) -> F64:
@@ -123,72 +208,117 @@ def homography_distances(H: F64, xy1: F64, xy2: F64) -> F64:
     return np.stack([first, (c[:, 1] - l21 * first) / l22], axis=1)
 
 
-def _fit_homography(x1: F64, x2: F64, sigma: float) -> tuple[F64, F64, F64]:
-    """H of unit determinant, its covariance (9, 9), and the squared distances (N,)."""
-    start = estimate_homography(x1, x2)
-    found = minimize_residuals(
-        lambda h: homography_distances(h.reshape(3, 3), x1, x2).ravel(),
-        start.ravel(),
-        loss="huber",
-        loss_scale=3.0 * sigma,
-        max_iterations=20,
-    )
-    H = found.x.reshape(3, 3)
-    squared = np.sum(homography_distances(H, x1, x2) ** 2, axis=1)
-    determinant = float(np.cbrt(np.linalg.det(H)))
-    size = float(np.linalg.norm(H))
-    if not abs(determinant) > 1e-6 * size:
-        return H / size, np.zeros((9, 9)), squared
-    return H / determinant, _homography_covariance(H / determinant, x1, x2, sigma), squared
+def _excess_errors(case: _Case, near: B8, rss_plane: float) -> float:
+    """By how many standard errors the squared parallax of the matches near the plane is more than noise.
 
-
-def _homography_covariance(H: F64, x1: F64, x2: F64, sigma: float) -> F64:
-    h, J = H.ravel(), np.empty((2 * len(x1), 9))
-    for m, step in enumerate(1e-6 * np.eye(9)):
-        ends = [homography_distances((h + s * step).reshape(3, 3), x1, x2).ravel() for s in (1.0, -1.0)]
-        J[:, m] = (ends[0] - ends[1]) / 2e-6
-    values, vectors = np.linalg.eigh(J.T @ J)
-    # The least eigenvalue is the scale of H, which no residual sees.
-    half = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-14 * values[-1]))
-    return np.asarray(sigma**2 * half @ half.T)
-
-
-def _excess_errors(squared: F64) -> float:
-    n = len(squared)
-    total = float(np.minimum(squared, TRUNCATION).sum())
-    # The noise itself is known from n - 7 residuals: its error is part of the error of the sum.
-    spread = np.sqrt(TRUNCATED_VARIANCE * n + (TRUNCATED_MEAN * n) ** 2 * 2.0 / (n - 7))
-    return float((total - TRUNCATED_MEAN * (n - 4)) / spread)
+    A homography has 8 parameters for 2 K residuals, F takes 7 of the K across the lines: K - 1 are left along
+    them, and of the same variance if they are noise. The F of just these matches is compared.
+    """
+    k = int(near.sum())
+    if k < MINIMUM - 4:
+        return float("inf")
+    across = _least_squares(case.f, case.points[near])
+    ratio = max(rss_plane - across, 1e-24) / (k - 1) * (k - 7) / max(across, 1e-24)
+    return float(np.log(ratio) / np.sqrt(2.0 / (k - 1) + 2.0 / (k - 7)))
 
 
 def _turning(H: F64, covariance: F64) -> tuple[float, float]:
     """|trace H - trace H^-1| in standard errors and the angle, deg: H of a rotation has eigenvalues
     1, exp(+-i angle) whatever the camera (HZ 13.2; Hartley 1994)."""
-
-    def traces(h: F64) -> F64:
-        M = h.reshape(3, 3) / np.cbrt(np.linalg.det(h.reshape(3, 3)))
-        return np.array([np.trace(M), np.trace(np.linalg.inv(M))])
-
-    if not abs(np.linalg.det(H)) > 1e-12:
+    determinant = float(np.cbrt(np.linalg.det(H)))
+    if not abs(determinant) > 1e-4 * float(np.linalg.norm(H)):
         return np.inf, np.nan
-    h = H.ravel()
-    t, back = traces(h)
-    slopes = np.stack([(traces(h + step) - traces(h - step)) / 2e-6 for step in 1e-6 * np.eye(9)], axis=1)
-    spread = slopes @ covariance @ slopes.T
-    gap = float(np.sqrt(max(spread[0, 0] - 2.0 * spread[0, 1] + spread[1, 1], 1e-300)))
-    mean, error = 0.5 * (t + back), float(np.sqrt(max(spread[0, 0], 1e-300)))
-    still = bool(np.linalg.norm(H - np.eye(3)) ** 2 < 16.0 * np.trace(covariance) + 1e-18)
-    turned = -1.0 <= mean < 3.0 - TURN_ERRORS * error
+    # Of unit determinant; what the covariance has along H itself is 0, and traces do not see it.
+    M, back = H / determinant, np.linalg.inv(H / determinant)
+    covariance = covariance / determinant**2
+    t, t_back = float(np.trace(M)), float(np.trace(back))
+    # d trace M = <I, dM>, d trace M^-1 = -<M^-2', dM>, for dM that keeps the determinant.
+    project = back.T / 3.0
+    slope: F64 = (np.eye(3) - project * t).ravel()
+    difference: F64 = slope - (project * t_back - (back @ back).T).ravel()
+    gap = float(np.sqrt(max(float(difference @ covariance @ difference), 1e-300)))
+    mean, error = 0.5 * (t + t_back), float(np.sqrt(max(float(slope @ covariance @ slope), 1e-300)))
+    still = bool(np.linalg.norm(M - np.eye(3)) ** 2 < 16.0 * np.trace(covariance) + 1e-18)
+    turned = -1.0 <= mean < 3.0 - 3.0 * error
     angle = (
         float(np.degrees(np.arccos(np.clip(0.5 * (mean - 1.0), -1.0, 1.0)))) if turned or still else np.nan
     )
-    return abs(float(t - back)) / gap, angle
+    return abs(t - t_back) / gap, angle
 
 
-def _translation_ratio(x1: F64, x2: F64, rss: float) -> float:
+def _turn_limit(n: int) -> float:
+    """Standard errors that the turning of a rotation keeps to: Student's, since the noise is estimated."""
+    return float(stdtrit(n - 7, 1.0 - RISK))
+
+
+def _translation_ratio(case: _Case) -> float:
     """(RSS of [e]x - RSS of F) over the limit that noise keeps to, an F-test with 5 and n - 7 degrees."""
-    start = np.linalg.svd(np.cross(homogenize(x1), homogenize(x2)), full_matrices=False)[2][2]
-    found = minimize_residuals(lambda e: sampson_residuals(cross_matrix(e), x1, x2), start, max_iterations=20)
-    degrees = len(x1) - 7
-    limit = 5.0 * float(f_distribution.ppf(1.0 - RISK, 5, degrees)) * max(rss / degrees, 1e-24)
-    return float((2.0 * found.cost - rss) / limit)
+    mine = case.points[case.agree]
+    f = _fit_translation(mine, case.sigma)
+    simple = np.asarray(sampson_distances(f, case.points))
+    off = simple > np.sqrt(FAR) * case.sigma
+    if case.false_alarms(off, 5) < LARGEST_CHANCE:
+        return float("inf")
+    near = case.points[simple < TRANSLATED * case.sigma]
+    degrees = len(near) - 7
+    if degrees < MINIMUM - 7:
+        return float("inf")
+    # The same matches for both models, chosen by neither's favour: F would keep what it fits best.
+    _refine_translation(f, near, np.inf)
+    rss_simple = float(np.sum(np.asarray(sampson_distances(f, near)) ** 2))
+    rss = min(rss_simple, *(_least_squares(start, near) for start in (case.f, f)))
+    limit = 5.0 * float(fdtri(5, degrees, 1.0 - RISK)) * max(rss / degrees, 1e-24)
+    return (rss_simple - rss) / limit
+
+
+def _least_squares(f: F64, points: F64) -> float:
+    f = f.copy()
+    refine(f, points, GRADIENT, np.inf, UNBOUNDED, CORRECTIONS)
+    return float(np.sum(np.asarray(sampson_distances(f, points)) ** 2))
+
+
+def _fit_translation(points: F64, sigma: float) -> F64:
+    """[e]x (9,) of most points: from pairs of them, then from all within a shrinking gate."""
+    rng = np.random.default_rng(len(points))
+    identity = np.eye(3).ravel() / np.sqrt(3.0)
+    some = points[rng.permutation(len(points))[:200]]
+    pairs = rng.integers(0, len(some), (100, 2))
+    weights = np.ones((1, len(some)))
+    F, _, found = geometries_of_plane(identity, some, weights, pairs, 4.0 * BAND * sigma)
+    f: F64 = F[int(np.argmax(found[:, 0]))].copy()
+    for gate in (4.0, 2.0, 1.5):
+        _refine_translation(f, points, gate * 4.0 * sigma)
+    return f
+
+
+def _refine_translation(f: F64, points: F64, gate: float) -> None:
+    """Least squares of the Sampson distances of [e]x (9,) within the gate (in place), by Gauss-Newton."""
+    e = np.array([f[7], f[2], f[3]])
+    if not np.linalg.norm(e) > EXACT:
+        return
+    e /= np.linalg.norm(e)
+    kept = points[np.asarray(sampson_distances(f, points)) < gate]
+    if len(kept) < 5:
+        return
+    x1, x2 = homogenize(kept[:, :2]), homogenize(kept[:, 2:])
+    normal = np.cross(x1, x2)
+    for _ in range(CORRECTIONS):
+        # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two rows.
+        l2, l1 = np.cross(e, x1)[:, :2], np.cross(x2, e)[:, :2]
+        g = np.sum(l1**2, axis=1) + np.sum(l2**2, axis=1) + EXACT**2
+        value = normal @ e
+        size = 1.0 / np.sqrt(g)
+        # d g / d e = 2 (l1 . dl1 + l2 . dl2)
+        dg = np.zeros((len(kept), 3))
+        dg[:, 0] = l2[:, 1] * -x1[:, 2] + l1[:, 1] * x2[:, 2]
+        dg[:, 1] = l2[:, 0] * x1[:, 2] - l1[:, 0] * x2[:, 2]
+        dg[:, 2] = -l2[:, 0] * x1[:, 1] + l2[:, 1] * x1[:, 0] + l1[:, 0] * x2[:, 1] - l1[:, 1] * x2[:, 0]
+        J = normal * size[:, None] - (value * size**3)[:, None] * dg
+        basis = np.linalg.svd(e[None])[2][1:].T
+        Jb = J @ basis
+        step = basis @ np.linalg.lstsq(Jb, -(value * size), rcond=None)[0]
+        e = e + step
+        e /= np.linalg.norm(e)
+        if step @ step < 1e-20:
+            break
+    f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()

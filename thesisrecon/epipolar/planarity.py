@@ -6,6 +6,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from thesisrecon.epipolar.certainty.kernels import count_transferred
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.geometry.multiview import epipoles, estimate_homography, homography_residuals, unit_norm
 
@@ -46,11 +47,11 @@ def homography_share(F: F64, xy1: F64, xy2: F64, *, tolerance_px: float, rng: Ge
     triples = np.argsort(rng.random((SAMPLES, min(len(chosen), 50))), axis=1)[:, :3]
     offsets = rng.integers(0, len(chosen), (SAMPLES, 1))
     triples = chosen[(triples + offsets) % len(chosen)]
-    best, count = np.eye(3), -1
-    for H in plane_homographies(F, xy1, xy2, triples):
-        found = int(np.sum(homography_residuals(H, xy1[chosen], xy2[chosen]) < tolerance_px))
-        if found > count:
-            best, count = H, found
+    planes = plane_homographies(F, xy1, xy2, triples)
+    if not len(planes):
+        return _refit_share(np.eye(3), xy1, xy2, tolerance_px)
+    counts = count_transferred(planes, xy1[chosen], xy2[chosen], tolerance_px)
+    best = planes[int(np.argmax(counts))]
     return _refit_share(best, xy1, xy2, tolerance_px)
 
 

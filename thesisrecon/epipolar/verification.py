@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thesisrecon.epipolar.certainty import judge_certainty
+from thesisrecon.epipolar.degeneracy import MINIMUM, Configuration, classify_configuration
 from thesisrecon.epipolar.planarity import homography_share
-from thesisrecon.types import FundamentalFit, Matches, TwoView
+from thesisrecon.errors import StageFailure
+from thesisrecon.types import Certainty, FundamentalFit, Matches, TwoView
 
 HOMOGRAPHY_SIGMAS = 4.3
 """99 % of a plane's matches: the root of chi-square(2) is 3.03, times sqrt(2) for noise in both images."""
@@ -19,7 +22,7 @@ class PairVerification:
 
     A false F on a repetitive facade gathers about 30 inliers, and few of the matches; a right one gathers
     more. A plane or a camera that only turned gives good tracks and an undetermined F: the pair is accepted
-    and ``homography_share`` says so.
+    and its ``configuration``, ``certainty`` and ``homography_share`` say so.
 
     Parameters
     ----------
@@ -50,6 +53,7 @@ class PairVerification:
         tolerance = max(self.homography_px, HOMOGRAPHY_SIGMAS * fit.sigma_px)
         share = homography_share(fit.F, xy1, xy2, tolerance_px=tolerance, rng=rng)
         reason = self._objection(len(xy1), len(kept))
+        configuration, certainty = judge_pair(matches, fit, rng)
         return TwoView(
             i=matches.i,
             j=matches.j,
@@ -64,6 +68,8 @@ class PairVerification:
             homography_share=share,
             accepted=not reason,
             reason=reason,
+            configuration=configuration,
+            certainty=certainty,
         )
 
     def _objection(self, verified: int, candidates: int) -> str:
@@ -78,3 +84,20 @@ class PairVerification:
                 f"geometry; {100.0 * self.min_share:.0f} % are needed"
             )
         return ""
+
+
+def judge_pair(
+    matches: Matches, fit: FundamentalFit, rng: np.random.Generator
+) -> tuple[str, Certainty | None]:
+    """The name of what the matches show and whether they determine F; ("", None) below 12 inliers."""
+    if fit.inliers.sum() < MINIMUM:
+        return "", None
+    try:
+        found = classify_configuration(fit.F, matches.xy1, matches.xy2, inliers=fit.inliers)
+        certainty = judge_certainty(fit, matches.xy1, matches.xy2, rng=rng)
+    except StageFailure:
+        return "", None
+    if found.kind in (Configuration.PLANE, Configuration.ROTATION):
+        reason = f"one homography explains the matches ({found.kind.value})"
+        certainty = replace(certainty, determined=False, reasons=(reason, *certainty.reasons))
+    return found.kind.value, certainty

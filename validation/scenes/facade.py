@@ -29,8 +29,8 @@ RELIEF_LEVELS = (0.0, 0.0, 0.0, 0.5, 1.0)
 class Facade:
     """Matches xy1, xy2 (N, 2) px with noise, ``right`` (N,), the true F, and exact matches to judge an F by.
 
-    ``exact1, exact2`` (M, 2) px are the noise-free places of the right matches; ``off_plane`` counts the right
-    matches more than 3 ``sigma_px`` from where the plane's homography takes them.
+    ``exact1, exact2`` (M, 2) px are the noise-free places of the right matches; ``off_plane`` counts the
+    right matches more than 3 ``sigma_px`` from where the plane's homography takes them.
     """
 
     xy1: F64
@@ -51,7 +51,7 @@ class FacadeMaker:
     ----------
     matches : how many, right and wrong.
     relief : depth of the panes behind the wall, in distances from the camera.
-    off_plane : share of the right matches that lie before or behind the facade, up to a fifth of the distance.
+    off_plane : share of the right matches on things before or behind it, up to a fifth of the distance.
     wrong : share of the matches that are wrong; of these ``repeated`` lead to another window, the rest
         anywhere.
     sigma_px : noise of every coordinate.
@@ -108,7 +108,7 @@ class FacadeMaker:
         )
 
     def _points(self, period: F64, rng: np.random.Generator) -> F64:
-        """Corners of windows, each of a few kinds of place within its window, and what stands off the wall."""
+        """Corners of windows, a few kinds of place within each, and what stands off the wall."""
         kinds = rng.random((12, 2))
         depth = self.relief * DISTANCE * rng.choice(RELIEF_LEVELS, 12)
         kind = rng.integers(0, 12, self.matches)
@@ -120,14 +120,15 @@ class FacadeMaker:
 
 
 def _things(n: int, rng: np.random.Generator) -> F64:
-    """n points on one to four upright boards before or behind the wall: cars, trees, balconies, a side street."""
+    """n points on one to four boards before or behind the wall: cars, trees, balconies, a side street."""
     boards = int(rng.integers(1, 5))
     centre = rng.uniform((-4.0, -3.0, -0.2 * DISTANCE), (4.0, 3.0, 0.1 * DISTANCE), (boards, 3))
     size = rng.uniform(0.3, 1.2, (boards, 2))
     tilt = rng.uniform(-0.3, 0.3, (boards, 2))
     board = rng.integers(0, boards, n)
     on_board = rng.uniform(-1.0, 1.0, (n, 2)) * size[board]
-    return centre[board] + np.column_stack([on_board, np.sum(on_board * tilt[board], axis=1)])
+    place: F64 = centre[board] + np.column_stack([on_board, np.sum(on_board * tilt[board], axis=1)])
+    return place
 
 
 def _cameras(rng: np.random.Generator) -> tuple[F64, F64, F64]:

@@ -1,4 +1,4 @@
-"""Whether the matches of a pair determine its F, beyond agreeing with it: evidence, and a verdict with reasons.
+"""Whether the matches of a pair determine its F, beyond agreeing with it: evidence, verdict, reasons.
 
 Where most matches lie on one plane, every [e]x H of its homography H explains them, and the epipole rests on
 the rest. A wrong F then has as many inliers as the right one, or more. It betrays itself in four ways: hardly
@@ -46,7 +46,7 @@ CONTRADICTED, MOST_CONTRADICTED, JUDGED = 0.3, 0.2, 60
 
 @dataclass(frozen=True)
 class _Support:
-    """Weights of matches off the plane: ``agreeing`` with F, ``tried``, and how much of it is contradicted."""
+    """Weights of matches off the plane: ``agreeing`` with F, all ``tried``, and what is ``contradicted``."""
 
     agreeing: float
     tried: float

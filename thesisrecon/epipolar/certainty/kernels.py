@@ -274,3 +274,18 @@ def contradicted_shares(h: F64, points: F64, on_plane: B8, chosen: I64, near: fl
             shares[c] += 1.0 if on_plane[m] and apart > nearest[n] else 0.0
         shares[c] /= max(found, 1)
     return shares
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
+    """How many of the points (N, 2) each of the homographies (S, 3, 3) takes to within ``tolerance``."""
+    counts = np.zeros(len(H), np.int64)
+    for s in range(len(H)):
+        h = H[s]
+        for k in range(len(xy1)):
+            x, y = xy1[k, 0], xy1[k, 1]
+            w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+            u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w - xy2[k, 0]
+            v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w - xy2[k, 1]
+            counts[s] += 1 if u * u + v * v < tolerance * tolerance else 0
+    return counts

@@ -30,7 +30,7 @@ SAME_PX = 2.0
 
 @dataclass(frozen=True)
 class DominantPlane:
-    """``h`` (9,) unit norm in the frame of the points, ``squared`` (N,) distances of all points in sigma^2."""
+    """``h`` (9,) unit norm in the frame of the points, ``squared`` (N,) distances of all, in sigma^2."""
 
     h: F64
     squared: F64
@@ -111,4 +111,4 @@ def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:
     A band of width 2 sqrt(2) band_px across the picture, over the picture: the bounds of the matches.
     """
     narrow = min(float(np.ptp(xy)) for xy in (*xy1.T, *xy2.T))
-    return min(1.0, 2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300))
+    return min(1.0, float(2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300)))

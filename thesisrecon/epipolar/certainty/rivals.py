@@ -1,4 +1,4 @@
-"""Other epipolar geometries of the same plane that explain about as many matches as the one that was found."""
+"""Other epipolar geometries of the same plane that explain about as many matches as the one found."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ F64 = NDArray[np.float64]
 B8 = NDArray[np.bool_]
 
 PAIRS, SUBSET, RIVALS, LOOKED_AT = 300, 400, 3, 100
-"""Epipoles tried, matches off the plane that each is judged on, and how many of the best by all of these, and by
-those that the found F does not explain, are refined if they are unlike each other."""
+"""Epipoles tried, matches off the plane that each is judged on, and how many of the best by all of these, and
+by those that the found F does not explain, are refined if they are unlike each other."""
 TYPICAL = 0.3
 """Of the epipoles tried, so many are taken for wrong: what they explain, chance explains."""
 ALIKE = 0.8
