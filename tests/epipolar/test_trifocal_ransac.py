@@ -20,9 +20,17 @@ from tests.epipolar.test_trifocal_estimation import (
 )
 from tests.geometry.properties import holds_for_every
 from thesisrecon.epipolar import TrifocalFit, TrifocalRansac, estimate_trifocal
-from thesisrecon.epipolar.six_point.kernels import SAMPLE, reprojection_distances, score, search, six_point
+from thesisrecon.epipolar.six_point.kernels import (
+    SAMPLE,
+    draw_samples,
+    reprojection_distances,
+    score,
+    search,
+    six_point,
+)
 from thesisrecon.epipolar.trifocal_estimation import NO_POINTS, NO_SEGMENTS, refine_trifocal
 from thesisrecon.epipolar.trifocal_ransac import line_distances_px, noise_of_tracks
+from thesisrecon.epipolar.trifocal_reprojection import _off_principal_planes
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import camera_from_centre, decompose_camera, project
 from thesisrecon.geometry.homogeneous import homogenize
@@ -148,10 +156,10 @@ def test_distances_are_those_of_the_least_reprojection_error():
 def test_the_search_keeps_the_best_and_what_is_better_already():
     rng = np.random.default_rng(2)
     track = tracks(matches(three_cameras(rng), rng, 60, 0, 0.3)[0])
-    best, uniforms = np.zeros((3, 3, 4)), rng.random((50, SAMPLE))
-    found = search(track, uniforms, 2.0 * SCALE, 0.0, best)
+    best, samples = np.zeros((3, 3, 4)), draw_samples(rng.random((50, SAMPLE)), 60)
+    found = search(track, samples, track, 2.0 * SCALE, 0.0, best)
     assert found == pytest.approx(score(best, track, 1.0 / (2.0 * SCALE) ** 2, 0.0))
-    assert search(track, uniforms, 2.0 * SCALE, 60.0, np.zeros((3, 3, 4))) == 60.0
+    assert search(track, samples, track, 2.0 * SCALE, 60.0, np.zeros((3, 3, 4))) == 60.0
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])
@@ -231,6 +239,24 @@ def test_tracks_that_cannot_work_are_named(kind):
         with pytest.raises(StageFailure) as caught:
             TrifocalRansac(max_samples=2000).estimate(points[:, :8] if kind == "few" else points)
         assert "; " in str(caught.value)
+
+
+@pytest.mark.parametrize("off", [0, 12])
+def test_a_plane_among_wrong_tracks_is_named_and_a_tenth_off_it_is_enough(off):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        P, X = three_cameras(rng), rng.uniform(-2.0, 2.0, (120, 3))
+        X[off:, 2] = 0.3 * X[off:, 0]
+        points = np.stack([project(camera, X) for camera in P])
+        points += rng.normal(0.0, 0.5, points.shape)
+        wrong = np.arange(120) >= 90
+        points[:, wrong] = rng.uniform(200.0, 1000.0, (3, 30, 2))
+        if not off:
+            with pytest.raises(StageFailure, match="do not determine"):
+                TrifocalRansac().estimate(points, rng=rng)
+            continue
+        found = TrifocalRansac().estimate(points, rng=rng)
+        assert np.median(point_transfer_px(found.fit.T, matches(P, rng, 50, 0, 0.0)[0])) < 1.5
 
 
 def test_wrong_calls():
@@ -327,9 +353,12 @@ def test_merton_college_with_wrong_tracks(share):
 
 
 def test_a_start_on_a_principal_plane_is_no_division_by_zero():
+    P = np.stack([np.eye(3, 4), *np.random.default_rng(0).normal(size=(2, 3, 4))])
+    X = _off_principal_planes(np.array([[1.0, 2.0, 0.0, 0.5], [1.0, 2.0, 3.0, 0.5]]), P)
+    assert (np.einsum("va,na->nv", P[:, 2], X) != 0.0).all()
+    np.testing.assert_allclose(X[1], np.array([1.0, 2.0, 3.0, 0.5]) / np.linalg.norm([1.0, 2.0, 3.0, 0.5]))
     rng = np.random.default_rng(928)
-    points = rng.integers(0, 4, (200, 3, 8, 2)) * 1.0
-    for few in points:
+    for few in rng.integers(0, 4, (15, 3, 8, 2)) * 1.0:
         failure, fit = _outcome(lambda few=few: estimate_trifocal(few, max_iterations=5))
         assert failure is not None or np.isfinite(fit.T).all()
     with pytest.raises(ValueError, match="beyond"):

@@ -127,7 +127,7 @@ def estimate_trifocal(
     return fit
 
 
-def refuse_undetermined(fit: TrifocalFit, equations: TensorEquations, xy: F64) -> None:
+def refuse_undetermined(fit: TrifocalFit, equations: TensorEquations, xy: F64, *, weak: float = WEAK) -> None:
     """``StageFailure`` where the noise alone decides the fit; xy (3, K, 2) all points and ends, in px.
 
     Three kinds of evidence: noise like that of the fit explains many solutions of the linear equations; the
@@ -136,12 +136,12 @@ def refuse_undetermined(fit: TrifocalFit, equations: TensorEquations, xy: F64) -
     family = int(np.sum(equations.explained_px() <= SAME_NOISE * fit.sigma_px))
     across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
-    if not (family < FAMILY and fit.weakness <= WEAK and narrowest > 3.0 * fit.sigma_px):
+    if not (family < FAMILY and fit.weakness <= weak and narrowest > 3.0 * fit.sigma_px):
         raise StageFailure(
             "the matches do not determine the geometry of three views",
             f"noise {fit.sigma_px:.2g} px, which explains {family} independent tensors where {FAMILY - 1} "
             f"is the most, narrowest spread of the matches {narrowest:.3g} px, weakness {fit.weakness:.2g} "
-            f"where {WEAK:.2g} is the most",
+            f"where {weak:.2g} is the most",
             "use matches of more than one plane from three places; wrong matches look like this, too",
         )
 

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar.six_point.kernels import SAMPLE, WIDTHS, reprojection_distances, search
+from thesisrecon.epipolar.six_point.kernels import (
+    SAMPLE,
+    WIDTHS,
+    draw_samples,
+    reprojection_distances,
+    search,
+)
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_SEGMENTS,
     TrifocalFit,
@@ -24,6 +30,7 @@ from thesisrecon.epipolar.trifocal_estimation import (
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
+from thesisrecon.geometry.multiview import estimate_homography, homography_residuals
 from thesisrecon.geometry.trifocal import tensor_from_cameras
 from thesisrecon.geometry.trifocal_linear import check_triplets, tensor_equations
 from thesisrecon.robust.kernels import required_samples
@@ -31,15 +38,19 @@ from thesisrecon.robust.kernels import required_samples
 F64 = NDArray[np.float64]
 B8 = NDArray[np.bool_]
 
-CHUNK = 200
+CHUNK, COMPLETIONS = 200, 1000
 REFINEMENTS, SHORT = 3, 4
 ROUNDS, MIXTURE_STEPS = 6, 100
 INSIDE = 3.5
 """Widths of the noise within which a track is right: of 3 freedoms, 99.3 % are."""
 LINE_INSIDE = 3.2
+OFF_PLANE, PLANE_ROUNDS, PLANE_WIDTH = 4, 6, 6.0
 HUBER = 3.0
 """Widths of the noise from which a residual counts less in the refinement."""
 NEEDED = 9
+WEAK = 0.2
+"""As in :func:`estimate_trifocal`, but less: of a plane and a wrong track or two that happen to fit it is
+0.25 to 0.4."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +111,9 @@ class TrifocalRansac:
         if segments.shape[1]:
             fit, inliers, line_inliers = self._with_lines(frame, fit, points, segments)
         p, s = points[:, inliers], segments[:, line_inliers]
-        refuse_undetermined(fit, tensor_equations(p, s), np.concatenate([p, s.reshape(3, -1, 2)], axis=1))
+        self._refuse_a_plane(p, fit.sigma_px)
+        xy = np.concatenate([p, s.reshape(3, -1, 2)], axis=1)
+        refuse_undetermined(fit, tensor_equations(p, s), xy, weak=WEAK)
         return RobustTrifocal(fit, inliers, line_inliers, samples)
 
     def _search(self, frame: _Frame, points: F64, rng: Generator) -> tuple[F64, int]:
@@ -111,7 +124,8 @@ class TrifocalRansac:
         needed = self.max_samples
         while drawn < needed:
             count = min(CHUNK, needed - drawn)
-            found = search(track, rng.random((count, SAMPLE)), threshold, bar, best)
+            samples = draw_samples(rng.random((count, SAMPLE)), len(track))
+            found = search(track, samples, track, threshold, bar, best)
             drawn += count
             if found > bar:
                 best, bar = self._improve(frame, track, best, found)
@@ -119,7 +133,32 @@ class TrifocalRansac:
                 needed = min(needed, required_samples(share, SAMPLE, self.confidence, self.max_samples))
         if not bar > 0.0:
             raise self._no_consensus(points.shape[1], 0)
-        return best, drawn
+        best, _ = self._off_the_plane(frame, track, best, bar, rng)
+        return best, drawn + COMPLETIONS
+
+    def _off_the_plane(
+        self, frame: _Frame, track: F64, best: F64, bar: float, rng: Generator
+    ) -> tuple[F64, float]:
+        """The best with four tracks that agree and two that do not, where that is better.
+
+        Most samples of a scene with a dominant plane lie on it but for one, and explain nothing else (Chum,
+        Werner and Matas, CVPR 2005, for two views).
+        """
+        threshold = self.threshold_px * frame.scale
+        near = _distances(best, track) < threshold / np.sqrt(WIDTHS[1])
+        on, off = np.flatnonzero(near), np.flatnonzero(~near)
+        if len(on) < SAMPLE or len(off) < 2:
+            return best, bar
+        four = on[draw_samples(rng.random((COMPLETIONS, SAMPLE - 2)), len(on))]
+        two = off[draw_samples(rng.random((COMPLETIONS, 2)), len(off))]
+        better = best.copy()
+        # The solver's frame is of the first five, no four of which may be of one plane. Judged by the others
+        # alone: on the plane no sample is as good as what was refined there.
+        found = search(track, np.concatenate([two, four], axis=1), track[off], threshold, 0.0, better)
+        if not found > 0.0:
+            return best, bar
+        better, found = self._improve(frame, track, better, 0.0)
+        return (better, found) if found > bar else (best, bar)
 
     def _improve(self, frame: _Frame, track: F64, P: F64, value: float) -> tuple[F64, float]:
         """Cameras refined on the tracks they agree with, while their score grows."""
@@ -173,6 +212,26 @@ class TrifocalRansac:
         if found < NEEDED or _by_chance(found, len(track), INSIDE * sigma / frame.width_px):
             raise self._no_consensus(len(track), found)
         return right, sigma
+
+    def _refuse_a_plane(self, points: F64, sigma_px: float) -> None:
+        """``StageFailure`` where fewer than 4 tracks are off a plane: any two off it decide all the rest."""
+        off = np.zeros(points.shape[1], dtype=bool)
+        for _ in range(PLANE_ROUNDS):
+            distances = [
+                homography_residuals(
+                    estimate_homography(points[0, ~off], points[v, ~off]), points[0], points[v]
+                )
+                for v in (1, 2)
+            ]
+            worst = np.max(distances, axis=0)
+            off = worst > max(float(np.quantile(worst, 0.8)), PLANE_WIDTH * sigma_px)
+        count = int(np.sum(worst > PLANE_WIDTH * sigma_px))
+        if count < OFF_PLANE:
+            raise StageFailure(
+                "the matches do not determine the geometry of three views",
+                f"{count} of {len(off)} tracks are off a plane or a rotation, {OFF_PLANE} are needed",
+                "use matches of more than one plane from three places",
+            )
 
     def _no_consensus(self, n: int, found: int) -> StageFailure:
         return StageFailure(

@@ -374,16 +374,24 @@ def score(P: F64, track: F64, inverse: float, bar: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def search(track: F64, uniforms: F64, threshold: float, bar: float, best: F64) -> float:
-    """The best score above ``bar`` of the samples that ``uniforms`` (S, 6) draw, its cameras in ``best``.
+def draw_samples(uniforms: F64, n: int) -> I64:
+    """Samples of distinct indices below n from uniform numbers (S, k); (S, k)."""
+    samples = np.empty(uniforms.shape, dtype=np.int64)
+    for s in range(len(uniforms)):
+        draw_sample(uniforms[s], n, samples[s])
+    return samples
+
+
+@njit(cache=True, nogil=True)
+def search(track: F64, samples: I64, judges: F64, threshold: float, bar: float, best: F64) -> float:
+    """The best score over ``judges`` above ``bar`` of ``samples`` (S, 6) of tracks, its cameras in ``best``.
 
     ``bar`` itself, with ``best`` untouched, where none is better.
     """
-    sample, P = np.empty(SAMPLE, dtype=np.int64), np.empty((3, 3, 3, 4))
-    for s in range(len(uniforms)):
-        draw_sample(uniforms[s], len(track), sample)
-        for k in range(six_point(track, sample, P)):
-            value = score(P[k], track, 1.0 / threshold**2, bar)
+    P = np.empty((3, 3, 3, 4))
+    for s in range(len(samples)):
+        for k in range(six_point(track, samples[s], P)):
+            value = score(P[k], judges, 1.0 / threshold**2, bar)
             if value > bar:
                 bar = value
                 best[:] = P[k]
