@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -207,8 +208,22 @@ def _match_pairs(work: _Work) -> None:
     work.result = replace(result, pairs=tuple(two_views))
     accepted = [pair for pair in two_views if pair.accepted]
     counts = {"pairs": len(pairs), "accepted": len(accepted), "verified": sum(p.inliers for p in accepted)}
+    counts["undetermined"] = sum(pair.undetermined for pair in accepted)
     metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
-    run.finish("matches", counts=counts, metrics=metrics)
+    run.finish("matches", counts=counts, metrics=metrics, warnings=_open_pairs(accepted))
+
+
+def _open_pairs(accepted: Sequence[TwoView]) -> list[str]:
+    """A sentence where the geometry of most pairs is open: what follows rests on few."""
+    undetermined = [pair for pair in accepted if pair.undetermined]
+    if 2 * len(undetermined) <= len(accepted):
+        return []
+    kinds = Counter(pair.configuration for pair in undetermined)
+    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    return [
+        f"{len(undetermined)} of {len(accepted)} accepted pairs leave their epipolar geometry undetermined "
+        f"({told})"
+    ]
 
 
 def _prepared(work: _Work) -> dict[int, Any]:

@@ -49,7 +49,9 @@ BAND = 2.5
 FLEXIBLE = 2.0
 """An F is fitted to the wrong matches too, which moves it toward them: they agree so many times as often."""
 RISK = 2e-3
-"""Chance to take a pure translation or rotation for more than that, each."""
+"""Chance to take a pure translation for more than that."""
+TURN_RISK = 4e-3
+"""Chance to take a rotation for a plane, on either side: less, and more planes pass for rotations."""
 TRANSLATED = 3.3
 """Matches within so many sigma of a translation are compared with F; more would be cut by what noise does."""
 CORRECTIONS, EXACT = 10, 1e-12
@@ -248,7 +250,7 @@ def _turning(H: F64, covariance: F64) -> tuple[float, float]:
 
 def _turn_limit(n: int) -> float:
     """Standard errors that the turning of a rotation keeps to: Student's, since the noise is estimated."""
-    return float(stdtrit(n - 7, 1.0 - RISK))
+    return float(stdtrit(n - 7, 1.0 - TURN_RISK))
 
 
 def _translation_ratio(case: _Case) -> float:

@@ -231,6 +231,8 @@ def _pair_words(pair: TwoView) -> str:
         words += f", noise {pair.sigma_px:.2f} px per coordinate"
     if np.isfinite(pair.homography_share):
         words += f", one plane explains {100 * pair.homography_share:.0f} %"
+    if pair.undetermined and pair.certainty is not None:
+        words += f"; its epipolar geometry is undetermined: {pair.certainty.reasons[0]}"
     return words
 
 

@@ -41,6 +41,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
             "matched": len(result.pairs),
             "accepted": sum(pair.accepted for pair in result.pairs),
             "verified_matches": sum(pair.inliers for pair in result.pairs if pair.accepted),
+            "undetermined": sum(pair.undetermined for pair in result.pairs if pair.accepted),
         },
         "cameras": views,
         "refused": _refused(result, views),

@@ -119,10 +119,10 @@ def _registered(data: ReportData) -> Fact:
 
 def _pair_fact(pairs: Sequence[TwoView]) -> Fact:
     accepted = [pair for pair in pairs if pair.accepted]
-    matches = sum(pair.inliers for pair in accepted)
-    return Fact(
-        "Pairs accepted", f"{len(accepted)} of {len(pairs)}", f"{grouped(matches)} verified matches in them"
-    )
+    note = f"{grouped(sum(pair.inliers for pair in accepted))} verified matches in them"
+    if undetermined := sum(pair.undetermined for pair in accepted):
+        note += f"; {undetermined} leave their epipolar geometry undetermined"
+    return Fact("Pairs accepted", f"{len(accepted)} of {len(pairs)}", note)
 
 
 def _point_fact(points: int, overall: ResidualSummary | None) -> Fact:
