@@ -228,11 +228,14 @@ def main() -> int:
         for sigma in ([WRONG_NOISE_PX] if wrong else arguments.noise)
         for n in arguments.points
     ]
-    results = run_study(settings, methods, arguments.trials)
-    judged = [r for r in results if r.method in (GOLD, DEFAULT) and not (r.told or r.setting.wrong)]
-    if arguments.out:
-        results = merged(read_results(arguments.out) if arguments.out.exists() else [], results)
-        write_results(arguments.out, results)
+    results = read_results(arguments.out) if arguments.out and arguments.out.exists() else []
+    judged = []
+    for setting in settings:
+        block = run_study([setting], methods, arguments.trials)
+        judged += [r for r in block if r.method in (GOLD, DEFAULT) and not (r.told or setting.wrong)]
+        results = merged(results, block)
+        if arguments.out:
+            write_results(arguments.out, results)
     print(report(results))
     return int(any(r.rms_ratio > ALLOWED for r in judged))
 
