@@ -33,6 +33,33 @@ def test_every_kind_is_named_at_every_noise(kind, sigma):
     assert right >= 24
 
 
+@pytest.mark.parametrize("kind", list(Configuration))
+@pytest.mark.parametrize("sigma", [0.25, 1.0])
+def test_every_kind_is_named_with_wrong_matches_too(kind, sigma):
+    right = 0
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        scene = make_two_views(kind, 200, rng)
+        xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (scene.xy1, scene.xy2))
+        wrong = rng.random(200) < 0.3
+        xy2[wrong] = rng.uniform((0.0, 0.0), (1280.0, 960.0), (int(wrong.sum()), 2))
+        fit = estimate_fundamental(xy1, xy2, threshold_px=max(1.0, 2.0 * sigma))
+        found = classify_configuration(fit.F, xy1, xy2, inliers=fit.inliers)
+        right += found.kind is kind
+    assert right >= 14
+
+
+def test_relief_of_the_size_of_the_noise_is_seen_in_many_matches():
+    """Parallax of about the noise: hardly a match stands off the plane, but all together do."""
+    flat = make_two_views(Configuration.PLANE, 800, np.random.default_rng(6))
+    rng = np.random.default_rng(7)
+    X = flat.X + np.c_[np.zeros((800, 2)), rng.normal(0.0, 0.025, 800)]
+    xy1, xy2 = (project(P, X) + rng.normal(0.0, 0.7, (800, 2)) for P in (flat.P1, flat.P2))
+    found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
+    assert found.kind is Configuration.GENERAL
+    assert found.off_homography < 0.1
+
+
 def test_wrong_matches_that_f_fits_do_not_hide_a_plane():
     rng = np.random.default_rng(0)
     scene = make_two_views(Configuration.PLANE, 200, rng)
@@ -87,5 +114,7 @@ def test_exact_and_wrong_calls():
     xy1, xy2, _ = spoil(pair, np.random.default_rng(0), sigma=0.3, outliers=0.0)
     with pytest.raises(StageFailure, match="needed at least 12"):
         classify_configuration(pair.F, xy1[:11], xy2[:11])
+    with pytest.raises(ValueError, match="11"):
+        classify_configuration(pair.F, xy1, xy2, inliers=np.ones(11, bool))
     with pytest.raises(ValueError, match="rank 2"):
         classify_configuration(np.zeros((3, 3)), xy1, xy2)

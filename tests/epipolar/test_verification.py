@@ -39,12 +39,19 @@ def test_a_good_pair_keeps_its_inliers_and_is_accepted():
     np.testing.assert_array_equal(pair.index2, 299 - np.flatnonzero(fit.inliers))
     assert len(pair.affine) == pair.inliers
     assert pair.homography_share < 0.5
+    assert pair.configuration == "general"
+    assert not pair.undetermined
+    assert pair.certainty is not None
 
 
 def test_a_plane_is_accepted_and_says_so():
     pair, _, _ = verified(make_pair(300, np.random.default_rng(1), planar=True), outliers=0.2)
     assert pair.accepted
     assert pair.homography_share > 0.97
+    assert pair.configuration == "plane"
+    assert pair.undetermined
+    assert pair.certainty is not None
+    assert "one homography explains the matches (plane)" in pair.certainty.reasons
 
 
 def test_a_turned_camera_is_a_homography_too():
@@ -55,6 +62,7 @@ def test_a_turned_camera_is_a_homography_too():
     turned = Pair(scene.xy1, moved[:, :2] / moved[:, 2:], scene.F, scene.P1, scene.P2)
     pair, _, _ = verified(turned, outliers=0.1)
     assert pair.homography_share > 0.97
+    assert pair.undetermined
 
 
 def test_few_inliers_are_refused_with_numbers():
@@ -109,6 +117,7 @@ def test_verification_is_the_same_every_time_and_safe_on_nothing():
             PairVerification().verify(as_matches(xy, xy), fit, np.random.default_rng(0)) for _ in range(2)
         )
         assert first.homography_share == second.homography_share
+        assert first.configuration == second.configuration
         assert np.isfinite(first.homography_share)
         assert not first.accepted
 

@@ -1,7 +1,8 @@
 """Whether degenerate pairs are named, and a wrong F is not called sure.
 
-``python -m validation.checks.epipolar_certainty`` prints the tables. An F is right where the RMS distance of exact correspondences to its epipolar lines is at most 1 px, and sure
-where the certainty of its fit says that the matches determine it.
+``python -m validation.checks.epipolar_certainty`` prints the tables. An F is right where the RMS distance of
+exact correspondences to its epipolar lines is at most 1 px, and sure where the certainty of its fit says that
+the matches determine it.
 """
 
 from __future__ import annotations

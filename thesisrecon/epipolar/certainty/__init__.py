@@ -38,6 +38,8 @@ LARGEST_CHANCE = -2.0
 LEAST_MARGIN = 3.0
 """Standard errors by which a rival must be worse. Right ones of real facades have 7 and more, wrong ones less
 than 2; it is no bound of a probability, since matches of repeated parts are not independent."""
+LEAST_GAIN = 0.05
+"""A rival that changes less than this share of the matches off the plane is F with other wrong matches."""
 LARGEST_ERROR_PX = 1.0
 """Distance from epipolar lines that matters, in pixels, or 2 sigma where that is more."""
 CONTRADICTED, MOST_CONTRADICTED, JUDGED = 0.3, 0.2, 60
@@ -86,9 +88,9 @@ def judge_certainty(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) 
         free=2,
     )
     matters_px = max(LARGEST_ERROR_PX, 2.0 * fit.sigma_px)
-    other = min(
-        (r for r in rivals if r.apart > matters_px * frame.scale), key=lambda r: r.margin, default=None
-    )
+    least = _least_gain(support, chance_of_agreement(xy1, xy2, band_px))
+    different = [r for r in rivals if r.gained >= least and _differs(r, matters_px * frame.scale)]
+    other = min(different, key=lambda r: r.margin, default=None)
     return Certainty(
         determined=not (reasons := tuple(_reasons(support, chance, other, error_px, matters_px))),
         reasons=reasons,
@@ -99,6 +101,18 @@ def judge_certainty(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) 
         rival=frame.matrix_in_pixels(other.f) if other is not None else None,
         expected_error_px=error_px,
     )
+
+
+def _least_gain(support: _Support, chance: float) -> float:
+    """Weight of matches that a rival must gain to be one: more than of the wrong ones agree by chance."""
+    expected = 2.0 * chance * (support.tried - support.agreeing)
+    return float(max(LEAST_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
+
+
+def _differs(rival: Rival, matters: float) -> bool:
+    """Whether F is wrong if the rival is right; one that explains all that F does must explain much more, as
+    a wrong match or two that it gains are far from F too."""
+    return rival.apart > matters or (rival.error > matters and rival.margin < -LEAST_MARGIN)
 
 
 def _support(points: F64, inliers: B8, weights: F64, plane: DominantPlane, near: float) -> _Support:

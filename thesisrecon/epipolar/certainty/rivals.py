@@ -34,13 +34,15 @@ FAR = 20.0
 class Rival:
     """Another F: ``f`` (9,) in the frame, and how it differs from the one that was found.
 
-    ``lost`` and ``gained`` are weights of matches that only the one or only the other explains;
-    ``apart`` is the lesser RMS distance of the inliers of one to the other, in the units of the frame.
+    ``lost`` and ``gained`` are weights of matches that only the one or only the other explains; ``error`` is
+    the RMS distance of the rival's inliers to the found F, ``apart`` that or the other way round, whichever
+    is less, in the units of the frame.
     """
 
     f: F64
     lost: float
     gained: float
+    error: float
     apart: float
 
     @property
@@ -106,6 +108,8 @@ def _rival(f: F64, points: F64, weights: F64, found: tuple[F64, B8], band: float
     agreeing = own < band
     lost, gained = weights[inside & ~agreeing].sum(), weights[agreeing & ~inside].sum()
     if not agreeing.any() or not inside.any():
-        return Rival(f, float(lost), float(gained), np.inf)
-    apart = [np.sqrt(np.mean(np.minimum(d, FAR * band) ** 2)) for d in (distances[agreeing], own[inside])]
-    return Rival(f, float(lost), float(gained), float(min(apart)))
+        return Rival(f, float(lost), float(gained), np.inf, np.inf)
+    error, back = (
+        np.sqrt(np.mean(np.minimum(d, FAR * band) ** 2)) for d in (distances[agreeing], own[inside])
+    )
+    return Rival(f, float(lost), float(gained), float(error), float(min(error, back)))

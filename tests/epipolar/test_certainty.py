@@ -1,0 +1,254 @@
+"""Whether an F is determined is told from the matches off the plane, not from the number of inliers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.epipolar.pairs import make_pair, spoil
+from thesisrecon.epipolar import estimate_fundamental, judge_certainty
+from thesisrecon.epipolar.certainty.kernels import (
+    contradicted_shares,
+    count_transferred,
+    geometries_of_plane,
+    plane_distances,
+    refine_plane,
+)
+from thesisrecon.epipolar.certainty.plane import (
+    find_dominant_plane,
+    log10_false_alarms,
+    once_each,
+    plane_covariance,
+)
+from thesisrecon.epipolar.degeneracy import homography_distances
+from thesisrecon.epipolar.frame import PairFrame
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.multiview import (
+    epipoles,
+    estimate_homography,
+    homography_residuals,
+    sampson_residuals,
+    symmetric_residuals,
+    unit_norm,
+)
+from thesisrecon.types import FundamentalFit
+from validation.scenes.facade import FacadeMaker
+
+
+def judged(xy1, xy2, seed=0):
+    fit = estimate_fundamental(xy1, xy2, seed=seed)
+    return fit, judge_certainty(fit, xy1, xy2, rng=np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
+def test_a_general_scene_is_sure(outliers):
+    for seed in range(5):
+        pair = make_pair(400, np.random.default_rng(seed))
+        xy1, xy2, _ = spoil(pair, np.random.default_rng(seed), sigma=0.5, outliers=outliers)
+        _, certainty = judged(xy1, xy2)
+        assert certainty.determined, certainty.reasons
+        assert certainty.reasons == ()
+        assert certainty.log10_false_alarms < -10
+        assert certainty.expected_error_px < 0.5
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3])
+def test_a_plane_is_not_sure_however_many_inliers(outliers):
+    for seed in range(8):
+        pair = make_pair(500, np.random.default_rng(seed), planar=True)
+        xy1, xy2, _ = spoil(pair, np.random.default_rng(seed), sigma=0.4, outliers=outliers)
+        fit, certainty = judged(xy1, xy2)
+        assert fit.inliers.sum() > 300
+        assert not certainty.determined
+        assert certainty.reasons
+
+
+def test_relief_makes_a_facade_sure():
+    sure = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        facade = FacadeMaker(
+            matches=500, relief=0.03, off_plane=0.15, wrong=0.2, repeated=0.2, sigma_px=0.3
+        ).make(rng)
+        fit, certainty = judged(facade.xy1, facade.xy2)
+        assert np.sqrt(np.mean(symmetric_residuals(fit.F, facade.exact1, facade.exact2) ** 2) / 2.0) < 1.0
+        sure += certainty.determined
+    assert sure >= 6
+
+
+def test_matches_between_windows_do_not_make_a_facade_sure():
+    contradicted = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        facade = FacadeMaker(
+            matches=500, relief=0.0, off_plane=0.0, wrong=0.4, repeated=0.7, sigma_px=0.3
+        ).make(rng)
+        fit, certainty = judged(facade.xy1, facade.xy2)
+        assert not certainty.determined
+        # More matches agree than are right: the row of windows has an epipolar geometry of its own.
+        assert fit.inliers.sum() > 0.95 * facade.right.sum()
+        contradicted += certainty.contradicted > 0.5 * certainty.off_plane
+    assert contradicted >= 9
+
+
+def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_rival():
+    """All matches of a plane and few others, of which a wrong F has some."""
+    rng = np.random.default_rng(3)
+    flat = make_pair(300, np.random.default_rng(8), planar=True)
+    X = np.c_[rng.uniform(-1.0, 1.0, (30, 2)), rng.uniform(4.0, 4.6, 30)]
+    Xh = np.c_[X, np.ones(30)]
+    away1, away2 = (Xh @ P.T for P in (flat.P1, flat.P2))
+    xy1 = np.r_[flat.xy1, away1[:, :2] / away1[:, 2:]] + rng.normal(0.0, 0.3, (330, 2))
+    xy2 = np.r_[flat.xy2, away2[:, :2] / away2[:, 2:]] + rng.normal(0.0, 0.3, (330, 2))
+    H = estimate_homography(flat.xy1, flat.xy2)
+    _, e2 = epipoles(flat.F)
+    wrong_pole = e2 + np.array([0.0, 0.4, 0.0]) * np.linalg.norm(e2)
+    cross = np.cross(np.eye(3), wrong_pole) * -1.0
+    F = unit_norm(cross @ H)
+    inliers = np.abs(sampson_residuals(F, xy1, xy2)) < 0.75
+    assert inliers[:300].mean() > 0.95
+    fit = FundamentalFit(F, inliers, 0.3, 1e-12 * np.eye(9))
+    certainty = judge_certainty(fit, xy1, xy2, rng=np.random.default_rng(0))
+    assert not certainty.determined
+    assert certainty.rival is not None
+    assert certainty.rival_margin < 0.0
+    assert np.mean(np.abs(sampson_residuals(certainty.rival, xy1, xy2)) < 0.9) > 0.97
+    assert any("another geometry" in reason for reason in certainty.reasons)
+
+
+def test_a_wide_covariance_is_a_reason():
+    pair = make_pair(300, np.random.default_rng(0))
+    xy1, xy2, _ = spoil(pair, np.random.default_rng(0), sigma=0.3, outliers=0.0)
+    fit = estimate_fundamental(xy1, xy2)
+    vague = FundamentalFit(fit.F, fit.inliers, fit.sigma_px, fit.covariance * 1e4)
+    certainty = judge_certainty(vague, xy1, xy2, rng=np.random.default_rng(0))
+    assert not certainty.determined
+    assert certainty.expected_error_px > 1.0
+    assert "covariance" in certainty.reasons[0]
+
+
+def test_the_front_door_judges_when_asked():
+    pair = make_pair(200, np.random.default_rng(1))
+    xy1, xy2, _ = spoil(pair, np.random.default_rng(1), sigma=0.3, outliers=0.2)
+    plain, told = estimate_fundamental(xy1, xy2), estimate_fundamental(xy1, xy2, judge=True)
+    assert plain.certainty is None
+    assert told.certainty is not None
+    assert told.certainty.determined
+    np.testing.assert_array_equal(plain.F, told.F)
+
+
+def test_the_same_generator_gives_the_same_verdict():
+    rng = np.random.default_rng(5)
+    facade = FacadeMaker().make(rng)
+    first, second = (judged(facade.xy1, facade.xy2, seed=4)[1] for _ in range(2))
+    assert first.reasons == second.reasons
+    assert first.rival_margin == second.rival_margin
+
+
+def test_wrong_and_hopeless_calls():
+    pair = make_pair(40, np.random.default_rng(0))
+    fit = FundamentalFit(pair.F, np.ones(39, bool), 0.3, np.eye(9))
+    with pytest.raises(ValueError, match="39"):
+        judge_certainty(fit, pair.xy1, pair.xy2, rng=np.random.default_rng(0))
+    with pytest.raises(StageFailure, match="needed at least 8"):
+        judge_certainty(fit, pair.xy1[:7], pair.xy2[:7], rng=np.random.default_rng(0))
+    nobody = FundamentalFit(pair.F, np.zeros(40, bool), 0.3, np.eye(9))
+    assert not judge_certainty(nobody, pair.xy1, pair.xy2, rng=np.random.default_rng(0)).determined
+
+
+# ---------------------------------------------------------------- the pieces
+
+
+def test_plane_distances_match_their_numpy_twin():
+    pair = make_pair(50, np.random.default_rng(2), planar=True)
+    xy1, xy2, _ = spoil(pair, np.random.default_rng(2), sigma=2.0, outliers=0.1)
+    H = estimate_homography(pair.xy1, pair.xy2)
+    expected = np.sum(homography_distances(H, xy1, xy2) ** 2, axis=1)
+    np.testing.assert_allclose(plane_distances(H.ravel(), np.hstack([xy1, xy2])), expected, rtol=1e-6)
+
+
+def test_transfers_are_counted_as_by_numpy():
+    pair = make_pair(60, np.random.default_rng(3))
+    H = np.stack([estimate_homography(pair.xy1[k : k + 12], pair.xy2[k : k + 12]) for k in (0, 12, 24)])
+    expected = [int(np.sum(homography_residuals(h, pair.xy1, pair.xy2) < 30.0)) for h in H]
+    np.testing.assert_array_equal(count_transferred(H, pair.xy1, pair.xy2, 30.0), expected)
+
+
+def test_geometries_of_a_plane_keep_the_plane_and_the_two_matches():
+    rng = np.random.default_rng(4)
+    flat = make_pair(40, rng, planar=True)
+    frame = PairFrame.of(flat.xy1, flat.xy2)
+    points = frame.points(flat.xy1, flat.xy2)
+    h = estimate_homography(points[:, :2], points[:, 2:]).ravel()
+    away = points[:6].copy()
+    away[:, 2:] += rng.uniform(0.2, 0.5, (6, 2))
+    F, agree, sums = geometries_of_plane(h, away, np.ones((1, 6)), np.array([[0, 1], [2, 5]]), 1e-6)
+    for f, (a, b) in zip(F, ((0, 1), (2, 5)), strict=True):
+        r = np.abs(sampson_residuals(f.reshape(3, 3), points[:, :2], points[:, 2:]))
+        assert r.max() < 1e-9
+        r = np.abs(sampson_residuals(f.reshape(3, 3), away[:, :2], away[:, 2:]))
+        assert r[[a, b]].max() < 1e-9
+    np.testing.assert_array_equal(agree.sum(axis=1), sums[:, 0])
+    assert (sums[:, 0] >= 2).all()
+
+
+def test_the_dominant_plane_is_found_among_others():
+    rng = np.random.default_rng(6)
+    flat = make_pair(120, np.random.default_rng(9), planar=True)
+    X = np.c_[rng.uniform(-1.0, 1.0, (80, 2)), rng.uniform(4.0, 6.0, 80), np.ones(80)]
+    far1, far2 = (X @ P.T for P in (flat.P1, flat.P2))
+    xy1 = np.r_[flat.xy1, far1[:, :2] / far1[:, 2:]] + rng.normal(0.0, 0.3, (200, 2))
+    xy2 = np.r_[flat.xy2, far2[:, :2] / far2[:, 2:]] + rng.normal(0.0, 0.3, (200, 2))
+    frame = PairFrame.of(xy1, xy2)
+    plane = find_dominant_plane(
+        frame.matrix_in_frame(flat.F),
+        frame.points(xy1, xy2),
+        np.ones(200, bool),
+        sigma=0.3 * frame.scale,
+        rng=np.random.default_rng(0),
+    )
+    assert plane is not None
+    assert not plane.off[:120].any()
+    assert plane.off[120:].mean() > 0.9
+
+
+def test_the_covariance_of_a_homography_is_that_of_trials():
+    rng = np.random.default_rng(7)
+    pair = make_pair(60, rng, planar=True)
+    frame = PairFrame.of(pair.xy1, pair.xy2)
+    exact, found = frame.points(pair.xy1, pair.xy2), []
+    truth = estimate_homography(exact[:, :2], exact[:, 2:]).ravel()
+    for _ in range(300):
+        h = truth.copy()
+        refine_plane(h, exact + rng.normal(0.0, 1e-3, exact.shape), 1e3, 5)
+        found.append(h * np.sign(h @ truth))
+    predicted = np.trace(plane_covariance(truth, exact, 1e-3))
+    assert np.trace(np.cov(np.array(found).T)) == pytest.approx(predicted, rel=0.15)
+
+
+def test_chance_and_surprise():
+    assert log10_false_alarms(2.0, 50.0, chance=0.05, free=2) == 0.0
+    assert log10_false_alarms(7.0, 100.0, chance=0.05, free=2) > 0.0
+    assert log10_false_alarms(30.0, 100.0, chance=0.02, free=2) < -15.0
+    # More tried matches make the same number less of a surprise.
+    few, many = (log10_false_alarms(12.0, n, chance=0.02, free=2) for n in (30.0, 300.0))
+    assert few < many
+
+
+def test_matches_that_share_a_place_count_once():
+    xy1 = np.array([[10.0, 10.0], [50.0, 80.0], [90.0, 20.0], [200.0, 200.0]])
+    xy2 = np.array([[30.0, 30.0], [30.2, 30.1], [30.4, 30.3], [90.0, 90.0]])
+    np.testing.assert_allclose(once_each(xy1, xy2), [1 / 3, 1 / 3, 1 / 3, 1.0])
+
+
+def test_one_that_would_change_places_with_the_wall_is_contradicted():
+    x, y = np.meshgrid(np.arange(10.0), np.arange(10.0))
+    points = np.column_stack([x.ravel(), y.ravel(), x.ravel(), y.ravel()])
+    lone, patch = 44, (77, 78, 79, 87, 88, 89, 97, 98, 99)
+    points[lone, 2] += 3.0
+    points[list(patch), 2] += 3.0
+    on_plane = np.ones(100, bool)
+    on_plane[[lone, *patch]] = False
+    shares = contradicted_shares(np.eye(3).ravel(), points, on_plane, np.array([lone, 88]), 0.1)
+    assert shares[0] == 1.0
+    assert shares[1] == 0.0
