@@ -154,7 +154,7 @@ def _ratio_cell(r: Result) -> str:
 
 
 def _short(value: float) -> str:
-    return f"{value:.2f}" if value < 10.0 else f"{value:.2g}"
+    return f"{value:.2f}" if value < 10.0 else f"{value:.0f}"
 
 
 def _table(results: Sequence[Result], head: Callable[[Setting], str], cell: Callable[[Result], str]) -> str:
