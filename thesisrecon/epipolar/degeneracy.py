@@ -47,9 +47,12 @@ LARGEST_CHANCE = -3.0
 """log10 of the false alarms that matches off the simpler model may be."""
 BAND = 2.5
 FLEXIBLE = 2.0
-"""An F is fitted to the wrong matches too, which moves it toward them: they agree so many times as often."""
-RISK = 2e-3
-"""Chance to take a pure translation for more than that."""
+"""An F of a plane is fitted to wrong matches too, and moves toward them: they agree so much more often."""
+EPIPOLE, BEYOND_TRANSLATION = 2, 5
+"""Degrees of freedom that F has beyond a homography, and beyond [e]x."""
+RISK, ALLOWANCE = 2e-3, 0.4
+"""Chance to take a pure translation for more than that, were all residuals normal; what is allowed beyond it
+where a wrong match or more is expected in the band, for F to bend to."""
 TURN_RISK = 4e-3
 """Chance to take a rotation for a plane, on either side: less, and more planes pass for rotations."""
 TRANSLATED = 3.3
@@ -129,7 +132,7 @@ def classify_configuration(
     refine(f, points[inliers], GRADIENT, np.inf, _scale(f, points[inliers]) * 3.0, 15)
     sigma = _scale(f, points[inliers])
     agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
-    chance = FLEXIBLE * chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
+    chance = chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
     case = _Case(f, points, agree, once_each(xy1, xy2), sigma, chance)
     return _classify(case, frame.scale, seed)
 
@@ -148,7 +151,9 @@ class _Case:
     def false_alarms(self, off: B8, free: int) -> float:
         """How often, log10, as many of the matches ``off`` a simpler model agree with a better one."""
         agreeing, tried = self.weights[off & self.agree].sum(), self.weights[off].sum()
-        return log10_false_alarms(float(agreeing), float(tried), chance=self.chance, free=free)
+        # What F can still choose beside the model, it chooses to agree with wrong matches.
+        chance = FLEXIBLE * self.chance if free == EPIPOLE else self.chance
+        return log10_false_alarms(float(agreeing), float(tried), chance=chance, free=free)
 
 
 def _scale(f: F64, points: F64) -> float:
@@ -165,7 +170,7 @@ def _classify(case: _Case, scale: float, seed: int) -> Degeneracy:
         noise = _plane_noise(squared[case.agree])
         near, far = squared < NEAR * noise**2, squared > FAR * noise**2
         errors = _excess_errors(case, near, float(squared[near].sum()))
-        off, chance = float(np.mean(far[case.agree])), case.false_alarms(far, 2)
+        off, chance = float(np.mean(far[case.agree])), case.false_alarms(far, EPIPOLE)
         # Least squares of all of them, for which the covariance holds.
         refine_plane(plane.h, case.points[near], 1e6 * noise, 4)
         turning, angle = _turning(plane.h.reshape(3, 3), plane_covariance(plane.h, case.points[near], noise))
@@ -259,7 +264,7 @@ def _translation_ratio(case: _Case) -> float:
     f = _fit_translation(mine, case.sigma)
     simple = np.asarray(sampson_distances(f, case.points))
     off = simple > np.sqrt(FAR) * case.sigma
-    if case.false_alarms(off, 5) < LARGEST_CHANCE:
+    if case.false_alarms(off, BEYOND_TRANSLATION) < LARGEST_CHANCE:
         return float("inf")
     near = case.points[simple < TRANSLATED * case.sigma]
     degrees = len(near) - 7
@@ -269,8 +274,11 @@ def _translation_ratio(case: _Case) -> float:
     _refine_translation(f, near, np.inf)
     rss_simple = float(np.sum(np.asarray(sampson_distances(f, near)) ** 2))
     rss = min(rss_simple, *(_least_squares(start, near) for start in (case.f, f)))
-    limit = 5.0 * float(fdtri(5, degrees, 1.0 - RISK)) * max(rss / degrees, 1e-24)
-    return (rss_simple - rss) / limit
+    limit = (
+        BEYOND_TRANSLATION * float(fdtri(BEYOND_TRANSLATION, degrees, 1.0 - RISK)) * max(rss / degrees, 1e-24)
+    )
+    strays = case.chance * float(case.weights[~case.agree].sum())
+    return (rss_simple - rss) / (limit * (1.0 + ALLOWANCE * min(strays, 1.0)))
 
 
 def _least_squares(f: F64, points: F64) -> float:
