@@ -17,7 +17,7 @@ from thesisrecon.report.wording import (
     named_number,
     plus_minus,
 )
-from thesisrecon.types import IntrinsicInterval
+from thesisrecon.types import Certainty, IntrinsicInterval
 
 TIME = "Computing time of this result"
 
@@ -87,3 +87,15 @@ def test_the_first_glance_tells_what_there_is() -> None:
     assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
     early = dataclasses.replace(projective_run(), reconstruction=None)
     assert [fact.label for fact in first_glance(early, None)] == ["Photographs", "Pairs accepted", TIME]
+
+
+def test_pairs_that_leave_their_geometry_open_are_counted() -> None:
+    run = dataclasses.replace(projective_run(), reconstruction=None)
+    unsure = Certainty(False, ("one homography explains the matches (plane)",))
+    pairs = tuple(
+        dataclasses.replace(pair, certainty=unsure) if pair.accepted else pair for pair in run.pairs
+    )
+    early = dataclasses.replace(run, pairs=pairs)
+    note = first_glance(early, None)[1].note
+    assert f"; {sum(pair.accepted for pair in pairs)} leave their epipolar geometry undetermined" in note
+    assert "undetermined" not in first_glance(run, None)[1].note
