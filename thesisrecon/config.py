@@ -46,6 +46,9 @@ from thesisrecon.types import (
     TwoView,
 )
 
+PRECISE_SIGMAS = 2.5
+"""Matches in the tail of the noise are right, but tracks are made of precise ones."""
+
 EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
 
 
@@ -174,6 +177,10 @@ class IntrinsicsAssumption:
             raise ValueError(f"focal_px must be above 0; got {self.focal_px}")
 
 
+def _precise_ransac() -> LocallyOptimisedRansac:
+    return LocallyOptimisedRansac(inlier_sigmas=PRECISE_SIGMAS)
+
+
 @dataclass(frozen=True)
 class PipelineConfig:
     """The whole pipeline as values; the defaults are the preset ``default``."""
@@ -182,7 +189,7 @@ class PipelineConfig:
     intrinsics: IntrinsicsAssumption = IntrinsicsAssumption()
     features: Detector = field(default_factory=MultiScaleCorners)
     matching: Matcher = field(default_factory=SeedsAndGrowth)
-    epipolar: FundamentalEstimator = field(default_factory=LocallyOptimisedRansac)
+    epipolar: FundamentalEstimator = field(default_factory=_precise_ransac)
     verification: Verifier = field(default_factory=PairVerification)
     tracks: TrackBuilder = field(default_factory=AlignedTracks)
     projective: ProjectiveReconstructor = field(default_factory=GatedIncremental)

@@ -1,8 +1,8 @@
-"""The default estimator of F: sampling that is refined where it succeeds, from several starts."""
+"""The default estimator of F: sampling that is refined where it succeeds, until several searches agree."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
@@ -13,56 +13,79 @@ from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.kernels import sampson_distances, search, truncated_score
 from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
 from thesisrecon.errors import StageFailure
-from thesisrecon.robust.noise import noise_scale, noise_width, trimmed_noise_scale
+from thesisrecon.robust.noise import NoiseMixture, best_huber_width, noise_scale, noise_width
 from thesisrecon.types import FundamentalFit
 
 F64 = NDArray[np.float64]
 
 BATCH = 512
 MINIMUM = 8
-START_STEPS, START_POINTS = 5, 500
-"""Solves of each refinement of a start, and the points that all but its last refinement are on."""
-REFINEMENT_STEPS = 15
-SHARPENINGS, MORE_SHARPENINGS = 2, 5
+PARAMETERS = 7
+START_STEPS, LAST_STEPS, START_POINTS = 5, 20, 500
+"""Solves of each refinement of a start and of its last, and the points that all but the last are on."""
+REFINEMENT_STEPS, SHARPENINGS = 15, 2
 KNEE = 0.25
 """Where Huber's loss turns linear, in widths of the gate: wrong matches within the gate are not rare."""
 PRIOR = (100.0, 5.0)
 """What is thought of wrong matrices before the first was seen: of 100 points 5 lie within the gate."""
 EXACT = 1e-9
 """Smallest width of the loss (in units of the spread of the points), for matches without noise."""
+SHARES = 4
+"""Parts of ``max_samples`` and of the confidence; each start may take one."""
+SAME_SCORE = 0.3
+"""Sums of truncated squares that differ by less are of one minimum: a match more changes them by 1."""
+SPREAD = 1.0
+"""Of wrong matches before any was seen, in units of the spread of the points."""
+FEW_MATCHES = 28.0
+"""How much wider the last loss is for few matches: by 1 + 28 / (n - 7), as a fit bends to what it keeps."""
+COVERED = 3.0
+"""Widths of the noise within which matches bear on the covariance."""
+WIDER, RING = 4.0, 15.0
+"""Gate of the second search, and how far beyond the noise is looked whether it goes on, in gates."""
+EXCESS = 0.25
+"""Share of the inliers that more matches than expected in the ring give reason to search again."""
+FEW_WRONG = 0.2
 
 
 @dataclass(frozen=True)
 class LocallyOptimisedRansac:
     """Seven-point sampling with a truncated quadratic score, refined over rank-2 matrices.
 
-    Each of ``starts`` searches draws until a sample free of outliers was seen with the probability that makes
-    ``confidence`` over all starts; its best matrix is refined by Levenberg-Marquardt on the gradient
-    criterion (5.4) under Huber's loss at the ``gates`` (times the threshold), and the best of the starts once
-    more with the loss as wide as the noise, beyond the threshold too where the noise goes on. Torr and
-    Zisserman, MLESAC, CVIU 2000 (score); Chum, Matas and Kittler, DAGM 2003 (local optimisation). Fitting the
-    points of a shrinking gate alone gets stuck where the scene is nearly a plane; the several starts and the
-    soft loss do not.
+    A start draws samples until one free of outliers was seen; its best matrix is refined by
+    Levenberg-Marquardt on the gradient criterion (5.4) under Huber's loss at the ``gates`` (times the
+    threshold). Starts go on until ``starts`` of them ended at the best score: where one plane or a repeated
+    pattern has many inliers they disagree, and more are made (Torr and Zisserman, MLESAC, CVIU 2000; Chum,
+    Matas and Kittler, DAGM 2003).
+
+    The best matrix is refined once more with the loss that suits the noise its residuals show: a mixture of
+    noise, its heavier tail and wrong matches says where the noise ends, and Huber's loss is as wide as the
+    residuals say is best. Where more matches than wrong ones explain lie just beyond, the noise may be
+    larger than the threshold: the search is repeated with a wider gate, and the likelier of the two answers
+    taken, if it leaves few matches unexplained.
 
     Parameters
     ----------
     threshold_px : Sampson distance beyond which a match counts as wrong during the search.
-    confidence : probability that at least one start saw a sample free of outliers.
-    starts : independent searches.
-    min_samples : samples of all starts together, however many inliers were found: where most of the scene is
-        one plane, a wrong F has many too.
+    confidence : probability that four starts saw a sample free of outliers.
+    starts : searches that must end at the same score.
+    max_starts : searches after which the best is taken though they disagree.
+    min_samples : samples of four starts, however many inliers were found: where most of the scene is one
+        plane, a wrong F has many too.
     max_samples : samples of all starts together, whatever the confidence.
     gates : widths of the loss in thresholds, one refinement each, in this order.
-    inlier_sigmas, inlier_floor_px : a match is an inlier within max(inlier_sigmas sigma, inlier_floor_px).
+    inlier_sigmas : a match is an inlier where noise is likelier than a wrong match, and within so many sigma
+        (infinite: the tail of the noise too); less where only precise matches are wanted.
+    inlier_floor_px : a match within this is always an inlier.
     """
 
     threshold_px: float = 1.0
     confidence: float = 0.9999
-    starts: int = 4
+    starts: int = 3
+    max_starts: int = 16
     min_samples: int = 4000
-    max_samples: int = 50000
+    max_samples: int = 100000
     gates: tuple[float, ...] = (2.0, 1.5, 1.0)
-    inlier_sigmas: float = 2.5
+    inlier_sigmas: float = np.inf
     inlier_floor_px: float = 0.3
 
     def __post_init__(self) -> None:
@@ -70,8 +93,12 @@ class LocallyOptimisedRansac:
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence must lie between 0 and 1; got {self.confidence}")
-        if self.starts < 1 or self.max_samples < self.starts or min(self.gates, default=0.0) <= 0.0:
-            raise ValueError("a search needs at least one start, one sample per start and gates above 0")
+        if not 1 <= self.starts <= self.max_starts:
+            raise ValueError(f"starts must lie in [1, max_starts]; got {self.starts} and {self.max_starts}")
+        if self.max_samples < SHARES or min(self.gates, default=0.0) <= 0.0:
+            raise ValueError("a search needs at least four samples and gates above 0")
+        if not self.inlier_sigmas > 0.0:
+            raise ValueError(f"inlier_sigmas must be positive; got {self.inlier_sigmas}")
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """F of matches (N >= 8, 2) px with its inliers, noise and covariance.
@@ -83,31 +110,45 @@ class LocallyOptimisedRansac:
         frame = PairFrame.of(xy1, xy2)
         points = frame.points(xy1, xy2)
         gate = self.threshold_px * frame.scale
+        found = self._candidate(points, gate, rng)
+        if found.noise is None or _goes_on(found.residuals, found.noise, gate):
+            wide = self._candidate(points, WIDER * gate, rng)
+            samples = found.samples + wide.samples
+            found = replace(wide if wide.explains_more_than(found) else found, samples=samples)
+        return self._finish(frame, found, points)
+
+    def _candidate(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         f, samples = self._best_of_starts(points, gate, rng)
-        if f.any():
-            self._sharpen(f, points, gate)
-        return self._finish(frame, f, points, samples)
+        noise = _sharpen(f, points, gate) if f.any() else None
+        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise)
 
     def _best_of_starts(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
-        best, best_score, samples = np.zeros(9), np.inf, 0
-        for _ in range(self.starts):
+        found: list[tuple[float, F64]] = []
+        samples = 0
+        for _ in range(self.max_starts):
             shuffled = points[rng.permutation(len(points))]
             f, drawn = self._search(shuffled, gate, rng)
             samples += drawn
-            if not f.any():
-                continue
-            for k, width in enumerate(self.gates, start=1):
-                some = shuffled if k == len(self.gates) else shuffled[:START_POINTS]
-                refine(f, some, GRADIENT, width * gate, KNEE * width * gate, START_STEPS)
-            score, _, _ = truncated_score(f, np.ascontiguousarray(shuffled.T), gate, 1.0, (0.0, 0.0))
-            if score < best_score:
-                best, best_score = f, score
-        return best, samples
+            if f.any():
+                self._refine_start(f, shuffled, gate)
+                score, _, _ = truncated_score(f, np.ascontiguousarray(shuffled.T), gate, 1.0, (0.0, 0.0))
+                found.append((score * len(points), f))
+            best = min((score for score, _ in found), default=np.inf)
+            agreeing = sum(score - best < SAME_SCORE for score, _ in found)
+            if agreeing >= self.starts + (len(found) - agreeing) // 2 or samples >= self.max_samples:
+                break
+        return min(found, key=lambda start: start[0], default=(np.inf, np.zeros(9)))[1], samples
+
+    def _refine_start(self, f: F64, points: F64, gate: float) -> None:
+        for width in self.gates[:-1]:
+            refine(f, points[:START_POINTS], GRADIENT, width * gate, KNEE * width * gate, START_STEPS)
+        width = self.gates[-1]
+        refine(f, points, GRADIENT, width * gate, KNEE * width * gate, LAST_STEPS)
 
     def _search(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
-        least, most = self.min_samples // self.starts, self.max_samples // self.starts
-        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / self.starts)
+        least, most = self.min_samples // SHARES, self.max_samples // self.max_starts
+        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / SHARES)
         drawn = 0
         while drawn < most:
             uniforms = rng.random((min(BATCH, most - drawn), 7))
@@ -116,32 +157,88 @@ class LocallyOptimisedRansac:
                 break
         return f, drawn
 
-    def _sharpen(self, f: F64, points: F64, gate: float) -> None:
-        """Refine once more with the width of the loss at the noise that the inliers show (in place)."""
-        before = gate
-        for k in range(MORE_SHARPENINGS):
-            r = np.asarray(sampson_distances(f, points))
-            width = noise_width(r, gate)
-            if k >= SHARPENINGS and width == before:
-                return
-            before = width
-            near = r[r < width]
-            if len(near) < MINIMUM:
-                return
-            knee = min(max(noise_scale(near), EXACT), width)
-            refine(f, points, GRADIENT, width, knee, REFINEMENT_STEPS)
-
-    def _finish(self, frame: PairFrame, f: F64, points: F64, samples: int) -> FundamentalFit:
-        residuals = np.asarray(sampson_distances(f, points)) / frame.scale
-        near = residuals < noise_width(residuals, self.threshold_px)
-        if not f.any() or near.sum() < MINIMUM:
+    def _finish(self, frame: PairFrame, found: _Candidate, points: F64) -> FundamentalFit:
+        r, noise = found.residuals, found.noise
+        if noise is None:
+            near = np.count_nonzero(r < self.threshold_px * frame.scale) * found.f.any()
             raise StageFailure(
                 "no epipolar geometry explains the matches",
-                f"the best of {samples} samples has {near.sum() * f.any()} of {len(points)} matches within "
+                f"the best of {found.samples} samples has {near} of {len(points)} matches within "
                 f"{self.threshold_px:g} px, needed at least {MINIMUM}",
-                "The photographs may not overlap, or the matches are wrong",
+                "the photographs may not overlap, or the matches are wrong",
             )
-        sigma = trimmed_noise_scale(residuals, noise_scale(residuals[near]))
-        inliers = residuals < max(self.inlier_sigmas * sigma, self.inlier_floor_px)
-        covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
-        return FundamentalFit(frame.matrix_in_pixels(f), inliers, sigma, covariance, samples)
+        limit = min(noise.limit, self.inlier_sigmas * noise.sigma)
+        inliers = r < max(limit, self.inlier_floor_px * frame.scale)
+        eighth = float(np.partition(r, MINIMUM - 1)[MINIMUM - 1])
+        core = r <= (COVERED * noise.sigma if COVERED * noise.sigma > eighth else eighth)
+        _, effective = best_huber_width(r[core], noise.sigma)
+        effective *= np.sqrt(core.sum() / (core.sum() - PARAMETERS))
+        covariance = fundamental_covariance(frame, found.f, points[core], effective)
+        F = frame.matrix_in_pixels(found.f)
+        return FundamentalFit(F, inliers, noise.sigma / frame.scale, covariance, found.samples)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A matrix ``f`` (9,), the samples it took, its residuals (N,) and their noise, None for no F."""
+
+    f: F64
+    samples: int
+    residuals: F64
+    noise: NoiseMixture | None
+
+    def explains_more_than(self, rival: _Candidate) -> bool:
+        """Whether this, found with a wider gate, is likelier and leaves few matches unexplained.
+
+        A wide gate finds wrong matrices that many wrong matches are near to; noise beyond the threshold is
+        believed only if it explains most of what the ``rival`` calls wrong, or nearly everything.
+        """
+        if self.noise is None or rival.noise is None:
+            return rival.noise is None
+        explained = int(np.count_nonzero(self.residuals < self.noise.limit))
+        more = explained - int(np.count_nonzero(rival.residuals < rival.noise.limit))
+        left = len(self.residuals) - explained
+        few = left <= max(more, FEW_WRONG * len(self.residuals))
+        return few and self.noise.log_likelihood > rival.noise.log_likelihood
+
+
+def _noise(r: F64, gate: float) -> NoiseMixture | None:
+    """The noise of residuals (N,) in ascending order; None where too few are of it."""
+    near = r[: np.searchsorted(r, noise_width(r, gate))]
+    if len(near) < MINIMUM:
+        return None
+    return NoiseMixture.fit(r, max(noise_scale(near), EXACT), spread=SPREAD)
+
+
+def _sharpen(f: F64, points: F64, gate: float) -> NoiseMixture | None:
+    """Refine once more with the loss that suits the noise that the residuals show (in place)."""
+    noise = None
+    for k in range(SHARPENINGS + 1):
+        r = np.sort(sampson_distances(f, points))
+        noise = _noise(r, gate)
+        if noise is None or k == SHARPENINGS:
+            break
+        limit = noise.limit
+        if k > 0:
+            free = max(noise.core * len(r) - PARAMETERS, 1.0)
+            few = 1.0 + FEW_MATCHES / free
+            limit = min(limit, few * noise.core_limit)
+        limit = max(limit, EXACT)
+        near = r[: np.searchsorted(r, limit)]
+        if len(near) < MINIMUM:
+            break
+        width, _ = best_huber_width(near, noise.sigma)
+        refine(f, points, GRADIENT, limit, min(max(width, EXACT), limit), REFINEMENT_STEPS)
+    return noise
+
+
+def _goes_on(r: F64, noise: NoiseMixture, gate: float) -> bool:
+    """Whether just beyond the noise that was found lie more residuals (N,) than wrong ones explain."""
+    end = COVERED * noise.sigma
+    inside = int(np.count_nonzero(r < end))
+    beyond = len(r) - inside
+    ring = int(np.count_nonzero(r < end + RING * gate)) - inside
+    # Of a half-normal distribution of unit spread, which wrong matches roughly have.
+    expected = float(np.sqrt(2.0 / np.pi)) * beyond * RING * gate / SPREAD
+    needed = inside * max(0.05, EXCESS * (1.0 - 3.0 * PARAMETERS / max(inside, 1)))
+    return ring - expected > max(2.0 * float(np.sqrt(expected)), needed)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+
+from thesisrecon.robust.kernels import TAIL, fit_noise_mixture
 
 F64 = NDArray[np.float64]
 
@@ -13,6 +17,10 @@ ENDED, WIDENINGS = 0.22, 6
 RAYLEIGH_MEDIAN = 1.1774
 CUT, CUT_VARIANCE, TRIMMINGS = 2.5, 0.91125, 5
 """Where the noise is cut, and the variance of a standard normal variable cut there."""
+ROUNDS, QUANTILES = 6, 300
+"""Rounds of a mixture's fit, and the residuals (evenly spaced in order) that stand for more of them."""
+BISECTIONS = 20
+HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
 
 
 def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
@@ -40,12 +48,13 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
     The width grows, by 1.5 a step, until the noise ends; where it does not end within 11 thresholds they are
     wrong matches, and the threshold stands.
     """
-    width = threshold
+    width, ordered = threshold, np.sort(residuals)
     for _ in range(WIDENINGS + 1):
-        near = residuals[residuals < width]
-        if len(near) <= parameters:
+        n = int(np.searchsorted(ordered, width))
+        if n <= parameters:
             return threshold
-        if np.median(near) <= ENDED * width * np.sqrt(1.0 - parameters / len(near)):
+        median = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
+        if median <= ENDED * width * np.sqrt(1.0 - parameters / n):
             return width
         width *= 1.5
     return threshold
@@ -72,3 +81,72 @@ def noise_from_distances(distances: F64) -> float:
     The median of a Rayleigh variable is 1.1774 sigma.
     """
     return float(np.median(distances)) / RAYLEIGH_MEDIAN
+
+
+@dataclass(frozen=True)
+class NoiseMixture:
+    """Residuals as normal noise of ``sigma``, its tail four times as wide, and wrong ones of ``spread``.
+
+    ``core``, ``tail`` and ``wrong`` are the shares, ``log_likelihood`` the mean over the residuals: of two
+    models of the same data the one with the higher explains them better, whatever its noise.
+    """
+
+    sigma: float
+    spread: float
+    core: float
+    tail: float
+    wrong: float
+    log_likelihood: float = -np.inf
+
+    @classmethod
+    def fit(cls, residuals: F64, sigma: float, *, spread: float, parameters: int = 7) -> NoiseMixture:
+        """The mixture of residuals (N > 0,) >= 0 in ascending order, by expectation-maximisation.
+
+        ``sigma`` > 0 is where it starts, ``spread`` what wrong residuals are thought to have before any was
+        seen, ``parameters`` how many were fitted to the residuals (McLachlan and Peel, 2000).
+        """
+        step = max(len(residuals) // QUANTILES, 1)
+        some = residuals[step // 2 :: step]
+        share = float(np.count_nonzero(some < 3.0 * sigma)) / len(some)
+        mixture = np.array([sigma, spread, 0.9 * share, 0.1 * share, 1.0 - share])
+        likelihood = fit_noise_mixture(some, parameters / step, spread, ROUNDS, mixture)
+        sigma, spread, core, tail, wrong = mixture.tolist()
+        return cls(sigma, spread, core, tail, wrong, float(likelihood))
+
+    @property
+    def limit(self) -> float:
+        """The residual at which noise, with its tail, and wrong ones are equally likely."""
+        low, high = self.sigma, self.spread
+        for _ in range(BISECTIONS):
+            middle = float(np.sqrt(low * high))
+            core = self.core * np.exp(-0.5 * (middle / self.sigma) ** 2)
+            tail = self.tail / TAIL * np.exp(-0.5 * (middle / (TAIL * self.sigma)) ** 2)
+            wrong = self.wrong / self.spread * np.exp(-0.5 * (middle / self.spread) ** 2)
+            low, high = (middle, high) if core + tail > self.sigma * wrong else (low, middle)
+        return low
+
+    @property
+    def core_limit(self) -> float:
+        """The residual at which noise and its tail are equally likely."""
+        odds = max(TAIL * self.core / self.tail, 1.5)
+        return self.sigma * float(np.sqrt(2.0 * np.log(odds) / (1.0 - TAIL**-2)))
+
+
+def best_huber_width(residuals: F64, sigma: float) -> tuple[float, float]:
+    """Width of Huber's loss that promises the least variance for residuals (N > 0,) >= 0, and a noise.
+
+    The asymptotic variance of an M-estimator is mean(psi^2) / mean(psi')^2 (Huber, 1964), judged here from
+    the residuals themselves (Jaeckel, 1971). Least squares (infinite width) is left only for a gain of more
+    than the chance of N residuals. The noise is the standard deviation of normal residuals with which least
+    squares would be as uncertain.
+    """
+    n = len(residuals)
+    width, variance = np.inf, float(residuals @ residuals) / n
+    least = variance
+    for k in HUBER_SIGMAS:
+        psi = np.minimum(residuals, k * sigma)
+        straight = max(float(np.count_nonzero(residuals < k * sigma)) / n, 1.0 / n)
+        other = float(psi @ psi) / n / straight**2
+        if other * (1.0 + 1.0 / np.sqrt(n)) < least:
+            width, variance, least = k * sigma, other, other * (1.0 + 1.0 / np.sqrt(n))
+    return width, float(np.sqrt(variance))
