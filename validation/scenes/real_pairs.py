@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -19,6 +17,7 @@ from thesisrecon.geometry.camera import compose_camera
 from thesisrecon.geometry.multiview import fundamental_from_cameras, sampson_residuals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.triangulation import triangulate_linear
+from validation.references.sift import SiftKeypoints, detect_sift, match_sift
 from validation.scenes.real import data_root, load_real_scene
 
 F64 = NDArray[np.float64]
@@ -56,30 +55,17 @@ def match_photographs(
     if kept.is_file():
         found = np.load(kept)
         return found[:, :2].copy(), found[:, 2:].copy()
-    (xy1, d1), (xy2, d2) = (_sift(path) for path in paths)
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    # One feature of the second image may be the nearest of many in the first: a fact of plain ratio matching.
-    pairs = [
-        (m.queryIdx, m.trainIdx)
-        for m, second in matcher.knnMatch(d1, d2, k=2)
-        if m.distance < ratio * second.distance
-    ]
-    if mutual:
-        back = {m.queryIdx: m.trainIdx for m in matcher.match(d2, d1)}
-        pairs = [(a, b) for a, b in pairs if back[b] == a]
-    index = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    found = np.hstack([xy1[index[:, 0]], xy2[index[:, 1]]])
+    first, second = (_sift(path) for path in paths)
+    index = match_sift(first, second, ratio=ratio, mutual=mutual)
+    found = np.hstack([first.xy[index[:, 0]], second.xy[index[:, 1]]])
     cache.mkdir(parents=True, exist_ok=True)
     np.save(kept, found)
     return found[:, :2].copy(), found[:, 2:].copy()
 
 
-@lru_cache(maxsize=16)
-def _sift(path: Path) -> tuple[F64, NDArray[np.float32]]:
+def _sift(path: Path) -> SiftKeypoints:
     with Image.open(path) as photograph:
-        grey = np.asarray(photograph.convert("L"))
-    keypoints, descriptors = cv2.SIFT.create().detectAndCompute(grey, None)
-    return np.array([k.pt for k in keypoints], dtype=np.float64), np.asarray(descriptors, dtype=np.float32)
+        return detect_sift(np.asarray(photograph.convert("L")))
 
 
 def kusvod2_pairs(

@@ -1,0 +1,112 @@
+"""OpenCV's SIFT with Lowe's ratio test, alone and as a front end that the pipeline can run in place of ours.
+
+As a front end its matches go through the same estimator of F and the same verification as ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from thesisrecon.config import EstimateFundamental, PipelineConfig
+from thesisrecon.types import F32, F64, I64, Features, Image, Matches
+
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class SiftKeypoints:
+    """All keypoints of one photograph: ``xy`` (N, 2) px, ``size`` and ``response`` (N,), ``descriptors``
+    (N, 128)."""
+
+    xy: F64
+    size: F32
+    response: F32
+    descriptors: F32
+
+
+def detect_sift(grey: U8) -> SiftKeypoints:
+    """SIFT of a grey photograph (H, W) with OpenCV's defaults; those of the last photographs are kept."""
+    return _detect(grey.tobytes(), grey.shape)
+
+
+@lru_cache(maxsize=32)
+def _detect(pixels: bytes, shape: tuple[int, ...]) -> SiftKeypoints:
+    grey = np.frombuffer(pixels, dtype=np.uint8).reshape(shape)
+    keypoints, descriptors = cv2.SIFT.create().detectAndCompute(grey, None)
+    return SiftKeypoints(
+        np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2),
+        np.array([k.size for k in keypoints], dtype=np.float32),
+        np.array([k.response for k in keypoints], dtype=np.float32),
+        np.zeros((0, 128), np.float32) if descriptors is None else np.asarray(descriptors, np.float32),
+    )
+
+
+def match_sift(first: SiftKeypoints, second: SiftKeypoints, *, ratio: float, mutual: bool) -> I64:
+    """Pairs of indices (M, 2) whose nearest descriptor is below ``ratio`` times the second nearest; with
+    ``mutual`` each must be the other's nearest."""
+    if len(first.xy) == 0 or len(second.xy) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    # One feature of the second image may be the nearest of many in the first: a fact of plain ratio matching.
+    pairs = [
+        (m.queryIdx, m.trainIdx)
+        for m, rival in matcher.knnMatch(first.descriptors, second.descriptors, k=2)
+        if m.distance < ratio * rival.distance
+    ]
+    if mutual:
+        back = {m.queryIdx: m.trainIdx for m in matcher.match(second.descriptors, first.descriptors)}
+        pairs = [(a, b) for a, b in pairs if back[b] == a]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class SiftCorners:
+    """SIFT keypoints, all of them, in the place of corners."""
+
+    def detect(self, image: Image) -> Features:
+        """The keypoints, strongest first."""
+        found = detect_sift(grey_of(image))
+        order = np.argsort(-found.response, kind="stable")
+        return Features(found.xy[order], found.size[order], found.response[order])
+
+
+@dataclass(frozen=True)
+class SiftRatioTest:
+    """Matches of SIFT descriptors, each the other's nearest, that pass the ratio test."""
+
+    ratio: float = 0.8
+
+    def prepare(self, image: Image, features: Features) -> SiftKeypoints:  # noqa: ARG002
+        """The keypoints with their descriptors."""
+        return detect_sift(grey_of(image))
+
+    def match(
+        self,
+        view1: SiftKeypoints,
+        view2: SiftKeypoints,
+        *,
+        pair: tuple[int, int],
+        estimate_fundamental: EstimateFundamental,  # noqa: ARG002
+        rng: np.random.Generator,  # noqa: ARG002
+    ) -> Matches:
+        """Matches by descriptors alone."""
+        one, two = match_sift(view1, view2, ratio=self.ratio, mutual=True).T
+        affine = np.broadcast_to(np.eye(2), (len(one), 2, 2)).copy()
+        score = np.ones(len(one), np.float32)
+        return Matches(*pair, one, two, view1.xy[one], view2.xy[two], score, affine)
+
+
+def sift_front_end(config: PipelineConfig) -> PipelineConfig:
+    """The same pipeline with SIFT in the place of corners and correlation."""
+    return replace(config, features=SiftCorners(), matching=SiftRatioTest())
+
+
+def grey_of(image: Image) -> U8:
+    """8-bit luminance (H, W)."""
+    return np.asarray(PillowImage.fromarray(image.rgb).convert("L"))
