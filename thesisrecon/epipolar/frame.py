@@ -15,18 +15,34 @@ F64 = NDArray[np.float64]
 COLLINEAR = 1e-9
 """Spread across the longest direction, relative to it, below which points count as lying on one line."""
 
+LARGEST_PX, SMALLEST_PX = 1e15, 1e-50
+"""Beyond the first a double has no fraction of a pixel left; below the second, fourth powers underflow."""
 
-def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
-    """The matches as float64 (N, 2) arrays that can determine an F.
 
-    Raises ``ValueError`` for other shapes and for coordinates that are not finite, ``StageFailure`` for fewer
-    than ``needed`` matches and for points that are all equal or on one line in an image.
+def as_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
+    """The matches as contiguous float64 (N, 2) arrays.
+
+    Raises ``ValueError`` for other shapes and for coordinates that are not real and finite or beyond 1e15 px.
     """
+    if np.iscomplexobj(xy1) or np.iscomplexobj(xy2):
+        raise ValueError("a fundamental matrix needs real pixel coordinates; got complex ones")
     xy1, xy2 = np.ascontiguousarray(xy1, dtype=np.float64), np.ascontiguousarray(xy2, dtype=np.float64)
     if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
         raise ValueError(f"a fundamental matrix needs two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
     if not (np.isfinite(xy1).all() and np.isfinite(xy2).all()):
         raise ValueError("a fundamental matrix needs finite pixel coordinates; some are NaN or infinite")
+    if max(np.abs(xy1).max(initial=0.0), np.abs(xy2).max(initial=0.0)) > LARGEST_PX:
+        raise ValueError(f"a fundamental matrix needs pixels of photographs; some are beyond {LARGEST_PX:g}")
+    return xy1, xy2
+
+
+def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
+    """The matches as float64 (N, 2) arrays that can determine an F.
+
+    Raises ``ValueError`` as :func:`as_matches`, ``StageFailure`` for fewer than ``needed`` matches and for
+    points that are all equal or on one line in an image.
+    """
+    xy1, xy2 = as_matches(xy1, xy2)
     if len(xy1) < needed:
         raise StageFailure(
             "too few matches for the geometry of the pair",
@@ -37,7 +53,8 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
         if _clearly_spread(xy):
             continue
         spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
-        if not spread[1] > COLLINEAR * max(spread[0], float(np.abs(xy).max()) * 1e-3, 1e-300):
+        length = max(float(spread[0]), 1e-3 * float(np.abs(xy).max()))
+        if not spread[1] > max(COLLINEAR * length, SMALLEST_PX):
             raise StageFailure(
                 f"the matched points lie on one line in the {name} image",
                 f"{len(xy)} points, spread across the line {spread[1] / np.sqrt(len(xy)):.3g} px",
@@ -50,7 +67,9 @@ def _clearly_spread(xy: F64) -> bool:
     """Whether the points are far from lying on one line, so far that squares cannot hide it."""
     centred = xy - xy.sum(axis=0) / len(xy)
     (a, b), (_, d) = centred.T @ centred
-    return bool(a * d - b * b > 1e-6 * (a + d) ** 2 and a + d > 1e-6 * len(xy) * float(xy[0] @ xy[0]))
+    size = a + d
+    large = size > max(1e-6 * len(xy) * float(xy[0] @ xy[0]), SMALLEST_PX**2)
+    return bool(large and a * d - b * b > 1e-6 * size**2)
 
 
 @dataclass(frozen=True)

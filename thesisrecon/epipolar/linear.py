@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar.frame import PairFrame, check_matches
+from thesisrecon.epipolar.frame import SMALLEST_PX, PairFrame, as_matches, check_matches
 from thesisrecon.epipolar.kernels import seven_point
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
@@ -28,6 +28,7 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
     Raises ``ValueError`` for fewer than 8 matches, wrong shapes or coordinates that are not finite, and
     ``StageFailure`` where the matches leave F free (all on a line, or on a plane without noise).
     """
+    xy1, xy2 = as_matches(xy1, xy2)
     if len(xy1) < 8:
         raise ValueError(f"the eight-point algorithm needs at least 8 matches; got {len(xy1)}")
     xy1, xy2 = check_matches(xy1, xy2, needed=8)
@@ -55,12 +56,10 @@ def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
     matches are degenerate (their equations dependent, or every member singular). Raises ``ValueError`` for
     other shapes or coordinates that are not finite.
     """
-    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    if xy1.shape != (7, 2) or xy2.shape != (7, 2):
+    xy1, xy2 = as_matches(xy1, xy2)
+    if xy1.shape != (7, 2):
         raise ValueError(f"the seven-point algorithm needs two (7, 2) arrays; got {xy1.shape}, {xy2.shape}")
-    if not (np.isfinite(xy1).all() and np.isfinite(xy2).all()):
-        raise ValueError("the seven-point algorithm needs finite pixel coordinates; some are NaN or infinite")
-    if not (np.ptp(xy1, axis=0).any() and np.ptp(xy2, axis=0).any()):
+    if not min(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()) > SMALLEST_PX:
         return np.empty((0, 3, 3))
     frame = PairFrame.of(xy1, xy2)
     solutions = np.empty((3, 9))

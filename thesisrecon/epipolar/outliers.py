@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.epipolar.frame import as_matches
 from thesisrecon.geometry.multiview import epipolar_distances, sampson_residuals, symmetric_residuals
 from thesisrecon.robust.noise import noise_scale
 
@@ -87,8 +88,10 @@ def discard_outliers(
 
     ``test`` is by Sampson's distance unless given. The median is over the matches within ``limit_px`` of
     that distance (at least 8), r^2 <= 3.84 sigma^2 the test. Without a limit sigma is too large where more
-    than half of the matches are wrong. Raises ``ValueError`` for fewer than 8 matches.
+    than half of the matches are wrong. Raises ``ValueError`` for fewer than 8 matches and as
+    :func:`~thesisrecon.epipolar.frame.as_matches`.
     """
+    xy1, xy2 = as_matches(xy1, xy2)
     test = SampsonTest() if test is None else test
     residuals = test.distances(F, xy1, xy2)
     if len(residuals) < MINIMUM:

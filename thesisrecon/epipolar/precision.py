@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from thesisrecon.epipolar.covariance import fundamental_covariance
-from thesisrecon.epipolar.frame import PairFrame, check_matches
+from thesisrecon.epipolar.frame import PairFrame, as_matches, check_matches
 from thesisrecon.geometry.camera import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.multiview import epipoles, fundamental_from_cameras, unit_norm
@@ -51,9 +51,10 @@ def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
     (else :func:`epipolar_distance_interval`). The ``covariance`` (9, 9) of vec(F) is for F (3, 3) of unit
     norm. A match with noise sigma of its own is off by sqrt(std^2 + sigma^2 (1 + g1 / g2)) instead, g1 and g2
     the squared gradients of x2' F x1 by x1 and x2.
-    Raises ``ValueError`` for other shapes.
+    Raises ``ValueError`` for other shapes and as :func:`~thesisrecon.epipolar.frame.as_matches`.
     """
     _check(F, covariance)
+    xy1, xy2 = as_matches(xy1, xy2)
     x1, x2 = homogenize(xy1), homogenize(xy2)
     lines = x1 @ F.T
     norm = np.sqrt(np.sum(lines[:, :2] ** 2, axis=1, keepdims=True)) + 1e-300

@@ -15,6 +15,8 @@ I64 = NDArray[np.int64]
 B8 = NDArray[np.bool_]
 
 NEIGHBOURS = 5
+SINGULAR_REL, FARTHEST = 1e-28, 1e280
+"""det J J' over the square of its trace below which an H is singular at a match, and its distance squared."""
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
@@ -29,10 +31,12 @@ def squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) -
     c1 = h[3] * x1 + h[4] * y1 + h[5] - w * y2
     j00, j01 = h[0] - x2 * h[6], h[1] - x2 * h[7]
     j10, j11 = h[3] - y2 * h[6], h[4] - y2 * h[7]
-    a = j00 * j00 + j01 * j01 + w * w
-    b = j00 * j10 + j01 * j11
-    d = j10 * j10 + j11 * j11 + w * w
-    squared: float = (d * c0 * c0 - 2.0 * b * c0 * c1 + a * c1 * c1) / (a * d - b * b + 1e-300)
+    # Sums of squares (Lagrange's identity): the difference of products would round to less than nothing.
+    above = (c0 * j10 - c1 * j00) ** 2 + (c0 * j11 - c1 * j01) ** 2 + w * w * (c0 * c0 + c1 * c1)
+    entries = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11 + w * w
+    below = (j00 * j11 - j01 * j10) ** 2 + w * w * entries
+    # An H that takes all of the image to one place has no exact match nearby.
+    squared: float = above / below if below > SINGULAR_REL * entries * entries else FARTHEST
     return squared
 
 
@@ -99,10 +103,11 @@ def plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
         j10, j11 = h[3] - y2 * h[6], h[4] - y2 * h[7]
         a = j00 * j00 + j01 * j01 + w * w
         b = j00 * j10 + j01 * j11
-        d = j10 * j10 + j11 * j11 + w * w
+        # a d - b^2, without its rounding.
+        determinant = (j00 * j11 - j01 * j10) ** 2 + w * w * (a + j10 * j10 + j11 * j11)
         # The rows of L^-1 [equations], L the Cholesky factor of J J', times the root of the weight.
-        s = (1.0 - share) / np.sqrt(a + 1e-300)
-        t = (1.0 - share) / np.sqrt(max(d - b * b / a, 1e-300))
+        s = (1.0 - share) / np.sqrt(a)
+        t = (1.0 - share) * np.sqrt(a / determinant)
         for j in range(3):
             x = x1 if j == 0 else (y1 if j == 1 else 1.0)
             row[0, j], row[0, 6 + j] = s * x, -s * x2 * x

@@ -62,7 +62,8 @@ def find_dominant_plane(
     # A plane through three noisy matches is off elsewhere: the gate starts wide.
     refine_plane(h, some, 2.0 * GATE * sigma, SUBSET_STEPS)
     refine_plane(h, mine, GATE * sigma, ALL_STEPS)
-    return DominantPlane(h, np.asarray(plane_distances(h, points)) / sigma**2)
+    squared = np.asarray(plane_distances(h, points)) / sigma**2
+    return DominantPlane(h, squared) if (squared < GATE**2).any() else None
 
 
 def plane_covariance(h: F64, points: F64, sigma: float) -> F64:

@@ -1,0 +1,156 @@
+"""Matches no pair of photographs has: every function answers with finite numbers or refuses by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+
+from tests.epipolar.pairs import make_pair, spoil
+from thesisrecon.epipolar import (
+    LeastMedianOfSquares,
+    ThesisRansac,
+    estimate_eight_point,
+    estimate_fundamental,
+    estimate_seven_point,
+    refine_epipolar_distance,
+    refine_gradient,
+    refine_reprojection,
+)
+from thesisrecon.epipolar.degeneracy import classify_configuration
+from thesisrecon.epipolar.outliers import discard_outliers
+from thesisrecon.epipolar.precision import epipolar_distance_interval, epipoles_of
+from thesisrecon.epipolar.row_parameterization import refine_gradient_by_rows
+from thesisrecon.errors import StageFailure
+
+PAIR = make_pair(60, np.random.default_rng(0))
+GOOD1, GOOD2, _ = spoil(PAIR, np.random.default_rng(1), sigma=0.4, outliers=0.0)
+T = np.linspace(0.0, 1.0, 60)[:, None]
+LINE = 500.0 * T * [1.0, 0.7] + 5.0
+NOISE = np.random.default_rng(2).normal(size=(60, 2))
+NAN_HALF = np.where(np.arange(60)[:, None] % 2 == 0, np.nan, GOOD1)
+EVEN = np.random.default_rng(3).uniform(0.0, 1000.0, (2, 60, 2))
+
+VALUE_ERRORS = {
+    "half NaN": (NAN_HALF, GOOD2),
+    "infinite": (GOOD1, np.r_[GOOD2[:-1], [[np.inf, 1.0]]]),
+    "too large": (1e100 * GOOD1, 1e100 * GOOD2),
+    "overflow": (1e300 * GOOD1, 1e300 * GOOD2),
+    "complex": (GOOD1 + 1j, GOOD2),
+    "transposed": (GOOD1.T, GOOD2.T),
+    "three columns": (np.c_[GOOD1, T], np.c_[GOOD2, T]),
+    "of two lengths": (GOOD1, GOOD2[:-1]),
+    "flat": (GOOD1.ravel(), GOOD2.ravel()),
+    "numbers": (1.0, 2.0),
+    "nothing": (None, None),
+}
+HOSTILE = {
+    "empty": (GOOD1[:0], GOOD2[:0]),
+    "six": (GOOD1[:6], GOOD2[:6]),
+    "seven": (GOOD1[:7], GOOD2[:7]),
+    "eight": (GOOD1[:8], GOOD2[:8]),
+    "nine exact": (PAIR.xy1[:9], PAIR.xy2[:9]),
+    "exact": (PAIR.xy1, PAIR.xy2),
+    "equal": (np.full((60, 2), 3.3), np.full((60, 2), 7.7)),
+    "equal in one image": (GOOD1, np.full((60, 2), 1e8 + 0.1)),
+    "all but two equal": (np.r_[np.ones((58, 2)), GOOD1[:2]], np.r_[np.ones((58, 2)), GOOD2[:2]]),
+    "collinear": (LINE, 2.0 * LINE[:, ::-1]),
+    "nearly collinear": (LINE + 1e-6 * NOISE, GOOD2),
+    "all but one collinear": (np.r_[LINE[:-1], GOOD1[:1]], GOOD2),
+    "four places": (np.tile(GOOD1[:4], (15, 1)), np.tile(GOOD2[:4], (15, 1))),
+    "eight places": (np.tile(GOOD1[:8], (8, 1)), np.tile(GOOD2[:8], (8, 1))),
+    "wrong": (EVEN[0], EVEN[1]),
+    "same image": (GOOD1, GOOD1),
+    "shifted": (GOOD1.round(), GOOD1.round() + 5.0),
+    "one to many": (np.tile(GOOD1[:1], (60, 1)), GOOD2),
+    "huge": (1e8 * GOOD1, 1e8 * GOOD2),
+    "tiny": (1e-8 * GOOD1, 1e-8 * GOOD2),
+    "vanishing": (1e-150 * GOOD1, 1e-150 * GOOD2),
+    "subnormal": (5e-324 * GOOD1, 5e-324 * GOOD2),
+    "far from the origin": (GOOD1 + 1e10, GOOD2 + 1e10),
+    "far from each other": (GOOD1 + 1e5, GOOD2),
+    "farther from each other": (GOOD1 + 1e8, GOOD2),
+    "of two sizes": (1e-8 * GOOD1, GOOD2),
+    "one wild match": (np.r_[GOOD1, [[1e12, 5.0]]], np.r_[GOOD2, [[5.0, 1e12]]]),
+}
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+def default_with_all_it_says(xy1, xy2):
+    fit = estimate_fundamental(xy1, xy2, judge=True)
+    e1, e2 = epipoles_of(fit)
+    return fit, epipolar_distance_interval(fit, xy1, xy2), e1.direction, e2.direction, e1.covariance
+
+
+FUNCTIONS: dict[str, Callable[..., object]] = {
+    "default": default_with_all_it_says,
+    "named": lambda a, b: classify_configuration(
+        (fit := estimate_fundamental(a, b)).F, a, b, inliers=fit.inliers
+    ),
+    "thesis": lambda a, b: ThesisRansac(samples=30).estimate(a, b, rng()),
+    "both lines": lambda a, b: ThesisRansac(samples=30, both_lines=True).estimate(a, b, rng()),
+    "least median": lambda a, b: LeastMedianOfSquares(samples=30).estimate(a, b, rng()),
+    "eight-point": estimate_eight_point,
+    "eight-point raw": lambda a, b: estimate_eight_point(a, b, normalized=False),
+    "seven-point": lambda a, b: estimate_seven_point(a[:7], b[:7]),
+    "gradient": lambda a, b: refine_gradient(PAIR.F, a, b),
+    "epipolar distance": lambda a, b: refine_epipolar_distance(PAIR.F, a, b),
+    "reprojection": lambda a, b: refine_reprojection(PAIR.F, a, b),
+    "rows": lambda a, b: refine_gradient_by_rows(PAIR.F, a, b),
+    "configuration": lambda a, b: classify_configuration(PAIR.F, a, b),
+    "noise": lambda a, b: discard_outliers(PAIR.F, a, b),
+}
+
+
+def holds_nan(answer: object) -> bool:
+    """NaN anywhere in an answer; the angle of no rotation is NaN by its definition."""
+    if is_dataclass(answer):
+        return any(holds_nan(getattr(answer, f.name)) for f in fields(answer) if f.name != "turn_deg")
+    if isinstance(answer, tuple):
+        return any(map(holds_nan, answer))
+    return isinstance(answer, float | np.ndarray) and bool(np.isnan(answer).any())
+
+
+def answer_or_refusal(function, xy1, xy2):
+    try:
+        return function(xy1, xy2), None
+    except (StageFailure, ValueError) as refusal:
+        return None, refusal
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_hostile_matches_give_numbers_or_a_named_failure(name):
+    """LinAlgError is a ValueError, too, and warnings are errors here."""
+    for kind, (xy1, xy2) in HOSTILE.items():
+        answer, refusal = answer_or_refusal(FUNCTIONS[name], xy1, xy2)
+        assert not isinstance(refusal, np.linalg.LinAlgError), kind
+        assert refusal is None or len(str(refusal)) > 20, kind
+        assert not holds_nan(answer), kind
+
+
+@pytest.mark.parametrize("name", FUNCTIONS.keys() - {"seven-point"})
+def test_what_is_no_list_of_matches_is_a_wrong_call(name):
+    for kind, (xy1, xy2) in VALUE_ERRORS.items():
+        with pytest.raises(ValueError, match="fundamental matrix needs") as failure:
+            FUNCTIONS[name](xy1, xy2)
+        assert not isinstance(failure.value, np.linalg.LinAlgError), kind
+
+
+@pytest.mark.parametrize("name", ["default", "thesis", "least median", "eight-point", "gradient"])
+def test_storage_of_the_matches_does_not_matter(name):
+    whole1, whole2 = GOOD1.round(), GOOD2.round()
+    expected = FUNCTIONS[name](whole1, whole2)
+    both = np.hstack([whole1, whole2])
+    for xy1, xy2 in (
+        (whole1.astype(np.int64), whole2.astype(np.int32)),
+        (whole1.astype(np.float32), whole2.astype(np.float32)),
+        (np.asfortranarray(whole1), np.asfortranarray(whole2)),
+        (both[:, :2], both[:, 2:]),
+        (whole1.tolist(), whole2.tolist()),
+    ):
+        assert repr(FUNCTIONS[name](xy1, xy2)) == repr(expected)
