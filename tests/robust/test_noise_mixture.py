@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from thesisrecon.robust.kernels import TAIL, fit_noise_mixture
-from thesisrecon.robust.noise import NoiseMixture, best_huber_width
+from thesisrecon.robust.noise import NoiseMixture, best_huber_width, effective_noise
 
 
 def draw(n: int, wrong: float, tail: float, seed: int) -> np.ndarray:
@@ -91,11 +91,18 @@ def test_exact_residuals_give_a_finite_mixture():
 def test_normal_residuals_want_least_squares_and_heavy_ones_a_bend():
     rng = np.random.default_rng(7)
     normal = np.abs(rng.normal(0.0, 0.5, 2000))
-    width, noise = best_huber_width(normal, 0.5)
-    assert width == np.inf
-    assert noise == pytest.approx(0.5, rel=0.05)
+    assert best_huber_width(normal, 0.5) == np.inf
+    assert effective_noise(normal, np.inf) == pytest.approx(0.5, rel=0.05)
+    # Huber's width of 1.345 sigma keeps 95 % of the information of normal noise.
+    assert effective_noise(normal, 1.345 * 0.5) == pytest.approx(0.5 / np.sqrt(0.95), rel=0.05)
     laplace = rng.exponential(0.5, 2000)
-    width, noise = best_huber_width(laplace, 0.5)
+    width = best_huber_width(laplace, 0.5)
     assert width <= 1.0
     # The best M-estimator of a Laplace scale b has variance b^2, least squares 2 b^2.
-    assert noise < 0.9 * np.sqrt(2.0) * 0.5
+    assert effective_noise(laplace, width) < 0.9 * np.sqrt(2.0) * 0.5
+
+
+def test_the_noise_of_a_fit_allows_for_what_was_fitted():
+    r = np.ones(17)
+    assert effective_noise(r, np.inf, parameters=7) == pytest.approx(np.sqrt(1.7))
+    assert effective_noise(r, 0.5, parameters=7) > 1.0

@@ -13,7 +13,13 @@ from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.kernels import sampson_distances, search, truncated_score
 from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
 from thesisrecon.errors import StageFailure
-from thesisrecon.robust.noise import NoiseMixture, best_huber_width, noise_scale, noise_width
+from thesisrecon.robust.noise import (
+    NoiseMixture,
+    best_huber_width,
+    effective_noise,
+    noise_scale,
+    noise_width,
+)
 from thesisrecon.types import FundamentalFit
 
 F64 = NDArray[np.float64]
@@ -39,7 +45,7 @@ SPREAD = 1.0
 FEW_MATCHES = 28.0
 """How much wider the last loss is for few matches: by 1 + 28 / (n - 7), as a fit bends to what it keeps."""
 COVERED = 3.0
-"""Widths of the noise within which matches bear on the covariance."""
+"""Standard deviations within which nearly all noise lies."""
 WIDER, RING = 4.0, 15.0
 """Gate of the second search, and how far beyond the noise is looked whether it goes on, in gates."""
 EXCESS = 0.25
@@ -119,8 +125,8 @@ class LocallyOptimisedRansac:
 
     def _candidate(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         f, samples = self._best_of_starts(points, gate, rng)
-        noise = _sharpen(f, points, gate) if f.any() else None
-        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise)
+        noise, loss = _sharpen(f, points, gate) if f.any() else (None, (0.0, 0.0))
+        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss)
 
     def _best_of_starts(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         found: list[tuple[float, F64]] = []
@@ -169,23 +175,25 @@ class LocallyOptimisedRansac:
             )
         limit = min(noise.limit, self.inlier_sigmas * noise.sigma)
         inliers = r < max(limit, self.inlier_floor_px * frame.scale)
-        eighth = float(np.partition(r, MINIMUM - 1)[MINIMUM - 1])
-        core = r <= (COVERED * noise.sigma if COVERED * noise.sigma > eighth else eighth)
-        _, effective = best_huber_width(r[core], noise.sigma)
-        effective *= np.sqrt(core.sum() / (core.sum() - PARAMETERS))
-        covariance = fundamental_covariance(frame, found.f, points[core], effective)
+        fitted = r < found.loss[0]
+        effective = effective_noise(r[fitted], found.loss[1], parameters=PARAMETERS)
+        covariance = fundamental_covariance(frame, found.f, points[fitted], effective)
         F = frame.matrix_in_pixels(found.f)
         return FundamentalFit(F, inliers, noise.sigma / frame.scale, covariance, found.samples)
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A matrix ``f`` (9,), the samples it took, its residuals (N,) and their noise, None for no F."""
+    """A matrix ``f`` (9,), the samples it took, its residuals (N,) and their noise, None for no F.
+
+    ``loss`` is what it was fitted with: where matches stop to count and where Huber's loss turns linear.
+    """
 
     f: F64
     samples: int
     residuals: F64
     noise: NoiseMixture | None
+    loss: tuple[float, float]
 
     def explains_more_than(self, rival: _Candidate) -> bool:
         """Whether this, found with a wider gate, is likelier and leaves few matches unexplained.
@@ -210,9 +218,9 @@ def _noise(r: F64, gate: float) -> NoiseMixture | None:
     return NoiseMixture.fit(r, max(noise_scale(near), EXACT), spread=SPREAD)
 
 
-def _sharpen(f: F64, points: F64, gate: float) -> NoiseMixture | None:
-    """Refine once more with the loss that suits the noise that the residuals show (in place)."""
-    noise = None
+def _sharpen(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
+    """Refine with the loss that suits the noise that the residuals show (in place); both are returned."""
+    loss = (0.0, 0.0)
     for k in range(SHARPENINGS + 1):
         r = np.sort(sampson_distances(f, points))
         noise = _noise(r, gate)
@@ -223,13 +231,15 @@ def _sharpen(f: F64, points: F64, gate: float) -> NoiseMixture | None:
             free = max(noise.core * len(r) - PARAMETERS, 1.0)
             few = 1.0 + FEW_MATCHES / free
             limit = min(limit, few * noise.core_limit)
-        limit = max(limit, EXACT)
+        limit = max(limit, EXACT, 1.001 * float(r[MINIMUM - 1]))
         near = r[: np.searchsorted(r, limit)]
-        if len(near) < MINIMUM:
-            break
-        width, _ = best_huber_width(near, noise.sigma)
-        refine(f, points, GRADIENT, limit, min(max(width, EXACT), limit), REFINEMENT_STEPS)
-    return noise
+        # The start bends to few of the matches: whether the noise is heavy-tailed cannot be seen before the
+        # first refinement.
+        width = best_huber_width(near, noise.sigma, parameters=PARAMETERS) if k > 0 else np.inf
+        width = min(max(width, EXACT), limit)
+        refine(f, points, GRADIENT, limit, width, REFINEMENT_STEPS)
+        loss = (limit, width)
+    return noise, loss
 
 
 def _goes_on(r: F64, noise: NoiseMixture, gate: float) -> bool:

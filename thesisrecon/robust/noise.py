@@ -132,21 +132,33 @@ class NoiseMixture:
         return self.sigma * float(np.sqrt(2.0 * np.log(odds) / (1.0 - TAIL**-2)))
 
 
-def best_huber_width(residuals: F64, sigma: float) -> tuple[float, float]:
-    """Width of Huber's loss that promises the least variance for residuals (N > 0,) >= 0, and a noise.
+def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> float:
+    """Width of Huber's loss that promises the least variance for residuals (N > 0,) >= 0 of noise ``sigma``.
 
     The asymptotic variance of an M-estimator is mean(psi^2) / mean(psi')^2 (Huber, 1964), judged here from
     the residuals themselves (Jaeckel, 1971). Least squares (infinite width) is left only for a gain of more
-    than the chance of N residuals. The noise is the standard deviation of normal residuals with which least
-    squares would be as uncertain.
+    than twice the chance of N residuals to which ``parameters`` were fitted: few of them look heavy-tailed
+    too easily, and the variance would be judged too small with them.
     """
     n = len(residuals)
-    width, variance = np.inf, float(residuals @ residuals) / n
-    least = variance
+    if n <= 2 * parameters:
+        return np.inf
+    needed = (1.0 + 2.0 / np.sqrt(n)) * n / (n - 2 * parameters)
+    width, least = np.inf, effective_noise(residuals, np.inf) ** 2
     for k in HUBER_SIGMAS:
-        psi = np.minimum(residuals, k * sigma)
-        straight = max(float(np.count_nonzero(residuals < k * sigma)) / n, 1.0 / n)
-        other = float(psi @ psi) / n / straight**2
-        if other * (1.0 + 1.0 / np.sqrt(n)) < least:
-            width, variance, least = k * sigma, other, other * (1.0 + 1.0 / np.sqrt(n))
-    return width, float(np.sqrt(variance))
+        variance = effective_noise(residuals, k * sigma) ** 2 * needed
+        if variance < least:
+            width, least = k * sigma, variance
+    return width
+
+
+def effective_noise(residuals: F64, width: float, *, parameters: int = 0) -> float:
+    """Standard deviation of normal noise with which least squares would be as uncertain as Huber's loss is.
+
+    sqrt(sum(psi^2) / (N - p)) / mean(psi') for residuals (N > 0,) >= 0 to which ``parameters`` p were fitted
+    under the loss of ``width`` (Huber, 1973).
+    """
+    n = len(residuals)
+    psi = np.minimum(residuals, width)
+    straight = max(int(np.count_nonzero(residuals < width)), 1) / n
+    return float(np.sqrt(psi @ psi / max(n - parameters, 1))) / straight
