@@ -14,7 +14,9 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from validation.checks.front_end_kermit import check_kermit, kermit_table, measure_kermit
 from validation.checks.front_end_pairs import check_pairs, measure_pairs, pair_table
+from validation.checks.front_end_time import check_time, measure_time
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS
 
@@ -37,6 +39,14 @@ def blocks(wishes: argparse.Namespace) -> Iterator[Block]:
     parts = PARTS if wishes.only is None else (wishes.only,)
     if "pairs" in parts:
         yield from pair_blocks(wishes)
+    if "kermit" in parts:
+        run = measure_kermit()
+        if run is not None:
+            yield "kermit, all pairs", check_kermit(run), kermit_table(run)
+    if "time" in parts:
+        runs = measure_time()
+        if runs is not None:
+            yield "Time and memory, fountain-P11, 2 threads", check_time(runs), ""
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -33,18 +33,13 @@ class ReferenceRun:
     seconds: Mapping[str, float]
 
 
-def reconstruct_with_pycolmap(
-    images: Path,
-    out: Path,
-    *,
-    shared_camera: bool = True,
-    refine_principal_point: bool = False,
-    threads: int = 2,
-) -> ReferenceRun:
-    """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
+def match_with_pycolmap(
+    images: Path, out: Path, *, shared_camera: bool = True, threads: int = 2
+) -> dict[str, float]:
+    """SIFT and exhaustive matching of all pairs with their verification; the seconds of both.
 
-    ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database, the
-    models and the times. Raises :class:`StageFailure` where COLMAP makes no model.
+    ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database and
+    the times.
     """
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
@@ -62,13 +57,31 @@ def reconstruct_with_pycolmap(
 
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
-    seconds["match"], start = time.perf_counter() - start, time.perf_counter()
+    seconds["match"] = time.perf_counter() - start
+    (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    return seconds
 
+
+def reconstruct_with_pycolmap(
+    images: Path,
+    out: Path,
+    *,
+    shared_camera: bool = True,
+    refine_principal_point: bool = False,
+    threads: int = 2,
+) -> ReferenceRun:
+    """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
+
+    ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database, the
+    models and the times. Raises :class:`StageFailure` where COLMAP makes no model.
+    """
+    seconds = match_with_pycolmap(images, out, shared_camera=shared_camera, threads=threads)
+    start = time.perf_counter()
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads, ba_refine_principal_point=refine_principal_point
     )
     options.mapper.num_threads = threads
-    pycolmap.incremental_mapping(database, images, out / "sparse", options)
+    pycolmap.incremental_mapping(out / "database.db", images, out / "sparse", options)
     seconds["map"] = time.perf_counter() - start
     (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
     return read_run(images, out)
@@ -103,7 +116,11 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--refine-principal-point", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--only-matches", action="store_true", help="end before the mapping")
     wishes = parser.parse_args()
+    if wishes.only_matches:
+        match_with_pycolmap(wishes.images, wishes.out, threads=wishes.threads)
+        return
     reconstruct_with_pycolmap(
         wishes.images,
         wishes.out,
