@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -19,6 +19,13 @@ from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification, Thesi
 from thesisrecon.errors import UsageError
 from thesisrecon.features import HarrisCorners, MultiScaleCorners
 from thesisrecon.matching import AlignedTracks, PlainTracks, SeedsAndGrowth, StrengthOfMatch
+from thesisrecon.matching.pair_selection import (
+    AllPairs,
+    ListedPairs,
+    MapAll,
+    OverlapEstimate,
+    SequenceWindow,
+)
 from thesisrecon.metric import UpgradeAndBundle
 from thesisrecon.projective import GatedIncremental, SequentialProjective
 from thesisrecon.selfcalibration import HartleySearch, HypothesesAndRefinement
@@ -40,6 +47,7 @@ from thesisrecon.types import (
     Image,
     Matches,
     MetricResult,
+    PairChoice,
     Reconstruction,
     SelfCalibration,
     Tracks,
@@ -56,6 +64,21 @@ class Detector(Protocol):
     """Section 4.2.1: corners of one photograph."""
 
     def detect(self, image: Image) -> Features: ...
+
+
+class PairSelector(Protocol):
+    """Which pairs of photographs are matched; ``check`` refuses a wrong wish before anything is computed."""
+
+    def check(self, names: Sequence[str], left_out: Collection[str]) -> None: ...
+
+    def select(
+        self,
+        names: Sequence[str],
+        features: Sequence[Features],
+        *,
+        map_all: MapAll,
+        rng: np.random.Generator,
+    ) -> PairChoice: ...
 
 
 class Matcher(Protocol):
@@ -188,6 +211,7 @@ class PipelineConfig:
     images: ImageOptions = ImageOptions()
     intrinsics: IntrinsicsAssumption = IntrinsicsAssumption()
     features: Detector = field(default_factory=MultiScaleCorners)
+    pairs: PairSelector = field(default_factory=OverlapEstimate)
     matching: Matcher = field(default_factory=SeedsAndGrowth)
     epipolar: FundamentalEstimator = field(default_factory=_precise_ransac)
     verification: Verifier = field(default_factory=PairVerification)
@@ -200,6 +224,12 @@ class PipelineConfig:
 # One table per stage: the word of the text and the class it means. A new variant is one line here.
 KINDS: Mapping[str, Mapping[str, type[Any]]] = {
     "features": {"multi-scale-corners": MultiScaleCorners, "harris-corners": HarrisCorners},
+    "pairs": {
+        "all-pairs": AllPairs,
+        "overlap-estimate": OverlapEstimate,
+        "sequence-window": SequenceWindow,
+        "listed-pairs": ListedPairs,
+    },
     "matching": {"seeds-and-growth": SeedsAndGrowth, "strength-of-match": StrengthOfMatch},
     "epipolar": {"locally-optimised-ransac": LocallyOptimisedRansac, "thesis-ransac": ThesisRansac},
     "verification": {"pair-verification": PairVerification},
@@ -216,6 +246,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
     "default": PipelineConfig(),
     "thesis": PipelineConfig(
         features=HarrisCorners(),
+        pairs=AllPairs(),
         matching=StrengthOfMatch(),
         epipolar=ThesisRansac(),
         tracks=PlainTracks(),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -21,6 +20,7 @@ from thesisrecon.types import (
     Features,
     FocalPrior,
     Image,
+    PairChoice,
     RunResult,
     TwoView,
 )
@@ -112,6 +112,8 @@ class _Work:
                 f"at least {needed} different ones are needed{'; ' + why if why else ''}",
                 "take more photographs of the scene from other places",
             )
+        if self.until != "features":
+            self.config.pairs.check([image.name for image in self.result.images], self.result.refused)
 
 
 def _read(run: Run, images: ImageSource) -> PhotographSet:
@@ -188,9 +190,30 @@ def detect_features(config: PipelineConfig, image: Image) -> Features:
 # ---------------------------------------------------------------- 4.2.2 and chapter 5: pairs of views
 
 
+def _choose_pairs(work: _Work) -> None:
+    run, images, features = work.run, work.result.images, work.result.features
+    names = [image.name for image in images]
+    key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
+    run.progress("pairs", 0, 1)
+    choice: PairChoice = run.kept(
+        "pairs",
+        "choice",
+        key,
+        lambda: work.config.pairs.select(
+            names, features, map_all=run.workers.map_all, rng=stream(run.seed, "pairs")
+        ),
+    )
+    work.result = replace(work.result, pair_choice=choice)
+    possible = len(images) * (len(images) - 1) // 2
+    counts = {"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
+    run.finish("pairs", counts=counts)
+    run.progress("pairs", 1, 1)
+
+
 def _match_pairs(work: _Work) -> None:
     run, result = work.run, work.result
-    pairs = list(combinations(range(len(result.images)), 2))
+    assert result.pair_choice is not None
+    pairs = [(int(i), int(j)) for i, j in result.pair_choice.pairs]
     variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
     features = list(run.logs["features"].keys.values())
     keys = {
@@ -413,7 +436,7 @@ def _quality(result: RunResult) -> tuple[bool, bool, int, int]:
 
 STEPS = {
     "features": (_find_features,),
-    "matches": (_find_features, _match_pairs),
-    "projective": (_find_features, _match_pairs, _build_tracks, _reconstruct_projective),
-    "metric": (_find_features, _match_pairs, _build_tracks, _reconstruct_metric),
+    "matches": (_find_features, _choose_pairs, _match_pairs),
+    "projective": (_find_features, _choose_pairs, _match_pairs, _build_tracks, _reconstruct_projective),
+    "metric": (_find_features, _choose_pairs, _match_pairs, _build_tracks, _reconstruct_metric),
 }

@@ -26,6 +26,7 @@ Progress = Callable[[str, int, int], None]
 
 FOLDERS: Mapping[str, str] = {
     "features": "01-features",
+    "pairs": "02-pairs",
     "matches": "02-matches",
     "tracks": "03-tracks",
     "projective": "04-projective",

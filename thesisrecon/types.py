@@ -98,6 +98,18 @@ class Matches:
 
 
 @dataclass(frozen=True)
+class PairChoice:
+    """Which pairs of views are matched: ``pairs`` (M, 2) view numbers, the smaller first, sorted.
+
+    ``how`` says in a clause how they were chosen, ``compared`` of how many pairs the overlap was estimated.
+    """
+
+    pairs: I64
+    how: str
+    compared: int = 0
+
+
+@dataclass(frozen=True)
 class Certainty:
     """Whether the matches of a pair determine its F, with the evidence; ``reasons`` say why not.
 
@@ -293,9 +305,9 @@ class RunResult:
     """Everything one run found; what lies beyond ``until`` or could not be made is None.
 
     ``images`` are the V views at working size, ``features`` one per view, ``pairs`` every pair that was
-    matched, accepted or not. ``refused`` maps the photographs that never became a view to the reason; a view
-    that was not registered has its reason in ``metric.reconstruction.reasons``. ``groups`` (V,) is the
-    camera number of each view. ``reports`` holds one record per stage, ``settings`` the configuration as
+    matched, accepted or not, and ``pair_choice`` how these were chosen. ``refused`` maps the photographs that
+    never became a view to the reason; a view that was not registered has its reason in
+    ``metric.reconstruction.reasons``. ``groups`` (V,) is the camera number of each view. ``reports`` holds one record per stage, ``settings`` the configuration as
     plain tables (stage -> field -> value), ``summary`` what ``summary.json`` says. All coordinates are
     pixels at working size; ``summary`` and the exported model are in original pixels. ``failure`` is the
     sentence that ended the run early, empty otherwise.
@@ -308,6 +320,7 @@ class RunResult:
     pairs: tuple[TwoView, ...]
     groups: I64
     settings: Mapping[str, Mapping[str, Any]]
+    pair_choice: PairChoice | None = None
     tracks: Tracks | None = None
     projective: Reconstruction | None = None
     calibration: SelfCalibration | None = None

@@ -38,6 +38,9 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "identifiable": result.calibration.identifiable if result.calibration is not None else None,
         "self_check": dict(result.metric.self_check) if result.metric is not None else {},
         "pairs": {
+            "chosen_by": result.pair_choice.how if result.pair_choice is not None else None,
+            "possible": len(result.images) * (len(result.images) - 1) // 2,
+            "compared": result.pair_choice.compared if result.pair_choice is not None else None,
             "matched": len(result.pairs),
             "accepted": sum(pair.accepted for pair in result.pairs),
             "verified_matches": sum(pair.inliers for pair in result.pairs if pair.accepted),

@@ -1,0 +1,84 @@
+"""Many photographs from few: zoomed parts, whose overlap is known where they share a source."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from thesisrecon.types import Image
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A part of a photograph as a photograph of its own.
+
+    ``source`` counts the photographs it may come from, ``scene`` the sets these belong to; ``box`` (4,)
+    is the part (left, top, right, bottom) as shares of the width and the height of the source.
+    """
+
+    image: Image
+    source: int
+    scene: int
+    box: F64
+
+
+def make_crops(
+    scenes: Sequence[Sequence[Path]],
+    count: int,
+    *,
+    long_side: int,
+    rng: np.random.Generator,
+    least_share: float = 0.5,
+) -> list[Crop]:
+    """``count`` parts of the photographs of some scenes, at random places and zooms.
+
+    The sources take turns in an order drawn from ``rng``, so that ``count`` photographs come from as many
+    sources as there are. The side of a part is ``least_share`` to 1 of that of its source, all logarithms
+    equally likely; it is resized to ``long_side`` px, never enlarged by more than its source allows.
+    """
+    sources = [(scene, path) for scene, paths in enumerate(scenes) for path in paths]
+    order = np.concatenate([rng.permutation(len(sources)) for _ in range(-(-count // len(sources)))])[:count]
+    kept: dict[int, U8] = {}
+    crops = []
+    for number, source in enumerate(int(s) for s in order):
+        scene, path = sources[source]
+        if source not in kept:
+            kept[source] = _read(path)
+        share = float(np.exp(rng.uniform(np.log(least_share), 0.0)))
+        left, top = rng.uniform(0.0, 1.0 - share, 2)
+        box = np.array([left, top, left + share, top + share])
+        rgb = _cut(kept[source], box, long_side)
+        name = f"{number:04d}.png"
+        crops.append(Crop(Image(name, rgb, (rgb.shape[1], rgb.shape[0])), source, scene, box))
+    return crops
+
+
+def shared_area(a: Crop, b: Crop) -> float:
+    """The part that two crops of one source share, as a share of the smaller one; 0 for different sources."""
+    if a.source != b.source:
+        return 0.0
+    low, high = np.maximum(a.box[:2], b.box[:2]), np.minimum(a.box[2:], b.box[2:])
+    area = float(np.prod(np.maximum(high - low, 0.0)))
+    return area / min(float(np.prod(c.box[2:] - c.box[:2])) for c in (a, b))
+
+
+def _read(path: Path) -> U8:
+    with PillowImage.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def _cut(rgb: U8, box: F64, long_side: int) -> U8:
+    height, width = rgb.shape[:2]
+    left, top, right, bottom = (float(v) for v in box * np.array([width, height, width, height]))
+    scale = min(1.0, long_side / max(right - left, bottom - top))
+    size = (round((right - left) * scale), round((bottom - top) * scale))
+    picture = PillowImage.fromarray(rgb)
+    return np.asarray(picture.resize(size, PillowImage.Resampling.LANCZOS, box=(left, top, right, bottom)))
