@@ -5,10 +5,18 @@ import pytest
 from scipy.special import erf
 
 from tests.textures import photograph, texture
-from thesisrecon.features import HarrisCorners, MultiScaleCorners
-from thesisrecon.types import Image
+from thesisrecon.features import CornerMeasure, HarrisCorners, MultiScaleCorners
+from thesisrecon.features.harris import select_spread
+from thesisrecon.features.measure import find_corners
+from thesisrecon.types import F64, Image
 
-VARIANTS = [HarrisCorners(), MultiScaleCorners()]
+HARRIS = CornerMeasure(formula="harris", integration_sigma_px=1.0, integration_taps=9, colour=True)
+VARIANTS = [
+    HarrisCorners(),
+    MultiScaleCorners(),
+    HarrisCorners(selection="spread", measure=HARRIS),
+    MultiScaleCorners(measure=HARRIS),
+]
 Variant = HarrisCorners | MultiScaleCorners
 
 
@@ -100,3 +108,110 @@ def test_turned_patches_turn_with_the_photograph() -> None:
             agreement.append(float(one.patches[first][n] @ two.patches[second][m]))
     assert len(agreement) > 50
     assert np.median(agreement) > 0.95
+
+
+@pytest.mark.parametrize("formula", ["noble", "harris"])
+def test_both_formulas_find_the_same_corner_and_no_edge(formula: str) -> None:
+    measure = CornerMeasure(formula=formula)  # type: ignore[arg-type]
+    xy, response = find_corners(chessboard(0.3, -0.2).gray[None], measure)
+    # det - k trace^2 has the flatter top.
+    assert np.linalg.norm(xy[0] - (60.3, 49.8)) < (0.25 if formula == "noble" else 0.5)
+    assert (response[1:] < 0.01 * response[0]).all()
+
+
+def test_a_grey_photograph_has_the_same_response_in_colour() -> None:
+    image = photograph(texture(90, 110))
+    gray, colour = CornerMeasure(), CornerMeasure(colour=True)
+    one, three = gray.response(gray.channels(image)), colour.response(colour.channels(image))
+    assert colour.channels(image).shape == (3, 90, 110)
+    assert np.abs(one - three).max() < 1e-4 * one.max()
+
+
+def test_corners_that_only_colour_shows_are_found_in_colour() -> None:
+    """Red and green squares of one luminance."""
+    board = chessboard(0.0, 0.0).rgb[:, :, 0] > 128
+    rgb = np.where(board[:, :, None], np.array([200, 60, 90]), np.array([50, 136, 91])).astype(np.uint8)
+    image = Image("a.png", rgb, (120, 100))
+    found = {c: HarrisCorners(measure=CornerMeasure(colour=c)).detect(image) for c in (False, True)}
+    assert found[False].response.max(initial=0.0) < 0.01 * found[True].response.max()
+    assert np.linalg.norm(found[True].xy[0] - (60.0, 50.0)) < 3.0
+
+
+def test_the_derivation_kernel_is_scaled_to_slope_one() -> None:
+    channels = texture(70, 80)[None].astype(np.float32)
+    one = CornerMeasure().response(channels)
+    twice = CornerMeasure(derivative_taps=(-3.0, 0.0, 3.0)).response(channels)
+    assert np.abs(one - twice).max() < 1e-5 * one.max()
+
+
+def test_without_surface_fit_corners_stay_on_pixels_and_with_it_they_are_nearer() -> None:
+    error: dict[bool, list[F64]] = {False: [], True: []}
+    for dx, dy in np.random.default_rng(1).uniform(-0.5, 0.5, (12, 2)):
+        for subpixel, told in error.items():
+            measure = CornerMeasure(subpixel=subpixel)
+            xy, _ = find_corners(chessboard(dx, dy).gray[None], measure)
+            assert subpixel or not (xy % 1.0).any()
+            told.append(np.linalg.norm(xy[0] - (60 + dx, 50 + dy)))
+    assert np.mean(error[True]) < 0.5 * np.mean(error[False])
+
+
+def brute_force_suppression(xy: F64, response: F64, count: int) -> set[int]:
+    """The ``count`` corners that keep longest as the circle around each shrinks that no clearly stronger one
+    may enter."""
+    radius = np.full(len(xy), np.inf)
+    for i in range(len(xy)):
+        for j in range(len(xy)):
+            if 0.9 * response[j] > response[i]:
+                radius[i] = min(radius[i], float(np.hypot(*(xy[i] - xy[j]))))
+    return set(np.argsort(-radius, kind="stable")[:count].tolist())
+
+
+def test_spread_selection_is_adaptive_non_maximal_suppression() -> None:
+    rng = np.random.default_rng(5)
+    xy, response = rng.uniform(0, 300, (120, 2)), np.sort(rng.exponential(size=120))[::-1]
+    kept = select_spread(xy, response.astype(np.float32), 40, pool=120)
+    assert set(kept.tolist()) == brute_force_suppression(xy, response, 40)
+    assert (np.diff(kept) > 0).all()
+
+
+@pytest.mark.parametrize("selection", ["spacing", "spread", "strongest"])
+def test_each_selection_keeps_the_number_and_the_strongest(selection: str) -> None:
+    image = photograph(texture(300, 400))
+    variant = HarrisCorners(max_corners=100, selection=selection, threshold_rel=0.0)  # type: ignore[arg-type]
+    all_of_them = HarrisCorners(max_corners=10**6, selection="strongest", threshold_rel=0.0).detect(image)
+    features = variant.detect(image)
+    assert len(features.xy) == 100
+    assert np.array_equal(features.xy[0], all_of_them.xy[0])
+    if selection == "strongest":
+        assert np.array_equal(features.xy, all_of_them.xy[:100])
+
+
+def test_the_strongest_of_each_size_where_corners_are_not_spread() -> None:
+    gray = texture(400, 1100)
+    gray[:, 550:] = 128 + 0.15 * (gray[:, 550:] - 128)
+    features = MultiScaleCorners(full_corners=600, half_corners=0, spread=False).detect(photograph(gray))
+    assert set(features.scale.tolist()) == {1.0}
+    assert (features.xy[:, 0] > 560).mean() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("derivative_taps", (-1.0, 1.0)),
+        ("derivative_taps", (1.0, 1.0, 1.0)),
+        ("derivative_taps", (0.5, 0.0, -0.5)),
+        ("harris_k", 0.3),
+        ("integration_taps", 4),
+        ("integration_sigma_px", 0.0),
+    ],
+)
+def test_a_measure_that_cannot_be_is_refused(field: str, value: object) -> None:
+    with pytest.raises(ValueError, match=field):
+        CornerMeasure(**{field: value})  # type: ignore[arg-type]
+
+
+def test_values_that_are_not_finite_are_refused() -> None:
+    gray = texture(60, 60).astype(np.float32)
+    gray[30, 30] = np.nan
+    with pytest.raises(ValueError, match="NaN"):
+        find_corners(gray[None], CornerMeasure())

@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates, maximum_filter
+import pytest
+from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordinates, maximum_filter
 
 from tests.textures import texture
 from thesisrecon.features.kernels import (
@@ -15,22 +16,31 @@ from thesisrecon.geometry.raster import gaussian_taps
 from thesisrecon.types import F32, F64
 
 
-def response_twin(blurred: F32, taps: F32) -> F64:
-    b = blurred.astype(np.float64)
-    gx, gy = np.zeros_like(b), np.zeros_like(b)
-    gx[:, 1:-1] = 0.5 * (b[:, 2:] - b[:, :-2])
-    gy[1:-1] = 0.5 * (b[2:] - b[:-2])
-    a, m, c = (convolve1d(convolve1d(p, taps, axis=0), taps, axis=1) for p in (gx * gx, gx * gy, gy * gy))
-    return np.asarray((a * c - m * m) / (a + c + 1e-6))
+def moments_twin(channels: F32, derivative: F32, taps: F32) -> F64:
+    """(3, H, W): M11, M12, M22 by convolutions, summed over the channels."""
+    total = np.zeros((3, *channels.shape[1:]))
+    for channel in channels.astype(np.float64):
+        gx, gy = (correlate1d(channel, derivative, axis=axis) for axis in (1, 0))
+        for m, product in enumerate((gx * gx, gx * gy, gy * gy)):
+            total[m] += convolve1d(convolve1d(product, taps, axis=0), taps, axis=1)
+    return total
 
 
-def test_corner_response_equals_its_numpy_twin() -> None:
-    blurred = texture(60, 83, 1).astype(np.float32)
-    taps = gaussian_taps(1.5)
-    found, twin = corner_response(blurred, taps), response_twin(blurred, taps)
-    border = len(taps) // 2 + 1
+@pytest.mark.parametrize("trace_weight", [0.0, 0.04])
+@pytest.mark.parametrize("derivative", [(-0.5, 0.0, 0.5), (0.1, -0.8, 0.0, 0.8, -0.1)])
+@pytest.mark.parametrize("count", [1, 3])
+def test_corner_response_equals_its_numpy_twin(
+    trace_weight: float, derivative: tuple[float, ...], count: int
+) -> None:
+    channels = np.stack([texture(60, 83, seed).astype(np.float32) for seed in range(count)])
+    taps, along = gaussian_taps(1.5), np.array(derivative, np.float32)
+    found = corner_response(channels, along, taps, trace_weight)
+    a, m, c = moments_twin(channels, along, taps)
+    noble = (a * c - m * m) / (a + c + 1e-6)
+    twin = a * c - m * m - trace_weight * (a + c) ** 2 if trace_weight else noble
+    border = len(taps) // 2 + len(along) // 2
     inside = (slice(border, -border), slice(border, -border))
-    assert np.abs(found[inside] - twin[inside]).max() < 1e-4 * twin.max()
+    assert np.abs(found[inside] - twin[inside]).max() < 1e-4 * np.abs(twin).max()
     assert not found[:border].any()
     assert not found[:, -border:].any()
 

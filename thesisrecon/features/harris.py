@@ -6,16 +6,15 @@ C. Harris, M. Stephens, A combined corner and edge detector, Alvey Vision Confer
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
-from thesisrecon.features.kernels import corner_response, fit_maxima, keep_apart, squared_suppression_radii
-from thesisrecon.geometry.raster import gaussian_taps, smooth
+from thesisrecon.features.kernels import keep_apart, squared_suppression_radii
+from thesisrecon.features.measure import CornerMeasure, find_corners
 from thesisrecon.types import F32, F64, I64, Features, Image
 
-# Below this response (grey levels squared) the corners are those of quantisation and compression noise.
-NOISE_RESPONSE = 0.05
 # How many times its share one part of the image may fill of the pool of strong corners.
 SHARE = 1.5
 
@@ -28,45 +27,37 @@ class HarrisCorners:
     Parameters
     ----------
     max_corners : corners kept.
-    derivative_sigma_px, integration_sigma_px : the two Gaussians of section 4.2.1.
-    threshold_rel : share of the largest response that a corner must reach.
-    spacing_rel : least distance of two corners, as a share of the long side: clusters are thinned so that the
-        corners cover a large area.
+    threshold_rel : share of the largest response that a corner must reach; 0 for those above the noise.
+    selection : how the corners are made to cover a large area: "spacing" drops those too near to a stronger
+        one, "spread" is :func:`select_spread`, "strongest" does nothing.
+    spacing_rel : least distance of two corners where ``selection`` is "spacing", as a share of the long side.
+    pool_ratio : corners among which "spread" chooses, as a multiple of ``max_corners``.
+    measure : the R-matrix and its parameters.
     """
 
     max_corners: int = 2000
-    derivative_sigma_px: float = 1.0
-    integration_sigma_px: float = 1.5
     threshold_rel: float = 0.002
+    selection: Literal["spacing", "spread", "strongest"] = "spacing"
     spacing_rel: float = 0.004
+    pool_ratio: float = 1.7
+    measure: CornerMeasure = field(default_factory=CornerMeasure)
 
     def detect(self, image: Image) -> Features:
         """Corners of one photograph, strongest first, at scale 1; none where the image has no structure."""
-        xy, response = find_corners(image.gray, self.derivative_sigma_px, self.integration_sigma_px)
+        xy, response = find_corners(self.measure.channels(image), self.measure)
         if len(xy):
             strong = response >= self.threshold_rel * float(response[0])
             xy, response = xy[strong], response[strong]
-        order = np.arange(len(xy), dtype=np.int64)
-        kept = keep_apart(xy, order, self.spacing_rel * max(image.size))[: self.max_corners]
+        kept = self._select(xy, response, max(image.size))
         return Features(xy=xy[kept], scale=np.ones(len(kept), np.float32), response=response[kept])
 
-
-def find_corners(
-    gray: F32, derivative_sigma_px: float = 1.0, integration_sigma_px: float = 1.5
-) -> tuple[F64, F32]:
-    """All corners of (H, W) above the noise, strongest first: ``xy`` (N, 2) px and response (N,).
-
-    R = det M / trace M (the thesis' measure; its two lost signs restored), maxima of 3 x 3 neighbourhoods
-    refined by a quadratic surface. Equal responses are ordered as they are read, so the result is
-    reproducible.
-    """
-    taps = gaussian_taps(integration_sigma_px)
-    if min(gray.shape) < 2 * len(taps):
-        return np.empty((0, 2)), np.empty(0, np.float32)
-    response = corner_response(smooth(gray, derivative_sigma_px), taps)
-    xy, value = fit_maxima(response, NOISE_RESPONSE)
-    order = np.argsort(-value, kind="stable")
-    return xy[order], value[order]
+    def _select(self, xy: F64, response: F32, long_side: int) -> I64:
+        if self.selection == "spread":
+            return select_spread(xy, response, self.max_corners, pool=int(self.pool_ratio * self.max_corners))
+        kept = np.arange(len(xy), dtype=np.int64)
+        if self.selection == "spacing":
+            kept = keep_apart(xy, kept, self.spacing_rel * long_side)
+        return kept[: self.max_corners]
 
 
 def select_spread(xy: F64, response: F32, count: int, *, pool: int, robustness: float = 0.9) -> I64:

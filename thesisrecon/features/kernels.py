@@ -12,63 +12,96 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def corner_response(blurred: F32, taps: F32) -> F32:
-    """R = det M / (M11 + M22) of section 4.2.1, M the products of the gradient of ``blurred`` smoothed by
-    ``taps``.
+def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: float) -> F32:
+    """The R-matrix of section 4.2.1, (H, W): M are the products of the gradients of ``channels`` (C, H, W),
+    summed over the channels and smoothed by ``taps``.
 
-    One sweep down the image keeps the last 2 r + 1 rows of products only, so that they stay in the cache.
-    Rows and columns closer than r + 1 pixels to the border are zero.
+    The gradient at x is sum_k derivative[k] I(x + k), k from the middle. R = det M / trace M where
+    ``trace_weight`` is 0, else det M - trace_weight (trace M)^2. One sweep down the image keeps the last
+    2 r + 1 rows of products only, so that they stay in the cache. Rows and columns whose windows leave the
+    image are zero.
     """
-    height, width = blurred.shape
-    r = taps.size // 2
+    count, height, width = channels.shape
+    reach, size = derivative.size // 2, taps.size
     out = np.zeros((height, width), np.float32)
-    ring = np.zeros((taps.size, 3, width), np.float32)
+    ring = np.zeros((size, 3, width), np.float32)
+    slope = np.empty((2, width), np.float32)
     column = np.empty((3, width), np.float32)
     moment = np.empty((3, width), np.float32)
-    half = np.float32(0.5)
-    for y in range(1, height - 1):
-        # Slices that start where they are read keep the checks for negative indices out of the loops.
-        above, below = blurred[y - 1, 1:], blurred[y + 1, 1:]
-        left, right = blurred[y], blurred[y, 2:]
-        slot = ring[y % taps.size]
-        xx, xy, yy = slot[0, 1:], slot[1, 1:], slot[2, 1:]
-        for x in range(width - 2):
-            gx = half * (right[x] - left[x])
-            gy = half * (below[x] - above[x])
-            xx[x] = gx * gx
-            xy[x] = gx * gy
-            yy[x] = gy * gy
-        if y < taps.size:
+    border = size // 2 + reach
+    for y in range(reach, height - reach):
+        products = ring[y % size]
+        products[:] = np.float32(0.0)
+        for c in range(count):
+            _slopes(channels[c], derivative, y, slope)
+            _add_products(slope, reach, products)
+        if y < size + reach - 1:
             continue
         column[:] = np.float32(0.0)
-        for k in range(taps.size):
-            products = ring[(y - taps.size + 1 + k) % taps.size]
+        for k in range(size):
+            earlier = ring[(y - size + 1 + k) % size]
             weight = taps[k]
             for m in range(3):
-                source, target = products[m], column[m]
+                source, target = earlier[m], column[m]
                 for x in range(width):
                     target[x] += weight * source[x]
         moment[:] = np.float32(0.0)
         for m in range(3):
-            target = moment[m, r + 1 :]
-            for k in range(taps.size):
+            target = moment[m, border:]
+            for k in range(size):
                 weight = taps[k]
-                source = column[m, k + 1 :]
-                for x in range(width - 2 * r - 2):
+                # Slices that start where they are read keep the checks for negative indices out of the loops.
+                source = column[m, k + reach :]
+                for x in range(width - 2 * border):
                     target[x] += weight * source[x]
-        row = out[y - r, r + 1 :]
-        a, b, c = moment[0, r + 1 :], moment[1, r + 1 :], moment[2, r + 1 :]
-        for x in range(width - 2 * r - 2):
-            row[x] = (a[x] * c[x] - b[x] * b[x]) / (a[x] + c[x] + np.float32(1e-6))
+        _measure(moment[:, border:], width - 2 * border, trace_weight, out[y - size // 2, border:])
     return out
 
 
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _slopes(image: F32, derivative: F32, y: int, out: F32) -> None:
+    """Row y of the derivatives of ``image`` along x and y, from column ``len(derivative) // 2`` on."""
+    reach, width = derivative.size // 2, image.shape[1]
+    out[:] = np.float32(0.0)
+    along, across = out[0, reach:], out[1, reach:]
+    for k in range(derivative.size):
+        weight = derivative[k]
+        if weight == 0.0:
+            continue
+        beside, below = image[y, k:], image[y + k - reach, reach:]
+        for x in range(width - 2 * reach):
+            along[x] += weight * beside[x]
+            across[x] += weight * below[x]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _add_products(slope: F32, reach: int, out: F32) -> None:
+    gx, gy = slope[0, reach:], slope[1, reach:]
+    xx, xy, yy = out[0, reach:], out[1, reach:], out[2, reach:]
+    for x in range(slope.shape[1] - 2 * reach):
+        xx[x] += gx[x] * gx[x]
+        xy[x] += gx[x] * gy[x]
+        yy[x] += gy[x] * gy[x]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _measure(moment: F32, count: int, trace_weight: float, out: F32) -> None:
+    a, b, c = moment[0], moment[1], moment[2]
+    if trace_weight == 0.0:
+        for x in range(count):
+            out[x] = (a[x] * c[x] - b[x] * b[x]) / (a[x] + c[x] + np.float32(1e-6))
+    else:
+        for x in range(count):
+            trace = a[x] + c[x]
+            out[x] = a[x] * c[x] - b[x] * b[x] - trace_weight * trace * trace
+
+
 @njit(cache=True, nogil=True)
-def fit_maxima(response: F32, threshold: float) -> tuple[F64, F32]:
+def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[F64, F32]:
     """Maxima of the quadratic surfaces fitted by least squares to the 3 x 3 neighbourhoods of local maxima.
 
     Returns ``xy`` (N, 2) px and the response (N,) at the pixel. A fit without a maximum within one pixel
-    keeps the pixel itself.
+    keeps the pixel itself; so do all where not ``subpixel``.
     """
     height, width = response.shape
     # No two maxima touch, so that there is at most one in four pixels.
@@ -82,7 +115,7 @@ def fit_maxima(response: F32, threshold: float) -> tuple[F64, F32]:
         for x in range(1, width - 1):
             v = row[x]
             if v > limit and v > row[x - 1] and v >= row[x + 1] and _is_maximum(response, x, y):
-                dx, dy = _surface_maximum(response, x, y)
+                dx, dy = _surface_maximum(response, x, y) if subpixel else (0.0, 0.0)
                 xy[n, 0], xy[n, 1] = x + dx, y + dy
                 value[n] = v
                 n += 1

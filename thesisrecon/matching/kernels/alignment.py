@@ -212,7 +212,8 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
         if g >= 2:
             damped[g, g] += ridge
             right[g] -= ridge * moved[g]
-    delta: F64 = np.linalg.solve(damped, right)
+    delta = np.empty(unknowns)
+    delta[:] = np.linalg.solve(damped, right)
     for g in range(2, unknowns):
         moved[g] += delta[g]
     return delta

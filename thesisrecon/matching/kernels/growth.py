@@ -102,7 +102,8 @@ def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: t
     s[0, 0] += ridge
     s[1, 1] += ridge
     s[1, 0], s[2, 0], s[2, 1] = s[0, 1], s[0, 2], s[1, 2]
-    correction: F64 = np.linalg.solve(s, r)
+    correction = np.empty((3, 2))
+    correction[:] = np.linalg.solve(s, r)
     return correction
 
 
