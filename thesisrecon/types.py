@@ -305,12 +305,13 @@ class RunResult:
     """Everything one run found; what lies beyond ``until`` or could not be made is None.
 
     ``images`` are the V views at working size, ``features`` one per view, ``pairs`` every pair that was
-    matched, accepted or not, and ``pair_choice`` how these were chosen. ``refused`` maps the photographs that
-    never became a view to the reason; a view that was not registered has its reason in
-    ``metric.reconstruction.reasons``. ``groups`` (V,) is the camera number of each view. ``reports`` holds one record per stage, ``settings`` the configuration as
-    plain tables (stage -> field -> value), ``summary`` what ``summary.json`` says. All coordinates are
-    pixels at working size; ``summary`` and the exported model are in original pixels. ``failure`` is the
-    sentence that ended the run early, empty otherwise.
+    matched, accepted or not, and ``pair_choice`` how these were chosen. ``refused`` maps the photographs
+    that never became a view to the reason; a view that was not registered has its reason in
+    ``metric.reconstruction.reasons``. ``groups`` (V,) is the camera number of each view. ``reports`` holds
+    one record per stage, ``settings`` the configuration as plain tables (stage -> field -> value),
+    ``summary`` what ``summary.json`` says. All coordinates are pixels at working size; ``summary`` and the
+    exported model are in original pixels. ``failure`` is the sentence that ended the run early, empty
+    otherwise.
     """
 
     out: Path
