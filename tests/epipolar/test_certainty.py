@@ -20,12 +20,12 @@ from thesisrecon.epipolar.certainty.plane import (
     once_each,
     plane_covariance,
 )
-from thesisrecon.epipolar.degeneracy import homography_distances
 from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.multiview import (
     epipoles,
     estimate_homography,
+    homography_distances,
     homography_residuals,
     sampson_residuals,
     symmetric_residuals,

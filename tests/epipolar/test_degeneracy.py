@@ -10,11 +10,13 @@ from thesisrecon.epipolar import estimate_eight_point, estimate_fundamental
 from thesisrecon.epipolar.degeneracy import (
     Configuration,
     classify_configuration,
-    homography_distances,
 )
+from thesisrecon.epipolar.turning import turned_camera, turning_ratio
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import project
-from thesisrecon.geometry.multiview import homography_residuals
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.multiview import homography_distances, homography_residuals
+from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
 from validation.scenes.two_views import make_two_views
 
 
@@ -97,6 +99,26 @@ def test_the_angle_of_a_rotation_is_found_without_the_camera():
     found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
     angle = np.degrees(np.arccos((np.trace(R) - 1.0) / 2.0))
     assert found.turn_deg == pytest.approx(angle, abs=0.5)
+
+
+@pytest.mark.parametrize("focal", [0.8, 3.0])
+def test_a_turned_camera_is_told_from_a_homography_with_the_eigenvalues_of_a_rotation(focal):
+    """H = A R A^-1 has those eigenvalues for every A; only for an A of square pixels is it a rotation's."""
+    rng = np.random.default_rng(1)
+    xy1 = rng.uniform(-1.2, 1.2, (100, 2))
+    turn = turned_camera(np.array([np.log(focal), 0.1, -0.2, 0.02, 0.15, -0.05]))
+    skewed = np.diag([1.0, 2.5, 1.0])
+    for H, is_turn in ((turn, True), (skewed @ turn @ np.linalg.inv(skewed), False)):
+        xy2 = dehomogenize(homogenize(xy1) @ H.T)
+        ratios = []
+        for seed in range(20):
+            noisy = [xy + np.random.default_rng(seed).normal(0.0, 1e-3, xy.shape) for xy in (xy1, xy2)]
+            fitted = minimize_residuals(
+                lambda h, noisy=noisy: homography_distances(h.reshape(3, 3), *noisy).ravel(), H.ravel()
+            ).x.reshape(3, 3)
+            ratios.append(turning_ratio(fitted, *noisy, risk=0.001))
+        assert (np.array(ratios) <= 1.0).sum() == (20 if is_turn else 0)
+        assert min(ratios) >= -1e-6
 
 
 def test_homography_distances_are_half_the_transfer_of_a_similarity():

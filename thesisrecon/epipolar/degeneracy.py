@@ -27,6 +27,7 @@ from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
 from thesisrecon.epipolar.kernels import sampson_distances
 from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
 from thesisrecon.epipolar.refinement import UNBOUNDED
+from thesisrecon.epipolar.turning import turning_ratio
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.robust.noise import noise_scale, trimmed_noise_scale
 
@@ -53,8 +54,8 @@ EPIPOLE, BEYOND_TRANSLATION = 2, 5
 RISK, ALLOWANCE = 2e-3, 0.4
 """Chance to take a pure translation for more than that, were all residuals normal; what is allowed beyond it
 where a wrong match or more is expected in the band, for F to bend to."""
-TURN_RISK = 4e-3
-"""Chance to take a rotation for a plane, on either side: less, and more planes pass for rotations."""
+TURN_RISK = 1e-3
+"""Chance to take a rotation for a plane, by its eigenvalues (on either side) and as a camera's."""
 TRANSLATED = 3.3
 """Matches within so many sigma of a translation are compared with F; more would be cut by what noise does."""
 CORRECTIONS, EXACT = 10, 1e-12
@@ -83,6 +84,8 @@ class Degeneracy:
     off_homography_chance : log10 of how often chance has as many of the wrong matches agree with F; below -3
         they show relief.
     turning_errors : |trace H - trace H^-1| (det H = 1), 0 for a rotation, in its standard errors.
+    turning_camera_ratio : increase of the squared residuals from the homography to that of a camera of square
+        pixels that turned, over its limit; at most 1 for a rotation, NaN where the eigenvalues told already.
     turn_deg : the angle of that rotation, NaN where the eigenvalues are not those of one.
     translation_ratio : increase of the squared residuals from F to [e]x, over its limit; at most 1 where F is
         that of a translation, inf where more matches leave [e]x than chance would have.
@@ -94,6 +97,7 @@ class Degeneracy:
     off_homography: float
     off_homography_chance: float
     turning_errors: float
+    turning_camera_ratio: float
     turn_deg: float
     translation_ratio: float
 
@@ -113,9 +117,9 @@ def classify_configuration(
 
     ``inliers`` (N,), at least 12, are those that agree, all of them where None. Given the wrong ones too it
     is known how many could agree by chance: an F fitted to a plane gathers wrong matches at will. Both images
-    are taken to share their intrinsics (else a rotation is named a plane, a translation general); a plane of
-    a camera that moved by it sideways is told from a rotation by its eigenvalues alone. GENERAL where relief
-    and baseline stand out of the noise. ``seed`` draws the planes that are tried. Raises as
+    are taken to share their intrinsics (else a rotation is named a plane, a translation general) and to have
+    square pixels, which tell a plane from a rotation where its eigenvalues happen to be those of one. GENERAL
+    where relief and baseline stand out of the noise. ``seed`` draws the planes that are tried. Raises as
     :func:`~thesisrecon.epipolar.frame.check_matches`, and ``ValueError`` for an F below rank 2 and for flags
     of another shape.
     """
@@ -163,7 +167,7 @@ def _scale(f: F64, points: F64) -> float:
 
 def _classify(case: _Case, scale: float, seed: int) -> Degeneracy:
     sigma = case.sigma
-    errors, off, chance, turning, angle = np.inf, 1.0, -np.inf, np.inf, np.nan
+    errors, off, chance, turning, angle, camera = np.inf, 1.0, -np.inf, np.inf, np.nan, np.nan
     plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
     if plane is not None:
         squared = plane.squared * case.sigma**2
@@ -180,10 +184,14 @@ def _classify(case: _Case, scale: float, seed: int) -> Degeneracy:
         # F has fitted itself to the noise of a plane; the homography could not.
         sigma = noise
         turned = turning < _turn_limit(int(near.sum())) and np.isfinite(angle)
+        if turned:
+            xy1, xy2 = case.points[near, :2], case.points[near, 2:]
+            camera = turning_ratio(plane.h.reshape(3, 3), xy1, xy2, risk=TURN_RISK)
+            turned = camera <= 1.0
         kind = Configuration.ROTATION if turned else Configuration.PLANE
     elif ratio <= 1.0:
         kind = Configuration.TRANSLATION
-    return Degeneracy(kind, sigma / scale, errors, off, chance, turning, angle, ratio)
+    return Degeneracy(kind, sigma / scale, errors, off, chance, turning, camera, angle, ratio)
 
 
 def _plane_noise(squared: F64) -> float:
@@ -195,24 +203,6 @@ def _plane_noise(squared: F64) -> float:
             break
         variance = float(near.sum()) / (2.0 * NEAR_MEAN * (len(near) - 4))
     return float(np.sqrt(max(variance, 1e-24)))
-
-
-def homography_distances(H: F64, xy1: F64, xy2: F64) -> F64:
-    """Whitened residuals (N, 2) of x2 ~ H x1: to first order the two parts of the distance to the nearest
-    exact match, each with the standard deviation of one coordinate (Sampson; Chum, Pajdla and Sturm 2005)."""
-    x1 = homogenize(xy1)
-    u, v, w = (x1 @ H.T).T
-    c = np.stack([u - w * xy2[:, 0], v - w * xy2[:, 1]], axis=1)
-    J = np.zeros((len(x1), 2, 4))
-    J[:, :, :2] = H[None, :2, :2] - xy2[:, :, None] * H[2, :2]
-    J[:, 0, 2] = J[:, 1, 3] = -w
-    # Cholesky of J J' by hand: two by two.
-    a, b, d = (np.sum(J[:, i] * J[:, j], axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
-    l11 = np.sqrt(a + 1e-300)
-    l21 = b / l11
-    l22 = np.sqrt(np.maximum(d - l21**2, 1e-300))
-    first = c[:, 0] / l11
-    return np.stack([first, (c[:, 1] - l21 * first) / l22], axis=1)
 
 
 def _excess_errors(case: _Case, near: B8, rss_plane: float) -> float:

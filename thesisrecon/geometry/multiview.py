@@ -121,6 +121,24 @@ def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
     return np.where(np.isfinite(distance), distance, np.inf)
 
 
+def homography_distances(H: F64, xy1: F64, xy2: F64) -> F64:
+    """Whitened residuals (N, 2) of x2 ~ H x1: to first order the two parts of the distance to the nearest
+    exact match, each with the standard deviation of one coordinate (Sampson; Chum, Pajdla and Sturm 2005)."""
+    x1 = homogenize(xy1)
+    u, v, w = (x1 @ H.T).T
+    c = np.stack([u - w * xy2[:, 0], v - w * xy2[:, 1]], axis=1)
+    J = np.zeros((len(x1), 2, 4))
+    J[:, :, :2] = H[None, :2, :2] - xy2[:, :, None] * H[2, :2]
+    J[:, 0, 2] = J[:, 1, 3] = -w
+    # Cholesky of J J' by hand: two by two.
+    a, b, d = (np.sum(J[:, i] * J[:, j], axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
+    l11 = np.sqrt(a + 1e-300)
+    l21 = b / l11
+    l22 = np.sqrt(np.maximum(d - l21**2, 1e-300))
+    first = c[:, 0] / l11
+    return np.stack([first, (c[:, 1] - l21 * first) / l22], axis=1)
+
+
 def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -> tuple[F64, F64]:
     """P1 = [I 0], P2 = [-[e2]x F + e2 v'  scale e2] (3.42): two cameras of a projective frame that have F.
 
