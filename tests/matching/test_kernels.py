@@ -13,13 +13,14 @@ from thesisrecon.matching.kernels import (
     displacement_weight,
     fit_local_affines,
     grow_corners,
+    relative_difference_weight,
     scan_correlations,
     strength_of_match,
     unite,
     update_column_best,
 )
 from thesisrecon.matching.prepared import PreparedView, prepare_view
-from thesisrecon.types import F64, I64
+from thesisrecon.types import F64, I64, Features, Image
 
 RNG = np.random.default_rng(0)
 
@@ -198,26 +199,42 @@ def test_alignment_drops_what_its_gradients_cannot_place() -> None:
     assert kept == [True, False]
 
 
-def test_strength_of_match_equals_its_numpy_twin() -> None:
+def product_twin(a: F64, b: F64, closeness: float, terms: tuple[bool, bool, bool]) -> float:
+    lengths = np.linalg.norm(a), np.linalg.norm(b)
+    factors = [max(float(a @ b) / (lengths[0] * lengths[1]), 0.0)]
+    factors += [max(min(lengths), 1.0) / max(lengths), closeness]
+    return float(np.prod([f for f, used in zip(factors, terms, strict=True) if used]))
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.3])
+@pytest.mark.parametrize("terms", [(True, True, True), (False, True, False), (True, False, True)])
+def test_strength_of_match_equals_its_brute_force_twin(
+    tolerance: float, terms: tuple[bool, bool, bool]
+) -> None:
     xy1, xy2 = RNG.uniform(0, 60, (25, 2)), RNG.uniform(0, 60, (30, 2))
     correlation = RNG.uniform(-1, 1, (25, 30)).astype(np.float32)
     near1, near2 = (
         np.linalg.norm(xy[:, None] - xy[None], axis=2).argsort(axis=1)[:, 1:6] for xy in (xy1, xy2)
     )
     near1[3, 2:] = -1
-    index, strength = strength_of_match(correlation, (xy1, xy2), (near1, near2), 30.0, 4)
+    index, strength = strength_of_match(
+        correlation, (xy1, xy2), (near1, near2), (30.0, 4, 0.1), (tolerance, terms)
+    )
+
+    def agreement(u: int, v: int, m: int, n: int) -> float:
+        a, b, apart = xy2[v] - xy1[u], xy2[n] - xy1[m], float(np.linalg.norm(xy1[m] - xy1[u]))
+        if tolerance:
+            return float(np.exp(-0.5 * (np.linalg.norm(a - b) / (0.3 * apart + 1.0)) ** 2))
+        return product_twin(a, b, 1 - apart / 30.0, terms)
+
     for u in range(25):
         c = np.where(np.linalg.norm(xy2 - xy1[u], axis=1) <= 30.0, correlation[u], -1.0)
         best, expected = 0.0, -1
-        for v in [v for v in np.argsort(-c)[:4] if c[v] > 0]:
-            total = 0.0
-            for m in near1[u][near1[u] >= 0]:
-                closeness = 1 - np.linalg.norm(xy1[m] - xy1[u]) / 30.0
-                total += max(
-                    max(float(correlation[m, n]), 0.0)
-                    * displacement_weight.py_func(xy2[v] - xy1[u], xy2[n] - xy1[m], closeness)
-                    for n in near2[v]
-                )
+        for v in [v for v in np.argsort(-c)[:4] if c[v] > 0.1]:
+            total = sum(
+                max(max(float(correlation[m, n]), 0.0) * agreement(u, v, m, n) for n in near2[v])
+                for m in near1[u][near1[u] >= 0]
+            )
             if c[v] * total > best:
                 best, expected = c[v] * total, v
         assert index[u] == expected
@@ -225,11 +242,44 @@ def test_strength_of_match_equals_its_numpy_twin() -> None:
 
 
 def test_displacements_that_agree_weigh_one() -> None:
-    a = np.array([10.0, 0.0])
-    assert displacement_weight(a, a, 1.0) == pytest.approx(1.0)
-    assert displacement_weight(a, 0.5 * a, 1.0) == pytest.approx(0.5)
-    assert displacement_weight(a, -a, 1.0) == 0.0
-    assert displacement_weight(a, np.array([10.0, 10.0]), 0.8) == pytest.approx(0.4)
+    a, every = np.array([10.0, 0.0]), (True, True, True)
+    assert displacement_weight(a, a, 1.0, every) == pytest.approx(1.0)
+    assert displacement_weight(a, 0.5 * a, 1.0, every) == pytest.approx(0.5)
+    assert displacement_weight(a, -a, 1.0, every) == 0.0
+    assert displacement_weight(a, np.array([10.0, 10.0]), 0.8, every) == pytest.approx(0.4)
+    assert displacement_weight(a, np.array([10.0, 10.0]), 0.8, (True, False, False)) == pytest.approx(
+        0.5**0.5
+    )
+    assert displacement_weight(0.01 * a, -0.01 * a, 0.8, every) == pytest.approx(0.8)
+    assert relative_difference_weight(a, a, 5.0, 0.3) == 1.0
+    assert relative_difference_weight(a, -a, 5.0, 0.3) < 1e-6
+    near, far = (relative_difference_weight(a, a + 3.0, apart, 0.3) for apart in (5.0, 50.0))
+    assert near < 0.5 < far
+
+
+@pytest.mark.parametrize("colour", [False, True])
+@pytest.mark.parametrize("side", [7, 15])
+def test_products_of_corner_windows_are_normalised_cross_correlations(colour: bool, side: int) -> None:
+    """The formula of section 4.2.2, each colour by itself."""
+    rng = np.random.default_rng(2)
+    rgb = np.stack([texture(80, 90, seed) for seed in (1, 2, 3)], axis=2).astype(np.uint8)
+    image = Image("a.png", rgb, (90, 80))
+    xy = np.round(rng.uniform(20, 60, (12, 2)))
+    features = Features(xy, np.ones(12, np.float32), np.ones(12, np.float32))
+    found = prepare_view(image, features, window=side, colour=colour).patches
+    planes = list(np.moveaxis(rgb.astype(np.float64), 2, 0)) if colour else [image.gray.astype(np.float64)]
+    k = side // 2
+
+    def window(plane: F64, n: int) -> F64:
+        x, y = xy[n].astype(int)
+        return plane[y - k : y + k + 1, x - k : x + k + 1]
+
+    def correlation(a: F64, b: F64) -> float:
+        return float(np.mean((a - a.mean()) * (b - b.mean())) / (a.std() * b.std()))
+
+    for a, b in ((0, 1), (2, 2), (3, 7)):
+        twin = np.mean([correlation(window(p, a), window(p, b)) for p in planes])
+        assert found[a] @ found[b] == pytest.approx(twin, abs=1e-4)
 
 
 def test_union_never_puts_two_corners_of_a_view_together() -> None:

@@ -7,7 +7,7 @@ from tests.textures import disparity, photograph, sideways_fundamental, stereo_s
 from thesisrecon.errors import StageFailure
 from thesisrecon.features import HarrisCorners, MultiScaleCorners
 from thesisrecon.matching import PreparedView, SeedsAndGrowth, StrengthOfMatch
-from thesisrecon.matching.seeds import match_seeds, neighbour_support
+from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
 from thesisrecon.types import F64, FundamentalFit, Image, Matches
 
 Detector = HarrisCorners | MultiScaleCorners
@@ -15,6 +15,22 @@ Variant = SeedsAndGrowth | StrengthOfMatch
 VARIANTS: list[tuple[Detector, Variant]] = [
     (MultiScaleCorners(), SeedsAndGrowth()),
     (HarrisCorners(), StrengthOfMatch()),
+]
+SWITCHED: list[Variant] = [
+    SeedsAndGrowth(orientation="upright"),
+    SeedsAndGrowth(orientation="turned"),
+    SeedsAndGrowth(support="always"),
+    SeedsAndGrowth(support="never"),
+    SeedsAndGrowth(growth=False),
+    SeedsAndGrowth(coarse_first=False),
+    SeedsAndGrowth(rematch=False),
+    SeedsAndGrowth(coarse_first=False, rematch=False),
+    SeedsAndGrowth(align=False),
+    SeedsAndGrowth(growth=False, align=False),
+    StrengthOfMatch(weight="relative-difference", least_correlation=0.7, least_strength=0.15),
+    StrengthOfMatch(use_direction=False, use_distance=False),
+    StrengthOfMatch(window=11, colour=True),
+    StrengthOfMatch(align=True),
 ]
 BOTH = pytest.mark.parametrize(("detector", "variant"), VARIANTS, ids=["seeds", "strength"])
 
@@ -111,3 +127,86 @@ def test_seeds_find_a_photograph_that_was_turned(quarter_turns: int) -> None:
     assert right.sum() > 200
     assert right.mean() > 0.9
     assert support[right].mean() > 5.0 > 2.0 > support[~right].mean() if (~right).any() else True
+
+
+def errors(matches: Matches) -> F64:
+    found = matches.xy1 - matches.xy2 - np.c_[disparity(matches.xy2), 0 * matches.score]
+    return np.asarray(np.linalg.norm(found, axis=1))
+
+
+@pytest.fixture(scope="module")
+def stereo() -> tuple[PreparedView, PreparedView]:
+    one, two = views(MultiScaleCorners(), SeedsAndGrowth(), *stereo_scene())
+    return one, two
+
+
+@pytest.mark.parametrize("variant", SWITCHED, ids=repr)
+def test_every_switch_leaves_right_matches_one_to_one(
+    stereo: tuple[PreparedView, PreparedView], variant: Variant
+) -> None:
+    if isinstance(variant, StrengthOfMatch):
+        one, two = views(HarrisCorners(), variant, *stereo_scene())
+    else:
+        one, two = stereo
+    matches = run(variant, one, two)
+    assert len(matches.xy1) > 100
+    assert (errors(matches) < 1.5).mean() > 0.9
+    assert len(np.unique(matches.index1)) == len(np.unique(matches.index2)) == len(matches.index1)
+    if not variant.align:
+        assert np.array_equal(matches.xy2, two.features.xy[matches.index2])
+    else:
+        assert np.median(errors(matches)) < 0.05
+
+
+def test_growth_multiplies_the_matches_and_alignment_makes_them_finer(
+    stereo: tuple[PreparedView, PreparedView],
+) -> None:
+    whole = run(SeedsAndGrowth(), *stereo)
+    seeds, corners = run(SeedsAndGrowth(growth=False), *stereo), run(SeedsAndGrowth(align=False), *stereo)
+    assert len(whole.xy1) > 1.5 * len(seeds.xy1)
+    assert np.median(errors(corners)) > 3.0 * np.median(errors(whole))
+
+
+def test_relative_difference_and_thresholds_drop_wrong_matches() -> None:
+    """Half of the second photograph shows something else."""
+    left, right = stereo_scene()
+    rgb = right.rgb.copy()
+    rgb[150:] = photograph(texture(150, 420, 77)).rgb
+    mixed = Image("mixed.png", rgb, right.original_size)
+    wrong = []
+    for weight, least in (("product", 0.0), ("product", 0.4), ("relative-difference", 0.4)):
+        variant = StrengthOfMatch(weight=weight, least_strength=least)  # type: ignore[arg-type]
+        matches = run(variant, *views(HarrisCorners(), variant, left, mixed))
+        wrong.append(int((errors(matches) >= 1.5).sum()))
+        assert (errors(matches) < 1.5).sum() > 700
+    assert wrong[0] > 400
+    assert wrong[1] < 0.2 * wrong[0]
+    assert wrong[2] < 0.2 * wrong[1]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("window", 8), ("radius_rel", 0.0), ("candidates", 0), ("tolerance", 0.0)]
+)
+def test_a_strength_that_cannot_be_is_refused(field: str, value: float) -> None:
+    with pytest.raises(ValueError, match=field):
+        StrengthOfMatch(**{field: value})  # type: ignore[arg-type]
+
+
+def test_corners_of_seeds_are_one_to_one_and_follow_the_map() -> None:
+    rng = np.random.default_rng(3)
+    xy1 = rng.uniform(0, 400, (60, 2))
+    turn = np.array([[0.0, -1.2], [1.2, 0.0]])
+    order = rng.permutation(60)
+    xy2 = (xy1 @ turn.T)[order]
+    seeds = xy1[:30] + rng.uniform(-1, 1, (30, 2))
+    known = SeedMatches(
+        np.vstack([seeds, seeds[:5], [[-50.0, -50.0]]]),
+        np.vstack([seeds, seeds[:5], [[-50.0, -50.0]]]) @ turn.T,
+        np.tile(turn, (36, 1, 1)),
+        np.linspace(1, 0.5, 36).astype(np.float32),
+    )
+    one, two, found = corners_of_seeds(xy1, xy2, known)
+    assert set(one.tolist()) <= set(range(60))
+    assert len(one) >= 29
+    assert (order[two] == one).all()
+    assert np.array_equal(found.xy2, xy2[two])

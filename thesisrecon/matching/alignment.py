@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from scipy.spatial import cKDTree
 
 from thesisrecon.matching.kernels import align_windows
 from thesisrecon.matching.prepared import PreparedView
-from thesisrecon.types import F32, F64
+from thesisrecon.matching.records import matches_at
+from thesisrecon.types import F32, F64, I64, Matches
 
 ITERATIONS = 12
 # A window of half the width sees less: it must fit better, and not wander from what the wider one found.
@@ -63,3 +67,42 @@ def align_corners(
     fits = fine_score >= FINE_CORRELATION
     xy2[coarse[fits]] = fine_xy2[fits]
     return xy2, affine, score
+
+
+def aligned_matches(
+    view1: PreparedView,
+    view2: PreparedView,
+    matches: Matches,
+    *,
+    affine_std: float,
+    least_correlation: float,
+    largest_shift: float = 3.0,
+) -> Matches:
+    """The matches of corners with the places in image 2 moved to sub-pixel by :func:`align_corners`.
+
+    Those that do not reach ``least_correlation`` are dropped, and those that the alignment led to the place
+    of a better one.
+    """
+    xy2, affine, score = align_corners(
+        view1,
+        view2,
+        (matches.xy1, view1.features.scale[matches.index1], matches.xy2, matches.affine),
+        affine_std=affine_std,
+        largest_shift=largest_shift,
+    )
+    moved = replace(matches, xy2=xy2, affine=affine, score=score)
+    good = matches_at(moved, np.flatnonzero(score >= least_correlation))
+    return matches_at(good, strongest_distinct(good))
+
+
+def strongest_distinct(matches: Matches, *, apart_px: float = 1.0) -> I64:
+    """Rows, in order, of the matches that repeat no stronger one within ``apart_px`` in both images."""
+    rows = np.argsort(-matches.score, kind="stable")
+    keep = np.ones(len(rows), np.bool_)
+    if len(rows) >= 2:
+        places = np.hstack([matches.xy1, matches.xy2])[rows]
+        for a, b in sorted(cKDTree(places).query_pairs(apart_px)):
+            if keep[a]:
+                keep[b] = False
+    kept: I64 = np.sort(rows[keep])
+    return kept

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.geometry.raster import halve, resample
-from thesisrecon.matching.kernels import corner_patches
+from thesisrecon.matching.kernels import SIDE, corner_patches
 from thesisrecon.types import F32, F64, I64, Features, Image
 
 PYRAMID_LEVELS = 4
@@ -20,7 +20,8 @@ class PreparedView:
     ``size`` (width, height) px; ``features`` as detected. The grey pyramid is ``pixels`` (all levels one
     after the other), ``levels`` (L, 3) offset, height, width, level k spanning ``base 2^k`` px per pixel.
     ``patches`` (N, 225): the normalised 15 x 15 window of each corner at its scale (zero where it leaves the
-    image). ``cell_px, cell_shape, cell_start, cell_order``: the corners sorted into square cells.
+    image); other widths where the matcher asked for them.
+    ``cell_px, cell_shape, cell_start, cell_order``: the corners sorted into square cells.
     """
 
     size: tuple[int, int]
@@ -50,22 +51,31 @@ class PreparedView:
         return max(self.size)
 
 
-def prepare_view(image: Image, features: Features) -> PreparedView:
+def prepare_view(
+    image: Image, features: Features, *, window: int = SIDE, colour: bool = False
+) -> PreparedView:
     """Grey pyramid, corner windows and corner cells of one photograph.
 
-    The pyramid starts at twice the size where the corners were found there (scale below 1).
+    The pyramid starts at twice the size where the corners were found there (scale below 1). ``window``, odd,
+    is the side of the correlation windows; where ``colour``, they hold the three colours one after the other,
+    each normalised, so that the product of two is the mean of the colours' correlations.
     """
+    if window < 3 or window % 2 == 0:
+        raise ValueError(f"a correlation window has an odd side of at least 3; got {window}")
     doubled = len(features.scale) > 0 and float(features.scale.min()) < 0.75
     base = 0.5 if doubled else 1.0
-    pixels, levels = _pyramid(image, doubled)
-    patches = corner_patches(pixels, levels, base, features.xy, features.scale)
+    pixels, levels = _pyramid(image.gray, doubled)
+    channels = [pixels]
+    if colour:
+        channels = [_pyramid(image.rgb[:, :, c].astype(np.float32), doubled)[0] for c in range(3)]
+    parts = [corner_patches(c, levels, base, features.xy, features.scale, window) for c in channels]
+    patches = np.hstack(parts) / np.float32(np.sqrt(3.0)) if colour else parts[0]
     cell_px = max(4.0, 0.01 * max(image.size))
     shape, start, order = _cells(features.xy, image.size, cell_px)
     return PreparedView(image.size, features, pixels, levels, base, patches, cell_px, shape, start, order)
 
 
-def _pyramid(image: Image, doubled: bool) -> tuple[F32, I64]:
-    gray = image.gray
+def _pyramid(gray: F32, doubled: bool) -> tuple[F32, I64]:
     if doubled:
         gray = resample(gray, 2 * gray.shape[1], 2 * gray.shape[0])
     grays = [gray]

@@ -22,3 +22,17 @@ def one_to_one(index: I64, score: F32) -> I64:
     rows = np.flatnonzero(index >= 0)
     rows = rows[np.lexsort((rows, -score[rows]))]
     return np.sort(rows[np.unique(index[rows], return_index=True)[1]])
+
+
+def matches_at(matches: Matches, rows: I64) -> Matches:
+    """A part of the matches."""
+    return Matches(
+        matches.i,
+        matches.j,
+        matches.index1[rows],
+        matches.index2[rows],
+        matches.xy1[rows],
+        matches.xy2[rows],
+        matches.score[rows],
+        matches.affine[rows],
+    )

@@ -109,3 +109,23 @@ def neighbour_support(matches: SeedMatches, *, neighbours: int = 10, tolerance: 
         strain = np.linalg.norm((there[near] - there[:, None]) - (here[near] - here[:, None]), axis=2)
         support += np.exp(-0.5 * (strain / (tolerance * apart + 1.0)) ** 2).sum(axis=1)
     return 0.5 * support
+
+
+def corners_of_seeds(
+    xy1: F64, xy2: F64, known: SeedMatches, *, reach_px: float = 4.0
+) -> tuple[I64, I64, SeedMatches]:
+    """Pairs of corners that the seeds stand on: the nearest to each seed in image 1 and the nearest in image
+    2 to where the seed's map takes it, both within ``reach_px``; one-to-one, the best correlations first.
+
+    ``xy1`` (N, 2), ``xy2`` (K, 2) the corners px. Returns their numbers (M,), (M,) and the matches.
+    """
+    apart1, one = cKDTree(xy1).query(known.xy1)
+    led = known.xy2 + np.einsum("mij,mj->mi", known.affine, xy1[one] - known.xy1)
+    apart2, two = cKDTree(xy2).query(led)
+    order = np.argsort(-known.score, kind="stable")
+    order = order[(apart1[order] <= reach_px) & (apart2[order] <= reach_px)]
+    for corner in (one, two):
+        order = order[np.sort(np.unique(corner[order], return_index=True)[1])]
+    order = order[np.argsort(one[order], kind="stable")]
+    one, two = one[order].astype(np.int64), two[order].astype(np.int64)
+    return one, two, SeedMatches(xy1[one], xy2[two], known.affine[order], known.score[order])

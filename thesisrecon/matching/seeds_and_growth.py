@@ -4,17 +4,21 @@ alignment."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.matching.alignment import align_corners
+from thesisrecon.matching.alignment import aligned_matches, strongest_distinct
 from thesisrecon.matching.kernels import fit_local_affines, grow_corners
 from thesisrecon.matching.prepared import PreparedView, prepare_view
-from thesisrecon.matching.records import FundamentalEstimator, empty_matches, one_to_one
-from thesisrecon.matching.seeds import SeedMatches, match_seeds, neighbour_support
-from thesisrecon.types import B8, F64, I64, Features, Image, Matches
+from thesisrecon.matching.records import FundamentalEstimator, empty_matches, matches_at, one_to_one
+from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
+from thesisrecon.types import F64, I64, Features, Image, Matches
+
+Found = tuple[I64, I64, SeedMatches]
+"""Corners of image 1, corners of image 2, and the matches with their places, maps and correlations."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,15 @@ class SeedsAndGrowth:
     grown_ratio : as ``ratio``, for a grown match and the rivals in its part of the epipolar band.
     neighbours : matches that define a local affine map.
     affine_std : prior standard deviation of an affine coefficient in the alignment.
+    orientation : seeds by their upright patches, by those turned to their gradient, or "auto": the turned
+        ones too where the upright ones do not relate the pair well.
+    support : whether F is sought among the seeds whose neighbours move as they do ("always"), among all
+        ("never"), or in both ways and the better kept ("auto").
+    growth : corners are sought where the seeds tell, else only those that a seed stands on are matched.
+    coarse_first : the corners of the coarser size grow before all of them, and give a better F to these.
+    rematch : guided rematching: all corners are sought once more with the F and the maps of the matches that
+        grew.
+    align : places in image 2 are moved to sub-pixel by least-squares matching, else stay at the corners.
     """
 
     ratio: float = 0.8
@@ -45,6 +58,12 @@ class SeedsAndGrowth:
     grown_ratio: float = 0.8
     neighbours: int = 10
     affine_std: float = 0.02
+    orientation: Literal["auto", "upright", "turned"] = "auto"
+    support: Literal["auto", "always", "never"] = "auto"
+    growth: bool = True
+    coarse_first: bool = True
+    rematch: bool = True
+    align: bool = True
 
     def prepare(self, image: Image, features: Features) -> PreparedView:
         """What is computed once for a photograph."""
@@ -65,20 +84,20 @@ class SeedsAndGrowth:
         start = self._verified_seeds(view1, view2, estimate_fundamental, rng)
         if start is None:
             return empty_matches(pair)
-        known, F = start
-        one = two = np.empty(0, np.int64)
-        for scales in (np.greater, np.greater_equal):
-            chosen = np.flatnonzero(scales(view1.features.scale, view1.features.scale.min()))
-            one, two, grown = self._grow(view1, view2, chosen, known, F)
-            if len(one) < 8:
-                continue
-            try:
-                fit = estimate_fundamental(grown.xy1, grown.xy2, rng)
-            except StageFailure:
-                continue
-            F, known = fit.F, grown.at(fit.inliers)
-        one, two, grown = self._grow(view1, view2, np.arange(len(view1.features.xy)), known, F)
-        return self._align(view1, view2, pair, (one, two, grown))
+        if self.growth:
+            one, two, found = self._grow_in_rounds(view1, view2, start, estimate_fundamental, rng)
+        else:
+            one, two, found = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
+        matches = Matches(*pair, one, two, found.xy1, found.xy2, found.score, found.affine)
+        if not self.align:
+            return matches_at(matches, strongest_distinct(matches))
+        return aligned_matches(
+            view1,
+            view2,
+            matches,
+            affine_std=self.affine_std,
+            least_correlation=self.aligned_correlation,
+        )
 
     def _verified_seeds(
         self,
@@ -91,12 +110,9 @@ class SeedsAndGrowth:
         assert seeds1 is not None
         assert seeds2 is not None
         best: tuple[SeedMatches, F64] | None = None
-        for turned in (False, True):
+        for turned in {"auto": (False, True), "upright": (False,), "turned": (True,)}[self.orientation]:
             seeds = match_seeds(seeds1, seeds2, turned=turned, ratio=self.ratio)
-            supported = neighbour_support(seeds) >= self.least_support
-            if supported.sum() < self.least_seeds:
-                continue
-            for trial in (seeds.at(supported), seeds):
+            for trial in self._trials(seeds):
                 try:
                     fit = estimate(trial.xy1, trial.xy2, rng)
                 except StageFailure:
@@ -109,9 +125,43 @@ class SeedsAndGrowth:
                 break
         return best
 
+    def _trials(self, seeds: SeedMatches) -> tuple[SeedMatches, ...]:
+        """The sets of seeds among which F is sought; none where there are too few."""
+        if self.support == "never":
+            return (seeds,) if len(seeds) >= self.least_seeds else ()
+        supported = neighbour_support(seeds) >= self.least_support
+        if supported.sum() < self.least_seeds:
+            return ()
+        return (seeds.at(supported), seeds) if self.support == "auto" else (seeds.at(supported),)
+
+    def _grow_in_rounds(
+        self,
+        view1: PreparedView,
+        view2: PreparedView,
+        start: tuple[SeedMatches, F64],
+        estimate: FundamentalEstimator,
+        rng: np.random.Generator,
+    ) -> Found:
+        """The corners of the coarser size, then all, then all once more, each led by those before it."""
+        known, F = start
+        scale = view1.features.scale
+        everything = np.arange(len(scale))
+        rounds = [np.flatnonzero(scale > scale.min())] if self.coarse_first else []
+        rounds += [everything] * (1 + self.rematch)
+        for chosen in rounds[:-1]:
+            one, _, grown = self._grow(view1, view2, chosen, known, F)
+            if len(one) < 8:
+                continue
+            try:
+                fit = estimate(grown.xy1, grown.xy2, rng)
+            except StageFailure:
+                continue
+            F, known = fit.F, grown.at(fit.inliers)
+        return self._grow(view1, view2, everything, known, F)
+
     def _grow(
         self, view1: PreparedView, view2: PreparedView, chosen: I64, known: SeedMatches, F: F64
-    ) -> tuple[I64, I64, SeedMatches]:
+    ) -> Found:
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
         near = cKDTree(known.xy1).query(xy1, min(self.neighbours, len(known)))[1]
         affine, place, spread = fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
@@ -130,35 +180,3 @@ class SeedsAndGrowth:
         rows = one_to_one(index, score)
         one, two = chosen[rows], index[rows]
         return one, two, SeedMatches(xy1[rows], view2.features.xy[two], affine[rows], score[rows])
-
-    def _align(
-        self,
-        view1: PreparedView,
-        view2: PreparedView,
-        pair: tuple[int, int],
-        grown: tuple[I64, I64, SeedMatches],
-    ) -> Matches:
-        one, two, known = grown
-        xy2, affine, score = align_corners(
-            view1,
-            view2,
-            (known.xy1, view1.features.scale[one], known.xy2, known.affine),
-            affine_std=self.affine_std,
-            largest_shift=3.0,
-        )
-        good = np.flatnonzero(score >= self.aligned_correlation)
-        good = good[np.argsort(-score[good], kind="stable")]
-        good = good[_distinct(known.xy1[good], xy2[good])]
-        good = good[np.argsort(one[good], kind="stable")]
-        return Matches(*pair, one[good], two[good], known.xy1[good], xy2[good], score[good], affine[good])
-
-
-def _distinct(xy1: F64, xy2: F64, apart_px: float = 1.0) -> B8:
-    """Matches (strongest first) that do not repeat a stronger one within ``apart_px`` in both images."""
-    keep = np.ones(len(xy1), np.bool_)
-    if len(xy1) < 2:
-        return keep
-    for a, b in sorted(cKDTree(np.hstack([xy1, xy2])).query_pairs(apart_px)):
-        if keep[a]:
-            keep[b] = False
-    return keep

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from thesisrecon.matching.kernels import strength_of_match
+from thesisrecon.matching.alignment import aligned_matches
+from thesisrecon.matching.kernels import SIDE, strength_of_match
 from thesisrecon.matching.prepared import PreparedView, prepare_view
 from thesisrecon.matching.records import FundamentalEstimator, empty_matches, one_to_one
 from thesisrecon.types import F64, I64, Features, Image, Matches
@@ -20,24 +22,55 @@ class StrengthOfMatch:
     Every corner is compared with those within a radius; for its best candidates the strength SM_k = c_k sum_m
     max_n (c_mn lambda_n) (4.1) is computed over its neighbours, and of matches that share a corner the
     strongest stays. Figure 4.4 with the weight functions is lost; lambda is taken as the product of direction
-    max(0, cos), length min / max and distance 1 - d / radius.
+    max(0, cos), length min / max and distance 1 - d / radius, as the text tells it. The fields after
+    ``neighbours`` and ``weight`` = "relative-difference" go beyond the thesis, and are off.
 
     Parameters
     ----------
     radius_rel : search radius as a share of the long side of the photographs.
     candidates : K, the corners of highest correlation whose strength is computed.
     neighbours : M, the nearest corners around a corner that lend it strength, and half as many again on the
-        other
-        side, because some of them have no partner.
+        other side, because some of them have no partner.
+    window : K = L, side of the correlation window in pixels, odd.
+    colour : the correlation is the mean of those of red, green and blue, else that of the grey values.
+    weight : "product" is figure 4.4; "relative-difference" is exp(-1/2 (|d_m - d| / (tolerance |u_m - u| +
+        1 px))^2), d the displacements: right also where displacements are short or the scene is deep.
+    use_direction, use_length, use_distance : the factors of the product that take part.
+    tolerance : of the relative difference.
+    least_correlation : a candidate must correlate by more.
+    least_strength : of a match, as a share of what M neighbours that agree perfectly would lend; in [0, 1).
+    align : places in image 2 are moved to sub-pixel by least-squares matching.
     """
 
     radius_rel: float = 0.16
     candidates: int = 10
     neighbours: int = 10
+    window: int = SIDE
+    colour: bool = False
+    weight: Literal["product", "relative-difference"] = "product"
+    use_direction: bool = True
+    use_length: bool = True
+    use_distance: bool = True
+    tolerance: float = 0.3
+    least_correlation: float = 0.0
+    least_strength: float = 0.0
+    align: bool = False
+
+    def __post_init__(self) -> None:
+        if self.candidates < 1 or self.neighbours < 1:
+            raise ValueError(
+                f"candidates and neighbours must be at least 1; got {self.candidates} and {self.neighbours}"
+            )
+        if self.window < 3 or self.window % 2 == 0:
+            raise ValueError(f"window must be odd and at least 3; got {self.window}")
+        if not (self.radius_rel > 0.0 and self.tolerance > 0.0):
+            raise ValueError(
+                f"radius_rel and tolerance must be above 0; got {self.radius_rel} and {self.tolerance}"
+            )
 
     def prepare(self, image: Image, features: Features) -> PreparedView:
         """What is computed once for a photograph."""
-        return prepare_view(image, features)
+        return prepare_view(image, features, window=self.window, colour=self.colour)
 
     def match(
         self,
@@ -54,14 +87,28 @@ class StrengthOfMatch:
         ``estimate_fundamental`` and ``rng`` belong to the stage's protocol; this variant uses neither.
         """
         del estimate_fundamental, rng
-        xy1, xy2 = view1.features.xy, view2.features.xy
-        if min(len(xy1), len(xy2)) < 2:
+        if min(len(view1.features.xy), len(view2.features.xy)) < 2:
             return empty_matches(pair)
+        matches = self._strongest(view1, view2, pair)
+        if not self.align:
+            return matches
+        return aligned_matches(view1, view2, matches, affine_std=0.02, least_correlation=0.8)
+
+    def _strongest(self, view1: PreparedView, view2: PreparedView, pair: tuple[int, int]) -> Matches:
+        xy1, xy2 = view1.features.xy, view2.features.xy
         correlation = view1.patches @ view2.patches.T
         radius = self.radius_rel * max(view1.long_side, view2.long_side)
         near1 = _nearest(xy1, self.neighbours, radius)
         near2 = _nearest(xy2, self.neighbours + self.neighbours // 2, radius)
-        index, strength = strength_of_match(correlation, (xy1, xy2), (near1, near2), radius, self.candidates)
+        terms = (self.use_direction, self.use_length, self.use_distance)
+        index, strength = strength_of_match(
+            correlation,
+            (xy1, xy2),
+            (near1, near2),
+            (radius, self.candidates, self.least_correlation),
+            (self.tolerance if self.weight == "relative-difference" else 0.0, terms),
+        )
+        index[strength < self.least_strength * self.neighbours] = -1
         rows = one_to_one(index, strength)
         two = index[rows]
         maps = np.tile(np.eye(2), (len(rows), 1, 1))

@@ -10,7 +10,11 @@ from thesisrecon.matching.kernels.alignment import align_windows
 from thesisrecon.matching.kernels.chains import chain_maps, unite
 from thesisrecon.matching.kernels.correlation import scan_correlations, update_column_best
 from thesisrecon.matching.kernels.growth import fit_local_affines, grow_corners
-from thesisrecon.matching.kernels.strength import displacement_weight, strength_of_match
+from thesisrecon.matching.kernels.strength import (
+    displacement_weight,
+    relative_difference_weight,
+    strength_of_match,
+)
 from thesisrecon.matching.kernels.windows import SAMPLES, SIDE, corner_patches
 
 __all__ = [
@@ -22,6 +26,7 @@ __all__ = [
     "displacement_weight",
     "fit_local_affines",
     "grow_corners",
+    "relative_difference_weight",
     "scan_correlations",
     "strength_of_match",
     "unite",

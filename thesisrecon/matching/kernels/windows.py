@@ -91,14 +91,15 @@ def dot(a: F32, b: F32) -> float:
 
 
 @njit(cache=True, nogil=True)
-def corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32) -> F32:
-    """(N, 225) normalised upright 15 x 15 windows of the corners at their scale; zero where they leave."""
-    out = np.zeros((len(xy), SAMPLES), np.float32)
+def corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, side: int = SIDE) -> F32:
+    """(N, side^2) normalised upright windows of the corners at their scale; zero where they leave the
+    image."""
+    out = np.zeros((len(xy), side * side), np.float32)
     step = np.zeros((2, 2))
     for n in range(len(xy)):
         k = level_of(scale[n], base, len(levels))
         step[0, 0] = step[1, 1] = scale[n]
-        if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy[n], step, SIDE, out[n]):
+        if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy[n], step, side, out[n]):
             normalize_window(out[n])
         else:
             out[n] = np.float32(0.0)
