@@ -47,7 +47,8 @@ LINE_INSIDE = 3.2
 OFF_PLANE, PLANE_ROUNDS, PLANE_WIDTH = 4, 6, 6.0
 HUBER = 3.0
 """Widths of the noise from which a residual counts less in the refinement."""
-NEEDED = 9
+NEEDED, SMALLEST_PX = 9, 1e-50
+"""Tracks, and their spread, below which powers of it underflow."""
 WEAK = 0.2
 """As in :func:`estimate_trifocal`, but less: of a plane and a wrong track or two that happen to fit it is
 0.25 to 0.4."""
@@ -254,7 +255,7 @@ class _Frame:
         centre = np.median(points, axis=1)
         offsets = points - points.mean(axis=1, keepdims=True)
         spread = np.linalg.svd(offsets, compute_uv=False) / np.sqrt(points.shape[1])
-        if not (spread[:, 1] > 1e-9 * np.maximum(spread[:, 0], 1e-300)).all():
+        if not (spread[:, 1] > np.maximum(1e-9 * spread[:, 0], SMALLEST_PX)).all():
             raise StageFailure(
                 "the tracked points of a photograph lie on one line",
                 f"spread along and across {spread[:, 0].min():.3g} and {spread[:, 1].min():.3g} px",

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.geometry.conics import form
+from thesisrecon.geometry.homogeneous import inverse_of, require_finite
 
 F64 = NDArray[np.float64]
 
@@ -22,8 +23,8 @@ ABSOLUTE_DUAL_QUADRIC = np.diag([1.0, 1.0, 1.0, 0.0])
 
 
 def image_of_absolute_conic(K: F64) -> F64:
-    """omega = K^-T K^-1 (3.13) of calibration matrices (..., 3, 3)."""
-    inverse = np.linalg.inv(K)
+    """omega = K^-T K^-1 (3.13) of calibration matrices (..., 3, 3); ``ValueError`` for singular ones."""
+    inverse = inverse_of(K, "image_of_absolute_conic")
     return np.asarray(np.swapaxes(inverse, -1, -2) @ inverse)
 
 
@@ -75,7 +76,11 @@ def dual_quadric_of_plane(K: F64, plane: F64) -> F64:
 
 
 def plane_at_infinity(dual_quadric: F64) -> F64:
-    """Unit null vector (4,) of the absolute dual quadric (4, 4): the plane at infinity of its frame."""
+    """Unit null vector (4,) of the absolute dual quadric (4, 4): the plane at infinity of its frame.
+
+    Raises ``ValueError`` for entries that are not finite.
+    """
+    require_finite("plane_at_infinity", dual_quadric)
     s, V = np.linalg.eigh((dual_quadric + dual_quadric.T) / 2.0)
     return np.asarray(V[:, np.abs(s).argmin()])
 

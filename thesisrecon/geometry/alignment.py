@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.geometry.homogeneous import require_finite
+
 F64 = NDArray[np.float64]
 
 
@@ -34,12 +36,14 @@ class Similarity:
 def estimate_similarity(source: F64, target: F64) -> Similarity:
     """Least-squares similarity that takes ``source`` (N, 3) to ``target`` (N, 3).
 
-    Raises ``ValueError`` for fewer than 3 points or points on a line (the rotation about it is free).
+    Raises ``ValueError`` for fewer than 3 points, points on a line (the rotation about it is free) and
+    coordinates that are not finite.
     """
     if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) < 3:
         raise ValueError(
             f"estimate_similarity needs two (N >= 3, 3) arrays; got {source.shape} and {target.shape}"
         )
+    require_finite("estimate_similarity", source, target)
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - mean_s, target - mean_t
     U, D, Vt = np.linalg.svd(t.T @ s / len(s))

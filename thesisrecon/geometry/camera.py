@@ -63,7 +63,7 @@ def _left_determinant(P: F64, caller: str) -> F64:
     if not np.isfinite(P).all():
         raise ValueError(f"{caller} needs finite cameras; some entries are NaN or infinite")
     det = np.linalg.det(P[..., :3])
-    if (np.abs(det) < 1e-14 * np.linalg.norm(P[..., :3], axis=(-2, -1)) ** 3).any():
+    if not (np.abs(det) > 1e-14 * np.linalg.norm(P[..., :3], axis=(-2, -1)) ** 3).all():
         raise ValueError(f"{caller} needs a finite camera; the left 3x3 part of P is singular")
     return np.asarray(det)
 
@@ -93,9 +93,10 @@ def principal_point(P: F64) -> F64:
 def back_project(P: F64, xy: F64) -> F64:
     """Points at infinity (..., 4) on the rays of pixels (..., 2): (M^-1 (u, v, 1), 0), the ray's direction.
 
-    With the centre they span the ray. P (3, 4) finite. In a projective frame they are points of the plane
-    W = 0, which is no special one.
+    With the centre they span the ray. In a projective frame they are points of the plane W = 0, which is no
+    special one. Raises ``ValueError`` for a camera P (3, 4) at infinity.
     """
+    _left_determinant(P, "back_project")
     direction = np.linalg.solve(P[:, :3], homogenize(xy)[..., None])[..., 0]
     return np.concatenate([direction, np.zeros((*direction.shape[:-1], 1))], axis=-1)
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.geometry.homogeneous import require_finite, unit_of
+
 F64 = NDArray[np.float64]
 
 
@@ -29,7 +31,9 @@ def dual(C: F64) -> F64:
 
     The adjugate, from the singular values, so that a conic of rank 2 (two lines) has a dual as well: the
     point they share, twice. Zero for lower rank. The dual of the dual is the conic where that has full rank.
+    Raises ``ValueError`` for entries that are not finite.
     """
+    require_finite("dual", C)
     U, s, Vt = np.linalg.svd(C)
     others = np.array([np.prod(np.delete(s, k)) for k in range(len(s))])
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
@@ -57,9 +61,10 @@ def meet_line(C: F64, x: F64, y: F64) -> F64:
 
     Roots (a, b) of a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y: in homogeneous form, so
     that x and y themselves are found. A discriminant of 0 to rounding is one point. Empty as well where the
-    line lies on the quadric altogether.
+    line lies on the quadric altogether. Raises ``ValueError`` for a point or conic that is zero or not
+    finite.
     """
-    x, y, C = x / np.linalg.norm(x), y / np.linalg.norm(y), C / np.linalg.norm(C)
+    x, y, C = (unit_of(array, "meet_line") for array in (x, y, C))
     sxx, sxy, syy = float(form(C, x, x)), float(form(C, x, y)), float(form(C, y, y))
     size = max(abs(sxx), abs(sxy), abs(syy))
     # Each of the three forms is known to some 1e-15, being of unit vectors.
@@ -77,8 +82,10 @@ def meet_line(C: F64, x: F64, y: F64) -> F64:
 def tangents_from(C: F64, x: F64) -> F64:
     """The real tangent lines (0, 1 or 2; 3) of a conic (3, 3) of full rank through an image point (3,).
 
-    They touch where the polar of x meets the conic; a point of the conic has one tangent.
+    They touch where the polar of x meets the conic; a point of the conic has one tangent. Raises as
+    :func:`meet_line`.
     """
+    require_finite("tangents_from", C, x)
     basis = np.linalg.svd(tangent(C, x)[None])[2][1:]
     return tangent(C, meet_line(C, basis[0], basis[1]))
 
@@ -110,7 +117,7 @@ def curvature_sign(Q: F64) -> int:
     cylinders and planes. K = -det Q / |grad|^4 up to a positive factor, and det(G^-T Q G^-1)
     has the sign of det Q.
     """
-    scaled = Q / np.linalg.norm(Q)
+    scaled = unit_of(Q, "curvature_sign")
     det = float(np.linalg.det(scaled))
     return 0 if abs(det) < 1e-14 else -int(np.sign(det))
 

@@ -8,6 +8,30 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 
+def require_finite(caller: str, *arrays: F64) -> None:
+    """``ValueError`` that names ``caller`` where an entry is NaN or infinite: decompositions fail there."""
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ValueError(f"{caller} needs finite numbers; some are NaN or infinite")
+
+
+def inverse_of(G: F64, caller: str) -> F64:
+    """G^-1 (..., d, d); ``ValueError`` that names ``caller`` where G is singular or not finite."""
+    require_finite(caller, G)
+    try:
+        return np.asarray(np.linalg.inv(G), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(f"{caller} needs an invertible matrix; got a singular one of {G.shape}") from error
+
+
+def unit_of(array: F64, caller: str) -> F64:
+    """An array of any shape with Frobenius norm 1; ``ValueError`` where it is zero or not finite."""
+    require_finite(caller, array)
+    norm = float(np.linalg.norm(array))
+    if not norm > 0.0:
+        raise ValueError(f"{caller} needs numbers that are not all zero")
+    return array / norm
+
+
 def homogenize(x: F64) -> F64:
     """Append a 1 to each row: (..., d) -> (..., d + 1)."""
     return np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
@@ -29,8 +53,9 @@ def cross_matrix(a: F64) -> F64:
 def normalizing_transform(xy: F64) -> F64:
     """Hartley's conditioning: centroid to 0, mean distance to sqrt(2); (N, 2) -> (3, 3).
 
-    Raises ``ValueError`` where all points are equal (no scale exists).
+    Raises ``ValueError`` where all points are equal (no scale exists) and where one is not finite.
     """
+    require_finite("normalizing_transform", xy)
     centroid = xy.mean(axis=0)
     distance = float(np.linalg.norm(xy - centroid, axis=1).mean())
     if not distance > 1e-12 * max(1.0, float(np.abs(centroid).max())):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.geometry.camera import camera_centre
-from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, unit_of
 from thesisrecon.geometry.multiview import epipoles, unit_norm
 
 F64 = NDArray[np.float64]
@@ -29,11 +29,11 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
 
     H = P2 ((Pi'C) I - C Pi') P1^+ with the centre C of P1: the ray of a pixel meets the plane, and the point
     is seen again. It equals H_Pi2 H_Pi1^-1 (3.30), without its exception of planes through the origin.
-    Singular where the plane holds the second centre; raises ``ValueError`` where it holds the first one.
+    Singular where the plane holds the second centre; raises ``ValueError`` where it holds the first one, and
+    for cameras and planes that are zero or not finite.
     """
-    P1, P2 = P1 / np.linalg.norm(P1), P2 / np.linalg.norm(P2)
-    centre = camera_centre(P1)
-    centre, plane = centre / np.linalg.norm(centre), plane / np.linalg.norm(plane)
+    P1, P2, plane = (unit_of(array, "plane_homography") for array in (P1, P2, plane))
+    centre = unit_of(camera_centre(P1), "plane_homography, for the centre of its first camera,")
     if not abs(plane @ centre) > 1e-14:
         raise ValueError("plane_homography needs a plane that does not hold the first camera's centre")
     meet = (plane @ centre) * np.eye(4) - np.outer(centre, plane)
@@ -45,8 +45,9 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
 
     K2 R2 R1' K1^-1 in a metric frame (3.28, where the thesis' R are transposed), whatever the centres are;
     in an affine one it still is the homography of the plane at infinity, in a projective one that of a plane
-    like others. Raises ``ValueError`` for a first camera at infinity.
+    like others. Raises ``ValueError`` for a first camera at infinity and for entries that are not finite.
     """
+    require_finite("infinite_homography", P1, P2)
     if not np.linalg.cond(P1[:, :3]) < 1e14:
         raise ValueError("infinite_homography needs a finite first camera")
     H = np.linalg.solve(P1[:, :3].T, P2[:, :3].T).T

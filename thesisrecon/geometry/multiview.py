@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.geometry.camera import camera_centre
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, normalizing_transform
+from thesisrecon.geometry.homogeneous import (
+    cross_matrix,
+    dehomogenize,
+    homogenize,
+    normalizing_transform,
+    require_finite,
+    unit_of,
+)
 
 F64 = NDArray[np.float64]
 
@@ -20,8 +27,15 @@ def unit_norm(F: F64) -> F64:
     return F / np.where(norm > 0.0, norm, 1.0)
 
 
+def _check(F: F64, caller: str) -> None:
+    if F.shape != (3, 3):
+        raise ValueError(f"{caller} needs a fundamental matrix (3, 3); got {F.shape}")
+    require_finite(caller, F)
+
+
 def enforce_rank_two(F: F64) -> F64:
-    """The nearest matrix of rank 2 (Frobenius norm), scaled to unit norm; (3, 3)."""
+    """The nearest matrix of rank 2 (Frobenius norm), scaled to unit norm; (3, 3), else ``ValueError``."""
+    _check(F, "enforce_rank_two")
     U, s, Vt = np.linalg.svd(F)
     return unit_norm((U[:, :2] * s[:2]) @ Vt[:2])
 
@@ -31,11 +45,11 @@ def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
 
     The line of x joins e2 and the image of P1^+ x, another point of its ray; F has rank 2 (3.35).
 
-    Raises ``ValueError`` where the centres coincide: the views are then related by a homography, not by an F.
+    Raises ``ValueError`` where the centres coincide: the views are then related by a homography, not by an F;
+    and for cameras that are zero, not finite or of a rank below 3, which have no centre.
     """
-    P1, P2 = P1 / np.linalg.norm(P1), P2 / np.linalg.norm(P2)
-    centre = camera_centre(P1)
-    e2 = P2 @ (centre / np.linalg.norm(centre))
+    P1, P2 = unit_of(P1, "fundamental_from_cameras"), unit_of(P2, "fundamental_from_cameras")
+    e2 = P2 @ unit_of(camera_centre(P1), "fundamental_from_cameras, for the centre of its first camera,")
     if not np.linalg.norm(e2) > 1e-12:
         raise ValueError("fundamental_from_cameras needs cameras with different centres")
     return unit_norm(cross_matrix(e2) @ P2 @ np.linalg.pinv(P1))
@@ -44,8 +58,10 @@ def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
 def epipoles(F: F64) -> tuple[F64, F64]:
     """Unit vectors e1, e2 (3,) with F e1 = 0 and F' e2 = 0, of the nearest matrix of rank 2 (3.34, 3.35).
 
-    e2 is the thesis' e_ij, the image of the first centre, e1 its e_ji (section 5.3 exchanges the two).
+    e2 is the thesis' e_ij, the image of the first centre, e1 its e_ji (section 5.3 exchanges the two). Raises
+    ``ValueError`` for another shape and entries that are not finite.
     """
+    _check(F, "epipoles")
     U, _, Vt = np.linalg.svd(F)
     return Vt[2], U[:, 2]
 

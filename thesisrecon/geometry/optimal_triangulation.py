@@ -10,15 +10,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.geometry.homogeneous import require_finite, unit_of
+
 F64 = NDArray[np.float64]
 
 
 def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
-    """Nearest pairs with x2' F x1 = 0 to measured pairs (N, 2), (N, 2); minimises the sum of squared
-    distances.
+    """Nearest pairs with x2' F x1 = 0 to measured pairs (N, 2), (N, 2): least sum of squared distances.
 
-    F (3, 3) of rank 2. Every stationary point is tried, infinity included, so the minimum is global.
+    F (3, 3) of rank 2. Every stationary point is tried, infinity included, so the minimum is global. Raises
+    ``ValueError`` for a zero F and numbers that are not finite.
     """
+    require_finite("correct_matches", xy1, xy2)
+    F = unit_of(F, "correct_matches")
     E1, e1 = _to_origin_and_axis(xy1, np.linalg.svd(F)[2][2])
     E2, e2 = _to_origin_and_axis(xy2, np.linalg.svd(F)[0][:, 2])
     G = np.linalg.inv(E2).swapaxes(1, 2) @ F @ np.linalg.inv(E1)
@@ -70,9 +74,10 @@ def _product(p: F64, q: F64) -> F64:
 
 
 def _roots(c: F64) -> F64:
-    """Real parts of all roots of polynomials c (N, 7), highest power first; a vanishing leading coefficient
-    sends
-    roots to infinity, which the reversed polynomial shows as zeros."""
+    """Real parts of all roots of polynomials c (N, 7), highest power first.
+
+    A vanishing leading coefficient sends roots to infinity, which the reversed polynomial shows as zeros.
+    """
     n = c.shape[1] - 1
     reverse = np.abs(c[:, 0]) < np.abs(c[:, -1])
     ordered = np.where(reverse[:, None], c[:, ::-1], c)

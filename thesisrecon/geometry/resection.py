@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.geometry.homogeneous import normalizing_transform
+from thesisrecon.geometry.homogeneous import normalizing_transform, require_finite
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -31,6 +31,7 @@ def resect_linear(X: F64, xy: F64) -> F64:
     """
     if X.shape[-2] < 6:
         raise ValueError(f"resect_linear needs at least 6 points; got {X.shape[-2]}")
+    require_finite("resect_linear", X, xy)
     flat = xy.reshape(-1, 2)
     T = normalizing_transform(flat)
     conditioned = xy * T[0, 0] + T[:2, 2]

@@ -1,6 +1,7 @@
 """Sections 3.3 and 3.4: how each entity is transformed, and the four strata with their groups of transforms.
 
-A transform G (4, 4) acts on points as X -> G X. The matrices of 3.4.2 to 3.4.5 in the thesis' text have
+A transform G (4, 4) acts on points as X -> G X; a singular one is none and a ``ValueError`` where its inverse
+is needed. The matrices of 3.4.2 to 3.4.5 in the thesis' text have
 their zeros in the fourth column: they act on rows, X' -> X' G, and are the transposes of the ones here, which
 follow its table in 3.3.
 """
@@ -12,6 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+from thesisrecon.geometry.homogeneous import inverse_of, require_finite
 
 F64 = NDArray[np.float64]
 Group = Literal["projective", "affine", "metric", "euclidean"]
@@ -30,17 +33,17 @@ def transform_points(G: F64, X: F64) -> F64:
 
 def transform_cameras(G: F64, P: F64) -> F64:
     """P -> P G^-1; (4, 4), (..., 3, 4). The images P X stay what they are."""
-    return np.asarray(P @ np.linalg.inv(G))
+    return np.asarray(P @ inverse_of(G, "transform_cameras"))
 
 
 def transform_planes(G: F64, plane: F64) -> F64:
     """Pi' -> Pi' G^-1; (4, 4), (..., 4), and image lines (..., 3) under a homography (3, 3)."""
-    return np.asarray(plane @ np.linalg.inv(G))
+    return np.asarray(plane @ inverse_of(G, "transform_planes"))
 
 
 def transform_conics(G: F64, C: F64) -> F64:
     """C -> G^-T C G^-1 and Q -> G^-T Q G^-1: conics (3, 3), (..., 3, 3) and quadrics (4, 4), (..., 4, 4)."""
-    inverse = np.linalg.inv(G)
+    inverse = inverse_of(G, "transform_conics")
     return np.asarray(inverse.T @ C @ inverse)
 
 
@@ -57,6 +60,7 @@ def affine_transform(A: F64, t: F64) -> F64:
 
     With A = s R it is metric (7), with A = R Euclidean (6). Raises ``ValueError`` for a singular A.
     """
+    require_finite("affine_transform", A, t)
     if not np.linalg.cond(A) < 1e14:
         raise ValueError("affine_transform needs an invertible matrix")
     G = np.eye(4)

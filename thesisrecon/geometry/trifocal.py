@@ -11,7 +11,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import (
+    cross_matrix,
+    dehomogenize,
+    homogenize,
+    inverse_of,
+    require_finite,
+    unit_of,
+)
 from thesisrecon.geometry.multiview import unit_norm
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 
@@ -28,9 +35,9 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
     """T_i^jk = (-1)^i det [P1 without row i; row j of P2; row k of P3], unit norm (HZ 17.12), i from 0.
 
     For P1 = [I 0], P2 = [A a], P3 = [B b] it is A_ji b_k - a_j B_ki. Cameras (3, 4) of any frame and scales.
-    Zero where all three centres coincide.
+    Zero where all three centres coincide. Raises ``ValueError`` for cameras that are zero or not finite.
     """
-    P1, P2, P3 = (P / np.linalg.norm(P) for P in (P1, P2, P3))
+    P1, P2, P3 = (unit_of(P, "tensor_from_cameras") for P in (P1, P2, P3))
     T = np.empty((3, 3, 3))
     for i in range(3):
         rows = np.empty((3, 3, 4, 4))
@@ -69,8 +76,9 @@ def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
 
     The planes of both lines meet in the line that view 3 sees: l3 is the null vector of [l1]x (l2_j T_i^jk),
     for which l1 and the line transferred back are parallel vectors. Not determined where both lines belong to
-    one epipolar plane of views 1 and 2.
+    one epipolar plane of views 1 and 2. Raises ``ValueError`` for entries that are not finite.
     """
+    require_finite("transfer_lines", T, l1, l2)
     M = np.einsum("...j,ijk->...ik", l2, T)
     scaled = l1 / np.maximum(np.linalg.norm(l1, axis=-1, keepdims=True), 1e-300)
     return np.asarray(np.linalg.svd(cross_matrix(scaled) @ M)[2][..., 2, :])
@@ -110,8 +118,9 @@ def tensor_epipoles(T: F64) -> tuple[F64, F64]:
     """Unit epipoles e2, e3 (3,) of the first camera in views 2 and 3 (HZ algorithm 15.1).
 
     e2 is orthogonal to the three left null vectors u_i of the T_i (u_i'T_i = 0), e3 to the right ones.
-    Least squares where T has noise.
+    Least squares where T has noise. Raises ``ValueError`` for entries that are not finite.
     """
+    require_finite("tensor_epipoles", T)
     U, _, Vt = np.linalg.svd(T)
     return np.linalg.svd(U[:, :, 2])[2][2], np.linalg.svd(Vt[:, 2])[2][2]
 
@@ -142,9 +151,9 @@ def cameras_from_tensor(T: F64) -> tuple[F64, F64, F64]:
 def transform_tensor(T: F64, H1: F64, H2: F64, H3: F64) -> F64:
     """T in image coordinates x' = H x of the three views (3, 3): H1^-1 on points, H2 and H3 on T's others.
 
-    Tensor rule T'_i^jk = (H1^-1)^r_i H2^j_s H3^k_t T_r^st; unit norm.
+    Tensor rule T'_i^jk = (H1^-1)^r_i H2^j_s H3^k_t T_r^st; unit norm. ``ValueError`` for a singular H1.
     """
-    return unit_tensor(np.einsum("ri,js,kt,rst->ijk", np.linalg.inv(H1), H2, H3, T))
+    return unit_tensor(np.einsum("ri,js,kt,rst->ijk", inverse_of(H1, "transform_tensor"), H2, H3, T))
 
 
 def reordered_tensor(T: F64, order: tuple[int, int, int]) -> F64:

@@ -148,6 +148,8 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
     Raises ``ValueError`` for other shapes, values that are not finite or beyond 1e15, and segments of no
     length.
     """
+    if np.iscomplexobj(points) or np.iscomplexobj(segments):
+        raise ValueError("points and segments must be real numbers; got complex ones")
     points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
     right = points.ndim == 3 and points.shape[::2] == (3, 2)
     if not right or segments.ndim != 4 or (segments.shape[0], *segments.shape[2:]) != (3, 2, 2):

@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
-Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
 
 LANES = 32
-TO_BASIS_1, TO_BASIS_2, SIDES, OTHERS_1, OTHERS_2, FIRST, SECOND, CUBIC = 0, 9, 18, 21, 30, 39, 45, 51
-"""Rows of a solved batch where these begin: the two transforms (9 each), the orientation of the first three
-matches, the last three points of either image (9 each), the two members (6 each) that span the pencil and
-the three coefficients of the monic cubic."""
-ROWS = 54
+TO_BASIS_1, TO_BASIS_2, FIRST, SECOND, ROWS = 0, 9, 39, 45, 54
+"""Rows of a solved batch: from 0 and 9 the two transforms (9 each), from 18 the orientation of the first
+three matches, from 21 and 30 the last three points of either image (9 each), from 39 and 45 the two members
+(6 each) that span the pencil, from 51 the three coefficients of the monic cubic."""
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
