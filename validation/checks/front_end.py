@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from validation.checks.front_end_invariance import check_invariance, measure_invariance
 from validation.checks.front_end_kermit import check_kermit, kermit_table, measure_kermit
 from validation.checks.front_end_pairs import check_pairs, measure_pairs, pair_table
 from validation.checks.front_end_time import check_time, measure_time
@@ -47,6 +48,9 @@ def blocks(wishes: argparse.Namespace) -> Iterator[Block]:
         runs = measure_time()
         if runs is not None:
             yield "Time and memory, fountain-P11, 2 threads", check_time(runs), ""
+    if "invariance" in parts:
+        for title, copies in measure_invariance().items():
+            yield f"Copies of {title}", check_invariance(title, copies), ""
 
 
 def main(arguments: list[str] | None = None) -> int:

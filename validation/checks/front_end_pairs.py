@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -119,9 +120,7 @@ def measure_pairs(
     configs = front_ends()
     by = {name: PreparedViews(configs[name], images) for name in names}
     for gap in gaps:
-        for i, pair in enumerate(camera_pairs(scene_name, cache, (gap,))):
-            if most is not None and i >= most:
-                break
+        for i, pair in enumerate(islice(camera_pairs(scene_name, cache, (gap,)), most)):
             assert pair.truth is not None
             views = {name: prepared.relate(i, i + gap) for name, prepared in by.items()}
             related = {name: Related(view, _error(view, pair.truth)) for name, view in views.items()}
