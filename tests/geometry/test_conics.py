@@ -240,3 +240,8 @@ def test_3_4_2_intersection_and_tangency_of_surfaces_are_kept_by_projective_tran
         before = tangency_discriminant(C, start, end)
         after = tangency_discriminant(moved, G @ start, G @ end)
         assert np.sign(before) == np.sign(after)
+
+
+def test_the_dual_is_the_adjugate_with_its_sign():
+    for C in (np.diag([1.0, 2.0, -3.0]), np.diag([-1.0, -2.0, -3.0]), np.diag([1.0, 2.0, 3.0, -4.0])):
+        np.testing.assert_allclose(dual(C), np.linalg.det(C) * np.linalg.inv(C), atol=1e-12)
