@@ -88,14 +88,21 @@ def test_the_target_is_the_best_rival() -> None:
     assert least({OURS: 0.1}, ("PoseLib",)) is None
 
 
-def test_a_wrong_matrix_is_sure_only_where_its_covariance_is_small() -> None:
-    F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) / np.sqrt(2.0)
-    xy = np.random.default_rng(0).uniform(0.0, 500.0, (20, 2))
-    truth, inliers = np.hstack([xy, xy + np.array([7.0, 3.0])]), np.ones(20, dtype=bool)
-    assert called_sure(Estimate(F, inliers, np.eye(9) * 1e-18), truth, 1.0)
-    assert not called_sure(Estimate(F, inliers, np.eye(9)), truth, 1.0)
-    assert not called_sure(Estimate(F, inliers, np.eye(9) * 1e-18), truth, 4.0)
-    assert not called_sure(Estimate(None, inliers), truth, 1.0)
+def test_a_wrong_matrix_is_called_sure_only_where_its_matches_are_said_to_determine_it() -> None:
+    rng = np.random.default_rng(0)
+    X = rng.uniform(-1.0, 1.0, (200, 3)) + np.array([0.0, 0.0, 5.0])
+    xy1 = 1000.0 * X[:, :2] / X[:, 2:]
+    xy2 = 1000.0 * (X[:, :2] + np.array([1.0, 0.2])) / X[:, 2:]
+    noisy1, noisy2 = (xy + rng.normal(0.0, 0.3, xy.shape) for xy in (xy1, xy2))
+    found = estimate_with(OURS, noisy1, noisy2, threshold_px=1.0, seed=0)
+    # The same geometry, judged against correspondences of another: wrong by many pixels, and sure.
+    other = np.hstack([xy1, xy2 + np.array([0.0, 9.0])])
+    assert called_sure(found, RealPair("off", noisy1, noisy2, truth=other), 1.0)
+    assert not called_sure(found, RealPair("off", noisy1, noisy2, truth=other), 100.0)
+    assert not called_sure(Estimate(None, found.inliers), RealPair("off", noisy1, noisy2, truth=other), 1.0)
+    plane1, plane2 = noisy1, noisy1 * 1.01 + np.array([20.0, 5.0]) + rng.normal(0.0, 0.3, noisy1.shape)
+    found = estimate_with(OURS, plane1, plane2, threshold_px=1.0, seed=0)
+    assert not called_sure(found, RealPair("plane", plane1, plane2, truth=other), 0.0)
 
 
 def test_rows_of_a_scene_judge_ours_against_poselib() -> None:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar.precision import epipolar_distance_std
+from thesisrecon.epipolar.certainty import judge_certainty
 from validation.metrics.epipolar import precision_recall, rms_epipolar_distance, rms_sampson_distance
 from validation.metrics.record import Metric, markdown_table
 from validation.references.fundamental import OURS, SOLVERS, Estimate, estimate_with
@@ -37,8 +37,6 @@ THRESHOLD_PX = 1.0
 FAILED_PX = 5.0
 STRONG, STRONGEST = ("USAC_ACCURATE", "USAC_MAGSAC", "COLMAP", "PoseLib"), ("PoseLib",)
 """References to beat on kusvod2, and on the scenes with cameras."""
-SURE = 3.0
-"""A wrong F was called sure where its error exceeds this many times the one its covariance tells."""
 
 
 def run_pair(
@@ -104,7 +102,7 @@ def check_kusvod2(pairs: Iterable[RealPair], methods: list[str], seeds: int) -> 
         labels.append(f"{pair.name} ({len(pair.xy1)} matches)")
         errors.append(errors_of(runs, pair, rms_epipolar_distance))
         sampson.append(errors_of(runs, pair, rms_sampson_distance))
-        sure += sum(called_sure(e, pair.truth, FAILED_PX) for e in runs.get(OURS, []))
+        sure += sum(called_sure(e, pair, FAILED_PX) for e in runs.get(OURS, []))
     if not labels:
         return []
     rows = error_rows("kusvod2", labels, errors, STRONG, (FAILED_PX,))
@@ -121,13 +119,13 @@ def check_kusvod2(pairs: Iterable[RealPair], methods: list[str], seeds: int) -> 
     return rows
 
 
-def called_sure(estimate: Estimate, truth: F64, limit_px: float) -> bool:
-    """Whether F is off by more than the limit and its covariance tells less than a third of that."""
-    error = rms_epipolar_distance(estimate.F, truth)
-    if estimate.F is None or estimate.covariance is None or error <= limit_px:
+def called_sure(estimate: Estimate, pair: RealPair, limit_px: float) -> bool:
+    """Whether F is off by more than the limit and yet the matches are said to determine it."""
+    assert pair.truth is not None
+    if estimate.fit is None or rms_epipolar_distance(estimate.F, pair.truth) <= limit_px:
         return False
-    told = epipolar_distance_std(estimate.F, estimate.covariance, truth[:, :2], truth[:, 2:])
-    return bool(error > SURE * np.sqrt(np.mean(told**2)))
+    rng = np.random.default_rng(0)
+    return judge_certainty(estimate.fit, pair.xy1, pair.xy2, rng=rng).determined
 
 
 def check_cameras(
@@ -144,7 +142,7 @@ def check_cameras(
         runs = run_pair(pair, methods, seeds=seeds, threshold_px=THRESHOLD_PX)
         labels.append(f"{pair.name.split()[1]} ({len(pair.xy1)} matches)")
         errors.append(errors_of(runs, pair, rms_epipolar_distance))
-        sure += sum(called_sure(e, pair.truth, 1.0) for e in runs.get(OURS, []))
+        sure += sum(called_sure(e, pair, 1.0) for e in runs.get(OURS, []))
     if not labels:
         return []
     rows = error_rows(scene, labels, errors, STRONGEST, (1.0, 3.0))

@@ -7,7 +7,7 @@ state, so only the order makes its runs differ. Libraries with a seed get it too
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from thesisrecon.epipolar import estimate_fundamental
 from thesisrecon.errors import StageFailure
+from thesisrecon.types import FundamentalFit
 
 F64 = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-Answer = tuple[Any, Any, F64 | None]
+Answer = tuple[Any, Any, FundamentalFit | None]
 
 OURS = "ours"
 CONFIDENCE, ITERATIONS = 0.9999, 20000
@@ -32,12 +33,12 @@ MIN_ITERATIONS = 10000
 
 @dataclass(frozen=True)
 class Estimate:
-    """``F`` (3, 3), None where the method gave none, ``inliers`` (N,) as the method tells them, and where
-    there is one the ``covariance`` (9, 9)."""
+    """``F`` (3, 3), None where the method gave none, ``inliers`` (N,) as the method tells them; of ours the
+    whole ``fit``."""
 
     F: F64 | None
     inliers: BoolArray
-    covariance: F64 | None = None
+    fit: FundamentalFit | None = None
 
 
 Solver = Callable[[F64, F64, float, int], Answer]
@@ -48,7 +49,7 @@ def _ours(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
         fit = estimate_fundamental(xy1, xy2, threshold_px=threshold_px, seed=seed)
     except StageFailure:
         return None, None, None
-    return fit.F, fit.inliers, fit.covariance
+    return fit.F, fit.inliers, fit
 
 
 def _opencv(method: int, confidence: float = 0.99, iterations: int = 1000) -> Solver:
@@ -103,11 +104,11 @@ def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed:
     """
     order = np.random.default_rng(seed).permutation(len(xy1))
     some1, some2 = np.ascontiguousarray(xy1[order]), np.ascontiguousarray(xy2[order])
-    F, told, covariance = SOLVERS[method](some1, some2, threshold_px, seed)
+    F, told, fit = SOLVERS[method](some1, some2, threshold_px, seed)
     inliers = np.zeros(len(xy1), dtype=bool)
     F = None if F is None else np.asarray(F, dtype=np.float64)
     # OpenCV answers with nothing, zeros or three stacked matrices where it failed.
     if F is None or F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
         return Estimate(None, inliers)
     inliers[order] = np.asarray(told).ravel() > 0
-    return Estimate(F, inliers, covariance)
+    return Estimate(F, inliers, None if fit is None else replace(fit, inliers=inliers))
