@@ -7,14 +7,17 @@ and (i, i+3); 0.6, 0.7 and 0.75 of its sigma).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from thesisrecon.geometry.camera import calibration_matrix, compose_camera, project_camera
 from thesisrecon.io.images import read_photographs
-from thesisrecon.types import Features, Image
+from thesisrecon.types import Features, Image, Reconstruction, Tracks, TwoView
 from validation.checks.front_end_invariance import Copy, make_copies, repeatability, score_copy
+from validation.checks.front_end_kermit import CONTRADICTS_PX, disagreement, judge
 from validation.checks.front_end_pairs import OURS, SIFT, check_pairs, front_ends, measure_pairs
 from validation.scenes.real import load_real_scene
 
@@ -92,3 +95,51 @@ def test_repeatability_counts_each_corner_once() -> None:
     share, shown = repeatability(at(xy), at(second), (100, 60), copy)
     assert shown == 3
     assert share == pytest.approx(2.0 / 3.0)
+
+
+def _model_and_pair(k1: float, moved: float) -> tuple[Reconstruction, TwoView]:
+    """Two cameras with distortion that saw 50 points; the model has the second one ``moved`` up."""
+    rng = np.random.default_rng(0)
+    X = rng.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 5.0], (50, 3))
+    K, R, t = (
+        calibration_matrix(700.0, 700.0, 319.5, 239.5),
+        np.eye(3),
+        np.array([[0.0] * 3, [-0.8, 0.0, 0.1]]),
+    )
+    xy1, xy2 = (project_camera(K, R, t[i], X, k1=k1) for i in range(2))
+    nothing = np.zeros(0, dtype=np.int64)
+    P = np.stack([compose_camera(K, R, t[0]), compose_camera(K, R, t[1] + [0.0, moved, 0.0])])
+    model = Reconstruction(
+        stratum="metric",
+        P=P,
+        X=np.zeros((0, 4)),
+        registered=np.ones(2, bool),
+        valid=np.zeros(0, bool),
+        inlier=np.zeros(0, bool),
+        tracks=Tracks(nothing, nothing, np.zeros((0, 2)), 2, 0),
+        sizes=np.array([[640, 480]] * 2),
+        sigma_px=0.1,
+        reasons=("", ""),
+        K=np.stack([K, K]),
+        k1=np.full(2, k1),
+    )
+    index = np.arange(50)
+    affine = np.broadcast_to(np.eye(2), (50, 2, 2))
+    pair = TwoView(0, 1, np.eye(3), 0.1, index, index, xy1, xy2, affine, 50, 0.0, True)
+    return model, pair
+
+
+def test_a_pair_agrees_with_the_cameras_that_saw_it_and_contradicts_others() -> None:
+    model, pair = _model_and_pair(k1=-0.12, moved=0.0)
+    assert disagreement(pair, model) < 1e-6
+    assert not judge(pair, {"a model": model}).contradicts("a model")
+    model, pair = _model_and_pair(k1=-0.12, moved=0.1)
+    assert disagreement(pair, model) > CONTRADICTS_PX
+    assert judge(pair, {"a model": model}).contradicts("a model")
+
+
+def test_a_pair_whose_view_is_not_in_the_model_cannot_contradict_it() -> None:
+    model, pair = _model_and_pair(k1=0.0, moved=0.1)
+    partial = replace(model, registered=np.array([True, False]))
+    assert np.isnan(disagreement(pair, partial))
+    assert not judge(pair, {"a model": partial}).contradicts("a model")
