@@ -75,6 +75,7 @@ HOSTILE = {
     "of two sizes": (1e-8 * GOOD1, GOOD2),
     "one wild match": (np.r_[GOOD1, [[1e12, 5.0]]], np.r_[GOOD2, [[5.0, 1e12]]]),
 }
+NAN_BY_DEFINITION = ("turn_deg", "turning_camera_ratio")
 
 
 def rng():
@@ -108,9 +109,11 @@ FUNCTIONS: dict[str, Callable[..., object]] = {
 
 
 def holds_nan(answer: object) -> bool:
-    """NaN anywhere in an answer; the angle of no rotation is NaN by its definition."""
+    """NaN anywhere in an answer but where it says by its definition that there is no such number."""
     if is_dataclass(answer):
-        return any(holds_nan(getattr(answer, f.name)) for f in fields(answer) if f.name != "turn_deg")
+        return any(
+            holds_nan(getattr(answer, f.name)) for f in fields(answer) if f.name not in NAN_BY_DEFINITION
+        )
     if isinstance(answer, tuple):
         return any(map(holds_nan, answer))
     return isinstance(answer, float | np.ndarray) and bool(np.isnan(answer).any())
