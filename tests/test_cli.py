@@ -18,6 +18,7 @@ import pytest
 
 import thesisrecon.cli as cli
 from thesisrecon.cli import run_command
+from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
 
 ROOT = Path(__file__).parent.parent
 COURTYARD = ROOT / "fixtures" / "courtyard"
@@ -184,6 +185,10 @@ def test_the_written_config_runs_again(
         (["reconstruct", ".", "-o", "out", "--until", "dense"], "does not exist yet"),
         (["reconstruct", ".", "-o", "out", "--executor", "dask://x"], "does not exist yet"),
         (["reconstruct", ".", "-o", "out", "--max-size", "5"], "at least 64"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "window:0"], "a window of 0 gives no pairs"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "window"], "takes a whole number"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "most"], "all, overlap, window:N, or a file"),
+        (["reconstruct", ".", "-o", "out", "--set", "pairs.kind=some"], "unknown kind of pairs"),
         (["inspect", "nowhere"], "no summary"),
         (["reconstruct", ".", "-o", ""], "the folder has no name"),
         (["reconstruct", "", "-o", "out"], "the folder has no name"),
@@ -267,3 +272,29 @@ def test_the_demo_without_its_photographs_says_where_they_are(
     monkeypatch.setattr(cli, "DEMO_SCENE", Path("fixtures") / "absent")
     assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
     assert "come with the source" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wish", "kind"),
+    [("all", AllPairs()), ("overlap", OverlapEstimate()), ("window:3", SequenceWindow(3))],
+)
+def test_the_pairs_of_the_command_are_those_of_the_settings(wish: str, kind: object) -> None:
+    assert cli._config(None, None, cli._option_tables(None, None, wish), []).pairs == kind
+
+
+def test_a_list_of_pairs_is_read_matched_and_told(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = sorted(path.name for path in photographs.iterdir())
+    wish, out = tmp_path / "pairs.txt", tmp_path / "out"
+    wish.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
+    given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
+    assert run_command([*given, "--pairs", str(wish)]) == 0
+    assert "of 2 pairs of photographs accepted (15 are possible)" in capsys.readouterr().out
+    pairs = json.loads((out / "summary.json").read_text(encoding="utf-8"))["pairs"]
+    assert (pairs["matched"], pairs["possible"], pairs["chosen_by"]) == (2, 15, "the listed pairs")
+    assert "2 of 15 pairs were tried: the listed pairs." in (out / "report.html").read_text(encoding="utf-8")
+    for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is none"), ("", "leaves no pair")):
+        wish.write_text(line, encoding="utf-8")
+        assert run_command([*given, "--pairs", str(wish), "--overwrite"]) == 2
+        assert words in capsys.readouterr().err

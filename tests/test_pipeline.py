@@ -20,6 +20,7 @@ from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
 from thesisrecon.assumptions import camera_groups, prior_warnings
 from thesisrecon.config import ImageOptions, IntrinsicsAssumption
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline import reconstruct
 from thesisrecon.run import stream
 from thesisrecon.types import Image, RunResult
@@ -402,3 +403,25 @@ def test_the_first_error_of_a_worker_ends_the_rest() -> None:
     with pytest.raises(StageFailure, match="three"):
         Workers(2).run(fail, [(n,) for n in range(1000)], lambda n, _: heard.append(n))
     assert len(heard) < 1000
+
+
+def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path: Path) -> None:
+    config = fake_config(pairs=SequenceWindow(1))
+    result = run(tmp_path, config=config, until="matches")
+    assert [(pair.i, pair.j) for pair in result.pairs] == [(0, 1), (1, 2), (2, 3)]
+    assert result.pair_choice is not None
+    assert read(tmp_path / "summary.json")["pairs"]["possible"] == 6
+    CALLS.clear()
+    more = run(tmp_path, config=fake_config(), until="matches", overwrite=True)
+    assert sorted(c for c in CALLS if c.startswith("match")) == [
+        "match (0, 2)",
+        "match (0, 3)",
+        "match (1, 3)",
+    ]
+    assert "pairs" not in more.summary["resumed"]
+
+
+def test_a_list_that_names_no_photograph_is_refused_before_anything_is_computed(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"'9\.png', which is none of the 4 photographs"):
+        run(tmp_path, config=fake_config(pairs=ListedPairs((("00.png", "9.png"),))))
+    assert CALLS == []

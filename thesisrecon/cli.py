@@ -30,6 +30,7 @@ DEBUG_VARIABLE = "THESISRECON_DEBUG"
 DEMO_SCENE = Path("fixtures") / "courtyard"
 STAGE_WORDS = {
     "features": "corners",
+    "pairs": "choice of pairs",
     "matches": "pairs of photographs",
     "projective": "projective cameras",
     "selfcalibration": "self-calibration",
@@ -103,6 +104,15 @@ def reconstruct(
         int | None,
         typer.Option("--max-size", help="Long side (px) photographs are reduced to (default: 1600)."),
     ] = None,
+    pairs: Annotated[
+        str | None,
+        typer.Option(
+            "--pairs",
+            metavar="all|overlap|window:N|FILE",
+            help="Which pairs are matched: all, those that seem to overlap (the default above 30 "
+            "photographs), each with the next N by name, or those of a file with two names on a line.",
+        ),
+    ] = None,
     until: Annotated[
         str, typer.Option("--until", help="The last stage: features, matches, projective or metric.")
     ] = "metric",
@@ -113,7 +123,8 @@ def reconstruct(
 ) -> None:
     """Reconstruct metric cameras and points from a folder of photographs."""
     _cap_threads(threads)
-    chosen = _config(preset.value if preset else None, config, cameras, max_size, settings or [])
+    wishes = _option_tables(cameras, max_size, pairs)
+    chosen = _config(preset.value if preset else None, config, wishes, settings or [])
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
     _run(images, out, chosen, seed, options)
 
@@ -135,7 +146,7 @@ def demo(
         )
     # The folder of an older demo may hold other settings: the demo is always that of today.
     options = {"threads": threads or None, "overwrite": True}
-    _run(scene, out, _config(None, None, None, None, []), 0, options)
+    _run(scene, out, _config(None, None, {}, []), 0, options)
 
 
 @app.command()
@@ -174,11 +185,43 @@ def _cap_threads(threads: int) -> None:
     os.environ["NUMBA_NUM_THREADS"] = str(threads or available_threads())
 
 
+def _option_tables(
+    cameras: Cameras | None, max_size: int | None, pairs: str | None
+) -> dict[str, dict[str, Any]]:
+    """The settings that have options of their own, as tables."""
+    options: dict[str, dict[str, Any]] = {}
+    if cameras is not None:
+        options["intrinsics"] = {"cameras": cameras.value}
+    if max_size is not None:
+        options["images"] = {"max_size_px": max_size}
+    if pairs is not None:
+        options["pairs"] = _pairs_table(pairs)
+    return options
+
+
+def _pairs_table(wish: str) -> dict[str, Any]:
+    """The settings that ``--pairs`` means: a word, or a file where one of that name is there."""
+    words = {"all": "all-pairs", "overlap": "overlap-estimate"}
+    if wish in words:
+        return {"kind": words[wish]}
+    word, colon, number = wish.partition(":")
+    if word == "window" and (colon or not Path(wish).is_file()):
+        if not number.strip().lstrip("-").isdecimal():
+            raise UsageError(f"--pairs window:N takes a whole number of photographs; got {wish!r}")
+        return {"kind": "sequence-window", "window": int(number)}
+    if not Path(wish).is_file():
+        raise UsageError(
+            f"--pairs takes all, overlap, window:N, or a file of pairs; there is no file {wish!r}"
+        )
+    from thesisrecon.io.pairs import read_pairs
+
+    return {"kind": "listed-pairs", "listed": read_pairs(Path(wish))}
+
+
 def _config(
     preset: str | None,
     file: Path | None,
-    cameras: Cameras | None,
-    max_size: int | None,
+    options: Mapping[str, Mapping[str, Any]],
     settings: list[str],
 ) -> PipelineConfig:
     """The preset (of the command, else of the file, else default), then the file, then the options, then
@@ -188,11 +231,6 @@ def _config(
     from thesisrecon.io.text import read_text
 
     text = "" if file is None else read_text(file)
-    options: dict[str, dict[str, Any]] = {}
-    if cameras is not None:
-        options["intrinsics"] = {"cameras": cameras.value}
-    if max_size is not None:
-        options["images"] = {"max_size_px": max_size}
     return configs.config_from_toml(
         text,
         configs.preset(preset or "default"),
@@ -261,8 +299,10 @@ def _found(summary: Mapping[str, Any]) -> str:
         kind = " in projective cameras" if summary["stratum"] == "projective" else ""
         return f"{summary['registered']} of {images} photographs registered{kind}, {summary['points']} points"
     if pairs["matched"]:
+        possible = pairs.get("possible", pairs["matched"])
+        chosen = f" ({possible} are possible)" if possible > pairs["matched"] else ""
         return (
-            f"{pairs['accepted']} of {pairs['matched']} pairs of photographs accepted, "
+            f"{pairs['accepted']} of {pairs['matched']} pairs of photographs accepted{chosen}, "
             f"{pairs['verified_matches']} verified matches"
         )
     corners = [view["corners"] for view in summary["cameras"] if view["corners"] is not None]

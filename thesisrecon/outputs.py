@@ -157,6 +157,7 @@ def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: Stage
         version=__version__,
         unread=tuple(result.refused.items()),
         pairs=result.pairs,
+        pair_choice=result.pair_choice,
         reconstruction=result.projective,
         metric=result.metric,
         colours=colours,

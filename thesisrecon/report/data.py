@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.types import IntrinsicInterval, MetricResult, Reconstruction, StageReport, TwoView
+from thesisrecon.types import (
+    IntrinsicInterval,
+    MetricResult,
+    PairChoice,
+    Reconstruction,
+    StageReport,
+    TwoView,
+)
 
 U8 = NDArray[np.uint8]
 
@@ -50,6 +57,7 @@ class ReportData:
     version : of thesisrecon.
     unread : (name, reason) of the files that are no photographs and hence no views.
     pairs : the pairs of views whose epipolar geometry was estimated, accepted or not.
+    pair_choice : how these pairs were chosen, None where the caller does not say.
     reconstruction : the projective reconstruction, where the run has one; ``metric`` goes before it.
     metric : the result of the metric stage.
     colours : (N, 3) uint8 of the points of the metric reconstruction (valid or not), or None.
@@ -70,6 +78,7 @@ class ReportData:
     version: str
     unread: tuple[tuple[str, str], ...] = ()
     pairs: Sequence[TwoView] = field(default=())
+    pair_choice: PairChoice | None = None
     reconstruction: Reconstruction | None = None
     metric: MetricResult | None = None
     colours: U8 | None = None

@@ -34,6 +34,7 @@ from thesisrecon.report.residuals import (
 )
 from thesisrecon.report.scene import MAX_POINTS, build_scene
 from thesisrecon.report.wording import (
+    chosen_pairs,
     count_of,
     decimals,
     duration,
@@ -109,6 +110,7 @@ def render_report(data: ReportData) -> str:
             shown_points=shown,
             most_points=MAX_POINTS,
             all_points=int(best.valid.sum()) if best is not None else 0,
+            chosen_pairs=chosen_pairs(data),
             drawn_pairs=_drawn_pairs(data),
             listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:MAX_LISTED_PAIRS],
             stages=_stages(data.reports),

@@ -125,6 +125,15 @@ def _pair_fact(pairs: Sequence[TwoView]) -> Fact:
     return Fact("Pairs accepted", f"{len(accepted)} of {len(pairs)}", note)
 
 
+def chosen_pairs(data: ReportData) -> str:
+    """How many of the possible pairs were tried and how they were chosen, as a sentence; '' if unsaid."""
+    if data.pair_choice is None:
+        return ""
+    views = len(data.photographs)
+    possible, tried = views * (views - 1) // 2, len(data.pairs)
+    return f"{grouped(tried)} of {grouped(possible)} pairs were tried: {data.pair_choice.how}."
+
+
 def _point_fact(points: int, overall: ResidualSummary | None) -> Fact:
     seen = f"seen in {overall.count / points:.1f} photographs on average" if overall and points else ""
     return Fact("Points", grouped(points), seen)

@@ -67,17 +67,19 @@ class OverlapEstimate:
         """The pairs worth matching. Raises :class:`UsageError` for features without seeds in a large set."""
         n = len(names)
         if n <= self.all_up_to:
-            how = f"all pairs, for no more than {self.all_up_to} photographs"
+            how = f"all pairs, as there are no more than {self.all_up_to} photographs"
             return PairChoice(pair_array(combinations(range(n), 2)), how)
         sketches = map_all(self._sketches, features)
-        alike = sum(
-            likeness([s[k].patches for s in sketches], self.words, map_all=map_all, rng=rng) for k in (0, 1)
-        )
-        compared = most_alike(np.asarray(alike), self.shortlist)
+        alike = np.zeros((n, n))
+        if n - 1 > self.shortlist:
+            for kind in (0, 1):
+                patches = [sketch[kind].patches for sketch in sketches]
+                alike += likeness(patches, self.words, map_all=map_all, rng=rng)
+        compared = most_alike(alike, self.shortlist)
         evidence = np.array(
             map_all(lambda pair: self._evidence(sketches[pair[0]], sketches[pair[1]]), compared.tolist())
         )
-        chosen = self._choose(np.asarray(alike), compared, evidence)
+        chosen = self._choose(alike, compared, evidence)
         how = (
             f"those of {len(compared)} compared whose patches agree beyond chance, and the nearest "
             f"{self.nearest} of each photograph"

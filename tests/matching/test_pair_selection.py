@@ -1,0 +1,287 @@
+"""Which pairs are matched: the wishes of the user, and the estimate of the overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from tests.textures import photograph, texture
+from thesisrecon.config import PairSelector
+from thesisrecon.errors import UsageError
+from thesisrecon.features import HarrisCorners, MultiScaleCorners
+from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
+from thesisrecon.matching.pair_selection.estimate import bridges, most_alike
+from thesisrecon.matching.pair_selection.kernels import most_agreeing, mutual_best
+from thesisrecon.matching.pair_selection.overlap import OverlapTest, sketch_seeds
+from thesisrecon.matching.pair_selection.records import pair_array
+from thesisrecon.matching.pair_selection.words import likeness
+from thesisrecon.types import Features, PairChoice
+
+SIDE, CROPS = 260, 14
+NO_FEATURES = Features(np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0, np.float32))
+
+
+def one_by_one(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+    return [function(item) for item in items]
+
+
+def names_of(n: int) -> list[str]:
+    return [f"{i:02d}.jpg" for i in range(n)]
+
+
+def choose(selector: PairSelector, n: int, features: Any = None, map_all: Any = one_by_one) -> PairChoice:
+    names = names_of(n)
+    selector.check(names, ["blank.jpg"])
+    rng = np.random.default_rng(0)
+    return selector.select(names, features or [NO_FEATURES] * n, map_all=map_all, rng=rng)
+
+
+def as_set(pairs: Any) -> set[tuple[int, int]]:
+    return {(int(i), int(j)) for i, j in pairs}
+
+
+# ---------------------------------------------------------------- what the user can say
+
+
+@pytest.mark.parametrize(
+    "selector", [AllPairs(), OverlapEstimate(), SequenceWindow(99), SequenceWindow(99, loop=True)]
+)
+@pytest.mark.parametrize("n", [1, 2, 3, 7])
+def test_all_pairs_of_a_small_set_in_order(selector: PairSelector, n: int) -> None:
+    choice = choose(selector, n)
+    assert choice.pairs.tolist() == [list(pair) for pair in combinations(range(n), 2)]
+    assert choice.pairs.shape == (n * (n - 1) // 2, 2)
+    assert choice.compared == 0
+    assert choice.how
+
+
+@given(st.integers(2, 12), st.integers(1, 12))
+def test_a_window_takes_the_next_ones(n: int, window: int) -> None:
+    pairs = as_set(choose(SequenceWindow(window), n).pairs)
+    assert pairs == {(i, j) for i, j in combinations(range(n), 2) if j - i <= window}
+    looped = as_set(choose(SequenceWindow(window, loop=True), n).pairs)
+    assert looped == {(i, j) for i, j in combinations(range(n), 2) if min(j - i, n - j + i) <= window}
+
+
+def test_listed_pairs_in_any_order_and_without_those_left_out() -> None:
+    listed = (("03.jpg", "00.jpg"), ("01.jpg", "02.jpg"), ("blank.jpg", "02.jpg"))
+    assert choose(ListedPairs(listed), 4).pairs.tolist() == [[0, 3], [1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("listed", "words"),
+    [
+        ((("00.jpg", "nope.jpg"),), r"names 'nope.jpg', which is none of the 5 photographs"),
+        ((("zz", "nope.jpg"), ("x", "y")), r"names 'nope.jpg' and 3 more"),
+        ((), "leaves no pair to match"),
+        ((("00.jpg", "blank.jpg"),), "photographs were left out"),
+    ],
+)
+def test_a_list_that_does_not_fit_the_photographs_is_refused(listed: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        choose(ListedPairs(listed), 4)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ListedPairs((("a", "a"),)), "pairs 'a' with itself"),
+        (lambda: ListedPairs((("a", "b"), ("b", "a"))), "'b', 'a' twice"),
+        (lambda: SequenceWindow(0), "a window of 0 gives no pairs"),
+        (lambda: SequenceWindow(-3), "a window of -3"),
+        (lambda: OverlapEstimate(nearest=0), "nearest must be at least 1"),
+        (lambda: OverlapEstimate(words=0), "words must be at least 1"),
+    ],
+)
+def test_wishes_that_cannot_be_meant_are_refused(make: Callable[[], Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+# ---------------------------------------------------------------- the estimate of the overlap
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of two walls: features, which wall, and where (left, top) px."""
+
+    features: list[Features]
+    wall: list[int]
+    place: np.ndarray
+
+    def shared(self, i: int, j: int) -> float:
+        """The part of a window that two of them share."""
+        if self.wall[i] != self.wall[j]:
+            return 0.0
+        return float(np.prod(np.maximum(1.0 - np.abs(self.place[i] - self.place[j]) / SIDE, 0.0)))
+
+
+@pytest.fixture(scope="module")
+def windows() -> Windows:
+    rng = np.random.default_rng(7)
+    walls = [texture(520, 700, seed) for seed in (1, 2)]
+    wall = [k % 2 for k in range(CROPS)]
+    place = rng.uniform(0.0, (700 - SIDE, 520 - SIDE), (CROPS, 2)).astype(int)
+    detector = MultiScaleCorners(full_corners=300, half_corners=100, seeds_per_level=400)
+    images = [photograph(walls[w][y : y + SIDE, x : x + SIDE]) for w, (x, y) in zip(wall, place, strict=True)]
+    return Windows([detector.detect(image) for image in images], wall, place.astype(float))
+
+
+ESTIMATE = OverlapEstimate(all_up_to=2, nearest=1, shortlist=9, words=256)
+
+
+def test_pairs_that_overlap_are_chosen_and_few_others(windows: Windows) -> None:
+    choice = choose(ESTIMATE, CROPS, windows.features)
+    chosen, every = as_set(choice.pairs), list(combinations(range(CROPS), 2))
+    much = {pair for pair in every if windows.shared(*pair) > 0.15}
+    apart = {pair for pair in every if windows.shared(*pair) == 0.0}
+    assert len(much) > 10
+    assert much <= chosen
+    assert len(chosen & apart) <= 0.3 * len(apart)
+    assert choice.compared < len(every)
+    assert str(choice.compared) in choice.how
+
+
+def test_every_photograph_is_paired_and_all_hang_together(windows: Windows) -> None:
+    strict = replace(ESTIMATE, least_evidence=1e9)
+    pairs = choose(strict, CROPS, windows.features).pairs
+    assert set(pairs.ravel().tolist()) == set(range(CROPS))
+    assert len(pairs) <= 2 * CROPS
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(CROPS, CROPS))
+    assert connected_components(graph, directed=False)[0] == 1
+
+
+def test_the_number_of_threads_changes_nothing(windows: Windows) -> None:
+    def in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+        with ThreadPoolExecutor(3) as pool:
+            return list(pool.map(function, items))
+
+    alone, together = (choose(ESTIMATE, CROPS, windows.features, m) for m in (one_by_one, in_threads))
+    assert alone.pairs.tolist() == together.pairs.tolist()
+
+
+def test_photographs_without_structure_are_no_obstacle(windows: Windows) -> None:
+    blank = MultiScaleCorners().detect(photograph(np.full((SIDE, SIDE), 90.0)))
+    choice = choose(ESTIMATE, CROPS, [*windows.features[:-1], blank])
+    assert CROPS - 1 in choice.pairs
+    assert len(choose(ESTIMATE, 5, [blank] * 5).pairs) >= 4
+
+
+def test_features_without_seeds_are_refused_with_the_way_out() -> None:
+    features = [HarrisCorners(max_corners=20).detect(photograph(texture(80, 90, k))) for k in range(4)]
+    with pytest.raises(UsageError, match=r"features\.kind=multi-scale-corners, or pairs\.kind=all-pairs"):
+        choose(ESTIMATE, 4, features)
+
+
+def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows: Windows) -> None:
+    image = photograph(texture(SIDE, SIDE, 5))
+    turned = photograph(np.rot90(texture(SIDE, SIDE, 5)).copy())
+    detector = MultiScaleCorners()
+    one, other = (detector.detect(view).seeds for view in (image, turned))
+    assert one is not None
+    assert other is not None
+    strange = [f.seeds for f in windows.features]
+    for kind, least in ((True, 20.0), (False, -10.0)):
+        test, sketch = OverlapTest(), sketch_seeds(one, turned=kind, per_scale=200)
+        assert test.score(sketch, sketch_seeds(other, turned=kind, per_scale=200)) > least
+        assert test.score(sketch, sketch) > 20.0
+        # The number of false alarms bounds how often chance reaches an evidence.
+        chance = [test.score(sketch, sketch_seeds(s, turned=kind, per_scale=200)) for s in strange if s]
+        assert max(chance) < 2.0
+
+
+def test_photographs_of_one_wall_use_the_same_words(windows: Windows) -> None:
+    sketches = [sketch_seeds(f.seeds, turned=False, per_scale=200) for f in windows.features if f.seeds]
+    alike = likeness([s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(alike, alike.T, atol=1e-12)
+    np.testing.assert_allclose(np.diag(alike), 1.0)
+    pairs = list(combinations(range(CROPS), 2))
+    shared = np.array([windows.shared(i, j) for i, j in pairs])
+    value = np.array([alike[i, j] for i, j in pairs])
+    assert np.median(value[shared > 0.4]) > np.quantile(value[shared == 0.0], 0.9)
+
+
+# ---------------------------------------------------------------- its parts
+
+
+@given(st.integers(2, 9), st.integers(1, 9), st.integers(0, 2**31))
+def test_the_most_alike_of_each(n: int, count: int, seed: int) -> None:
+    alike = np.random.default_rng(seed).random((n, n))
+    alike += alike.T
+    pairs = as_set(most_alike(alike, count))
+    for i in range(n):
+        others = sorted((j for j in range(n) if j != i), key=lambda j: -alike[i, j])[:count]
+        assert {(min(i, j), max(i, j)) for j in others} <= pairs
+    assert len(pairs) <= n * count
+
+
+@given(st.integers(2, 9), st.integers(0, 2**31))
+def test_bridges_join_what_is_apart_by_the_best_pairs_and_nothing_else(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    order = rng.random((n, n))
+    order += order.T
+    every = list(combinations(range(n), 2))
+    chosen = pair_array([pair for pair in every if rng.random() < 0.2])
+    added = bridges(chosen, order)
+    parts, part = _parts(n, chosen)
+    assert len(added) == parts - 1
+    assert _parts(n, np.concatenate([chosen, added]))[0] == 1
+    if parts == 2:
+        across = [pair for pair in every if part[pair[0]] != part[pair[1]]]
+        assert as_set(np.sort(added, axis=1)) == {max(across, key=lambda pair: order[pair])}
+
+
+def _parts(n: int, pairs: np.ndarray) -> Any:
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(n, n))
+    return connected_components(graph, directed=False)
+
+
+def mutual_best_numpy(correlation: Any, xy2: Any, apart2: Any) -> tuple[np.ndarray, np.ndarray]:
+    best, back = correlation.argmax(axis=1), correlation.argmax(axis=0)
+    mutual = back[best] == np.arange(len(best))
+    apart = ((xy2[None] - xy2[best][:, None]) ** 2).sum(axis=2) > apart2[best][:, None]
+    rival = np.where(apart, correlation, -1.0).max(axis=1)
+    return np.where(mutual, best, -1), np.where(mutual, rival, -1.0)
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
+def test_mutual_best_is_its_numpy_twin(rows: int, columns: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    correlation = rng.uniform(-1.0, 1.0, (rows, columns)).astype(np.float32)
+    xy2 = rng.uniform(0.0, 10.0, (columns, 2)).astype(np.float32)
+    apart2 = rng.uniform(0.0, 40.0, columns).astype(np.float32)
+    index, rival = mutual_best(correlation, xy2, apart2)
+    wanted, wanted_rival = mutual_best_numpy(correlation, xy2, apart2)
+    assert index.tolist() == wanted.tolist()
+    np.testing.assert_array_equal(rival, wanted_rival.astype(np.float32))
+
+
+def most_agreeing_numpy(xy1: Any, xy2: Any, scale: Any, angle: Any, limits: Any) -> int:
+    z1, z2 = xy1 @ [1.0, 1.0j], xy2 @ [1.0, 1.0j]
+    turn = scale * np.exp(1j * angle)
+    miss = np.abs(z2[:, None] + turn[:, None] * (z1[None] - z1[:, None]) - z2[None])
+    near = miss <= limits[0]
+    near &= np.abs(np.log(scale[None] / scale[:, None])) <= limits[1]
+    near &= np.abs(np.angle(np.exp(1j * (angle[None] - angle[:, None])))) <= limits[2]
+    np.fill_diagonal(near, False)
+    return int(near.sum(axis=1).max())
+
+
+@given(st.integers(1, 14), st.integers(0, 2**31))
+def test_most_agreeing_is_its_numpy_twin(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    xy1, xy2 = rng.uniform(0.0, 30.0, (2, n, 2))
+    scale, angle = rng.uniform(0.5, 2.0, n), rng.uniform(-4.0, 4.0, n)
+    given_limits = np.array([12.0, 0.6, 0.9])
+    wanted = most_agreeing_numpy(xy1, xy2, scale, angle, given_limits)
+    assert most_agreeing(xy1, xy2, scale, angle, given_limits) == wanted
