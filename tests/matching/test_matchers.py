@@ -24,6 +24,7 @@ SWITCHED: list[Variant] = [
     SeedsAndGrowth(growth=False),
     SeedsAndGrowth(coarse_first=False),
     SeedsAndGrowth(rematch=False),
+    SeedsAndGrowth(neighbours=1),
     SeedsAndGrowth(coarse_first=False, rematch=False),
     SeedsAndGrowth(align=False),
     SeedsAndGrowth(growth=False, align=False),

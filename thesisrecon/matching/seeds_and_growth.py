@@ -163,7 +163,9 @@ class SeedsAndGrowth:
         self, view1: PreparedView, view2: PreparedView, chosen: I64, known: SeedMatches, F: F64
     ) -> Found:
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
-        near = cKDTree(known.xy1).query(xy1, min(self.neighbours, len(known)))[1]
+        # Asked for a list of ranks, the tree answers with a row a corner even where that is one neighbour.
+        ranks = np.arange(1, min(self.neighbours, len(known)) + 1)
+        near = cKDTree(known.xy1).query(xy1, ranks)[1]
         affine, place, spread = fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, self.radius_rel * long_side)

@@ -1,0 +1,123 @@
+"""Photographs that corners and correlation cannot relate, and odd ones that they can, by the front door."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import zoom
+
+from tests.textures import disparity, photograph, sideways_fundamental, stereo_scene, texture
+from thesisrecon import match_pair
+from thesisrecon.config import preset
+from thesisrecon.errors import StageFailure
+from thesisrecon.features import HarrisCorners, MultiScaleCorners
+from thesisrecon.matching import SeedsAndGrowth, StrengthOfMatch
+from thesisrecon.types import F64, TwoView
+
+U8 = NDArray[np.uint8]
+SHAPE = (300, 420)
+PRESETS = pytest.mark.parametrize("name", ["default", "thesis"])
+
+
+def gray(values: F64) -> U8:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def stereo() -> tuple[U8, U8]:
+    left, right = stereo_scene()
+    return left.rgb, right.rgb
+
+
+def related(first: U8, second: U8, name: str) -> TwoView | None:
+    """The pair, or None where it is refused as one that does not match."""
+    try:
+        return match_pair(first, second, config=preset(name))
+    except StageFailure as failure:
+        if "do not match" not in str(failure):
+            raise
+        return None
+
+
+@PRESETS
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_a_photograph_without_texture_is_named(name: str, level: int) -> None:
+    with pytest.raises(StageFailure, match="blank"):
+        match_pair(np.full(SHAPE, level, np.uint8), stereo()[1], config=preset(name))
+
+
+@PRESETS
+def test_a_photograph_of_32_pixels_is_named_with_what_is_needed(name: str) -> None:
+    left, right = stereo()
+    with pytest.raises(StageFailure, match="32 x 32 pixels; 64 x 64"):
+        match_pair(left[:32, :32].copy(), right[:32, :32].copy(), config=preset(name))
+
+
+@pytest.mark.parametrize(
+    ("detector", "matcher"),
+    [(MultiScaleCorners(), SeedsAndGrowth()), (HarrisCorners(), StrengthOfMatch())],
+    ids=["default", "thesis"],
+)
+def test_the_stages_themselves_take_32_pixels(
+    detector: MultiScaleCorners | HarrisCorners, matcher: SeedsAndGrowth | StrengthOfMatch
+) -> None:
+    image = photograph(texture(32, 32))
+    view = matcher.prepare(image, detector.detect(image))
+    rng = np.random.default_rng(0)
+    found = matcher.match(view, view, pair=(0, 1), estimate_fundamental=sideways_fundamental, rng=rng)
+    assert np.abs(found.xy1 - found.xy2).max(initial=0.0) < 1.0
+
+
+@PRESETS
+def test_saturated_photographs_match_rightly_or_not_at_all(name: str) -> None:
+    """Six times too long exposed: only the darkest spots are left."""
+    left, right = (gray(image[:, :, 0] * 6.0) for image in stereo())
+    pair = related(left, right, name)
+    if pair is not None:
+        assert np.median(np.abs(pair.xy1[:, 0] - pair.xy2[:, 0] - disparity(pair.xy2))) < 0.3
+
+
+@PRESETS
+@pytest.mark.parametrize("kind", ["chequers", "stripes", "noise"])
+def test_repeated_patterns_lines_and_noise_do_not_match(name: str, kind: str) -> None:
+    rng = np.random.default_rng(0)
+    rows, columns = np.indices(SHAPE)
+    first = {
+        "chequers": 20.0 + 200.0 * ((rows // 20 + columns // 20) % 2),
+        "stripes": np.repeat(texture(1, SHAPE[1], 3), SHAPE[0], axis=0),
+        "noise": rng.uniform(0, 255, SHAPE),
+    }[kind]
+    second = rng.uniform(0, 255, SHAPE) if kind == "noise" else np.roll(first, 7, axis=1)
+    # On noisy stripes corners slide along them, and all agree with one F: the aperture problem of section 4.1.
+    scale = 0.0 if kind == "stripes" else 3.0
+    noisy = [gray(image + rng.normal(scale=scale, size=SHAPE)) for image in (first, second)]
+    with pytest.raises(StageFailure, match="do not match"):
+        match_pair(*noisy, config=preset(name))
+
+
+@PRESETS
+def test_one_photograph_twice_stays_where_it_is_and_determines_no_geometry(name: str) -> None:
+    left = stereo()[0]
+    pair = related(left, left.copy(), name)
+    if pair is not None:
+        assert np.abs(pair.xy1 - pair.xy2).max() < 0.01
+        assert pair.undetermined
+
+
+def test_photographs_of_different_sizes_match() -> None:
+    left, right = stereo()
+    half = match_pair(left, gray(zoom(right[:, :, 0].astype(np.float64), 0.5, order=1)))
+    # scipy's zoom keeps the centres of the corner pixels.
+    step = (np.array(SHAPE[::-1]) - 1.0) / (np.array(SHAPE[::-1]) / 2.0 - 1.0)
+    whole = half.xy2 * step
+    assert half.inliers > 500
+    assert np.median(np.abs(half.xy1[:, 0] - whole[:, 0] - disparity(whole))) < 0.3
+    upright = match_pair(left, right[:, 60:260].copy())
+    whole = upright.xy2 + np.array([60.0, 0.0])
+    assert upright.inliers > 500
+    assert np.median(np.abs(upright.xy1[:, 0] - whole[:, 0] - disparity(whole))) < 0.1
+
+
+def test_numbers_that_are_no_pixels_are_refused() -> None:
+    with pytest.raises(ValueError, match="uint8"):
+        match_pair(np.full(SHAPE, np.nan), stereo()[1])
