@@ -33,6 +33,31 @@ def test_a_preset_survives_toml(name: str) -> None:
     assert tomllib.loads(toml_from_config(config)) == tables_from_config(config)
 
 
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("features.spread=false", False),
+        ("features.levels=3", 3),
+        ("features.measure.formula=harris", "harris"),
+        ("features.measure.derivative_taps=[-1, 0, 1]", (-1.0, 0.0, 1.0)),
+        ("features.measure.colour=true", True),
+        ("matching.growth=false", False),
+        ("matching.coarse_first=false", False),
+        ("matching.rematch=false", False),
+        ("matching.align=false", False),
+        ("matching.support=never", "never"),
+        ("matching.orientation=upright", "upright"),
+    ],
+)
+def test_the_steps_of_the_front_end_are_switched_by_settings(setting: str, value: object) -> None:
+    config = apply_settings(setting)
+    found = config
+    for name in setting.partition("=")[0].split("."):
+        found = getattr(found, name)
+    assert found == value
+    assert config_from_toml(toml_from_config(config)) == config
+
+
 @pytest.mark.parametrize(("stage", "kind"), [(s, k) for s, kinds in KINDS.items() for k in kinds])
 def test_every_kind_can_be_chosen_by_its_word(stage: str, kind: str) -> None:
     config = apply_settings(f"{stage}.kind={kind}")

@@ -88,7 +88,7 @@ def test_repeated_patterns_lines_and_noise_do_not_match(name: str, kind: str) ->
         "noise": rng.uniform(0, 255, SHAPE),
     }[kind]
     second = rng.uniform(0, 255, SHAPE) if kind == "noise" else np.roll(first, 7, axis=1)
-    # On noisy stripes corners slide along them, and all agree with one F: the aperture problem of section 4.1.
+    # On noisy stripes corners slide along them and all agree with one F: the aperture problem (section 4.1).
     scale = 0.0 if kind == "stripes" else 3.0
     noisy = [gray(image + rng.normal(scale=scale, size=SHAPE)) for image in (first, second)]
     with pytest.raises(StageFailure, match="do not match"):

@@ -110,19 +110,26 @@ class Bench:
 
 @dataclass(frozen=True)
 class Row:
-    """One front end on all pairs of a scene."""
+    """One front end on all pairs of a scene; CPU seconds, means."""
 
     found: Sequence[Related]
     image_s: float
     pair_s: float
 
-    def cells(self) -> str:
-        """verified | right of all | sigma | s per image | s per pair."""
-        right = [f for f in self.found if f.right]
-        sigma = f"{np.median([f.view.sigma_px for f in right]):.3f}" if right else "-"
-        verified = np.mean([f.verified for f in self.found])
-        share = f"{len(right)} of {len(self.found)}"
-        return f"{verified:.0f} | {share} | {sigma} | {self.image_s:.2f} | {self.pair_s:.2f}"
+    @property
+    def right(self) -> Sequence[Related]:
+        """The pairs whose F is right."""
+        return [f for f in self.found if f.right]
+
+    @property
+    def verified(self) -> float:
+        """Verified matches, mean over the pairs; 0 for a wrong F."""
+        return float(np.mean([f.verified for f in self.found]))
+
+    @property
+    def sigma_px(self) -> float:
+        """Median noise of the inliers of right F's."""
+        return float(np.median([f.view.sigma_px for f in self.right] or [np.nan]))
 
 
 def benches(gap: int, most: int, cache: Path) -> Iterator[tuple[str, Bench]]:
@@ -161,13 +168,17 @@ def warm_up(bench: Bench) -> None:
 
 
 def table(title: str, rows: Mapping[str, FrontEnd], scenes: Mapping[str, Bench]) -> str:
-    """A row for each front end and scene."""
-    head = f"| {title} | scene | verified | F right | sigma, px | s per image | s per pair |"
-    lines = [head, "| --- |" + " --- |" * 6]
+    """A row for each front end; numbers of the scenes beside each other."""
+    head = f"| {title}: {', '.join(scenes)} | verified | F right | sigma, px | s per image | s per pair |"
+    lines = [head, "| --- |" + " --- |" * 5]
     for name, front_end in rows.items():
-        for scene, bench in scenes.items():
-            lines.append(f"| {name} | {scene} | {measure(bench, front_end).cells()} |")
-            print(lines[-1], file=sys.stderr, flush=True)
+        found = [measure(bench, front_end) for bench in scenes.values()]
+        verified = ", ".join(f"{row.verified:.0f}" for row in found)
+        right = f"{sum(len(row.right) for row in found)} of {sum(len(row.found) for row in found)}"
+        sigma = ", ".join(f"{row.sigma_px:.3f}" for row in found)
+        seconds = [f"{np.mean([getattr(row, of) for row in found]):.2f}" for of in ("image_s", "pair_s")]
+        lines.append(f"| {name} | {verified} | {right} | {sigma} | {' | '.join(seconds)} |")
+        print(lines[-1], file=sys.stderr, flush=True)
     return "\n".join(lines)
 
 
