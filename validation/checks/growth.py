@@ -4,6 +4,9 @@
 to their matches, each set in a process of its own, once with all pairs and once with the estimate of the
 overlap; all pairs only up to ``--all-pairs-up-to``. The exponents are slopes of straight lines through the
 logarithms; those of time are of processor time, which does not hang on what else the machine does.
+
+By default every ten photographs show a scene of their own, so that each overlaps with as many whatever their
+number; with ``--same-scenes`` all sizes show the same ones, and the overlapping pairs grow with the square.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate
 from thesisrecon.pipeline import reconstruct
 from thesisrecon.types import RunResult
 from validation.main_job import run_process
-from validation.scenes.crops import Crop, make_crops, shared_area
+from validation.scenes.crops import Crop, make_crops, make_separate_crops, shared_area
 from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene
 
 METHODS = ("overlap-estimate", "all-pairs")
@@ -58,11 +61,15 @@ class Growth:
     recall: float | None = None
 
 
-def draw_crops(count: int, long_side: int, seed: int) -> list[Crop]:
-    """The set of this size: parts of the photographs of all scenes that are on this machine."""
+def draw_crops(count: int, long_side: int, seed: int, *, separate: bool = False) -> list[Crop]:
+    """The set of this size: parts of the photographs of all scenes that are on this machine.
+
+    ``separate`` : each ten have a scene of their own, else all scenes give to all sizes.
+    """
     scenes = [load_fixture_scene(), *(load_real_scene(name) for name in REAL_SCENES)]
     paths = [scene.image_paths for scene in scenes if scene is not None]
-    return make_crops(paths, count, long_side=long_side, rng=np.random.default_rng([seed, count]))
+    make = make_separate_crops if separate else make_crops
+    return make(paths, count, long_side=long_side, rng=np.random.default_rng([seed, count]))
 
 
 def configure(method: str) -> PipelineConfig:
@@ -71,9 +78,10 @@ def configure(method: str) -> PipelineConfig:
     return replace(preset("default"), pairs=pairs)
 
 
-def measure_here(method: str, count: int, long_side: int, threads: int, seed: int) -> Growth:
+def measure_here(wishes: argparse.Namespace, method: str, count: int) -> Growth:
     """Take one set up to its matches in this process, warm."""
-    crops = draw_crops(count, long_side, seed)
+    crops = draw_crops(count, wishes.long_side, wishes.seed, separate=not wishes.same_scenes)
+    threads = wishes.threads
     config = configure(method)
     with tempfile.TemporaryDirectory() as place:
         # Loading the compiled kernels is no part of what grows.
@@ -117,8 +125,10 @@ def recall_of(tried: Growth, everything: Growth) -> float:
 
 
 def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """The slope of log cost against log size, least squares."""
-    return float(np.polyfit(np.log(sizes), np.log(np.maximum(costs, 1e-9)), 1)[0])
+    """The slope of log cost against log size, least squares; NaN where all sizes are the same."""
+    if min(sizes) == max(sizes):
+        return float("nan")
+    return float(np.polyfit(np.log(np.maximum(sizes, 1e-9)), np.log(np.maximum(costs, 1e-9)), 1)[0])
 
 
 def table(rows: Sequence[Growth]) -> str:
@@ -183,6 +193,7 @@ def measure(wishes: argparse.Namespace, method: str, count: int) -> Growth:
         command = [sys.executable, "-m", "validation.checks.growth", "--child", method, str(count)]
         command += ["--long-side", str(wishes.long_side), "--threads", str(wishes.threads)]
         command += ["--seed", str(wishes.seed), "-o", str(answer)]
+        command += ["--same-scenes"] if wishes.same_scenes else []
         log = Path(place) / "log"
         environment = {"OPENBLAS_NUM_THREADS": "1"}
         process = run_process(command, log=log, threads=wishes.threads, environment=environment)
@@ -198,15 +209,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m validation.checks.growth", description=__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[10, 30, 100])
     parser.add_argument("--all-pairs-up-to", type=int, default=30)
-    parser.add_argument("--long-side", type=int, default=640)
+    parser.add_argument("--long-side", type=int, default=480)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--same-scenes", action="store_true", help="overlaps grow with the square")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--out", type=Path, help="JSON of the rows")
     parser.add_argument("--child", nargs=2, metavar=("METHOD", "COUNT"), help=argparse.SUPPRESS)
     wishes = parser.parse_args(arguments)
     if wishes.child:
         method, count = wishes.child
-        row = measure_here(method, int(count), wishes.long_side, wishes.threads, wishes.seed)
+        row = measure_here(wishes, method, int(count))
         wishes.out.write_text(json.dumps(asdict(row)), encoding="utf-8")
         return 0
     # Compiling the kernels would take the most memory of all, in whichever process comes first.

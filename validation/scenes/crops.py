@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +58,36 @@ def make_crops(
         rgb = _cut(kept[source], box, long_side)
         name = f"{number:04d}.png"
         crops.append(Crop(Image(name, rgb, (rgb.shape[1], rgb.shape[0])), source, scene, box))
+    return crops
+
+
+def make_separate_crops(
+    scenes: Sequence[Sequence[Path]],
+    count: int,
+    *,
+    long_side: int,
+    rng: np.random.Generator,
+    per_scene: int = 10,
+) -> list[Crop]:
+    """As :func:`make_crops`, but every ``per_scene`` photographs have a scene of their own.
+
+    So a photograph overlaps with as many others however many there are. Where the sets do not suffice they
+    come again as negatives, mirrored, and as mirrored negatives, which show nothing that the first ones show.
+    Raises ``ValueError`` where these do not suffice either.
+    """
+    most = 4 * len(scenes) * per_scene
+    if count > most:
+        raise ValueError(f"{len(scenes)} sets make at most {most} photographs; got {count}")
+    crops: list[Crop] = []
+    for k in range(-(-count // per_scene)):
+        change, scene = divmod(k, len(scenes))
+        want = min(per_scene, count - len(crops))
+        for crop in make_crops([scenes[scene]], want, long_side=long_side, rng=rng):
+            rgb = 255 - crop.image.rgb if change % 2 else crop.image.rgb
+            rgb = np.ascontiguousarray(rgb[:, ::-1]) if change >= 2 else rgb
+            image = replace(crop.image, name=f"{len(crops):04d}.png", rgb=rgb)
+            # Photographs of other scenes have other numbers.
+            crops.append(replace(crop, image=image, scene=k, source=1000 * k + crop.source))
     return crops
 
 
