@@ -135,7 +135,9 @@ class Certainty:
 class FundamentalFit:
     """A robust estimate of F: ``F`` (3, 3) unit Frobenius norm, ``inliers`` (M,) bool, ``sigma_px`` the
     standard deviation of one image coordinate estimated from the inliers, ``covariance`` (9, 9) of vec(F)
-    row-major. ``certainty`` says whether the matches determine it, None where nobody asked.
+    row-major. ``rivals`` (K, 3, 3) are other matrices that the search ended at, the best first: where they
+    explain about as many matches, F is one of several. ``certainty`` says whether the matches determine it,
+    None where nobody asked.
     """
 
     F: F64
@@ -143,6 +145,7 @@ class FundamentalFit:
     sigma_px: float
     covariance: F64
     iterations: int = 0
+    rivals: F64 = field(default_factory=lambda: np.empty((0, 3, 3)))
     certainty: Certainty | None = None
 
 

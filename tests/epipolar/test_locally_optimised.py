@@ -61,6 +61,20 @@ def test_noise_beyond_the_threshold_is_not_invented_for_wrong_matches():
         assert fit.inliers[wrong].mean() < 0.05
 
 
+def test_other_ends_of_the_search_are_told_as_rivals():
+    """Two motions of as many matches each: the one that is not taken is the first rival."""
+    rng = np.random.default_rng(0)
+    one, other = make_pair(60, rng), make_pair(60, np.random.default_rng(1))
+    xy1, xy2 = np.vstack([one.xy1, other.xy1]), np.vstack([one.xy2, other.xy2])
+    noisy1, noisy2 = (xy + rng.normal(0.0, 0.2, xy.shape) for xy in (xy1, xy2))
+    fit = LocallyOptimisedRansac(starts=8).estimate(noisy1, noisy2, np.random.default_rng(0))
+    everyone = np.ones(60, dtype=bool)
+    errors = [[squared_error(F, pair, everyone) for pair in (one, other)] for F in (fit.F, *fit.rivals)]
+    taken = int(np.argmin(errors[0]))
+    assert errors[0][taken] < 0.5
+    assert min(error[1 - taken] for error in errors[1:]) < 0.5
+
+
 def test_searches_that_disagree_are_repeated():
     rng = np.random.default_rng(2)
     pair = make_pair(100, rng)

@@ -46,6 +46,7 @@ FEW_MATCHES = 28.0
 """How much wider the last loss is for few matches: by 1 + 28 / (n - 7), as a fit bends to what it keeps."""
 COVERED = 3.0
 """Standard deviations within which nearly all noise lies."""
+RIVALS = 3
 WIDER, RING = 4.0, 15.0
 """Gate of the second search, and how far beyond the noise is looked whether it goes on, in gates."""
 EXCESS = 0.25
@@ -124,11 +125,13 @@ class LocallyOptimisedRansac:
         return self._finish(frame, found, points)
 
     def _candidate(self, points: F64, gate: float, rng: Generator) -> _Candidate:
-        f, samples = self._best_of_starts(points, gate, rng)
+        ends, samples = self._starts(points, gate, rng)
+        f, rivals = _best_and_rivals(ends)
         noise, loss = _sharpen(f, points, gate) if f.any() else (None, (0.0, 0.0))
-        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss)
+        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, rivals)
 
-    def _best_of_starts(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
+    def _starts(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
+        """Score and matrix (9,) where each search ended, until enough agree; and the samples drawn."""
         found: list[tuple[float, F64]] = []
         samples = 0
         for _ in range(self.max_starts):
@@ -143,7 +146,7 @@ class LocallyOptimisedRansac:
             agreeing = sum(score - best < SAME_SCORE for score, _ in found)
             if agreeing >= self.starts + (len(found) - agreeing) // 2 or samples >= self.max_samples:
                 break
-        return min(found, key=lambda start: start[0], default=(np.inf, np.zeros(9)))[1], samples
+        return found, samples
 
     def _refine_start(self, f: F64, points: F64, gate: float) -> None:
         for width in self.gates[:-1]:
@@ -179,7 +182,8 @@ class LocallyOptimisedRansac:
         effective = effective_noise(r[fitted], found.loss[1], parameters=PARAMETERS)
         covariance = fundamental_covariance(frame, found.f, points[fitted], effective)
         F = frame.matrix_in_pixels(found.f)
-        return FundamentalFit(F, inliers, noise.sigma / frame.scale, covariance, found.samples)
+        rivals = np.array([frame.matrix_in_pixels(f) for f in found.rivals]).reshape(-1, 3, 3)
+        return FundamentalFit(F, inliers, noise.sigma / frame.scale, covariance, found.samples, rivals)
 
 
 @dataclass(frozen=True)
@@ -187,6 +191,7 @@ class _Candidate:
     """A matrix ``f`` (9,), the samples it took, its residuals (N,) and their noise, None for no F.
 
     ``loss`` is what it was fitted with: where matches stop to count and where Huber's loss turns linear.
+    ``rivals`` are where other searches ended.
     """
 
     f: F64
@@ -194,6 +199,7 @@ class _Candidate:
     residuals: F64
     noise: NoiseMixture | None
     loss: tuple[float, float]
+    rivals: list[F64]
 
     def explains_more_than(self, rival: _Candidate) -> bool:
         """Whether this, found with a wider gate, is likelier and leaves few matches unexplained.
@@ -208,6 +214,19 @@ class _Candidate:
         left = len(self.residuals) - explained
         few = left <= max(more, FEW_WRONG * len(self.residuals))
         return few and self.noise.log_likelihood > rival.noise.log_likelihood
+
+
+def _best_and_rivals(ends: list[tuple[float, F64]]) -> tuple[F64, list[F64]]:
+    """The matrix with the lowest score, 0 where there is none, and the next of clearly other scores."""
+    best, last = np.zeros(9), -np.inf
+    rivals: list[F64] = []
+    for score, f in sorted(ends, key=lambda end: end[0]):
+        if last == -np.inf:
+            best = f
+        elif score - last >= SAME_SCORE and len(rivals) < RIVALS:
+            rivals.append(f)
+        last = score
+    return best, rivals
 
 
 def _noise(r: F64, gate: float) -> NoiseMixture | None:

@@ -23,7 +23,7 @@ from thesisrecon.epipolar.certainty.plane import (
     log10_false_alarms,
     once_each,
 )
-from thesisrecon.epipolar.certainty.rivals import Rival, find_rivals
+from thesisrecon.epipolar.certainty.rivals import Rival, compare_rivals, find_rivals
 from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.precision import epipolar_distance_std
 from thesisrecon.types import Certainty, FundamentalFit
@@ -59,10 +59,11 @@ def judge_certainty(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) 
     """Whether the matches (N, 2) px, wrong ones too, leave only ``fit`` as their epipolar geometry.
 
     Undetermined where fewer matches off the dominant plane agree with F than would be a surprise by chance,
-    where another F of that plane explains about as many (McNemar's test, distances that matter), where more
-    than a fifth of those off the plane are contradicted by neighbours on it, or where the covariance lets the
-    inliers be more than a pixel off their lines. A pure translation is determined. Wrong matches that are as
-    coherent as a surface (a whole facade shifted by a window) cannot be told from one.
+    where another F, of that plane or from another search, explains about as many (McNemar's test, distances
+    that matter), where more than a fifth of those off the plane are contradicted by neighbours on it, or
+    where the covariance lets the inliers be more than a pixel off their lines. A pure translation is
+    determined. Wrong matches that are as coherent as a surface (a whole facade shifted by a window) cannot be
+    told from one.
 
     Raises ``ValueError`` where ``fit`` and the matches do not belong together, and as
     :func:`~thesisrecon.epipolar.frame.check_matches`.
@@ -80,6 +81,8 @@ def judge_certainty(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) 
         return Certainty(False, ("too few matches agree with the geometry",), expected_error_px=error_px)
     weights = once_each(xy1, xy2)
     rivals, share = find_rivals(f, points, weights, plane, band=band_px * frame.scale, rng=rng)
+    ends = [frame.matrix_in_frame(F) for F in fit.rivals]
+    rivals += compare_rivals(ends, f, points, weights, band=band_px * frame.scale)
     support = _support(points, fit.inliers, weights, plane, 2.0 * sigma_px * frame.scale)
     chance = log10_false_alarms(
         support.agreeing - support.contradicted,
@@ -149,7 +152,7 @@ def _reasons(
         )
     if rival is not None and rival.margin < LEAST_MARGIN:
         reasons.append(
-            f"another geometry of the same plane explains {rival.gained:.0f} matches that it does not, and "
+            f"another geometry explains {rival.gained:.0f} matches that it does not, and "
             f"leaves {rival.lost:.0f} of its own"
         )
     if error_px > matters_px:

@@ -102,6 +102,13 @@ def _refined(f: F64, points: F64, band: float) -> F64:
     return f
 
 
+def compare_rivals(others: list[F64], f: F64, points: F64, weights: F64, *, band: float) -> list[Rival]:
+    """Other matrices (9,) in the frame as rivals of ``f``, each refined on all ``points`` (N, 4)."""
+    distances = np.asarray(sampson_distances(f, points))
+    found = (distances, distances < band)
+    return [_rival(_refined(other, points, band), points, weights, found, band) for other in others]
+
+
 def _rival(f: F64, points: F64, weights: F64, found: tuple[F64, B8], band: float) -> Rival:
     distances, inside = found
     own = np.asarray(sampson_distances(f, points))
