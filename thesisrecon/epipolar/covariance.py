@@ -27,9 +27,10 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
     normal_equations(f, points, GRADIENT, np.inf, 1e150, G, h)
     values, vectors = np.linalg.eigh(B.T @ G @ B)
     half = B @ (vectors / np.sqrt(np.maximum(values, FLATTEST_REL * max(values[-1], 1e-300))))
-    pixels = frame.to_pixels @ f
+    to_pixels = frame.to_pixels
+    pixels = to_pixels @ f
     norm = float(np.linalg.norm(pixels))
-    moved = frame.to_pixels @ half / norm
+    moved = to_pixels @ half / norm
     moved -= np.outer(pixels, pixels @ moved) / norm**2
     covariance: F64 = sigma**2 * moved @ moved.T
     return covariance

@@ -107,7 +107,8 @@ class PairFrame:
 
     def matrix_in_pixels(self, f: F64) -> F64:
         """F (3, 3) in pixels, unit norm, from a flat vector (9,) in the frame."""
-        return unit_norm((self.to_pixels @ f).reshape(3, 3))
+        T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
+        return unit_norm(T2.T @ f.reshape(3, 3) @ T1)
 
     def matrix_in_frame(self, F: F64) -> F64:
         """Flat unit vector (9,) in the frame from F (3, 3) in pixels."""

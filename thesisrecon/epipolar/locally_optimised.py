@@ -36,8 +36,8 @@ PRIOR = (100.0, 5.0)
 """What is thought of wrong matrices before the first was seen: of 100 points 5 lie within the gate."""
 EXACT = 1e-9
 """Smallest width of the loss (in units of the spread of the points), for matches without noise."""
-SHARES = 4
-"""Parts of ``max_samples`` and of the confidence; each start may take one."""
+SHARES, TRIES = 4, 6
+"""Starts that the least samples are shared by, and starts of which one sees a sample free of outliers."""
 SAME_SCORE = 0.3
 """Sums of truncated squares that differ by less are of one minimum: a match more changes them by 1."""
 SPREAD = 1.0
@@ -73,7 +73,7 @@ class LocallyOptimisedRansac:
     Parameters
     ----------
     threshold_px : Sampson distance beyond which a match counts as wrong during the search.
-    confidence : probability that four starts saw a sample free of outliers.
+    confidence : probability that one of six starts sees a sample free of outliers; those that agree are sure.
     starts : searches that must end at the same score.
     max_starts : searches after which the best is taken though they disagree.
     min_samples : samples of four starts, however many inliers were found: where most of the scene is one
@@ -157,7 +157,7 @@ class LocallyOptimisedRansac:
     def _search(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
         least, most = self.min_samples // SHARES, self.max_samples // self.max_starts
-        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / SHARES)
+        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / TRIES)
         drawn = 0
         while drawn < most:
             uniforms = rng.random((min(BATCH, most - drawn), 7))
