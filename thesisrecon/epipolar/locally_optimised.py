@@ -36,10 +36,10 @@ PRIOR = (100.0, 5.0)
 """What is thought of wrong matrices before the first was seen: of 100 points 5 lie within the gate."""
 EXACT = 1e-9
 """Smallest width of the loss (in units of the spread of the points), for matches without noise."""
-SHARES, TRIES = 4, 6
-"""Starts that the least samples are shared by, and starts of which one sees a sample free of outliers."""
-SAME_SCORE = 0.3
-"""Sums of truncated squares that differ by less are of one minimum: a match more changes them by 1."""
+SHARES = 6
+"""Starts that the least samples are shared by, and of which one sees a sample free of outliers."""
+SAME_SCORE = 0.03
+"""Sums of truncated squares of N matches that differ by less than this times sqrt(N) are of one minimum."""
 SPREAD = 1.0
 """Of wrong matches before any was seen, in units of the spread of the points."""
 FEW_MATCHES = 28.0
@@ -76,7 +76,7 @@ class LocallyOptimisedRansac:
     confidence : probability that one of six starts sees a sample free of outliers; those that agree are sure.
     starts : searches that must end at the same score.
     max_starts : searches after which the best is taken though they disagree.
-    min_samples : samples of four starts, however many inliers were found: where most of the scene is one
+    min_samples : samples of six starts, however many inliers were found: where most of the scene is one
         plane, a wrong F has many too.
     max_samples : samples of all starts together, whatever the confidence.
     gates : widths of the loss in thresholds, one refinement each, in this order.
@@ -103,7 +103,7 @@ class LocallyOptimisedRansac:
         if not 1 <= self.starts <= self.max_starts:
             raise ValueError(f"starts must lie in [1, max_starts]; got {self.starts} and {self.max_starts}")
         if self.max_samples < SHARES or min(self.gates, default=0.0) <= 0.0:
-            raise ValueError("a search needs at least four samples and gates above 0")
+            raise ValueError("a search needs at least six samples and gates above 0")
         if not self.inlier_sigmas > 0.0:
             raise ValueError(f"inlier_sigmas must be positive; got {self.inlier_sigmas}")
 
@@ -126,7 +126,7 @@ class LocallyOptimisedRansac:
 
     def _candidate(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         ends, samples = self._starts(points, gate, rng)
-        f, rivals = _best_and_rivals(ends)
+        f, rivals = _best_and_rivals(ends, SAME_SCORE * len(points) ** 0.5)
         noise, loss = _sharpen(f, points, gate) if f.any() else (None, (0.0, 0.0))
         return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, rivals)
 
@@ -143,7 +143,7 @@ class LocallyOptimisedRansac:
                 score, _, _ = truncated_score(f, np.ascontiguousarray(shuffled.T), gate, 1.0, (0.0, 0.0))
                 found.append((score * len(points), f))
             best = min((score for score, _ in found), default=np.inf)
-            agreeing = sum(score - best < SAME_SCORE for score, _ in found)
+            agreeing = sum(score - best < SAME_SCORE * len(points) ** 0.5 for score, _ in found)
             if agreeing >= self.starts + (len(found) - agreeing) // 2 or samples >= self.max_samples:
                 break
         return found, samples
@@ -157,7 +157,7 @@ class LocallyOptimisedRansac:
     def _search(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
         least, most = self.min_samples // SHARES, self.max_samples // self.max_starts
-        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / TRIES)
+        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / SHARES)
         drawn = 0
         while drawn < most:
             uniforms = rng.random((min(BATCH, most - drawn), 7))
@@ -216,14 +216,14 @@ class _Candidate:
         return few and self.noise.log_likelihood > rival.noise.log_likelihood
 
 
-def _best_and_rivals(ends: list[tuple[float, F64]]) -> tuple[F64, list[F64]]:
-    """The matrix with the lowest score, 0 where there is none, and the next of clearly other scores."""
+def _best_and_rivals(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:
+    """The matrix with the lowest score, 0 where there is none, and the next ones, each ``same`` or more above."""
     best, last = np.zeros(9), -np.inf
     rivals: list[F64] = []
     for score, f in sorted(ends, key=lambda end: end[0]):
         if last == -np.inf:
             best = f
-        elif score - last >= SAME_SCORE and len(rivals) < RIVALS:
+        elif score - last >= same and len(rivals) < RIVALS:
             rivals.append(f)
         last = score
     return best, rivals
