@@ -217,7 +217,7 @@ class _Candidate:
 
 
 def _best_and_rivals(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:
-    """The matrix with the lowest score, 0 where there is none, and the next ones, each ``same`` or more above."""
+    """The matrix with the lowest score, 0 where there is none, and the next, each ``same`` or more above."""
     best, last = np.zeros(9), -np.inf
     rivals: list[F64] = []
     for score, f in sorted(ends, key=lambda end: end[0]):
