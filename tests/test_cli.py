@@ -187,6 +187,7 @@ def test_the_written_config_runs_again(
         (["reconstruct", ".", "-o", "out", "--max-size", "5"], "at least 64"),
         (["reconstruct", ".", "-o", "out", "--pairs", "window:0"], "a window of 0 gives no pairs"),
         (["reconstruct", ".", "-o", "out", "--pairs", "window"], "takes a whole number"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "window:--5"], "takes a whole number"),
         (["reconstruct", ".", "-o", "out", "--pairs", "most"], "all, overlap, window:N, or a file"),
         (["reconstruct", ".", "-o", "out", "--set", "pairs.kind=some"], "unknown kind of pairs"),
         (["inspect", "nowhere"], "no summary"),
@@ -298,3 +299,18 @@ def test_a_list_of_pairs_is_read_matched_and_told(
         wish.write_text(line, encoding="utf-8")
         assert run_command([*given, "--pairs", str(wish), "--overwrite"]) == 2
         assert words in capsys.readouterr().err
+    # The run that was there is whole.
+    assert json.loads((out / "run.json").read_text(encoding="utf-8"))["settings"]["pairs"]["listed"][0] == [
+        names[1],
+        names[0],
+    ]
+    assert (out / "report.html").is_file()
+
+
+def test_a_list_of_pairs_that_was_mended_needs_no_overwriting(photographs: Path, tmp_path: Path) -> None:
+    names = sorted(path.name for path in photographs.iterdir())
+    wish, out = tmp_path / "pairs.txt", tmp_path / "out"
+    given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
+    for line, code in ((f"{names[0]} nope.jpg", 2), (f"{names[0]} {names[1]}", 0)):
+        wish.write_text(line, encoding="utf-8")
+        assert run_command([*given, "--pairs", str(wish)]) == code

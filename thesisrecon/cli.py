@@ -206,9 +206,10 @@ def _pairs_table(wish: str) -> dict[str, Any]:
         return {"kind": words[wish]}
     word, colon, number = wish.partition(":")
     if word == "window" and (colon or not Path(wish).is_file()):
-        if not number.strip().lstrip("-").isdecimal():
-            raise UsageError(f"--pairs window:N takes a whole number of photographs; got {wish!r}")
-        return {"kind": "sequence-window", "window": int(number)}
+        try:
+            return {"kind": "sequence-window", "window": int(number)}
+        except ValueError:
+            raise UsageError(f"--pairs window:N takes a whole number of photographs; got {wish!r}") from None
     if not Path(wish).is_file():
         raise UsageError(
             f"--pairs takes all, overlap, window:N, or a file of pairs; there is no file {wish!r}"

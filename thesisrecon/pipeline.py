@@ -70,6 +70,7 @@ def reconstruct(
     # Reading photographs takes long: whether the folder is free for this run is asked before.
     with run.directory.claimed(_wishes(run), overwrite=overwrite):
         photographs = _read(run, images)
+        _check_pairs(run, photographs, until)
         run.directory.adopt(_identity(run, photographs), overwrite=overwrite, results=RESULT_FILES)
         work = _Work(run, photographs, _empty_result(run, photographs), until)
         try:
@@ -112,8 +113,6 @@ class _Work:
                 f"at least {needed} different ones are needed{'; ' + why if why else ''}",
                 "take more photographs of the scene from other places",
             )
-        if self.until != "features":
-            self.config.pairs.check([image.name for image in self.result.images], self.result.refused)
 
 
 def _read(run: Run, images: ImageSource) -> PhotographSet:
@@ -128,6 +127,13 @@ def _read(run: Run, images: ImageSource) -> PhotographSet:
     warnings = [*notes, *refusals, *prior_warnings(run.config.intrinsics, photographs.exif_focal_px)]
     run.finish("images", counts={"read": found, "refused": refused}, warnings=warnings)
     return photographs
+
+
+def _check_pairs(run: Run, photographs: PhotographSet, until: str) -> None:
+    """Refuse a choice of pairs that does not fit, before the folder becomes that of this run: a list that is
+    mended must find it as it was."""
+    if until != "features" and len(photographs.images) >= 2:
+        run.config.pairs.check([image.name for image in photographs.images], photographs.refused)
 
 
 def _wishes(run: Run) -> dict[str, Any]:

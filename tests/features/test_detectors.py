@@ -210,6 +210,25 @@ def test_a_measure_that_cannot_be_is_refused(field: str, value: object) -> None:
         CornerMeasure(**{field: value})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("kind", "field", "value"),
+    [
+        (HarrisCorners, "max_corners", 0),
+        (HarrisCorners, "threshold_rel", 2.0),
+        (HarrisCorners, "threshold_rel", np.nan),
+        (HarrisCorners, "spacing_rel", -0.1),
+        (HarrisCorners, "pool_ratio", 0.5),
+        (MultiScaleCorners, "seeds_per_level", -5),
+        (MultiScaleCorners, "pool_ratio", 0.0),
+        (MultiScaleCorners, "full_corners", -1),
+        (MultiScaleCorners, "levels", 0),
+    ],
+)
+def test_a_detector_that_cannot_be_is_refused(kind: type, field: str, value: float) -> None:
+    with pytest.raises(ValueError, match=field):
+        kind(**{field: value})
+
+
 def test_values_that_are_not_finite_are_refused() -> None:
     gray = texture(60, 60).astype(np.float32)
     gray[30, 30] = np.nan

@@ -24,6 +24,12 @@ def test_names_with_and_without_blanks(tmp_path: Path) -> None:
     ]
 
 
+def test_the_mark_and_the_line_ends_of_other_systems_belong_to_no_name(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    path.write_bytes(b"\xef\xbb\xbfa.jpg b.jpg\r\nc.jpg\td.jpg\r\n")
+    assert read_pairs(path) == [("a.jpg", "b.jpg"), ("c.jpg", "d.jpg")]
+
+
 @pytest.mark.parametrize("line", ["a.jpg", "a.jpg b.jpg c.jpg", 'a.jpg "b.jpg', "a\tb\tc"])
 def test_a_line_that_is_no_pair_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "pairs.txt"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.textures import disparity, photograph, sideways_fundamental, stereo_scene, texture
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.features import HarrisCorners, MultiScaleCorners
 from thesisrecon.matching import PreparedView, SeedsAndGrowth, StrengthOfMatch
 from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
@@ -109,7 +109,7 @@ def test_no_fundamental_matrix_leaves_no_matches() -> None:
 def test_corners_without_seeds_are_refused() -> None:
     variant = SeedsAndGrowth()
     one, two = views(HarrisCorners(), variant, *stereo_scene(120, 160))
-    with pytest.raises(ValueError, match="seeds"):
+    with pytest.raises(UsageError, match=r"features\.kind=multi-scale-corners"):
         run(variant, one, two)
 
 
@@ -186,11 +186,29 @@ def test_relative_difference_and_thresholds_drop_wrong_matches() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("window", 8), ("radius_rel", 0.0), ("candidates", 0), ("tolerance", 0.0)]
+    ("field", "value"),
+    [("window", 8), ("radius_rel", 0.0), ("candidates", 0), ("tolerance", 0.0), ("least_strength", 5.0)],
 )
 def test_a_strength_that_cannot_be_is_refused(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=field):
         StrengthOfMatch(**{field: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("neighbours", 0),
+        ("least_seeds", 0),
+        ("ratio", 0.0),
+        ("grown_ratio", -1.0),
+        ("band_rel", 0.0),
+        ("radius_rel", -1.0),
+        ("affine_std", -1.0),
+    ],
+)
+def test_a_growth_that_cannot_be_is_refused(field: str, value: float) -> None:
+    with pytest.raises(ValueError, match=field):
+        SeedsAndGrowth(**{field: value})  # type: ignore[arg-type]
 
 
 def test_corners_of_seeds_are_one_to_one_and_follow_the_map() -> None:

@@ -42,6 +42,17 @@ class HarrisCorners:
     pool_ratio: float = 1.7
     measure: CornerMeasure = field(default_factory=CornerMeasure)
 
+    def __post_init__(self) -> None:
+        if self.max_corners < 1:
+            raise ValueError(f"max_corners must be at least 1; got {self.max_corners}")
+        if not 0.0 <= self.threshold_rel <= 1.0:
+            raise ValueError(f"threshold_rel must lie between 0 and 1; got {self.threshold_rel}")
+        if not (self.spacing_rel >= 0.0 and self.pool_ratio >= 1.0):
+            raise ValueError(
+                "spacing_rel must be at least 0 and pool_ratio at least 1; "
+                f"got {self.spacing_rel} and {self.pool_ratio}"
+            )
+
     def detect(self, image: Image) -> Features:
         """Corners of one photograph, strongest first, at scale 1; none where the image has no structure."""
         xy, response = find_corners(self.measure.channels(image), self.measure)

@@ -67,6 +67,11 @@ class MultiScaleCorners:
                 "full_corners and half_corners must be at least 0, and one of them above; "
                 f"got {self.full_corners} and {self.half_corners}"
             )
+        if not (self.seeds_per_level >= 0 and self.pool_ratio >= 1.0):
+            raise ValueError(
+                "seeds_per_level must be at least 0 and pool_ratio at least 1; "
+                f"got {self.seeds_per_level} and {self.pool_ratio}"
+            )
 
     def detect(self, image: Image) -> Features:
         """Corners, strongest first (scale 1 and 2, or 0.5 and 1 where doubled), and seeds."""

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.matching.alignment import aligned_matches, strongest_distinct
 from thesisrecon.matching.kernels import fit_local_affines, grow_corners
 from thesisrecon.matching.prepared import PreparedView, prepare_view
@@ -65,6 +65,16 @@ class SeedsAndGrowth:
     rematch: bool = True
     align: bool = True
 
+    def __post_init__(self) -> None:
+        for name in ("least_seeds", "neighbours"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
+        for name in ("ratio", "grown_ratio", "band_rel", "radius_rel"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}")
+        if not self.affine_std >= 0.0:
+            raise ValueError(f"affine_std must be at least 0; got {self.affine_std}")
+
     def prepare(self, image: Image, features: Features) -> PreparedView:
         """What is computed once for a photograph."""
         return prepare_view(image, features)
@@ -78,9 +88,15 @@ class SeedsAndGrowth:
         estimate_fundamental: FundamentalEstimator,
         rng: np.random.Generator,
     ) -> Matches:
-        """Corner matches of two photographs, one-to-one, aligned to sub-pixel; empty if none."""
+        """Corner matches of two photographs, one-to-one, aligned to sub-pixel; empty if none.
+
+        Raises :class:`UsageError` for features without seeds.
+        """
         if view1.features.seeds is None or view2.features.seeds is None:
-            raise ValueError("SeedsAndGrowth needs features with seeds; MultiScaleCorners finds them")
+            raise UsageError(
+                "matching by seeds and growth needs features with seeds; set "
+                "features.kind=multi-scale-corners, or matching.kind=strength-of-match"
+            )
         start = self._verified_seeds(view1, view2, estimate_fundamental, rng)
         if start is None:
             return empty_matches(pair)

@@ -67,6 +67,8 @@ class StrengthOfMatch:
             raise ValueError(
                 f"radius_rel and tolerance must be above 0; got {self.radius_rel} and {self.tolerance}"
             )
+        if not 0.0 <= self.least_strength < 1.0:
+            raise ValueError(f"least_strength must lie in [0, 1); got {self.least_strength}")
 
     def prepare(self, image: Image, features: Features) -> PreparedView:
         """What is computed once for a photograph."""
