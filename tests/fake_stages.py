@@ -165,11 +165,9 @@ class FakeProjective:
 class FakeCalibrator:
     identifiable: bool = True
 
-    def calibrate(
-        self, reconstruction: Reconstruction, *, groups: Any, focal_prior: Any, rng: Any
-    ) -> SelfCalibration:
-        CALLS.append(f"calibrate prior={focal_prior is not None}")
-        Ks = np.broadcast_to(K, (len(groups), 3, 3)).copy()
+    def calibrate(self, reconstruction: Reconstruction, *, assumed: Any, rng: Any) -> SelfCalibration:
+        CALLS.append(f"calibrate prior={assumed.focal_known.any()}")
+        Ks = np.broadcast_to(K, (len(assumed.mean), 3, 3)).copy()
         upgrade = Upgrade(np.eye(4), Ks, 0.0, "fake")
         why = () if self.identifiable else ("the camera only rotates",)
         return SelfCalibration(np.eye(4), Ks, np.zeros_like(Ks), self.identifiable, why, (upgrade,))
@@ -181,11 +179,11 @@ class FakeMetric:
     doubts: tuple[str, ...] = ("odd focal",)
 
     def refine(
-        self, reconstruction: Reconstruction, calibration: Any, *, groups: Any, focal_prior: Any, rng: Any
+        self, reconstruction: Reconstruction, calibration: Any, *, assumed: Any, rng: Any
     ) -> MetricResult:
         attempt = sum(call.startswith("metric") for call in CALLS)
         CALLS.append(f"metric {attempt}")
-        views = len(groups)
+        views = len(assumed.mean)
         intervals = {
             "focal_px": IntrinsicInterval(100.0, 1.0, "fake"),
             "principal_x_px": IntrinsicInterval(47.0, 0.5, "fake"),

@@ -10,7 +10,8 @@ import pytest
 
 import thesisrecon
 from tests import fake_stages as fakes
-from thesisrecon.config import ImageOptions, IntrinsicsAssumption, PipelineConfig
+from thesisrecon.assumptions import IntrinsicsAssumption
+from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.report.summary import original_from_working, point_colours
 from thesisrecon.types import Image, Reconstruction, Tracks
@@ -63,16 +64,18 @@ def test_self_calibration_groups_views_by_size_and_takes_a_prior() -> None:
     heard = []
 
     class Listening(fakes.FakeCalibrator):
-        def calibrate(self, reconstruction, *, groups, focal_prior, rng):  # type: ignore[no-untyped-def]
-            heard.append((groups.tolist(), focal_prior))
-            return super().calibrate(reconstruction, groups=groups, focal_prior=focal_prior, rng=rng)
+        def calibrate(self, reconstruction, *, assumed, rng):  # type: ignore[no-untyped-def]
+            heard.append(assumed)
+            return super().calibrate(reconstruction, assumed=assumed, rng=rng)
 
     config = fakes.fake_config(selfcalibration=Listening())
     thesisrecon.self_calibrate(small_reconstruction(), config=config)
     wish = IntrinsicsAssumption(focal_px=50.0, focal_std_rel=0.1, cameras="per-image")
     thesisrecon.self_calibrate(small_reconstruction(), config=replace(config, intrinsics=wish))
-    assert heard[0] == ([0, 1], None)
-    assert heard[1][1].focal_px.tolist() == [50.0, 50.0]
+    assert heard[0].group.tolist() == [0, 1]
+    assert not heard[0].focal_known.any()
+    assert heard[1].focal_known.all()
+    assert heard[1].mean[:, 0].tolist() == [50.0, 50.0]
 
 
 def test_triangulate_and_estimate_fundamental_are_front_doors() -> None:

@@ -17,8 +17,8 @@ import pytest
 
 from tests import fake_stages as fakes
 from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
-from thesisrecon.assumptions import camera_groups, prior_warnings
-from thesisrecon.config import ImageOptions, IntrinsicsAssumption
+from thesisrecon.assumptions import IntrinsicsAssumption, camera_groups, prior_warnings
+from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline import reconstruct

@@ -1,13 +1,88 @@
-"""What the user lets the pipeline assume of the cameras, as the stages take it."""
+"""What the user lets the pipeline assume of the cameras: the wish in words, and as the stages take it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from thesisrecon.config import IntrinsicsAssumption
-from thesisrecon.types import F64, I64, FocalPrior
+from thesisrecon.types import F64, I64, INTRINSICS, Assumptions, Reconstruction
+
+Mode = Literal["known", "constant", "free"]
+"""``known``: has the given value; ``constant``: one unknown value per camera; ``free``: another in every
+photograph."""
+
+
+@dataclass(frozen=True)
+class IntrinsicsAssumption:
+    """What is assumed of the intrinsics. By default nothing of the focal length; square pixels without skew;
+    a principal point within a few hundredths of the image's middle; a moderate radial distortion.
+
+    Every intrinsic has a mode (:data:`Mode`), a value and, where it is not known exactly, the value's
+    standard deviation; ``none`` for the deviation: the value is only a place to start.
+
+    Parameters
+    ----------
+    cameras : "shared": all photographs of one size come from one camera; "per-image": each has its own, and
+        what is constant in a camera varies from photograph to photograph.
+    alike : photographs of one size come from cameras of one kind: where they do not share a value, their
+        values are taken to scatter about a common one. How much they scatter is measured.
+    focal, focal_px, focal_std_rel : the focal length in pixels of the original photographs and its relative
+        standard deviation, which must be given with it (unless the mode is known).
+    exif : take the focal length of the EXIF header (35 mm equivalent) where there is one and ``focal_px`` is
+        not given.
+    aspect, aspect_ratio, aspect_std : height over width of a pixel, fy / fx.
+    skew, skew_px, skew_std_px : in pixels of the original photographs.
+    principal_point, principal_point_px, principal_point_std_rel : in pixels of the original photographs
+        (None: the middle of the image); the deviation is a share of the long side.
+    k1, k1_value, k1_std : radial distortion, a pure number.
+    """
+
+    cameras: Literal["shared", "per-image"] = "shared"
+    alike: bool = True
+    focal: Mode = "constant"
+    focal_px: float | None = None
+    focal_std_rel: float | None = None
+    exif: bool = False
+    aspect: Mode = "known"
+    aspect_ratio: float = 1.0
+    aspect_std: float | None = None
+    skew: Mode = "known"
+    skew_px: float = 0.0
+    skew_std_px: float | None = None
+    principal_point: Mode = "constant"
+    principal_point_px: tuple[float, float] | None = None
+    principal_point_std_rel: float | None = 0.01
+    k1: Mode = "constant"
+    k1_value: float = 0.0
+    k1_std: float | None = 0.05
+
+    def __post_init__(self) -> None:
+        wanted = self.exif or self.focal_px is not None
+        if wanted and self.focal != "known" and self.focal_std_rel is None:
+            raise ValueError(
+                "a focal prior needs its weight: set focal_std_rel (0.1 means 'within about 10 %')"
+            )
+        if self.focal == "known" and not wanted:
+            raise ValueError("a known focal needs its value: set focal_px, or exif = true")
+        for name in ("focal_px", "aspect_ratio"):
+            value = getattr(self, name)
+            if value is not None and not (value > 0 and math.isfinite(value)):
+                raise ValueError(f"{name} must be above 0; got {value}")
+        for name in ("focal_std_rel", "aspect_std", "skew_std_px", "principal_point_std_rel", "k1_std"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(
+                    f"{name} must be above 0; got {value} (what is known exactly has the mode known)"
+                )
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """The mode of each of :data:`INTRINSICS`."""
+        return self.focal, self.aspect, self.skew, self.principal_point, self.principal_point, self.k1
 
 
 def camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I64:
@@ -20,15 +95,63 @@ def camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I6
     return np.array([distinct.index(size) for size in original_sizes], dtype=np.int64)
 
 
-def focal_prior(wish: IntrinsicsAssumption, exif_focal_px: F64, scales: F64) -> FocalPrior | None:
-    """What is known of the focal lengths at working size; None where nothing is, or nothing has a weight.
+def assumptions_of_views(
+    wish: IntrinsicsAssumption, original_sizes: Sequence[tuple[int, int]], exif_focal_px: F64, scales: F64
+) -> Assumptions:
+    """The wish as the stages take it, in pixels at working size.
 
-    exif_focal_px (V,) original px, NaN = not said; scales (V,) working over original size.
+    original_sizes: V pairs (width, height); exif_focal_px (V,) original px, NaN = not said; scales (V,)
+    working over original size.
     """
-    if wish.focal_std_rel is None or not (wish.exif or wish.focal_px is not None):
-        return None
-    focal = exif_focal_px if wish.focal_px is None else np.full(len(scales), wish.focal_px)
-    return FocalPrior(focal * scales, wish.focal_std_rel) if np.isfinite(focal).any() else None
+    n = len(original_sizes)
+    group, own = camera_groups(original_sizes, wish.cameras), np.arange(n, dtype=np.int64)
+    # A known value is known for every view by itself: nothing is gained by tying it.
+    shared = np.stack([group if mode == "constant" else own for mode in wish.modes], axis=1)
+    alike = camera_groups(original_sizes, "shared") if wish.alike else own
+    mean, std = _values(wish, np.array(original_sizes, dtype=np.float64).reshape(n, 2), exif_focal_px)
+    for column, name in enumerate(INTRINSICS):
+        if wish.modes[column] == "known":
+            std[:, column] = 0.0
+        if name in ("principal_x", "principal_y"):
+            # Pixel (0, 0) is the centre of the first one: half a pixel stays where it is.
+            mean[:, column] = (mean[:, column] + 0.5) * scales - 0.5
+        elif name in ("focal", "skew"):
+            mean[:, column] *= scales
+        if name in ("skew", "principal_x", "principal_y"):
+            std[:, column] *= scales
+    silent = ~np.isfinite(mean[:, 0])
+    std[silent, 0] = np.inf
+    return Assumptions(shared, mean, std, alike)
+
+
+def assume(reconstruction: Reconstruction, wish: IntrinsicsAssumption | None = None) -> Assumptions:
+    """The wish (the default where None) for a reconstruction, which knows one size and no header: all that is
+    in pixels is meant in its own."""
+    sizes = [(int(width), int(height)) for width, height in reconstruction.sizes]
+    silent, same = np.full(len(sizes), np.nan), np.ones(len(sizes))
+    return assumptions_of_views(wish or IntrinsicsAssumption(), sizes, silent, same)
+
+
+def _values(wish: IntrinsicsAssumption, sizes: F64, exif_focal_px: F64) -> tuple[F64, F64]:
+    """Means and standard deviations (V, 6) in original pixels; the modes are not yet looked at."""
+    n = len(sizes)
+    focal = np.full(n, np.nan)
+    if wish.focal_px is not None:
+        focal[:] = wish.focal_px
+    elif wish.exif:
+        focal = exif_focal_px.astype(np.float64)
+    centre = (
+        (sizes - 1.0) / 2.0 if wish.principal_point_px is None else np.tile(wish.principal_point_px, (n, 1))
+    )
+    one = np.ones(n)
+    mean = np.column_stack([focal, wish.aspect_ratio * one, wish.skew_px * one, centre, wish.k1_value * one])
+    deviations = (
+        wish.focal_std_rel, wish.aspect_std, wish.skew_std_px, wish.principal_point_std_rel,
+        wish.principal_point_std_rel, wish.k1_std,
+    )  # fmt: skip
+    std = np.tile([np.inf if value is None else value for value in deviations], (n, 1))
+    std[:, 3:5] *= sizes.max(axis=1, keepdims=True)
+    return mean, std
 
 
 def prior_warnings(wish: IntrinsicsAssumption, exif_focal_px: F64) -> list[str]:

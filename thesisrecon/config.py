@@ -11,10 +11,11 @@ import dataclasses
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from thesisrecon.assumptions import IntrinsicsAssumption
 from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification, ThesisRansac
 from thesisrecon.errors import UsageError
 from thesisrecon.features import HarrisCorners, MultiScaleCorners
@@ -41,8 +42,8 @@ from thesisrecon.settings import (
 from thesisrecon.types import (
     F64,
     I64,
+    Assumptions,
     Features,
-    FocalPrior,
     FundamentalFit,
     Image,
     Matches,
@@ -138,8 +139,7 @@ class SelfCalibrator(Protocol):
         self,
         reconstruction: Reconstruction,
         *,
-        groups: I64,
-        focal_prior: FocalPrior | None,
+        assumed: Assumptions,
         rng: np.random.Generator,
     ) -> SelfCalibration: ...
 
@@ -152,8 +152,7 @@ class MetricRefiner(Protocol):
         reconstruction: Reconstruction,
         calibration: SelfCalibration,
         *,
-        groups: I64,
-        focal_prior: FocalPrior | None,
+        assumed: Assumptions,
         rng: np.random.Generator,
     ) -> MetricResult: ...
 
@@ -169,37 +168,6 @@ class ImageOptions:
             raise ValueError(f"max_size_px must be at least 64; got {self.max_size_px}")
 
 
-@dataclass(frozen=True)
-class IntrinsicsAssumption:
-    """What the user lets the pipeline assume of the cameras. Nothing of the focal length, unless it has a
-    weight.
-
-    Parameters
-    ----------
-    cameras : "shared": all photographs of one size come from one camera; "per-image": each has its own.
-    focal_px : the user's focal length in pixels of the original photographs, or None.
-    exif : whether the focal length of the EXIF header (35 mm equivalent) is taken where there is one and
-        ``focal_px`` is not given.
-    focal_std_rel : the weight of either: its relative standard deviation. Must be given with them.
-    """
-
-    cameras: Literal["shared", "per-image"] = "shared"
-    focal_px: float | None = None
-    exif: bool = False
-    focal_std_rel: float | None = None
-
-    def __post_init__(self) -> None:
-        wanted = self.exif or self.focal_px is not None
-        if wanted and self.focal_std_rel is None:
-            raise ValueError(
-                "a focal prior needs its weight: set focal_std_rel (0.1 means 'within about 10 %')"
-            )
-        if self.focal_std_rel is not None and not self.focal_std_rel > 0:
-            raise ValueError(f"focal_std_rel must be above 0; got {self.focal_std_rel}")
-        if self.focal_px is not None and not self.focal_px > 0:
-            raise ValueError(f"focal_px must be above 0; got {self.focal_px}")
-
-
 def _precise_ransac() -> LocallyOptimisedRansac:
     return LocallyOptimisedRansac(inlier_sigmas=PRECISE_SIGMAS)
 
@@ -209,7 +177,7 @@ class PipelineConfig:
     """The whole pipeline as values; the defaults are the preset ``default``."""
 
     images: ImageOptions = ImageOptions()
-    intrinsics: IntrinsicsAssumption = IntrinsicsAssumption()
+    intrinsics: IntrinsicsAssumption = field(default_factory=IntrinsicsAssumption)
     features: Detector = field(default_factory=MultiScaleCorners)
     pairs: PairSelector = field(default_factory=OverlapEstimate)
     matching: Matcher = field(default_factory=SeedsAndGrowth)
@@ -253,7 +221,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
         projective=SequentialProjective(),
         selfcalibration=HartleySearch(),
         # The thesis knows no distortion, and its self-calibration keeps the principal point in the centre.
-        metric=UpgradeAndBundle(principal_point_std=0.0, k1_std=0.0),
+        intrinsics=IntrinsicsAssumption(principal_point="known", k1="known"),
     ),
 }
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from thesisrecon.assumptions import camera_groups, focal_prior
+from thesisrecon.assumptions import assume
 from thesisrecon.config import PipelineConfig
 from thesisrecon.epipolar import estimate_fundamental
 from thesisrecon.errors import StageFailure
@@ -47,9 +45,6 @@ def self_calibrate(
     Cameras of one image size are taken for one camera, unless ``config.intrinsics.cameras`` says otherwise.
     """
     config = config or PipelineConfig()
-    sizes = [(int(width), int(height)) for width, height in reconstruction.sizes]
-    groups = camera_groups(sizes, config.intrinsics.cameras)
-    # A reconstruction knows one size, and no header: the focal length is meant in its own pixels.
-    prior = focal_prior(config.intrinsics, np.full(len(sizes), np.nan), np.ones(len(sizes)))
+    assumed = assume(reconstruction, config.intrinsics)
     rng = stream(seed, "selfcalibration")
-    return config.selfcalibration.calibrate(reconstruction, groups=groups, focal_prior=prior, rng=rng)
+    return config.selfcalibration.calibrate(reconstruction, assumed=assumed, rng=rng)

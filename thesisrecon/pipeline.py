@@ -10,15 +10,15 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from thesisrecon.assumptions import camera_groups, focal_prior, prior_warnings
+from thesisrecon.assumptions import assumptions_of_views, camera_groups, prior_warnings
 from thesisrecon.config import PipelineConfig, tables_from_config
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.images import ImageSource, PhotographSet, list_images, read_photographs, scene_name
 from thesisrecon.outputs import RESULT_FILES, write_outputs
 from thesisrecon.run import Progress, Run, RunOptions, start_run, stream
 from thesisrecon.types import (
+    Assumptions,
     Features,
-    FocalPrior,
     Image,
     PairChoice,
     RunResult,
@@ -98,10 +98,11 @@ class _Work:
         return self.run.config
 
     @property
-    def focal_prior(self) -> FocalPrior | None:
-        """What the user lets us assume of the focal lengths."""
+    def assumed(self) -> Assumptions:
+        """What the user lets us assume of the cameras."""
         scales = np.array([image.scale for image in self.result.images])
-        return focal_prior(self.config.intrinsics, self.photographs.exif_focal_px, scales)
+        sizes = [image.original_size for image in self.result.images]
+        return assumptions_of_views(self.config.intrinsics, sizes, self.photographs.exif_focal_px, scales)
 
     def check_photographs(self) -> None:
         """Refuse what is too little before anything is computed."""
@@ -353,12 +354,12 @@ def _reconstruct_projective(work: _Work, attempt: int = 0) -> None:
 
 
 def _calibrate(work: _Work, attempt: int) -> None:
-    run, prior = work.run, work.focal_prior
-    projective, groups = work.result.projective, work.result.groups
+    run, assumed = work.run, work.assumed
+    projective = work.result.projective
     assert projective is not None
     upstream = run.logs["projective"].keys[f"attempt-{attempt}"]
-    assumed = [groups, [prior.focal_px, prior.std_rel] if prior else None]
-    key = run.key("selfcalibration", run.variant_key("selfcalibration"), upstream, assumed, run.seed)
+    wish = [assumed.shared, assumed.mean, assumed.std, assumed.alike]
+    key = run.key("selfcalibration", run.variant_key("selfcalibration"), upstream, wish, run.seed)
     run.progress("selfcalibration", 0, 1)
     calibration = run.kept(
         "selfcalibration",
@@ -366,8 +367,7 @@ def _calibrate(work: _Work, attempt: int) -> None:
         key,
         lambda: work.config.selfcalibration.calibrate(
             projective,
-            groups=groups,
-            focal_prior=prior,
+            assumed=assumed,
             rng=stream(run.seed, "selfcalibration", attempt),
         ),
     )
@@ -378,7 +378,7 @@ def _calibrate(work: _Work, attempt: int) -> None:
 
 
 def _refine(work: _Work, attempt: int) -> None:
-    run, prior = work.run, work.focal_prior
+    run, assumed = work.run, work.assumed
     projective, calibration = work.result.projective, work.result.calibration
     assert projective is not None
     assert calibration is not None
@@ -392,8 +392,7 @@ def _refine(work: _Work, attempt: int) -> None:
         lambda: work.config.metric.refine(
             projective,
             calibration,
-            groups=work.result.groups,
-            focal_prior=prior,
+            assumed=assumed,
             rng=stream(run.seed, "metric", attempt),
         ),
     )

@@ -21,6 +21,9 @@ F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
 B8 = NDArray[np.bool_]
 
+INTRINSICS = ("focal", "aspect", "skew", "principal_x", "principal_y", "k1")
+"""The intrinsics of a view in the order of every array that has a column for each."""
+
 Stratum = Literal["projective", "affine", "metric"]
 
 
@@ -294,13 +297,31 @@ class StageReport:
 
 
 @dataclass(frozen=True)
-class FocalPrior:
-    """What the user says of the focal length: ``focal_px`` (V,) NaN = unknown, ``std_rel`` its relative
-    standard deviation (the weight). Nothing is assumed of a focal without one.
+class Assumptions:
+    """What is assumed of the intrinsics of V views, a column for each of :data:`INTRINSICS`.
+
+    ``shared`` (V, 6): views with equal numbers in a column have the same value (one camera, constant); every
+    number of its own means the value is free to vary. ``mean, std`` (V, 6): what is known beforehand, in px
+    at working size where the intrinsic has that unit; the focal's std is relative (it acts on log f). std 0 =
+    known to be the mean, inf = nothing is known and the mean is only a place to start (NaN for the focal,
+    which has none). ``alike`` (V,): views of equal number have cameras of one kind, whose values scatter
+    about a common one where they are not shared; all different = nothing of the sort is assumed.
     """
 
-    focal_px: F64
-    std_rel: float
+    shared: I64
+    mean: F64
+    std: F64
+    alike: I64
+
+    @property
+    def group(self) -> I64:
+        """(V,) number of the camera whose focal a view has, 0-based and dense."""
+        return np.unique(self.shared[:, 0], return_inverse=True)[1].astype(np.int64)
+
+    @property
+    def focal_known(self) -> B8:
+        """(V,) whether anything is known of a view's focal beforehand."""
+        return np.isfinite(self.std[:, 0]) & np.isfinite(self.mean[:, 0])
 
 
 @dataclass(frozen=True)

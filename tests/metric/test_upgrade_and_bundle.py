@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.geometry.alignment import estimate_similarity
 from thesisrecon.geometry.camera import camera_centre
 from thesisrecon.metric import UpgradeAndBundle
@@ -22,14 +23,13 @@ def run(
     shared: bool = True,
     reconstruction: Reconstruction | None = None,
     variant: UpgradeAndBundle | None = None,
+    wish: IntrinsicsAssumption | None = None,
 ) -> MetricResult:
     start = projective_reconstruction(scene) if reconstruction is None else reconstruction
-    groups = np.zeros(len(scene.P), dtype=np.int64) if shared else np.arange(len(scene.P))
+    assumed = assume(start, wish or IntrinsicsAssumption(cameras="shared" if shared else "per-image"))
     rng = np.random.default_rng(0)
-    calibration = HypothesesAndRefinement().calibrate(start, groups=groups, focal_prior=None, rng=rng)
-    return (variant or UpgradeAndBundle()).refine(
-        start, calibration, groups=groups, focal_prior=None, rng=rng
-    )
+    calibration = HypothesesAndRefinement().calibrate(start, assumed=assumed, rng=rng)
+    return (variant or UpgradeAndBundle()).refine(start, calibration, assumed=assumed, rng=rng)
 
 
 def centre_error(result: MetricResult, scene: TrueScene) -> float:
@@ -114,7 +114,7 @@ def test_a_view_without_points_keeps_its_reason() -> None:
 
 def test_fixed_principal_point_is_said_to_be_assumed() -> None:
     scene = make_scene(sigma_px=0.3, seed=7)
-    result = run(scene, variant=UpgradeAndBundle(principal_point_std=0.0, k1_std=0.0))
+    result = run(scene, wish=IntrinsicsAssumption(principal_point="known", k1="known"))
     interval = result.intrinsics[0]["principal_x_px"]
     assert interval.value == pytest.approx((1536 - 1) / 2)
     assert interval.source == "assumed"

@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.errors import StageFailure
 from thesisrecon.selfcalibration import HartleySearch, HypothesesAndRefinement
 from thesisrecon.selfcalibration.focal_scan import plane_from_focals
 from thesisrecon.selfcalibration.frame import build_frame, metric_from_reference
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion
-from thesisrecon.types import FocalPrior, SelfCalibration
+from thesisrecon.types import SelfCalibration
 
 METHODS = [HypothesesAndRefinement(), HartleySearch()]
 
 
 def calibrate(method: object, scene: TrueScene, *, shared: bool = True, seed: int = 0) -> SelfCalibration:
     reconstruction = projective_reconstruction(scene, seed=seed)
-    groups = np.zeros(len(scene.P), dtype=np.int64) if shared else np.arange(len(scene.P))
+    assumed = assume(reconstruction, IntrinsicsAssumption(cameras="shared" if shared else "per-image"))
     return method.calibrate(  # type: ignore[attr-defined]
-        reconstruction, groups=groups, focal_prior=None, rng=np.random.default_rng(seed)
+        reconstruction, assumed=assumed, rng=np.random.default_rng(seed)
     )
 
 
@@ -84,8 +85,7 @@ def test_two_cameras_are_refused() -> None:
     with pytest.raises(StageFailure, match="at least 3"):
         HypothesesAndRefinement().calibrate(
             replace(reconstruction, registered=registered),
-            groups=np.zeros(8, dtype=np.int64),
-            focal_prior=None,
+            assumed=assume(reconstruction),
             rng=np.random.default_rng(0),
         )
 
@@ -108,8 +108,7 @@ def test_a_prior_pulls_an_undetermined_focal() -> None:
     reconstruction = projective_reconstruction(still)
     answer = HypothesesAndRefinement().calibrate(
         reconstruction,
-        groups=np.zeros(8, dtype=np.int64),
-        focal_prior=FocalPrior(np.full(8, 1500.0), 0.01),
+        assumed=assume(reconstruction, IntrinsicsAssumption(focal_px=1500.0, focal_std_rel=0.01)),
         rng=np.random.default_rng(0),
     )
     np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=0.1)

@@ -34,7 +34,7 @@ from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.types import (
     B8,
     I64,
-    FocalPrior,
+    Assumptions,
     MetricResult,
     Reconstruction,
     SelfCalibration,
@@ -53,9 +53,6 @@ class UpgradeAndBundle:
 
     Parameters
     ----------
-    principal_point_std : prior of the principal point around the image centre, as a share of the long side;
-        0 keeps it in the centre.
-    k1_std : prior of the radial distortion around 0; 0 leaves it out.
     outlier_sigmas : residual gates of the early and the late rounds, in noise sigmas.
     noise_floor_px : the noise is never taken to be below this.
     min_angle_deg : points under a smaller triangulation angle are left out.
@@ -68,8 +65,6 @@ class UpgradeAndBundle:
         square and are so only to one or two parts in a thousand.
     """
 
-    principal_point_std: float = 0.01
-    k1_std: float = 0.05
     outlier_sigmas: tuple[float, float] = (12.0, 7.0)
     noise_floor_px: float = 0.1
     min_angle_deg: float = 0.5
@@ -83,17 +78,17 @@ class UpgradeAndBundle:
         reconstruction: Reconstruction,
         calibration: SelfCalibration,
         *,
-        groups: I64,
-        focal_prior: FocalPrior | None,
+        assumed: Assumptions,
         rng: np.random.Generator,
     ) -> MetricResult:
         """The final model of one projective reconstruction; ``StageFailure`` where no candidate survives."""
-        trials = [self._start(reconstruction, u, groups, focal_prior) for u in calibration.candidates]
+        trials = [self._start(reconstruction, u, assumed) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
-        if not models and focal_prior is not None:
+        if not models and assumed.focal_known.any():
+            wide = float(assumed.std[assumed.focal_known, 0].max())
             raise StageFailure(
                 "the photographs contradict the focal length that was given",
-                f"none of {len(trials)} calibrations near it (+- {focal_prior.std_rel:.1%}) explains them",
+                f"none of {len(trials)} calibrations near it (+- {wide:.1%}) explains them",
                 "leave the prior out, or give it a larger focal_std_rel",
             )
         if not models:
@@ -105,12 +100,12 @@ class UpgradeAndBundle:
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         costs = np.array([truncated_cost(m, gate) for m in models])
         model = models[int(costs.argmin())]
-        model, reasons = self._complete(model, reconstruction, focal_prior, rng)
-        model, bundle, bundle_index = self._finish(model, focal_prior)
+        model, reasons = self._complete(model, reconstruction, assumed, rng)
+        model, bundle, bundle_index = self._finish(model, assumed)
         intervals = intrinsic_intervals(
             model,
             bundle,
-            self._prior(model, focal_prior),
+            self._prior(model, assumed),
             floor_rel=self.model_floor_rel,
             indices=bundle_index,
         )
@@ -119,10 +114,10 @@ class UpgradeAndBundle:
         return MetricResult(final, intervals, check, not doubts, tuple(doubts))
 
     def _start(
-        self, reconstruction: Reconstruction, upgrade: Upgrade, groups: I64, focal_prior: FocalPrior | None
+        self, reconstruction: Reconstruction, upgrade: Upgrade, assumed: Assumptions
     ) -> MetricModel | None:
         """The core cameras upgraded, on the points of the projective stage, with only the focals free."""
-        started = _upgraded_model(reconstruction, upgrade, groups, self.max_rotation_residual)
+        started = _upgraded_model(reconstruction, upgrade, assumed, self.max_rotation_residual)
         if started is None:
             return None
         early, _ = self.outlier_sigmas
@@ -130,7 +125,7 @@ class UpgradeAndBundle:
         for _ in range(2):
             if model.valid.sum() < 20:
                 return None
-            model = self._bundle(model, FOCAL_ONLY, focal_prior, iterations=10)[0]
+            model = self._bundle(model, FOCAL_ONLY, assumed, iterations=10)[0]
             model = mark(model, sigmas=early, min_angle=0.0)
         return model
 
@@ -138,7 +133,7 @@ class UpgradeAndBundle:
         self,
         model: MetricModel,
         reconstruction: Reconstruction,
-        focal_prior: FocalPrior | None,
+        assumed: Assumptions,
         rng: np.random.Generator,
     ) -> tuple[MetricModel, list[str]]:
         """All tracks triangulated, and the postponed cameras, in two passes since each adds points for the
@@ -155,7 +150,7 @@ class UpgradeAndBundle:
             if model.registered.sum() == before:
                 break
             model = retriangulate(model, sigmas=early, min_angle=angle)
-            model = self._bundle(model, FOCAL_ONLY, focal_prior, iterations=6)[0]
+            model = self._bundle(model, FOCAL_ONLY, assumed, iterations=6)[0]
             model = retriangulate(model, sigmas=late, min_angle=angle)
         reasons = [
             ""
@@ -166,21 +161,21 @@ class UpgradeAndBundle:
         return model, reasons
 
     def _finish(
-        self, model: MetricModel, focal_prior: FocalPrior | None
+        self, model: MetricModel, assumed: Assumptions
     ) -> tuple[MetricModel, MetricBundleResult, I64]:
-        free = np.array([True, False, False, *[self.principal_point_std > 0] * 2, self.k1_std > 0])
+        free = np.asarray((assumed.std > 0.0).any(axis=0))
         angle = np.radians(self.min_angle_deg)
         for _ in range(self.rounds):
-            model, bundle, index = self._bundle(model, free, focal_prior, iterations=12)
+            model, bundle, index = self._bundle(model, free, assumed, iterations=12)
             model = retriangulate(model, sigmas=self.outlier_sigmas[1], min_angle=angle)
-        model, bundle, index = self._bundle(model, free, focal_prior, iterations=15, covariance=True)
+        model, bundle, index = self._bundle(model, free, assumed, iterations=15, covariance=True)
         return mark(model, sigmas=self.outlier_sigmas[1], min_angle=angle), bundle, index
 
     def _bundle(
         self,
         model: MetricModel,
         free: B8,
-        focal_prior: FocalPrior | None,
+        assumed: Assumptions,
         *,
         iterations: int,
         covariance: bool = False,
@@ -195,34 +190,29 @@ class UpgradeAndBundle:
             )
         result = refine_metric_bundle(
             model.cameras, model.X, t.view_index[k], t.point_index[k], t.xy[k], free=free,
-            prior=self._prior(model, focal_prior), sigma_px=model.sigma_px, loss_px=2.0 * model.sigma_px,
+            prior=self._prior(model, assumed), sigma_px=model.sigma_px, loss_px=2.0 * model.sigma_px,
             max_iterations=iterations, covariance=covariance,
         )  # fmt: skip
         norms = np.asarray(np.linalg.norm(result.residual_px, axis=1))
         sigma = max(noise_from_distances(norms), self.noise_floor_px)
         return replace(model, cameras=result.cameras, X=result.X, sigma_px=sigma), result, k
 
-    def _prior(self, model: MetricModel, focal_prior: FocalPrior | None) -> IntrinsicsPrior:
-        """Per group: principal point at the image centre, k1 near 0, and the user's focal if there is one."""
-        n = len(model.cameras.intrinsics)
-        mean, std = model.cameras.intrinsics.copy(), np.full((n, 6), np.inf)
-        for g in range(n):
-            views = np.flatnonzero(model.cameras.group == g)
-            size = model.sizes[views[0]]
-            mean[g, 3:5] = (size - 1.0) / 2.0
-            std[g, 3:5] = max(self.principal_point_std, 1e-9) * size.max()
-            mean[g, 5], std[g, 5] = 0.0, max(self.k1_std, 1e-9)
-            if focal_prior is not None and np.isfinite(focal_prior.focal_px[views]).any():
-                mean[g, 0] = np.nanmedian(focal_prior.focal_px[views])
-                std[g, 0] = focal_prior.std_rel
+    def _prior(self, model: MetricModel, assumed: Assumptions) -> IntrinsicsPrior:
+        """What is assumed, per camera; a value that is known exactly keeps a deviation of next to nothing."""
+        rows = np.array(
+            [np.flatnonzero(model.cameras.group == g)[0] for g in range(len(model.cameras.intrinsics))]
+        )
+        mean, std = assumed.mean[rows].copy(), np.maximum(assumed.std[rows], 1e-9)
+        silent = ~np.isfinite(mean)
+        mean[silent] = model.cameras.intrinsics[silent]
         return IntrinsicsPrior(mean, std)
 
 
 def _upgraded_model(
-    reconstruction: Reconstruction, upgrade: Upgrade, groups: I64, max_rotation_residual: float
+    reconstruction: Reconstruction, upgrade: Upgrade, assumed: Assumptions, max_rotation_residual: float
 ) -> MetricModel | None:
     """Rotations, translations and intrinsics of an upgraded projective reconstruction."""
-    group = np.unique(groups, return_inverse=True)[1].astype(np.int64)
+    group = assumed.group
     views = np.flatnonzero(reconstruction.registered)
     P = reconstruction.P[views] @ np.linalg.inv(upgrade.metric_from_projective)
     Q = np.linalg.inv(upgrade.K[views]) @ P
@@ -238,7 +228,7 @@ def _upgraded_model(
     R[views], t[views] = U @ Vt, Q[:, :, 3] / scale[:, None]
     registered = np.zeros(n, dtype=bool)
     registered[views[good]] = True
-    intrinsics = _intrinsics(upgrade.K, reconstruction.registered, group, reconstruction.sizes)
+    intrinsics = _intrinsics(upgrade.K, reconstruction.registered, reconstruction.sizes, assumed)
     Xm = reconstruction.X @ upgrade.metric_from_projective.T
     with np.errstate(divide="ignore", invalid="ignore"):
         X = Xm[:, :3] / Xm[:, 3:]
@@ -260,18 +250,17 @@ def _upgraded_model(
     )
 
 
-def _intrinsics(K: F64, registered: B8, group: I64, sizes: I64) -> F64:
+def _intrinsics(K: F64, registered: B8, sizes: I64, assumed: Assumptions) -> F64:
     """(G, 6) rows from the K of the registered views; a group without any starts from the others' field of
     view."""
-    longest = sizes.max(axis=1)
+    group, longest = assumed.group, sizes.max(axis=1)
     typical = float(np.median(K[registered, 0, 0] / longest[registered]))
     rows = np.zeros((int(group.max()) + 1, 6))
     for g in range(len(rows)):
         views = np.flatnonzero(group == g)
         known = views[registered[views]]
         focal = float(np.median(K[known, 0, 0])) if len(known) else typical * longest[views[0]]
-        centre = (sizes[views[0]] - 1.0) / 2.0
-        rows[g] = [focal, 1.0, 0.0, centre[0], centre[1], 0.0]
+        rows[g] = [focal, *assumed.mean[views[0], 1:]]
     return rows
 
 

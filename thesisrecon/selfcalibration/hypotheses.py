@@ -18,9 +18,12 @@ from thesisrecon.selfcalibration.infinity_search import InfinitySearch
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std, refine_hypotheses
 from thesisrecon.selfcalibration.verdict import identifiability
-from thesisrecon.types import I64, FocalPrior, Reconstruction, SelfCalibration, Upgrade
+from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration, Upgrade
 
 F64 = NDArray[np.float64]
+
+KNOWN_STD = 1e-4
+"""Relative deviation that a focal known exactly gets, so that the criterion stays finite."""
 
 
 @dataclass(frozen=True)
@@ -46,15 +49,14 @@ class HypothesesAndRefinement:
         self,
         reconstruction: Reconstruction,
         *,
-        groups: I64,
-        focal_prior: FocalPrior | None,
+        assumed: Assumptions,
         rng: np.random.Generator,
     ) -> SelfCalibration:
         """Upgrade a projective reconstruction of at least three cameras; ``StageFailure`` where nothing
         holds."""
         require_cameras(reconstruction)
-        frame = build_frame(reconstruction, groups)
-        criterion = criterion_with_prior(self.criterion, frame, focal_prior)
+        frame = build_frame(reconstruction, assumed.group)
+        criterion = criterion_with_prior(self.criterion, frame, assumed)
         planes, log_f = self._propose(frame, reconstruction, rng)
         cost = np.nan_to_num(criterion.cost(frame, planes, log_f), nan=np.inf)
         best = np.argsort(cost, kind="stable")[: self.refined]
@@ -104,17 +106,16 @@ def require_cameras(reconstruction: Reconstruction) -> None:
 
 
 def criterion_with_prior(
-    criterion: RotationCriterion, frame: ReferenceFrame, focal_prior: FocalPrior | None
+    criterion: RotationCriterion, frame: ReferenceFrame, assumed: Assumptions
 ) -> RotationCriterion:
     """The criterion with the user's word on the focal in place of the weak pull."""
-    if focal_prior is None:
+    known = frame.views[assumed.focal_known[frame.views]]
+    if not len(known):
         return criterion
-    unit_focal = focal_prior.focal_px[frame.views] / frame.pixel_from_unit[frame.views, 0, 0]
-    if not np.isfinite(unit_focal).any():
-        return criterion
-    mean = float(np.nanmedian(np.log(unit_focal)))
+    mean = float(np.median(np.log(assumed.mean[known, 0] / frame.pixel_from_unit[known, 0, 0])))
+    std = max(float(np.median(assumed.std[known, 0])), KNOWN_STD)
     noise = 0.01
-    return RotationCriterion(criterion.scale, mean, focal_prior.std_rel, noise)
+    return RotationCriterion(criterion.scale, mean, std, noise)
 
 
 def focals_of_groups(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
@@ -213,14 +214,13 @@ class HartleySearch:
         self,
         reconstruction: Reconstruction,
         *,
-        groups: I64,
-        focal_prior: FocalPrior | None,
+        assumed: Assumptions,
         rng: np.random.Generator,
     ) -> SelfCalibration:
         """Upgrade by Hartley's search alone; ``StageFailure`` where the inequalities leave no plane."""
         require_cameras(reconstruction)
-        frame = build_frame(reconstruction, groups)
-        criterion = criterion_with_prior(self.criterion, frame, focal_prior)
+        frame = build_frame(reconstruction, assumed.group)
+        criterion = criterion_with_prior(self.criterion, frame, assumed)
         p, f = self.search.search(frame, reconstruction, rng)
         if len(p) == 0:
             raise StageFailure(
