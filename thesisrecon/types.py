@@ -241,12 +241,32 @@ class Upgrade:
 
 
 @dataclass(frozen=True)
+class MotionVerdict:
+    """Whether the photographs determine the calibration under what is assumed, and the critical motion that
+    the cameras come nearest to.
+
+    ``motion`` is its name ("pure translation", "turntable", ...; empty where nothing could be measured);
+    ``critical`` True where the cameras cannot be told from it by what a photographer does anyhow. A critical
+    motion may still be ``identifiable``: what it leaves open, the assumptions may settle. ``evidence`` maps
+    the name of each measure to its number; ``sentences`` say what was found, what it means and what to do;
+    ``undetermined`` are views whose own focal length is not determined.
+    """
+
+    identifiable: bool
+    motion: str
+    critical: bool
+    evidence: Mapping[str, float]
+    sentences: tuple[str, ...] = ()
+    undetermined: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
 class SelfCalibration:
     """The answer of chapter 7: the best upgrade, its rivals (best first, the best included), and how sure it
     is.
 
     ``K_std`` (V, 3, 3) standard deviations; ``identifiable`` False where the motion does not determine the
-    answer, with ``reasons``.
+    answer, with ``reasons``; ``verdict`` is the evidence for that, None where none was gathered.
     """
 
     metric_from_projective: F64
@@ -255,6 +275,7 @@ class SelfCalibration:
     identifiable: bool
     reasons: tuple[str, ...]
     candidates: tuple[Upgrade, ...] = ()
+    verdict: MotionVerdict | None = None
 
 
 @dataclass(frozen=True)
