@@ -183,7 +183,7 @@ def test_the_folder_is_judged_before_any_photograph_is_read(
     def read_nothing(*_: Any, **__: Any) -> None:
         raise AssertionError("photographs were read")
 
-    monkeypatch.setattr("thesisrecon.pipeline.read_photographs", read_nothing)
+    monkeypatch.setattr("thesisrecon.intake.read_photographs", read_nothing)
     with pytest.raises(UsageError, match="seed was 0 there and is 1 here"):
         run(tmp_path / "out", seed=1)
     with pytest.raises(UsageError, match="cannot be written"):

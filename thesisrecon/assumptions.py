@@ -95,6 +95,11 @@ def camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I6
     return np.array([distinct.index(size) for size in original_sizes], dtype=np.int64)
 
 
+def camera_numbers(original_sizes: Sequence[tuple[int, int]], wish: IntrinsicsAssumption) -> I64:
+    """(V,) numbers of the cameras: views of one number agree in all intrinsics."""
+    return camera_groups(original_sizes, "per-image" if "free" in wish.modes else wish.cameras)
+
+
 def assumptions_of_views(
     wish: IntrinsicsAssumption, original_sizes: Sequence[tuple[int, int]], exif_focal_px: F64, scales: F64
 ) -> Assumptions:

@@ -10,20 +10,14 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from thesisrecon.assumptions import assumptions_of_views, camera_groups, prior_warnings
-from thesisrecon.config import PipelineConfig, tables_from_config
+from thesisrecon.assumptions import assumptions_of_views
+from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.images import ImageSource, PhotographSet, list_images, read_photographs, scene_name
+from thesisrecon.intake import check_pairs, empty_result, identity, read_set, wishes
+from thesisrecon.io.images import ImageSource, PhotographSet, list_images, scene_name
 from thesisrecon.outputs import RESULT_FILES, write_outputs
 from thesisrecon.run import Progress, Run, RunOptions, start_run, stream
-from thesisrecon.types import (
-    Assumptions,
-    Features,
-    Image,
-    PairChoice,
-    RunResult,
-    TwoView,
-)
+from thesisrecon.types import Assumptions, Features, Image, PairChoice, RunResult, TwoView
 
 ATTEMPTS = 3
 MIN_CORNERS = 16
@@ -68,11 +62,11 @@ def reconstruct(
             raise UsageError(f"there are no photographs in {images}")
         run.title = scene_name(Path(images)) or run.title
     # Reading photographs takes long: whether the folder is free for this run is asked before.
-    with run.directory.claimed(_wishes(run), overwrite=overwrite):
-        photographs = _read(run, images)
-        _check_pairs(run, photographs, until)
-        run.directory.adopt(_identity(run, photographs), overwrite=overwrite, results=RESULT_FILES)
-        work = _Work(run, photographs, _empty_result(run, photographs), until)
+    with run.directory.claimed(wishes(run), overwrite=overwrite):
+        photographs = read_set(run, images)
+        check_pairs(run, photographs, until)
+        run.directory.adopt(identity(run, photographs), overwrite=overwrite, results=RESULT_FILES)
+        work = _Work(run, photographs, empty_result(run, photographs), until)
         try:
             work.check_photographs()
             for step in STEPS[until]:
@@ -114,53 +108,6 @@ class _Work:
                 f"at least {needed} different ones are needed{'; ' + why if why else ''}",
                 "take more photographs of the scene from other places",
             )
-
-
-def _read(run: Run, images: ImageSource) -> PhotographSet:
-    with run.clock("images"):
-        size = run.config.images.max_size_px
-        photographs = read_photographs(images, max_size_px=size, map_all=run.workers.map_all)
-    found, refused = len(photographs.photographs), len(photographs.refused)
-    if found + refused == 0:
-        raise UsageError("no images")
-    notes = [f"{p.image.name}: {p.note}" for p in photographs.photographs if p.note]
-    refusals = [f"{name} is left out: it {reason}" for name, reason in photographs.refused.items()]
-    warnings = [*notes, *refusals, *prior_warnings(run.config.intrinsics, photographs.exif_focal_px)]
-    run.finish("images", counts={"read": found, "refused": refused}, warnings=warnings)
-    return photographs
-
-
-def _check_pairs(run: Run, photographs: PhotographSet, until: str) -> None:
-    """Refuse a choice of pairs that does not fit, before the folder becomes that of this run: a list that is
-    mended must find it as it was."""
-    if until != "features" and len(photographs.images) >= 2:
-        run.config.pairs.check([image.name for image in photographs.images], photographs.refused)
-
-
-def _wishes(run: Run) -> dict[str, Any]:
-    """What of a run's identity is known before its photographs are read."""
-    return {"version": 1, "seed": run.seed, "settings": tables_from_config(run.config)}
-
-
-def _identity(run: Run, photographs: PhotographSet) -> dict[str, Any]:
-    """What makes two runs the same: settings, seed and the content of the photographs."""
-    digests = {p.image.name: p.digest for p in photographs.photographs}
-    refused = {name: f"refused: {reason}" for name, reason in photographs.refused.items()}
-    return _wishes(run) | {"photographs": digests | refused}
-
-
-def _empty_result(run: Run, photographs: PhotographSet) -> RunResult:
-    sizes = [image.original_size for image in photographs.images]
-    groups = camera_groups(sizes, run.config.intrinsics.cameras)
-    return RunResult(
-        out=run.directory.path,
-        images=photographs.images,
-        refused=photographs.refused,
-        features=(),
-        pairs=(),
-        groups=groups,
-        settings=tables_from_config(run.config),
-    )
 
 
 # ---------------------------------------------------------------- 4.2.1: features

@@ -126,7 +126,7 @@ class LocallyOptimisedRansac:
 
     def _candidate(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         ends, samples = self._starts(points, gate, rng)
-        f, rivals = _best_and_rivals(ends, SAME_SCORE * len(points) ** 0.5)
+        f, rivals = _best_and_rivals(ends, _chance_of_scores(points))
         noise, loss = _sharpen(f, points, gate) if f.any() else (None, (0.0, 0.0))
         return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, rivals)
 
@@ -143,7 +143,7 @@ class LocallyOptimisedRansac:
                 score, _, _ = truncated_score(f, np.ascontiguousarray(shuffled.T), gate, 1.0, (0.0, 0.0))
                 found.append((score * len(points), f))
             best = min((score for score, _ in found), default=np.inf)
-            agreeing = sum(score - best < SAME_SCORE * len(points) ** 0.5 for score, _ in found)
+            agreeing = sum(score - best < _chance_of_scores(points) for score, _ in found)
             if agreeing >= self.starts + (len(found) - agreeing) // 2 or samples >= self.max_samples:
                 break
         return found, samples
@@ -214,6 +214,11 @@ class _Candidate:
         left = len(self.residuals) - explained
         few = left <= max(more, FEW_WRONG * len(self.residuals))
         return few and self.noise.log_likelihood > rival.noise.log_likelihood
+
+
+def _chance_of_scores(points: F64) -> float:
+    """By how much sums of truncated squares of the same minimum may differ."""
+    return float(SAME_SCORE * len(points) ** 0.5)
 
 
 def _best_and_rivals(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:

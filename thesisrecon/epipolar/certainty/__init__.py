@@ -84,14 +84,15 @@ def judge_certainty(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) 
     ends = [frame.matrix_in_frame(F) for F in fit.rivals]
     rivals += compare_rivals(ends, f, points, weights, band=band_px * frame.scale)
     support = _support(points, fit.inliers, weights, plane, 2.0 * sigma_px * frame.scale)
+    by_chance = chance_of_agreement(xy1, xy2, band_px)
     chance = log10_false_alarms(
         support.agreeing - support.contradicted,
         support.tried,
-        chance=max(share, chance_of_agreement(xy1, xy2, band_px)),
+        chance=max(share, by_chance),
         free=2,
     )
     matters_px = max(LARGEST_ERROR_PX, 2.0 * fit.sigma_px)
-    least = _least_gain(support, chance_of_agreement(xy1, xy2, band_px))
+    least = _least_gain(support, by_chance)
     different = [r for r in rivals if r.gained >= least and _differs(r, matters_px * frame.scale)]
     other = min(different, key=lambda r: r.margin, default=None)
     return Certainty(

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from thesisrecon.errors import UsageError
-from thesisrecon.matching.pair_selection.records import MapAll, pair_array
+from thesisrecon.matching.pair_selection.records import MapAll, every_pair, pair_array
 from thesisrecon.types import Features, PairChoice
 
 # ruff: noqa: ARG002 (a choice takes what every choice is given)
@@ -31,7 +30,7 @@ class AllPairs:
         rng: np.random.Generator,
     ) -> PairChoice:
         """All pairs."""
-        return PairChoice(pair_array(combinations(range(len(names)), 2)), "all pairs")
+        return PairChoice(every_pair(len(names)), "all pairs")
 
 
 @dataclass(frozen=True)

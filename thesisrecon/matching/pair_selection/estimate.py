@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 
 import numpy as np
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from thesisrecon.errors import UsageError
 from thesisrecon.matching.pair_selection.overlap import OverlapTest, Sketch, sketch_seeds
-from thesisrecon.matching.pair_selection.records import MapAll, pair_array
+from thesisrecon.matching.pair_selection.records import MapAll, every_pair, pair_array
 from thesisrecon.matching.pair_selection.words import likeness
 from thesisrecon.types import F64, I64, Features, PairChoice
 
@@ -68,7 +67,7 @@ class OverlapEstimate:
         n = len(names)
         if n <= self.all_up_to:
             how = f"all pairs, as there are no more than {self.all_up_to} photographs"
-            return PairChoice(pair_array(combinations(range(n), 2)), how)
+            return PairChoice(every_pair(n), how)
         sketches = map_all(self._sketches, features)
         alike = np.zeros((n, n))
         if n - 1 > self.shortlist:

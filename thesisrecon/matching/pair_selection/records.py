@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -17,3 +18,8 @@ def pair_array(pairs: Iterable[Iterable[int]]) -> I64:
     """Pairs as (M, 2) with the smaller number first, sorted."""
     rows = sorted({(min(pair), max(pair)) for pair in (tuple(p) for p in pairs)})
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+def every_pair(n: int) -> I64:
+    """All pairs of ``n`` views."""
+    return pair_array(combinations(range(n), 2))
