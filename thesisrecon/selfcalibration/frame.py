@@ -7,15 +7,18 @@ centre is not at infinity.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.geometry.homogeneous import pixel_from_unit
-from thesisrecon.types import I64, Reconstruction
+from thesisrecon.types import I64, Assumptions, Reconstruction
 
 F64 = NDArray[np.float64]
+
+KNOWN_STD = 1e-4
+"""Relative deviation that a focal known exactly gets, so that every criterion stays finite."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,9 @@ class ReferenceFrame:
 
     ``A`` (R, 3, 3), ``a`` (R, 3) with camera i ~ [A_i | a_i]; ``views`` (R,) their view numbers;
     ``reference`` the place of the reference camera in ``views``; ``group`` (R,) camera number, 0-based and
-    dense; ``pixel_from_unit`` (V, 3, 3) for all views; ``reference_from_projective`` (4, 4).
+    dense; ``pixel_from_unit`` (V, 3, 3) for all views; ``reference_from_projective`` (4, 4). ``focal_mean,
+    focal_std`` (G,): what is known of the groups' log focals, NaN and infinite where that is nothing; None
+    where nothing is known of any.
     """
 
     A: F64
@@ -34,6 +39,8 @@ class ReferenceFrame:
     group: I64
     pixel_from_unit: F64
     reference_from_projective: F64
+    focal_mean: F64 | None = None
+    focal_std: F64 | None = None
 
     @property
     def n_groups(self) -> int:
@@ -42,24 +49,27 @@ class ReferenceFrame:
 
     def subset(self, keep: I64) -> ReferenceFrame:
         """The same frame with fewer cameras (places in ``views``; the reference must be among them)."""
-        groups = np.unique(self.group[keep], return_inverse=True)[1]
+        kept, groups = np.unique(self.group[keep], return_inverse=True)
         place = int(np.flatnonzero(keep == self.reference)[0])
         return ReferenceFrame(
             self.A[keep], self.a[keep], self.views[keep], place, groups.astype(np.int64),
             self.pixel_from_unit, self.reference_from_projective,
+            None if self.focal_mean is None else self.focal_mean[kept],
+            None if self.focal_std is None else self.focal_std[kept],
         )  # fmt: skip
 
 
 def build_frame(
-    reconstruction: Reconstruction, groups: I64, *, reference: int | None = None
+    reconstruction: Reconstruction, groups: I64, *, reference: int | None = None, unit: F64 | None = None
 ) -> ReferenceFrame:
     """Move the registered cameras of a projective reconstruction into a reference frame.
 
     ``groups`` (V,) camera number of every view; ``reference`` a registered view (by default the one with the
-    most observations).
+    most observations); ``unit`` (V, 3, 3) pixels from unit-free coordinates (by default the origin is the
+    image centre and the unit the long side).
     """
     views = np.flatnonzero(reconstruction.registered)
-    unit = pixel_from_unit(reconstruction.sizes)
+    unit = pixel_from_unit(reconstruction.sizes) if unit is None else unit
     P = np.linalg.inv(unit[views]) @ reconstruction.P[views]
     if reference is None:
         seen = reconstruction.tracks.view_index[reconstruction.inlier]
@@ -85,11 +95,52 @@ def build_frame(
     )
 
 
+def assumed_frame(
+    reconstruction: Reconstruction, assumed: Assumptions, *, reference: int | None = None
+) -> ReferenceFrame:
+    """:func:`build_frame` in coordinates that have the assumed aspect and principal point in them.
+
+    What is assumed there, known or only a place to start, is normalised away: the methods see cameras
+    diag(f, f, 1) as far as the assumption holds.
+    """
+    frame = build_frame(
+        reconstruction, assumed.group, reference=reference, unit=_unit_of(assumed, reconstruction.sizes)
+    )
+    known = assumed.focal_known[frame.views]
+    unit = frame.pixel_from_unit[frame.views, 0, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_f = np.log(assumed.mean[frame.views, 0] / unit)
+    mean, std = np.full(frame.n_groups, np.nan), np.full(frame.n_groups, np.inf)
+    for g in range(frame.n_groups):
+        mine = known & (frame.group == g)
+        if mine.any():
+            mean[g] = np.median(log_f[mine])
+            std[g] = max(float(np.median(assumed.std[frame.views[mine], 0])), KNOWN_STD)
+    return replace(frame, focal_mean=mean, focal_std=std)
+
+
+def _unit_of(assumed: Assumptions, sizes: I64) -> F64:
+    unit = pixel_from_unit(sizes)
+    unit[:, 1, 1] *= assumed.mean[:, 1]
+    unit[:, :2, 2] = assumed.mean[:, 3:5]
+    return unit
+
+
 def metric_from_reference(p: F64, focal: float) -> F64:
     """The upgrade H^-1 of a plane at infinity p (3,) and the reference camera's unit-free focal; -> (4,
     4)."""
-    K = np.diag([focal, focal, 1.0])
+    return metric_from_calibration(p, np.diag([focal, focal, 1.0]))
+
+
+def metric_from_calibration(p: F64, K: F64) -> F64:
+    """The upgrade H^-1 (4, 4) of a plane at infinity p (3,) and the reference camera's unit-free K (3, 3).
+
+    NaN where K is singular.
+    """
     H = np.eye(4)
     H[:3, :3] = K
     H[3, :3] = -p @ K
-    return np.asarray(np.linalg.inv(H), dtype=np.float64)
+    try:
+        return np.asarray(np.linalg.inv(H), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return np.full((4, 4), np.nan)

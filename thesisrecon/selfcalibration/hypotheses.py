@@ -12,18 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
+from thesisrecon.selfcalibration.conclusion import answers_from_theta, conclude, require_cameras
 from thesisrecon.selfcalibration.focal_scan import plane_from_focals
-from thesisrecon.selfcalibration.frame import ReferenceFrame, build_frame, metric_from_reference
+from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
 from thesisrecon.selfcalibration.infinity_search import InfinitySearch
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
-from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std, refine_hypotheses
-from thesisrecon.selfcalibration.verdict import identifiability
-from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration, Upgrade
+from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
+from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
 
 F64 = NDArray[np.float64]
-
-KNOWN_STD = 1e-4
-"""Relative deviation that a focal known exactly gets, so that the criterion stays finite."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +52,15 @@ class HypothesesAndRefinement:
         """Upgrade a projective reconstruction of at least three cameras; ``StageFailure`` where nothing
         holds."""
         require_cameras(reconstruction)
-        frame = build_frame(reconstruction, assumed.group)
-        criterion = criterion_with_prior(self.criterion, frame, assumed)
+        frame = assumed_frame(reconstruction, assumed)
         planes, log_f = self._propose(frame, reconstruction, rng)
-        cost = np.nan_to_num(criterion.cost(frame, planes, log_f), nan=np.inf)
+        cost = np.nan_to_num(self.criterion.cost(frame, planes, log_f), nan=np.inf)
         best = np.argsort(cost, kind="stable")[: self.refined]
         theta = np.concatenate([planes[best], log_f[best]], axis=1)
-        theta, cost = refine_hypotheses(criterion, frame, theta)
+        theta, cost = refine_hypotheses(self.criterion, frame, theta)
+        answers = answers_from_theta(frame, theta, cost, "hypotheses and refinement")
         return conclude(
-            frame, reconstruction, criterion, (theta, cost), kept=self.kept, min_positive=self.min_positive
+            frame, reconstruction, self.criterion, answers, kept=self.kept, min_positive=self.min_positive
         )
 
     def _propose(
@@ -94,30 +91,6 @@ class HypothesesAndRefinement:
         return first.ravel(), second.ravel()
 
 
-def require_cameras(reconstruction: Reconstruction) -> None:
-    """``StageFailure`` below three registered cameras."""
-    n = int(reconstruction.registered.sum())
-    if n < 3:
-        raise StageFailure(
-            "self-calibration needs at least 3 photographs that are tied together",
-            f"{n} could be registered",
-            "add photographs with more overlap",
-        )
-
-
-def criterion_with_prior(
-    criterion: RotationCriterion, frame: ReferenceFrame, assumed: Assumptions
-) -> RotationCriterion:
-    """The criterion with the user's word on the focal in place of the weak pull."""
-    known = frame.views[assumed.focal_known[frame.views]]
-    if not len(known):
-        return criterion
-    mean = float(np.median(np.log(assumed.mean[known, 0] / frame.pixel_from_unit[known, 0, 0])))
-    std = max(float(np.median(assumed.std[known, 0])), KNOWN_STD)
-    noise = 0.01
-    return RotationCriterion(criterion.scale, mean, std, noise)
-
-
 def focals_of_groups(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
     """Log focals (B, G) that suit planes p (B, 3) and reference focals (B,).
 
@@ -134,72 +107,6 @@ def focals_of_groups(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
     groups = np.stack([np.median(log_f[:, frame.group == g], axis=1) for g in range(frame.n_groups)], axis=1)
     groups[:, frame.group[frame.reference]] = np.log(f)
     return groups
-
-
-def conclude(
-    frame: ReferenceFrame,
-    reconstruction: Reconstruction,
-    criterion: RotationCriterion,
-    refined: tuple[F64, F64],
-    *,
-    kept: int,
-    min_positive: float,
-) -> SelfCalibration:
-    """Distinct refined answers with the scene in front of the cameras, best first, and the verdict on the
-    motion."""
-    theta, cost = refined
-    upgrades: list[Upgrade] = []
-    thetas: list[F64] = []
-    for b in np.argsort(cost, kind="stable"):
-        if len(upgrades) == kept or not np.isfinite(cost[b]):
-            break
-        if any(np.abs(theta[b, 3:] - t[3:]).max() < 0.03 for t in thetas):
-            continue
-        upgrade = _upgrade(frame, reconstruction, theta[b], float(cost[b]), min_positive)
-        if upgrade is not None:
-            upgrades.append(upgrade)
-            thetas.append(theta[b])
-    if not upgrades:
-        raise StageFailure(
-            "no camera calibration puts the scene in front of all cameras",
-            f"{len(theta)} hypotheses were refined over {len(frame.views)} cameras",
-            "photograph the scene from more directions, turning the camera between shots",
-        )
-    std_log_f, noise = focal_std(criterion, frame, thetas[0])
-    identifiable, reasons = identifiability(frame, thetas[0], std_log_f, noise)
-    K_std = np.zeros_like(upgrades[0].K)
-    K_std[frame.views, 0, 0] = K_std[frame.views, 1, 1] = upgrades[0].K[frame.views, 0, 0] * np.minimum(
-        std_log_f[frame.group], 1e3
-    )
-    best = upgrades[0]
-    return SelfCalibration(best.metric_from_projective, best.K, K_std, identifiable, reasons, tuple(upgrades))
-
-
-def _upgrade(
-    frame: ReferenceFrame, reconstruction: Reconstruction, theta: F64, cost: float, min_positive: float
-) -> Upgrade | None:
-    f = np.exp(theta[3:])[frame.group]
-    G = metric_from_reference(theta[:3], float(f[frame.reference])) @ frame.reference_from_projective
-    if not np.isfinite(G).all() or abs(np.linalg.det(G)) < 1e-300:
-        return None
-    keep = reconstruction.inlier
-    view, point = reconstruction.tracks.view_index[keep], reconstruction.tracks.point_index[keep]
-    P = reconstruction.P @ np.linalg.inv(G)
-    P *= np.where(np.linalg.det(P[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
-    X = reconstruction.X @ G.T
-    in_front = np.einsum("kj,kj->k", P[view, 2], X[point]) * X[point, 3] > 0
-    share = float(in_front.mean())
-    if share < 0.5:
-        G = np.diag([-1.0, -1.0, -1.0, 1.0]) @ G
-        share = 1.0 - share
-    if share < min_positive:
-        return None
-    K = np.zeros((len(reconstruction.P), 3, 3))
-    unit = np.zeros((len(frame.views), 3, 3))
-    unit[:, 0, 0] = unit[:, 1, 1] = f
-    unit[:, 2, 2] = 1.0
-    K[frame.views] = frame.pixel_from_unit[frame.views] @ unit
-    return Upgrade(G, K, cost, "refined")
 
 
 @dataclass(frozen=True)
@@ -219,8 +126,7 @@ class HartleySearch:
     ) -> SelfCalibration:
         """Upgrade by Hartley's search alone; ``StageFailure`` where the inequalities leave no plane."""
         require_cameras(reconstruction)
-        frame = build_frame(reconstruction, assumed.group)
-        criterion = criterion_with_prior(self.criterion, frame, assumed)
+        frame = assumed_frame(reconstruction, assumed)
         p, f = self.search.search(frame, reconstruction, rng)
         if len(p) == 0:
             raise StageFailure(
@@ -229,5 +135,7 @@ class HartleySearch:
                 "use the default preset, which does not depend on every single point being right",
             )
         theta = np.concatenate([p, focals_of_groups(frame, p, f)], axis=1)
-        refined = refine_hypotheses(criterion, frame, theta)
-        return conclude(frame, reconstruction, criterion, refined, kept=1, min_positive=0.5)
+        answers = answers_from_theta(
+            frame, *refine_hypotheses(self.criterion, frame, theta), "Hartley's search"
+        )
+        return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)

@@ -25,14 +25,16 @@ class RotationCriterion:
     """How far the upgraded cameras are from scaled rotations, robustly.
 
     ``scale``: residual norm of a camera beyond which it counts linearly (soft L1). ``focal_log_mean`` and
-    ``focal_log_std`` with ``focal_weight``: a weak pull of every log focal (in long sides) that keeps
-    hypotheses out of the absurd and is far below the noise of a well-determined problem.
+    ``focal_log_std`` with ``focal_weight``: a weak pull of every log focal (in long sides) of which nothing
+    is known; it keeps hypotheses out of the absurd and is far below the noise of a well-determined problem.
+    ``noise``: residual of a good camera, by which what is known of a focal weighs.
     """
 
     scale: float = 0.05
     focal_log_mean: float = 0.2
     focal_log_std: float = 1.0
     focal_weight: float = 2e-3
+    noise: float = 0.01
 
     def camera_residuals(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
         """p (B, 3), log_f (B, G) -> (B, R, 6) weighted entries of 3CC'/tr(CC') - I."""
@@ -49,19 +51,21 @@ class RotationCriterion:
         """Robust cost per camera of each hypothesis; (B,)."""
         norm2 = np.sum(self.camera_residuals(frame, p, log_f) ** 2, axis=-1)
         robust = 2.0 * self.scale**2 * (np.sqrt(1.0 + norm2 / self.scale**2) - 1.0)
-        pull = self._pull(log_f)
-        return np.asarray(
-            robust.sum(axis=1) / len(frame.views) + np.sum(pull**2, axis=1) / pull.shape[1], dtype=np.float64
-        )
+        pull = self._pull(frame, log_f)
+        return np.asarray((robust.sum(axis=1) + np.sum(pull**2, axis=1)) / len(frame.views), dtype=np.float64)
 
-    def _pull(self, log_f: F64) -> F64:
-        return self.focal_weight * (log_f - self.focal_log_mean) / self.focal_log_std
+    def _pull(self, frame: ReferenceFrame, log_f: F64) -> F64:
+        weak = self.focal_weight * (log_f - self.focal_log_mean) / self.focal_log_std
+        if frame.focal_mean is None or frame.focal_std is None:
+            return weak
+        known = np.isfinite(frame.focal_std)
+        scale = np.where(known, frame.focal_std, 1.0)
+        return np.where(known, self.noise * (log_f - np.where(known, frame.focal_mean, 0.0)) / scale, weak)
 
     def weighted_residuals(self, frame: ReferenceFrame, theta: F64, weights: F64) -> F64:
         """Residual vectors (B, 6 R + G) of theta = (p, log f) with fixed robust weights (B, R)."""
         residuals = self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) * weights[..., None]
-        scale = np.sqrt(len(frame.views) / (theta.shape[1] - 3.0))
-        return np.concatenate([residuals.reshape(len(theta), -1), scale * self._pull(theta[:, 3:])], axis=1)
+        return np.concatenate([residuals.reshape(len(theta), -1), self._pull(frame, theta[:, 3:])], axis=1)
 
     def weights(self, frame: ReferenceFrame, theta: F64) -> F64:
         """Square roots of the soft-L1 weights of each camera, (B, R)."""

@@ -1,0 +1,138 @@
+"""What every method of chapter 7 ends with: answers are turned into upgrades, checked and judged.
+
+A method gives a plane at infinity and calibrations; here the scene is put in front of the cameras, answers
+that cannot are dropped, and the verdict on the motion is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.selfcalibration.frame import ReferenceFrame, metric_from_calibration
+from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std
+from thesisrecon.selfcalibration.verdict import identifiability
+from thesisrecon.types import Reconstruction, SelfCalibration, Upgrade
+
+F64 = NDArray[np.float64]
+
+SAME_ANSWER = 0.03
+"""Answers whose log focals differ by less than this are one."""
+
+MAX_LOG_STD = 1e3
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A plane at infinity (3,) and unit-free calibrations ``K`` (R, 3, 3) in a reference frame, the ``cost``
+    by which answers are ordered, and the ``method`` they come from."""
+
+    plane: F64
+    K: F64
+    cost: float
+    method: str
+
+    def log_focals(self, frame: ReferenceFrame) -> F64:
+        """Log focals (G,) of the camera groups, each the median of its views."""
+        log_f = 0.5 * np.log(self.K[:, 0, 0] * self.K[:, 1, 1])
+        return np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
+
+
+def require_cameras(reconstruction: Reconstruction) -> None:
+    """``StageFailure`` below three registered cameras."""
+    n = int(reconstruction.registered.sum())
+    if n < 3:
+        raise StageFailure(
+            "self-calibration needs at least 3 photographs that are tied together",
+            f"{n} could be registered",
+            "add photographs with more overlap",
+        )
+
+
+def square_calibrations(log_f: F64) -> F64:
+    """Unit-free K (..., 3, 3) = diag(f, f, 1) of log focals (...)."""
+    K = np.zeros((*np.shape(log_f), 3, 3))
+    K[..., 0, 0] = K[..., 1, 1] = np.exp(log_f)
+    K[..., 2, 2] = 1.0
+    return K
+
+
+def answers_from_theta(frame: ReferenceFrame, theta: F64, cost: F64, method: str) -> list[Answer]:
+    """Answers of rows theta (B, 3 + G) = (plane, log focals) with their costs (B,)."""
+    K = square_calibrations(theta[:, 3:][:, frame.group])
+    return [Answer(t[:3], k, float(c), method) for t, k, c in zip(theta, K, cost, strict=True)]
+
+
+def conclude(
+    frame: ReferenceFrame,
+    reconstruction: Reconstruction,
+    criterion: RotationCriterion,
+    answers: Sequence[Answer],
+    *,
+    kept: int,
+    min_positive: float,
+) -> SelfCalibration:
+    """The ``kept`` best distinct answers with at least the share ``min_positive`` of the points in front of
+    the cameras, and the verdict on the motion; ``StageFailure`` where none is left."""
+    upgrades: list[Upgrade] = []
+    chosen: list[Answer] = []
+    for answer in sorted(answers, key=lambda a: a.cost):
+        if len(upgrades) == kept or not np.isfinite(answer.cost):
+            break
+        log_f = answer.log_focals(frame)
+        if any(np.abs(log_f - other.log_focals(frame)).max() < SAME_ANSWER for other in chosen):
+            continue
+        upgrade = upgrade_from_answer(frame, reconstruction, answer, min_positive)
+        if upgrade is not None:
+            upgrades.append(upgrade)
+            chosen.append(answer)
+    if not upgrades:
+        raise StageFailure(
+            "no camera calibration puts the scene in front of all cameras",
+            f"{len(answers)} answers were tried over {len(frame.views)} cameras",
+            "photograph the scene from more directions, turning the camera between shots",
+        )
+    theta = np.concatenate([chosen[0].plane, chosen[0].log_focals(frame)])
+    std_log_f, noise = focal_std(criterion, frame, theta)
+    identifiable, reasons = identifiability(frame, theta, std_log_f, noise)
+    best = upgrades[0]
+    K_std = np.zeros_like(best.K)
+    relative = np.minimum(std_log_f[frame.group], MAX_LOG_STD)
+    for k in (0, 1):
+        K_std[frame.views, k, k] = best.K[frame.views, k, k] * relative
+    return SelfCalibration(best.metric_from_projective, best.K, K_std, identifiable, reasons, tuple(upgrades))
+
+
+def upgrade_from_answer(
+    frame: ReferenceFrame, reconstruction: Reconstruction, answer: Answer, min_positive: float
+) -> Upgrade | None:
+    """The upgrade of an answer, mirrored where most points are behind; None where it is singular or leaves
+    less than ``min_positive`` of the observations in front."""
+    K_reference = answer.K[frame.reference]
+    if not (np.isfinite(answer.plane).all() and np.isfinite(answer.K).all()):
+        return None
+    G = metric_from_calibration(answer.plane, K_reference) @ frame.reference_from_projective
+    if not np.isfinite(G).all() or abs(np.linalg.det(G)) < 1e-300:
+        return None
+    share = _share_in_front(reconstruction, G)
+    if share < 0.5:
+        G, share = np.diag([-1.0, -1.0, -1.0, 1.0]) @ G, 1.0 - share
+    if share < min_positive:
+        return None
+    K = np.zeros((len(reconstruction.P), 3, 3))
+    K[frame.views] = frame.pixel_from_unit[frame.views] @ answer.K
+    return Upgrade(G, K, answer.cost, answer.method)
+
+
+def _share_in_front(reconstruction: Reconstruction, G: F64) -> float:
+    keep = reconstruction.inlier
+    view, point = reconstruction.tracks.view_index[keep], reconstruction.tracks.point_index[keep]
+    P = reconstruction.P @ np.linalg.inv(G)
+    P *= np.where(np.linalg.det(P[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
+    X = reconstruction.X @ G.T
+    in_front = np.einsum("kj,kj->k", P[view, 2], X[point]) * X[point, 3] > 0
+    return float(in_front.mean()) if len(in_front) else 0.0
