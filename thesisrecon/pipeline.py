@@ -17,7 +17,7 @@ from thesisrecon.intake import check_pairs, empty_result, identity, read_set, wi
 from thesisrecon.io.images import ImageSource, PhotographSet, list_images, scene_name
 from thesisrecon.outputs import RESULT_FILES, write_outputs
 from thesisrecon.run import Progress, Run, RunOptions, start_run, stream
-from thesisrecon.types import Assumptions, Features, Image, PairChoice, RunResult, TwoView
+from thesisrecon.types import Assumptions, Features, Image, PairChoice, RunResult, SelfCalibration, TwoView
 
 ATTEMPTS = 3
 MIN_CORNERS = 16
@@ -320,8 +320,14 @@ def _calibrate(work: _Work, attempt: int) -> None:
     )
     work.result = replace(work.result, calibration=calibration)
     counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
-    run.finish("selfcalibration", counts=counts)
+    run.finish("selfcalibration", counts=counts, warnings=_critical(calibration))
     run.progress("selfcalibration", 1, 1)
+
+
+def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
+    """The sentences on a critical motion that the assumptions make good for; what they do not is a doubt."""
+    verdict = calibration.verdict
+    return verdict.sentences if verdict is not None and verdict.critical and verdict.identifiable else ()
 
 
 def _refine(work: _Work, attempt: int) -> None:
@@ -346,7 +352,7 @@ def _refine(work: _Work, attempt: int) -> None:
     work.result = replace(work.result, metric=metric)
     best = metric.reconstruction
     counts = {"registered": int(best.registered.sum()), "points": int(best.valid.sum())}
-    run.finish("metric", counts=counts, metrics={"sigma_px": best.sigma_px})
+    run.finish("metric", counts=counts, metrics={"sigma_px": best.sigma_px}, warnings=metric.warnings)
     run.progress("metric", 1, 1)
 
 

@@ -296,7 +296,8 @@ class MetricResult:
 
     ``intrinsics[i]`` maps "focal_px", "principal_x_px", "principal_y_px", "k1" to an interval (empty where
     view i is not registered); ``self_check`` holds measured numbers; ``trusted`` False with ``doubts`` where
-    it failed.
+    it failed; ``warnings`` what should be known of a result that is trusted all the same (a focal that is
+    borrowed, a prior that the photographs contradict).
     """
 
     reconstruction: Reconstruction
@@ -304,6 +305,7 @@ class MetricResult:
     self_check: Mapping[str, float]
     trusted: bool
     doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

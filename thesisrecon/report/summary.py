@@ -36,6 +36,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "trusted": result.metric.trusted if result.metric is not None else None,
         "doubts": list(result.metric.doubts) if result.metric is not None else [],
         "identifiable": result.calibration.identifiable if result.calibration is not None else None,
+        "motion": _motion(result),
         "self_check": dict(result.metric.self_check) if result.metric is not None else {},
         "pairs": {
             "chosen_by": result.pair_choice.how if result.pair_choice is not None else None,
@@ -49,6 +50,19 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "cameras": views,
         "refused": _refused(result, views),
         "warnings": list(result.warnings),
+    }
+
+
+def _motion(result: RunResult) -> dict[str, Any] | None:
+    """The critical motion that the cameras come nearest to, and the measures behind it."""
+    verdict = None if result.calibration is None else result.calibration.verdict
+    if verdict is None:
+        return None
+    return {
+        "nearest_critical": verdict.motion,
+        "critical": verdict.critical,
+        "evidence": dict(verdict.evidence),
+        "sentences": list(verdict.sentences),
     }
 
 
