@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from thesisrecon.metric.model import MetricModel
 from thesisrecon.optimize.metric_bundle import (
+    BundleOptions,
     IntrinsicsPrior,
     MetricBundleResult,
     MetricCameras,
+    Observations,
     refine_metric_bundle,
 )
 from thesisrecon.types import I64, IntrinsicInterval
@@ -85,11 +87,15 @@ def measured_inflation(
     intrinsics = model.cameras.intrinsics[group]
     t = model.tracks
     result = refine_metric_bundle(
-        MetricCameras(model.cameras.R, model.cameras.t, intrinsics, separate), model.X, t.view_index[k],
-        t.point_index[k], t.xy[k], free=np.array([True, False, False, False, False, False]),
-        prior=IntrinsicsPrior(prior.mean[group], prior.std[group]), sigma_px=model.sigma_px,
-        loss_px=2.0 * model.sigma_px, max_iterations=8, covariance=True,
-    )  # fmt: skip
+        MetricCameras(model.cameras.R, model.cameras.t, intrinsics, separate),
+        model.X,
+        Observations(t.view_index[k], t.point_index[k], t.xy[k]),
+        free=np.array([True, False, False, False, False, False]),
+        prior=IntrinsicsPrior(prior.mean[group], prior.std[group]),
+        options=BundleOptions(
+            sigma_px=model.sigma_px, loss_px=2.0 * model.sigma_px, max_iterations=8, covariance=True
+        ),
+    )
     log_f = np.log(result.cameras.intrinsics[views, 0])
     std = (
         np.sqrt(np.maximum(result.intrinsics_covariance[views, 0, 0], 0.0))

@@ -25,9 +25,11 @@ from thesisrecon.metric.model import (
 from thesisrecon.metric.resection import add_missing_cameras
 from thesisrecon.metric.self_check import self_check
 from thesisrecon.optimize.metric_bundle import (
+    BundleOptions,
     IntrinsicsPrior,
     MetricBundleResult,
     MetricCameras,
+    Observations,
     refine_metric_bundle,
 )
 from thesisrecon.robust.noise import noise_from_distances
@@ -189,10 +191,18 @@ class UpgradeAndBundle:
                 "walk further around the scene between photographs",
             )
         result = refine_metric_bundle(
-            model.cameras, model.X, t.view_index[k], t.point_index[k], t.xy[k], free=free,
-            prior=self._prior(model, assumed), sigma_px=model.sigma_px, loss_px=2.0 * model.sigma_px,
-            max_iterations=iterations, covariance=covariance,
-        )  # fmt: skip
+            model.cameras,
+            model.X,
+            Observations(t.view_index[k], t.point_index[k], t.xy[k]),
+            free=free,
+            prior=self._prior(model, assumed),
+            options=BundleOptions(
+                sigma_px=model.sigma_px,
+                loss_px=2.0 * model.sigma_px,
+                max_iterations=iterations,
+                covariance=covariance,
+            ),
+        )
         norms = np.asarray(np.linalg.norm(result.residual_px, axis=1))
         sigma = max(noise_from_distances(norms), self.noise_floor_px)
         return replace(model, cameras=result.cameras, X=result.X, sigma_px=sigma), result, k

@@ -18,7 +18,7 @@ from thesisrecon.optimize.schur import (
     BundleSystem,
     Columns,
     Jacobians,
-    Observations,
+    SortedObservations,
     assemble_system,
     sort_observations,
 )
@@ -68,7 +68,7 @@ def _state(P: F64, X: F64) -> _State:
 class _ProjectiveProblem:
     """Reprojection in conditioned pixels; states hold unit vectors, steps lie in their tangent spaces."""
 
-    observations: Observations
+    observations: SortedObservations
     columns: Columns
     free_views: B8
     loss: int
@@ -174,10 +174,12 @@ def refine_projective_bundle(
     )
 
 
-def _projective_problem(observations: Observations, T: F64, free: B8, loss_px: float) -> _ProjectiveProblem:
+def _projective_problem(
+    observations: SortedObservations, T: F64, free: B8, loss_px: float
+) -> _ProjectiveProblem:
     """The problem in conditioned pixels, with buffers."""
     xy = observations.xy * T[0, 0] + T[:2, 2]
-    conditioned = Observations(
+    conditioned = SortedObservations(
         observations.view_index, observations.point_index, xy, observations.start, observations.order
     )
     first = np.where(free, VIEW_DOF * (np.cumsum(free) - 1), -1)
