@@ -18,7 +18,7 @@ import pycolmap
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
-from thesisrecon.types import Reconstruction
+from thesisrecon.types import F64, Reconstruction
 
 _DEFAULT_FOCAL_REL = 1.2
 
@@ -31,6 +31,17 @@ class ReferenceRun:
     names: tuple[str, ...]
     reconstruction: Reconstruction
     seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Start:
+    """What COLMAP starts from and refines: a focal length of ``focal_rel`` long sides, and the principal
+    point only where that is wished; or ``K`` (3, 3) by the name of the photograph, pixels as ours, taken for
+    exact (the cameras of the photographs must be their own then)."""
+
+    refine_principal_point: bool = False
+    focal_rel: float = _DEFAULT_FOCAL_REL
+    K: Mapping[str, F64] | None = None
 
 
 def match_with_pycolmap(
@@ -75,12 +86,43 @@ def reconstruct_with_pycolmap(
     ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database, the
     models and the times. Raises :class:`StageFailure` where COLMAP makes no model.
     """
-    seconds = match_with_pycolmap(images, out, shared_camera=shared_camera, threads=threads)
-    start = time.perf_counter()
+    match_with_pycolmap(images, out, shared_camera=shared_camera, threads=threads)
+    return _map(images, out, _options(threads, refine_principal_point))
+
+
+def map_with_pycolmap(
+    images: Path, matched: Path, out: Path, *, start: Start | None = None, threads: int = 2
+) -> ReferenceRun:
+    """Incremental mapping of what :func:`match_with_pycolmap` left in ``matched``, as ``start`` has it.
+
+    ``out`` is another folder, emptied first. Raises :class:`StageFailure` where COLMAP makes no model.
+    """
+    start = start or Start()
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    for name in ("database.db", "seconds.json"):
+        shutil.copy(matched / name, out / name)
+    pycolmap.set_random_seed(0)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    options = _options(threads, start.refine_principal_point)
+    _forget_focal_priors(out / "database.db", start.focal_rel)
+    if start.K is not None:
+        _give_calibration(out / "database.db", start.K)
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    return _map(images, out, options)
+
+
+def _options(threads: int, refine_principal_point: bool) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads, ba_refine_principal_point=refine_principal_point
     )
     options.mapper.num_threads = threads
+    return options
+
+
+def _map(images: Path, out: Path, options: pycolmap.IncrementalPipelineOptions) -> ReferenceRun:
+    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
+    start = time.perf_counter()
     pycolmap.incremental_mapping(out / "database.db", images, out / "sparse", options)
     seconds["map"] = time.perf_counter() - start
     (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
@@ -98,13 +140,26 @@ def read_run(images: Path, out: Path) -> ReferenceRun:
     return ReferenceRun(names, reconstruction_from_colmap(largest, names=names), seconds)
 
 
-def _forget_focal_priors(database: Path) -> None:
-    """Put COLMAP's default guess in the place of every focal length that came from EXIF."""
+def _forget_focal_priors(database: Path, focal_rel: float = _DEFAULT_FOCAL_REL) -> None:
+    """Put a guess in the place of every focal length, also of those that came from EXIF."""
     store = pycolmap.Database.open(database)
     for camera in store.read_all_cameras():
-        guess = _DEFAULT_FOCAL_REL * max(camera.width, camera.height)
+        guess = focal_rel * max(camera.width, camera.height)
         camera.params = [guess, *camera.params[1:]]
         camera.has_prior_focal_length = False
+        store.update_camera(camera)
+    store.close()
+
+
+def _give_calibration(database: Path, K: Mapping[str, F64]) -> None:
+    """Put the true calibration in the place of every camera."""
+    store = pycolmap.Database.open(database)
+    for image in store.read_all_images():
+        camera, known = store.read_camera(image.camera_id), K[image.name]
+        camera.model = pycolmap.CameraModelId.PINHOLE
+        # COLMAP's pixels have their origin at the corner of the first one.
+        camera.params = [known[0, 0], known[1, 1], known[0, 2] + 0.5, known[1, 2] + 0.5]
+        camera.has_prior_focal_length = True
         store.update_camera(camera)
     store.close()
 

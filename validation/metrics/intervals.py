@@ -1,0 +1,65 @@
+"""Whether stated intervals hold the truth: deviations in units of the standard deviation that was stated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.types import F64, MetricResult
+
+NAMES = ("focal_px", "principal_x_px", "principal_y_px")
+LEVEL = 1.96
+"""An interval of so many standard deviations to each side holds the truth in 95 of 100 cases."""
+
+
+@dataclass(frozen=True)
+class IntervalScores:
+    """``z`` (V, 3): (value - truth) / std of :data:`NAMES`, NaN where a view is not registered or the value
+    was given; ``std_rel`` (V,): stated standard deviation of the focal over its value."""
+
+    z: F64
+    std_rel: F64
+
+    def holding(self, columns: Sequence[int] = (0, 1, 2)) -> float:
+        """Share of the 95 % intervals of these columns that hold the truth; NaN without any."""
+        z = self.z[:, list(columns)]
+        z = z[np.isfinite(z)]
+        return float(np.mean(np.abs(z) <= LEVEL)) if len(z) else float("nan")
+
+    def worst(self, columns: Sequence[int] = (0, 1, 2)) -> float:
+        """Largest |z| of these columns; NaN without any."""
+        z = np.abs(self.z[:, list(columns)])
+        return float(np.nanmax(z)) if np.isfinite(z).any() else float("nan")
+
+
+def interval_scores(metric: MetricResult, K: F64) -> IntervalScores:
+    """Stated intervals against the true K (V, 3, 3); the focal's truth is the geometric mean of fx and fy."""
+    truth = np.column_stack([np.sqrt(K[:, 0, 0] * K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]])
+    z, std_rel = np.full((len(K), 3), np.nan), np.full(len(K), np.nan)
+    for view, intervals in enumerate(metric.intrinsics):
+        for column, name in enumerate(NAMES):
+            interval = intervals.get(name)
+            if interval is not None and interval.std > 0.0:
+                z[view, column] = (interval.value - truth[view, column]) / interval.std
+        if "focal_px" in intervals:
+            std_rel[view] = intervals["focal_px"].std / intervals["focal_px"].value
+    return IntervalScores(z, std_rel)
+
+
+def join_scores(scores: Sequence[IntervalScores]) -> IntervalScores:
+    """The views of several results together."""
+    return IntervalScores(np.concatenate([s.z for s in scores]), np.concatenate([s.std_rel for s in scores]))
+
+
+def focal_errors_pct(K: F64, K_true: F64) -> F64:
+    """|f / f_true - 1| (V,) in percent, f the geometric mean of fx and fy; NaN where K is zero."""
+    f = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
+    truth = np.sqrt(K_true[:, 0, 0] * K_true[:, 1, 1])
+    return np.where(f > 0, 100.0 * np.abs(f / truth - 1.0), np.nan)
+
+
+def source_of_focal(intervals: Mapping[str, object]) -> str:
+    """Where a view's focal is from, in the words of the result; empty where the view is not registered."""
+    return str(getattr(intervals.get("focal_px"), "source", ""))

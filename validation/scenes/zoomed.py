@@ -1,0 +1,132 @@
+"""Photographs taken anew from photographs: zoomed and cropped ones, their central parts, and photographs of
+which only a part is left. The truth of each is exact: the pixels are moved, and K with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from validation.scenes.real import Scene
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+FEATHER_PX = 24.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The part of a photograph that becomes one of its own: ``size`` (width, height) px, its corner at
+    ``(left, top)`` of the photograph enlarged ``zoom`` times."""
+
+    zoom: float
+    left: float
+    top: float
+    size: tuple[int, int]
+
+    def calibration(self, K: F64) -> F64:
+        """K (3, 3) of the new photograph, from that of the old one."""
+        move = 0.5 * self.zoom - 0.5 - np.array([self.left, self.top])
+        return np.array([[self.zoom, 0, move[0]], [0, self.zoom, move[1]], [0, 0, 1]]) @ K
+
+    def cut(self, rgb: U8) -> U8:
+        """The new photograph (H, W, 3), resampled once."""
+        box = np.array([self.left, self.top, self.left + self.size[0], self.top + self.size[1]]) / self.zoom
+        low, high = np.zeros(4), np.tile(rgb.shape[1::-1], 2)
+        left, top, right, bottom = (float(v) for v in np.clip(box, low, high))
+        picture = PillowImage.fromarray(rgb)
+        part = picture.resize(self.size, PillowImage.Resampling.LANCZOS, box=(left, top, right, bottom))
+        return np.asarray(part)
+
+
+@dataclass(frozen=True)
+class Rezoom:
+    """Every photograph zoomed and cropped for itself.
+
+    ``zoom``: the logarithm of the factor lies within +- this; ``shift``: the principal point moves from the
+    middle by up to this share of the new width and height. A frame is never larger than the photograph was.
+    """
+
+    zoom: float = 0.4
+    shift: float = 0.1
+
+    def frame(self, K: F64, size: tuple[int, int], rng: np.random.Generator) -> Frame:
+        """A frame of a photograph of this ``size`` (width, height) with the calibration K (3, 3)."""
+        factor = float(np.exp(rng.uniform(-self.zoom, self.zoom)))
+        off = rng.uniform(-self.shift, self.shift, 2)
+        centre, whole = factor * (K[:2, 2] + 0.5), factor * np.array(size)
+        room = np.minimum(centre, whole - centre) / (0.5 + np.abs(off))
+        width, height = (int(v) for v in np.minimum(room, size))
+        left, top = centre - (0.5 + off) * [width, height]
+        return Frame(factor, float(left), float(top), (width, height))
+
+
+def rezoom_scene(scene: Scene, folder: Path, *, seed: int, how: Rezoom | None = None) -> Scene:
+    """The scene with every photograph in a :class:`Rezoom` frame of its own, written to ``folder``."""
+    how, rng = how or Rezoom(), np.random.default_rng(seed)
+    return _framed(scene, folder, lambda K, size: how.frame(K, size, rng), f"zoom-{seed}")
+
+
+def central_scene(scene: Scene, folder: Path, *, share: float = 0.5, zoom: float = 1.0) -> Scene:
+    """The scene seen through a longer lens: ``share`` of the width and height around the middle of every
+    photograph, enlarged ``zoom`` times."""
+
+    def frame(_: F64, size: tuple[int, int]) -> Frame:
+        width, height = (round(zoom * share * side) for side in size)
+        left, top = (0.5 * (zoom * side - part) for side, part in zip(size, (width, height), strict=True))
+        return Frame(zoom, left, top, (width, height))
+
+    return _framed(scene, folder, frame, f"centre-{zoom:g}")
+
+
+def windowed_scene(scene: Scene, folder: Path, boxes: dict[int, F64]) -> Scene:
+    """The scene with only a part left of some photographs: ``boxes`` maps the number of a photograph to the
+    part (left, top, right, bottom) as shares of width and height. The rest is grey, with a soft edge that
+    gives no corners; the camera stays what it was."""
+    paths = []
+    for number, path in enumerate(scene.image_paths):
+        rgb = _read(path)
+        if number in boxes:
+            height, width = rgb.shape[:2]
+            left, top, right, bottom = boxes[number]
+            weight = np.outer(_ramp(height, top, bottom), _ramp(width, left, right))[..., None]
+            rgb = (weight * rgb + (1.0 - weight) * rgb.mean(axis=(0, 1))).astype(np.uint8)
+        paths.append(_write(folder, path.stem, rgb))
+    return Scene(f"{scene.name} windows", tuple(paths), scene.K, scene.R, scene.C)
+
+
+def _ramp(length: int, low: float, high: float) -> F64:
+    """1 between two shares of a length, and softly 0 outside."""
+    x = np.arange(length) + 0.5
+    inside = np.minimum(x - low * length, high * length - x)
+    return np.asarray(np.clip(inside / FEATHER_PX, 0.0, 1.0))
+
+
+def _framed(scene: Scene, folder: Path, frame: Callable[[F64, tuple[int, int]], Frame], name: str) -> Scene:
+    if scene.K is None:
+        raise ValueError(f"new photographs need the calibration of the old ones; {scene.name} has none")
+    paths, K = [], []
+    for path, calibration in zip(scene.image_paths, scene.K, strict=True):
+        rgb = _read(path)
+        part = frame(calibration, (rgb.shape[1], rgb.shape[0]))
+        paths.append(_write(folder, path.stem, part.cut(rgb)))
+        K.append(part.calibration(calibration))
+    return Scene(f"{scene.name} {name}", tuple(paths), np.array(K), scene.R, scene.C)
+
+
+def _read(path: Path) -> U8:
+    with PillowImage.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def _write(folder: Path, stem: str, rgb: U8) -> Path:
+    """Kept as it is where it is there already: the pixels follow from the folder's name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{stem}.png"
+    if not path.is_file():
+        PillowImage.fromarray(rgb).save(path, compress_level=1)
+    return path
