@@ -1,0 +1,327 @@
+"""Section 6.3: five methods of triangulation against plain twins, each other and what a minimum must be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import thesisrecon
+from tests.geometry import triangulation_twins as twins
+from tests.geometry.properties import holds_for_every, random_camera
+from thesisrecon.geometry.camera import camera_centre, compose_camera, project
+from thesisrecon.geometry.kernels import jacobi_least, reduce_reprojection
+from thesisrecon.geometry.multiview import fundamental_from_cameras
+from thesisrecon.geometry.optimal_triangulation import correct_matches
+from thesisrecon.geometry.triangulation import (
+    triangulate,
+    triangulate_iterated,
+    triangulate_linear,
+    triangulate_midpoint,
+    triangulate_observations,
+    triangulate_optimal,
+    triangulate_polynomial,
+)
+from thesisrecon.geometry.two_view.kernels import roots_in_unit_interval
+
+F64 = NDArray[np.float64]
+METHODS = ["polynomial", "linear", "midpoint", "iterated", "optimal"]
+KINDS = [
+    "general",
+    "forward",
+    "rectified",
+    "epipole at infinity",
+    "near the epipoles",
+    "far points",
+    "points at infinity",
+    "short baseline",
+    "projective frame",
+]
+K = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 480.0], [0.0, 0.0, 1.0]])
+RELATIVE, ROUNDING_PX = 1e-9, 1e-11
+"""Costs are equal to 1e-9 of themselves, or where the distances they are made of agree to rounding."""
+
+
+def two_views(kind: str, rng: np.random.Generator, n: int = 40) -> tuple[F64, F64]:
+    """P (2, 3, 4) and exact points X (n, 4) of one kind of geometry."""
+    R = Rotation.from_rotvec(rng.normal(0.0, 0.2, 3)).as_matrix()
+    c = rng.normal(size=3)
+    X = np.column_stack([rng.uniform(-2.0, 2.0, (n, 2)), rng.uniform(3.0, 9.0, n), np.ones(n)])
+    if kind in ("forward", "near the epipoles"):
+        c, R = (
+            np.append(rng.normal(0.0, 0.1, 2), 1.0),
+            Rotation.from_rotvec(rng.normal(0.0, 0.05, 3)).as_matrix(),
+        )
+    if kind == "near the epipoles":
+        X[:, :3] = c * rng.uniform(1.5, 6.0, (n, 1)) + rng.normal(size=(n, 3)) * 10 ** rng.uniform(
+            -6, -1.5, (n, 1)
+        )
+    if kind == "rectified":
+        c, R = np.array([1.0, 0.0, 0.0]), np.eye(3)
+    if kind == "epipole at infinity":
+        c[2] = 0.0
+    if kind == "short baseline":
+        c *= 1e-4
+    if kind == "far points":
+        X[:, :3] *= 10 ** rng.uniform(0.0, 8.0, (n, 1))
+    if kind == "points at infinity":
+        X[:, 3] = 0.0
+    P = compose_camera(np.stack([K, K]), np.stack([np.eye(3), R]), np.stack([np.zeros(3), -R @ c]))
+    if kind == "projective frame":
+        G = np.eye(4) + 0.25 * rng.normal(size=(4, 4))
+        P, X = P @ np.linalg.inv(G), X @ G.T
+    return P, X
+
+
+def images(P: F64, X: F64) -> F64:
+    return np.stack([project(camera, X) for camera in P])
+
+
+def excess(cost: F64, least: F64) -> float:
+    """Largest excess of costs over others, less what rounding of distances explains, as a share of them."""
+    allowed = 2.0 * np.sqrt(least) * ROUNDING_PX + ROUNDING_PX**2
+    return float(np.max((cost - least - allowed) / (least + 1e-300)))
+
+
+def polished(P: F64, X: F64, xy: F64) -> F64:
+    """X after as many descent steps as lower the reprojection error, from X itself."""
+    n = xy.shape[1]
+    cameras = np.ascontiguousarray(P / np.linalg.norm(P, axis=(1, 2), keepdims=True))
+    seen = np.ascontiguousarray(xy.transpose(1, 0, 2).reshape(-1, 2))
+    X = X.copy()
+    reduce_reprojection(cameras, 2 * np.arange(n + 1), np.tile([0, 1], n), seen, 200, X)
+    return X
+
+
+@holds_for_every(st.sampled_from(KINDS), st.sampled_from([1e-2, 1.0, 30.0]), examples=120)
+def test_6_3_3_polynomial_cost_is_the_optimum_in_every_geometry(rng, kind, sigma_px):
+    P, X = two_views(kind, rng)
+    xy = images(P, X)
+    xy = xy + sigma_px * rng.normal(size=xy.shape)
+    found = triangulate_polynomial(P, xy)
+    cost = twins.reprojection_costs(P, found, xy)
+    # No descent gets lower from there, and none from the linear answer gets below.
+    assert excess(cost, twins.reprojection_costs(P, polished(P, found, xy), xy)) < RELATIVE
+    many = twins.reprojection_costs(P, triangulate_optimal(P, xy), xy)
+    assert excess(cost, many) < RELATIVE
+    # Nor does any of many epipolar planes, each with the two lines' distances.
+    assert np.all(cost <= cost_of_planes(P, xy) * (1.0 + RELATIVE) + ROUNDING_PX)
+    if kind != "near the epipoles" and sigma_px <= 1.0:
+        assert excess(many, cost) < RELATIVE
+
+
+def cost_of_planes(P: F64, xy: F64) -> F64:
+    """Least sum of squared distances over a pencil of 4000 epipolar planes, per match."""
+    centres = camera_centre(P)
+    N = np.linalg.svd(centres / np.linalg.norm(centres, axis=1, keepdims=True))[2][2:]
+    angles = np.linspace(0.0, np.pi, 4000)
+    planes = np.outer(np.cos(angles), N[0]) + np.outer(np.sin(angles), N[1])
+    total = np.zeros((xy.shape[1], len(planes)))
+    for camera, pixels in zip(P, xy, strict=True):
+        lines = planes @ np.linalg.pinv(camera)
+        size = np.linalg.norm(lines[:, :2], axis=1)
+        with np.errstate(divide="ignore"):
+            total += ((pixels @ lines[:, :2].T + lines[:, 2]) / size) ** 2
+    return np.asarray(total.min(axis=1))
+
+
+@holds_for_every(
+    st.sampled_from(["general", "forward", "short baseline"]), st.sampled_from([0.0, 0.1, 3.0, 50.0])
+)
+def test_the_compiled_polynomial_method_is_its_plain_twin(rng, kind, sigma_px):
+    P, X = two_views(kind, rng)
+    xy = images(P, X)
+    xy = xy + sigma_px * rng.normal(size=xy.shape)
+    F = fundamental_from_cameras(*P)
+    ours, plain = correct_matches(F, *xy), twins.correct_matches(F, *xy)
+    np.testing.assert_allclose(ours, plain, atol=1e-5)
+    cost, least = (np.sum((np.stack(a) - xy) ** 2, axis=(0, 2)) for a in (ours, plain))
+    np.testing.assert_allclose(cost, least, rtol=1e-7, atol=1e-9)
+
+
+@holds_for_every(st.sampled_from(KINDS))
+def test_6_3_3_exact_matches_are_left_where_they_are_and_points_found(rng, kind):
+    P, X = two_views(kind, rng)
+    xy = images(P, X)
+    for method in (triangulate_polynomial, triangulate_optimal):
+        assert np.abs(images(P, method(P, xy)) - xy).max() < 1e-7
+    corrected = np.stack(correct_matches(fundamental_from_cameras(*P), *xy))
+    assert np.abs(corrected - xy).max() < 1e-6
+
+
+@holds_for_every()
+def test_6_3_3_corrected_matches_satisfy_the_epipolar_constraint(rng):
+    P, X = two_views("general", rng)
+    F = fundamental_from_cameras(*P)
+    x1, x2 = correct_matches(-3.0 * F, *(images(P, X) + 3.0 * rng.normal(size=(2, 40, 2))))
+    x1, x2 = np.column_stack([x1, np.ones(40)]), np.column_stack([x2, np.ones(40)])
+    lines = x1 @ F.T
+    assert np.abs(np.sum(x2 * lines, axis=1) / np.linalg.norm(lines[:, :2], axis=1)).max() < 1e-8
+
+
+def test_6_3_3_matches_on_epipoles_are_exact():
+    P, X = two_views("forward", np.random.default_rng(3))
+    xy = images(P, X)
+    e1, e2 = project(P[0], camera_centre(P[1])[None])[0], project(P[1], camera_centre(P[0])[None])[0]
+    xy[0, :2], xy[1, 1:3] = e1, e2
+    corrected = np.stack(correct_matches(fundamental_from_cameras(*P), *xy))
+    np.testing.assert_allclose(corrected[:, :3], xy[:, :3], atol=1e-9)
+    # Both on epipoles: some point of the baseline, seen where it should be.
+    found = triangulate_polynomial(P, xy)
+    np.testing.assert_allclose(images(P, found[1:2]), xy[:, 1:2], atol=1e-6)
+
+
+@holds_for_every(st.sampled_from(["general", "forward", "near the epipoles", "rectified"]))
+def test_6_3_optimal_methods_do_not_depend_on_the_frame_of_space(rng, kind):
+    P, X = two_views(kind, rng)
+    xy = images(P, X) + rng.normal(size=(2, 40, 2))
+    G = np.eye(4) + 0.2 * rng.normal(size=(4, 4))
+    moved = P @ np.linalg.inv(G) * rng.uniform(-3.0, 3.0, (2, 1, 1))
+    a, b = (twins.reprojection_costs(p, triangulate_polynomial(p, xy), xy) for p in (P, moved))
+    np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-11)
+
+
+def several_views(rng: np.random.Generator, sigma_px: float, n: int = 12) -> tuple[F64, F64]:
+    """Five cameras about the origin and noisy pixels (5, n, 2), a third of them not seen."""
+    P = np.stack([random_camera(rng)[0] for _ in range(5)]) * rng.uniform(0.2, 5.0, (5, 1, 1))
+    X = np.column_stack([rng.uniform(-1.0, 1.0, (n, 3)), np.ones(n)])
+    xy = images(P, X) + sigma_px * rng.normal(size=(5, n, 2))
+    hidden = rng.random((5, n)) < 0.3
+    hidden[:2] = False
+    xy[hidden] = np.nan
+    return P, xy
+
+
+@holds_for_every(st.sampled_from([0.0, 1.0, 10.0]))
+def test_the_compiled_methods_are_their_plain_twins(rng, sigma_px):
+    P, xy = several_views(rng, sigma_px)
+    scale = twins.view_scales(P, xy)
+    answers = [
+        (triangulate_linear(P, xy), twins.linear_point),
+        (triangulate_iterated(P, xy), twins.iterated_point),
+    ]
+    for found, twin in answers:
+        expected = np.stack([twin(P, scale, xy[:, n]) for n in range(xy.shape[1])])
+        np.testing.assert_allclose(np.abs(np.sum(found * expected, axis=1)), 1.0, atol=1e-10)
+    found = triangulate_midpoint(P, xy)
+    np.testing.assert_allclose(
+        found[:, :3], [twins.midpoint(P, xy[:, n]) for n in range(xy.shape[1])], atol=1e-7
+    )
+
+
+@holds_for_every(st.sampled_from([1.0, 10.0]), examples=10)
+def test_6_3_n_view_method_reaches_the_least_squares_optimum(rng, sigma_px):
+    P, xy = several_views(rng, sigma_px)
+    found = triangulate_optimal(P, xy)
+    cost = twins.reprojection_costs(P, found, xy)
+    for n in range(xy.shape[1]):
+        seen = np.isfinite(xy[:, n, 0])
+        assert cost[n] <= twins.least_reprojection_cost(P[seen], xy[seen, n], found[n]) * (1.0 + RELATIVE)
+
+
+def test_6_3_1_near_least_singular_values_go_to_jacobis_rotations():
+    rng = np.random.default_rng(0)
+    for ratio in (0.0, 1e-8, 0.5, 0.9, 0.999, 1.0):
+        U, V = (np.linalg.qr(rng.normal(size=(4, 4)))[0] for _ in range(2))
+        R = np.linalg.qr((U * [3.0, 2.0, 1.0, ratio]) @ V.T)[1]
+        x = np.empty(4)
+        jacobi_least(np.ascontiguousarray(R), x)
+        assert np.linalg.norm(R @ x) == pytest.approx(ratio, abs=1e-14)
+        assert np.linalg.norm(x) == pytest.approx(1.0)
+
+
+@holds_for_every()
+def test_real_roots_of_a_polynomial_in_the_unit_interval(rng):
+    inside = np.sort(rng.uniform(-0.95, 0.95, rng.integers(0, 5)))
+    outside = rng.uniform(1.1, 4.0, 6 - len(inside)) * rng.choice([-1.0, 1.0], 6 - len(inside))
+    outside = outside[: rng.integers(0, len(outside) + 1)]
+    c = np.zeros(7)
+    coefficients = np.polynomial.polynomial.polyfromroots([*inside, *outside]) * rng.choice([-2.0, 5.0])
+    c[: len(coefficients)] = coefficients
+    roots = np.empty(8)
+    count = roots_in_unit_interval(c, roots)
+    np.testing.assert_allclose(roots[:count], inside, atol=1e-5)
+
+
+def test_6_3_2_midpoint_degrades_in_a_projective_frame_and_the_optimal_methods_do_not():
+    rng = np.random.default_rng(0)
+    P, X = two_views("general", rng, 400)
+    xy = images(P, X) + rng.normal(size=(2, 400, 2))
+    # A plane across the points goes to infinity: some rays are parallel in this frame.
+    G = np.eye(4)
+    G[3] = [0.5, 0.3, -0.1, 0.2]
+    rms = {}
+    for frame, H in (("metric", np.eye(4)), ("projective", G)):
+        cameras = P @ np.linalg.inv(H)
+        for method in METHODS:
+            costs = twins.reprojection_costs(cameras, triangulate(cameras, xy, method=method), xy)
+            rms[frame, method] = np.sqrt(costs.mean())
+    assert rms["metric", "midpoint"] < 1.1 * rms["metric", "polynomial"]
+    assert rms["projective", "midpoint"] > 1.4 * rms["metric", "midpoint"]
+    for method in ("polynomial", "iterated", "optimal"):
+        assert rms["projective", method] == pytest.approx(rms["metric", method], rel=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_nan_means_not_seen_for_every_method(method):
+    P, X = two_views("general", np.random.default_rng(0))
+    xy = images(P, X)
+    xy[1, 3], xy[0, 5, 1] = np.nan, np.nan
+    found = thesisrecon.triangulate(P, xy, method=method)
+    assert not found[[3, 5]].any()
+    keep = np.delete(np.arange(40), [3, 5])
+    np.testing.assert_allclose(found[keep, :3] / found[keep, 3:], X[keep, :3], atol=1e-6)
+    assert thesisrecon.triangulate(P, np.full((2, 4, 2), np.nan), method=method).tolist() == [[0.0] * 4] * 4
+    assert thesisrecon.triangulate(P, np.empty((2, 0, 2)), method=method).shape == (0, 4)
+    one = thesisrecon.triangulate(P, xy[:, :1], method=method)
+    np.testing.assert_allclose(one[:, :3] / one[:, 3:], X[:1, :3], atol=1e-6)
+
+
+def test_observations_in_any_order_give_the_same_points():
+    rng = np.random.default_rng(1)
+    P, xy = several_views(rng, 1.0)
+    view, point = np.nonzero(np.isfinite(xy[:, :, 0]))
+    shuffled = rng.permutation(len(view))
+    view, point = view[shuffled], point[shuffled]
+    found = triangulate_observations(P, view, point, xy[view, point], 14)
+    np.testing.assert_allclose(found[:12], triangulate_linear(P, xy), atol=1e-12)
+    assert not found[12:].any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_refuses_what_it_cannot_take(method):
+    P, X = two_views("general", np.random.default_rng(0))
+    xy = images(P, X)
+
+    def refused(cameras, pixels, match):
+        with pytest.raises(ValueError, match=match):
+            triangulate(cameras, pixels, method=method)
+
+    refused(P[0], xy, r"P \(V, 3, 4\)")
+    refused(P, xy[:1], r"xy \(V, N, 2\)")
+    refused(P[:1], xy[:1], "two cameras")
+    refused(np.where(np.arange(2)[:, None, None] == 1, 0.0, P), xy, "not all zero")
+    refused(np.where(np.arange(4) == 1, np.nan, P), xy, "finite")
+    refused(P, np.where(xy > xy.mean(), np.inf, xy), "infinite")
+    refused(P.astype(complex), xy, "real")
+
+
+def test_what_single_methods_refuse():
+    P, X = two_views("general", np.random.default_rng(0))
+    xy = images(P, X)
+    with pytest.raises(ValueError, match="different centres"):
+        triangulate_polynomial(np.stack([P[0], np.diag([1.0, 2.0, 3.0]) @ P[0]]), xy)
+    with pytest.raises(ValueError, match="rank 3"):
+        triangulate_polynomial(np.stack([P[0], P[1] * [[1.0], [1.0], [0.0]]]), xy)
+    with pytest.raises(ValueError, match="exactly two"):
+        triangulate(np.concatenate([P, P]), np.concatenate([xy, xy]))
+    with pytest.raises(ValueError, match="finite cameras"):
+        triangulate_midpoint(np.stack([P[0], np.eye(3, 4) * [[1.0], [1.0], [0.0]] + [0, 0, 0, 1.0]]), xy)
+    with pytest.raises(ValueError, match="polynomial, linear, midpoint, iterated, optimal"):
+        triangulate(P, xy, method="guess")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="rank 2"):
+        correct_matches(np.outer([1.0, 2.0, 3.0], [2.0, 1.0, 1.0]), *xy)
+    with pytest.raises(ValueError, match=r"two \(N, 2\) arrays"):
+        correct_matches(fundamental_from_cameras(*P), xy[0], xy[1][:3])
