@@ -32,12 +32,20 @@ def project_block(cameras: MetricCameras, X: F64, view: F64, point: F64) -> F64:
     """The model of the metric cameras in plain NumPy."""
     Y = np.einsum("kab,kb->ka", cameras.R[view], X[point]) + cameras.t[view]
     x, y = Y[:, 0] / Y[:, 2], Y[:, 1] / Y[:, 2]
-    f, aspect, skew, cx, cy, k1 = cameras.intrinsics[cameras.group[view]].T
-    d = 1.0 + k1 * (x**2 + y**2)
+    f, aspect, skew, cx, cy, *radial = cameras.intrinsics[cameras.group[view]].T
+    d = 1.0 + sum(k * (x**2 + y**2) ** (n + 1) for n, k in enumerate(radial))
     return np.column_stack([f * x * d + skew * y * d + cx, aspect * f * y * d + cy])
 
 
-def make_block(*, views: int = 6, points: int = 80, k1: float = 0.0, groups: int = 1, seed: int = 3) -> Block:
+def make_block(
+    *,
+    views: int = 6,
+    points: int = 80,
+    k1: float = 0.0,
+    lens: tuple[float, ...] = (),
+    groups: int = 1,
+    seed: int = 3,
+) -> Block:
     """Cameras on an arc looking inwards, turned about their axes; every point seen by most of them."""
     rng = np.random.default_rng(seed)
     middle = np.array([1.0, -2.0, 0.5])
@@ -47,7 +55,7 @@ def make_block(*, views: int = 6, points: int = 80, k1: float = 0.0, groups: int
     for v, angle in enumerate(angles):
         R[v] = Rotation.from_euler("yxz", [angle, 0.25 * np.sin(3 * angle), 0.5 * v]).as_matrix()
         t[v] = [0.0, 0.0, 7.0 + 0.4 * np.cos(2.0 * v)] - R[v] @ middle
-    intrinsics = np.tile([1200.0, 1.0, 0.0, 515.0, 380.0, k1], (groups, 1))
+    intrinsics = np.tile([1200.0, 1.0, 0.0, 515.0, 380.0, k1, *lens], (groups, 1))
     cameras = MetricCameras(R, t, intrinsics, np.arange(views) % groups)
     seen = rng.random((points, views)) < 0.8
     seen[:, :2] = True
@@ -60,6 +68,9 @@ def perturbed(block: Block, *, seed: int = 5, size: float = 0.01) -> tuple[Metri
     rng = np.random.default_rng(seed)
     c = block.cameras
     turn = Rotation.from_rotvec(rng.normal(size=(len(c.R), 3)) * size).as_matrix()
-    intrinsics = c.intrinsics * [1.04, 1.0, 1.0, 1.0, 1.0, 0.0] + [0, 0, 0, -6.0, 5.0, 0.0]
+    intrinsics = c.intrinsics.copy()
+    intrinsics[:, 0] *= 1.04
+    intrinsics[:, 3:5] += [-6.0, 5.0]
+    intrinsics[:, 5:] = 0.0
     moved = MetricCameras(turn @ c.R, c.t + rng.normal(size=c.t.shape) * size, intrinsics, c.group)
     return moved, block.X + rng.normal(size=block.X.shape) * size

@@ -38,6 +38,17 @@ def test_exact_observations_give_the_true_calibration_and_shape(groups):
     np.testing.assert_allclose(seen - block.xy, result.residual_px, atol=1e-6)
 
 
+def test_a_lens_of_three_coefficients_comes_back():
+    block = make_block(k1=0.03, lens=(-0.04, 0.05), points=150)
+    cameras, X = perturbed(block)
+    free = np.array([True, False, False, True, True, True, True, True])
+    result = _refine(cameras, X, _seen(block), free=free, max_iterations=200, covariance=True)
+    assert np.abs(result.residual_px).max() < 1e-3
+    np.testing.assert_allclose(result.cameras.intrinsics, block.cameras.intrinsics, rtol=5e-3, atol=2e-3)
+    assert result.intrinsics_covariance.shape == (1, 8, 8)
+    assert (np.diag(result.intrinsics_covariance[0])[3:] > 0.0).all()
+
+
 def test_cost_does_not_depend_on_the_frame():
     block = make_block()
     cameras, X = perturbed(block)

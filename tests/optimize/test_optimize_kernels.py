@@ -11,15 +11,14 @@ from thesisrecon.optimize.losses import LOSS_CODES, LOSSES
 from thesisrecon.optimize.metric_bundle import MetricCameras
 from thesisrecon.optimize.schur import Columns, Jacobians, assemble_system, sort_observations
 
-FREE = np.arange(6)
-
 
 def _linearized_metric(block, xy, code=0, delta=1.0, sigma=1.0):
     c, n = block.cameras, len(xy)
-    J = Jacobians.allocate(n, 6, 6)
+    width = c.intrinsics.shape[1]
+    J = Jacobians.allocate(n, 6, width)
     cost = kernels.linearize_metric(
-        c.R, c.t, c.intrinsics, c.group, block.X, block.view, block.point, xy, FREE, sigma, code, delta,
-        J.residual, J.A, J.G, J.B,
+        c.R, c.t, c.intrinsics, c.group, block.X, block.view, block.point, xy, np.arange(width),
+        sigma, code, delta, J.residual, J.A, J.G, J.B,
     )  # fmt: skip
     return cost, J
 
@@ -32,8 +31,9 @@ def _moved(cameras, pose, intrinsics):
     return MetricCameras(turn @ cameras.R, t, q, cameras.group)
 
 
-def test_metric_jacobians_match_finite_differences():
-    block = make_block(k1=0.05, groups=2)
+@pytest.mark.parametrize("lens", [(), (-0.03, 0.02)])
+def test_metric_jacobians_match_finite_differences(lens):
+    block = make_block(k1=0.05, lens=lens, groups=2)
     _, J = _linearized_metric(block, block.xy + 3.0)
     V, G, h = len(block.cameras.R), 2, 1e-6
 
@@ -49,10 +49,13 @@ def test_metric_jacobians_match_finite_differences():
         ]
         return (ends[0] - ends[1]) / (2.0 * h)
 
-    none = np.zeros((V, 6)), np.zeros((G, 6)), np.zeros_like(block.X)
+    C = 6 + len(lens)
+    none = np.zeros((V, 6)), np.zeros((G, C)), np.zeros_like(block.X)
     for c in range(6):
         unit = np.eye(6)[c]
         np.testing.assert_allclose(J.A[:, :, c], difference(none[0] + unit, *none[1:]), rtol=2e-5, atol=2e-4)
+    for c in range(C):
+        unit = np.eye(C)[c]
         np.testing.assert_allclose(
             J.G[:, :, c], difference(none[0], none[1] + unit, none[2]), rtol=2e-5, atol=2e-4
         )

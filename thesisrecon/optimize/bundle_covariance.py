@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.levenberg_marquardt import invert_information
-from thesisrecon.optimize.metric_cameras import FOCAL, INTRINSIC_DOF, POSE_DOF
+from thesisrecon.optimize.metric_cameras import FOCAL, POSE_DOF
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -49,7 +49,7 @@ class CovarianceInput:
 
 
 def bundle_covariances(found: CovarianceInput, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
-    """Covariances of intrinsics (G, 6, 6), entry ``number`` (G, 6) an unknown's, and of poses (V, 6, 6).
+    """Covariances of intrinsics (G, C, C), entry ``number`` (G, C) an unknown's, and of poses (V, 6, 6).
 
     S is singular along the directions N of the frame's seven freedoms; (S + N N')^-1 is S's generalised
     inverse with the freedoms at unit variance, which are then removed. N has no part in the intrinsics, so
@@ -69,7 +69,7 @@ def bundle_covariances(found: CovarianceInput, number: I64, focal: F64, scale: f
     for n, view in enumerate(views):
         block = slice(POSE_DOF * n, POSE_DOF * (n + 1))
         poses[view] = covariance[block, block] * units * units[:, None]
-    intrinsics = np.zeros((*number.shape, INTRINSIC_DOF))
+    intrinsics = np.zeros((*number.shape, number.shape[1]))
     for g, row in enumerate(number):
         moves = np.flatnonzero(row >= 0)
         index = POSE_DOF * len(views) + row[moves]

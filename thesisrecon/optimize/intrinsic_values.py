@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.optimize.metric_cameras import FOCAL, INTRINSIC_DOF, IntrinsicsPrior, MetricCameras
+from thesisrecon.optimize.metric_cameras import FOCAL, IntrinsicsPrior, MetricCameras
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -61,7 +61,7 @@ class Links:
 
 @dataclass(frozen=True)
 class IntrinsicValues:
-    """``number`` (G, 6) names the unknown of every entry, -1 where it does not move; ``column`` (n,) says
+    """``number`` (G, C) names the unknown of every entry, -1 where it does not move; ``column`` (n,) says
     which intrinsic an unknown is; ``seen`` of the n stand in the table, the rest are means of populations."""
 
     number: I64
@@ -75,7 +75,7 @@ class IntrinsicValues:
         return len(self.column)
 
     def write(self, intrinsics: F64, x: F64) -> F64:
-        """The table (G, 6) with the unknowns x (n,) put in their places."""
+        """The table (G, C) with the unknowns x (n,) put in their places."""
         table = intrinsics.copy()
         moves = self.number >= 0
         table[moves] = x[self.number[moves]]
@@ -91,7 +91,7 @@ class IntrinsicValues:
 def number_values(
     cameras: MetricCameras, used: B8, free: B8, prior: IntrinsicsPrior | None
 ) -> tuple[IntrinsicValues, F64, F64]:
-    """The unknowns of a problem, where they start (n,), and the table (G, 6) with what is known put in.
+    """The unknowns of a problem, where they start (n,), and the table (G, C) with what is known put in.
 
     ``used`` (G,) rows that a photograph speaks of. A value starts at the mean of the used rows that share it;
     nothing but its prior moves a value that no photograph sees.
@@ -99,7 +99,7 @@ def number_values(
     table = _with_log_focal(cameras.intrinsics)
     nothing = IntrinsicsPrior(cameras.intrinsics, np.full_like(table, np.inf))
     prior = prior or nothing
-    number = np.full((len(table), INTRINSIC_DOF), NONE, dtype=np.int64)
+    number = np.full(table.shape, NONE, dtype=np.int64)
     parts = _Parts([], [], [])
     names = np.arange(len(table))
     for c in np.flatnonzero(free):

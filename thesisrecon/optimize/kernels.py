@@ -86,8 +86,9 @@ def project_metric(
     residual: F64,
     depth: F64,
 ) -> None:
-    """Fill residual (K, 2) px and depth (K,); R (V, 3, 3), t (V, 3), intrinsics (G, 6), group (V,), X (N,
-    3)."""
+    """Fill residual (K, 2) px and depth (K,); R (V, 3, 3), t (V, 3), intrinsics (G, 6) or (G, 8), group (V,),
+    X (N, 3)."""
+    lens = intrinsics.shape[1] > 6
     for k in range(len(xy)):
         v, x = view_index[k], X[point_index[k]]
         r, q = R[v], intrinsics[group[v]]
@@ -96,7 +97,10 @@ def project_metric(
         x2 = r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[v, 2]
         w = away_from_zero(x2)
         a, b = x0 / w, x1 / w
-        d = 1.0 + q[5] * (a * a + b * b)
+        r2 = a * a + b * b
+        d = 1.0 + q[5] * r2
+        if lens:
+            d += (q[6] + q[7] * r2) * r2 * r2
         depth[k] = x2
         residual[k, 0] = q[0] * a * d + q[2] * b * d + q[3] - xy[k, 0]
         residual[k, 1] = q[0] * q[1] * b * d + q[4] - xy[k, 1]
@@ -229,10 +233,12 @@ def linearize_metric(
     cameras.
 
     A pose moves by x -> exp(w) x + d in the camera's frame, columns (w, d); the focal column is that of log
-    f; ``free`` lists the F free columns of (log f, aspect, skew, cx, cy, k1). Returns the cost.
+    f; ``free`` lists the F free columns of (log f, aspect, skew, cx, cy, k1, k2, k3), of which intrinsics may
+    lack the last two. Returns the cost.
     """
     cost = 0.0
-    D = np.empty((2, 6))
+    lens = intrinsics.shape[1] > 6
+    D = np.empty((2, 8))
     for k in range(len(xy)):
         v, x = view_index[k], X[point_index[k]]
         r, q = R[v], intrinsics[group[v]]
@@ -242,7 +248,11 @@ def linearize_metric(
         a, b = x0 / w, x1 / w
         f, g, skew, k1 = q[0], q[0] * q[1], q[2], q[5]
         r2 = a * a + b * b
-        d = 1.0 + k1 * r2
+        # The slope of d over r^2, which is k1 where there is no more than k1.
+        d, slope = 1.0 + k1 * r2, k1
+        if lens:
+            d += (q[6] + q[7] * r2) * r2 * r2
+            slope += (2.0 * q[6] + 3.0 * q[7] * r2) * r2
         e0 = (f * a * d + skew * b * d + q[3] - xy[k, 0]) / sigma
         e1 = (g * b * d + q[4] - xy[k, 1]) / sigma
         s = e0 * e0 + e1 * e1
@@ -256,11 +266,13 @@ def linearize_metric(
         D[0, 3], D[1, 3] = 1.0, 0.0
         D[0, 4], D[1, 4] = 0.0, 1.0
         D[0, 5], D[1, 5] = (f * a + skew * b) * r2, g * b * r2
+        D[0, 6], D[1, 6] = D[0, 5] * r2, D[1, 5] * r2
+        D[0, 7], D[1, 7] = D[0, 6] * r2, D[1, 6] * r2
         for c in range(len(free)):
             G[k, 0, c] = root * D[0, free[c]]
             G[k, 1, c] = root * D[1, free[c]]
         # d(a d, b d) / d(a, b), then d(pixel) / d(a, b), then the chain through the division by depth.
-        m00, m01, m11 = d + 2.0 * k1 * a * a, 2.0 * k1 * a * b, d + 2.0 * k1 * b * b
+        m00, m01, m11 = d + 2.0 * slope * a * a, 2.0 * slope * a * b, d + 2.0 * slope * b * b
         n00, n01 = f * m00 + skew * m01, f * m01 + skew * m11
         n10, n11 = g * m01, g * m11
         h = root / w

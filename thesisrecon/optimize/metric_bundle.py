@@ -79,7 +79,7 @@ class MetricBundleResult:
 
     ``residual_px`` (K, 2) projection minus observation in the caller's order; ``cost``, ``initial_cost`` 1/2
     sum rho in units of the given sigma, priors included; ``sigma_px`` the standard deviation of one image
-    coordinate estimated from the residuals. With ``covariance``: ``intrinsics_covariance`` (G, 6, 6), zero
+    coordinate estimated from the residuals. With ``covariance``: ``intrinsics_covariance`` (G, C, C), zero
     for entries that do not move, and ``pose_covariance`` (V, 6, 6) of (rotation vector in rad, translation)
     of x -> exp(w) x + d in each camera's frame, with respect to the centre of all poses (the inner gauge: no
     camera is taken as exact).
@@ -185,7 +185,7 @@ def refine_metric_bundle(
     ----------
     cameras : where to start, and which intrinsics are shared. X : (N, 3) points.
     observations : K of them, in any order.
-    free : (6,) which of (focal, aspect, skew, cx, cy, k1) move at all. prior : what is known of them, which
+    free : (C,) which of the intrinsics move at all. prior : what is known of them, which
     may hold single ones; nothing by default.
 
     Views and points without observations come back untouched. The cost never rises; singular systems end the
@@ -196,7 +196,7 @@ def refine_metric_bundle(
     X = np.array(X, dtype=np.float64)
     check_cameras(cameras, X, free)
     if prior is not None:
-        check_prior(prior, len(cameras.intrinsics))
+        check_prior(prior, cameras.intrinsics.shape)
     o = sort_observations(
         observations.view_index, observations.point_index, observations.xy, len(cameras.R), len(X)
     )
@@ -214,7 +214,7 @@ def refine_metric_bundle(
     end, moved = solution.state, problem.free_views
     residual = problem.residual(end)[0]
     sigma = robust_sigma(residual, problem.columns.unknowns + 3 * int(seen_points.sum()) - SIMILARITY_DOF)
-    intrinsics_covariance, pose_covariance = np.zeros((len(table), 6, 6)), None
+    intrinsics_covariance, pose_covariance = np.zeros((*table.shape, table.shape[1])), None
     if options.covariance:
         intrinsics_covariance, pose_covariance = _covariances(problem, end, sigma or options.sigma_px, scale)
     refined = replace(
@@ -275,7 +275,7 @@ def _frame(X: F64) -> tuple[F64, float]:
 
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
-    """Covariances of intrinsics (G, 6, 6) and poses (V, 6, 6) for the noise found, t in the caller's unit."""
+    """Covariances of intrinsics (G, C, C) and poses (V, 6, 6) for the noise found, t in the caller's unit."""
     S, _, _ = replace(problem, sigma_px=sigma_px).linearize(state).reduce(1e-10)
     held = not problem.free_views[problem.observations.view_index].all()
     found = CovarianceInput(S, problem.free_views, state.R, state.t, held)

@@ -235,7 +235,7 @@ class _PoseProblem:
 
     def retract(self, state: _Pose, step: F64) -> _Pose:
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        moves = np.zeros(6)
+        moves = np.zeros(len(state.intrinsics))
         moves[self.free] = step[6:]
         intrinsics = state.intrinsics + moves
         intrinsics[0] = state.intrinsics[0] * np.exp(np.clip(moves[0], -3.0, 3.0))
@@ -267,19 +267,20 @@ def refine_pose(
 ) -> PoseRefinement:
     """Minimise sum rho(|x - project(X)|^2) over one pose and the free intrinsics, points held.
 
-    R (3, 3) world-to-camera, t (3,), intrinsics (6,) [focal_px, aspect, skew, cx, cy, k1] as in
-    ``MetricCameras``; X (M, 3); xy (M, 2) px; free (6,) which intrinsics move (none by default); rho =
+    R (3, 3) world-to-camera, t (3,), intrinsics (6,) or (8,) as in ``MetricCameras``; X (M,
+    3); xy (M, 2) px; free (6,) or (8,) which intrinsics move (none by default); rho =
     Huber's loss at ``loss_px``. Raises ``ValueError`` for wrong shapes, values that are not finite or a focal
     that is not positive.
     """
     R, t, q, X, xy = (np.array(a, dtype=np.float64) for a in (R, t, intrinsics, X, xy))
-    if R.shape != (3, 3) or t.shape != (3,) or q.shape != (6,) or X.shape != (len(xy), 3) or len(X) == 0:
+    shapes = R.shape, t.shape, q.shape, X.shape
+    if shapes != ((3, 3), (3,), (8 if q.shape == (8,) else 6,), (len(xy), 3)) or len(X) == 0:
         raise ValueError(f"refine_pose got R {R.shape}, t {t.shape}, intrinsics {q.shape}, X {X.shape}")
     if xy.shape != (len(X), 2) or not all(np.isfinite(a).all() for a in (R, t, q, X, xy)) or not q[0] > 0.0:
         raise ValueError(
             f"refine_pose needs finite (M, 2) pixels and a positive focal; got {xy.shape}, {q[0]}"
         )
-    columns = np.flatnonzero(np.zeros(6, bool) if free is None else free)
+    columns = np.flatnonzero(np.zeros(len(q), bool) if free is None else free)
     # Centred and scaled points: the pose's freedoms are of one size and well separated.
     origin = X.mean(axis=0)
     size = float(np.linalg.norm(X - origin, axis=1).mean())
