@@ -15,5 +15,6 @@ section               module
 6.3, 6.4              ``triangulation``, ``optimal_triangulation``, ``resection``
 ===================== ============================================================================
 
-``kernels`` and ``two_view`` are compiled triangulation. ``alignment`` compares two metric models, ``raster`` resamples images.
+``kernels`` and ``two_view`` are compiled triangulation. ``alignment`` compares two metric models, ``raster``
+resamples images.
 """
