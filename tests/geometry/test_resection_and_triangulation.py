@@ -109,7 +109,8 @@ def test_a_camera_at_infinity_is_refused() -> None:
 
 def test_undistortion_inverts_distortion() -> None:
     xy = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
-    for k1 in (-0.2, 0.0, 0.15):
+    np.testing.assert_allclose(distort(xy, np.array([0.15])), distort(xy, 0.15), rtol=1e-15)
+    for k1 in (-0.2, 0.0, 0.15, np.array([-0.1, 0.05, -0.02])):
         np.testing.assert_allclose(undistort(distort(xy, k1), k1), xy, atol=1e-9)
 
 

@@ -284,7 +284,7 @@ def test_import_refuses_distortion_it_has_no_camera_for() -> None:
     tangential = replace(
         model.cameras[0], model="OPENCV", params=(500.0, 500.0, 250.0, 200.0, 0.1, 0, 0.01, 0)
     )
-    with pytest.raises(StageFailure, match="first radial"):
+    with pytest.raises(StageFailure, match="three radial"):
         reconstruction_from_colmap(replace(model, cameras=(tangential,)))
     harmless = replace(model.cameras[0], model="RADIAL", params=(500.0, 250.0, 200.0, 0.1, 0.0))
     back = reconstruction_from_colmap(replace(model, cameras=(harmless,)))
@@ -292,6 +292,25 @@ def test_import_refuses_distortion_it_has_no_camera_for() -> None:
     assert back.k1[0] == 0.1
     with pytest.raises(ValueError, match="names must hold"):
         reconstruction_from_colmap(model, names=["other.jpg"])
+
+
+def test_a_lens_of_three_coefficients_goes_out_and_comes_back(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    ours = replace(_scene(k1=-0.1), lens=np.tile([0.05, -0.02], (V, 1)))
+    model = _plain_names(_export(ours))
+    assert {camera.model for camera in model.cameras} == {"FULL_OPENCV"}
+    write_colmap_model(tmp_path, model)
+    theirs = pycolmap.Reconstruction(tmp_path)
+    assert ours.K is not None
+    for i in np.flatnonzero(ours.registered):
+        pose = np.linalg.solve(ours.K[i], ours.P[i])
+        X = ours.X[ours.valid, :3]
+        xy = project_camera(ours.K[i], pose[:, :3], pose[:, 3], X, k1=ours.radial(int(i)))
+        projected = [theirs.images[int(i) + 1].project_point(x) for x in X]
+        np.testing.assert_allclose(projected, xy + 0.5, atol=1e-6, rtol=0)
+    back = reconstruction_from_colmap(model)
+    assert back.lens is not None
+    np.testing.assert_allclose(back.radial(0), ours.radial(0))
 
 
 def test_writing_refuses_an_inconsistent_model(tmp_path: Path) -> None:

@@ -124,21 +124,33 @@ def project(P: F64, X: F64) -> F64:
     return dehomogenize(Xh @ P.T)
 
 
-def distort(xy_normalized: F64, k1: float | F64) -> F64:
-    """(x, y) (1 + k1 r^2): the one-parameter radial model on normalised image points (N, 2); k1 or (N, 1)."""
+def distort(xy_normalized: F64, radial: float | F64) -> F64:
+    """(x, y) (1 + k1 r^2 + k2 r^4 + ...): radial distortion of normalised image points (N, 2).
+
+    ``radial`` is k1, or coefficients (C,) or (N, C), those of higher powers last.
+    """
     r2 = np.sum(xy_normalized**2, axis=-1, keepdims=True)
-    return np.asarray(xy_normalized * (1.0 + k1 * r2))
+    return np.asarray(xy_normalized * _radial_factor(radial, r2))
 
 
-def undistort(xy_normalized: F64, k1: float | F64, *, iterations: int = 30) -> F64:
+def undistort(xy_normalized: F64, radial: float | F64, *, iterations: int = 30) -> F64:
     """Inverse of :func:`distort` by fixed-point iteration; exact to rounding for |k1| r^2 < 0.3."""
     undistorted = xy_normalized
     for _ in range(iterations):
-        undistorted = xy_normalized / (1.0 + k1 * np.sum(undistorted**2, axis=-1, keepdims=True))
+        r2 = np.sum(undistorted**2, axis=-1, keepdims=True)
+        undistorted = xy_normalized / _radial_factor(radial, r2)
     return undistorted
 
 
-def project_camera(K: F64, R: F64, t: F64, X: F64, *, k1: float = 0.0) -> F64:
-    """Pixels of X (N, 3) seen by a metric camera with radial distortion k1; -> (N, 2)."""
+def _radial_factor(radial: float | F64, r2: F64) -> F64:
+    k = np.atleast_1d(radial)
+    factor = np.zeros_like(r2)
+    for n in reversed(range(k.shape[-1])):
+        factor = (factor + k[..., n : n + 1]) * r2
+    return 1.0 + factor
+
+
+def project_camera(K: F64, R: F64, t: F64, X: F64, *, k1: float | F64 = 0.0) -> F64:
+    """Pixels (N, 2) of X (N, 3) seen by a metric camera with radial distortion k1 or (C,) coefficients."""
     normalized = dehomogenize(X @ R.T + t)
     return distort(normalized, k1) @ K[:2, :2].T + K[:2, 2]

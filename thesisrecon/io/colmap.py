@@ -1,8 +1,8 @@
 """COLMAP sparse models in and out: the only place that knows COLMAP's conventions.
 
 COLMAP puts the centre of the top-left pixel at (0.5, 0.5), numbers things from 1, and keeps a camera apart
-from the images it took. Its SIMPLE_RADIAL distortion is the one used here: x (1 + k1 r^2) on normalised
-points.
+from the images it took. Its SIMPLE_RADIAL distortion is the one used here, x (1 + k1 r^2) on normalised
+points, and FULL_OPENCV where a lens has k2 and k3.
 """
 
 from __future__ import annotations
@@ -123,12 +123,10 @@ def _reproject(
     for i, (R, t) in poses.items():
         here = view == i
         Xh = reconstruction.X[point[here]]
-        xy[here] = project_camera(reconstruction.K[i], R, t, Xh[:, :3] / Xh[:, 3:], k1=_k1(reconstruction, i))
+        xy[here] = project_camera(
+            reconstruction.K[i], R, t, Xh[:, :3] / Xh[:, 3:], k1=reconstruction.radial(i)
+        )
     return xy
-
-
-def _k1(reconstruction: Reconstruction, i: int) -> float:
-    return 0.0 if reconstruction.k1 is None else float(reconstruction.k1[i])
 
 
 def _cameras(
@@ -140,21 +138,24 @@ def _cameras(
     numbers = {}
     for i in np.flatnonzero(reconstruction.registered).tolist():
         width, height = (int(size) for size in sizes[i])
-        model, params = _camera_params(reconstruction.K[i], _k1(reconstruction, i), scales[i])
+        model, params = _camera_params(reconstruction.K[i], reconstruction.radial(i), scales[i])
         key = (int(groups[i]), width, height, params)
         camera = cameras.setdefault(key, ColmapCamera(len(cameras) + 1, model, width, height, params))
         numbers[i] = camera.camera_id
     return tuple(cameras.values()), numbers
 
 
-def _camera_params(K: F64, k1: float, scale: F64) -> tuple[str, tuple[float, ...]]:
-    """The smallest COLMAP model that holds K and k1, and its parameters in original pixels."""
+def _camera_params(K: F64, radial: F64, scale: F64) -> tuple[str, tuple[float, ...]]:
+    """The smallest COLMAP model that holds K and (k1, k2, k3), and its parameters in original pixels."""
     if abs(K[0, 1]) > 1e-9 * K[0, 0]:
         raise ValueError(
             f"COLMAP has no camera with skew; K has {K[0, 1]:.3g} px, set it to 0 before the export"
         )
     fx, fy = float(K[0, 0] * scale[0]), float(K[1, 1] * scale[1])
     centre = tuple(float(value) for value in (K[:2, 2] + _PIXEL_CENTRE) * scale)
+    k1, k2, k3 = radial.tolist()
+    if k2 or k3:
+        return "FULL_OPENCV", (fx, fy, *centre, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)
     # Relative, and so small that taking one focal length for both moves no pixel by more than rounding.
     same_focal = abs(fx - fy) <= 1e-12 * fx
     if same_focal:
@@ -230,17 +231,17 @@ def reconstruction_from_colmap(model: ColmapModel, *, names: Sequence[str] | Non
             f"names must hold each image of the model once; missing or doubled: {unknown[:3] or names[:3]}"
         )
     cameras = {camera.camera_id: camera for camera in model.cameras}
-    K, k1 = np.zeros((len(names), 3, 3)), np.zeros(len(names))
+    K, radial = np.zeros((len(names), 3, 3)), np.zeros((len(names), 3))
     P, sizes = np.zeros((len(names), 3, 4)), np.zeros((len(names), 2), dtype=np.int64)
     poses = {}
     for i, name in enumerate(names):
         if name in by_name:
             image = by_name[name]
             camera = cameras[image.camera_id]
-            K[i], k1[i] = _intrinsics(camera)
+            K[i], radial[i] = _intrinsics(camera)
             poses[i] = Rotation.from_quat(np.roll(image.quaternion_wxyz, -1)).as_matrix(), image.translation
             P[i], sizes[i] = compose_camera(K[i], *poses[i]), (camera.width, camera.height)
-    return _with_observations(model, names, (P, K, k1, sizes), poses)
+    return _with_observations(model, names, (P, K, radial, sizes), poses)
 
 
 def _with_observations(
@@ -249,7 +250,7 @@ def _with_observations(
     cameras: tuple[F64, F64, F64, I64],
     poses: dict[int, tuple[F64, F64]],
 ) -> Reconstruction:
-    P, K, k1, sizes = cameras
+    P, K, radial, sizes = cameras
     registered = np.isin(np.arange(len(names)), list(poses))
     tracks = _tracks(model, names)
     reconstruction = Reconstruction(
@@ -264,7 +265,8 @@ def _with_observations(
         sigma_px=0.0,
         reasons=tuple("" if known else "not in the COLMAP model" for known in registered),
         K=K,
-        k1=k1,
+        k1=radial[:, 0],
+        lens=radial[:, 1:] if radial[:, 1:].any() else None,
     )
     # A model from elsewhere may hold points in a camera's plane, or so far away that their squares overflow.
     with np.errstate(all="ignore"):
@@ -291,22 +293,23 @@ def _tracks(model: ColmapModel, names: Sequence[str]) -> Tracks:
     return Tracks(view[first], point[first], positions, len(names), len(model.points.ids))
 
 
-def _intrinsics(camera: ColmapCamera) -> tuple[F64, float]:
-    """K (3, 3) and k1 in our pixels; refuses every other distortion that is not zero."""
+def _intrinsics(camera: ColmapCamera) -> tuple[F64, F64]:
+    """K (3, 3) and (k1, k2, k3) in our pixels; refuses every other distortion that is not zero."""
     params = camera.params
     single = camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     if not single and camera.model not in ("PINHOLE", "OPENCV", "FULL_OPENCV"):
         raise StageFailure(
             f"camera {camera.camera_id} of the COLMAP model is of the kind {camera.model}",
-            "one radial coefficient is all that is supported",
+            "three radial coefficients are all that is supported",
             "undistort the images, or reconstruct with SIMPLE_RADIAL",
         )
     focal, rest = ((params[0], params[0]), params[1:]) if single else ((params[0], params[1]), params[2:])
-    centre, distortion = rest[:2], rest[2:] or (0.0,)
-    if any(distortion[1:]):
+    centre, distortion = rest[:2], (*rest[2:], *[0.0] * 8)
+    radial = np.array([distortion[0], distortion[1], 0.0 if single else distortion[4]])
+    if any(distortion[2:4]) or any(distortion[5:]):
         raise StageFailure(
-            f"camera {camera.camera_id} of the COLMAP model has the distortion {distortion}",
-            "only the first radial coefficient is supported",
+            f"camera {camera.camera_id} of the COLMAP model has the distortion {rest[2:]}",
+            "only three radial coefficients are supported",
             "undistort the images, or reconstruct with SIMPLE_RADIAL",
         )
     if min(focal) <= 0:
@@ -314,4 +317,4 @@ def _intrinsics(camera: ColmapCamera) -> tuple[F64, float]:
             f"camera {camera.camera_id} of the COLMAP model has a focal length that is not positive"
         )
     x, y = (value - _PIXEL_CENTRE for value in centre)
-    return np.array([[focal[0], 0.0, x], [0.0, focal[1], y], [0.0, 0.0, 1.0]]), distortion[0]
+    return np.array([[focal[0], 0.0, x], [0.0, focal[1], y], [0.0, 0.0, 1.0]]), radial

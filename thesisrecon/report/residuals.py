@@ -66,7 +66,7 @@ def predicted_pixels(reconstruction: Reconstruction, i: int, X: F64) -> F64:
         return project(P, X)
     K = reconstruction.K[i]
     normalized = dehomogenize(X @ np.linalg.solve(K, P).T)
-    pixels: F64 = distort(normalized, float(reconstruction.k1[i])) @ K[:2, :2].T + K[:2, 2]
+    pixels: F64 = distort(normalized, reconstruction.radial(i)) @ K[:2, :2].T + K[:2, 2]
     return pixels
 
 

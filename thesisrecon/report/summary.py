@@ -137,12 +137,16 @@ def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
                 "height": image.original_size[1],
                 "K": original_from_working(image.scale) @ K,
                 "k1": float(reconstruction.k1[i]),
+                "radial": reconstruction.radial(i),
                 "R": Rt[:, :3],
                 "t": Rt[:, 3],
                 "centre": -Rt[:, :3].T @ Rt[:, 3],
             }
         )
-    convention = "x ~ K d(R X + t), d(u) = u (1 + k1 |u|^2); (0, 0) is the centre of the top-left pixel"
+    convention = (
+        "x ~ K d(R X + t), d(u) = u (1 + k1 |u|^2 + k2 |u|^4 + k3 |u|^6), radial = (k1, k2, k3); "
+        "(0, 0) is the centre of the top-left pixel"
+    )
     return {"convention": convention, "cameras": cameras}
 
 

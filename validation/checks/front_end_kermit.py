@@ -101,7 +101,7 @@ def _undistorted(xy: F64, model: Reconstruction, i: int) -> F64:
     if model.k1 is None:
         return xy
     normalized = dehomogenize(homogenize(xy) @ np.linalg.inv(model.K[i]).T)
-    return dehomogenize(homogenize(undistort(normalized, float(model.k1[i]))) @ model.K[i].T)
+    return dehomogenize(homogenize(undistort(normalized, model.radial(i))) @ model.K[i].T)
 
 
 def check_kermit(run: KermitRun) -> list[Metric]:
