@@ -25,10 +25,12 @@ NO_PARALLAX = 0.95
 
 
 def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView]:
-    """Accepted pairs, best beginning first.
+    """Accepted pairs, best beginning first, and each next one unlike those before it.
 
     The score is the number of points the pair shares, those seen in a third view counting twice, times the
-    share that no single homography explains.
+    share that no single homography explains; a pair whose matches leave F undetermined counts a tenth. Where
+    a beginning fails, one from the same view would likely fail with it: a pair counts half as much for every
+    time that one of its views has begun.
     """
     table = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
     table[tracks.view_index, tracks.point_index] = True
@@ -36,10 +38,20 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 
     def score(pair: TwoView) -> float:
         both = table[pair.i] & table[pair.j]
-        return float((both.sum() + (both & long).sum()) * (1.0 - pair.homography_share))
+        shared = float(both.sum() + (both & long).sum())
+        return shared * (1.0 - pair.homography_share) * (0.1 if pair.undetermined else 1.0)
 
-    usable = [pair for pair in pairs if pair.accepted]
-    return sorted(usable, key=lambda pair: (-score(pair), pair.i, pair.j))
+    left = sorted((pair for pair in pairs if pair.accepted), key=lambda pair: (pair.i, pair.j))
+    scores = np.array([score(pair) for pair in left])
+    views = np.array([(pair.i, pair.j) for pair in left]).reshape(-1, 2)
+    begun, ranked = np.zeros(tracks.n_views), []
+    for _ in range(len(left)):
+        worth = np.where(scores >= 0.0, scores * 0.5 ** begun[views].sum(axis=1), -1.0)
+        best = int(np.argmax(worth))
+        ranked.append(left[best])
+        begun[views[best]] += 1
+        scores[best] = -1.0
+    return ranked
 
 
 def require_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from thesisrecon.projective.initial_pair import NO_PARALLAX
-from thesisrecon.types import B8, I64, Reconstruction, Tracks, TwoView
+from thesisrecon.types import B8, F64, I64, Reconstruction, Tracks, TwoView
 
 
 def tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> B8:
@@ -55,6 +55,24 @@ def _first_in_turn(tracks: Tracks, k: I64, length: I64, cells: int) -> I64:
     start = np.searchsorted(sorted_cells, sorted_cells)
     turn = np.arange(len(k)) - start
     return by_length[np.lexsort((by_length, -length[tracks.point_index[k]][by_length], turn))]
+
+
+def spread_of_views(tracks: Tracks, chosen: B8, *, cells: int = 8) -> F64:
+    """How much of each view its ``chosen`` (K,) observations hold; -> (V,).
+
+    The sum over a grid of ``cells`` x ``cells`` of the view's extent of the root of their number in the cell:
+    many points count, and points all over the picture count more than a crowd in a corner.
+    """
+    score = np.zeros(tracks.n_views)
+    for view in range(tracks.n_views):
+        mine = tracks.view_index == view
+        if not (mine & chosen).any():
+            continue
+        low, high = tracks.xy[mine].min(axis=0), tracks.xy[mine].max(axis=0)
+        place = (tracks.xy[mine & chosen] - low) / np.maximum(high - low, 1e-9) * cells
+        cell = np.minimum(place, cells - 1).astype(np.int64)
+        score[view] = np.sqrt(np.bincount(cell[:, 0] * cells + cell[:, 1])).sum()
+    return score
 
 
 def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.projective.incremental import GatedIncremental, finish
+from thesisrecon.projective.growing import adjust, finish
+from thesisrecon.projective.incremental import GatedIncremental
 from thesisrecon.projective.initial_pair import require_parallax
 from thesisrecon.types import I64, Reconstruction, Tracks, TwoView
 
@@ -51,7 +52,7 @@ class SequentialProjective:
             final_rounds=0,
         )
         state = engine.begin(tracks, candidates[attempt], sizes)
-        while engine.add_next_camera(state, rng):
+        while engine.add_next_camera(state, rng) is not None:
             pass
-        engine.adjust(state, 10, self.outlier_sigmas)
+        adjust(state, 10, self.outlier_sigmas)
         return finish(state)
