@@ -25,6 +25,9 @@ SAME_ANSWER = 0.03
 
 MAX_LOG_STD = 1e3
 
+FOCAL_LIMITS = (0.02, 200.0)
+"""No lens has a focal length outside of these, in long sides of the image: 178 deg to 0.3 deg of view."""
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -59,6 +62,25 @@ def square_calibrations(log_f: F64) -> F64:
     K[..., 0, 0] = K[..., 1, 1] = np.exp(log_f)
     K[..., 2, 2] = 1.0
     return K
+
+
+def focals_of_groups(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
+    """Log focals (B, G) that suit planes p (B, 3) and reference focals (B,).
+
+    From w*_i = H_i K_r K_r' H_i': f_i^2 = (w11 + w22) / (2 w33); a group takes the median of its cameras, the
+    reference camera's group its own focal.
+    """
+    f = np.clip(f_reference, *FOCAL_LIMITS)
+    H = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
+    H[..., :2] *= f[:, None, None, None]
+    ww = np.sum(H**2, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_f = 0.5 * np.log((ww[..., 0] + ww[..., 1]) / (2.0 * ww[..., 2]))
+    low, high = np.log(FOCAL_LIMITS)
+    log_f = np.clip(np.nan_to_num(log_f, nan=0.0, posinf=high, neginf=low), low, high)
+    groups = np.stack([np.median(log_f[:, frame.group == g], axis=1) for g in range(frame.n_groups)], axis=1)
+    groups[:, frame.group[frame.reference]] = np.log(f)
+    return groups
 
 
 def answers_from_theta(frame: ReferenceFrame, theta: F64, cost: F64, method: str) -> list[Answer]:

@@ -12,8 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.selfcalibration.conclusion import answers_from_theta, conclude, require_cameras
-from thesisrecon.selfcalibration.focal_scan import plane_from_focals
+from thesisrecon.selfcalibration.conclusion import (
+    answers_from_theta,
+    conclude,
+    focals_of_groups,
+    require_cameras,
+)
+from thesisrecon.selfcalibration.focal_scan import focal_pairs, plane_from_focals
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
 from thesisrecon.selfcalibration.infinity_search import InfinitySearch
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
@@ -75,7 +80,7 @@ class HypothesesAndRefinement:
             chosen = np.sort(np.append(rng.choice(others, size, replace=False), frame.reference))
             found.append(quadric_hypotheses(frame.subset(chosen), focals[::4]))
         for other in others:
-            f1, f2 = self._focal_pairs(focals, frame.group[other] == frame.group[frame.reference])
+            f1, f2 = focal_pairs(focals, frame.group[other] == frame.group[frame.reference])
             found.append((plane_from_focals(frame, int(other), f1, f2), np.concatenate([f1, f1])))
         if self.search is not None:
             found.append(self.search.search(frame, reconstruction, rng))
@@ -83,30 +88,6 @@ class HypothesesAndRefinement:
         f = np.concatenate([part[1] for part in found])
         good = np.isfinite(p).all(axis=1) & np.isfinite(f)
         return p[good], focals_of_groups(frame, p[good], f[good])
-
-    def _focal_pairs(self, focals: F64, same_camera: bool) -> tuple[F64, F64]:
-        if same_camera:
-            return focals, focals
-        first, second = np.meshgrid(focals[::2], focals[::2])
-        return first.ravel(), second.ravel()
-
-
-def focals_of_groups(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
-    """Log focals (B, G) that suit planes p (B, 3) and reference focals (B,).
-
-    From w*_i = H_i K_r K_r' H_i': f_i^2 = (w11 + w22) / (2 w33); a group takes the median of its cameras, the
-    reference camera's group its own focal.
-    """
-    f = np.clip(f_reference, 0.05, 50.0)
-    H = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
-    H[..., :2] *= f[:, None, None, None]
-    ww = np.sum(H**2, axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_f = 0.5 * np.log((ww[..., 0] + ww[..., 1]) / (2.0 * ww[..., 2]))
-    log_f = np.clip(np.nan_to_num(log_f, nan=0.0, posinf=3.0, neginf=-3.0), -3.0, 3.9)
-    groups = np.stack([np.median(log_f[:, frame.group == g], axis=1) for g in range(frame.n_groups)], axis=1)
-    groups[:, frame.group[frame.reference]] = np.log(f)
-    return groups
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,18 @@ and the reference camera's K, so that its rank is 3 and it is positive by constr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
-from thesisrecon.selfcalibration.frame import ReferenceFrame
-from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics
+from thesisrecon.selfcalibration.conclusion import Answer, conclude, focals_of_groups, require_cameras
+from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
+from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
+from thesisrecon.selfcalibration.quadric import quadric_hypotheses
+from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
 
 F64 = NDArray[np.float64]
 
@@ -98,3 +102,40 @@ def _minimize(
     noise = max(float(np.sqrt(np.sum(data**2) / dof)), _LEAST_NOISE)
     scale = noise**2 * max(len(found.residual) - len(theta), 1) / max(2.0 * found.cost, 1e-300)
     return found.x, noise, found.covariance * scale, float(np.sum(data**2) / len(frame.views))
+
+
+@dataclass(frozen=True)
+class NonlinearQuadric:
+    """The nonlinear quadric alone, started from the linear one.
+
+    The linear quadric is scanned over ``focal_steps`` normalising focals in ``focal_range`` (long sides); the
+    ``starts`` whose cameras are nearest to rotations are refined over all intrinsics that the assumptions
+    leave unknown, and the least cost wins. ``loss_scale``: residual beyond which an entry counts linearly.
+    """
+
+    focal_range: tuple[float, float] = (0.2, 40.0)
+    focal_steps: int = 45
+    starts: int = 5
+    loss_scale: float = 0.05
+    criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    def calibrate(
+        self,
+        reconstruction: Reconstruction,
+        *,
+        assumed: Assumptions,
+        rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
+    ) -> SelfCalibration:
+        """Upgrade by the quadric; ``StageFailure`` below three cameras and where no answer puts the scene in
+        front of the cameras."""
+        require_cameras(reconstruction)
+        frame = assumed_frame(reconstruction, assumed)
+        unknown = unknown_intrinsics(frame, assumed)
+        p, f = quadric_hypotheses(frame, np.geomspace(*self.focal_range, self.focal_steps))
+        log_f = focals_of_groups(frame, p, f)
+        best = np.argsort(self.criterion.cost(frame, p, log_f), kind="stable")[: self.starts]
+        answers = []
+        for b in best:
+            found = minimize_quadric(frame, unknown, p[b], log_f[b][frame.group], loss_scale=self.loss_scale)
+            answers.append(Answer(found.plane, found.K, found.cost, "nonlinear quadric"))
+        return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)

@@ -7,10 +7,21 @@ normalising focal over the plausible range makes them right for one of the scann
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.selfcalibration.frame import ReferenceFrame
+from thesisrecon.selfcalibration.conclusion import (
+    FOCAL_LIMITS,
+    answers_from_theta,
+    conclude,
+    focals_of_groups,
+    require_cameras,
+)
+from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
+from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
 
 F64 = NDArray[np.float64]
 
@@ -32,14 +43,16 @@ def _symmetric(q: F64) -> F64:
 
 
 def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -> F64:
-    """Absolute dual quadrics (B, 4, 4) in the reference frame for each normalising focal (B,), rank 3, Q[2,
-    2] >= 0.
+    """Absolute dual quadrics (B, 4, 4) in the reference frame for normalising focals (B,) or (B, R).
 
     The rows are those of Pollefeys et al. with uncertainties 9 (focal), 0.2 (aspect), 0.01 (skew), 0.1
-    (principal point), divided by the w33 of the previous iterate.
+    (principal point), divided by the w33 of the previous iterate. The first iterate divides by the norm of
+    the row that gives w33 in place of their 1, which would depend on the scale of each camera. The sign is
+    that with which the reference camera's image has a positive trace, the norm is 1, the rank is 4 with noise
+    (:func:`rank_three` makes it 3).
     """
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
-    P[:, :, :2] /= focals[:, None, None, None]
+    P[:, :, :2] /= (focals if focals.ndim == 2 else focals[:, None])[:, :, None, None]
     p1, p2, p3 = P[:, :, 0], P[:, :, 1], P[:, :, 2]
     w11, w22, w33 = (_quadratic_rows(p, p) for p in (p1, p2, p3))
     rows = np.stack(
@@ -49,29 +62,120 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
     nu = np.linalg.norm(w33, axis=-1)
     q = np.zeros((len(focals), 10))
     for _ in range(iterations):
-        A = (rows / np.maximum(nu, 1e-9 * nu.max(axis=1, keepdims=True))[:, :, None, None]).reshape(
-            len(focals), -1, 10
-        )
-        q = np.linalg.eigh(np.einsum("bri,brj->bij", A, A))[1][:, :, 0]
+        weighted = rows / np.maximum(nu, 1e-9 * nu.max(axis=1, keepdims=True))[:, :, None, None]
+        A = weighted.reshape(len(focals), -1, 10)
+        # Of A, not of A'A, which would leave half the digits.
+        q = np.linalg.svd(A, full_matrices=A.shape[1] < 10)[2][:, 9]
         nu = np.abs(np.einsum("bvk,bk->bv", w33, q))
     Q = _symmetric(q)
     Q *= np.where(np.trace(Q[:, :3, :3], axis1=1, axis2=2) < 0, -1.0, 1.0)[:, None, None]
     return Q
 
 
-def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
-    """Planes at infinity (B, 3) and reference focals (B,) from the scanned linear quadric.
+def rank_three(Q: F64) -> tuple[F64, F64]:
+    """Nearest quadrics of rank 3 to Q (B, 4, 4) and their null vectors (B, 4), the planes at infinity.
 
-    The plane is the quadric's null vector (the smallest eigenvalue is set to zero); a quadric whose w* of the
-    reference camera is not positive keeps the normalising focal.
+    The eigenvalue of least magnitude is set to 0.
     """
-    Q = linear_quadric(frame, focals)
     value, vector = np.linalg.eigh(Q)
     smallest = np.abs(value).argmin(axis=1)
     null = np.take_along_axis(vector, smallest[:, None, None], axis=2)[:, :, 0]
+    np.put_along_axis(value, smallest[:, None], 0.0, axis=1)
+    return np.asarray((vector * value[:, None, :]) @ vector.swapaxes(1, 2)), null
+
+
+def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
+    """Planes at infinity (B, 3) and reference focals (B,) from the linear quadric scanned over ``focals``.
+
+    The plane is the null vector of the nearest quadric of rank 3; a quadric whose w* of the reference camera
+    is not positive keeps the normalising focal.
+    """
+    try:
+        Q, null = rank_three(linear_quadric(frame, focals))
+    except np.linalg.LinAlgError:
+        return np.zeros((0, 3)), np.zeros(0)
     with np.errstate(divide="ignore", invalid="ignore"):
         p = null[:, :3] / null[:, 3:]
         f2 = (Q[:, 0, 0] + Q[:, 1, 1]) / (2.0 * Q[:, 2, 2])
-    f = np.sqrt(np.where(np.isfinite(f2) & (f2 > 0), f2, focals**2))
+    supposed = focals if focals.ndim == 1 else focals[:, frame.reference]
+    f = np.sqrt(np.where(np.isfinite(f2) & (f2 > 0), f2, supposed**2))
     good = np.isfinite(p).all(axis=1)
-    return p[good], np.clip(f[good], 0.05, 50.0)
+    return p[good], np.clip(f[good], *FOCAL_LIMITS)
+
+
+@dataclass(frozen=True)
+class LinearQuadric:
+    """The linear quadric alone: one normalising focal, no refinement.
+
+    ``normalising_focal`` in long sides; 1.67 is the 60 mm lens of Pollefeys et al. on 36 mm film. The
+    equation that expects it pulls the answer even without noise, by tens of percent with another lens.
+    """
+
+    normalising_focal: float = 1.67
+    criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    def calibrate(
+        self,
+        reconstruction: Reconstruction,
+        *,
+        assumed: Assumptions,
+        rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
+    ) -> SelfCalibration:
+        """Upgrade by the quadric; ``StageFailure`` below three cameras and where no answer puts the scene in
+        front of the cameras."""
+        require_cameras(reconstruction)
+        frame = assumed_frame(reconstruction, assumed)
+        p, log_f = _with_cameras(frame, *quadric_hypotheses(frame, np.array([self.normalising_focal])))
+        return _conclude_best(frame, reconstruction, self.criterion, p, log_f)
+
+
+@dataclass(frozen=True)
+class ScannedQuadric:
+    """The linear quadric for each of ``focal_steps`` normalising focals in ``focal_range`` (long sides), the
+    one whose cameras are nearest to rotations, solved again with every camera normalised by its own focal.
+
+    Up to ``repeats`` times, until the focals stay: then no equation pulls any more, and exact cameras give
+    the exact answer.
+    """
+
+    focal_range: tuple[float, float] = (0.2, 40.0)
+    focal_steps: int = 45
+    repeats: int = 30
+    criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    def calibrate(
+        self,
+        reconstruction: Reconstruction,
+        *,
+        assumed: Assumptions,
+        rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
+    ) -> SelfCalibration:
+        """As :meth:`LinearQuadric.calibrate`."""
+        require_cameras(reconstruction)
+        frame = assumed_frame(reconstruction, assumed)
+        focals = np.geomspace(*self.focal_range, self.focal_steps)
+        p, log_f = _with_cameras(frame, *quadric_hypotheses(frame, focals))
+        best = int(np.nan_to_num(self.criterion.cost(frame, p, log_f), nan=np.inf).argmin()) if len(p) else 0
+        log_f = log_f[best : best + 1]
+        for _ in range(self.repeats if len(p) else 0):
+            before = log_f
+            again = quadric_hypotheses(frame, np.exp(log_f[:, frame.group]))
+            if not len(again[0]):
+                break
+            p, log_f = _with_cameras(frame, *again)
+            if np.abs(log_f - before).max() < 1e-12:
+                break
+        return _conclude_best(frame, reconstruction, self.criterion, p, log_f)
+
+
+def _with_cameras(frame: ReferenceFrame, p: F64, f_reference: F64) -> tuple[F64, F64]:
+    return p, focals_of_groups(frame, p, f_reference)
+
+
+def _conclude_best(
+    frame: ReferenceFrame, reconstruction: Reconstruction, criterion: RotationCriterion, p: F64, log_f: F64
+) -> SelfCalibration:
+    answers = answers_from_theta(
+        frame, np.concatenate([p, log_f], axis=1), criterion.cost(frame, p, log_f), "linear quadric"
+    )
+    return conclude(frame, reconstruction, criterion, answers, kept=1, min_positive=0.5)

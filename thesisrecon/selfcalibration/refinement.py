@@ -89,9 +89,17 @@ def _jacobian(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, w
 
 
 def refine_hypotheses(
-    criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, *, iterations: int = 25
+    criterion: RotationCriterion,
+    frame: ReferenceFrame,
+    theta: F64,
+    *,
+    iterations: int = 25,
+    planes_only: bool = False,
 ) -> tuple[F64, F64]:
-    """Levenberg-Marquardt on every row of theta (B, 3 + G) at once; -> refined theta and cost (B,)."""
+    """Levenberg-Marquardt on every row of theta (B, 3 + G) at once; -> refined theta and cost (B,).
+
+    ``planes_only`` leaves the focals as they are.
+    """
     theta = theta.copy()
     damping = np.full(len(theta), 1e-3)
     cost = criterion.cost(frame, theta[:, :3], theta[:, 3:])
@@ -99,12 +107,14 @@ def refine_hypotheses(
         weights = criterion.weights(frame, theta)
         r = criterion.weighted_residuals(frame, theta, weights)
         J = _jacobian(criterion, frame, theta, weights)
+        if planes_only:
+            J[:, :, 3:] = 0.0
         N = np.einsum("bri,brj->bij", J, J)
         g = np.einsum("bri,br->bi", J, r)
         diagonal = np.einsum("bii->bi", N)
         N = N + damping[:, None, None] * np.eye(theta.shape[1]) * (diagonal + 1e-12)[:, None, :]
         trial = theta - solve_guarded(N, g)
-        trial[:, 3:] = np.clip(trial[:, 3:], -4.0, 5.0)
+        trial[:, 3:] = np.clip(trial[:, 3:], -4.0, 5.4)
         trial_cost = criterion.cost(frame, trial[:, :3], trial[:, 3:])
         better = np.asarray(trial_cost < cost)
         converged = better & (cost - trial_cost < 1e-10 * cost)
