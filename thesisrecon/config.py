@@ -29,7 +29,16 @@ from thesisrecon.matching.pair_selection import (
 )
 from thesisrecon.metric import UpgradeAndBundle
 from thesisrecon.projective import GatedIncremental, SequentialProjective
-from thesisrecon.selfcalibration import HartleySearch, HypothesesAndRefinement
+from thesisrecon.selfcalibration import (
+    FocalScan,
+    FocalsFromFundamental,
+    HartleySearch,
+    HypothesesAndRefinement,
+    KruppaEquations,
+    LinearQuadric,
+    NonlinearQuadric,
+    ScannedQuadric,
+)
 from thesisrecon.settings import (
     Table,
     dataclass_from_table,
@@ -206,6 +215,12 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
     "selfcalibration": {
         "hypotheses-and-refinement": HypothesesAndRefinement,
         "hartley-search": HartleySearch,
+        "linear-quadric": LinearQuadric,
+        "scanned-quadric": ScannedQuadric,
+        "nonlinear-quadric": NonlinearQuadric,
+        "kruppa-equations": KruppaEquations,
+        "focals-from-fundamental": FocalsFromFundamental,
+        "focal-scan": FocalScan,
     },
     "metric": {"upgrade-and-bundle": UpgradeAndBundle},
 }
