@@ -58,6 +58,7 @@ class BundleOptions:
     max_iterations : linear systems at the most.
     fixed_views : (V,) True for poses that must not move; None: all move.
     covariance : whether to compute the covariances (one more linear system).
+    noise_floor_px : the covariances take the noise to be at least this, whatever the residuals say.
     """
 
     sigma_px: float = 1.0
@@ -66,6 +67,7 @@ class BundleOptions:
     max_iterations: int = 20
     fixed_views: B8 | None = field(default=None, compare=False)
     covariance: bool = False
+    noise_floor_px: float = 0.0
 
     def __post_init__(self) -> None:
         loss_code(self.loss, self.loss_px)
@@ -216,7 +218,9 @@ def refine_metric_bundle(
     sigma = robust_sigma(residual, problem.columns.unknowns + 3 * int(seen_points.sum()) - SIMILARITY_DOF)
     intrinsics_covariance, pose_covariance = np.zeros((*table.shape, table.shape[1])), None
     if options.covariance:
-        intrinsics_covariance, pose_covariance = _covariances(problem, end, sigma or options.sigma_px, scale)
+        intrinsics_covariance, pose_covariance = _covariances(
+            problem, end, max(sigma or options.sigma_px, options.noise_floor_px), scale
+        )
     refined = replace(
         cameras,
         R=np.where(moved[:, None, None], end.R, cameras.R),
