@@ -1,0 +1,269 @@
+"""Chapter 7 on synthetic scenes: error and success per method.
+
+``python -m validation.checks.selfcalibration``: every method of the table of kinds alone, and the whole with
+the metric stage behind it, on the thesis' cube and on a general cloud, over noise (at 27 cameras) and over
+the number of cameras (at 1 px), with one focal and with a zoomed one. The projective cameras are the minimum
+of the projective bundle adjustment, in a random frame: what is measured is chapter 7 alone. Success is a
+focal within 3 % (zoomed: the median camera's).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+import warnings
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.assumptions import IntrinsicsAssumption, assumptions_of_views
+from thesisrecon.config import KINDS
+from thesisrecon.errors import StageFailure
+from thesisrecon.metric import UpgradeAndBundle
+from thesisrecon.selfcalibration import HypothesesAndRefinement
+from thesisrecon.types import Assumptions, Reconstruction
+from validation.metrics.record import Metric, markdown_table
+from validation.scenes.cloud import make_cloud
+from validation.scenes.rigs import Rig, cube_rig, noisy_tracks, projective_from_truth, zoomed
+
+F64 = NDArray[np.float64]
+
+WHOLE, WITH_BUNDLE = "hypotheses-and-refinement", "the whole, with the metric stage"
+SCENES = ("cube", "cloud")
+MODES = ("constant", "zooming")
+NOISES_PX = (0.0, 0.5, 1.0, 2.0)
+VIEWS = (3, 5, 9, 18, 27)
+SUCCESS_PCT, WORST_PCT = 3.0, 5.0
+ZOOM = 0.3
+"""Focals are multiplied by e^u, u uniform within this of 0."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One place of the tables."""
+
+    scene: str
+    mode: str
+    sigma_px: float
+    views: int
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One method on one draw: median and worst |f / f_true - 1| over the cameras in percent, NaN where it
+    refused, with the reason; whether it called itself identifiable (the whole: trusted); seconds."""
+
+    scene: str
+    mode: str
+    sigma_px: float
+    views: int
+    seed: int
+    method: str
+    median_pct: float
+    worst_pct: float
+    sure: bool
+    seconds: float
+    refusal: str = ""
+
+
+def make_rig(cell: Cell, rng: np.random.Generator) -> Rig:
+    """The cameras of one draw. Of the cube's, subsets leave out the six that see a single face."""
+    if cell.scene == "cloud":
+        rig = make_cloud(cell.views, rng)
+    else:
+        rig = cube_rig()
+        if cell.views < len(rig.K):
+            assert rig.flat is not None
+            rig = rig.subset(np.sort(rng.choice(np.flatnonzero(~rig.flat), cell.views, replace=False)))
+    return zoomed(rig, np.exp(rng.uniform(-ZOOM, ZOOM, len(rig.K)))) if cell.mode == "zooming" else rig
+
+
+def assumptions(rig: Rig, mode: str) -> Assumptions:
+    """Square pixels, a principal point near the middle, no distortion; the focal constant or free."""
+    wish = IntrinsicsAssumption(focal="constant" if mode == "constant" else "free", k1="known")
+    n = len(rig.K)
+    return assumptions_of_views(wish, [rig.size] * n, np.full(n, np.nan), np.ones(n))
+
+
+def run_cell(cell: Cell, methods: Sequence[str], seeds: Iterable[int]) -> list[Trial]:
+    """All methods on all draws of a cell; every method sees the same draws."""
+    trials = []
+    for seed in seeds:
+        place = (
+            seed,
+            SCENES.index(cell.scene),
+            MODES.index(cell.mode),
+            cell.views,
+            round(100 * cell.sigma_px),
+        )
+        rng = np.random.default_rng(place)
+        rig = make_rig(cell, rng)
+        tracks = noisy_tracks(rig, cell.sigma_px, rng)
+        projective, assumed = projective_from_truth(rig, tracks, rng), assumptions(rig, cell.mode)
+        trials += [_run(cell, seed, method, rig, projective, assumed) for method in methods]
+    return trials
+
+
+def _run(
+    cell: Cell, seed: int, method: str, rig: Rig, projective: Reconstruction, assumed: Assumptions
+) -> Trial:
+    start = time.perf_counter()
+    head = (cell.scene, cell.mode, cell.sigma_px, cell.views, seed, method)
+    try:
+        K, sure = focals_of(method, projective, assumed)
+    except StageFailure as failure:
+        return Trial(*head, np.nan, np.nan, False, time.perf_counter() - start, failure.reason)
+    seconds = time.perf_counter() - start
+    good = K[:, 0, 0] > 0.0
+    error = 100.0 * np.abs(K[good, 0, 0] / rig.K[good, 0, 0] - 1.0)
+    worst = float(error.max()) if good.sum() >= projective.registered.sum() else np.inf
+    return Trial(*head, float(np.median(error)), worst, sure, seconds)
+
+
+def focals_of(method: str, projective: Reconstruction, assumed: Assumptions) -> tuple[F64, bool]:
+    """K (V, 3, 3) by a kind of the table or by the whole, and whether the method stands by it."""
+    rng = np.random.default_rng(0)
+    if method == WITH_BUNDLE:
+        calibration = HypothesesAndRefinement().calibrate(projective, assumed=assumed, rng=rng)
+        result = UpgradeAndBundle().refine(projective, calibration, assumed=assumed, rng=rng)
+        assert result.reconstruction.K is not None
+        return result.reconstruction.K, result.trusted
+    answer = KINDS["selfcalibration"][method]().calibrate(projective, assumed=assumed, rng=rng)
+    return answer.K, answer.identifiable
+
+
+def cells(
+    scenes: Sequence[str], modes: Sequence[str], noises: Sequence[float], views: Sequence[int]
+) -> list[Cell]:
+    """Noise at the most cameras, cameras at 1 px (or the noise nearest to it)."""
+    middle = min(noises, key=lambda s: abs(s - 1.0))
+    places = dict.fromkeys([(s, max(views)) for s in noises] + [(middle, v) for v in views])
+    return [Cell(scene, mode, s, v) for scene in scenes for mode in modes for s, v in places]
+
+
+def report(trials: Sequence[Trial]) -> str:
+    """Markdown: for each scene and mode a table over noise and one over cameras."""
+    blocks = []
+    for scene in dict.fromkeys(t.scene for t in trials):
+        for mode in dict.fromkeys(t.mode for t in trials if t.scene == scene):
+            here = [t for t in trials if (t.scene, t.mode) == (scene, mode)]
+            most = max(t.views for t in here)
+            blocks.append(
+                _table(f"{scene}, {mode}, {most} cameras: noise", here, "sigma_px", " px", views=most)
+            )
+            blocks.append(_table(f"{scene}, {mode}, 1 px: cameras", here, "views", "", sigma_px=1.0))
+    return "\n\n".join(blocks)
+
+
+def _table(title: str, trials: Sequence[Trial], by: str, unit: str, **fixed: float) -> str:
+    some = [t for t in trials if all(getattr(t, name) == value for name, value in fixed.items())]
+    columns = sorted({getattr(t, by) for t in some})
+    lines = [
+        f"| {title} | {' | '.join(f'{c:g}{unit}' for c in columns)} |",
+        f"| --- |{' --- |' * len(columns)}",
+    ]
+    for method in dict.fromkeys(t.method for t in some):
+        shown = [[t for t in some if t.method == method and getattr(t, by) == c] for c in columns]
+        lines.append(f"| {method} | {' | '.join(_entry(s) for s in shown)} |")
+    return "\n".join(lines)
+
+
+def _entry(trials: Sequence[Trial]) -> str:
+    """Median error (those that refused count as infinite), success, and zoomed the share of worst cameras
+    within 5 %; the number of trials where it is not the usual one."""
+    if not trials:
+        return "-"
+    error = np.array([t.median_pct if np.isfinite(t.median_pct) else np.inf for t in trials])
+    worst = np.array([t.worst_pct if np.isfinite(t.worst_pct) else np.inf for t in trials])
+    middle = float(np.median(error))
+    text = "refused" if not np.isfinite(middle) else f"{0.0 if middle < 1e-6 else middle:.2g}"
+    shares = f"{100 * np.mean(error <= SUCCESS_PCT):.0f}"
+    if trials[0].mode == "zooming":
+        shares += f", {100 * np.mean(worst <= WORST_PCT):.0f}"
+    return f"{text} ({shares})"
+
+
+def targets(trials: Sequence[Trial]) -> str:
+    """What the study must show, at 1 px and 27 cameras."""
+    rows = []
+    for scene in SCENES:
+        for mode in MODES:
+            place = (scene, mode, 1.0, 27, WITH_BUNDLE)
+            some = [t for t in trials if (t.scene, t.mode, t.sigma_px, t.views, t.method) == place]
+            if not some:
+                continue
+            error = np.nan_to_num([t.median_pct for t in some], nan=np.inf)
+            worst = np.nan_to_num([t.worst_pct for t in some], nan=np.inf)
+            name = f"{scene}, {mode}, {len(some)} trials"
+            if mode == "constant":
+                rows.append(_metric(name, "median focal error", "%", float(np.median(error)), 0.06, True))
+                success = float(100.0 * np.mean(error <= SUCCESS_PCT))
+                rows.append(_metric(name, "success", "%", success, 100.0, False))
+            else:
+                share = float(100.0 * np.mean(worst <= WORST_PCT))
+                rows.append(_metric(name, "worst camera within 5 %", "% of trials", share, 90.0, False))
+    return "\n\n".join(f"{m.scene}\n\n{markdown_table([m])}" for m in rows)
+
+
+def _metric(scene: str, name: str, unit: str, value: float, target: float, at_most: bool) -> Metric:
+    return Metric(scene, name, unit, {WITH_BUNDLE: value}, WITH_BUNDLE, target, at_most)
+
+
+def read_trials(paths: Sequence[Path]) -> list[Trial]:
+    """Trials written before; of two of the same draw and method the later counts."""
+    lines = [line for path in paths for line in path.read_text(encoding="utf-8").splitlines()]
+    trials = [Trial(**json.loads(line)) for line in lines]
+    unique = {(t.scene, t.mode, t.sigma_px, t.views, t.seed, t.method): t for t in trials}
+    order = [*KINDS["selfcalibration"], WITH_BUNDLE]
+    return sorted(unique.values(), key=lambda t: order.index(t.method) if t.method in order else len(order))
+
+
+def _quiet_cell(job: tuple[Cell, tuple[str, ...], int, int]) -> list[Trial]:
+    cell, methods, first, count = job
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return run_cell(cell, methods, range(first, first + count))
+
+
+def main() -> int:
+    """Run the cells, append every trial to a file, print the tables."""
+    known = [*KINDS["selfcalibration"], WITH_BUNDLE]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=SCENES, choices=SCENES)
+    parser.add_argument("--modes", nargs="+", default=MODES, choices=MODES)
+    parser.add_argument("--noise", type=float, nargs="+", default=NOISES_PX)
+    parser.add_argument("--views", type=int, nargs="+", default=VIEWS)
+    parser.add_argument("--methods", nargs="+", default=known, choices=known, metavar="NAME")
+    parser.add_argument("--trials", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0, help="number of the first draw")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument(
+        "--read", type=Path, nargs="*", default=[], help="trials of earlier runs; with --trials 0 only report"
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, help="file that every trial is appended to, a JSON line each"
+    )
+    arguments = parser.parse_args()
+    jobs = [
+        (cell, tuple(arguments.methods), arguments.first + k, 1)
+        for cell in cells(arguments.scenes, arguments.modes, arguments.noise, arguments.views)
+        for k in range(arguments.trials)
+    ]
+    trials = read_trials(arguments.read)
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        for found in pool.map(_quiet_cell, jobs):
+            trials += found
+            if arguments.out:
+                with arguments.out.open("a", encoding="utf-8") as file:
+                    file.writelines(json.dumps(asdict(t)) + "\n" for t in found)
+    print(report(trials), targets(trials), sep="\n\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,101 @@
+"""Synthetic cameras and points as the studies of chapters 6 and 7 take them: zoomed, noisy, projective."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.camera import compose_camera, project_camera
+from thesisrecon.geometry.strata import random_transform
+from thesisrecon.optimize.projective_bundle import refine_projective_bundle
+from thesisrecon.types import Reconstruction, Tracks
+from validation.scenes.cube import SIZE, make_cube
+
+F64 = NDArray[np.float64]
+B8 = NDArray[np.bool_]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """``K, R`` (V, 3, 3), R world-to-camera, ``C`` (V, 3), ``X`` (N, 3), ``seen`` (V, N) whether a view may
+    see a point (the border of the image is checked besides), ``size`` of every image; ``flat`` (V,) views
+    whose points lie on one plane, which leaves a projective camera open."""
+
+    K: F64
+    R: F64
+    C: F64
+    X: F64
+    seen: B8
+    size: tuple[int, int]
+    flat: B8 | None = None
+
+    def subset(self, views: I64) -> Rig:
+        """The rig of these views."""
+        flat = None if self.flat is None else self.flat[views]
+        return replace(
+            self, K=self.K[views], R=self.R[views], C=self.C[views], seen=self.seen[views], flat=flat
+        )
+
+    def pixels(self) -> F64:
+        """Exact pixels (V, N, 2), NaN where a view does not see a point."""
+        t = -np.einsum("vab,vb->va", self.R, self.C)
+        xy = np.stack([project_camera(K, R, t_, self.X) for K, R, t_ in zip(self.K, self.R, t, strict=True)])
+        inside = (xy >= -0.5).all(axis=2) & (xy <= np.array(self.size) - 0.5).all(axis=2)
+        return np.where((inside & self.seen)[..., None], xy, np.nan)
+
+
+def cube_rig() -> Rig:
+    """The thesis' cube sequence (5.5): always the same numbers."""
+    cube = make_cube()
+    facing = cube.C[:, cube.face] > 1.0
+    K = np.tile(cube.K, (len(cube.R), 1, 1))
+    return Rig(K, cube.R, cube.C, cube.X, facing, SIZE, cube.faces_seen() == 1)
+
+
+def zoomed(rig: Rig, factors: F64) -> Rig:
+    """The rig with every focal (V,) times a factor, about the image's middle where the points are."""
+    K = rig.K.copy()
+    K[:, 0, 0] *= factors
+    K[:, 1, 1] *= factors
+    return replace(rig, K=K)
+
+
+def noisy_tracks(rig: Rig, sigma_px: float, rng: np.random.Generator) -> Tracks:
+    """Observations of all points that two views or more see, with Gaussian noise of ``sigma_px``."""
+    xy = rig.pixels()
+    seen = np.isfinite(xy[..., 0])
+    seen &= seen.sum(axis=0) >= 2
+    point, view = np.nonzero(seen.T)
+    observed = xy[view, point] + sigma_px * rng.normal(size=(len(view), 2))
+    return Tracks(view, point, observed, len(rig.K), len(rig.X))
+
+
+def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) -> Reconstruction:
+    """The minimum of the projective bundle adjustment nearest to the truth, in a random projective frame.
+
+    What a projective stage without fault hands on; a study of self-calibration needs no other. Flat views are
+    left out, as the gate of the projective stage does.
+    """
+    n = len(rig.K)
+    registered = np.ones(n, dtype=bool) if rig.flat is None else ~rig.flat
+    P = compose_camera(rig.K, rig.R, -np.einsum("vab,vb->va", rig.R, rig.C))
+    use = registered[tracks.view_index]
+    use &= np.bincount(tracks.point_index[use], minlength=tracks.n_points)[tracks.point_index] >= 2
+    X = np.column_stack([rig.X, np.ones(len(rig.X))])
+    G = random_transform("projective", rng)
+    P = P @ np.linalg.inv(G) * (rng.uniform(0.5, 2.0, n) * rng.choice([-1.0, 1.0], n))[:, None, None]
+    X = X @ G.T * rng.choice([-1.0, 1.0], len(X))[:, None]
+    fitted = refine_projective_bundle(
+        P, X, tracks.view_index[use], tracks.point_index[use], tracks.xy[use], loss_px=10.0, max_iterations=30
+    )
+    valid = np.bincount(tracks.point_index[use], minlength=len(X)) >= 2
+    sigma = float(np.sqrt(np.mean(fitted.residual_px**2)))
+    reasons = tuple("" if r else "sees a single plane" for r in registered)
+    return Reconstruction(
+        "projective", np.where(registered[:, None, None], fitted.P, 0.0),
+        np.where(valid[:, None], fitted.X, 0.0), registered, valid, use, tracks,
+        np.tile(rig.size, (n, 1)).astype(np.int64), max(sigma, 1e-6), reasons,
+    )  # fmt: skip
