@@ -13,7 +13,7 @@ SEEN = 0.75
 """Share of the points in a view's sight that it has an observation of."""
 
 
-def make_cloud(views: int, rng: np.random.Generator, *, points: int = 300) -> Rig:
+def make_cloud(views: int, rng: np.random.Generator, *, points: int = 500) -> Rig:
     """``points`` uniform in a box of 4 x 3 x 3.2, ``views`` cameras 6 to 9 off on a cap of 80 by 40 degrees.
 
     The principal point is off the image's middle by a normal deviate of half a percent of the long side.
