@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -77,6 +77,17 @@ def make_scene(
     xy += rng.normal(0.0, sigma_px, xy.shape) if sigma_px else 0.0
     tracks = Tracks(view, point, xy, views, points)
     return TrueScene(Ka, Ra, ta, X, k1, tracks, np.tile(size, (views, 1)))
+
+
+def with_poses(scene: TrueScene, R: np.ndarray, centres: np.ndarray) -> TrueScene:
+    """The same points seen without noise by cameras that stand and look elsewhere."""
+    t = -np.einsum("vab,vb->va", R, centres)
+    view, point = scene.tracks.view_index, scene.tracks.point_index
+    xy = np.empty((len(view), 2))
+    for v in range(len(R)):
+        mine = view == v
+        xy[mine] = project_camera(scene.K[v], R[v], t[v], scene.X[point[mine]], k1=scene.k1)
+    return replace(scene, R=R, t=t, tracks=replace(scene.tracks, xy=xy))
 
 
 def projective_reconstruction(scene: TrueScene, *, seed: int = 0) -> Reconstruction:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
 from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.errors import StageFailure
 from thesisrecon.selfcalibration import HartleySearch, HypothesesAndRefinement
@@ -92,9 +92,7 @@ def test_two_cameras_are_refused() -> None:
 
 def test_pure_translation_is_called_unidentifiable() -> None:
     scene = make_scene(seed=7)
-    still = replace(
-        scene, R=np.tile(scene.R[0], (8, 1, 1)), t=-np.einsum("ab,vb->va", scene.R[0], scene.centres)
-    )
+    still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
     answer = calibrate(HypothesesAndRefinement(), still)
     assert not answer.identifiable
     assert any("translation" in reason for reason in answer.reasons)
@@ -102,9 +100,7 @@ def test_pure_translation_is_called_unidentifiable() -> None:
 
 def test_a_prior_pulls_an_undetermined_focal() -> None:
     scene = make_scene(seed=7)
-    still = replace(
-        scene, R=np.tile(scene.R[0], (8, 1, 1)), t=-np.einsum("ab,vb->va", scene.R[0], scene.centres)
-    )
+    still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
     reconstruction = projective_reconstruction(still)
     answer = HypothesesAndRefinement().calibrate(
         reconstruction,

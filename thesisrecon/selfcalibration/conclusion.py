@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from thesisrecon.errors import StageFailure
 from thesisrecon.selfcalibration.frame import ReferenceFrame, metric_from_calibration
 from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std
-from thesisrecon.selfcalibration.verdict import identifiability
+from thesisrecon.selfcalibration.verdict import judge_motion, verdict_without_an_answer
 from thesisrecon.types import Reconstruction, SelfCalibration, Upgrade
 
 F64 = NDArray[np.float64]
@@ -99,7 +99,10 @@ def conclude(
     min_positive: float,
 ) -> SelfCalibration:
     """The ``kept`` best distinct answers with at least the share ``min_positive`` of the points in front of
-    the cameras, and the verdict on the motion; ``StageFailure`` where none is left."""
+    the cameras, and the verdict on the motion under ``frame.assumed``; ``StageFailure`` where none is left.
+    """
+    if frame.assumed is None:
+        raise ValueError("a conclusion needs a frame that knows what is assumed: see assumed_frame")
     upgrades: list[Upgrade] = []
     chosen: list[Answer] = []
     for answer in sorted(answers, key=lambda a: a.cost):
@@ -113,20 +116,24 @@ def conclude(
             upgrades.append(upgrade)
             chosen.append(answer)
     if not upgrades:
+        said = verdict_without_an_answer(reconstruction, frame.assumed).sentences
         raise StageFailure(
             "no camera calibration puts the scene in front of all cameras",
             f"{len(answers)} answers were tried over {len(frame.views)} cameras",
-            "photograph the scene from more directions, turning the camera between shots",
+            "; ".join(said) or "photograph the scene from more directions, turning the camera between shots",
         )
     theta = np.concatenate([chosen[0].plane, chosen[0].log_focals(frame)])
-    std_log_f, noise = focal_std(criterion, frame, theta)
-    identifiable, reasons = identifiability(frame, theta, std_log_f, noise)
+    std_log_f, _ = focal_std(criterion, frame, theta)
     best = upgrades[0]
+    verdict = judge_motion(reconstruction, best, frame.assumed)
     K_std = np.zeros_like(best.K)
     relative = np.minimum(std_log_f[frame.group], MAX_LOG_STD)
     for k in (0, 1):
         K_std[frame.views, k, k] = best.K[frame.views, k, k] * relative
-    return SelfCalibration(best.metric_from_projective, best.K, K_std, identifiable, reasons, tuple(upgrades))
+    return SelfCalibration(
+        best.metric_from_projective, best.K, K_std, verdict.identifiable,
+        () if verdict.identifiable else verdict.sentences, tuple(upgrades), verdict,
+    )  # fmt: skip
 
 
 def upgrade_from_answer(

@@ -29,7 +29,7 @@ class ReferenceFrame:
     ``reference`` the place of the reference camera in ``views``; ``group`` (R,) camera number, 0-based and
     dense; ``pixel_from_unit`` (V, 3, 3) for all views; ``reference_from_projective`` (4, 4). ``focal_mean,
     focal_std`` (G,): what is known of the groups' log focals, NaN and infinite where that is nothing; None
-    where nothing is known of any.
+    where nothing is known of any. ``assumed`` is all that is known of the views, None where nobody said.
     """
 
     A: F64
@@ -41,6 +41,7 @@ class ReferenceFrame:
     reference_from_projective: F64
     focal_mean: F64 | None = None
     focal_std: F64 | None = None
+    assumed: Assumptions | None = None
 
     @property
     def n_groups(self) -> int:
@@ -56,6 +57,7 @@ class ReferenceFrame:
             self.pixel_from_unit, self.reference_from_projective,
             None if self.focal_mean is None else self.focal_mean[kept],
             None if self.focal_std is None else self.focal_std[kept],
+            self.assumed,
         )  # fmt: skip
 
 
@@ -116,7 +118,7 @@ def assumed_frame(
         if mine.any():
             mean[g] = np.median(log_f[mine])
             std[g] = max(float(np.median(assumed.std[frame.views[mine], 0])), KNOWN_STD)
-    return replace(frame, focal_mean=mean, focal_std=std)
+    return replace(frame, focal_mean=mean, focal_std=std, assumed=assumed)
 
 
 def _unit_of(assumed: Assumptions, sizes: I64) -> F64:

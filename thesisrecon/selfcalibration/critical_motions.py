@@ -1,0 +1,231 @@
+"""Section 7, "critical motions": how near the cameras come to motions that leave self-calibration open.
+
+P. Sturm, "Critical motion sequences for monocular self-calibration and uncalibrated Euclidean
+reconstruction", CVPR 1997, and BMVC 1999 for a varying focal; F. Kahl, B. Triggs and K. Astrom, "Critical
+motions for auto-calibration when some intrinsic parameters can vary", J. Math. Imaging and Vision 13, 2000.
+Every critical motion is kept by the transforms that it leaves open: a camera that did not turn did not turn
+in any of the answers that fit its images, parallel axes stay parallel, points of a plane in a plane. What is
+measured is thus the same for whichever of these answers was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+F64 = NDArray[np.float64]
+
+PLANE = "planar scene"
+ROTATION = "pure rotation"
+TRANSLATION = "pure translation"
+OPTICAL_AXIS = "rotation about the optical axis"
+TURNTABLE = "turntable"
+PLANAR = "planar motion"
+PARALLEL_AXES = "parallel rotation axes"
+
+TOLERANCES: Mapping[str, float] = {
+    "scene_thickness": 0.02,
+    "travel_over_distance": 0.03,
+    "image_shift": 0.08,
+    "image_shift_beyond_roll": 0.08,
+    "axis_spread_deg": 3.0,
+    "axis_line_over_distance": 0.05,
+    "climb_over_distance": 0.025,
+}
+"""What a photographer who wants the critical motion cannot avoid: a hand turns by a degree about each axis
+(between two photographs twice as far, all in all), and keeps a place to a hundredth of the distance."""
+
+FARTHEST_SHIFT = 10.0
+"""Long sides; what turns behind the camera counts as this."""
+
+_NAMED_BY: Mapping[str, tuple[str, ...]] = {
+    PLANE: ("scene_thickness",),
+    ROTATION: ("travel_over_distance",),
+    TRANSLATION: ("image_shift",),
+    OPTICAL_AXIS: ("image_shift_beyond_roll",),
+    TURNTABLE: ("axis_spread_deg", "axis_line_over_distance", "climb_over_distance"),
+    PLANAR: ("axis_spread_deg", "climb_over_distance"),
+    PARALLEL_AXES: ("axis_spread_deg",),
+}
+"""From what leaves most open to what leaves least; a motion is near where all its measures are."""
+
+
+@dataclass(frozen=True)
+class UpgradedCameras:
+    """Metric cameras in unit-free pixels, as an answer of self-calibration has them, and points.
+
+    ``focal`` (V,), ``R`` (V, 3, 3) world-to-camera, ``C`` (V, 3) centres, ``X`` (N, 3) the points.
+    """
+
+    focal: F64
+    R: F64
+    C: F64
+    X: F64
+
+    @property
+    def distance(self) -> float:
+        """Median distance from a camera to the middle of the points."""
+        centre = np.median(self.X, axis=0)
+        return max(float(np.median(np.linalg.norm(centre - self.C, axis=1))), 1e-300)
+
+    def infinite_homographies(self) -> F64:
+        """(V, 3, 3) how the picture of infinity moves from the view that turned least to each view."""
+        angles = Rotation.from_matrix(self.R @ Rotation.from_matrix(self.R).mean().as_matrix().T).magnitude()
+        middle = int(angles.argmin())
+        K = np.stack([self.focal, self.focal, np.ones_like(self.focal)], axis=1)
+        return np.asarray(K[:, :, None] * (self.R @ self.R[middle].T) / K[middle])
+
+
+def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
+    """The measures of ``TOLERANCES`` and the largest turn, by name."""
+    axis, turn, spread = common_axis(metric.R)
+    H = metric.infinite_homographies()
+    return {
+        "scene_thickness": thickness(metric.X),
+        "travel_over_distance": travel(metric.C) / metric.distance,
+        "image_shift": infinity_shift(H, roll=False),
+        "image_shift_beyond_roll": infinity_shift(H, roll=True),
+        "largest_turn_deg": turn,
+        "axis_spread_deg": spread,
+        "axis_line_over_distance": axis_line_residual(metric, axis) / metric.distance,
+        "climb_over_distance": climb(metric.C, axis) / metric.distance,
+    }
+
+
+def nearest_critical_motion(measures: Mapping[str, float]) -> tuple[str, float]:
+    """Its name and how near it is: the largest of its measures over their tolerances, below 1 where the
+    motion cannot be told from it by what a photographer does anyhow.
+
+    Of several below 1 the one that leaves most open is meant.
+    """
+    near: dict[str, float] = {}
+    for name, needed in _NAMED_BY.items():
+        if all(key in measures for key in needed):
+            near[name] = max(measures[key] / TOLERANCES[key] for key in needed)
+    within = [name for name, distance in near.items() if distance < 1.0]
+    chosen = within[0] if within else min(near, key=lambda name: near[name])
+    return chosen, near[chosen]
+
+
+def infinity_shift(H: F64, *, roll: bool) -> float:
+    """How far the picture of infinity moves between the views (rms over views and picture, in long sides)
+    beyond zooming and, with ``roll``, turning in its plane.
+
+    ``H`` (V, 3, 3): infinite homographies from one of the views in unit-free pixels, each compared with the
+    nearest diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]]. Zero for cameras that did not turn,
+    whatever their focals and whatever is taken for them.
+    """
+    template = np.zeros_like(H)
+    template[:, 0, 0] = template[:, 1, 1] = (H[:, 0, 0] + H[:, 1, 1]) / 2.0
+    template[:, 2, 2] = H[:, 2, 2]
+    if roll:
+        template[:, 1, 0] = (H[:, 1, 0] - H[:, 0, 1]) / 2.0
+        template[:, 0, 1] = -template[:, 1, 0]
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.4, 0.4, 5))
+    grid = np.stack([u.ravel(), v.ravel(), np.ones(25)])
+    shift = np.sum((_dehomogenized(H @ grid) - _dehomogenized(template @ grid)) ** 2, axis=1)
+    return float(np.sqrt(np.mean(np.minimum(shift, FARTHEST_SHIFT**2))))
+
+
+def _dehomogenized(x: F64) -> F64:
+    """(V, 3, M) -> (V, 2, M), kept finite."""
+    w = x[:, 2:]
+    return np.asarray(x[:, :2] / np.where(np.abs(w) < 1e-9, 1e-9, w))
+
+
+def shifts_without_an_answer(A: F64, a: F64) -> dict[str, float]:
+    """``image_shift`` and ``image_shift_beyond_roll`` of projective cameras [A | a] (V, 3, 3), (V, 3), one of
+    them [I | 0], in unit-free pixels.
+
+    Of all planes the one is taken that comes nearest to a camera that did not turn: A_i - a_i p' to be
+    diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]], which is linear in p, g, k, h. Small numbers
+    are thus necessary for a camera that did not turn, and not sufficient: cameras that look at one point from
+    a short arc give small ones too.
+    """
+    identity = np.zeros((3, 3, 3))
+    identity[0, 0, 0] = identity[0, 1, 1] = identity[1, 2, 2] = identity[2, 1, 0] = 1.0
+    identity[2, 0, 1] = -1.0
+    shifts = {}
+    for name, kinds in (("image_shift", 2), ("image_shift_beyond_roll", 3)):
+        rows = np.zeros((len(A), 9, 3 + kinds * len(A)))
+        for k in range(3):
+            rows[:, k::3, k] = a
+        for i in range(len(A)):
+            rows[i, :, 3 + kinds * i : 3 + kinds * (i + 1)] = identity[:kinds].reshape(kinds, 9).T
+        p = np.linalg.lstsq(rows.reshape(9 * len(A), -1), A.reshape(-1), rcond=None)[0][:3]
+        shifts[name] = infinity_shift(A - a[:, :, None] * p, roll=kinds == 3)
+    return shifts
+
+
+def common_axis(R: F64) -> tuple[F64, float, float]:
+    """The direction (3,) nearest to all rotation axes, the largest turn between two views, and the spread of
+    the axes, both in degrees.
+
+    The spread is the rms turn about any axis across the common one: with the rotation vectors r of all pairs,
+    in the world's frame, the root of the second eigenvalue of mean(r r').
+    """
+    i, j = np.triu_indices(len(R), 1)
+    relative = R[j].swapaxes(1, 2) @ R[i]
+    vectors = Rotation.from_matrix(relative).as_rotvec()
+    value, vector = np.linalg.eigh(vectors.T @ vectors / len(vectors))
+    turn = float(np.degrees(np.linalg.norm(vectors, axis=1).max()))
+    return vector[:, 2], turn, float(np.degrees(np.sqrt(max(value[1], 0.0))))
+
+
+def travel(C: F64) -> float:
+    """Rms distance of the centres from their mean."""
+    return float(np.sqrt(np.mean(np.sum((C - C.mean(axis=0)) ** 2, axis=1))))
+
+
+def climb(C: F64, axis: F64) -> float:
+    """Rms way of the centres along an axis."""
+    return float(np.sqrt(np.mean(((C - C.mean(axis=0)) @ axis) ** 2)))
+
+
+def axis_line_residual(metric: UpgradedCameras, axis: F64) -> float:
+    """Rms distance of the centres from where one line of this direction would turn them to.
+
+    Seen along the line, a camera on a turntable keeps its place relative to itself: R_i (C_i - c) is the same
+    for all views but for its part along R_i axis, which is the climb. The point c of the line is found by
+    least squares.
+    """
+    seen = metric.R @ (np.eye(3) - np.outer(axis, axis))
+    places = np.einsum("vab,vb->va", seen, metric.C)
+    coefficients, right = seen - seen.mean(axis=0), places - places.mean(axis=0)
+    c = np.linalg.lstsq(coefficients.reshape(-1, 3), right.ravel(), rcond=1e-9)[0]
+    return float(np.sqrt(np.mean(np.sum((right - coefficients @ c) ** 2, axis=1))))
+
+
+def thickness(X: F64, *, kept: float = 0.95) -> float:
+    """Rms distance of the points from their best plane over their rms extent along it; the ``kept`` nearest
+    to the centre and then to the plane count."""
+    for _ in range(3):
+        centred = X - np.median(X, axis=0)
+        near = np.argsort(np.linalg.norm(centred, axis=1), kind="stable")[: max(int(kept * len(X)), 4)]
+        X = X[near]
+        if len(X) < 50:
+            break
+    centred = X - X.mean(axis=0)
+    for _ in range(3):
+        normal = np.linalg.svd(centred, full_matrices=False)[2][2]
+        order = np.argsort(np.abs(centred @ normal), kind="stable")[: max(int(kept * len(centred)), 4)]
+        centred = centred[order] - centred[order].mean(axis=0)
+    s = np.linalg.svd(centred, compute_uv=False)
+    return float(s[2] / max(float(s[1]), 1e-300))
+
+
+def optical_axes_gap(F: F64) -> float:
+    """How far two cameras are from looking at one point: the distance (long sides) of one image's centre from
+    the epipolar line of the other's, the larger of the two. F (3, 3) in unit-free pixels.
+
+    At zero the optical axes meet or are parallel, and two focal lengths cannot be had from F alone (Bougnoux,
+    ICCV 1998; Sturm, BMVC 1999).
+    """
+    lines = np.stack([F[:, 2], F[2]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gap = np.abs(F[2, 2]) / np.linalg.norm(lines[:, :2], axis=1)
+    return float(np.nan_to_num(gap, nan=0.0, posinf=np.inf).max())

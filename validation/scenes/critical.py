@@ -1,0 +1,201 @@
+"""Sequences whose motion leaves self-calibration something open, and general ones that do not.
+
+Every motion comes exact and as a photographer makes it who wants it so: the hand turns the camera by
+``HAND_TURN_DEG`` about each axis and moves it by ``HAND_SHIFT`` of the distance along each, a wall has relief
+of ``WALL_RELIEF`` of its width. Scenes, focals, distances, numbers of cameras and noise are random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.geometry.camera import compose_camera, project_camera
+from thesisrecon.optimize.projective_bundle import refine_projective_bundle
+from thesisrecon.types import Reconstruction, Tracks
+from validation.scenes.pose import look_at
+
+F64 = NDArray[np.float64]
+SIZE = np.array([1536, 1024])
+HAND_TURN_DEG, HAND_SHIFT, WALL_RELIEF = 1.0, 0.01, 0.01
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Motion(Enum):
+    """What the cameras do, or what they see."""
+
+    GENERAL = "general"
+    TRANSLATION = "pure translation"
+    ROTATION = "pure rotation"
+    TURNTABLE = "turntable"
+    PLANAR = "planar motion"
+    PARALLEL_AXES = "parallel rotation axes"
+    OPTICAL_AXIS = "rotation about the optical axis"
+    PLANE = "planar scene"
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """``K, R`` (V, 3, 3), ``C`` (V, 3), ``X`` (N, 3), ``tracks`` with noise ``sigma_px``, ``sizes`` (V, 2)."""
+
+    K: F64
+    R: F64
+    C: F64
+    X: F64
+    tracks: Tracks
+    sizes: NDArray[np.int64]
+    sigma_px: float
+
+    @property
+    def P(self) -> F64:
+        """(V, 3, 4) true cameras."""
+        return compose_camera(self.K, self.R, -np.einsum("vab,vb->va", self.R, self.C))
+
+
+@dataclass(frozen=True)
+class _Wishes:
+    """``distance`` in units of the scene's radius; ``spread`` of the path in units of the distance."""
+
+    views: int
+    distance: float
+    spread: float
+
+
+def _general(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+    """Cameras on a cap of 40 to 80 degrees across, held at any roll up to 30 degrees, not quite aimed."""
+    half = np.radians(rng.uniform(20.0, 40.0))
+    azimuth, height = rng.uniform(-half, half, (2, w.views))
+    direction = np.stack(
+        [np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)], axis=1
+    )
+    C = direction * w.distance * rng.uniform(0.8, 1.25, (w.views, 1))
+    roll = rng.uniform(-np.pi / 6, np.pi / 6, w.views)
+    R = [look_at(c, 0.2 * rng.normal(size=3), float(a)) for c, a in zip(C, roll, strict=True)]
+    return np.array(R), C
+
+
+def _translation(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+    start = np.array([w.distance, 0.0, 0.0])
+    C = start + w.spread * w.distance * rng.uniform(-0.5, 0.5, (w.views, 3))
+    R = look_at(start, 0.1 * rng.normal(size=3), rng.uniform(-0.3, 0.3))
+    return np.tile(R, (w.views, 1, 1)), C
+
+
+def _rotation(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+    """A panorama from one point, turned up to 15 degrees about any axis."""
+    start = np.array([w.distance, 0.0, 0.0])
+    R = look_at(start, np.zeros(3), rng.uniform(-0.3, 0.3))
+    turns = np.radians(rng.uniform(-15.0, 15.0, (w.views, 3)))
+    return Rotation.from_rotvec(turns).as_matrix() @ R, np.tile(start, (w.views, 1))
+
+
+def _turntable(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+    """One camera at any height and roll that circles about an axis, by 40 to 360 degrees in all."""
+    height = np.radians(rng.uniform(-10.0, 45.0))
+    start = w.distance * np.array([np.cos(height), 0.0, np.sin(height)])
+    R = look_at(start, 0.2 * rng.normal(size=3), rng.uniform(-0.3, 0.3))
+    angle = np.sort(rng.uniform(0.0, np.radians(rng.uniform(40.0, 360.0)), w.views))
+    turn = Rotation.from_rotvec(angle[:, None] * UP).as_matrix()
+    return R @ turn.swapaxes(1, 2), turn @ start
+
+
+def _planar(w: _Wishes, rng: np.random.Generator, climb: float = 0.0) -> tuple[F64, F64]:
+    """A tripod rolled over the floor: headings of its own at every place, the tilt as it was."""
+    azimuth = rng.uniform(-0.6, 0.6, w.views)
+    C = w.distance * np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=1)
+    C *= rng.uniform(0.75, 1.25, (w.views, 1))
+    C[:, 2] = w.distance * (rng.uniform(-0.1, 0.4) + climb * rng.uniform(-0.5, 0.5, w.views))
+    start = look_at(np.array([w.distance, 0.0, C[:, 2].mean()]), 0.1 * rng.normal(size=3), rng.uniform(-0.3, 0.3))
+    heading = azimuth + np.radians(rng.uniform(-8.0, 8.0, w.views))
+    turn = Rotation.from_rotvec(heading[:, None] * UP).as_matrix()
+    return start @ turn.swapaxes(1, 2), C
+
+
+def _parallel_axes(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+    """The same with a lift."""
+    return _planar(w, rng, climb=rng.uniform(0.2, 0.6))
+
+
+def _optical_axis(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+    """Forward and sideways, rolled by any angle, the optical axis never turned."""
+    R, C = _translation(w, rng)
+    roll = rng.uniform(-np.pi, np.pi, w.views)
+    return Rotation.from_rotvec(roll[:, None] * UP).as_matrix() @ R, C
+
+
+_MOTIONS: dict[Motion, Callable[[_Wishes, np.random.Generator], tuple[F64, F64]]] = {
+    Motion.GENERAL: _general,
+    Motion.TRANSLATION: _translation,
+    Motion.ROTATION: _rotation,
+    Motion.TURNTABLE: _turntable,
+    Motion.PLANAR: _planar,
+    Motion.PARALLEL_AXES: _parallel_axes,
+    Motion.OPTICAL_AXIS: _optical_axis,
+    Motion.PLANE: _general,
+}
+
+
+def make_sequence(
+    motion: Motion, rng: np.random.Generator, *, by_hand: bool = False, zoom: float = 0.0
+) -> Sequence:
+    """5 to 15 cameras and 150 to 400 points in a box, 0.5 to 1 px noise, a focal of 0.7 to 2 long sides.
+
+    ``by_hand`` adds what a photographer cannot avoid; ``zoom``: focals vary by factors e^+-zoom. The principal
+    point is off by 0.5 % of the long side (rms), and a tenth of what is in the picture is not matched.
+    """
+    wishes = _Wishes(int(rng.integers(5, 16)), rng.uniform(3.0, 6.0), rng.uniform(0.4, 0.8))
+    R, C = _MOTIONS[motion](wishes, rng)
+    if by_hand:
+        R = Rotation.from_rotvec(np.radians(rng.normal(0.0, HAND_TURN_DEG, (len(R), 3)))).as_matrix() @ R
+        C = C + wishes.distance * rng.normal(0.0, HAND_SHIFT, C.shape)
+    X = rng.uniform(-1.0, 1.0, (int(rng.integers(150, 401)), 3)) * rng.uniform(0.5, 1.0, 3)
+    if motion is Motion.PLANE:
+        X[:, 0] = (WALL_RELIEF * rng.uniform(-1.0, 1.0, len(X)) if by_hand else 0.0) * np.ones(len(X))
+    focal = _focal(R, C, X, rng)
+    centre = (SIZE - 1) / 2 + rng.normal(0.0, 0.005 / np.sqrt(2.0), 2) * SIZE.max()
+    K = np.zeros((len(R), 3, 3))
+    K[:, 0, 0] = K[:, 1, 1] = focal * np.exp(rng.uniform(-zoom, zoom, len(R)))
+    K[:, :2, 2], K[:, 2, 2] = centre, 1.0
+    sigma = rng.uniform(0.5, 1.0)
+    return Sequence(K, R, C, X, _observe(K, R, C, X, sigma, rng), np.tile(SIZE, (len(R), 1)), sigma)
+
+
+def _focal(R: F64, C: F64, X: F64, rng: np.random.Generator) -> float:
+    """A focal (px) that fills the picture with the scene, give or take, within 0.6 and 2.5 long sides."""
+    Y = np.einsum("vab,vnb->vna", R, X[None] - C[:, None])
+    reach = np.quantile(np.abs(Y[..., 0] / np.maximum(Y[..., 2], 1e-3)), 0.9)
+    return float(np.clip(0.5 / reach * rng.uniform(0.7, 1.1), 0.6, 2.5) * SIZE.max())
+
+
+def _observe(K: F64, R: F64, C: F64, X: F64, sigma: float, rng: np.random.Generator) -> Tracks:
+    t = -np.einsum("vab,vb->va", R, C)
+    xy = np.stack([project_camera(K[v], R[v], t[v], X) for v in range(len(K))])
+    depth = np.einsum("va,vna->vn", R[:, 2], X[None] - C[:, None])
+    seen = (depth > 0.1) & ((xy >= 0) & (xy <= SIZE - 1)).all(axis=2) & (rng.random(depth.shape) < 0.9)
+    seen &= seen.sum(axis=0) >= 2
+    point, view = np.nonzero(seen.T)
+    noisy = xy[view, point] + rng.normal(0.0, sigma, (len(view), 2))
+    return Tracks(view.astype(np.int64), point.astype(np.int64), noisy, len(K), len(X))
+
+
+def projective_estimate(scene: Sequence, rng: np.random.Generator) -> Reconstruction:
+    """The projective reconstruction of maximum likelihood: the truth moved by a random projective transform
+    and adjusted to the noisy observations."""
+    G = np.eye(4) + 0.2 * rng.normal(size=(4, 4))
+    seen = np.bincount(scene.tracks.point_index, minlength=len(scene.X)) >= 2
+    Xh = np.column_stack([scene.X, np.ones(len(scene.X))]) @ G.T
+    Xh /= np.linalg.norm(Xh, axis=1, keepdims=True)
+    P = scene.P @ np.linalg.inv(G)
+    P /= np.linalg.norm(P, axis=(1, 2))[:, None, None]
+    t = scene.tracks
+    fit = refine_projective_bundle(P, Xh, t.view_index, t.point_index, t.xy, max_iterations=20)
+    n = len(P)
+    return Reconstruction(
+        "projective", fit.P, fit.X, np.ones(n, dtype=bool), seen, np.ones(len(t.xy), dtype=bool), t,
+        scene.sizes, scene.sigma_px, ("",) * n,
+    )  # fmt: skip
