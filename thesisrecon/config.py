@@ -28,7 +28,7 @@ from thesisrecon.matching.pair_selection import (
     SequenceWindow,
 )
 from thesisrecon.metric import UpgradeAndBundle
-from thesisrecon.projective import GatedIncremental, SequentialProjective
+from thesisrecon.projective import Factorization, GatedIncremental, SequentialProjective
 from thesisrecon.selfcalibration import (
     FocalScan,
     FocalsFromFundamental,
@@ -211,7 +211,11 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
     "epipolar": {"locally-optimised-ransac": LocallyOptimisedRansac, "thesis-ransac": ThesisRansac},
     "verification": {"pair-verification": PairVerification},
     "tracks": {"aligned-tracks": AlignedTracks, "plain-tracks": PlainTracks},
-    "projective": {"gated-incremental": GatedIncremental, "sequential-projective": SequentialProjective},
+    "projective": {
+        "gated-incremental": GatedIncremental,
+        "sequential-projective": SequentialProjective,
+        "factorization": Factorization,
+    },
     "selfcalibration": {
         "hypotheses-and-refinement": HypothesesAndRefinement,
         "hartley-search": HartleySearch,

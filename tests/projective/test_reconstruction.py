@@ -1,4 +1,4 @@
-"""Chapter 6 on exact and noisy tracks: both variants, the gate, the initial pair, robust resection."""
+"""Chapter 6 on exact and noisy tracks: all variants, the gate, the initial pair, robust resection."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from tests.synthetic import TrueScene, make_scene, true_pairs
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import project
 from thesisrecon.geometry.triangulation import triangulate_linear
-from thesisrecon.projective import GatedIncremental, SequentialProjective
+from thesisrecon.projective import Factorization, GatedIncremental, SequentialProjective
 from thesisrecon.projective.gate import predicted_spread_px
 from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs
 from thesisrecon.projective.resection import resect_robust
 from thesisrecon.projective.selection import select_tracks, tracks_with_parallax
 from thesisrecon.types import Reconstruction, Tracks
+
+VARIANTS = [GatedIncremental(), SequentialProjective(), Factorization()]
 
 
 def residuals(found: Reconstruction) -> np.ndarray:
@@ -40,9 +42,7 @@ def projective_error(found: Reconstruction, scene: TrueScene) -> float:
     return float(np.abs(Z[:, :3] / Z[:, 3:] - scene.X[valid]).max())
 
 
-@pytest.mark.parametrize(
-    "variant", [GatedIncremental(), SequentialProjective()], ids=lambda v: type(v).__name__
-)
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: type(v).__name__)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_exact_tracks_give_the_true_scene_up_to_a_projective_transform(
     variant: GatedIncremental, seed: int
@@ -96,7 +96,7 @@ def test_a_view_of_a_plane_is_postponed_with_its_reason() -> None:
 def test_without_accepted_pairs_there_is_one_clear_sentence() -> None:
     scene = make_scene()
     pairs = [replace(p, accepted=False) for p in true_pairs(scene)]
-    for variant in (GatedIncremental(), SequentialProjective()):
+    for variant in VARIANTS:
         with pytest.raises(StageFailure, match="photographs"):
             variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
 
@@ -104,7 +104,7 @@ def test_without_accepted_pairs_there_is_one_clear_sentence() -> None:
 def test_pairs_that_homographies_explain_are_refused_as_a_turning_camera_or_a_plane() -> None:
     scene = make_scene()
     pairs = [replace(p, homography_share=0.99) for p in true_pairs(scene)]
-    for variant in (GatedIncremental(), SequentialProjective()):
+    for variant in VARIANTS:
         with pytest.raises(StageFailure, match="no parallax"):
             variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
 

@@ -150,11 +150,15 @@ class GatedIncremental:
         rng: np.random.Generator,
     ) -> GrowingModel:
         model = self.begin(tracks, start, sizes)
+        self.complete(model, pairs, rng)
+        return model
+
+    def complete(self, model: GrowingModel, pairs: Sequence[TwoView], rng: np.random.Generator) -> None:
+        """Add, in place, what views can be added to a model begun in any way; discard what proves wrong."""
         self._grow(model, rng)
         while self._discard_camera(model, pairs):
             adjust(model, self.bundle_iterations, self.outlier_sigmas[0])
             self._grow(model, rng)
-        return model
 
     def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> GrowingModel:
         """Cameras (3.42) and points of the first two views."""

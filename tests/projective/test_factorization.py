@@ -1,0 +1,161 @@
+"""Sturm and Triggs' factorisation, its iterated form, and the core of views that it begins with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.projective.test_reconstruction import residuals
+from tests.synthetic import TrueScene, make_scene, true_pairs
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import project
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.projective import Factorization
+from thesisrecon.projective.factorization import factorize_robustly, grow_core, on_one_plane
+from thesisrecon.projective.sturm_triggs import balanced, depths_from_fundamentals, factorize
+from thesisrecon.types import Tracks
+
+STAR = [(0, k) for k in range(1, 6)]
+CHAIN = [(k, k + 1) for k in range(5)]
+
+
+def complete_table(seed: int, sigma_px: float = 0.0, points: int = 80) -> tuple[TrueScene, np.ndarray]:
+    """A scene of six views and its images (6, N, 2) of every point."""
+    scene = make_scene(views=6, points=points, seed=seed)
+    xy = np.stack([project(P, scene.X) for P in scene.P])
+    return scene, xy + sigma_px * np.random.default_rng(seed).normal(size=xy.shape)
+
+
+def fundamentals(scene: TrueScene) -> dict[tuple[int, int], np.ndarray]:
+    return {(p.i, p.j): -2.0 * p.F for p in true_pairs(scene)}
+
+
+@pytest.mark.parametrize("tree", [STAR, CHAIN])
+@pytest.mark.parametrize("seed", range(3))
+def test_depths_from_fundamental_matrices_are_those_of_the_cameras_up_to_scales(tree, seed):
+    scene, xy = complete_table(seed)
+    depths = depths_from_fundamentals(xy, fundamentals(scene), tree)
+    true = np.einsum("vb,nb->vn", scene.P[:, 2], homogenize(scene.X))
+    ratio = depths / true
+    # A rank of one: scales of views times scales of points.
+    s = np.linalg.svd(ratio, compute_uv=False)
+    assert s[1] < 1e-6 * s[0]
+
+
+@pytest.mark.parametrize("tree", [STAR, CHAIN])
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_matches_factorise_exactly(tree, seed):
+    scene, xy = complete_table(seed)
+    factors = factorize(xy, depths_from_fundamentals(xy, fundamentals(scene), tree))
+    assert factors.iterations == 0
+    assert factors.gap < 1e-6
+    assert factors.rms_px < 1e-3
+
+
+def test_iterations_bring_the_factors_to_the_noise_and_any_depths_will_do_to_begin():
+    for seed in range(3):
+        scene, xy = complete_table(seed, sigma_px=1.0)
+        depths = depths_from_fundamentals(xy, fundamentals(scene), STAR)
+        once, often, affine = (
+            factorize(xy, d, iterations=n).rms_px for d, n in ((depths, 0), (depths, 50), (None, 100))
+        )
+        # 6 x 80 x 2 coordinates, of which the model takes 6 x 11 + 80 x 3 - 15.
+        expected = np.sqrt(2.0 * (1.0 - (66 + 240 - 15) / 960))
+        assert often < 1.1 * expected
+        assert often <= once
+        assert affine == pytest.approx(often, rel=0.01)
+
+
+def test_balanced_depths_weigh_every_view_and_every_point_alike():
+    rng = np.random.default_rng(0)
+    sizes = rng.uniform(1.0, 2.0, (4, 30))
+    depths = (
+        rng.uniform(0.5, 2.0, (4, 30)) * 10.0 ** rng.uniform(-3, 3, (4, 1)) * 10.0 ** rng.uniform(-3, 3, 30)
+    )
+    squared = (balanced(depths, sizes) * sizes) ** 2
+    np.testing.assert_allclose(squared.sum(axis=0), 4.0, rtol=1e-3)
+    np.testing.assert_allclose(squared.sum(axis=1), 30.0, rtol=1e-12)
+
+
+def test_wrong_tables_and_trees_are_refused():
+    scene, xy = complete_table(0)
+    F = fundamentals(scene)
+    with pytest.raises(ValueError, match="N >= 8"):
+        factorize(xy[:, :7])
+    with pytest.raises(ValueError, match="depths"):
+        factorize(xy, np.ones((2, 2)))
+    with pytest.raises(ValueError, match="finite"):
+        factorize(np.where(xy > 900.0, np.nan, xy))
+    with pytest.raises(ValueError, match="reaches every view"):
+        depths_from_fundamentals(xy, F, STAR[:3])
+    with pytest.raises(ValueError, match="grows from view 0"):
+        depths_from_fundamentals(xy, F, [(0, 1), (2, 3)])
+    with pytest.raises(ValueError, match="core_points"):
+        Factorization(core_points=3)
+
+
+def test_points_that_disagree_are_left_out():
+    scene, xy = complete_table(1, sigma_px=0.5)
+    xy[3, :6] += 25.0
+    depths = depths_from_fundamentals(xy, fundamentals(scene), STAR)
+    factors, kept = factorize_robustly(xy, depths, 7.0, 50)
+    assert not kept[:6].any()
+    assert kept[6:].mean() > 0.95
+    assert factors.rms_px < 0.8
+
+
+def test_the_core_grows_by_the_view_that_shares_most_as_long_as_enough_is_shared():
+    seen = np.zeros((4, 100), dtype=bool)
+    seen[0], seen[1, :80], seen[2, :60], seen[3, :20] = True, True, True, True
+    pairs = [replace(p, homography_share=0.2) for p in true_pairs(make_scene(views=4, points=30))]
+    assert grow_core(seen, pairs, pairs[0], least=50)[1][1] == 2
+    assert len(grow_core(seen, pairs, pairs[0], least=50)) == 2
+    assert len(grow_core(seen, pairs, pairs[0], least=10)) == 3
+    # Views that no accepted pair ties to the core stay out.
+    untied = [replace(p, accepted=2 not in (p.i, p.j)) for p in pairs]
+    assert [j for _, j in grow_core(seen, untied, pairs[0], least=10)] == [1, 3]
+
+
+@pytest.mark.parametrize("iterations", [0, 50])
+def test_a_scene_is_reconstructed_from_its_core_whatever_the_rest(iterations):
+    scene = make_scene(seed=4, sigma_px=0.5, points=600)
+    t = scene.tracks
+    wrong = np.random.default_rng(5).random(len(t.xy)) < 0.03
+    xy = t.xy + np.where(wrong[:, None], 80.0, 0.0)
+    found = Factorization(core_points=60, iterations=iterations).reconstruct(
+        replace(t, xy=xy), true_pairs(scene), scene.sizes, rng=np.random.default_rng(0)
+    )
+    assert found.registered.all()
+    assert found.sigma_px == pytest.approx(0.5, rel=0.25)
+    assert found.inlier[wrong].mean() < 0.05
+    assert np.sqrt(np.mean(residuals(found) ** 2)) < 0.5 * np.sqrt(2.0) * 1.1
+
+
+def test_tracks_of_a_plane_that_all_of_a_core_share_do_not_begin_alone():
+    scene = make_scene(views=4, points=300, seed=6, sigma_px=0.3)
+    X = scene.X.copy()
+    flat = np.arange(300) < 120
+    X[flat, 2] = 0.3 * X[flat, 0] - 0.4
+    # Views 0 and 1 see everything, 2 and 3 the plane and half of the rest each.
+    sees = np.ones((4, 300), dtype=bool)
+    sees[2, 120::2] = sees[3, 121::2] = False
+    point, view = np.nonzero(sees.T)
+    xy = np.stack([project(P, X) for P in scene.P])[view, point]
+    tracks = Tracks(view, point, xy + np.random.default_rng(0).normal(0, 0.3, xy.shape), 4, 300)
+    planar = replace(scene, X=X, tracks=tracks)
+    images = np.stack([project(P, X) for P in scene.P])
+    assert on_one_plane(images[:, flat], STAR[:3], 1.0)
+    assert not on_one_plane(images, STAR[:3], 1.0)
+    found = Factorization().reconstruct(tracks, true_pairs(planar), scene.sizes, rng=np.random.default_rng(0))
+    assert found.registered.all()
+    assert found.inlier.mean() > 0.98
+
+
+def test_too_few_common_tracks_are_a_failure_in_words():
+    scene = make_scene(points=12)
+    with pytest.raises(StageFailure, match="too few tracks"):
+        Factorization().reconstruct(
+            scene.tracks, true_pairs(scene), scene.sizes, rng=np.random.default_rng(0)
+        )
