@@ -24,9 +24,8 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline import reconstruct
 from thesisrecon.selfcalibration import HypothesesAndRefinement
 from thesisrecon.types import Reconstruction, RunResult
-from validation.checks.calibration_parts import MODES, check_parts
+from validation.checks.calibration_parts import MODES, Cameras, check_parts
 from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS
-from validation.from_tracks import Cameras
 from validation.metrics.cameras import CameraErrors, TrueCameras, measure_cameras
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
 from validation.metrics.record import Metric, markdown_table
