@@ -19,6 +19,7 @@ from thesisrecon.config import (
     toml_from_config,
 )
 from thesisrecon.errors import UsageError
+from thesisrecon.selfcalibration import ModulusConstraint, PollefeysQuadric, Stratified
 from thesisrecon.settings import parse_word, toml_from_tables
 
 
@@ -89,6 +90,25 @@ def test_a_nested_setting_and_none() -> None:
     config = apply_settings("selfcalibration.search.steps=5", "selfcalibration.search=none")
     assert config.selfcalibration.search is None  # type: ignore[attr-defined]
     assert config_from_toml(toml_from_config(config)) == config
+
+
+def test_a_nested_field_of_several_kinds_takes_a_word_or_a_table() -> None:
+    kind = "selfcalibration.kind=stratified"
+    assert apply_settings(kind, "selfcalibration.plane=modulus-constraint").selfcalibration.plane == (
+        ModulusConstraint()
+    )
+    config = apply_settings(
+        kind, "selfcalibration.plane.kind=modulus-constraint", "selfcalibration.plane.starts=50",
+        "selfcalibration.calibration=pollefeys-quadric",
+    )  # fmt: skip
+    assert config.selfcalibration == Stratified(ModulusConstraint(starts=50), PollefeysQuadric())
+    assert config_from_toml(toml_from_config(config)) == config
+    with pytest.raises(UsageError, match="modulus-constraint"):
+        apply_settings(kind, "selfcalibration.plane=modulus")
+    with pytest.raises(UsageError, match="starts"):
+        apply_settings(kind, "selfcalibration.plane.kind=cheirality-search", "selfcalibration.plane.starts=5")
+    with pytest.raises(UsageError, match="a table"):
+        apply_settings(kind, "selfcalibration.plane=3")
 
 
 @pytest.mark.parametrize(

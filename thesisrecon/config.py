@@ -32,12 +32,12 @@ from thesisrecon.projective import Factorization, GatedIncremental, SequentialPr
 from thesisrecon.selfcalibration import (
     FocalScan,
     FocalsFromFundamental,
-    HartleySearch,
     HypothesesAndRefinement,
     KruppaEquations,
     LinearQuadric,
     NonlinearQuadric,
     ScannedQuadric,
+    Stratified,
 )
 from thesisrecon.settings import (
     Table,
@@ -218,7 +218,7 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
     },
     "selfcalibration": {
         "hypotheses-and-refinement": HypothesesAndRefinement,
-        "hartley-search": HartleySearch,
+        "stratified": Stratified,
         "linear-quadric": LinearQuadric,
         "scanned-quadric": ScannedQuadric,
         "nonlinear-quadric": NonlinearQuadric,
@@ -238,7 +238,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
         epipolar=ThesisRansac(),
         tracks=PlainTracks(),
         projective=SequentialProjective(),
-        selfcalibration=HartleySearch(),
+        selfcalibration=Stratified(),
         # The thesis knows no distortion, and its self-calibration keeps the principal point in the centre.
         intrinsics=IntrinsicsAssumption(principal_point="known", k1="known"),
     ),

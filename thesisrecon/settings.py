@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -19,11 +20,38 @@ from thesisrecon.errors import UsageError
 T = TypeVar("T")
 Table = dict[str, Any]
 NONE = "none"
+KIND = "kind"
+GIVEN = {"given": True}
+"""Metadata of a field that the composer fills with data: it is no setting."""
 
 
 def table_from_dataclass(value: Any) -> Table:
-    """The fields of a dataclass as a table of plain values (numbers, text, lists, tables)."""
-    return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    """The fields of a dataclass as a table of plain values (numbers, text, lists, tables).
+
+    Where a field may hold one of several dataclasses, its table begins with the ``kind``.
+    """
+    hints = typing.get_type_hints(type(value))
+    table = {}
+    for name in _settings_of(type(value)):
+        content, several = getattr(value, name), alternatives(typing.get_args(hints[name]))
+        head = {KIND: word_of(type(content))} if type(content) in several.values() else {}
+        table[name] = head | _plain(content) if head else _plain(content)
+    return table
+
+
+def _settings_of(kind: type[Any]) -> list[str]:
+    return [f.name for f in dataclasses.fields(kind) if not f.metadata.get("given")]
+
+
+def word_of(kind: type[Any]) -> str:
+    """The word of a class in text: ``ModulusConstraint`` is "modulus-constraint"."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "-", kind.__name__).lower()
+
+
+def alternatives(union: Iterable[Any]) -> dict[str, type[Any]]:
+    """Word -> class where several members of a union are dataclasses, else nothing."""
+    classes = [a for a in union if isinstance(a, type) and dataclasses.is_dataclass(a)]
+    return {word_of(a): a for a in classes} if len(classes) > 1 else {}
 
 
 def _plain(value: Any) -> Any:
@@ -41,7 +69,7 @@ def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, ba
     key, a value of another type, and whatever the dataclass itself refuses.
     """
     hints = typing.get_type_hints(kind)
-    names = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    names = _settings_of(kind)
     changes = {}
     for key, value in table.items():
         place = f"{where}.{key}"
@@ -83,8 +111,23 @@ def coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
 def _coerce_optional(value: Any, arguments: tuple[Any, ...], where: str, current: Any) -> Any:
     if value is None or value == NONE:
         return None
+    if several := alternatives(arguments):
+        return _coerce_alternative(value, several, where, current)
     rest = [a for a in arguments if a is not type(None)]
     return coerce(value, rest[0], where, current)
+
+
+def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str, current: Any) -> Any:
+    """One of several dataclasses: its word alone, or a table whose ``kind`` is the word (else as before)."""
+    table = {KIND: value} if isinstance(value, str) else value
+    if not isinstance(table, Mapping):
+        raise UsageError(f"{where} takes one of {', '.join(several)} or a table of settings; got {value!r}")
+    kind = table.get(KIND, word_of(type(current)))
+    if kind not in several:
+        raise UsageError(unknown_word(f"kind of {where}", str(kind), several))
+    fields = {key: v for key, v in table.items() if key != KIND}
+    base = current if type(current) is several[kind] else None
+    return dataclass_from_table(several[kind], fields, where, base)
 
 
 def _coerce_tuple(

@@ -10,14 +10,14 @@ import pytest
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
 from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.errors import StageFailure
-from thesisrecon.selfcalibration import HartleySearch, HypothesesAndRefinement
+from thesisrecon.selfcalibration import HypothesesAndRefinement, Stratified
 from thesisrecon.selfcalibration.focal_scan import plane_from_focals
 from thesisrecon.selfcalibration.frame import build_frame, metric_from_reference
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion
 from thesisrecon.types import SelfCalibration
 
-METHODS = [HypothesesAndRefinement(), HartleySearch()]
+METHODS = [HypothesesAndRefinement(), Stratified()]
 
 
 def calibrate(method: object, scene: TrueScene, *, shared: bool = True, seed: int = 0) -> SelfCalibration:

@@ -2,22 +2,31 @@
 
 from thesisrecon.selfcalibration.focal_scan import FocalScan
 from thesisrecon.selfcalibration.focal_vote import FocalsFromFundamental
-from thesisrecon.selfcalibration.hypotheses import HartleySearch, HypothesesAndRefinement
-from thesisrecon.selfcalibration.infinity_search import InfinitySearch
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations
 from thesisrecon.selfcalibration.nonlinear_quadric import NonlinearQuadric
 from thesisrecon.selfcalibration.quadric import LinearQuadric, ScannedQuadric
 from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.selfcalibration.stratified import (
+    CheiralitySearch,
+    HartleyLinear,
+    ModulusConstraint,
+    PollefeysQuadric,
+    Stratified,
+)
 
 __all__ = [
+    "CheiralitySearch",
     "FocalScan",
     "FocalsFromFundamental",
-    "HartleySearch",
+    "HartleyLinear",
     "HypothesesAndRefinement",
-    "InfinitySearch",
     "KruppaEquations",
     "LinearQuadric",
+    "ModulusConstraint",
     "NonlinearQuadric",
+    "PollefeysQuadric",
     "RotationCriterion",
     "ScannedQuadric",
+    "Stratified",
 ]

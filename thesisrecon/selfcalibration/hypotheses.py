@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.errors import StageFailure
 from thesisrecon.selfcalibration.conclusion import (
     answers_from_theta,
     conclude,
@@ -20,9 +19,9 @@ from thesisrecon.selfcalibration.conclusion import (
 )
 from thesisrecon.selfcalibration.focal_scan import focal_pairs, plane_from_focals
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
-from thesisrecon.selfcalibration.infinity_search import InfinitySearch
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
+from thesisrecon.selfcalibration.stratified import CheiralitySearch
 from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
 
 F64 = NDArray[np.float64]
@@ -45,7 +44,7 @@ class HypothesesAndRefinement:
     kept: int = 3
     min_positive: float = 0.95
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
-    search: InfinitySearch | None = field(default_factory=InfinitySearch)
+    search: CheiralitySearch | None = field(default_factory=CheiralitySearch)
 
     def calibrate(
         self,
@@ -89,34 +88,3 @@ class HypothesesAndRefinement:
         good = np.isfinite(p).all(axis=1) & np.isfinite(f)
         return p[good], focals_of_groups(frame, p[good], f[good])
 
-
-@dataclass(frozen=True)
-class HartleySearch:
-    """Section 7.7 as the thesis has it: cheirality bounds, grid search, the best plane, one nonlinear
-    refinement."""
-
-    search: InfinitySearch = field(default_factory=lambda: InfinitySearch(steps=20, keep=1))
-    criterion: RotationCriterion = field(default_factory=RotationCriterion)
-
-    def calibrate(
-        self,
-        reconstruction: Reconstruction,
-        *,
-        assumed: Assumptions,
-        rng: np.random.Generator,
-    ) -> SelfCalibration:
-        """Upgrade by Hartley's search alone; ``StageFailure`` where the inequalities leave no plane."""
-        require_cameras(reconstruction)
-        frame = assumed_frame(reconstruction, assumed)
-        p, f = self.search.search(frame, reconstruction, rng)
-        if len(p) == 0:
-            raise StageFailure(
-                "Hartley's search found no plane at infinity",
-                "no plane leaves all points and cameras on one side with a real image of the absolute conic",
-                "use the default preset, which does not depend on every single point being right",
-            )
-        theta = np.concatenate([p, focals_of_groups(frame, p, f)], axis=1)
-        answers = answers_from_theta(
-            frame, *refine_hypotheses(self.criterion, frame, theta), "Hartley's search"
-        )
-        return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)

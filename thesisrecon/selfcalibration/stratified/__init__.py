@@ -1,0 +1,8 @@
+"""Section 7.4 and 7.5, the stratified approach: the plane at infinity in three ways, then K in two."""
+
+from thesisrecon.selfcalibration.stratified.calibration import HartleyLinear, PollefeysQuadric
+from thesisrecon.selfcalibration.stratified.cheirality_search import CheiralitySearch
+from thesisrecon.selfcalibration.stratified.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.stratified.variant import Stratified
+
+__all__ = ["CheiralitySearch", "HartleyLinear", "ModulusConstraint", "PollefeysQuadric", "Stratified"]

@@ -1,0 +1,94 @@
+"""Section 7.4, the stratified approach: first the plane at infinity, then the calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.selfcalibration.conclusion import Answer, conclude, require_cameras
+from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
+from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
+from thesisrecon.selfcalibration.nonlinear_quadric import dual_image_residuals, minimize_quadric
+from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.selfcalibration.stratified.calibration import HartleyLinear, PollefeysQuadric, Strata
+from thesisrecon.selfcalibration.stratified.cheirality_search import CheiralitySearch
+from thesisrecon.selfcalibration.stratified.image_conic import conic_knowledge
+from thesisrecon.selfcalibration.stratified.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.stratified.scene import PlaneCandidates, ProjectiveScene
+from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stratified:
+    """Self-calibration in two steps, as the thesis has it: a plane at infinity, and K given the plane.
+
+    ``plane`` is the way to the plane and ``calibration`` the way from it to K; ``refined`` follows every
+    answer with the nonlinear criterion over plane and intrinsics together. ``kept`` answers at most are
+    handed on, with at least the share ``min_positive`` of the points in front of the cameras.
+    """
+
+    plane: CheiralitySearch | ModulusConstraint = field(default_factory=CheiralitySearch)
+    calibration: HartleyLinear | PollefeysQuadric = field(default_factory=HartleyLinear)
+    refined: bool = True
+    kept: int = 1
+    min_positive: float = 0.5
+    criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    def calibrate(
+        self,
+        reconstruction: Reconstruction,
+        *,
+        assumed: Assumptions,
+        rng: np.random.Generator,
+    ) -> SelfCalibration:
+        """Upgrade a projective reconstruction of at least three cameras.
+
+        ``StageFailure`` where no plane is found, and where no plane that was found has a calibration; the
+        reason is that of the best plane.
+        """
+        scene = projective_scene(reconstruction, assumed)
+        found = self.plane.locate(scene, rng)
+        unknown = unknown_intrinsics(scene.frame, assumed)
+        answers = self._answers(scene, found, unknown)
+        return conclude(
+            scene.frame, reconstruction, self.criterion, answers,
+            kept=self.kept, min_positive=self.min_positive,
+        )  # fmt: skip
+
+    def _answers(
+        self, scene: ProjectiveScene, found: PlaneCandidates, unknown: UnknownIntrinsics
+    ) -> list[Answer]:
+        strata = Strata(scene.frame, scene.knowledge, unknown, found.orthogonal)
+        answers: list[Answer] = []
+        refusals: list[StageFailure] = []
+        for plane in found.planes:
+            try:
+                K = self.calibration.calibrations(strata, plane)
+            except StageFailure as refusal:
+                refusals.append(refusal)
+                continue
+            answers.append(self._answer(scene.frame, unknown, plane, K))
+        if not answers:
+            raise refusals[0]
+        return answers
+
+    def _answer(self, frame: ReferenceFrame, unknown: UnknownIntrinsics, plane: F64, K: F64) -> Answer:
+        name = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
+        if not self.refined:
+            r = dual_image_residuals(frame.A, frame.a, K[None], K[None, frame.reference], plane[None])
+            return Answer(plane, K, float(np.mean(np.sum(r**2, axis=-1))), name)
+        log_f = 0.5 * np.log(K[:, 0, 0] * K[:, 1, 1])
+        least = minimize_quadric(frame, unknown, plane, log_f)
+        return Answer(least.plane, least.K, least.cost, f"{name}, refined")
+
+
+def projective_scene(reconstruction: Reconstruction, assumed: Assumptions) -> ProjectiveScene:
+    """The scene as the ways to the plane see it; ``StageFailure`` below three registered cameras."""
+    require_cameras(reconstruction)
+    frame = assumed_frame(reconstruction, assumed)
+    return ProjectiveScene(reconstruction, frame, conic_knowledge(frame, assumed))
