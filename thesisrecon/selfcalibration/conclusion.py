@@ -89,6 +89,22 @@ def answers_from_theta(frame: ReferenceFrame, theta: F64, cost: F64, method: str
     return [Answer(t[:3], k, float(c), method) for t, k, c in zip(theta, K, cost, strict=True)]
 
 
+def distinct_answers(frame: ReferenceFrame, answers: Sequence[Answer], most: int) -> list[Answer]:
+    """At most ``most`` answers of finite cost whose log focals or planes differ, the best first."""
+
+    def same(one: Answer, other: Answer) -> bool:
+        apart = np.linalg.norm(one.plane - other.plane) > SAME_ANSWER * np.linalg.norm(one.plane)
+        return not apart and np.abs(one.log_focals(frame) - other.log_focals(frame)).max() < SAME_ANSWER
+
+    chosen: list[Answer] = []
+    for answer in sorted(answers, key=lambda a: a.cost):
+        if len(chosen) == most or not np.isfinite(answer.cost):
+            break
+        if not any(same(answer, other) for other in chosen):
+            chosen.append(answer)
+    return chosen
+
+
 def conclude(
     frame: ReferenceFrame,
     reconstruction: Reconstruction,

@@ -35,6 +35,13 @@ class UnknownIntrinsics:
     mean: F64
     std: F64
 
+    @property
+    def loosest(self) -> float:
+        """The largest deviation of an unknown that is no focal, 0 where there is none."""
+        focals = np.unique(self.place[:, 0])
+        others = np.delete(np.arange(len(self.std)), focals[focals >= 0])
+        return float(self.std[others].max(initial=0.0))
+
     def calibrations(self, unknowns: F64) -> F64:
         """Unit-free K (B, R, 3, 3) of unknowns (B, D)."""
         values = np.repeat(self.value[None], len(unknowns), axis=0)

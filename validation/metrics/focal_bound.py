@@ -1,7 +1,7 @@
 """The least standard deviation that any unbiased method can have for the focals of a synthetic rig.
 
-Cramer-Rao: the inverse of J'J / sigma^2 over poses, points, focals and the principal point, whose prior counts
-as an observation. Dense, by finite differences: it is for judging the library and shares no code with it.
+Cramer-Rao: the inverse of J'J / sigma^2 over poses, points, focals and the principal point, whose prior
+counts as an observation. Dense, by finite differences: it judges the library and shares no code with it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _STEP = 1e-6
 
 
 def focal_bound(rig: Rig, sigma_px: float, *, zooming: bool, principal_std_px: float) -> F64:
-    """Relative standard deviations (V,) of the focals, in percent; the same of all views where they share one.
+    """Relative standard deviations (V,) of the focals, in percent; one of all views unless ``zooming``.
 
     All views share a principal point. Points seen by fewer than two views do not count.
     """
