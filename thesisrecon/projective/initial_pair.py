@@ -6,6 +6,7 @@ rotation, since a homography then explains it and F, hence the cameras, is not d
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,6 +23,12 @@ F64 = NDArray[np.float64]
 # Share of a pair's matches that one homography explains beyond which the pair shows no parallax: what is left
 # is of the size of the wrong matches that verification lets through.
 NO_PARALLAX = 0.95
+
+NO_PARALLAX_BECAUSE = {
+    "pure rotation": "the camera only turned about one point (a pure rotation)",
+    "plane": "all that is matched lies in one plane (a planar scene), or the camera hardly moved",
+}
+"""What the configurations that are found in pairs of views mean."""
 
 
 def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView]:
@@ -62,8 +69,12 @@ def require_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> 
     """
     shares = [pair.homography_share for pair in pairs if pair.accepted]
     if shares and min(shares) >= most:
+        kinds = Counter(pair.configuration for pair in pairs if pair.accepted)
+        told = NO_PARALLAX_BECAUSE.get(
+            kinds.most_common(1)[0][0], "the camera only turns, hardly moves, or sees one plane"
+        )
         raise StageFailure(
-            "the photographs show no parallax: the camera only turns, hardly moves, or sees one plane",
+            f"the photographs show no parallax: {told}",
             f"in the least planar of {len(shares)} pairs a homography explains {min(shares):.0%} of all",
             "walk around the scene between photographs, and have things at different depths in the picture",
         )
