@@ -1,25 +1,47 @@
 """Compiled kernels against plain NumPy and finite differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.optimize.bundle_scenes import make_block, project_block
-from thesisrecon.optimize import kernels
+from tests.optimize.bundle_scenes import make_block, perturbed, project_block
+from thesisrecon.optimize import kernels, schur
+from thesisrecon.optimize.kernels import Jacobians, Seen, Sums, Weighing
 from thesisrecon.optimize.levenberg_marquardt import floored_diagonal
 from thesisrecon.optimize.losses import LOSS_CODES, LOSSES
-from thesisrecon.optimize.metric_bundle import MetricCameras
-from thesisrecon.optimize.schur import Columns, Jacobians, assemble_system, sort_observations
+from thesisrecon.optimize.metric_bundle import (
+    BundleOptions,
+    MetricCameras,
+    Observations,
+    refine_metric_bundle,
+)
+from thesisrecon.optimize.observations import sort_observations
+from thesisrecon.optimize.reduced_solvers import (
+    BandedCholesky,
+    ConjugateGradients,
+    DenseCholesky,
+    ReducedSystem,
+    choose_solver,
+    multiply,
+)
+from thesisrecon.optimize.schur import BundleSystem, CameraPrior, lay_out
 
 
-def _linearized_metric(block, xy, code=0, delta=1.0, sigma=1.0):
+def _buffers(n, own, common):
+    return Jacobians(*(np.empty((n, *shape)) for shape in [(2,), (2, own), (2, common), (2, 3)]))
+
+
+def _linearized_metric(block, xy, loss="squared", delta=1.0, sigma=1.0):
     c, n = block.cameras, len(xy)
     width = c.intrinsics.shape[1]
-    J = Jacobians.allocate(n, 6, width)
-    cost = kernels.linearize_metric(
-        c.R, c.t, c.intrinsics, c.group, block.X, block.view, block.point, xy, np.arange(width),
-        sigma, code, delta, J.residual, J.A, J.G, J.B,
-    )  # fmt: skip
+    J = _buffers(n, 6, width)
+    model = kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen, weighing = Seen(block.view, block.point, xy), Weighing(sigma, LOSS_CODES[loss], delta)
+    own = np.zeros(0, dtype=np.int64)
+    cost = kernels.linearize_metric(model, seen, weighing, own, np.arange(width), J)
+    assert kernels.metric_cost(model, seen, weighing) == pytest.approx(cost, rel=1e-12)
     return cost, J
 
 
@@ -57,7 +79,7 @@ def test_metric_jacobians_match_finite_differences(lens):
     for c in range(C):
         unit = np.eye(C)[c]
         np.testing.assert_allclose(
-            J.G[:, :, c], difference(none[0], none[1] + unit, none[2]), rtol=2e-5, atol=2e-4
+            J.E[:, :, c], difference(none[0], none[1] + unit, none[2]), rtol=2e-5, atol=2e-4
         )
     for c in range(3):
         np.testing.assert_allclose(
@@ -76,8 +98,10 @@ def test_projective_jacobians_match_finite_differences():
     vP, bP, vX, bX = np.empty_like(P), np.empty(3), np.empty_like(X), np.empty(7)
     kernels.tangent_reflectors(P, vP, bP)
     kernels.tangent_reflectors(X, vX, bX)
-    J = Jacobians.allocate(21, 11, 0)
-    cost = kernels.linearize_projective(P, vP, bP, X, vX, bX, view, point, xy, 0, 1.0, J.residual, J.A, J.B)
+    J, state = _buffers(21, 11, 0), kernels.UnitState(P, X, vP, bP, vX, bX)
+    seen, weighing = Seen(view, point, xy), Weighing(1.0, 0, 1.0)
+    cost = kernels.linearize_projective(state, seen, weighing, J)
+    assert kernels.projective_cost(state, seen, weighing) == pytest.approx(cost, rel=1e-12)
     z = np.einsum("kab,kb->ka", P.reshape(3, 3, 4)[view], X[point])
     np.testing.assert_allclose(J.residual, z[:, :2] / z[:, 2:] - xy, rtol=1e-12)
     assert cost == pytest.approx(0.5 * np.sum(J.residual**2))
@@ -104,38 +128,140 @@ def test_projective_jacobians_match_finite_differences():
 def test_losses_of_the_kernels_are_those_of_numpy(loss):
     block = make_block()
     noise = np.random.default_rng(0).normal(size=block.xy.shape) * 2.0
-    cost, J = _linearized_metric(block, block.xy - noise, LOSS_CODES[loss], 1.5, 2.0)
+    cost, J = _linearized_metric(block, block.xy - noise, loss, 1.5, 2.0)
     s = np.sum((noise / 2.0) ** 2, axis=1)
     rho, weight = LOSSES[loss](s, 1.5)
     assert cost == pytest.approx(0.5 * rho.sum())
     np.testing.assert_allclose(J.residual, np.sqrt(weight)[:, None] * noise / 2.0, rtol=1e-9, atol=1e-9)
 
 
-def test_elimination_gives_the_step_of_the_full_dense_system():
-    block = make_block(views=4, points=12, groups=2)
+def _full_jacobian(J, layout):
+    """All columns of one problem side by side: blocks of the views, border, points."""
+    o, places, C = layout.observations, layout.places, layout.width
+    edge = C * len(places.pair)
+    full = np.zeros((2 * len(o.xy), layout.size + 3 * (len(o.start) - 1)))
+    for k in range(len(o.xy)):
+        rows, v, j = slice(2 * k, 2 * k + 2), places.block[o.view_index[k]], o.point_index[k]
+        if v >= 0:
+            full[rows, C * v : C * v + C] = J.A[k]
+        for f, column in enumerate(places.common[o.view_index[k]]):
+            if column >= 0:
+                full[rows, edge + column] += J.E[k, :, f]
+        full[rows, layout.size + 3 * j : layout.size + 3 * j + 3] = J.B[k]
+    return full
+
+
+@pytest.mark.parametrize("solver", ["chosen", "banded", "conjugate"])
+@pytest.mark.parametrize("twice", [False, True])
+def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
+    block = make_block(views=6, points=30, groups=2)
     rng = np.random.default_rng(2)
-    o = sort_observations(block.view, block.point, block.xy, 4, 12)
-    cost, J = _linearized_metric(block, block.xy + rng.normal(size=block.xy.shape))
-    # View 0 is held, so its columns are absent; views 1..3 have 6 each, then two groups of 6.
-    first = np.array([-1, 0, 6, 12])[block.view]
-    group = 18 + 6 * block.cameras.group[block.view]
-    system = assemble_system(cost, o.start, Columns(first, group, 30), J)
+    view = block.view.copy()
+    if twice:
+        view[1] = view[0]
+    o = sort_observations(view, block.point, block.xy + rng.normal(size=block.xy.shape), 6, 30)
+    c = block.cameras
+    # View 0 is held fixed; the focals are the views' own, the rest belongs to two groups, of which one has no
+    # third coefficient.
+    own, common = np.array([0]), np.arange(1, 6)
+    columns = np.arange(5) + 5 * c.group[:, None]
+    columns[c.group == 1, 4] = -1
+    layout = lay_out(o, np.arange(6) - 1, width=7, common=columns, border=9)
+    assert isinstance(layout.solver, DenseCholesky)
+    if solver == "banded":
+        layout = replace(layout, solver=BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
+    if solver == "conjugate":
+        layout = replace(layout, solver=ConjugateGradients(1e-13))
+    J = layout.jacobians()
+    model = kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen = Seen(o.view_index, o.point_index, o.xy)
+    cost = kernels.linearize_metric(model, seen, Weighing(1.0, 0, 1.0), own, common, J)
+    gradient = np.zeros(layout.size)
+    gradient[[6, 40]] = [3.0, -3.0]
+    prior = CameraPrior(np.array([6, 40]), np.array([40, -1]), np.array([2e4, 5e3]), gradient)
+    system = BundleSystem(cost, layout, J, prior)
     step, gain = system.solve(1e-3)
 
-    full = np.zeros((2 * len(block.xy), 30 + 36))
-    for k in range(len(block.xy)):
-        rows = slice(2 * k, 2 * k + 2)
-        if first[k] >= 0:
-            full[rows, first[k] : first[k] + 6] = J.A[k]
-        full[rows, group[k] : group[k] + 6] = J.G[k]
-        full[rows, 30 + 3 * block.point[k] : 33 + 3 * block.point[k]] = J.B[k]
-    r = J.residual.ravel()
+    full, r, D = _full_jacobian(J, layout), J.residual.ravel(), layout.size
     H, g = full.T @ full, full.T @ r
+    H[6, 6] += 2e4
+    H[40, 40] += 2.5e4
+    H[6, 40] -= 2e4
+    H[40, 6] -= 2e4
+    g[:D] += gradient
     damped = H + 1e-3 * np.diag(floored_diagonal(np.diag(H)))
     expected = np.linalg.solve(damped, -g)
-    np.testing.assert_allclose(step.cameras, expected[:30], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(step.points.ravel(), expected[30:], rtol=1e-6, atol=1e-9)
-    assert gain == pytest.approx(-g @ expected - 0.5 * expected @ H @ expected, rel=1e-6)
+    np.testing.assert_allclose(step.cameras, expected[:D], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(step.points.ravel(), expected[D:], rtol=1e-5, atol=1e-8)
+    assert gain == pytest.approx(-g @ expected - 0.5 * expected @ H @ expected, rel=1e-5)
+
+
+def test_chunks_and_threads_do_not_change_a_byte(monkeypatch):
+    block = make_block(views=6, points=200, groups=1)
+    monkeypatch.setattr(schur, "CHUNK", 100)
+    cameras, X = perturbed(block)
+    fits = [
+        refine_metric_bundle(
+            cameras,
+            X,
+            Observations(block.view, block.point, block.xy),
+            free=np.array([True, False, False, True, True, False]),
+            options=BundleOptions(threads=threads),
+        )
+        for threads in (1, 3)
+    ]
+    assert fits[0].X.tobytes() == fits[1].X.tobytes()
+    assert fits[0].cameras.R.tobytes() == fits[1].cameras.R.tobytes()
+    monkeypatch.setattr(schur, "CHUNK", 10**6)
+    whole = refine_metric_bundle(
+        cameras,
+        X,
+        Observations(block.view, block.point, block.xy),
+        free=np.array([True, False, False, True, True, False]),
+    )
+    np.testing.assert_allclose(whole.X, fits[0].X, atol=1e-6)
+
+
+def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
+    rng = np.random.default_rng(5)
+    row, column = np.array([0, 0, 1, 2, 2, 3]), np.array([0, 2, 1, 2, 3, 3])
+    blocks = rng.normal(size=(6, 2, 2))
+    blocks[row == column] += np.swapaxes(blocks[row == column], 1, 2)
+    border, corner = rng.normal(size=(4, 2, 3)), rng.normal(size=(3, 3))
+    corner += corner.T
+    dense = np.zeros((11, 11))
+    for i in range(6):
+        dense[2 * row[i] : 2 * row[i] + 2, 2 * column[i] : 2 * column[i] + 2] = blocks[i]
+    dense[:8, 8:], dense[8:, 8:] = border.reshape(8, 3), corner
+    full = np.triu(dense) + np.triu(dense, 1).T
+    system = ReducedSystem(row, column, Sums(blocks, border, corner, *np.zeros((3, 11))))
+    np.testing.assert_array_equal(np.triu(system.dense()), np.triu(dense))
+    x = rng.normal(size=11)
+    np.testing.assert_allclose(multiply(system, x), full @ x, rtol=1e-12)
+    place = np.array([1, 3, 0, 2])
+    band = np.zeros((8, 6))
+    kernels.fill_band(blocks, row, column, place, band)
+    order = (2 * np.argsort(place)[:, None] + np.arange(2)).ravel()
+    moved = full[np.ix_(order, order)]
+    for i in range(8):
+        for j in range(i, min(8, i + 6)):
+            assert band[i, j - i] == moved[j, i]
+
+
+def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
+    def chosen(n, pairs):
+        i, j = (np.array(a) for a in zip(*sorted(pairs), strict=True))
+        return choose_solver(i, j, n, 6, 4)
+
+    near = {(i, j) for i in range(400) for j in range(i, min(i + 8, 400))}
+    ring = near | {(j, i + 400) for i in range(-8, 0) for j in range(i + 8)}
+    rng = np.random.default_rng(0)
+    wild = {tuple(sorted(rng.integers(0, 2000, 2))) for _ in range(20000)} | {(i, i) for i in range(2000)}
+    every = {(i, j) for i in range(150) for j in range(i, 150)}
+    assert chosen(400, near).reach == 7
+    assert isinstance(chosen(400, ring), BandedCholesky)
+    assert isinstance(chosen(2000, wild), ConjugateGradients)
+    assert isinstance(chosen(150, every), DenseCholesky)
 
 
 def test_tangent_steps_keep_unit_norm_and_side():

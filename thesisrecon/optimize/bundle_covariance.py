@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.levenberg_marquardt import invert_information
 from thesisrecon.optimize.metric_cameras import FOCAL, POSE_DOF
+from thesisrecon.optimize.reduced_solvers import ReducedSystem
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 B8 = NDArray[np.bool_]
+SIMILARITY_DOF = 7
 MAD_TO_SIGMA = 1.4826
 # Variance of a standard normal variable cut at +-2.5.
 TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
@@ -38,54 +40,54 @@ def robust_sigma(residual: F64, parameters: int) -> float:
 
 @dataclass(frozen=True)
 class CovarianceInput:
-    """The reduced information ``S`` (D, D) (upper triangle), columns of the ``free_views`` (V,) first; poses
-    ``R`` (V, 3, 3), ``t`` (V, 3); ``held``: observed views are fixed, so that the frame is too."""
+    """The ``reduced`` information; ``block`` (V,) of each view whose pose moves, -1 for others; poses ``R``
+    (V, 3, 3), ``t`` (V, 3); ``held``: observed views are fixed, so that the frame is too."""
 
-    S: F64
-    free_views: B8
+    reduced: ReducedSystem
+    block: I64
     R: F64
     t: F64
     held: bool
 
 
 def bundle_covariances(found: CovarianceInput, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
-    """Covariances of intrinsics (G, C, C), entry ``number`` (G, C) an unknown's, and of poses (V, 6, 6).
+    """Covariances of intrinsics (G, C, C), entry ``number`` (G, C) a column's, and of poses (V, 6, 6).
 
     S is singular along the directions N of the frame's seven freedoms; (S + N N')^-1 is S's generalised
     inverse with the freedoms at unit variance, which are then removed. N has no part in the intrinsics, so
     their covariance does not depend on the frame. ``focal`` (G,) takes log f to f, ``scale`` the lengths.
     """
-    S = np.triu(found.S) + np.triu(found.S, 1).T
-    views = np.flatnonzero(found.free_views)
+    S = found.reduced.dense()
+    S = np.triu(S) + np.triu(S, 1).T
+    width = found.reduced.sums.border.shape[1]
+    views = np.flatnonzero(found.block >= 0)
+    columns = width * found.block[views, None] + np.arange(POSE_DOF)
     if found.held or not len(views):
         covariance = invert_information(S)
     else:
-        N = gauge_directions(found.R[views], found.t[views], len(S))
+        N = np.zeros((len(S), SIMILARITY_DOF))
+        N[columns.ravel()] = gauge_directions(found.R[views], found.t[views])
         weight = float(np.median(np.diag(S)))
         covariance = invert_information(S + weight * N @ N.T)
         covariance = covariance - N @ (N.T @ covariance @ N) @ N.T
     poses = np.zeros((len(found.t), POSE_DOF, POSE_DOF))
     units = np.array([1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale, 1.0 / scale])
-    for n, view in enumerate(views):
-        block = slice(POSE_DOF * n, POSE_DOF * (n + 1))
-        poses[view] = covariance[block, block] * units * units[:, None]
+    poses[views] = covariance[columns[:, :, None], columns[:, None, :]] * units * units[:, None]
     intrinsics = np.zeros((*number.shape, number.shape[1]))
     for g, row in enumerate(number):
         moves = np.flatnonzero(row >= 0)
-        index = POSE_DOF * len(views) + row[moves]
         units = np.where(moves == FOCAL, focal[g], 1.0)
-        intrinsics[g][np.ix_(moves, moves)] = covariance[np.ix_(index, index)] * units * units[:, None]
+        intrinsics[g][np.ix_(moves, moves)] = (
+            covariance[np.ix_(row[moves], row[moves])] * units * units[:, None]
+        )
     return intrinsics, poses
 
 
-def gauge_directions(R: F64, t: F64, size: int) -> F64:
-    """Orthonormal (size, 7): how the poses, first of ``size`` unknowns, move when the world is shifted,
-    turned and scaled."""
-    directions = np.zeros((len(t), POSE_DOF, 7))
+def gauge_directions(R: F64, t: F64) -> F64:
+    """Orthonormal (6 V, 7): how poses move when the world is shifted, turned and scaled."""
+    directions = np.zeros((len(t), POSE_DOF, SIMILARITY_DOF))
     directions[:, 3:, 0:3] = -R
     directions[:, :3, 3:6] = -R
     directions[:, 3:, 3:6] = -cross_matrix(t) @ R
     directions[:, 3:, 6] = t
-    N = np.zeros((size, 7))
-    N[: len(t) * POSE_DOF] = directions.reshape(-1, 7)
-    return np.asarray(np.linalg.qr(N)[0])
+    return np.asarray(np.linalg.qr(directions.reshape(-1, SIMILARITY_DOF))[0])

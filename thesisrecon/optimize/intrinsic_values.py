@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.optimize.metric_cameras import FOCAL, IntrinsicsPrior, MetricCameras
+from thesisrecon.optimize.metric_cameras import FOCAL, POSE_DOF, IntrinsicsPrior, MetricCameras
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -94,7 +94,7 @@ def number_values(
     """The unknowns of a problem, where they start (n,), and the table (G, C) with what is known put in.
 
     ``used`` (G,) rows that a photograph speaks of. A value starts at the mean of the used rows that share it;
-    nothing but its prior moves a value that no photograph sees.
+    one that no photograph sees is no unknown.
     """
     table = _with_log_focal(cameras.intrinsics)
     nothing = IntrinsicsPrior(cameras.intrinsics, np.full_like(table, np.inf))
@@ -110,7 +110,7 @@ def number_values(
     if prior.population is not None and prior.spread is not None:
         for c in np.flatnonzero(free & np.isfinite(prior.spread)):
             for kind in np.unique(prior.population[prior.population >= 0]):
-                rows = np.flatnonzero(prior.population == kind)
+                rows = np.flatnonzero((prior.population == kind) & used)
                 sharing = rows if cameras.shared is None else cameras.shared[rows, c]
                 rows = rows[np.unique(sharing, return_index=True)[1]]
                 parts.bind_population(int(c), number[rows, c], table[rows, c], float(prior.spread[c]))
@@ -156,16 +156,17 @@ def _number_column(
     tightest = np.lexsort((std, value))
     tightest = tightest[np.unique(value[tightest], return_index=True)[1]]
     width, mean = std[tightest], _with_log_focal(prior.mean)[tightest, c]
-    counted = used | ~np.isin(value, value[used])
+    silent = np.bincount(value[used], minlength=len(width)) == 0
+    counted = used | silent[value]
     average = np.bincount(value[counted], at[counted]) / np.bincount(value[counted])
-    known = width == 0.0
-    own = np.where(known, NONE, len(parts.start) + np.cumsum(~known) - 1)
-    bound = np.isfinite(width) & ~known
+    known, still = width == 0.0, silent | (width == 0.0)
+    own = np.where(still, NONE, len(parts.start) + np.cumsum(~still) - 1)
+    bound = np.isfinite(width) & ~still
     none = np.full(np.count_nonzero(bound), NONE)
     parts.links.append((own[bound], none, mean[bound], width[bound] ** -2.0))
     start = np.where(known, mean, average)
-    parts.start.extend(start[~known].tolist())
-    parts.column.extend([c] * int(np.count_nonzero(~known)))
+    parts.start.extend(start[~still].tolist())
+    parts.column.extend([c] * int(np.count_nonzero(~still)))
     return start[value], own[value]
 
 
@@ -175,3 +176,54 @@ def _with_log_focal(intrinsics: F64) -> F64:
     with np.errstate(invalid="ignore", divide="ignore"):
         table[:, FOCAL] = np.log(table[:, FOCAL])
     return table
+
+
+@dataclass(frozen=True)
+class IntrinsicColumns:
+    """Where the unknowns stand among the columns of the reduced system.
+
+    ``own`` lists the intrinsics that no two views share: they join the poses in the ``block`` (V,) of their
+    view, -1 for a view that nothing moves. ``common`` lists the others, in the columns ``border`` (V, F), -1
+    for one that does not move, of ``n_border`` in all. ``pinned`` (V, C) marks columns of a block that do not
+    move. ``place`` (n,) is the column of every unknown.
+    """
+
+    own: I64
+    common: I64
+    block: I64
+    border: I64
+    n_border: int
+    pinned: B8
+    place: I64
+
+    def of(self, number: I64) -> I64:
+        """The columns of unknowns of these numbers; -1 for none."""
+        return np.append(self.place, NONE)[number]
+
+
+def place_intrinsics(
+    values: IntrinsicValues, group: I64, free: I64, seen: B8, free_views: B8
+) -> IntrinsicColumns:
+    """Share the unknowns of the views (``group`` (V,) their rows) out to blocks and border.
+
+    ``free`` lists the intrinsics that move somewhere, ``seen`` and ``free_views`` (V,) mark views with
+    observations and those whose pose moves.
+    """
+    number = np.where(seen[:, None], values.number[group], NONE)
+    repeated = [len(np.unique(m)) < len(m) for m in (number[number[:, c] >= 0, c] for c in free)]
+    own, common = free[np.logical_not(repeated)], free[np.array(repeated, dtype=bool)]
+    mine = number[:, own]
+    moves = free_views | (mine >= 0).any(axis=1)
+    block = np.where(moves, np.cumsum(moves) - 1, NONE)
+    pose = np.repeat(~free_views[:, None], POSE_DOF, axis=1)
+    pinned = np.concatenate([pose, mine < 0], axis=1) & moves[:, None]
+    width, n_blocks = POSE_DOF + len(own), int(moves.sum())
+    place = np.full(values.size, NONE, dtype=np.int64)
+    for c in range(len(own)):
+        v = np.flatnonzero(mine[:, c] >= 0)
+        place[mine[v, c]] = width * block[v] + POSE_DOF + c
+    rest = np.flatnonzero(place < 0)
+    place[rest] = width * n_blocks + np.arange(len(rest))
+    theirs = number[:, common]
+    border = np.where(theirs >= 0, np.append(place, NONE)[theirs] - width * n_blocks, NONE)
+    return IntrinsicColumns(own, common, block, border, len(rest), pinned, place)

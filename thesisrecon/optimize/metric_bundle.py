@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.optimize import kernels
 from thesisrecon.optimize.bundle_covariance import CovarianceInput, bundle_covariances, robust_sigma
-from thesisrecon.optimize.intrinsic_values import IntrinsicValues, number_values
+from thesisrecon.optimize.intrinsic_values import (
+    IntrinsicColumns,
+    IntrinsicValues,
+    number_values,
+    place_intrinsics,
+)
+from thesisrecon.optimize.kernels import Jacobians, MetricModel, Seen, Weighing
 from thesisrecon.optimize.levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.optimize.losses import LossName, loss_code
 from thesisrecon.optimize.metric_cameras import (
@@ -21,15 +27,14 @@ from thesisrecon.optimize.metric_cameras import (
     check_cameras,
     check_prior,
 )
+from thesisrecon.optimize.observations import Observations, SortedObservations, sort_observations
 from thesisrecon.optimize.schur import (
+    BundleLayout,
     BundleStep,
     BundleSystem,
-    Columns,
-    Jacobians,
-    Observations,
-    SortedObservations,
-    assemble_system,
-    sort_observations,
+    CameraPrior,
+    hold_flipping,
+    lay_out,
 )
 
 __all__ = [
@@ -59,6 +64,7 @@ class BundleOptions:
     fixed_views : (V,) True for poses that must not move; None: all move.
     covariance : whether to compute the covariances (one more linear system).
     noise_floor_px : the covariances take the noise to be at least this, whatever the residuals say.
+    threads : how many may work on it; the answer does not depend on them.
     """
 
     sigma_px: float = 1.0
@@ -68,6 +74,7 @@ class BundleOptions:
     fixed_views: B8 | None = field(default=None, compare=False)
     covariance: bool = False
     noise_floor_px: float = 0.0
+    threads: int = 1
 
     def __post_init__(self) -> None:
         loss_code(self.loss, self.loss_px)
@@ -101,71 +108,75 @@ class MetricBundleResult:
 
 @dataclass(frozen=True)
 class _State:
-    R: F64
-    t: F64
+    model: MetricModel
     values: F64
-    intrinsics: F64
-    X: F64
 
 
 @dataclass(frozen=True)
 class _MetricProblem:
-    """Reprojection in units of ``sigma_px`` plus the priors; unknowns are poses (6 each), then values."""
+    """Reprojection in units of sigma plus the priors; the columns of a view are its pose and the intrinsics
+    that no other shares, the rest of the unknowns are common columns."""
 
-    observations: SortedObservations
-    columns: Columns
+    layout: BundleLayout
+    columns: IntrinsicColumns
     free_views: B8
-    group: I64
-    free: I64
     values: IntrinsicValues
-    loss: int
-    loss_scale: float
-    sigma_px: float
+    weighing: Weighing
     jacobians: Jacobians
 
-    @property
-    def n_pose(self) -> int:
-        """Unknowns of the poses; those of the intrinsics follow."""
-        return POSE_DOF * int(self.free_views.sum())
-
     def linearize(self, state: _State) -> BundleSystem:
-        o, J, s = self.observations, self.jacobians, state
-        cost = kernels.linearize_metric(
-            s.R, s.t, s.intrinsics, self.group, s.X, o.view_index, o.point_index, o.xy, self.free,
-            self.sigma_px, self.loss, self.loss_scale, J.residual, J.A, J.G, J.B,
-        )  # fmt: skip
-        links, first = self.values.links, self.n_pose
-        Q, q = np.zeros((self.columns.unknowns,) * 2), np.zeros(self.columns.unknowns)
-        Q[first:, first:] = links.information(self.values.size)
-        q[first:] = links.gradient(s.values)
-        return assemble_system(cost + links.cost(s.values), o.start, self.columns, J, prior=(Q, q))
+        J, c = self.jacobians, self.columns
+
+        def work(which: slice, seen: Seen) -> float:
+            part = J.part(which.start, which.stop)
+            return float(kernels.linearize_metric(state.model, seen, self.weighing, c.own, c.common, part))
+
+        cost = sum(self.layout.over_observations(work)) + self.values.links.cost(state.values)
+        if c.pinned.any():
+            J.A[:] = np.where(c.pinned[self.layout.observations.view_index][:, None], 0.0, J.A)
+        return BundleSystem(cost, self.layout, J, self._prior(state))
+
+    def _prior(self, state: _State) -> CameraPrior | None:
+        links, place = self.values.links, self.columns.place
+        if not len(links.first):
+            return None
+        gradient = np.zeros(self.layout.size)
+        gradient[place] = links.gradient(state.values)
+        return CameraPrior(
+            self.columns.of(links.first), self.columns.of(links.second), links.weight, gradient
+        )
 
     def retract(self, state: _State, step: BundleStep) -> _State:
-        poses = np.zeros((len(state.t), POSE_DOF))
-        poses[self.free_views] = step.cameras[: self.n_pose].reshape(-1, POSE_DOF)
+        m, layout = state.model, self.layout
+        n_own = layout.size - layout.border
+        poses = np.zeros((len(m.t), POSE_DOF))
+        poses[self.free_views] = step.cameras[:n_own].reshape(-1, layout.width)[
+            layout.places.block[self.free_views], :POSE_DOF
+        ]
         turn = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-        t = np.einsum("vab,vb->va", turn, state.t) + poses[:, 3:]
-        values = self.values.step(state.values, step.cameras[self.n_pose :])
-        R, X = turn @ state.R, state.X + step.points
-        o = self.observations
-        before = np.column_stack([state.R[:, 2], state.t[:, 2]])
-        after = np.column_stack([R[:, 2], t[:, 2]])
-        kernels.hold_flipping_points(o.start, o.view_index, before, after, state.X, X)
-        return _State(R, t, values, self.values.write(state.intrinsics, values), X)
+        R, t = turn @ m.R, np.einsum("vab,vb->va", turn, m.t) + poses[:, 3:]
+        values = self.values.step(state.values, step.cameras[self.columns.place])
+        X = m.X + step.points
+        before, after = np.column_stack([m.R[:, 2], m.t[:, 2]]), np.column_stack([R[:, 2], t[:, 2]])
+        hold_flipping(layout, before, after, m.X, X)
+        return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
 
-    def residual(self, state: _State) -> tuple[F64, F64]:
-        """Residuals (K, 2) in px and depths (K,)."""
-        o, s = self.observations, state
-        residual, depth = np.empty_like(o.xy), np.empty(len(o.xy))
-        kernels.project_metric(
-            s.R, s.t, s.intrinsics, self.group, s.X, o.view_index, o.point_index, o.xy, residual, depth
-        )
-        return residual, depth
+    def residual(self, state: _State) -> F64:
+        """Residuals (K, 2) in px."""
+        K = len(self.layout.observations.xy)
+        residual, depth = np.empty((K, 2)), np.empty(K)
+
+        def work(which: slice, seen: Seen) -> None:
+            kernels.project_metric(state.model, seen, residual[which], depth[which])
+
+        self.layout.over_observations(work)
+        return residual
 
     def cost(self, state: _State) -> float:
-        residual = self.residual(state)[0] / self.sigma_px
-        data = float(kernels.robust_cost(residual, self.loss, self.loss_scale))
-        return data + self.values.links.cost(state.values)
+        def work(_: slice, seen: Seen) -> float:
+            return float(kernels.metric_cost(state.model, seen, self.weighing))
+
+        return sum(self.layout.over_observations(work)) + self.values.links.cost(state.values)
 
 
 def refine_metric_bundle(
@@ -205,21 +216,22 @@ def refine_metric_bundle(
     seen_points = np.diff(o.start) > 0
     origin, scale = _frame(X[seen_points])
     problem, values, table = _metric_problem(cameras, o, np.asarray(free, dtype=bool), prior, options)
-    state = _State(
+    start = MetricModel(
         np.array(cameras.R, dtype=np.float64),
         scale * (cameras.t + cameras.R @ origin),
-        values,
         problem.values.write(table, values),
+        np.ascontiguousarray(cameras.group, dtype=np.int64),
         np.ascontiguousarray(scale * (X - origin)),
     )
-    solution = run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations)
-    end, moved = solution.state, problem.free_views
-    residual = problem.residual(end)[0]
-    sigma = robust_sigma(residual, problem.columns.unknowns + 3 * int(seen_points.sum()) - SIMILARITY_DOF)
+    solution = run_levenberg_marquardt(problem, _State(start, values), max_iterations=options.max_iterations)
+    end, moved = solution.state.model, problem.free_views
+    residual = problem.residual(solution.state)
+    freedoms = POSE_DOF * int(moved.sum()) + problem.values.size + 3 * int(seen_points.sum())
+    sigma = robust_sigma(residual, freedoms - SIMILARITY_DOF)
     intrinsics_covariance, pose_covariance = np.zeros((*table.shape, table.shape[1])), None
     if options.covariance:
         intrinsics_covariance, pose_covariance = _covariances(
-            problem, end, max(sigma or options.sigma_px, options.noise_floor_px), scale
+            problem, solution.state, max(sigma or options.sigma_px, options.noise_floor_px), scale
         )
     refined = replace(
         cameras,
@@ -249,23 +261,25 @@ def _metric_problem(
     options: BundleOptions,
 ) -> tuple[_MetricProblem, F64, F64]:
     """The problem, where its intrinsic values start, and the table of intrinsics they are put into."""
-    group = np.ascontiguousarray(cameras.group, dtype=np.int64)
+    group = np.asarray(cameras.group, dtype=np.int64)
     seen = np.bincount(o.view_index, minlength=len(group)) > 0
     used = np.bincount(group[seen], minlength=len(cameras.intrinsics)) > 0
     values, start, table = number_values(cameras, used, free, prior)
     fixed = np.zeros(len(group), bool) if options.fixed_views is None else options.fixed_views
-    free_views, n_free = seen & ~np.asarray(fixed, bool), int(np.count_nonzero(free))
-    first = np.where(free_views, POSE_DOF * (np.cumsum(free_views) - 1), -1)
-    base = POSE_DOF * int(free_views.sum())
-    tail = values.number[:, free].ravel()
-    fold = np.concatenate([np.arange(base), np.where(tail >= 0, base + tail, -1)])
-    columns = Columns(
-        first[o.view_index], base + n_free * group[o.view_index], len(fold), fold, base + values.size
+    free_views = seen & ~np.asarray(fixed, bool)
+    columns = place_intrinsics(values, group, np.flatnonzero(free), seen, free_views)
+    layout = lay_out(
+        o,
+        columns.block,
+        width=POSE_DOF + len(columns.own),
+        common=columns.border,
+        border=columns.n_border,
+        threads=options.threads,
     )
-    problem = _MetricProblem(
-        o, columns, free_views, group, np.flatnonzero(free), values, loss_code(options.loss, options.loss_px),
-        options.loss_px / options.sigma_px, options.sigma_px, Jacobians.allocate(len(o.xy), POSE_DOF, n_free),
-    )  # fmt: skip
+    weighing = Weighing(
+        options.sigma_px, loss_code(options.loss, options.loss_px), options.loss_px / options.sigma_px
+    )
+    problem = _MetricProblem(layout, columns, free_views, values, weighing, layout.jacobians())
     return problem, start, table
 
 
@@ -280,7 +294,12 @@ def _frame(X: F64) -> tuple[F64, float]:
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
     """Covariances of intrinsics (G, C, C) and poses (V, 6, 6) for the noise found, t in the caller's unit."""
-    S, _, _ = replace(problem, sigma_px=sigma_px).linearize(state).reduce(1e-10)
-    held = not problem.free_views[problem.observations.view_index].all()
-    found = CovarianceInput(S, problem.free_views, state.R, state.t, held)
-    return bundle_covariances(found, problem.values.number, state.intrinsics[:, 0], scale)
+    w = problem.weighing
+    problem = replace(problem, weighing=Weighing(sigma_px, w.code, w.delta))
+    reduced, _, _ = problem.linearize(state).reduce(1e-10)
+    layout, m = problem.layout, state.model
+    held = not problem.free_views[layout.observations.view_index].all()
+    block = np.where(problem.free_views, layout.places.block, -1)
+    found = CovarianceInput(reduced, block, m.R, m.t, held)
+    number = problem.columns.of(problem.values.number)
+    return bundle_covariances(found, number, m.intrinsics[:, 0], scale)

@@ -3,7 +3,7 @@ fixed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,17 +11,11 @@ from numpy.typing import NDArray
 
 from thesisrecon.optimize import kernels
 from thesisrecon.optimize.conditioning import pixel_conditioning, whitening_transform
+from thesisrecon.optimize.kernels import Jacobians, Seen, UnitState, Weighing
 from thesisrecon.optimize.levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.optimize.losses import loss_code
-from thesisrecon.optimize.schur import (
-    BundleStep,
-    BundleSystem,
-    Columns,
-    Jacobians,
-    SortedObservations,
-    assemble_system,
-    sort_observations,
-)
+from thesisrecon.optimize.observations import SortedObservations, sort_observations
+from thesisrecon.optimize.schur import BundleLayout, BundleStep, BundleSystem, hold_flipping, lay_out
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -44,77 +38,57 @@ class ProjectiveBundleResult:
     converged: bool
 
 
-@dataclass(frozen=True)
-class _State:
-    """Unit cameras (V, 12) and points (N, 4) with the Householder vectors that span their tangent spaces."""
-
-    P: F64
-    X: F64
-    vP: F64
-    bP: F64
-    vX: F64
-    bX: F64
-
-
-def _state(P: F64, X: F64) -> _State:
+def _state(P: F64, X: F64) -> UnitState:
     vP, vX = np.empty_like(P), np.empty_like(X)
     bP, bX = np.empty(len(P)), np.empty(len(X))
     kernels.tangent_reflectors(P, vP, bP)
     kernels.tangent_reflectors(X, vX, bX)
-    return _State(P, X, vP, bP, vX, bX)
+    return UnitState(P, X, vP, bP, vX, bX)
 
 
 @dataclass(frozen=True)
 class _ProjectiveProblem:
     """Reprojection in conditioned pixels; states hold unit vectors, steps lie in their tangent spaces."""
 
-    observations: SortedObservations
-    columns: Columns
-    free_views: B8
-    loss: int
-    loss_scale: float
+    layout: BundleLayout
+    weighing: Weighing
     jacobians: Jacobians
 
-    def linearize(self, state: _State) -> BundleSystem:
-        o, J, s = self.observations, self.jacobians, state
-        cost = kernels.linearize_projective(
-            s.P,
-            s.vP,
-            s.bP,
-            s.X,
-            s.vX,
-            s.bX,
-            o.view_index,
-            o.point_index,
-            o.xy,
-            self.loss,
-            self.loss_scale,
-            J.residual,
-            J.A,
-            J.B,
-        )
-        return assemble_system(cost, o.start, self.columns, J)
+    def linearize(self, state: UnitState) -> BundleSystem:
+        def work(which: slice, seen: Seen) -> float:
+            part = self.jacobians.part(which.start, which.stop)
+            return float(kernels.linearize_projective(state, seen, self.weighing, part))
 
-    def retract(self, state: _State, step: BundleStep) -> _State:
+        cost = sum(self.layout.over_observations(work))
+        return BundleSystem(cost, self.layout, self.jacobians)
+
+    def retract(self, state: UnitState, step: BundleStep) -> UnitState:
+        block = self.layout.places.block
         views = np.zeros((len(state.P), VIEW_DOF))
-        views[self.free_views] = step.cameras.reshape(-1, VIEW_DOF)
+        views[block >= 0] = step.cameras.reshape(-1, VIEW_DOF)
         P, X = np.empty_like(state.P), np.empty_like(state.X)
         kernels.tangent_step(state.P, state.vP, state.bP, views, P)
         kernels.tangent_step(state.X, state.vX, state.bX, step.points, X)
-        o = self.observations
-        kernels.hold_flipping_points(o.start, o.view_index, state.P[:, 8:], P[:, 8:], state.X, X)
+        hold_flipping(self.layout, state.P[:, 8:], P[:, 8:], state.X, X)
         return _state(P, X)
 
-    def residual(self, state: _State) -> tuple[F64, F64]:
-        o = self.observations
-        residual, depth = np.empty_like(o.xy), np.empty(len(o.xy))
-        kernels.project_projective(
-            state.P.reshape(-1, 3, 4), state.X, o.view_index, o.point_index, o.xy, residual, depth
-        )
-        return residual, depth
+    def residual(self, state: UnitState) -> F64:
+        K = len(self.layout.observations.xy)
+        residual, depth = np.empty((K, 2)), np.empty(K)
 
-    def cost(self, state: _State) -> float:
-        return float(kernels.robust_cost(self.residual(state)[0], self.loss, self.loss_scale))
+        def work(which: slice, seen: Seen) -> None:
+            kernels.project_projective(
+                state.P.reshape(-1, 3, 4), state.X, seen, residual[which], depth[which]
+            )
+
+        self.layout.over_observations(work)
+        return residual
+
+    def cost(self, state: UnitState) -> float:
+        def work(_: slice, seen: Seen) -> float:
+            return float(kernels.projective_cost(state, seen, self.weighing))
+
+        return sum(self.layout.over_observations(work))
 
 
 def refine_projective_bundle(
@@ -162,7 +136,7 @@ def refine_projective_bundle(
     scale = T[0, 0]
     P_back = np.linalg.inv(T) @ (solution.state.P * P_norms[:, None]).reshape(-1, 3, 4) @ M
     X_back = (solution.state.X * X_norms[:, None]) @ np.linalg.inv(M).T
-    residual = observations.unsort(problem.residual(solution.state)[0]) / scale
+    residual = observations.unsort(problem.residual(solution.state)) / scale
     return ProjectiveBundleResult(
         np.where(free[:, None, None], _with_norms(P_back, P, axis=(1, 2)), P),
         np.where(seen_points[:, None], _with_norms(X_back, X, axis=1), X),
@@ -178,16 +152,12 @@ def _projective_problem(
     observations: SortedObservations, T: F64, free: B8, loss_px: float
 ) -> _ProjectiveProblem:
     """The problem in conditioned pixels, with buffers."""
-    xy = observations.xy * T[0, 0] + T[:2, 2]
-    conditioned = SortedObservations(
-        observations.view_index, observations.point_index, xy, observations.start, observations.order
-    )
-    first = np.where(free, VIEW_DOF * (np.cumsum(free) - 1), -1)
-    none = np.full(len(xy), -1, dtype=np.int64)
-    columns = Columns(first[observations.view_index], none, VIEW_DOF * int(free.sum()))
-    buffers = Jacobians.allocate(len(xy), VIEW_DOF, 0)
-    code = loss_code("huber", loss_px)
-    return _ProjectiveProblem(conditioned, columns, free, code, loss_px * float(T[0, 0]), buffers)
+    conditioned = replace(observations, xy=observations.xy * T[0, 0] + T[:2, 2])
+    block = np.where(free, np.cumsum(free) - 1, -1)
+    none = np.zeros((len(free), 0), dtype=np.int64)
+    layout = lay_out(conditioned, block, width=VIEW_DOF, common=none, border=0)
+    weighing = Weighing(1.0, loss_code("huber", loss_px), loss_px * float(T[0, 0]))
+    return _ProjectiveProblem(layout, weighing, layout.jacobians())
 
 
 def _unit_rows(rows: F64, used: B8, what: str) -> tuple[F64, F64]:

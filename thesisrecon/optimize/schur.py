@@ -1,125 +1,132 @@
-"""The sparse linear system of bundle adjustment: points are eliminated, cameras are solved densely.
+"""The sparse linear system of bundle adjustment: points are eliminated, cameras are solved together.
 
 [[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then
-b = -V^-1 (h + W' a). The reduced matrix is dense over the cameras, which suits a few hundred of them.
+b = -V^-1 (h + W' a). The reduced matrix holds a block for every pair of views that see a point together, and
+a border for what views have in common. Points are eliminated in chunks whose number depends on the problem
+alone, added up in their order: the same bytes whatever the number of threads.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.optimize import kernels
-from thesisrecon.optimize.levenberg_marquardt import floored_diagonal, solve_positive
+from thesisrecon.optimize.kernels import Jacobians, Places, PointSums, Seen, Sums
+from thesisrecon.optimize.levenberg_marquardt import floored_diagonal
+from thesisrecon.optimize.observations import SortedObservations
+from thesisrecon.optimize.reduced_solvers import ReducedSolver, ReducedSystem, choose_solver
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 B8 = NDArray[np.bool_]
+Result = TypeVar("Result")
+
+CHUNK = 16384
+# Every chunk has sums of its own: few chunks where these are large.
+MOST_CHUNKS, CHUNK_BYTES = 16, 128e6
 
 
 @dataclass(frozen=True)
-class Observations:
-    """What the photographs show: observation k is point ``point_index[k]`` in view ``view_index[k]`` at
-    ``xy[k]`` px; (K,), (K,) and (K, 2) in any order, sorted by point is fastest."""
+class BundleLayout:
+    """Where everything of one problem stands.
 
-    view_index: I64
-    point_index: I64
-    xy: F64
-
-
-@dataclass(frozen=True)
-class SortedObservations:
-    """Observations sorted by (point, view), checked; ``order`` (K,) takes the caller's order to this one.
-
-    ``start`` (N + 1,) is where the observations of each point begin.
+    The unknowns of the cameras are ``width`` columns for each of b views' blocks, then ``border`` columns
+    that views have in common. ``row``, ``column`` (n,) name the views of each block of the reduced matrix;
+    ``chunks`` are ranges of points (first, last); ``threads`` may work on them.
     """
 
-    view_index: I64
-    point_index: I64
-    xy: F64
-    start: I64
-    order: I64
+    observations: SortedObservations
+    places: Places
+    width: int
+    border: int
+    row: I64
+    column: I64
+    chunks: tuple[tuple[int, int], ...]
+    solver: ReducedSolver
+    threads: int
 
-    def unsort(self, values: F64) -> F64:
-        """Values per observation (K, ...) in the caller's order."""
-        out = np.empty_like(values)
-        out[self.order] = values
-        return out
+    @property
+    def size(self) -> int:
+        """Unknowns of the cameras, D."""
+        return len(self.places.pair) * self.width + self.border
+
+    def over_chunks(self, work: Callable[[int, int], Result]) -> list[Result]:
+        """work(first, last) for every range of points, in their order."""
+        if self.threads == 1 or len(self.chunks) == 1:
+            return [work(*chunk) for chunk in self.chunks]
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(lambda chunk: work(*chunk), self.chunks))
+
+    def over_observations(self, work: Callable[[slice, Seen], Result]) -> list[Result]:
+        """work(which, they) for the observations of every range of points, in their order."""
+        start, o = self.observations.start, self.observations
+        seen = Seen(o.view_index, o.point_index, o.xy)
+
+        def run(first: int, last: int) -> Result:
+            return work(slice(start[first], start[last]), seen.part(start[first], start[last]))
+
+        return self.over_chunks(run)
+
+    def jacobians(self) -> Jacobians:
+        """Buffers of one linearisation."""
+        K = len(self.observations.xy)
+        shapes = [(2,), (2, self.width), (2, self.places.common.shape[1]), (2, 3)]
+        return Jacobians(*(np.empty((K, *shape)) for shape in shapes))
+
+    def sums(self) -> Sums:
+        """A reduced system of zeros."""
+        C, b, e, D = self.width, len(self.places.pair), self.border, self.size
+        shapes = [(len(self.row), C, C), (b, C, e), (e, e), (D,), (D,), (D,)]
+        return Sums(*(np.zeros(shape) for shape in shapes))
 
 
-def sort_observations(
-    view_index: I64, point_index: I64, xy: F64, n_views: int, n_points: int
-) -> SortedObservations:
-    """Check and sort observations by (point, view); raises ``ValueError`` for wrong shapes, indices or
-    NaN."""
-    view = np.ascontiguousarray(view_index, dtype=np.int64)
-    point = np.ascontiguousarray(point_index, dtype=np.int64)
-    xy = np.ascontiguousarray(xy, dtype=np.float64)
-    if view.ndim != 1 or view.shape != point.shape or xy.shape != (len(view), 2):
-        raise ValueError(
-            f"observations need (K,), (K,) and (K, 2) arrays; got {view.shape}, {point.shape} and {xy.shape}"
-        )
-    if not np.isfinite(xy).all():
-        raise ValueError("observations must be finite")
-    if len(view) and (view.min() < 0 or view.max() >= n_views or point.min() < 0 or point.max() >= n_points):
-        raise ValueError(
-            f"observations name views or points beyond the {n_views} views and {n_points} points"
-        )
-    key = point * max(n_views, 1) + view
-    order = np.arange(len(key))
-    if np.any(key[1:] < key[:-1]):
-        order = np.argsort(key, kind="stable")
-        view, point, xy = view[order], point[order], xy[order]
-    start = np.zeros(n_points + 1, dtype=np.int64)
-    np.cumsum(np.bincount(point, minlength=n_points), out=start[1:])
-    return SortedObservations(view, point, xy, start, order)
+def lay_out(
+    observations: SortedObservations,
+    block: I64,
+    *,
+    width: int,
+    common: I64,
+    border: int,
+    threads: int = 1,
+) -> BundleLayout:
+    """Find the pairs of views that share points, cut the points into chunks and choose a solver.
 
-
-@dataclass(frozen=True)
-class Columns:
-    """Where each observation's camera parameters stand among the ``size`` columns of the reduced system.
-
-    ``view`` and ``group`` (K,) first columns, -1 for a fixed view. ``fold`` (size,) takes every column to
-    that of the unknown behind it, of which there are ``unknowns``; -1 for one that does not move. None: every
-    column is its own unknown.
+    ``block`` (V,) is the number of a view's block, -1 for one that does not move; ``common`` (V, F) its
+    columns of the border, -1 for none.
     """
-
-    view: I64
-    group: I64
-    size: int
-    fold: I64 | None = None
-    unknowns: int = 0
-
-    def sum_columns(self, values: F64) -> F64:
-        """Values per column (size, ...) added up per unknown."""
-        if self.fold is None:
-            return values
-        out = np.zeros((self.unknowns, *values.shape[1:]))
-        np.add.at(out, self.fold[self.fold >= 0], values[self.fold >= 0])
-        return out
-
-    def spread_columns(self, values: F64) -> F64:
-        """Values per unknown (unknowns,) put to every column."""
-        return values if self.fold is None else np.where(self.fold >= 0, values[self.fold], 0.0)
+    o, n = observations, int(block.max(initial=-1)) + 1
+    marked = np.eye(n, dtype=bool)
+    kernels.mark_pairs(o.start, o.view_index, block, marked)
+    row, column = (a.astype(np.int64) for a in np.nonzero(marked))
+    pair = np.full((n, n), -1, dtype=np.int64)
+    pair[row, column] = np.arange(len(row))
+    solver = choose_solver(row, column, n, width, border)
+    bytes_each = 8.0 * (len(row) * width**2 + n * width * border + border**2)
+    most = max(1, min(MOST_CHUNKS, int(CHUNK_BYTES / max(bytes_each, 1.0))))
+    count = int(np.clip(len(o.xy) // CHUNK, 1, most))
+    bounds = np.searchsorted(o.start, np.linspace(0, len(o.xy), count + 1)[1:-1])
+    ends = [0, *bounds.tolist(), len(o.start) - 1]
+    chunks = tuple(itertools.pairwise(ends))
+    places = Places(o.start, o.view_index, block, pair, np.ascontiguousarray(common))
+    return BundleLayout(o, places, width, border, row, column, chunks, solver, threads)
 
 
 @dataclass(frozen=True)
-class Jacobians:
-    """Buffers of one linearisation: ``residual`` (K, 2), ``A`` (K, 2, C), ``G`` (K, 2, F), ``B`` (K, 2,
-    3)."""
+class CameraPrior:
+    """Gaussian terms between camera columns: ``weight`` (L,) on the differences of columns ``first`` and
+    ``second`` (L,), -1 for a number instead; the second always one of the border. ``gradient`` (D,)."""
 
-    residual: F64
-    A: F64
-    G: F64
-    B: F64
-
-    @classmethod
-    def allocate(cls, n_observations: int, view_width: int, group_width: int) -> Jacobians:
-        """Uninitialised buffers for K observations."""
-        shapes = [(2,), (2, view_width), (2, group_width), (2, 3)]
-        return cls(*(np.empty((n_observations, *shape)) for shape in shapes))
+    first: I64
+    second: I64
+    weight: F64
+    gradient: F64
 
 
 @dataclass(frozen=True)
@@ -132,72 +139,90 @@ class BundleStep:
 
 @dataclass(frozen=True)
 class BundleSystem:
-    """Normal equations of a bundle problem at one state; the Jacobian buffers belong to the latest one."""
+    """A bundle problem linearised at one state; the Jacobian buffers belong to the latest one."""
 
     cost: float
-    start: I64
-    columns: Columns
+    layout: BundleLayout
     jacobians: Jacobians
-    H: F64
-    g: F64
-    V: F64
-    h: F64
-    prior: tuple[F64, F64] | None
+    prior: CameraPrior | None = None
 
-    def diagonal(self) -> F64:
-        """(D,) diagonal of the information before elimination."""
-        total = self.columns.sum_columns(np.diag(self.H))
-        return total if self.prior is None else total + np.diag(self.prior[0])
+    def reduce(self, damping: float) -> tuple[ReducedSystem, PointSums, F64]:
+        """The damped reduced system, what back substitution needs, and the damping of each column (D,)."""
+        N, layout = len(self.layout.observations.start) - 1, self.layout
+        points = PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
 
-    def gradient(self) -> F64:
-        """(D,) gradient of the cost over the unknowns of the cameras."""
-        total = self.columns.sum_columns(self.g)
-        return total if self.prior is None else total + self.prior[1]
+        def eliminate(first: int, last: int) -> Sums:
+            sums = layout.sums()
+            kernels.eliminate_points(first, last, damping, self.jacobians, layout.places, sums, points)
+            return sums
 
-    def reduce(self, damping: float) -> tuple[F64, F64, F64]:
-        """Reduced matrix S (D, D) (upper triangle), right-hand side (D,) and inverse point blocks (N, 3,
-        3)."""
-        S, rhs = self.H.copy(), -self.g
-        inverses = np.zeros_like(self.V)
-        J, c = self.jacobians, self.columns
-        kernels.eliminate_points(
-            self.start, c.view, c.group, J.A, J.G, J.B, self.V, self.h, damping, S, rhs, inverses
-        )
-        if c.fold is not None:
-            S = np.triu(S) + np.triu(S, 1).T
-            S, rhs = c.sum_columns(c.sum_columns(S).T), c.sum_columns(rhs)
+        total, *rest = layout.over_chunks(eliminate)
+        for part in rest:
+            for into, values in zip(total, part, strict=True):
+                into += values
         if self.prior is not None:
-            S, rhs = S + self.prior[0], rhs - self.prior[1]
-        S[np.diag_indices_from(S)] += damping * floored_diagonal(self.diagonal())
-        return S, rhs, inverses
+            _add_prior(layout, total, self.prior)
+        damped = damping * floored_diagonal(total.diagonal)
+        # A column nothing acts upon stays: any positive pivot does.
+        _add_diagonal(layout, total, np.where(total.diagonal == 0.0, 1.0, damped))
+        system = ReducedSystem(layout.row, layout.column, total)
+        return system, points, damped
 
     def solve(self, damping: float) -> tuple[BundleStep, float] | None:
         """The damped step and its promised gain, or None where the reduced matrix is not positive."""
-        S, rhs, inverses = self.reduce(damping)
-        # Row-major upper is column-major lower: LAPACK reads the transpose without a copy.
-        cameras = solve_positive(S.T, rhs)
+        reduced, points, damped = self.reduce(damping)
+        cameras = self.layout.solver.solve(reduced)
         if cameras is None:
             return None
-        points = np.empty_like(self.h)
-        J, c = self.jacobians, self.columns
-        step = c.spread_columns(cameras)
-        kernels.substitute_points(self.start, c.view, c.group, J.A, J.G, J.B, inverses, self.h, step, points)
-        if not np.isfinite(points).all():
+        moves = np.zeros_like(points.gradient)
+
+        def substitute(first: int, last: int) -> None:
+            kernels.substitute_points(first, last, cameras, self.jacobians, self.layout.places, points, moves)
+
+        self.layout.over_chunks(substitute)
+        if not np.isfinite(moves).all():
             return None
-        damped = damping * float(cameras**2 @ floored_diagonal(self.diagonal()))
-        damped += damping * float(np.einsum("na,naa->", points**2, self.V))
-        gain = 0.5 * (damped - float(cameras @ self.gradient()) - float(np.vdot(points, self.h)))
-        return BundleStep(cameras, points), gain
+        stiff = float(damped @ cameras**2) + damping * float(np.vdot(points.diagonal, moves**2))
+        slope = float(reduced.sums.gradient @ cameras) + float(np.vdot(points.gradient, moves))
+        return BundleStep(cameras, moves), 0.5 * (stiff - slope)
 
 
-def assemble_system(
-    cost: float, start: I64, columns: Columns, jacobians: Jacobians, *, prior: tuple[F64, F64] | None = None
-) -> BundleSystem:
-    """Normal equations from weighted Jacobians; ``prior``: information (D, D) and gradient (D,) to be
-    added."""
-    n_points = len(start) - 1
-    H, g = np.zeros((columns.size, columns.size)), np.zeros(columns.size)
-    V, h = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
-    J = jacobians
-    kernels.add_normal_blocks(start, columns.view, columns.group, J.A, J.G, J.B, J.residual, H, g, V, h)
-    return BundleSystem(cost, start, columns, jacobians, H, g, V, h, prior)
+def _add_prior(layout: BundleLayout, total: Sums, prior: CameraPrior) -> None:
+    """The prior's information and gradient."""
+    first, second, w, edge = prior.first, prior.second, prior.weight, layout.size - layout.border
+    total.rhs[:] -= prior.gradient
+    total.gradient[:] += prior.gradient
+    both = second >= 0
+    weight = np.bincount(first, w, minlength=layout.size).astype(np.float64)
+    weight += np.bincount(second[both], w[both], minlength=layout.size)
+    total.diagonal[:] += weight
+    _add_diagonal(layout, total, weight)
+    first, second, w = first[both], second[both] - edge, w[both]
+    inside = first >= edge
+    np.add.at(total.corner, (first[inside] - edge, second[inside]), -w[inside])
+    np.add.at(total.corner, (second[inside], first[inside] - edge), -w[inside])
+    flat = total.border.reshape(edge, layout.border)
+    np.add.at(flat, (first[~inside], second[~inside]), -w[~inside])
+
+
+def _add_diagonal(layout: BundleLayout, total: Sums, values: F64) -> None:
+    """values (D,) on the diagonal of the reduced matrix."""
+    b, C = len(layout.places.pair), layout.width
+    own = np.diagonal(layout.places.pair)
+    total.blocks[own[:, None], np.arange(C), np.arange(C)] += values[: b * C].reshape(b, C)
+    total.corner[np.diag_indices_from(total.corner)] += values[b * C :]
+
+
+def hold_flipping(layout: BundleLayout, before: F64, after: F64, X_before: F64, X_after: F64) -> None:
+    """Put back the points whose step takes them through the focal plane of a view that sees them.
+
+    ``before``, ``after`` (V, 4) third rows of the cameras; X (N, 4), or (N, 3) with a fourth coordinate 1.
+    """
+    start, view = layout.observations.start, layout.observations.view_index
+
+    def work(first: int, last: int) -> None:
+        kernels.hold_flipping_points(
+            start[first : last + 1], view, before, after, X_before[first:last], X_after[first:last]
+        )
+
+    layout.over_chunks(work)

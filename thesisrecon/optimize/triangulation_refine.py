@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.optimize import kernels
 from thesisrecon.optimize.conditioning import pixel_conditioning, whitening_transform
+from thesisrecon.optimize.kernels import Jacobians, MetricModel, Seen, UnitState, Weighing
 from thesisrecon.optimize.levenberg_marquardt import (
     DenseSystem,
     invert_information,
     run_levenberg_marquardt,
 )
 from thesisrecon.optimize.losses import loss_code
-from thesisrecon.optimize.schur import sort_observations
+from thesisrecon.optimize.observations import sort_observations
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -107,38 +108,46 @@ class _CameraProblem:
     """One unit camera (1, 12) against whitened unit points, conditioned pixels."""
 
     X: F64
-    xy: F64
-    code: int
-    delta: float
+    seen: Seen
+    weighing: Weighing
+
+    def _state(self, P: F64) -> UnitState:
+        v, beta = np.empty_like(P), np.empty(1)
+        kernels.tangent_reflectors(P, v, beta)
+        return UnitState(P, self.X, v, beta, np.zeros_like(self.X), np.zeros(len(self.X)))
 
     def linearize(self, state: F64) -> DenseSystem:
-        v, beta = np.empty_like(state), np.empty(1)
-        vX, bX = np.zeros_like(self.X), np.zeros(len(self.X))
-        kernels.tangent_reflectors(state, v, beta)
-        n = len(self.X)
-        residual, A, B = np.empty((n, 2)), np.empty((n, 2, 11)), np.empty((n, 2, 3))
-        view, point = np.zeros(n, dtype=np.int64), np.arange(n)
-        cost = kernels.linearize_projective(
-            state, v, beta, self.X, vX, bX, view, point, self.xy, self.code, self.delta, residual, A, B
-        )
-        J, r = A.reshape(-1, 11), residual.ravel()
-        return DenseSystem(cost, J.T @ J, J.T @ r)
+        J = _jacobians(len(self.X), 11, 0)
+        cost = kernels.linearize_projective(self._state(state), self.seen, self.weighing, J)
+        return _dense_system(cost, J)
 
     def retract(self, state: F64, step: F64) -> F64:
-        v, beta, moved = np.empty_like(state), np.empty(1), np.empty_like(state)
-        kernels.tangent_reflectors(state, v, beta)
-        kernels.tangent_step(state, v, beta, step[None], moved)
+        s, moved = self._state(state), np.empty_like(state)
+        kernels.tangent_step(state, s.vP, s.bP, step[None], moved)
         return moved
 
     def residual(self, state: F64) -> F64:
-        n = len(self.X)
-        residual, depth = np.empty((n, 2)), np.empty(n)
-        view, point = np.zeros(n, dtype=np.int64), np.arange(n)
-        kernels.project_projective(state.reshape(1, 3, 4), self.X, view, point, self.xy, residual, depth)
+        residual, depth = np.empty((len(self.X), 2)), np.empty(len(self.X))
+        kernels.project_projective(state.reshape(1, 3, 4), self.X, self.seen, residual, depth)
         return residual
 
     def cost(self, state: F64) -> float:
-        return float(kernels.robust_cost(self.residual(state), self.code, self.delta))
+        return float(kernels.projective_cost(self._state(state), self.seen, self.weighing))
+
+
+def _seen_by_one(xy: F64) -> Seen:
+    """Every point once, by the only view."""
+    return Seen(np.zeros(len(xy), dtype=np.int64), np.arange(len(xy)), np.ascontiguousarray(xy))
+
+
+def _jacobians(n: int, own: int, common: int) -> Jacobians:
+    return Jacobians(*(np.empty((n, *shape)) for shape in [(2,), (2, own), (2, common), (2, 3)]))
+
+
+def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
+    """Normal equations of the camera's columns."""
+    A, r = J.A.reshape(-1, J.A.shape[2]), J.residual.ravel()
+    return DenseSystem(cost, A.T @ A, A.T @ r)
 
 
 def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> CameraRefinement:
@@ -162,8 +171,8 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     start = (T @ P @ np.linalg.inv(M)).reshape(1, 12)
     scale = float(T[0, 0])
-    code = loss_code("huber", loss_px)
-    problem = _CameraProblem(points, xy * scale + T[:2, 2], code, loss_px * scale)
+    weighing = Weighing(1.0, loss_code("huber", loss_px), loss_px * scale)
+    problem = _CameraProblem(points, _seen_by_one(xy * scale + T[:2, 2]), weighing)
     solution = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations)
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
     back = np.kron(np.linalg.inv(T), M.T)
@@ -191,67 +200,34 @@ def _camera_covariance(problem: _CameraProblem, state: F64) -> F64:
 
 
 @dataclass(frozen=True)
-class _Pose:
-    R: F64
-    t: F64
-    intrinsics: F64
-
-
-@dataclass(frozen=True)
 class _PoseProblem:
-    X: F64
-    xy: F64
+    """One calibrated camera against points held still; a state's model has one view and one row."""
+
+    seen: Seen
     free: I64
-    code: int
-    delta: float
+    weighing: Weighing
 
-    def _indices(self) -> tuple[I64, I64, I64]:
-        return np.zeros(1, dtype=np.int64), np.zeros(len(self.X), dtype=np.int64), np.arange(len(self.X))
+    def linearize(self, state: MetricModel) -> DenseSystem:
+        J = _jacobians(len(state.X), 6 + len(self.free), 0)
+        cost = kernels.linearize_metric(state, self.seen, self.weighing, self.free, self.free[:0], J)
+        return _dense_system(cost, J)
 
-    def linearize(self, state: _Pose) -> DenseSystem:
-        n, F = len(self.X), len(self.free)
-        group, view, point = self._indices()
-        residual, A, G, B = (np.empty((n, *shape)) for shape in [(2,), (2, 6), (2, F), (2, 3)])
-        cost = kernels.linearize_metric(
-            state.R[None],
-            state.t[None],
-            state.intrinsics[None],
-            group,
-            self.X,
-            view,
-            point,
-            self.xy,
-            self.free,
-            1.0,
-            self.code,
-            self.delta,
-            residual,
-            A,
-            G,
-            B,
-        )
-        J, r = np.concatenate([A, G], axis=2).reshape(2 * n, 6 + F), residual.ravel()
-        return DenseSystem(cost, J.T @ J, J.T @ r)
-
-    def retract(self, state: _Pose, step: F64) -> _Pose:
+    def retract(self, state: MetricModel, step: F64) -> MetricModel:
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        moves = np.zeros(len(state.intrinsics))
+        moves = np.zeros(state.intrinsics.shape[1])
         moves[self.free] = step[6:]
         intrinsics = state.intrinsics + moves
-        intrinsics[0] = state.intrinsics[0] * np.exp(np.clip(moves[0], -3.0, 3.0))
-        return _Pose(turn @ state.R, turn @ state.t + step[3:6], intrinsics)
+        intrinsics[0, 0] = state.intrinsics[0, 0] * np.exp(np.clip(moves[0], -3.0, 3.0))
+        t = state.t @ turn.T + step[3:6]
+        return state._replace(R=turn @ state.R, t=t, intrinsics=intrinsics)
 
-    def residual(self, state: _Pose) -> F64:
-        group, view, point = self._indices()
-        residual, depth = np.empty_like(self.xy), np.empty(len(self.xy))
-        kernels.project_metric(
-            state.R[None], state.t[None], state.intrinsics[None], group, self.X, view, point, self.xy,
-            residual, depth,
-        )  # fmt: skip
+    def residual(self, state: MetricModel) -> F64:
+        residual, depth = np.empty_like(self.seen.xy), np.empty(len(self.seen.xy))
+        kernels.project_metric(state, self.seen, residual, depth)
         return residual
 
-    def cost(self, state: _Pose) -> float:
-        return float(kernels.robust_cost(self.residual(state), self.code, self.delta))
+    def cost(self, state: MetricModel) -> float:
+        return float(kernels.metric_cost(state, self.seen, self.weighing))
 
 
 def refine_pose(
@@ -285,17 +261,20 @@ def refine_pose(
     origin = X.mean(axis=0)
     size = float(np.linalg.norm(X - origin, axis=1).mean())
     scale = 1.0 / size if size > 0.0 else 1.0
-    problem = _PoseProblem(scale * (X - origin), xy, columns, loss_code("huber", loss_px), loss_px)
-    start = _Pose(R, scale * (t + R @ origin), q)
+    weighing = Weighing(1.0, loss_code("huber", loss_px), loss_px)
+    problem = _PoseProblem(_seen_by_one(xy), columns, weighing)
+    moved = scale * (t + R @ origin)
+    group = np.zeros(1, dtype=np.int64)
+    start = MetricModel(R[None], moved[None], q[None], group, np.ascontiguousarray(scale * (X - origin)))
     solution = run_levenberg_marquardt(problem, start, max_iterations=iterations)
     end = solution.state
     units = np.ones(6 + len(columns))
     units[3:6] = 1.0 / scale
     covariance = invert_information(problem.linearize(end).hessian) * units * units[:, None]
     return PoseRefinement(
-        end.R,
-        end.t / scale - end.R @ origin,
-        end.intrinsics,
+        end.R[0],
+        end.t[0] / scale - end.R[0] @ origin,
+        end.intrinsics[0],
         covariance,
         problem.residual(end),
         solution.cost,

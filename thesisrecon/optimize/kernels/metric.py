@@ -1,0 +1,136 @@
+"""Calibrated cameras with radial distortion: projection, cost and Jacobians."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from thesisrecon.optimize.kernels.records import Jacobians, Seen, Weighing
+from thesisrecon.optimize.kernels.scalars import away_from_zero, loss_value, loss_weight
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+class MetricModel(NamedTuple):
+    """``R`` (V, 3, 3), ``t`` (V, 3), ``intrinsics`` (G, 6) or (G, 8) with k2 and k3, ``group`` (V,) the row
+    of each view, ``X`` (N, 3)."""
+
+    R: F64
+    t: F64
+    intrinsics: F64
+    group: I64
+    X: F64
+
+
+@njit(cache=True, nogil=True, inline="always")
+def image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
+    """Pixel of a point in the camera's frame, w away from 0; q a row of intrinsics."""
+    a, b = x0 / w, x1 / w
+    r2 = a * a + b * b
+    d = 1.0 + q[5] * r2
+    if len(q) > 6:
+        d += (q[6] + q[7] * r2) * r2 * r2
+    return q[0] * a * d + q[2] * b * d + q[3], q[0] * q[1] * b * d + q[4]
+
+
+@njit(cache=True, nogil=True)
+def project_metric(model: MetricModel, seen: Seen, residual: F64, depth: F64) -> None:
+    """Fill residual (K, 2) px, projection minus observation, and depth (K,)."""
+    for k in range(len(seen.xy)):
+        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+        r, t = model.R[v], model.t[v]
+        x0 = r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0]
+        x1 = r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1]
+        x2 = r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2]
+        px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
+        depth[k] = x2
+        residual[k, 0] = px - seen.xy[k, 0]
+        residual[k, 1] = py - seen.xy[k, 1]
+
+
+@njit(cache=True, nogil=True)
+def metric_cost(model: MetricModel, seen: Seen, weighing: Weighing) -> float:
+    """1/2 sum rho of the residuals."""
+    cost = 0.0
+    for k in range(len(seen.xy)):
+        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+        r, t = model.R[v], model.t[v]
+        x0 = r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0]
+        x1 = r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1]
+        x2 = r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2]
+        px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
+        e0, e1 = (px - seen.xy[k, 0]) / weighing.sigma, (py - seen.xy[k, 1]) / weighing.sigma
+        cost += loss_value(weighing.code, e0 * e0 + e1 * e1, weighing.delta)
+    return 0.5 * cost
+
+
+@njit(cache=True, nogil=True)
+def linearize_metric(
+    model: MetricModel, seen: Seen, weighing: Weighing, own: I64, common: I64, J: Jacobians
+) -> float:
+    """Fill J with weighted residuals in units of sigma and the Jacobians; returns the cost.
+
+    A pose moves by x -> exp(w) x + d in the camera's frame: columns (w, d) of A, behind them the intrinsics
+    that ``own`` lists of (log f, aspect, skew, cx, cy, k1, k2, k3); those that ``common`` lists make E.
+    """
+    cost = 0.0
+    D = np.empty((2, 8))
+    for k in range(len(seen.xy)):
+        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+        r, t, q = model.R[v], model.t[v], model.intrinsics[model.group[v]]
+        x0 = r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0]
+        x1 = r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1]
+        w = away_from_zero(r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2])
+        px, py = image_of(q, x0, x1, w)
+        e0, e1 = (px - seen.xy[k, 0]) / weighing.sigma, (py - seen.xy[k, 1]) / weighing.sigma
+        s = e0 * e0 + e1 * e1
+        cost += loss_value(weighing.code, s, weighing.delta)
+        root = np.sqrt(loss_weight(weighing.code, s, weighing.delta))
+        J.residual[k, 0], J.residual[k, 1] = root * e0, root * e1
+        root /= weighing.sigma
+        n00, n01, n10, n11 = intrinsic_columns(q, x0 / w, x1 / w, root, D)
+        for c in range(len(own)):
+            J.A[k, 0, 6 + c], J.A[k, 1, 6 + c] = D[0, own[c]], D[1, own[c]]
+        for c in range(len(common)):
+            J.E[k, 0, c], J.E[k, 1, c] = D[0, common[c]], D[1, common[c]]
+        a, b = x0 / w, x1 / w
+        j00, j01, j02 = n00 / w, n01 / w, -(n00 * a + n01 * b) / w
+        j10, j11, j12 = n10 / w, n11 / w, -(n10 * a + n11 * b) / w
+        A = J.A[k]
+        A[0, 0], A[0, 1], A[0, 2] = j02 * x1 - j01 * w, j00 * w - j02 * x0, j01 * x0 - j00 * x1
+        A[1, 0], A[1, 1], A[1, 2] = j12 * x1 - j11 * w, j10 * w - j12 * x0, j11 * x0 - j10 * x1
+        A[0, 3], A[0, 4], A[0, 5] = j00, j01, j02
+        A[1, 3], A[1, 4], A[1, 5] = j10, j11, j12
+        for c in range(3):
+            J.B[k, 0, c] = j00 * r[0, c] + j01 * r[1, c] + j02 * r[2, c]
+            J.B[k, 1, c] = j10 * r[0, c] + j11 * r[1, c] + j12 * r[2, c]
+    return 0.5 * cost
+
+
+@njit(cache=True, nogil=True)
+def intrinsic_columns(q: F64, a: float, b: float, root: float, D: F64) -> tuple[float, float, float, float]:
+    """Fill D (2, 8), derivatives of the pixel by the intrinsics at the normalised point (a, b), times root.
+
+    Returns d pixel / d (a, b), times root too, row by row.
+    """
+    f, g, skew = root * q[0], root * q[0] * q[1], root * q[2]
+    r2 = a * a + b * b
+    # d is the distortion, slope its derivative over r^2.
+    d, slope = 1.0 + q[5] * r2, q[5]
+    if len(q) > 6:
+        d += (q[6] + q[7] * r2) * r2 * r2
+        slope += (2.0 * q[6] + 3.0 * q[7] * r2) * r2
+    D[0, 0], D[1, 0] = f * a * d, g * b * d
+    D[0, 1], D[1, 1] = 0.0, f * b * d
+    D[0, 2], D[1, 2] = root * b * d, 0.0
+    D[0, 3], D[1, 3] = root, 0.0
+    D[0, 4], D[1, 4] = 0.0, root
+    D[0, 5], D[1, 5] = (f * a + skew * b) * r2, g * b * r2
+    D[0, 6], D[1, 6] = D[0, 5] * r2, D[1, 5] * r2
+    D[0, 7], D[1, 7] = D[0, 6] * r2, D[1, 6] * r2
+    m00, m01, m11 = d + 2.0 * slope * a * a, 2.0 * slope * a * b, d + 2.0 * slope * b * b
+    return f * m00 + skew * m01, f * m01 + skew * m11, g * m01, g * m11
