@@ -128,8 +128,8 @@ def conic_equations(H: F64, knowledge: ConicKnowledge, focals: F64) -> F64:
     constant = carried[:, later] - carried[:, knowledge.first[later]]
     constant[bad[:, later] | bad[:, knowledge.first[later]]] = 0.0
     return np.concatenate(
-        [(known * weight[..., None]).reshape(len(H), -1, 6),
-         (constant * _ENTRY_WEIGHT[:, None]).reshape(len(H), -1, 6)], axis=1,
+        [(known * weight[..., None]).reshape(len(H), 4 * H.shape[1], 6),
+         (constant * _ENTRY_WEIGHT[:, None]).reshape(len(H), 6 * len(later), 6)], axis=1,
     )  # fmt: skip
 
 
