@@ -6,8 +6,10 @@ that cannot are dropped, and the verdict on the motion is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
+from typing import ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ from thesisrecon.selfcalibration.verdict import judge_motion, verdict_without_an
 from thesisrecon.types import Reconstruction, SelfCalibration, Upgrade
 
 F64 = NDArray[np.float64]
+P = ParamSpec("P")
 
 SAME_ANSWER = 0.03
 """Answers whose log focals differ by less than this are one."""
@@ -43,6 +46,27 @@ class Answer:
         """Log focals (G,) of the camera groups, each the median of its views."""
         log_f = 0.5 * np.log(self.K[:, 0, 0] * self.K[:, 1, 1])
         return np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
+
+
+def guarded(calibrate: Callable[P, SelfCalibration]) -> Callable[P, SelfCalibration]:
+    """A ``calibrate`` whose decompositions end in a ``StageFailure`` where they do not converge.
+
+    Numbers that overflow on the way make hypotheses without a finite cost, which never win; they warn nobody.
+    """
+
+    @wraps(calibrate)
+    def inner(*args: P.args, **kwargs: P.kwargs) -> SelfCalibration:
+        with np.errstate(all="ignore"):
+            try:
+                return calibrate(*args, **kwargs)
+            except np.linalg.LinAlgError as error:
+                raise StageFailure(
+                    "the projective cameras are not such that they can be calibrated",
+                    f"a decomposition failed: {error}",
+                    "photograph the scene from different places",
+                ) from error
+
+    return inner
 
 
 def require_cameras(reconstruction: Reconstruction) -> None:

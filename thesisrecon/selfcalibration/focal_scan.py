@@ -16,6 +16,7 @@ from thesisrecon.selfcalibration.conclusion import (
     answers_from_theta,
     conclude,
     focals_of_groups,
+    guarded,
     require_cameras,
 )
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
@@ -134,6 +135,7 @@ class FocalScan:
     refined: int = 10
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
+    @guarded
     def calibrate(
         self,
         reconstruction: Reconstruction,

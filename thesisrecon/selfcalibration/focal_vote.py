@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
-from thesisrecon.selfcalibration.conclusion import Answer, conclude, require_cameras, square_calibrations
+from thesisrecon.selfcalibration.conclusion import (
+    Answer,
+    conclude,
+    guarded,
+    require_cameras,
+    square_calibrations,
+)
 from thesisrecon.selfcalibration.focal_from_fundamental import kruppa_chi_square, kruppa_whitening
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
@@ -159,6 +165,7 @@ class FocalsFromFundamental:
     min_principal_std: float = 1e-3
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
+    @guarded
     def calibrate(
         self,
         reconstruction: Reconstruction,

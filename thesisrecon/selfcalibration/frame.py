@@ -12,10 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.types import I64, Assumptions, Reconstruction
 
 F64 = NDArray[np.float64]
+
+FLAT = 1e-11
+"""Share of the largest below which a singular value, or a distance of centres, is rounding."""
 
 KNOWN_STD = 1e-4
 """Relative deviation that a focal known exactly gets, so that every criterion stays finite."""
@@ -73,6 +77,7 @@ def build_frame(
     views = np.flatnonzero(reconstruction.registered)
     unit = pixel_from_unit(reconstruction.sizes) if unit is None else unit
     P = np.linalg.inv(unit[views]) @ reconstruction.P[views]
+    _require_cameras_of_full_rank(P)
     if reference is None:
         seen = reconstruction.tracks.view_index[reconstruction.inlier]
         reference = int(views[np.bincount(seen, minlength=len(unit))[views].argmax()])
@@ -94,6 +99,28 @@ def build_frame(
         dense_group,
         unit,
         np.linalg.inv(projective_from_reference),
+    )
+
+
+def _require_cameras_of_full_rank(P: F64) -> None:
+    """``StageFailure`` where a camera (R, 3, 4) is no camera, or all have one centre."""
+    if not np.isfinite(P).all() or (np.linalg.norm(P, axis=(1, 2)) == 0.0).any():
+        bad = int((~np.isfinite(P)).any(axis=(1, 2)).sum() + (np.linalg.norm(P, axis=(1, 2)) == 0.0).sum())
+        evidence = f"{bad} of {len(P)} cameras are zero or not finite"
+    else:
+        S = np.linalg.svd(P / np.linalg.norm(P, axis=(1, 2))[:, None, None], compute_uv=False)
+        flat = int((S[:, 2] < FLAT * S[:, 0]).sum())
+        centres = np.linalg.svd(P)[2][:, 3]
+        apart = float(np.sqrt(np.maximum(1.0 - (centres @ centres[0]) ** 2, 0.0)).max())
+        if not flat and apart > FLAT:
+            return
+        evidence = (
+            f"{flat} of {len(P)} cameras see a line only" if flat else f"their centres are {apart:.1e} apart"
+        )
+    raise StageFailure(
+        "the projective cameras are not such that they can be calibrated",
+        evidence,
+        "photograph the scene from different places",
     )
 
 

@@ -6,19 +6,25 @@ what decides is one robust criterion over all cameras, cheirality, and later the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.selfcalibration.conclusion import (
+    Answer,
     answers_from_theta,
     conclude,
+    distinct_answers,
     focals_of_groups,
+    guarded,
     require_cameras,
 )
 from thesisrecon.selfcalibration.focal_scan import focal_pairs, plane_from_focals
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
+from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
+from thesisrecon.selfcalibration.nonlinear_quadric import minimize_quadric
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
 from thesisrecon.selfcalibration.stratified import CheiralitySearch
@@ -27,25 +33,34 @@ from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
 F64 = NDArray[np.float64]
 
 
+LOOSE = 0.02
+"""Deviation of a principal point (long sides), an aspect or a skew beyond which focals alone do not do."""
+
+
 @dataclass(frozen=True)
 class HypothesesAndRefinement:
-    """Self-calibration of square-pixel cameras with an unknown focal each or in common.
+    """Self-calibration by hypotheses of every method, one refinement and cheirality.
+
+    The refinement knows focals; where the assumptions leave more open than a slight displacement of the
+    principal point, the best answers go on to the nonlinear quadric over everything that is open.
 
     ``focal_range`` (in long sides) and ``focal_steps`` of the scans; ``subsets`` random camera subsets for
-    the quadric; ``refined`` hypotheses that are refined; ``kept`` answers that go on to bundle adjustment;
-    ``min_positive`` share of points in front that an answer needs; ``search`` Hartley's search, None to
-    leave it out.
+    the quadric; ``refined`` hypotheses that are refined, and ``freed`` distinct answers over all intrinsics;
+    ``kept`` answers that go on to bundle adjustment; ``min_positive`` share of points in front that an answer
+    needs; ``search`` Hartley's search, None to leave it out.
     """
 
-    focal_range: tuple[float, float] = (0.3, 10.0)
-    focal_steps: int = 33
+    focal_range: tuple[float, float] = (0.2, 40.0)
+    focal_steps: int = 45
     subsets: int = 6
     refined: int = 40
     kept: int = 3
+    freed: int = 8
     min_positive: float = 0.95
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
     search: CheiralitySearch | None = field(default_factory=CheiralitySearch)
 
+    @guarded
     def calibrate(
         self,
         reconstruction: Reconstruction,
@@ -63,9 +78,23 @@ class HypothesesAndRefinement:
         theta = np.concatenate([planes[best], log_f[best]], axis=1)
         theta, cost = refine_hypotheses(self.criterion, frame, theta)
         answers = answers_from_theta(frame, theta, cost, "hypotheses and refinement")
+        unknown = unknown_intrinsics(frame, assumed)
+        if unknown.loosest > LOOSE:
+            answers = self._with_all_intrinsics(frame, unknown, answers)
         return conclude(
             frame, reconstruction, self.criterion, answers, kept=self.kept, min_positive=self.min_positive
         )
+
+    def _with_all_intrinsics(
+        self, frame: ReferenceFrame, unknown: UnknownIntrinsics, answers: Sequence[Answer]
+    ) -> list[Answer]:
+        """The best distinct answers under the nonlinear quadric, over all that the assumptions leave open."""
+        found: list[Answer] = []
+        for answer in distinct_answers(frame, answers, self.freed):
+            log_f = answer.log_focals(frame)[frame.group]
+            best = minimize_quadric(frame, unknown, answer.plane, log_f, loss_scale=self.criterion.scale)
+            found.append(Answer(best.plane, best.K, best.cost, "hypotheses and nonlinear quadric"))
+        return found
 
     def _propose(
         self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
@@ -87,4 +116,3 @@ class HypothesesAndRefinement:
         f = np.concatenate([part[1] for part in found])
         good = np.isfinite(p).all(axis=1) & np.isfinite(f)
         return p[good], focals_of_groups(frame, p[good], f[good])
-

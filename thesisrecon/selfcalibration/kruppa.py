@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
-from thesisrecon.selfcalibration.conclusion import Answer, conclude, require_cameras, square_calibrations
+from thesisrecon.selfcalibration.conclusion import (
+    Answer,
+    conclude,
+    guarded,
+    require_cameras,
+    square_calibrations,
+)
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
 from thesisrecon.selfcalibration.frame import assumed_frame
 from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
@@ -120,6 +126,7 @@ class KruppaEquations:
     own_matches: bool = False
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
+    @guarded
     def calibrate(
         self,
         reconstruction: Reconstruction,

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
-from thesisrecon.selfcalibration.conclusion import Answer, conclude, focals_of_groups, require_cameras
+from thesisrecon.selfcalibration.conclusion import (
+    Answer,
+    conclude,
+    focals_of_groups,
+    guarded,
+    require_cameras,
+)
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
 from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
@@ -119,6 +125,7 @@ class NonlinearQuadric:
     loss_scale: float = 0.05
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
+    @guarded
     def calibrate(
         self,
         reconstruction: Reconstruction,
@@ -133,9 +140,10 @@ class NonlinearQuadric:
         unknown = unknown_intrinsics(frame, assumed)
         p, f = quadric_hypotheses(frame, np.geomspace(*self.focal_range, self.focal_steps))
         log_f = focals_of_groups(frame, p, f)
-        best = np.argsort(self.criterion.cost(frame, p, log_f), kind="stable")[: self.starts]
+        cost = self.criterion.cost(frame, p, log_f)
+        best = np.argsort(cost, kind="stable")[: self.starts]
         answers = []
-        for b in best:
+        for b in best[np.isfinite(cost[best])]:
             found = minimize_quadric(frame, unknown, p[b], log_f[b][frame.group], loss_scale=self.loss_scale)
             answers.append(Answer(found.plane, found.K, found.cost, "nonlinear quadric"))
         return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)

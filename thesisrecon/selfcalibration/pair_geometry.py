@@ -52,10 +52,14 @@ def camera_pairs(
             both = np.isfinite(xy[i, :, 0]) & np.isfinite(xy[j, :, 0])
             if both.sum() < max(min_common, 8):
                 continue
-            F, covariance = fit_fundamental(
-                fundamental_from_cameras(P[i], P[j]), xy[i, both], xy[j, both], iterations=5 if refine else 0
-            )
-            found.append((i, j, F, covariance))
+            try:
+                start = fundamental_from_cameras(P[i], P[j])
+            except ValueError:
+                # One centre: no epipolar geometry.
+                continue
+            F, covariance = fit_fundamental(start, xy[i, both], xy[j, both], iterations=5 if refine else 0)
+            if np.isfinite(F).all() and np.isfinite(covariance).all():
+                found.append((i, j, F, covariance))
     columns = list(zip(*found, strict=True)) if found else [(), (), np.zeros((0, 3, 3)), np.zeros((0, 9, 9))]
     return PairGeometry(
         np.array(columns[0], dtype=np.int64), np.array(columns[1], dtype=np.int64), np.array(columns[2]),

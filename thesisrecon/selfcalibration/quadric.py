@@ -17,6 +17,7 @@ from thesisrecon.selfcalibration.conclusion import (
     answers_from_theta,
     conclude,
     focals_of_groups,
+    guarded,
     require_cameras,
 )
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
@@ -114,6 +115,7 @@ class LinearQuadric:
     normalising_focal: float = 1.67
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
+    @guarded
     def calibrate(
         self,
         reconstruction: Reconstruction,
@@ -143,6 +145,7 @@ class ScannedQuadric:
     repeats: int = 30
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
+    @guarded
     def calibrate(
         self,
         reconstruction: Reconstruction,

@@ -1,0 +1,220 @@
+"""Each direct method alone: exact on exact cameras, steady under noise, and what each refuses."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from thesisrecon.errors import StageFailure
+from thesisrecon.optimize.projective_bundle import refine_projective_bundle
+from thesisrecon.selfcalibration import (
+    FocalScan,
+    FocalsFromFundamental,
+    KruppaEquations,
+    LinearQuadric,
+    NonlinearQuadric,
+    RotationCriterion,
+    ScannedQuadric,
+)
+from thesisrecon.selfcalibration.focal_scan import calibrations_of, scan_cost
+from thesisrecon.selfcalibration.frame import assumed_frame
+from thesisrecon.selfcalibration.quadric import linear_quadric, rank_three
+from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
+
+FREE = RotationCriterion(focal_weight=0.0)
+EXACT = [
+    ScannedQuadric(criterion=FREE),
+    NonlinearQuadric(criterion=FREE),
+    KruppaEquations(criterion=FREE),
+    FocalsFromFundamental(criterion=FREE, min_principal_std=1e-9),
+    FocalScan(criterion=FREE),
+]
+ALONE = [LinearQuadric(), *EXACT]
+
+
+def name(method: object) -> str:
+    return type(method).__name__
+
+
+def assume(
+    scene: TrueScene, *, shared: bool = True, stds: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> Assumptions:
+    """The focal unknown, common or of each view; deviations of aspect, skew (px) and principal point (px),
+    0 = known to be 1, 0 and the middle of the image."""
+    n = len(scene.P)
+    own, common = np.arange(n), np.zeros(n, dtype=np.int64)
+    columns = [common if shared else own, *[common] * 5]
+    middle = (scene.sizes - 1) / 2.0
+    mean = np.column_stack([np.full(n, np.nan), np.ones(n), np.zeros(n), middle, np.zeros(n)])
+    std = np.tile([np.inf, stds[0], stds[1], stds[2], stds[2], 0.05], (n, 1))
+    return Assumptions(np.stack(columns, axis=1), mean, std, common)
+
+
+def calibrate(method: object, scene: TrueScene, assumed: Assumptions, *, seed: int = 0) -> SelfCalibration:
+    reconstruction = adjusted(scene, seed)
+    return method.calibrate(  # type: ignore[attr-defined]
+        reconstruction, assumed=assumed, rng=np.random.default_rng(seed)
+    )
+
+
+def adjusted(scene: TrueScene, seed: int) -> Reconstruction:
+    """The projective bundle adjustment of the scene's observations, in a random frame."""
+    rec, t = projective_reconstruction(scene, seed=seed), scene.tracks
+    fitted = refine_projective_bundle(rec.P, rec.X, t.view_index, t.point_index, t.xy, max_iterations=30)
+    return replace(rec, P=fitted.P, X=fitted.X)
+
+
+def focal_error(answer: SelfCalibration, scene: TrueScene) -> float:
+    return float(np.abs(answer.K[:, 0, 0] / scene.K[:, 0, 0] - 1.0).max())
+
+
+@pytest.mark.parametrize("method", EXACT, ids=name)
+@pytest.mark.parametrize("zoom", [0.0, 0.3])
+def test_exact_cameras_give_the_exact_focals(method: object, zoom: float) -> None:
+    scene = make_scene(zoom=zoom, seed=1)
+    reconstruction = projective_reconstruction(scene, seed=1)
+    answer = method.calibrate(  # type: ignore[attr-defined]
+        reconstruction, assumed=assume(scene, shared=zoom == 0.0), rng=np.random.default_rng(0)
+    )
+    np.testing.assert_allclose(answer.K, scene.K, rtol=1e-8, atol=1e-5)
+    assert answer.identifiable
+
+
+@pytest.mark.parametrize("method", EXACT, ids=name)
+@pytest.mark.parametrize("focal", [400.0, 15000.0])
+def test_wide_and_long_lenses_are_found_without_being_told(method: object, focal: float) -> None:
+    scene = at_distance(make_scene(seed=3), focal)
+    reconstruction = projective_reconstruction(scene, seed=3)
+    answer = method.calibrate(  # type: ignore[attr-defined]
+        reconstruction, assumed=assume(scene), rng=np.random.default_rng(0)
+    )
+    assert focal_error(answer, scene) < 1e-5
+
+
+def at_distance(scene: TrueScene, focal: float) -> TrueScene:
+    """The same views through another lens: the image the same size, the scene's depth that of a longer or
+    shorter one."""
+    K = scene.K.copy()
+    K[:, 0, 0] = K[:, 1, 1] = focal
+    t = scene.t.copy()
+    t[:, 2] *= focal / 1500.0
+    return replace(scene, K=K, t=t, tracks=reprojected(replace(scene, K=K, t=t)))
+
+
+def reprojected(scene: TrueScene):  # type: ignore[no-untyped-def]
+    tracks = scene.tracks
+    x = np.einsum("kab,kb->ka", scene.R[tracks.view_index], scene.X[tracks.point_index])
+    x += scene.t[tracks.view_index]
+    pixel = np.einsum("kab,kb->ka", scene.K[tracks.view_index], x)
+    return replace(tracks, xy=pixel[:, :2] / pixel[:, 2:])
+
+
+@pytest.mark.parametrize(
+    "method", [NonlinearQuadric(criterion=FREE), KruppaEquations(criterion=FREE)], ids=name
+)
+def test_all_intrinsics_of_a_constant_camera_are_found(method: object) -> None:
+    scene = make_scene(seed=2)
+    K = np.array([[1500.0, 12.0, 790.0], [0.0, 1620.0, 480.0], [0.0, 0.0, 1.0]])
+    scene = replace(scene, K=np.tile(K, (len(scene.P), 1, 1)))
+    scene = replace(scene, tracks=reprojected(scene))
+    reconstruction = projective_reconstruction(scene, seed=2)
+    free = assume(scene, stds=(np.inf, np.inf, np.inf))
+    answer = method.calibrate(reconstruction, assumed=free, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
+    np.testing.assert_allclose(answer.K[0], K, rtol=1e-7, atol=1e-4)
+
+
+def test_a_known_aspect_and_principal_point_are_normalised_away() -> None:
+    scene = make_scene(seed=4, principal_shift=(150.0, -90.0))
+    K = scene.K.copy()
+    K[:, 1, 1] *= 1.2
+    scene = replace(scene, K=K)
+    scene = replace(scene, tracks=reprojected(scene))
+    told = assume(scene)
+    told.mean[:, 1], told.mean[:, 3:5] = 1.2, scene.K[0, :2, 2]
+    for method in EXACT:
+        answer = method.calibrate(
+            projective_reconstruction(scene, seed=4), assumed=told, rng=np.random.default_rng(0)
+        )
+        np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ALONE, ids=name)
+def test_noise_of_a_pixel_leaves_the_focal_within_a_few_percent(method: object) -> None:
+    bound = 0.2 if isinstance(method, LinearQuadric) else 0.03
+    errors = []
+    for seed in range(3):
+        scene = make_scene(sigma_px=1.0, seed=seed)
+        errors.append(focal_error(calibrate(method, scene, assume(scene), seed=seed), scene))
+    assert np.median(errors) < bound
+
+
+@pytest.mark.parametrize("method", ALONE, ids=name)
+def test_two_cameras_and_nonsense_are_refused_with_a_reason(method: object) -> None:
+    scene = make_scene()
+    reconstruction = projective_reconstruction(scene)
+    two = np.arange(len(scene.P)) < 2
+    rng = np.random.default_rng(0)
+    with pytest.raises(StageFailure, match="at least 3"):
+        method.calibrate(replace(reconstruction, registered=two), assumed=assume(scene), rng=rng)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("method", ALONE, ids=name)
+@settings(max_examples=6, derandomize=True, deadline=None)
+@given(seed=st.integers(0, 10_000), kind=st.sampled_from(["random", "still", "same", "flat"]))
+def test_no_input_escapes_as_an_error_of_a_solver(method: object, seed: int, kind: str) -> None:
+    scene = make_scene(views=4, points=40, seed=seed % 50)
+    reconstruction = projective_reconstruction(scene, seed=seed)
+    rng = np.random.default_rng(seed)
+    P = reconstruction.P.copy()
+    if kind == "random":
+        P = rng.normal(size=P.shape)
+    elif kind == "still":
+        P[:, :, :3] = P[0, :, :3]
+    elif kind == "same":
+        P[:] = P[0]
+    else:
+        P[:, 2] = P[:, 1]
+    with contextlib.suppress(StageFailure):
+        answer = method.calibrate(  # type: ignore[attr-defined]
+            replace(reconstruction, P=P), assumed=assume(scene), rng=rng
+        )
+        assert np.isfinite(answer.K).all()
+
+
+def test_the_linear_quadric_is_the_true_one_at_the_true_normalising_focal() -> None:
+    scene = make_scene(seed=6)
+    frame = assumed_frame(projective_reconstruction(scene, seed=6), assume(scene))
+    Q, null = rank_three(linear_quadric(frame, np.array([scene.K[0, 0, 0] / 1536.0])))
+    assert np.sort(np.abs(np.linalg.eigvalsh(Q[0])))[0] < 1e-12
+    np.testing.assert_allclose(Q[0] @ null[0], 0.0, atol=1e-12)
+    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
+    w = P @ Q[0] @ P.swapaxes(1, 2)
+    w /= w[:, 2:, 2:]
+    f2 = (scene.K[0, 0, 0] / 1536.0) ** 2
+    np.testing.assert_allclose(w, np.tile(np.diag([f2, f2, 1.0]), (len(w), 1, 1)), atol=1e-9)
+
+
+@settings(max_examples=25, derandomize=True, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_calibrations_by_the_scan_are_those_of_the_triangular_factor(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = make_scene(views=4, seed=seed % 20)
+    frame = assumed_frame(projective_reconstruction(scene, seed=seed), assume(scene))
+    p, f = rng.normal(size=(3, 3)), rng.uniform(0.3, 3.0, 3)
+    K = calibrations_of(frame, p, f)
+    C = (
+        (frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :])
+        * np.array([1.0, 1.0, 0.0])[None, None, None]
+        * f[:, None, None, None]
+    )
+    C[..., 2] = (frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :])[..., 2]
+    w = C @ C.swapaxes(-1, -2)
+    ours = K @ K.swapaxes(-1, -2)
+    np.testing.assert_allclose(ours, w / w[..., 2:, 2:], rtol=1e-6, atol=1e-8 * np.abs(ours).max())
+    assert (scan_cost(K) >= 0.0).all()
