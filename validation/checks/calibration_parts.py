@@ -67,7 +67,7 @@ def check_subsets(title: str, matched: Matched, K: F64, cameras: Cameras) -> lis
             continue
         assert result.reconstruction.K is not None
         errors.append(float(np.nanmax(focal_errors_pct(result.reconstruction.K, K[views]))))
-        scores.append(_one_camera(interval_scores(result, K[views]), cameras))
+        scores.append(one_camera(interval_scores(result, K[views]), cameras))
     rows = _Rows(title)
     rows.add(f"trusted of {SUBSETS}", float(len(scores)))
     if not scores:
@@ -103,7 +103,7 @@ def draw_subset(matched: Matched, rng: np.random.Generator) -> tuple[Matched, I6
     return take_views(matched, views, rng.random(matched.tracks.n_points) < KEPT_TRACKS), views
 
 
-def _one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
+def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
     """A value that all views share is one value, not as many as there are views."""
     if cameras == "per-image":
         return scores
