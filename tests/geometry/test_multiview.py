@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from tests.epipolar.pairs import angle_between, make_pair
 from thesisrecon.geometry.camera import camera_centre, project
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
 from thesisrecon.geometry.multiview import (
     algebraic_residuals,
     canonical_cameras,
@@ -20,6 +21,7 @@ from thesisrecon.geometry.multiview import (
     estimate_homography,
     fundamental_from_cameras,
     homography_residuals,
+    rotation_planes,
     sampson_residuals,
     symmetric_residuals,
     unit_norm,
@@ -67,9 +69,40 @@ def test_default_plane_keeps_the_second_camera_away_from_singular():
         s = np.diag([1e-3, 1e-3, 1.0])
         F = unit_norm(np.linalg.inv(s).T @ make_pair(8, rng).F @ np.linalg.inv(s))
         _, P2 = canonical_cameras(F)
-        assert np.linalg.cond(P2[:, :3]) < 100.0
+        singular_values = np.linalg.svd(F, compute_uv=False)
+        assert np.linalg.cond(P2[:, :3]) == pytest.approx(singular_values[0] / singular_values[1])
         _, singular = canonical_cameras(F, plane=np.zeros(3))
         assert np.linalg.cond(singular[:, :3]) > 1e8
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(seeds, st.sampled_from([0.0, 1e-3]))
+def test_3_42_the_default_planes_are_the_true_one_and_its_twisted_twin_where_calibration_is_the_identity(
+    seed, noise
+):
+    rng = np.random.default_rng(seed)
+    R = Rotation.random(random_state=rng).as_matrix()
+    t = rng.normal(size=3)
+    F = cross_matrix(t / np.linalg.norm(t)) @ R + noise * rng.normal(size=(3, 3))
+    F = enforce_rank_two(rng.choice([-3.0, 0.2]) * F)
+    found = []
+    for plane in rotation_planes(F):
+        A = canonical_cameras(F, plane=plane)[1][:, :3]
+        found.append(A * np.sign(np.linalg.det(A)) / np.cbrt(abs(np.linalg.det(A))))
+    near = min(np.linalg.norm(A - R) for A in found)
+    assert near < 1e-9 + 30.0 * noise
+    assert np.trace(found[0]) >= np.trace(found[1])
+    # No other plane gives a left part nearer to a multiple of a rotation.
+    residual = [
+        _distance_from_rotations(F, rotation_planes(F)[0] + d) for d in 0.05 * rng.normal(size=(20, 3))
+    ]
+    assert _distance_from_rotations(F, rotation_planes(F)[0]) <= min(residual) + 1e-12
+
+
+def _distance_from_rotations(F: np.ndarray, plane: np.ndarray) -> float:
+    """Frobenius distance of the left part from the nearest multiple of an orthogonal matrix."""
+    s = np.linalg.svd(canonical_cameras(F, plane=plane)[1][:, :3], compute_uv=False)
+    return float(np.linalg.norm(s - s.mean()))
 
 
 def test_cameras_with_one_centre_have_no_fundamental_matrix():

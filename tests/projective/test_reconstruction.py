@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.synthetic import TrueScene, make_scene, true_pairs
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import project
+from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.projective import Factorization, GatedIncremental, SequentialProjective
 from thesisrecon.projective.gate import predicted_spread_px
@@ -123,7 +125,28 @@ def test_initial_cameras_have_the_fundamental_matrix_they_came_from() -> None:
     F = cross @ M
     F /= np.linalg.norm(F) * np.sign(np.sum(F * pair.F))
     np.testing.assert_allclose(F, pair.F, atol=1e-9)
-    assert np.linalg.cond(M) < 1e5
+    # In unit-free pixels the left part is near a rotation.
+    T1, T2 = pixel_from_unit(scene.sizes[:2])
+    assert np.linalg.cond(np.linalg.inv(T2) @ M @ T1) < 3.0
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 90.0, 180.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_initial_cameras_put_infinity_beyond_the_scene_however_the_camera_is_held(roll_deg, seed) -> None:
+    scene = make_scene(seed=seed, sigma_px=1.0)
+    roll = Rotation.from_euler("z", roll_deg, degrees=True).as_matrix()
+    pair = true_pairs(scene)[0]
+    # The second photograph held otherwise: turned about the middle of the picture, and F with it.
+    middle = (scene.sizes[1] - 1) / 2.0
+    turn = np.eye(3)
+    turn[:2, :2], turn[:2, 2] = roll[:2, :2], middle - roll[:2, :2] @ middle
+    held = replace(pair, xy2=pair.xy2 @ turn[:2, :2].T + turn[:2, 2], F=np.linalg.inv(turn).T @ pair.F)
+    P = np.stack(initial_cameras(held, scene.sizes[:2]))
+    X = triangulate_linear(P, np.stack([held.xy1, held.xy2]))
+    beyond = np.sign(X[:, 3] * (X @ P[0, 2]))
+    assert abs(beyond.mean()) > 0.97
+    T1, T2 = pixel_from_unit(scene.sizes[:2])
+    assert np.linalg.cond(np.linalg.inv(T2) @ P[1, :, :3] @ np.linalg.inv(P[0, :, :3]) @ T1) < 3.0
 
 
 def test_a_planar_pair_is_not_the_first_choice() -> None:

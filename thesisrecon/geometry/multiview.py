@@ -155,25 +155,36 @@ def homography_distances(H: F64, xy1: F64, xy2: F64) -> F64:
     return np.stack([first, (c[:, 1] - l21 * first) / l22], axis=1)
 
 
+def rotation_planes(F: F64) -> F64:
+    """The two v (2, 3) for which the left part of :func:`canonical_cameras` comes nearest to a rotation.
+
+    With the singular values s1 >= s2 of F and unit epipoles, v = +-(s1 + s2) / 2 e1 makes -[e2]x F + e2 v'
+    have the singular values s1, (s1 + s2) / 2, s2: the nearest multiple of a rotation that any v gives (least
+    squares). In pixels that make the calibration near the identity, the plane v plays infinity well, so that
+    the frame is near a metric one (quasi-Euclidean; Beardsley, Zisserman and Murray, IJCV 23, 1997). The two
+    differ by half a turn about the baseline, as the two rotations of an essential matrix do; the one that
+    turns less comes first, and only matches can tell.
+    """
+    F = unit_norm(F)
+    e1, e2 = epipoles(F)
+    M = -cross_matrix(e2) @ F
+    v = 0.5 * np.linalg.svd(F, compute_uv=False)[:2].sum() * e1
+    turned = float(np.trace(M) * np.linalg.det(M + np.outer(e2, v)))
+    return np.stack([v, -v]) if turned >= 0.0 else np.stack([-v, v])
+
+
 def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -> tuple[F64, F64]:
     """P1 = [I 0], P2 = [-[e2]x F + e2 v'  scale e2] (3.42): two cameras of a projective frame that have F.
 
     ``plane`` v (3,) are the free coordinates of the plane that plays the part of infinity. With v = 0 the
-    left part of P2 is singular; without a plane v is chosen such that it is the nearest to a multiple of the
-    identity (least squares). ``scale`` is the last of the four free parameters and must not be 0.
+    left part of P2 is singular; without a plane v is the first of :func:`rotation_planes`, for which its
+    condition number is s1 / s2, the ratio of the singular values of F. ``scale`` is the last of the four free
+    parameters and must not be 0.
     """
     if scale == 0.0 or not np.isfinite(scale):
         raise ValueError(f"canonical_cameras needs a finite scale other than 0; got {scale}")
     F = unit_norm(F)
     _, e2 = epipoles(F)
-    M = -cross_matrix(e2) @ F
-    if plane is None:
-        # |M + e2 v' - m I| is least for v = m e2 - M'e2 (the row along e2 matched exactly) and m = trace(M) /
-        # 2, the other two rows' mean diagonal; a trace near 0 would leave M nearly singular, so m keeps to
-        # M's size.
-        m = float(np.trace(M)) / 2.0
-        size = float(np.linalg.norm(M)) / np.sqrt(2.0)
-        m = m if abs(m) > 0.1 * size else size
-        plane = m * e2 - M.T @ e2
-    P2 = np.hstack([M + np.outer(e2, plane), scale * e2[:, None]])
+    plane = rotation_planes(F)[0] if plane is None else plane
+    P2 = np.hstack([-cross_matrix(e2) @ F + np.outer(e2, plane), scale * e2[:, None]])
     return np.hstack([np.eye(3), np.zeros((3, 1))]), P2

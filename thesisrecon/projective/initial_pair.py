@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
-from thesisrecon.geometry.multiview import canonical_cameras
+from thesisrecon.geometry.multiview import canonical_cameras, rotation_planes
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.types import I64, Tracks, TwoView
 
@@ -84,12 +84,21 @@ def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:
     """Initial cameras (3.42), P1 = [I | 0] and P2 = [[e]x F + e pi' | e], in pixels.
 
     ``sizes`` (2, 2) width and height of the two images. The plane pi is chosen in unit-free pixels, such that
-    the left part of P2 comes near a multiple of the identity: a pair of similar photographs then starts near
-    a metric frame. The sign of P2 is the one that puts most of the pair's matches in front of both cameras.
+    the left part of P2 comes near a rotation: the frame is then near a metric one, whose focal length is the
+    long side. Of the two such planes the one is taken that fewer of the pair's points lie beyond, and the
+    sign of P2 that puts most of them in front of both cameras.
     """
     T1, T2 = pixel_from_unit(sizes)
-    P1, P2 = canonical_cameras(T2.T @ pair.F @ T1)
-    P = np.stack([T1 @ P1, T2 @ P2])
-    X = triangulate_linear(P, np.stack([pair.xy1, pair.xy2]))
-    same_side = np.sum(np.sign(X @ P[0, 2]) * np.sign(X @ P[1, 2]))
-    return P[0], P[1] if same_side >= 0 else -P[1]
+    F = T2.T @ pair.F @ T1
+    best, most = None, -1.0
+    for plane in rotation_planes(F):
+        P1, P2 = canonical_cameras(F, plane=plane)
+        P = np.stack([T1 @ P1, T2 @ P2])
+        X = triangulate_linear(P, np.stack([pair.xy1, pair.xy2]))
+        first, second = np.sign(X @ P[0, 2]), np.sign(X @ P[1, 2])
+        side = 1.0 if np.sum(first * second) >= 0 else -1.0
+        here = abs(float(np.sum(first * np.sign(X[:, 3]))))
+        if here > most:
+            best, most = (P[0], side * P[1]), here
+    assert best is not None
+    return best
