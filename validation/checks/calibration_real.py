@@ -20,32 +20,30 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline import reconstruct
 from thesisrecon.selfcalibration import HypothesesAndRefinement
-from thesisrecon.types import Reconstruction, RunResult
-from validation.checks.calibration_parts import MODES, Cameras, check_parts
-from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS
-from validation.metrics.cameras import CameraErrors, TrueCameras, measure_cameras
-from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
+from thesisrecon.types import Reconstruction
+from validation.checks.calibration_bench import Bench, Config, Rows, model_of, truth_of
+from validation.checks.calibration_parts import LEAST_HOLDING, MODES, check_parts
+from validation.checks.calibration_wide import check_against_shared, check_wide
+from validation.checks.reconstruction import COLMAP, OURS
+from validation.metrics.intervals import interval_scores, join_scores
 from validation.metrics.record import Metric, markdown_table
-from validation.references.pycolmap_reference import Start, map_with_pycolmap, match_with_pycolmap, read_run
-from validation.scenes.real import Scene, load_real_scene
+from validation.references.pycolmap_reference import Start
+from validation.scenes.real import REAL_SCENES, load_real_scene
 from validation.scenes.zoomed import central_scene, rezoom_scene
 
 TRUE_K = "COLMAP, true K"
-PARTS = ("cameras", "guesses", "centre", "zoom", "parts")
-Config = Callable[[PipelineConfig], PipelineConfig]
+PARTS = ("cameras", "guesses", "centre", "zoom", "wide", "parts")
 
 
 @dataclass(frozen=True)
 class Targets:
     """Of one set: focal %, principal point px, centres mm, rotations deg, with one camera for all."""
 
-    focal_pct: float
-    principal_point_px: float
-    centre_mm: float
-    rotation_deg: float
+    focal_pct: float | None = None
+    principal_point_px: float | None = None
+    centre_mm: float | None = None
+    rotation_deg: float | None = None
 
 
 TARGETS = {
@@ -55,179 +53,25 @@ TARGETS = {
 PER_IMAGE_MEDIAN_PCT, PER_IMAGE_WORST_PCT = 0.2, 0.5
 ZOOM_MEDIAN_PCT, ZOOM_WORST_PCT = 0.5, 3.0
 GUESS_CHANGE_PCT = 0.02
-LEAST_HOLDING = 0.92
-"""Of the 95 % intervals: what chance leaves a study of a hundred of them."""
-
-
-def truth_of(scene: Scene) -> TrueCameras:
-    """The true cameras of a scene that has them."""
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
-    return TrueCameras(scene.K, scene.R, scene.C)
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Where the runs of one scene are kept, and how they are made."""
-
-    scene: Scene
-    out: Path
-    threads: int = 2
-    seed: int = 0
-
-    def ours(self, cameras: Cameras, change: Config | None = None) -> RunResult | None:
-        """A run of ours; the photographs are matched once for all of them. None where it fails."""
-        config = PipelineConfig()
-        config = replace(config, intrinsics=replace(config.intrinsics, cameras=cameras))
-        config = config if change is None else change(config)
-        images = list(self.scene.image_paths)
-        try:
-            return reconstruct(
-                images, self.out / "ours", config=config, seed=self.seed, threads=self.threads, overwrite=True
-            )
-        except StageFailure as failure:
-            print(f"{self.scene.name}: {cameras}: {failure}", flush=True)
-            return None
-
-    def colmap(self, cameras: Cameras, name: str, start: Start) -> Reconstruction | None:
-        """A run of COLMAP, read where it is there already. None where it fails."""
-        images, place = self.scene.image_paths[0].parent, self.out / f"colmap-{cameras}"
-        try:
-            if (place / name / "sparse" / "0").is_dir():
-                return read_run(images, place / name).reconstruction
-            if not (place / "matched" / "seconds.json").is_file():
-                match_with_pycolmap(
-                    images, place / "matched", shared_camera=cameras == "shared", threads=self.threads
-                )
-            run = map_with_pycolmap(
-                images, place / "matched", place / name, start=start, threads=self.threads
-            )
-        except StageFailure as failure:
-            print(f"{self.scene.name}: COLMAP, {name}: {failure}", flush=True)
-            return None
-        return run.reconstruction
-
-    def methods(self, cameras: Cameras) -> tuple[RunResult | None, dict[str, Reconstruction | None]]:
-        """Ours and COLMAP's models in this mode, COLMAP also with its principal point refined."""
-        run = self.ours(cameras)
-        models = {OURS: model_of(run), COLMAP: self.colmap(cameras, "default", Start())}
-        models[COLMAP_PP] = self.colmap(cameras, "principal-point", Start(refine_principal_point=True))
-        return run, models
-
-    def colmap_true(self) -> Reconstruction | None:
-        """COLMAP with the true calibration."""
-        assert self.scene.K is not None
-        K = {path.name: K for path, K in zip(self.scene.image_paths, self.scene.K, strict=True)}
-        return self.colmap("per-image", "true-K", Start(K=K))
-
-
-def model_of(run: RunResult | None) -> Reconstruction | None:
-    """The metric model of a run; None without one."""
-    return None if run is None or run.metric is None else run.metric.reconstruction
-
-
-class Rows:
-    """Rows of one table: the same quantities of several methods."""
-
-    def __init__(self, title: str, scene: Scene, models: Mapping[str, Reconstruction | None]) -> None:
-        self.title, self.models, self.metrics = title, models, list[Metric]()
-        truth = truth_of(scene)
-        self.K, self.total = truth.K, len(truth.K)
-        self.errors = {m: None if r is None else measure_cameras(r, truth) for m, r in models.items()}
-
-    def add(
-        self, name: str, unit: str, values: Mapping[str, float | None], target: float | None = None
-    ) -> None:
-        """A row, at most ``target``."""
-        self.metrics.append(Metric(self.title, name, unit, values, OURS, target))
-
-    def registered(self) -> None:
-        """Cameras of all."""
-        values = {m: 0.0 if r is None else float(r.registered.sum()) for m, r in self.models.items()}
-        name = f"cameras registered of {self.total}"
-        self.metrics.append(Metric(self.title, name, "", values, OURS, float(self.total), at_most=False))
-
-    def error(
-        self,
-        name: str,
-        unit: str,
-        read: Callable[[CameraErrors], float | None],
-        target: float | None = None,
-    ) -> None:
-        """A row of one of the errors of the cameras."""
-        self.add(name, unit, {m: None if e is None else read(e) for m, e in self.errors.items()}, target)
-
-    def focals(self, median: float | None = None, worst: float | None = None) -> None:
-        """Median and worst focal error of the views."""
-        errors = {m: self._focals(r) for m, r in self.models.items()}
-        self.add("focal error, median", "%", {m: _of(np.median, e) for m, e in errors.items()}, median)
-        self.add("focal error, worst", "%", {m: _of(np.max, e) for m, e in errors.items()}, worst)
-
-    def _focals(self, model: Reconstruction | None) -> np.ndarray | None:
-        if model is None or model.K is None or not model.registered.any():
-            return None
-        return focal_errors_pct(model.K, self.K)[model.registered]
-
-    def poses(self, targets: Targets | None = None) -> None:
-        """Centres and rotations."""
-        t = targets
-        self.error("camera centres, mean", "mm", _centre_mm, None if t is None else t.centre_mm)
-        self.error(
-            "camera rotations, median",
-            "deg",
-            lambda e: e.rotation_error_deg,
-            None if t is None else t.rotation_deg,
-        )
-
-    def intervals(self, run: RunResult | None, least: float | None = LEAST_HOLDING) -> None:
-        """What the 95 % intervals of focal and principal point hold, and how wide they are."""
-        if run is None or run.metric is None:
-            return
-        scores = interval_scores(run.metric, self.K)
-        for name, columns in (("focal", (0,)), ("principal point", (1, 2))):
-            held = {OURS: scores.holding(columns)}
-            row = f"95 % intervals of the {name} that hold the truth"
-            self.metrics.append(Metric(self.title, row, "", held, OURS, least, at_most=False))
-            self.add(f"largest deviation, {name}", "stated sigmas", {OURS: scores.worst(columns)})
-        width = 100.0 * scores.std_rel
-        self.add("stated sigma of the focal, median", "%", {OURS: float(np.nanmedian(width))})
-        self.add("trusted by the self-check", "", {OURS: float(run.metric.trusted)})
-
-
-def _of(reduce: Callable[[np.ndarray], float], values: np.ndarray | None) -> float | None:
-    return None if values is None or not len(values) else float(reduce(values))
-
-
-def _centre_mm(errors: CameraErrors) -> float | None:
-    return None if errors.centre_error is None else 1000.0 * errors.centre_error
-
-
 # ---------------------------------------------------------------- the set as it is
 
 
 def check_cameras(bench: Bench) -> list[list[Metric]]:
     """One camera for all photographs, and one for each."""
-    targets = TARGETS.get(bench.scene.name)
     tables = []
     for cameras in MODES:
         run, models = bench.methods(cameras)
         rows = Rows(f"{bench.scene.name}, {cameras}", bench.scene, {**models, TRUE_K: bench.colmap_true()})
         rows.registered()
-        shared = targets if cameras == "shared" else None
+        target = TARGETS[bench.scene.name] if cameras == "shared" else Targets()
         if cameras == "shared":
-            rows.error(
-                "focal error", "%", lambda e: e.focal_error_pct, None if shared is None else shared.focal_pct
-            )
+            rows.error("focal error", "%", lambda e: e.focal_error_pct, target.focal_pct)
         else:
             rows.focals(PER_IMAGE_MEDIAN_PCT, PER_IMAGE_WORST_PCT)
         rows.error(
-            "principal point error",
-            "px",
-            lambda e: e.principal_point_error_px,
-            None if shared is None else shared.principal_point_px,
+            "principal point error", "px", lambda e: e.principal_point_error_px, target.principal_point_px
         )
-        rows.poses(shared)
+        rows.poses(target.centre_mm, target.rotation_deg)
         # A value that all views share is one value: it is in its interval or not.
         rows.intervals(run, 1.0 if cameras == "shared" else LEAST_HOLDING)
         tables.append(rows.metrics)
@@ -336,7 +180,7 @@ def check_zoom(bench: Bench, seeds: Sequence[int]) -> list[list[Metric]]:
         rows.intervals(run)
         tables.append(rows.metrics)
         for method, model in models.items():
-            pooled.setdefault(method, []).append(_all_focals(rows, model))
+            pooled.setdefault(method, []).append(rows.all_focals(model))
         if run is not None and run.metric is not None:
             scores.append(interval_scores(run.metric, rows.K))
     tables.append(_pooled(f"{title}, all seeds", pooled))
@@ -347,12 +191,6 @@ def check_zoom(bench: Bench, seeds: Sequence[int]) -> list[list[Metric]]:
             held = {OURS: joined.holding(columns)}
             tables[-1].append(Metric(title, row, "", held, OURS, LEAST_HOLDING, at_most=False))
     return tables
-
-
-def _all_focals(rows: Rows, model: Reconstruction | None) -> np.ndarray:
-    """Focal errors of all views, those that are not registered infinitely wrong."""
-    errors = None if model is None or model.K is None else focal_errors_pct(model.K, rows.K)
-    return np.full(rows.total, np.inf) if errors is None else np.nan_to_num(errors, nan=np.inf)
 
 
 def _pooled(title: str, pooled: Mapping[str, list[np.ndarray]]) -> list[Metric]:
@@ -388,9 +226,12 @@ def measure(bench: Bench, parts: Sequence[str], seeds: Sequence[int]) -> list[li
         "guesses": lambda: check_guesses(bench),
         "centre": lambda: check_centre(bench),
         "zoom": lambda: check_zoom(bench, seeds),
+        "wide": lambda: check_wide(bench),
         "parts": lambda: check_parts(bench.scene.name, bench.ours("shared"), truth_of(bench.scene)),
     }
     tables = []
+    if not bench.scene.has_truth:
+        checks, parts = {"against shared": lambda: check_against_shared(bench)}, ["against shared"]
     for part in parts:
         found = checks[part]()
         for rows in found:
@@ -403,7 +244,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Measure, write, and say whether every target was reached."""
     parser = argparse.ArgumentParser(prog="python -m validation.checks.calibration_real", description=__doc__)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--scenes", nargs="+", default=list(TARGETS), choices=list(TARGETS))
+    parser.add_argument("--scenes", nargs="+", default=list(REAL_SCENES), choices=list(REAL_SCENES))
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the zoomed sets")
     parser.add_argument("--threads", type=int, default=2)
