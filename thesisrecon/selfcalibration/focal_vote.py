@@ -7,6 +7,7 @@ named.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from thesisrecon.selfcalibration.conclusion import (
 from thesisrecon.selfcalibration.focal_from_fundamental import kruppa_chi_square, kruppa_whitening
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
+from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
 from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_residuals, require_pairs
 from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs
 from thesisrecon.selfcalibration.refinement import RotationCriterion
@@ -120,32 +122,57 @@ def _moments(grid: F64, posterior: F64) -> tuple[F64, F64]:
 
 
 def refine_focals(
-    pairs: PairGeometry, group: I64, start: FocalVote, prior: tuple[F64, F64], *, principal_std: float = 0.01
+    pairs: PairGeometry, unknown: UnknownIntrinsics, log_f: F64, *, principal_std: float = 1e-3
 ) -> tuple[F64, F64]:
-    """Log focals (G,) and their standard deviations from all pairs together, near the vote.
+    """Log focals (R,) of the cameras and their standard deviations from all pairs, near a start (R,).
 
-    Least squares of the Kruppa residuals, each whitened by its own covariance at the last answer. The loss
-    turns at three sigmas: first that of soft L1, which leads to the minimum from afar, then Cauchy's against
-    wrong pairs. ``prior`` (G,), (G,) means and standard deviations, all finite.
+    Least squares of the Kruppa residuals over all that is ``unknown``, each residual whitened by its own
+    covariance at the last answer. A principal point that all views share is one unknown: its error pulls all
+    pairs the same way, and no number of them averages it out. ``principal_std`` (long sides) is what may be
+    wrong with each view's by itself. The loss turns at three sigmas: first that of soft L1, which leads to
+    the minimum from afar, then Cauchy's against wrong pairs.
     """
-    x, share = start.log_f, independent_share(pairs)
-    covariance = np.diag(start.std**2)
-    for loss in ("soft_l1", "soft_l1", "cauchy", "cauchy"):
-        root = np.sqrt(share) * kruppa_whitening(pairs, x[group], principal_std=principal_std)
+    unknown = _with_weak_focals(unknown)
+    x, share = unknown.start(log_f[None])[0], independent_share(pairs)
+    covariance = np.zeros((len(x), len(x)))
+    for loss in ("soft_l1", "soft_l1", "cauchy", "cauchy") if len(x) else ():
+        whitening = kruppa_whitening(pairs, unknown.focals(x[None])[0], principal_std=principal_std)
+        root = np.sqrt(share) * whitening
 
-        def residuals(log_f: F64, root: F64 = root) -> F64:
-            w = dual_images(square_calibrations(log_f[group]))[None]
-            g = kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j])[0]
-            return np.concatenate([np.einsum("mab,mb->ma", root, g).ravel(), (log_f - prior[0]) / prior[1]])
+        def residuals(batch: F64, root: F64 = root) -> F64:
+            w = dual_images(unknown.calibrations(batch))
+            g = kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j])
+            white = np.einsum("mac,bmc->bma", root, g).reshape(len(batch), -1)
+            return np.concatenate([white, unknown.deviations(batch)], axis=1)
 
         found = minimize_residuals(
-            residuals, x, loss=loss, loss_scale=3.0 * np.sqrt(share), max_iterations=40
-        )
-        x = np.clip(found.x, start.log_f - 2.0, start.log_f + 2.0)
-        # The noise is known: undo the scale that the minimiser estimated from the residuals.
+            lambda y: residuals(y[None])[0], x, jacobian=lambda y: _central(residuals, y), loss=loss,
+            loss_scale=3.0 * np.sqrt(share), max_iterations=40,
+        )  # fmt: skip
+        x = found.x
+        # The noise is known: in place of the scale that the minimiser estimated stands 1, or what the pairs
+        # (two equations each) contradict each other more than their noise allows.
         variance = 2.0 * found.cost / max(len(found.residual) - len(x), 1)
-        covariance = found.covariance / max(variance, 1e-300)
-    return x, np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+        contradiction = 2.0 * found.cost / (share * max(2 * len(pairs.i) - len(x), 1))
+        covariance = found.covariance / max(variance, 1e-300) * max(contradiction, 1.0)
+    variances = np.append(np.maximum(covariance.diagonal(), 0.0), 0.0)
+    return unknown.focals(x[None])[0], np.sqrt(variances[unknown.place[:, 0]])
+
+
+def _with_weak_focals(unknown: UnknownIntrinsics) -> UnknownIntrinsics:
+    """The unknowns, what is told of no focal replaced by :func:`focal_prior`."""
+    focals = np.unique(unknown.place[:, 0])
+    focals = focals[focals >= 0]
+    mean, std = unknown.mean.copy(), unknown.std.copy()
+    mean[focals], std[focals] = focal_prior(
+        np.where(np.isfinite(std[focals]), mean[focals], np.nan), std[focals]
+    )
+    return replace(unknown, mean=mean, std=std)
+
+
+def _central(residuals: Callable[[F64], F64], x: F64) -> F64:
+    steps = np.diag(np.full(len(x), 1e-6))
+    return np.asarray(((residuals(x + steps) - residuals(x - steps)) / 2e-6).T)
 
 
 @dataclass(frozen=True)
@@ -180,13 +207,14 @@ class FocalsFromFundamental:
         pairs = camera_pairs(frame, reconstruction, min_common=self.min_common)
         require_pairs(pairs, self.min_common)
         log_f, std = self.focals(pairs, frame, assumed)
+        log_f = np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
         plane, cost = planes_for_focals(frame, self.criterion, log_f)
         answer = Answer(plane, square_calibrations(log_f[frame.group]), cost, "focals from F")
         found = conclude(frame, reconstruction, self.criterion, [answer], kept=1, min_positive=0.5)
         return self._with_own_deviations(found, frame, std)
 
     def focals(self, pairs: PairGeometry, frame: ReferenceFrame, assumed: Assumptions) -> tuple[F64, F64]:
-        """Log focals (G,) of the camera groups, unit-free, and their standard deviations."""
+        """Log focals (R,) of the cameras, unit-free, and their standard deviations."""
         several = frame.n_groups > 1
         grid = log_grid(self.focal_range, self.focal_steps // 4 if several else self.focal_steps)
         spread = np.median(assumed.std[frame.views, 3]) / frame.pixel_from_unit[frame.views[0], 0, 0]
@@ -197,15 +225,17 @@ class FocalsFromFundamental:
         )  # fmt: skip
         prior = focal_prior(*known)
         vote = vote_on_focals(pairs, frame.group, grid, principal_std=principal_std, prior=prior)
-        return refine_focals(pairs, frame.group, vote, prior, principal_std=principal_std)
+        unknown = unknown_intrinsics(frame, assumed)
+        start = vote.log_f[frame.group]
+        return refine_focals(pairs, unknown, start, principal_std=self.min_principal_std)
 
     def _with_own_deviations(
         self, found: SelfCalibration, frame: ReferenceFrame, std: F64
     ) -> SelfCalibration:
         K_std = np.zeros_like(found.K_std)
         for k in (0, 1):
-            K_std[frame.views, k, k] = found.K[frame.views, k, k] * std[frame.group]
-        open_views = frame.views[std[frame.group] > self.max_std]
+            K_std[frame.views, k, k] = found.K[frame.views, k, k] * std
+        open_views = frame.views[std > self.max_std]
         if not len(open_views):
             return replace(found, K_std=K_std)
         names = ", ".join(str(v) for v in open_views[:10])

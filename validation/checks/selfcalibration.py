@@ -277,8 +277,8 @@ def main() -> int:
     arguments = parser.parse_args()
     jobs = [
         (cell, tuple(arguments.methods), arguments.first + k, 1)
-        for cell in cells(arguments.scenes, arguments.modes, arguments.noise, arguments.views)
         for k in range(arguments.trials)
+        for cell in cells(arguments.scenes, arguments.modes, arguments.noise, arguments.views)
     ]
     trials = read_trials(arguments.read)
     with ProcessPoolExecutor(arguments.workers) as pool:
