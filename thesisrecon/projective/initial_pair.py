@@ -26,7 +26,10 @@ NO_PARALLAX = 0.95
 
 NO_PARALLAX_BECAUSE = {
     "pure rotation": "the camera only turned about one point (a pure rotation)",
-    "plane": "all that is matched lies in one plane (a planar scene), or the camera hardly moved",
+    "plane": (
+        "all that is matched lies in one plane (a planar scene), or the camera hardly moved, "
+        "or it turned about one point while it zoomed (a pure rotation)"
+    ),
 }
 """What the configurations that are found in pairs of views mean."""
 
@@ -62,14 +65,18 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 
 
 def require_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> None:
-    """``StageFailure`` where one homography explains at least the share ``most`` of every accepted pair.
+    """``StageFailure`` where every accepted pair was found to show a plane or a camera that only turned, or
+    where one homography explains at least the share ``most`` of every one.
 
     Then the cameras turned about one point, hardly moved, or see a single plane: no F is determined, and
     whatever is reconstructed from one is arbitrary, however small its residuals.
     """
-    shares = [pair.homography_share for pair in pairs if pair.accepted]
-    if shares and min(shares) >= most:
-        kinds = Counter(pair.configuration for pair in pairs if pair.accepted)
+    accepted = [pair for pair in pairs if pair.accepted]
+    if not accepted:
+        return
+    shares = [pair.homography_share for pair in accepted]
+    kinds = Counter(pair.configuration for pair in accepted)
+    if min(shares) >= most or all(kind in NO_PARALLAX_BECAUSE for kind in kinds):
         told = NO_PARALLAX_BECAUSE.get(
             kinds.most_common(1)[0][0], "the camera only turns, hardly moves, or sees one plane"
         )
