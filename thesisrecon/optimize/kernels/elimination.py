@@ -58,17 +58,14 @@ class PointSums(NamedTuple):
     diagonal: F64
 
 
-class _Scratch(NamedTuple):
-    """Room for one point: ``Bt`` (m, 2, 3), ``rt`` (m, 2), ``E`` and ``T`` (m, 2, e), ``root`` (3, 3) = L^-1,
-    ``slot`` (columns of the border,) and ``column`` (e,), places of the common columns it is seen with."""
+class _Left(NamedTuple):
+    """What the steps of their points leave: ``Bt`` (k, 2, 3) = B~ and ``residual`` (k, 2) of the observations
+    from ``first`` on, ``g`` (n, 3) = L^-1 h of the points."""
 
+    first: int
     Bt: F64
-    rt: F64
-    E: F64
-    T: F64
-    root: F64
-    slot: I64
-    column: I64
+    residual: F64
+    g: F64
 
 
 @njit(cache=True, nogil=True)
@@ -80,59 +77,50 @@ def eliminate_points(
     The diagonal of a point's J'J is multiplied by 1 + damping; a point whose block is not positive stays
     where it is.
     """
-    most, border = 1, len(sums.corner)
-    for j in range(first, last):
-        most = max(most, places.start[j + 1] - places.start[j])
-    wide = min(border, most * places.common.shape[1])
-    room = _Scratch(
-        np.empty((most, 2, 3)), np.empty((most, 2)), np.empty((most, 2, wide)), np.empty((most, 2, wide)),
-        np.empty((3, 3)), np.full(border, -1), np.empty(wide, np.int64),
-    )  # fmt: skip
-    for j in range(first, last):
-        s, e = places.start[j], places.start[j + 1]
-        if s == e:
-            continue
-        sum_point(s, e, j, damping, J, points, room)
-        add_views(s, e, J, places, sums, room)
-        if border > 0:
-            add_common(s, e, J, places, sums, room)
+    k = places.start[first]
+    n = places.start[last] - k
+    left = _Left(k, np.empty((n, 2, 3)), np.empty((n, 2)), np.empty((last - first, 3)))
+    sum_points(first, last, damping, J, places, points, left)
+    add_views(first, last, J, places, sums, left)
+    if len(sums.corner) > 0:
+        add_common(first, last, J, places, sums, left)
+
+
+# A call costs more than a point, for all the arrays that go with it: the loops over the points are inside.
 
 
 @njit(cache=True, nogil=True)
-def sum_point(
-    s: int, e: int, j: int, damping: float, J: Jacobians, points: PointSums, room: _Scratch
+def sum_points(
+    first: int, last: int, damping: float, J: Jacobians, places: Places, points: PointSums, left: _Left
 ) -> None:
-    """J'J and J'r of one point, its inverse, B~ and the residuals that its own step leaves."""
-    v00 = v01 = v02 = v11 = v12 = v22 = h0 = h1 = h2 = 0.0
-    for k in range(s, e):
-        for i in range(2):
-            b0, b1, b2, r = J.B[k, i, 0], J.B[k, i, 1], J.B[k, i, 2], J.residual[k, i]
-            v00 += b0 * b0
-            v01 += b0 * b1
-            v02 += b0 * b2
-            v11 += b1 * b1
-            v12 += b1 * b2
-            v22 += b2 * b2
-            h0 += b0 * r
-            h1 += b1 * r
-            h2 += b2 * r
-    h, d = points.gradient[j], points.diagonal[j]
-    h[0], h[1], h[2] = h0, h1, h2
-    d[0], d[1], d[2] = v00, v11, v22
-    M = room.root
-    more = 1.0 + damping
-    inverse_root(v00 * more, v01, v02, v11 * more, v12, v22 * more, M)
-    for a in range(3):
-        for b in range(3):
-            points.inverse[j, a, b] = M[0, a] * M[0, b] + M[1, a] * M[1, b] + M[2, a] * M[2, b]
-    g0, g1, g2 = M[0, 0] * h0, M[1, 0] * h0 + M[1, 1] * h1, M[2, 0] * h0 + M[2, 1] * h1 + M[2, 2] * h2
-    for k in range(s, e):
-        for i in range(2):
-            b0, b1, b2 = J.B[k, i, 0], J.B[k, i, 1], J.B[k, i, 2]
-            t0, t1, t2 = M[0, 0] * b0, M[1, 0] * b0 + M[1, 1] * b1, M[2, 0] * b0 + M[2, 1] * b1 + M[2, 2] * b2
-            t = room.Bt[k - s, i]
-            t[0], t[1], t[2] = t0, t1, t2
-            room.rt[k - s, i] = J.residual[k, i] - t0 * g0 - t1 * g1 - t2 * g2
+    """J'J and J'r of each point, its inverse, B~ and the residuals that its own step leaves."""
+    M, more = np.empty((3, 3)), 1.0 + damping
+    for j in range(first, last):
+        v00 = v01 = v02 = v11 = v12 = v22 = h0 = h1 = h2 = 0.0
+        s, e = places.start[j], places.start[j + 1]
+        for k in range(s, e):
+            for i in range(2):
+                b0, b1, b2, r = J.B[k, i, 0], J.B[k, i, 1], J.B[k, i, 2], J.residual[k, i]
+                v00, v01, v02 = v00 + b0 * b0, v01 + b0 * b1, v02 + b0 * b2
+                v11, v12, v22 = v11 + b1 * b1, v12 + b1 * b2, v22 + b2 * b2
+                h0, h1, h2 = h0 + b0 * r, h1 + b1 * r, h2 + b2 * r
+        h, d, g = points.gradient[j], points.diagonal[j], left.g[j - first]
+        h[0], h[1], h[2] = h0, h1, h2
+        d[0], d[1], d[2] = v00, v11, v22
+        inverse_root(v00 * more, v01, v02, v11 * more, v12, v22 * more, M)
+        for a in range(3):
+            for b in range(3):
+                points.inverse[j, a, b] = M[0, a] * M[0, b] + M[1, a] * M[1, b] + M[2, a] * M[2, b]
+        m00, m10, m11, m20, m21, m22 = M[0, 0], M[1, 0], M[1, 1], M[2, 0], M[2, 1], M[2, 2]
+        g0, g1, g2 = m00 * h0, m10 * h0 + m11 * h1, m20 * h0 + m21 * h1 + m22 * h2
+        g[0], g[1], g[2] = g0, g1, g2
+        for k in range(s, e):
+            for i in range(2):
+                b0, b1, b2 = J.B[k, i, 0], J.B[k, i, 1], J.B[k, i, 2]
+                t0, t1, t2 = m00 * b0, m10 * b0 + m11 * b1, m20 * b0 + m21 * b1 + m22 * b2
+                t = left.Bt[k - left.first, i]
+                t[0], t[1], t[2] = t0, t1, t2
+                left.residual[k - left.first, i] = J.residual[k, i] - t0 * g0 - t1 * g1 - t2 * g2
 
 
 @njit(cache=True, nogil=True)
@@ -159,37 +147,39 @@ def inverse_root(v00: float, v01: float, v02: float, v11: float, v12: float, v22
 
 
 @njit(cache=True, nogil=True)
-def add_views(s: int, e: int, J: Jacobians, places: Places, sums: Sums, room: _Scratch) -> None:
-    """The blocks of all pairs of views that see one point, and the views' part of the right-hand side."""
+def add_views(first: int, last: int, J: Jacobians, places: Places, sums: Sums, left: _Left) -> None:
+    """The blocks of all pairs of views that see a point, and the views' part of the right-hand side."""
     C = J.A.shape[2]
-    for k in range(s, e):
-        v = places.block[places.view_index[k]]
-        if v < 0:
-            continue
-        r0, r1 = J.residual[k, 0], J.residual[k, 1]
-        t0, t1 = room.rt[k - s, 0], room.rt[k - s, 1]
-        for a in range(C):
-            a0, a1 = J.A[k, 0, a], J.A[k, 1, a]
-            sums.gradient[v * C + a] += a0 * r0 + a1 * r1
-            sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
-            sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
-        b = room.Bt[k - s]
-        for m in range(k, e):
-            w = places.block[places.view_index[m]]
-            if w < 0:
+    for j in range(first, last):
+        for k in range(places.start[j], places.start[j + 1]):
+            v = places.block[places.view_index[k]]
+            if v < 0:
                 continue
-            c = room.Bt[m - s]
-            same = 1.0 if m == k else 0.0
-            q00 = same - b[0, 0] * c[0, 0] - b[0, 1] * c[0, 1] - b[0, 2] * c[0, 2]
-            q01 = -b[0, 0] * c[1, 0] - b[0, 1] * c[1, 1] - b[0, 2] * c[1, 2]
-            q10 = -b[1, 0] * c[0, 0] - b[1, 1] * c[0, 1] - b[1, 2] * c[0, 2]
-            q11 = same - b[1, 0] * c[1, 0] - b[1, 1] * c[1, 1] - b[1, 2] * c[1, 2]
-            add_block(sums.blocks[places.pair[v, w]], J.A[k], J.A[m], q00, q01, q10, q11)
-            if v == w and m > k:
-                add_block(sums.blocks[places.pair[v, w]], J.A[m], J.A[k], q00, q10, q01, q11)
+            r0, r1 = J.residual[k, 0], J.residual[k, 1]
+            t0, t1 = left.residual[k - left.first, 0], left.residual[k - left.first, 1]
+            for a in range(C):
+                a0, a1 = J.A[k, 0, a], J.A[k, 1, a]
+                sums.gradient[v * C + a] += a0 * r0 + a1 * r1
+                sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
+                sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
+            b = left.Bt[k - left.first]
+            for m in range(k, places.start[j + 1]):
+                w = places.block[places.view_index[m]]
+                if w < 0:
+                    continue
+                c = left.Bt[m - left.first]
+                same = 1.0 if m == k else 0.0
+                q00 = same - b[0, 0] * c[0, 0] - b[0, 1] * c[0, 1] - b[0, 2] * c[0, 2]
+                q01 = -b[0, 0] * c[1, 0] - b[0, 1] * c[1, 1] - b[0, 2] * c[1, 2]
+                q10 = -b[1, 0] * c[0, 0] - b[1, 1] * c[0, 1] - b[1, 2] * c[0, 2]
+                q11 = same - b[1, 0] * c[1, 0] - b[1, 1] * c[1, 1] - b[1, 2] * c[1, 2]
+                S = sums.blocks[places.pair[v, w]]
+                add_block(S, J.A[k], J.A[m], q00, q01, q10, q11)
+                if v == w and m > k:
+                    add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", fastmath={"contract"})
 def add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float, q11: float) -> None:
     """S (C, C) += left' Q right for left, right (2, C)."""
     C = S.shape[0]
@@ -201,64 +191,93 @@ def add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float,
 
 
 @njit(cache=True, nogil=True)
-def add_common(s: int, e: int, J: Jacobians, places: Places, sums: Sums, room: _Scratch) -> None:
-    """Border, corner and right-hand side of the common columns that one point is seen with.
+def add_common(first: int, last: int, J: Jacobians, places: Places, sums: Sums, left: _Left) -> None:
+    """Border, corner and right-hand side of the columns that views have in common.
 
-    Gathered side by side they are E (2m, n); T = (I - B~ B~') E is what the point's own step leaves of them.
+    Those of one point side by side are E (2m, n). With p = B~' E the point's own step leaves T = E - B~ p of
+    them, and E' T = E'E - p'p.
     """
-    C, E, T = J.A.shape[2], room.E, room.T
-    n = gather_common(s, e, J, places, room)
-    first = sums.border.shape[0] * C
-    for c in range(n):
-        p0 = p1 = p2 = 0.0
+    most, C = 1, J.A.shape[2]
+    for j in range(first, last):
+        most = max(most, places.start[j + 1] - places.start[j])
+    wide = min(len(sums.corner), most * places.common.shape[1])
+    E, T, p = np.empty((most, 2, wide)), np.empty((2, wide)), np.empty((3, wide))
+    column, slot = np.empty(wide, np.int64), np.full(len(sums.corner), -1)
+    edge = C * sums.border.shape[0]
+    ends = (sums.corner, sums.rhs[edge:], sums.diagonal[edge:], sums.gradient[edge:])
+    for j in range(first, last):
+        s, e = places.start[j], places.start[j + 1]
+        n = gather_common(s, e, J.E, places.view_index, places.common, E, column, slot)
+        p[:, :n] = 0.0
         for i in range(e - s):
             for x in range(2):
-                p0 += room.Bt[i, x, 0] * E[i, x, c]
-                p1 += room.Bt[i, x, 1] * E[i, x, c]
-                p2 += room.Bt[i, x, 2] * E[i, x, c]
+                b = left.Bt[s + i - left.first, x]
+                for c in range(n):
+                    p[0, c] += b[0] * E[i, x, c]
+                    p[1, c] += b[1] * E[i, x, c]
+                    p[2, c] += b[2] * E[i, x, c]
         for i in range(e - s):
-            for x in range(2):
-                b = room.Bt[i, x]
-                T[i, x, c] = E[i, x, c] - b[0] * p0 - b[1] * p1 - b[2] * p2
-    for i in range(e - s):
-        k, v = s + i, places.block[places.view_index[s + i]]
-        for c in range(n):
-            column, t0, t1 = room.column[c], T[i, 0, c], T[i, 1, c]
-            if v >= 0:
-                for a in range(C):
-                    sums.border[v, a, column] += J.A[k, 0, a] * t0 + J.A[k, 1, a] * t1
-            e0, e1 = E[i, 0, c], E[i, 1, c]
-            if e0 == 0.0 and e1 == 0.0:
+            v = places.block[places.view_index[s + i]]
+            if v < 0:
                 continue
-            sums.gradient[first + column] += e0 * J.residual[k, 0] + e1 * J.residual[k, 1]
-            sums.rhs[first + column] -= e0 * room.rt[i, 0] + e1 * room.rt[i, 1]
-            sums.diagonal[first + column] += e0 * e0 + e1 * e1
-            for d in range(n):
-                sums.corner[column, room.column[d]] += e0 * T[i, 0, d] + e1 * T[i, 1, d]
-    for c in range(n):
-        room.slot[room.column[c]] = -1
+            for x in range(2):
+                b = left.Bt[s + i - left.first, x]
+                for c in range(n):
+                    T[x, c] = E[i, x, c] - b[0] * p[0, c] - b[1] * p[1, c] - b[2] * p[2, c]
+            for a in range(C):
+                a0, a1 = J.A[s + i, 0, a], J.A[s + i, 1, a]
+                for c in range(n):
+                    sums.border[v, a, column[c]] += a0 * T[0, c] + a1 * T[1, c]
+        add_corner(column[:n], E[: e - s], p, left.g[j - first], J.residual[s:e], ends)
 
 
 @njit(cache=True, nogil=True)
-def gather_common(s: int, e: int, J: Jacobians, places: Places, room: _Scratch) -> int:
-    """The common columns of one point's observations side by side in ``room.E``; returns how many."""
-    F, n = places.common.shape[1], 0
+def gather_common(
+    s: int, e: int, J_E: F64, view_index: I64, common: I64, E: F64, column: I64, slot: I64
+) -> int:
+    """The common columns of observations s..e side by side in E (m, 2, n), their ``column`` in the border;
+    returns n. ``slot`` (columns of the border,) is -1 all over, before and after."""
+    F, n = common.shape[1], 0
     for k in range(s, e):
         for f in range(F):
-            column = places.common[places.view_index[k], f]
-            if column >= 0 and room.slot[column] < 0:
-                room.slot[column] = n
-                room.column[n] = column
+            c = common[view_index[k], f]
+            if c >= 0 and slot[c] < 0:
+                slot[c] = n
+                column[n] = c
                 n += 1
     for k in range(s, e):
         for c in range(n):
-            room.E[k - s, 0, c] = room.E[k - s, 1, c] = 0.0
+            E[k - s, 0, c] = E[k - s, 1, c] = 0.0
         for f in range(F):
-            column = places.common[places.view_index[k], f]
-            if column >= 0:
-                room.E[k - s, 0, room.slot[column]] += J.E[k, 0, f]
-                room.E[k - s, 1, room.slot[column]] += J.E[k, 1, f]
+            c = common[view_index[k], f]
+            if c >= 0:
+                E[k - s, 0, slot[c]] += J_E[k, 0, f]
+                E[k - s, 1, slot[c]] += J_E[k, 1, f]
+    for c in range(n):
+        slot[column[c]] = -1
     return n
+
+
+@njit(cache=True, nogil=True)
+def add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[F64, F64, F64, F64]) -> None:
+    """What the common columns of one point add to (corner, rhs, diagonal, gradient) of the border."""
+    corner, rhs, diagonal, gradient = ends
+    n = len(column)
+    for c in range(n):
+        r = squared = 0.0
+        for i in range(len(E)):
+            r += E[i, 0, c] * residual[i, 0] + E[i, 1, c] * residual[i, 1]
+            squared += E[i, 0, c] * E[i, 0, c] + E[i, 1, c] * E[i, 1, c]
+        gradient[column[c]] += r
+        rhs[column[c]] -= r - p[0, c] * g[0] - p[1, c] * g[1] - p[2, c] * g[2]
+        diagonal[column[c]] += squared
+        for d in range(c, n):
+            total = -p[0, c] * p[0, d] - p[1, c] * p[1, d] - p[2, c] * p[2, d]
+            for i in range(len(E)):
+                total += E[i, 0, c] * E[i, 0, d] + E[i, 1, c] * E[i, 1, d]
+            corner[column[c], column[d]] += total
+            if d > c:
+                corner[column[d], column[c]] += total
 
 
 @njit(cache=True, nogil=True)
