@@ -35,7 +35,7 @@ def linear_point(P: F64, scale: F64, xy: F64) -> F64:
 
 
 def iterated_point(P: F64, scale: F64, xy: F64, *, passes: int = 10, tolerance: float = 1e-6) -> F64:
-    """Rows over the depths of the pass before, until these rest; the linear answer where they do not."""
+    """Rows over the depths of the pass before, until these rest; else the better of last and first."""
     first = X = linear_point(P, scale, xy)
     before = None
     for _ in range(passes):
@@ -43,7 +43,8 @@ def iterated_point(P: F64, scale: F64, xy: F64, *, passes: int = 10, tolerance: 
         if before is not None and (np.abs(depths / before - 1.0) < tolerance).all():
             return X
         X, before = linear_point(P, 1.0 / depths, xy), depths
-    return first
+    one, last = (reprojection_costs(P, x[None], xy[:, None])[0] for x in (first, X))
+    return X if last < one else first
 
 
 def midpoint(P: F64, xy: F64) -> F64:

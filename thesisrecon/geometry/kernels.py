@@ -131,13 +131,27 @@ def least_algebraic(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64) -> float:
+    """Sum of squared distances of one point's images, infinite or NaN in a focal plane."""
+    cost = 0.0
+    for k in range(first, last):
+        p = P[view[k]]
+        w = 1.0 / (p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3])
+        du = w * (p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]) - xy[k, 0]
+        dv = w * (p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]) - xy[k, 1]
+        cost += du * du + dv * dv
+    return cost
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_linearly(
     P: F64, scale: F64, start: I64, view: I64, xy: F64, passes: int, tolerance: float, X: F64
 ) -> None:
     """Fill X (N, 4) by the linear method, a view's rows times its ``scale`` (V,).
 
     ``passes`` > 0: then anew with each row over the depth p3'X of the pass before, until no depth changes by
-    more than ``tolerance`` of itself; a point that does not come to rest keeps the linear answer.
+    more than ``tolerance`` of itself. Where they do not come to rest, the last and the linear answer are
+    compared by reprojection.
     """
     R, row, x, y = np.zeros((4, 4)), np.empty(4), np.empty(4), np.empty(4)
     weight = np.empty(len(xy))
@@ -151,6 +165,7 @@ def triangulate_linearly(
         least_algebraic(P, weight, first, last, view, xy, R, row, x)
         X[j] = x
         y[:] = x
+        rest = False
         for n in range(passes):
             change = 0.0
             for k in range(first, last):
@@ -158,12 +173,15 @@ def triangulate_linearly(
                 depth = abs(p[0] * y[0] + p[1] * y[1] + p[2] * y[2] + p[3] * y[3])
                 change = max(change, abs(depth * weight[k] - 1.0))
                 weight[k] = 1.0 / depth if depth > 0.0 else math.inf
-            if n > 0 and change < tolerance:
-                X[j] = y
-                break
-            if not math.isfinite(weight[first:last].sum()):
+            rest = n > 0 and change < tolerance
+            if rest or not math.isfinite(weight[first:last].sum()):
                 break
             least_algebraic(P, weight, first, last, view, xy, R, row, y)
+        if passes > 0 and (
+            rest
+            or reprojection_cost(P, y, first, last, view, xy) < reprojection_cost(P, x, first, last, view, xy)
+        ):
+            X[j] = y
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -209,19 +227,6 @@ def triangulate_midpoints(
         for i in range(3):
             X[j, i] = X[j, i] / det + origin[i]
         X[j, 3] = 1.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64) -> float:
-    """Sum of squared distances of one point's images, infinite or NaN in a focal plane."""
-    cost = 0.0
-    for k in range(first, last):
-        p = P[view[k]]
-        w = 1.0 / (p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3])
-        du = w * (p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]) - xy[k, 0]
-        dv = w * (p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]) - xy[k, 1]
-        cost += du * du + dv * dv
-    return cost
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

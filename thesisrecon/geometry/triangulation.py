@@ -77,8 +77,9 @@ def triangulate_iterated(P: F64, xy: F64) -> F64:
     :func:`triangulate_linear`.
 
     The rows are divided by the depth p3'X of the pass before, which makes them the reprojection residuals at
-    rest, and solved again, ten times at most; a point whose depths do not come to rest keeps its linear
-    answer. The limit is near the least reprojection error, not at it: the depths count as constants.
+    rest, and solved again, ten times at most; where the depths do not come to rest, the last or the linear
+    answer stands, whichever reprojects better. The limit is near the least reprojection error, not at it: the
+    depths count as constants.
     """
     P, xy = _checked(P, xy)
     return _linear(P, _listed(xy), PASSES)
