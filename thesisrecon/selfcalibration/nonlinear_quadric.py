@@ -32,6 +32,8 @@ F64 = NDArray[np.float64]
 _UPPER = np.triu_indices(3)
 _ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
 _LEAST_NOISE = 1e-9
+PASSES = 6
+"""Estimates of the noise at the most."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +74,14 @@ def minimize_quadric(
 
     Huber's loss turns at ``loss_scale``, so that a camera that bad matches made wrong does not pull the rest.
     The priors weigh against the residuals by their noise, which is estimated from the residuals themselves: a
-    first pass supposes 1 %, a second takes what the first one found.
+    first pass supposes 1 %, each further one takes what the last one found until that no longer falls.
     """
     theta, noise = np.concatenate([plane, unknown.start(log_f[None])[0]]), 0.01
-    for _ in range(2):
+    for _ in range(PASSES):
+        supposed = noise
         theta, noise, covariance, cost = _minimize(frame, unknown, theta, noise, loss_scale)
+        if noise > 0.7 * supposed or not np.isfinite(unknown.std).any():
+            break
     K = unknown.calibrations(theta[None, 3:])[0]
     return QuadricMinimum(theta[:3], theta[3:], K, cost, noise, covariance)
 
