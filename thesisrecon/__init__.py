@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from thesisrecon.config import PipelineConfig
-    from thesisrecon.doors import estimate_fundamental, match_pair, self_calibrate
+    from thesisrecon.doors import estimate_fundamental, match_pair, self_calibrate, upgrade_affine
     from thesisrecon.geometry.triangulation import triangulate
     from thesisrecon.pipeline import reconstruct
 
@@ -23,6 +23,7 @@ _HOME_OF = {
     "reconstruct": "pipeline",
     "self_calibrate": "doors",
     "triangulate": "geometry.triangulation",
+    "upgrade_affine": "doors",
 }
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "reconstruct",
     "self_calibrate",
     "triangulate",
+    "upgrade_affine",
 ]
 
 

@@ -11,7 +11,7 @@ import dataclasses
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -151,6 +151,12 @@ class SelfCalibrator(Protocol):
         assumed: Assumptions,
         rng: np.random.Generator,
     ) -> SelfCalibration: ...
+
+
+def seeing(variant: SelfCalibrator, photographs: Sequence[Image]) -> SelfCalibrator:
+    """The variant with the photographs, where it looks at them (for parallel lines); else as it is."""
+    given = getattr(variant, "with_photographs", None)
+    return variant if given is None else cast(SelfCalibrator, given(photographs))
 
 
 class MetricRefiner(Protocol):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from thesisrecon.affine import upgrade_affine
 from thesisrecon.assumptions import assume
-from thesisrecon.config import PipelineConfig
+from thesisrecon.config import PipelineConfig, seeing
 from thesisrecon.epipolar import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.images import read_photographs
@@ -13,7 +15,7 @@ from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.run import stream
 from thesisrecon.types import Image, Reconstruction, SelfCalibration, TwoView
 
-__all__ = ["estimate_fundamental", "match_pair", "self_calibrate"]
+__all__ = ["estimate_fundamental", "match_pair", "self_calibrate", "upgrade_affine"]
 
 
 def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0) -> TwoView:
@@ -38,13 +40,18 @@ def _read_one(image: Any, config: PipelineConfig) -> Image:
 
 
 def self_calibrate(
-    reconstruction: Reconstruction, *, config: PipelineConfig | None = None, seed: int = 0
+    reconstruction: Reconstruction,
+    *,
+    config: PipelineConfig | None = None,
+    photographs: Sequence[Image] = (),
+    seed: int = 0,
 ) -> SelfCalibration:
     """The metric frame and the intrinsics of a projective reconstruction (chapter 7).
 
     Cameras of one image size are taken for one camera, unless ``config.intrinsics.cameras`` says otherwise.
+    ``photographs``, one per view, are what a variant looks at that finds parallel lines in them.
     """
     config = config or PipelineConfig()
+    variant = seeing(config.selfcalibration, photographs) if photographs else config.selfcalibration
     assumed = assume(reconstruction, config.intrinsics)
-    rng = stream(seed, "selfcalibration")
-    return config.selfcalibration.calibrate(reconstruction, assumed=assumed, rng=rng)
+    return variant.calibrate(reconstruction, assumed=assumed, rng=stream(seed, "selfcalibration"))

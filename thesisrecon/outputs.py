@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon import __version__
+from thesisrecon.affine import affine_of, write_affine
 from thesisrecon.config import toml_from_config
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.colmap import colmap_from_reconstruction, write_colmap_model
@@ -26,7 +27,7 @@ THUMBNAIL_PX = 800
 SUMMARY, PAGE = "summary.json", "report.html"
 MODEL_FILES = (
     *(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D")),
-    *("points.ply", "cameras.json"),
+    *("points.ply", "affine.ply", "cameras.json"),
 )
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 U8 = NDArray[np.uint8]
@@ -79,6 +80,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         if result.metric is not None:
             colours = point_colours(result.metric.reconstruction, result.images)
             write_model(out, result, result.metric.reconstruction, colours)
+            write_affine(out / "affine.ply", affine_of(result), colours)
         else:
             run.directory.remove(MODEL_FILES)
         result = _described(run, result, until, failure)

@@ -11,7 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from thesisrecon.assumptions import assumptions_of_views
-from thesisrecon.config import PipelineConfig
+from thesisrecon.config import PipelineConfig, seeing
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intake import check_pairs, empty_result, identity, read_set, wishes
 from thesisrecon.io.images import ImageSource, PhotographSet, list_images, scene_name
@@ -312,7 +312,7 @@ def _calibrate(work: _Work, attempt: int) -> None:
         "selfcalibration",
         f"attempt-{attempt}",
         key,
-        lambda: work.config.selfcalibration.calibrate(
+        lambda: seeing(work.config.selfcalibration, work.result.images).calibrate(
             projective,
             assumed=assumed,
             rng=stream(run.seed, "selfcalibration", attempt),

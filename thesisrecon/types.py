@@ -284,6 +284,12 @@ class SelfCalibration:
     candidates: tuple[Upgrade, ...] = ()
     verdict: MotionVerdict | None = None
 
+    @property
+    def plane_at_infinity(self) -> F64:
+        """Unit (4,) plane at infinity in the projective frame: what the upgrade takes to (0, 0, 0, 1)."""
+        plane = self.metric_from_projective[3]
+        return np.asarray(plane / np.linalg.norm(plane), dtype=np.float64)
+
 
 @dataclass(frozen=True)
 class IntrinsicInterval:

@@ -11,8 +11,12 @@ from thesisrecon.selfcalibration.stratified import (
     CheiralitySearch,
     HartleyLinear,
     ModulusConstraint,
+    ParallelLines,
     PollefeysQuadric,
     Stratified,
+    VanishingPoints,
+    affine_camera_centres,
+    upgrade_to_affine,
 )
 
 __all__ = [
@@ -25,8 +29,12 @@ __all__ = [
     "LinearQuadric",
     "ModulusConstraint",
     "NonlinearQuadric",
+    "ParallelLines",
     "PollefeysQuadric",
     "RotationCriterion",
     "ScannedQuadric",
     "Stratified",
+    "VanishingPoints",
+    "affine_camera_centres",
+    "upgrade_to_affine",
 ]

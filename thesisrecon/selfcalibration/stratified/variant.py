@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,9 @@ from thesisrecon.selfcalibration.stratified.calibration import HartleyLinear, Po
 from thesisrecon.selfcalibration.stratified.cheirality_search import CheiralitySearch
 from thesisrecon.selfcalibration.stratified.image_conic import conic_knowledge
 from thesisrecon.selfcalibration.stratified.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.stratified.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.stratified.scene import PlaneCandidates, ProjectiveScene
-from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.types import Assumptions, Image, Reconstruction, SelfCalibration
 
 F64 = NDArray[np.float64]
 
@@ -32,12 +34,18 @@ class Stratified:
     handed on, with at least the share ``min_positive`` of the points in front of the cameras.
     """
 
-    plane: CheiralitySearch | ModulusConstraint = field(default_factory=CheiralitySearch)
+    plane: CheiralitySearch | ModulusConstraint | ParallelLines = field(default_factory=CheiralitySearch)
     calibration: HartleyLinear | PollefeysQuadric = field(default_factory=HartleyLinear)
     refined: bool = True
     kept: int = 1
     min_positive: float = 0.5
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    def with_photographs(self, photographs: Iterable[Image]) -> Stratified:
+        """The same where the way to the plane looks at the photographs, one per view."""
+        if not isinstance(self.plane, ParallelLines):
+            return self
+        return replace(self, plane=self.plane.with_photographs(photographs))
 
     def calibrate(
         self,
@@ -59,6 +67,15 @@ class Stratified:
             scene.frame, reconstruction, self.criterion, answers,
             kept=self.kept, min_positive=self.min_positive,
         )  # fmt: skip
+
+    def locate(
+        self, reconstruction: Reconstruction, *, assumed: Assumptions, rng: np.random.Generator
+    ) -> F64:
+        """The best plane at infinity alone, unit (4,) in the projective frame; ``StageFailure`` as above."""
+        scene = projective_scene(reconstruction, assumed)
+        p = self.plane.locate(scene, rng).planes[0]
+        plane = np.append(p, 1.0) @ scene.frame.reference_from_projective
+        return np.asarray(plane / np.linalg.norm(plane))
 
     def _answers(
         self, scene: ProjectiveScene, found: PlaneCandidates, unknown: UnknownIntrinsics

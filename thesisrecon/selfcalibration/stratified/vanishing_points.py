@@ -1,0 +1,212 @@
+"""Parallel lines found in photographs: vanishing points of each, matched over all through the cameras.
+
+Every photograph proposes vanishing points (pairs of segments, the consensus of all). A vanishing point of one
+photograph and one of another make a point of projective space if they are the same direction, and that point
+is seen by every other camera: the segments of all photographs that run towards it are its support. No
+calibration is needed for this; the points of three directions span the plane at infinity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.selfcalibration.frame import ReferenceFrame
+from thesisrecon.selfcalibration.stratified.descent import descend
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+B8 = NDArray[np.bool_]
+
+NEAR = 4.0
+"""Segments within this many tolerances of a direction are not offered to another one."""
+
+NEARLY = -2
+
+
+@dataclass(frozen=True)
+class SegmentSet:
+    """Segments of all photographs in unit-free coordinates: ``camera`` (S,) place in the frame, ``middle``
+    (S, 2), unit ``along`` (S, 2), ``half`` (S,) half the length in px."""
+
+    camera: I64
+    middle: F64
+    along: F64
+    half: F64
+
+    def subset(self, keep: B8 | I64) -> SegmentSet:
+        """The kept ones."""
+        return SegmentSet(self.camera[keep], self.middle[keep], self.along[keep], self.half[keep])
+
+    def misses(self, v: F64) -> F64:
+        """Distance (..., S) px by which a segment, turned about its middle to the points v (..., S, 3),
+        misses its ends."""
+        towards = v[..., :2] - v[..., 2:] * self.middle
+        norm = np.maximum(np.linalg.norm(towards, axis=-1), 1e-300)
+        across = towards[..., 0] * self.along[:, 1] - towards[..., 1] * self.along[:, 0]
+        return np.asarray(across / norm * self.half)
+
+
+def segment_set(frame: ReferenceFrame, segments: list[F64]) -> SegmentSet:
+    """Pixel segments (S_i, 4) of each registered camera in the frame's coordinates."""
+    parts = []
+    for place, pixels in enumerate(segments):
+        unit = np.linalg.inv(frame.pixel_from_unit[frame.views[place]])
+        ends = pixels.reshape(-1, 2, 2) @ unit[:2, :2].T + unit[:2, 2]
+        step = ends[:, 1] - ends[:, 0]
+        length = np.maximum(np.linalg.norm(step, axis=1), 1e-300)
+        half = 0.5 * np.linalg.norm(pixels[:, 2:] - pixels[:, :2], axis=1)
+        parts.append((np.full(len(pixels), place), ends.mean(axis=1), step / length[:, None], half))
+    camera, middle, along, half = (np.concatenate([part[k] for part in parts]) for k in range(4))
+    return SegmentSet(camera.astype(np.int64), middle, along, half)
+
+
+def support(segments: SegmentSet, v: F64, tolerance_px: float) -> F64:
+    """Support (..., S) of points v (..., S, 3): length times how well it fits, 0 beyond the tolerance."""
+    miss = segments.misses(v) / tolerance_px
+    return np.asarray(segments.half * np.maximum(1.0 - miss**2, 0.0))
+
+
+def propose_points(
+    segments: SegmentSet, *, keep: int, samples: int, tolerance_px: float, rng: np.random.Generator
+) -> F64:
+    """Vanishing points (K, 3) of one photograph, the best supported first: each is refined on its segments,
+    which then are taken away."""
+    found: list[F64] = []
+    left = segments
+    while len(found) < keep and len(left.half) >= 5:
+        weight = left.half / left.half.sum()
+        first, second = (rng.choice(len(weight), samples, p=weight) for _ in range(2))
+        lines = np.cross(_homogeneous(left.middle), np.column_stack([left.along, np.zeros(len(left.half))]))
+        v = np.cross(lines[first], lines[second])
+        v = v[np.linalg.norm(v, axis=1) > 1e-9]
+        if not len(v):
+            break
+        v /= np.linalg.norm(v, axis=1, keepdims=True)
+        total = support(left, v[:, None], tolerance_px).sum(axis=1)
+        best = v[total.argmax()]
+        mine = support(left, best[None], tolerance_px) > 0
+        if mine.sum() < 4:
+            break
+        best = _nearest_to_lines(lines[mine], left.half[mine])
+        found.append(best)
+        left = left.subset(~mine & (np.abs(left.misses(best[None])) > NEAR * tolerance_px))
+    return np.array(found).reshape(-1, 3)
+
+
+def _homogeneous(xy: F64) -> F64:
+    return np.column_stack([xy, np.ones(len(xy))])
+
+
+def _nearest_to_lines(lines: F64, weight: F64) -> F64:
+    scaled = lines / np.linalg.norm(lines, axis=1, keepdims=True) * weight[:, None]
+    return np.asarray(np.linalg.svd(scaled)[2][2])
+
+
+def triangulate_directions(P: F64, v: F64) -> F64:
+    """Space points (B, 4) of unit norm from image points v (B, n, 3) in cameras P (B, n, 3, 4).
+
+    v x P X = 0 by least squares; any of them may be at infinity."""
+    rows = np.cross(v[..., None], P, axisa=-2, axisb=-2, axisc=-2)
+    normal = np.einsum("bnri,bnrj->bij", rows, rows)
+    return np.asarray(np.linalg.eigh(normal)[1][:, :, 0])
+
+
+def find_directions(
+    frame: ReferenceFrame,
+    segments: SegmentSet,
+    proposals: list[F64],
+    *,
+    keep: int,
+    tolerance_px: float,
+) -> tuple[F64, I64]:
+    """Points at infinity (D, 4) in the reference frame, the best supported first, and the direction (S,) of
+    every segment, -1 for none.
+
+    ``proposals`` are the vanishing points (K_i, 3) of each camera. A point needs support in three cameras,
+    so that the third confirms what two made.
+    """
+    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
+    candidates = _triangulated_pairs(P, proposals)
+    direction = np.full(len(segments.half), -1, dtype=np.int64)
+    found: list[F64] = []
+    while len(found) < keep and len(candidates):
+        free = np.flatnonzero(direction == -1)
+        left = segments.subset(free)
+        total = np.concatenate([
+            support(left, np.einsum("sij,bj->bsi", P[left.camera], part), tolerance_px).sum(axis=1)
+            for part in np.array_split(candidates, max(1, len(candidates) // 64))
+        ])  # fmt: skip
+        X = _refined_point(P, left, candidates[total.argmax()], tolerance_px)
+        mine = support(left, (P @ X)[left.camera], tolerance_px) > 0
+        if mine.sum() < 8 or len(np.unique(left.camera[mine])) < 3:
+            break
+        direction[free[mine]] = len(found)
+        found.append(X)
+        # What nearly fits belongs to it too; left over, it would come up again as a direction of its own.
+        near = np.abs(left.misses((P @ X)[left.camera])) < NEAR * tolerance_px
+        direction[free[near & ~mine]] = NEARLY
+    return np.array(found).reshape(-1, 4), np.maximum(direction, -1)
+
+
+def _triangulated_pairs(P: F64, proposals: list[F64]) -> F64:
+    """Points (B, 4) of every two vanishing points of different cameras that lie on each other's epipolar
+    line to a few degrees."""
+    i, j, v1, v2 = [], [], [], []
+    for a in range(len(P)):
+        for b in range(a + 1, len(P)):
+            first, second = np.indices((len(proposals[a]), len(proposals[b]))).reshape(2, -1)
+            i.append(np.full(len(first), a))
+            j.append(np.full(len(first), b))
+            v1.append(proposals[a][first])
+            v2.append(proposals[b][second])
+    pair = np.column_stack([np.concatenate(i), np.concatenate(j)])
+    v = np.stack([np.concatenate(v1), np.concatenate(v2)], axis=1)
+    v /= np.linalg.norm(v, axis=-1, keepdims=True)
+    X = triangulate_directions(P[pair], v)
+    seen = np.einsum("bnij,bj->bni", P[pair], X)
+    sine = np.linalg.norm(np.cross(seen, v), axis=-1) / np.maximum(np.linalg.norm(seen, axis=-1), 1e-300)
+    return np.asarray(X[sine.max(axis=1) < 0.1])
+
+
+def _refined_point(P: F64, segments: SegmentSet, X: F64, tolerance_px: float) -> F64:
+    """X (4,) moved to least misses of its segments, whose choice widens with the better point."""
+    for _ in range(3):
+        mine = segments.subset(support(segments, (P @ X)[segments.camera], tolerance_px) > 0)
+        if len(mine.half) < 4:
+            break
+        tangent = np.linalg.svd(X[None])[2][1:]
+
+        def misses(step: F64, X: F64 = X, tangent: F64 = tangent, mine: SegmentSet = mine) -> F64:
+            return mine.misses(np.einsum("sij,bj->bsi", P[mine.camera], X + step @ tangent))
+
+        step = descend(misses, np.zeros((1, 3)), iterations=10, loss_scale=tolerance_px / 2.0)[0][0]
+        X = X + step @ tangent
+        X = X / np.linalg.norm(X)
+    return X
+
+
+def refine_plane(
+    frame: ReferenceFrame, segments: SegmentSet, direction: I64, plane: F64, v: F64, *, scale_px: float = 0.5
+) -> tuple[F64, F64, float]:
+    """Plane p (3,) and vanishing points v (D, 3) in the reference view that fit all segments together.
+
+    A direction seen at v in the reference view is seen at H_i v in view i, so plane and directions share the
+    least squares over the segments of every photograph (``direction`` (S,), -1 for none). Returns also the
+    cost, the mean loss of a segment.
+    """
+    mine = segments.subset(direction >= 0)
+    of, camera = direction[direction >= 0], mine.camera
+    tangents = np.stack([np.linalg.svd(row[None])[2][1:] for row in v])
+
+    def misses(x: F64) -> F64:
+        points = v + np.einsum("bdk,dki->bdi", x[:, 3:].reshape(len(x), len(v), 2), tangents)
+        w = points[:, of]
+        depth = np.einsum("bsi,bi->bs", w, plane + x[:, :3])
+        return mine.misses(np.einsum("sij,bsj->bsi", frame.A[camera], w) - frame.a[camera] * depth[..., None])
+
+    x, cost = descend(misses, np.zeros((1, 3 + 2 * len(v))), iterations=30, loss_scale=scale_px)
+    points = v + np.einsum("dk,dki->di", x[0, 3:].reshape(len(v), 2), tangents)
+    return plane + x[0, :3], points / np.linalg.norm(points, axis=1, keepdims=True), float(cost[0])
