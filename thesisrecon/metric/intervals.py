@@ -1,10 +1,12 @@
 """Intervals of the intrinsics that may be believed.
 
 The covariance of bundle adjustment is right for independent noise and a right model, and too small on
-photographs: matches err together and lenses have more coefficients than ours. Two things are measured on top
-of it. Where views share a camera, each view alone gives its own intrinsics, and their scatter around the
-common value against what the covariance promises is a factor of inflation. And a floor stands for what the
-camera model leaves out.
+photographs: matches err together, their noise has heavy tails, and lenses have more coefficients than ours.
+How much too small it is shows in how far parts of the scene pull the cameras in different directions
+(:mod:`thesisrecon.optimize.bundle_blocks`). What all parts have in common shows nowhere: a floor stands for
+it, but only where the data are seen to be more than a right model and normal noise. A value that one
+photograph holds alone feels an error of the model more than one that many average: its floor is higher by as
+much as its standard deviation is.
 """
 
 from __future__ import annotations
@@ -13,36 +15,41 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student_t
 
 from thesisrecon.metric.model import MetricModel
-from thesisrecon.optimize.metric_bundle import (
-    BundleOptions,
-    IntrinsicsPrior,
-    MetricBundleResult,
-    MetricCameras,
-    Observations,
-    refine_metric_bundle,
-)
-from thesisrecon.types import I64, IntrinsicInterval
+from thesisrecon.metric.population import Borrowing
+from thesisrecon.optimize.bundle_blocks import BlockScatter
+from thesisrecon.optimize.metric_bundle import IntrinsicsPrior
+from thesisrecon.types import IntrinsicInterval
 
 F64 = NDArray[np.float64]
 
-# What photographs are known to need (covariances 4 to 10 times too small), and how many degrees of freedom
-# that knowledge is worth beside the scatter that a set of photographs shows itself.
-DEFAULT_INFLATION = 4.0
-DEFAULT_WEIGHT = 4.0
+NORMAL_95 = 1.959964
+# What photographs need (covariances 4 to 10 times too small) where there are too few points to measure it.
+DEFAULT_INFLATION, LEAST_BLOCKS = 4.0, 4
+# The contradiction of noise alone keeps below the first; at the second the model is surely wrong somewhere.
+CONTRADICTION = (1.3, 1.8)
+# The same of the residuals' tail: normal noise has 1, matches of photographs 2 to 3.
+TAIL = (1.2, 1.6)
 _COLUMNS = {"focal_px": 0, "principal_x_px": 3, "principal_y_px": 4, "k1": 5}
 
 
 def intrinsic_intervals(
-    model: MetricModel, bundle: MetricBundleResult, prior: IntrinsicsPrior, *, floor_rel: float, indices: I64
+    model: MetricModel,
+    scatter: BlockScatter,
+    prior: IntrinsicsPrior,
+    *,
+    floor_rel: float,
+    borrowed: Borrowing,
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
     """Per view the intervals named in ``MetricResult`` (empty where not registered).
 
-    ``bundle`` is the last adjustment, made on observations ``indices``, with its covariance.
+    ``scatter`` of the last adjustment under ``prior``; ``floor_rel`` is that of photographs, relative to the
+    focal. The std is such that +- 1.96 of it hold 95 % although it was measured on few blocks.
     """
-    inflation, how = measured_inflation(model, prior, indices)
-    covariance = bundle.intrinsics_covariance
+    floor_rel *= model_error_share(scatter, model.tail)
+    together, typical = _together(model, borrowed), float(np.sqrt(max(scatter.typical_ratio, 1.0)))
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for view in range(len(model.registered)):
         if not model.registered[view]:
@@ -50,70 +57,55 @@ def intrinsic_intervals(
             continue
         g = int(model.cameras.group[view])
         row = model.cameras.intrinsics[g]
-        floor = floor_rel * np.array([row[0], row[0], row[0], 1.0])
         intervals = {}
-        for n, (name, column) in enumerate(_COLUMNS.items()):
-            deviation = float(np.sqrt(max(covariance[g, column, column], 0.0)))
-            std = float(np.hypot(inflation * deviation, floor[n]))
-            if deviation == 0.0:
-                intervals[name] = IntrinsicInterval(float(row[column]), 0.0, "assumed")
+        for name, column in _COLUMNS.items():
+            value, variance = float(row[column]), float(scatter.model[g, column])
+            if not variance > 0.0:
+                intervals[name] = IntrinsicInterval(value, 0.0, "assumed")
                 continue
-            limit = float(prior.std[g, column]) * (row[0] if column == 0 else 1.0)
-            std = min(std, limit) if np.isfinite(limit) else std
-            intervals[name] = IntrinsicInterval(float(row[column]), std, f"bundle adjustment, {how}")
+            inflation = _inflation(scatter, g, column)
+            alone = max(1.0, typical * float(np.sqrt(variance)) / together[column])
+            floor = floor_rel * alone * (row[0] if column in (3, 4) else 1.0)
+            std = float(np.hypot(inflation * np.sqrt(variance), floor))
+            std = min(std, float(prior.std[g, column])) * (row[0] if column == 0 else 1.0)
+            how = _source(borrowed, view, column, inflation)
+            intervals[name] = IntrinsicInterval(value, float(std), how)
         answer.append(intervals)
     return tuple(answer)
 
 
-def measured_inflation(
-    model: MetricModel, prior: IntrinsicsPrior, indices: I64, *, max_observations: int = 30000
-) -> tuple[float, str]:
-    """How many times too small the covariance is, and how that is known.
-
-    Adjusts once more with a focal of its own for every view of the largest camera group and compares the
-    scatter of those focals with their standard deviations: z_i = (f_i - weighted mean) / std_i. A few views
-    say little of a spread, hence the factor is sqrt((n0 a^2 + sum z^2) / (n0 + n - 1)) with the known a =
-    ``DEFAULT_INFLATION`` counting as n0 = ``DEFAULT_WEIGHT`` degrees of freedom. With fewer than four views
-    nothing is measured and a is taken.
-    """
-    registered = np.flatnonzero(model.registered)
-    group = model.cameras.group
-    largest = int(np.bincount(group[registered]).argmax())
-    views = registered[group[registered] == largest]
-    if len(views) < 4:
-        return DEFAULT_INFLATION, f"covariance x {DEFAULT_INFLATION:.0f}"
-    k = _thin(model, indices, max_observations)
-    separate = np.arange(len(group), dtype=np.int64)
-    intrinsics = model.cameras.intrinsics[group]
-    t = model.tracks
-    result = refine_metric_bundle(
-        MetricCameras(model.cameras.R, model.cameras.t, intrinsics, separate),
-        model.X,
-        Observations(t.view_index[k], t.point_index[k], t.xy[k]),
-        free=np.array([True, False, False, False, False, False]),
-        prior=IntrinsicsPrior(prior.mean[group], prior.std[group]),
-        options=BundleOptions(
-            sigma_px=model.sigma_px, loss_px=2.0 * model.sigma_px, max_iterations=8, covariance=True
-        ),
-    )
-    log_f = np.log(result.cameras.intrinsics[views, 0])
-    std = (
-        np.sqrt(np.maximum(result.intrinsics_covariance[views, 0, 0], 0.0))
-        / result.cameras.intrinsics[views, 0]
-    )
-    if not (np.isfinite(std).all() and (std > 0).all()):
-        return DEFAULT_INFLATION, f"covariance x {DEFAULT_INFLATION:.0f}"
-    weight = 1.0 / std**2
-    mean = np.sum(weight * log_f) / weight.sum()
-    squares = float(np.sum(weight * (log_f - mean) ** 2))
-    known = DEFAULT_WEIGHT * DEFAULT_INFLATION**2
-    factor = float(np.sqrt((known + squares) / (DEFAULT_WEIGHT + len(views) - 1)))
-    return factor, f"covariance x {factor:.1f} from the scatter between views"
+def model_error_share(scatter: BlockScatter, tail: float) -> float:
+    """0 where nothing but normal noise is seen, 1 where the model of camera and noise is surely not the whole
+    truth."""
+    if scatter.blocks < LEAST_BLOCKS or not np.isfinite(scatter.contradiction):
+        return 1.0
+    signs = [(scatter.contradiction, CONTRADICTION), (tail, TAIL)]
+    return max(float(np.clip((sign - low) / (high - low), 0.0, 1.0)) for sign, (low, high) in signs)
 
 
-def _thin(model: MetricModel, indices: I64, most: int) -> I64:
-    """Observations of every n-th point, so that at most about ``most`` remain."""
-    step = int(np.ceil(len(indices) / most))
-    point = model.tracks.point_index[indices]
-    rank = np.unique(point, return_inverse=True)[1]
-    return np.asarray(indices[rank % step == 0])
+def _together(model: MetricModel, borrowed: Borrowing) -> F64:
+    """(8,) standard deviation of each intrinsic were it common to all cameras that have it on their own."""
+    assert model.cameras.shared is not None
+    own = borrowed.own.variance
+    answer = np.ones(own.shape[1])
+    for column in range(own.shape[1]):
+        first = np.unique(model.cameras.shared[:, column], return_index=True)[1]
+        variance = own[first, column]
+        variance = variance[variance > 0.0]
+        if len(variance):
+            answer[column] = float(np.sqrt(1.0 / np.sum(1.0 / variance)))
+    return answer
+
+
+def _inflation(scatter: BlockScatter, g: int, column: int) -> float:
+    ratio = float(scatter.ratio[g, column])
+    if scatter.blocks < LEAST_BLOCKS or not np.isfinite(ratio):
+        return DEFAULT_INFLATION
+    return float(np.sqrt(ratio) * student_t.ppf(0.975, scatter.blocks - 1) / NORMAL_95)
+
+
+def _source(borrowed: Borrowing, view: int, column: int, inflation: float) -> str:
+    if column == 0 and borrowed.weight[view] < 0.5:
+        own = 1.96 * float(borrowed.own_std[view])
+        return f"borrowed from the other cameras; its own matches leave it open by {own:.2%}"
+    return f"bundle adjustment, covariance x {inflation:.1f} from the scatter between parts of the scene"

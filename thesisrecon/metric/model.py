@@ -15,12 +15,16 @@ from thesisrecon.optimize.triangulation_refine import refine_points
 from thesisrecon.types import B8, I64, Tracks
 
 F64 = NDArray[np.float64]
+# The first column of radial distortion in a table of intrinsics.
+RADIAL = 5
 
 
 @dataclass(frozen=True)
 class MetricModel:
     """All views have a camera entry; only those ``registered`` count. ``X`` (N, 3), zero where not ``valid``;
-    ``ok`` (K,) observations of registered views that the model explains."""
+    ``ok`` (K,) observations of registered views that the model explains; ``sigma_px`` their noise,
+    ``loss_sigmas`` where a robust loss should turn, and ``tail`` how many times wider than that of normal
+    noise its tail is, which gates allow for."""
 
     tracks: Tracks
     sizes: I64
@@ -30,6 +34,13 @@ class MetricModel:
     valid: B8
     ok: B8
     sigma_px: float
+    loss_sigmas: float = 2.0
+    tail: float = 1.0
+
+    @property
+    def gate_px(self) -> float:
+        """The unit of gates in sigmas."""
+        return self.sigma_px * self.tail
 
     def with_cameras(self, cameras: MetricCameras, registered: B8 | None = None) -> MetricModel:
         """The same with other cameras."""
@@ -43,22 +54,24 @@ def project_observations(cameras: MetricCameras, X: F64, view: I64, point: I64) 
     Y = np.einsum("kab,kb->ka", cameras.R[view], X[point]) + cameras.t[view]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         xy = Y[:, :2] / Y[:, 2:]
-        k1 = cameras.intrinsics[cameras.group, 5][view]
-        return apply_calibration(cameras, view, distort(xy, k1[:, None])), Y[:, 2]
+        radial = cameras.intrinsics[cameras.group[view], RADIAL:]
+        return apply_calibration(cameras, view, distort(xy, radial)), Y[:, 2]
 
 
 def apply_calibration(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     """Normalised image points to pixels."""
-    f, aspect, skew, cx, cy, _ = cameras.intrinsics[cameras.group[view]].T
+    f, aspect, skew, cx, cy = cameras.intrinsics[cameras.group[view], :RADIAL].T
     return np.column_stack([f * xy[:, 0] + skew * xy[:, 1] + cx, aspect * f * xy[:, 1] + cy])
 
 
 def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     """Pixels to normalised image points without distortion (K, 2)."""
-    f, aspect, skew, cx, cy, k1 = cameras.intrinsics[cameras.group[view]].T
+    rows = cameras.intrinsics[cameras.group[view]]
+    f, aspect, skew, cx, cy = rows[:, :RADIAL].T
     y = (xy[:, 1] - cy) / (aspect * f)
     distorted = np.column_stack([(xy[:, 0] - cx - skew * y) / f, y])
-    return undistort(distorted, k1[:, None], iterations=10) if np.any(k1 != 0.0) else distorted
+    radial = rows[:, RADIAL:]
+    return undistort(distorted, radial, iterations=10) if radial.any() else distorted
 
 
 def retriangulate(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
@@ -103,7 +116,7 @@ def agreeing_observations(model: MetricModel, *, sigmas: float) -> B8:
     residual = np.nan_to_num(np.linalg.norm(xy - t.xy[k], axis=1), nan=np.inf)
     known = np.abs(model.X[point]).sum(axis=1) > 0
     ok = np.zeros(len(t.xy), dtype=bool)
-    ok[k] = (residual < sigmas * model.sigma_px) & (depth > 0) & known
+    ok[k] = (residual < sigmas * model.gate_px) & (depth > 0) & known
     return ok
 
 
@@ -138,3 +151,11 @@ def truncated_cost(model: MetricModel, gate_px: float) -> float:
     squared = np.ones(len(model.tracks.xy))
     squared[model.ok] = np.minimum(residual_norms(model) ** 2 / gate_px**2, 1.0)
     return float(squared.mean())
+
+
+def explained_shares(model: MetricModel) -> F64:
+    """(V,) share of each view's observations of valid points that are explained; 1 where it has none."""
+    t = model.tracks
+    seen = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
+    good = np.bincount(t.view_index[model.ok], minlength=t.n_views)
+    return np.asarray(np.where(seen > 0, good / np.maximum(seen, 1), 1.0))

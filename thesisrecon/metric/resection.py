@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.metric.model import MetricModel, normalized_observations
 from thesisrecon.optimize.triangulation_refine import refine_pose
-from thesisrecon.types import B8
+from thesisrecon.types import B8, I64
 
 F64 = NDArray[np.float64]
+# What the focal of a camera that shares none is multiplied with in turn.
+ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
 
 
 def resect_calibrated(
@@ -47,18 +49,23 @@ def _squared(R: F64, t: F64, X: F64, xy: F64) -> F64:
 
 
 def add_missing_cameras(
-    model: MetricModel, *, sigmas: float, min_points: int, rng: np.random.Generator
+    model: MetricModel,
+    *,
+    sigmas: float,
+    min_points: int,
+    rng: np.random.Generator,
+    allowed: B8 | None = None,
 ) -> tuple[MetricModel, dict[int, str]]:
     """Register by calibrated resection every view that sees enough of the model; the reasons of the others.
 
-    A camera is taken with its group's intrinsics; when it has a group of its own, its focal is refined with
-    the pose. Views are tried with most points first.
+    A camera is taken with the intrinsics that it shares; a focal that no registered view shares is refined
+    with the pose. Views are tried with most points first; ``allowed`` (V,) says which may join (all).
     """
     t = model.tracks
     counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
     refused: dict[int, str] = {}
     for view in np.argsort(-counts, kind="stable"):
-        if model.registered[view]:
+        if model.registered[view] or not (allowed is None or allowed[view]):
             continue
         if counts[view] < min_points:
             refused[int(view)] = (
@@ -78,24 +85,44 @@ def _add(
 ) -> MetricModel | str:
     t, cameras = model.tracks, model.cameras
     k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
-    X = model.X[t.point_index[k]]
-    group = int(cameras.group[view])
-    threshold = 2.0 * sigmas * model.sigma_px / cameras.intrinsics[group, 0]
-    found = resect_calibrated(
-        X, normalized_observations(cameras, t.view_index[k], t.xy[k]), threshold=threshold, rng=rng
-    )
-    support = 0 if found is None else int(found[2].sum())
+    row = int(cameras.group[view])
+    focals = np.arange(len(cameras.intrinsics)) if cameras.shared is None else cameras.shared[:, 0]
+    alone = not model.registered[focals[cameras.group] == focals[row]].any()
+    found = _pose_and_focal(model, k, row, 2.0 * sigmas * model.gate_px, (ZOOMS if alone else (1.0,), rng))
+    support = 0 if found is None else int(found[3].sum())
     if found is None or support < min_points or support < 0.3 * len(k):
         return f"only {support} of its {len(k)} points agree with one camera"
-    R, translation, inlier = found
-    own = not model.registered[cameras.group == group].any()
-    free = np.array([own, False, False, False, False, False])
+    R, translation, start, inlier = found
     pose = refine_pose(
-        R, translation, cameras.intrinsics[group], X[inlier], t.xy[k][inlier], free=free,
-        loss_px=2.0 * model.sigma_px, iterations=20,
+        R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
+        free=(np.arange(len(start)) == 0) & alone, loss_px=2.0 * model.sigma_px, iterations=20,
     )  # fmt: skip
     Rs, ts, intrinsics = cameras.R.copy(), cameras.t.copy(), cameras.intrinsics.copy()
-    Rs[view], ts[view], intrinsics[group] = pose.R, pose.t, pose.intrinsics
+    Rs[view], ts[view], intrinsics[row] = pose.R, pose.t, pose.intrinsics
     registered = model.registered.copy()
     registered[view] = True
     return model.with_cameras(replace(cameras, R=Rs, t=ts, intrinsics=intrinsics), registered)
+
+
+def _pose_and_focal(
+    model: MetricModel,
+    k: I64,
+    row: int,
+    threshold_px: float,
+    tried: tuple[tuple[float, ...], np.random.Generator],
+) -> tuple[F64, F64, F64, B8] | None:
+    """The best supported R, t, intrinsics and inliers of observations ``k`` over zooms of the row's focal."""
+    t, best = model.tracks, None
+    zooms, rng = tried
+    for zoom in zooms:
+        table = model.cameras.intrinsics.copy()
+        table[row, 0] *= zoom
+        cameras = replace(model.cameras, intrinsics=table)
+        normalized = normalized_observations(cameras, t.view_index[k], t.xy[k])
+        threshold = threshold_px / table[row, 0]
+        # A focal that is off by some per cent needs a wider gate to show that it is the nearest.
+        threshold = max(threshold, 0.01) if len(zooms) > 1 else threshold
+        pose = resect_calibrated(model.X[t.point_index[k]], normalized, threshold=threshold, rng=rng)
+        if pose is not None and (best is None or pose[2].sum() > best[3].sum()):
+            best = pose[0], pose[1], table[row], pose[2]
+    return best

@@ -1,0 +1,95 @@
+"""The scatter between parts of a scene: 1 on independent noise, more where noise or model are otherwise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.optimize.bundle_scenes import make_block
+from thesisrecon.optimize.bundle_blocks import block_scatter, metric_jacobians, point_blocks
+from thesisrecon.optimize.metric_bundle import (
+    BundleOptions,
+    IntrinsicsPrior,
+    Observations,
+    refine_metric_bundle,
+)
+
+FREE = np.array([True, False, False, True, True, True])
+SIGMA = 0.5
+
+
+def _scatter(block, xy, *, free=FREE, loss=20.0):
+    seen = Observations(block.view, block.point, xy)
+    q = block.cameras.intrinsics
+    prior = IntrinsicsPrior(q, np.full_like(q, np.inf))
+    options = BundleOptions(sigma_px=SIGMA, loss_px=loss * SIGMA, max_iterations=30, covariance=True)
+    fit = refine_metric_bundle(block.cameras, block.X, seen, free=free, prior=prior, options=options)
+    noise = (SIGMA, loss * SIGMA)
+    return fit, block_scatter(fit.cameras, fit.X, seen, free=free, prior=prior, noise=noise)
+
+
+def test_jacobians_match_finite_differences():
+    block = make_block(k1=0.05, lens=(-0.03, 0.02), groups=2)
+    c, h = block.cameras, 1e-6
+    seen = Observations(block.view, block.point, block.xy + 1.0)
+    residual, _, G, B = metric_jacobians(c, block.X, seen)
+    np.testing.assert_allclose(residual, -1.0, atol=1e-8)
+    for column in range(8):
+        step = np.zeros(8)
+        step[column] = h * (c.intrinsics[0, 0] if column == 0 else 1.0)
+        moved = metric_jacobians(replace(c, intrinsics=c.intrinsics + step), block.X, seen)[0]
+        np.testing.assert_allclose(G[:, :, column], (moved - residual) / h, rtol=1e-3, atol=1e-3)
+    for column in range(3):
+        moved = metric_jacobians(c, block.X + h * np.eye(3)[column], seen)[0]
+        np.testing.assert_allclose(B[:, :, column], (moved - residual) / h, rtol=1e-3, atol=2e-3)
+
+
+def test_the_variance_is_that_of_bundle_adjustment():
+    block = make_block(points=200)
+    xy = block.xy + SIGMA * np.random.default_rng(0).normal(size=block.xy.shape)
+    fit, scatter = _scatter(block, xy)
+    scale = SIGMA / fit.sigma_px
+    expected = scale**2 * np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2)
+    expected[:, 0] /= fit.cameras.intrinsics[:, 0] ** 2
+    np.testing.assert_allclose(scatter.model, expected, rtol=0.02)
+    assert np.isnan(scatter.ratio[0, 1])
+    assert scatter.blocks >= 8
+
+
+def test_independent_noise_has_the_ratio_one_whatever_its_distribution():
+    block = make_block(points=400)
+    rng = np.random.default_rng(1)
+    normal, heavy = [], []
+    for _ in range(12):
+        noise = SIGMA * rng.normal(size=block.xy.shape)
+        normal.append(_scatter(block, block.xy + noise)[1])
+        noise *= np.where(rng.random(len(noise)) < 0.2, 4.0, 1.0)[:, None]
+        heavy.append(_scatter(block, block.xy + noise, loss=1.5)[1])
+    assert np.mean([s.typical_ratio for s in normal]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean([s.contradiction for s in normal]) == pytest.approx(1.0, abs=0.12)
+    assert np.mean([s.contradiction for s in heavy]) == pytest.approx(1.0, abs=0.15)
+    # Four times as wide in a fifth of the matches: more than the size of the core says.
+    assert np.mean([s.typical_ratio for s in heavy]) > 1.3
+
+
+def test_noise_that_neighbours_share_is_seen():
+    block = make_block(points=400)
+    rng = np.random.default_rng(2)
+    # A smooth field of errors in each image beside a little noise.
+    wave = rng.normal(size=(len(block.cameras.R), 2, 2))
+    field = np.sin(np.einsum("kab,kb->ka", wave[block.view], block.xy / 150.0))
+    _, scatter = _scatter(block, block.xy + 0.3 * SIGMA * rng.normal(size=field.shape) + SIGMA * field)
+    assert scatter.contradiction > 2.0
+
+
+def test_blocks_are_of_neighbours_and_of_equal_size():
+    rng = np.random.default_rng(3)
+    X, used = rng.normal(size=(500, 3)) * [5.0, 1.0, 1.0], rng.random(500) < 0.9
+    block = point_blocks(X, used)
+    assert (block[~used] == -1).all()
+    counts = np.bincount(block[used])
+    assert len(counts) == 32
+    assert counts.min() > 0.8 * counts.mean()
+    within = np.mean([np.var(X[block == b], axis=0).sum() for b in range(32)])
+    assert within < 0.3 * np.var(X, axis=0).sum()
+    assert point_blocks(X[:20], np.ones(20, bool)).max() == 0

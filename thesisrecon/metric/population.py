@@ -1,0 +1,164 @@
+"""Cameras of one kind: how much their intrinsics scatter about a common value, measured on themselves.
+
+Photographs of one size are likely of one kind of lens. Each camera's own value is q_i with variance s_i^2
+from its matches; the kind's values are taken as N(mu, tau^2) with mu and tau unknown (a random-effects model;
+tau by restricted maximum likelihood, Harville 1977). Where the values agree within their noise tau is small
+and a camera that is determined badly borrows from the others; where photographs were zoomed tau is large and
+binds nothing. A camera far off the rest is left alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.metric.adjustment import Adjustment, Population
+from thesisrecon.metric.model import MetricModel
+from thesisrecon.metric.start import FOCAL, K1, WIDTH
+from thesisrecon.optimize.bundle_blocks import BlockScatter
+from thesisrecon.types import B8, I64
+
+F64 = NDArray[np.float64]
+
+# Intrinsics that a kind may have in common: focal, principal point, k1.
+COLUMNS = (FOCAL, 3, 4, K1)
+LEAST_MEMBERS = 3
+OUTLIER_SIGMAS = 4.0
+# Cameras of one zoom setting are of one lens, whose k2 and k3 they share.
+SAME_ZOOM = 0.01
+LEAST_SPREAD = 1e-6
+
+
+@dataclass(frozen=True)
+class OwnValues:
+    """What each row's own matches say: ``value``, ``std`` (G, 8) (log of the focal, its std relative), and
+    which rows are ``members`` of a kind (G,), -1 for none."""
+
+    value: F64
+    std: F64
+    members: I64
+
+    @property
+    def variance(self) -> F64:
+        """(G, 8) squared deviations."""
+        return self.std**2
+
+
+def own_values(model: MetricModel, adjustment: Adjustment, scatter: BlockScatter) -> OwnValues:
+    """The model's intrinsics before a population binds them; rows without a registered view are no
+    members."""
+    group = model.cameras.group
+    first = np.unique(group, return_index=True)[1]
+    value = model.cameras.intrinsics.copy()
+    value[:, FOCAL] = np.log(value[:, FOCAL])
+    members = np.unique(adjustment.assumed.alike[first], return_inverse=True)[1].reshape(-1)
+    registered = np.isin(np.arange(len(first)), group[model.registered])
+    inflation = np.sqrt(np.maximum(scatter.typical_ratio, 1.0))
+    members = np.where(registered, members, -1)
+    return OwnValues(value, inflation * np.sqrt(np.maximum(scatter.model, 0.0)), members)
+
+
+def estimate_population(own: OwnValues, shared: I64) -> Population | None:
+    """The kinds among the rows and the spread of their values; None where nothing is to be borrowed.
+
+    Raises nothing: kinds with fewer than ``LEAST_MEMBERS`` distinct values are left alone.
+    """
+    rows = own.members.copy()
+    spread = np.full(WIDTH, np.inf)
+    outside = np.zeros(len(rows), dtype=bool)
+    for column in COLUMNS:
+        found: list[float] = []
+        for kind in np.unique(rows[rows >= 0]):
+            index = np.flatnonzero(rows == kind)
+            index = index[np.unique(shared[index, column], return_index=True)[1]]
+            value, std = own.value[index, column], own.std[index, column]
+            if len(index) < LEAST_MEMBERS or not (std > 0.0).all():
+                continue
+            far = outlying(value, std)
+            if column == FOCAL:
+                outside |= np.isin(shared[:, column], shared[index[far], column]) & (rows == kind)
+            found.append(measured_spread(value[~far], std[~far]))
+        if found:
+            spread[column] = max(found)
+    rows[outside] = -1
+    return Population(rows, spread) if np.isfinite(spread).any() else None
+
+
+def outlying(value: F64, std: F64) -> B8:
+    """(n,) values further from the median than ``OUTLIER_SIGMAS`` of their noise and the values' scatter."""
+    off = np.abs(value - np.median(value))
+    scatter = 1.4826 * float(np.median(off))
+    return np.asarray(off > OUTLIER_SIGMAS * np.hypot(scatter, std))
+
+
+def measured_spread(value: F64, std: F64) -> float:
+    """Standard deviation tau of the true values behind n noisy ones: the largest within half a unit of the
+    restricted likelihood's maximum.
+
+    The upper end, since a few values can agree by chance and a tau too small would state intervals too
+    narrow.
+    """
+    if len(value) < 2:
+        return np.inf
+    least = max(1e-2 * float(std.min()), LEAST_SPREAD)
+    most = max(10.0 * float(np.ptp(value)), 10.0 * least)
+    taus = np.geomspace(least, most, 200)
+    variance = taus[:, None] ** 2 + std**2
+    weight = 1.0 / variance
+    mean = (weight @ value) / weight.sum(axis=1)
+    squares = np.sum(weight * (value - mean[:, None]) ** 2, axis=1)
+    likelihood = -0.5 * (np.log(variance).sum(axis=1) + np.log(weight.sum(axis=1)) + squares)
+    return float(taus[np.flatnonzero(likelihood >= likelihood.max() - 0.5).max()])
+
+
+def bind(
+    model: MetricModel, adjustment: Adjustment, population: Population
+) -> tuple[MetricModel, Adjustment]:
+    """The adjustment with the population, and the model with the lens shared where the zoom is one."""
+    assert model.cameras.shared is not None
+    if population.spread[FOCAL] < SAME_ZOOM:
+        shared = model.cameras.shared.copy()
+        for kind in np.unique(population.rows[population.rows >= 0]):
+            rows = np.flatnonzero(population.rows == kind)
+            shared[rows, K1 + 1 :] = shared[rows[0], K1 + 1 :]
+        model = replace(model, cameras=replace(model.cameras, shared=shared))
+    return model, replace(adjustment, population=population)
+
+
+@dataclass(frozen=True)
+class Borrowing:
+    """How far each view's focal stands on its own: ``own_std`` (V,) relative, what its own matches give, and
+    ``weight`` (V,) its part in the answer, 1 where nothing was borrowed; ``own`` values of all rows."""
+
+    own_std: F64
+    weight: F64
+    own: OwnValues
+
+    def warnings(self, registered: Sequence[int], least: float) -> tuple[str, ...]:
+        """A sentence for each focal that its own matches leave open by more than ``least`` (relative)."""
+        said = []
+        for view in registered:
+            if self.own_std[view] > least:
+                end = (
+                    "it is borrowed from the other cameras"
+                    if self.weight[view] < 0.5
+                    else "no other camera is there to borrow from"
+                )
+                said.append(
+                    f"the focal length of view {view} is not determined by its own matches "
+                    f"(+- {1.96 * self.own_std[view]:.0%}); {end}"
+                )
+        return tuple(said)
+
+
+def borrowing(own: OwnValues, population: Population | None, group: I64) -> Borrowing:
+    """Who borrows a focal: weight tau^2 / (tau^2 + s_i^2) on a camera's own matches."""
+    std = own.std[:, FOCAL]
+    weight = np.ones(len(std))
+    if population is not None and np.isfinite(population.spread[FOCAL]):
+        tau = population.spread[FOCAL]
+        weight = np.where(population.rows >= 0, tau**2 / (tau**2 + std**2), 1.0)
+    return Borrowing(std[group], weight[group], own)
