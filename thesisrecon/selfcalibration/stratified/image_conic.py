@@ -93,7 +93,7 @@ def dual_image_constant(H: F64) -> tuple[F64, F64]:
     The smallest is 0 for exact homographies; where the next one is 0 too w* is one of a family.
     """
     equations = _carried(H.swapaxes(-1, -2)) - np.eye(6)
-    _, s, Vt = np.linalg.svd((_ENTRY_WEIGHT[:, None] * equations).reshape(-1, 6))
+    _, s, Vt = np.linalg.svd((_ENTRY_WEIGHT[:, None] * equations).reshape(-1, 6), full_matrices=False)
     return _positive(Vt[5][_PLACE]), s
 
 
@@ -197,7 +197,7 @@ def solve_conic(
         back = np.array([focals[0, knowledge.first[knowledge.reference]]] * 2 + [1.0])
         if orthogonal is not None and len(orthogonal):
             rows = np.concatenate([rows, _orthogonal_rows(orthogonal / back)])
-        _, s, Vt = np.linalg.svd(rows)
+        _, s, Vt = np.linalg.svd(rows, full_matrices=False)
         scaled = _positive(Vt[5][_PLACE])
         conic = ImageConic(_unit(scaled / np.outer(back, back)), s)
         if not conic.definite:

@@ -25,6 +25,9 @@ NEAR = 4.0
 
 NEARLY = -2
 
+_FIRST_NOISE_PX, _LEAST_NOISE_PX = 0.5, 1e-3
+_MIN_SEGMENTS = 6
+
 
 @dataclass(frozen=True)
 class SegmentSet:
@@ -102,7 +105,7 @@ def _homogeneous(xy: F64) -> F64:
 
 def _nearest_to_lines(lines: F64, weight: F64) -> F64:
     scaled = lines / np.linalg.norm(lines, axis=1, keepdims=True) * weight[:, None]
-    return np.asarray(np.linalg.svd(scaled)[2][2])
+    return np.asarray(np.linalg.svd(scaled, full_matrices=False)[2][2])
 
 
 def triangulate_directions(P: F64, v: F64) -> F64:
@@ -189,24 +192,47 @@ def _refined_point(P: F64, segments: SegmentSet, X: F64, tolerance_px: float) ->
 
 
 def refine_plane(
-    frame: ReferenceFrame, segments: SegmentSet, direction: I64, plane: F64, v: F64, *, scale_px: float = 0.5
+    frame: ReferenceFrame, segments: SegmentSet, direction: I64, plane: F64, v: F64
 ) -> tuple[F64, F64, float]:
     """Plane p (3,) and vanishing points v (D, 3) in the reference view that fit all segments together.
 
     A direction seen at v in the reference view is seen at H_i v in view i, so plane and directions share the
-    least squares over the segments of every photograph (``direction`` (S,), -1 for none). Returns also the
-    cost, the mean loss of a segment.
+    least squares over the segments of every photograph (``direction`` (S,), -1 for none). After each of four
+    passes the noise is estimated, robustly, and segments beyond 2.5 times it are left out of the next.
+    Returns also the noise in px.
     """
-    mine = segments.subset(direction >= 0)
-    of, camera = direction[direction >= 0], mine.camera
+    kept, noise = direction >= 0, _FIRST_NOISE_PX
+    for _ in range(4):
+        plane, v = _fit_plane(frame, segments.subset(kept), direction[kept], (plane, v), noise)
+        misses = np.abs(_plane_misses(frame, segments, np.maximum(direction, 0), plane[None], v[None])[0])
+        noise = max(1.4826 * float(np.median(misses[direction >= 0])), _LEAST_NOISE_PX)
+        trimmed = (direction >= 0) & (misses <= 2.5 * noise)
+        counts = np.bincount(direction[trimmed], minlength=len(v))
+        if counts.min() < _MIN_SEGMENTS:
+            break
+        kept = trimmed
+    return plane, v, noise
+
+
+def _plane_misses(frame: ReferenceFrame, segments: SegmentSet, of: I64, plane: F64, v: F64) -> F64:
+    """Misses (B, S) px of segments of directions ``of`` (S,) under planes (B, 3) and points v (B, D, 3)."""
+    w, camera = v[:, of], segments.camera
+    depth = np.einsum("bsi,bi->bs", w, plane)
+    return segments.misses(np.einsum("sij,bsj->bsi", frame.A[camera], w) - frame.a[camera] * depth[..., None])
+
+
+def _fit_plane(
+    frame: ReferenceFrame, segments: SegmentSet, of: I64, start: tuple[F64, F64], noise: float
+) -> tuple[F64, F64]:
+    plane, v = start
     tangents = np.stack([np.linalg.svd(row[None])[2][1:] for row in v])
 
-    def misses(x: F64) -> F64:
-        points = v + np.einsum("bdk,dki->bdi", x[:, 3:].reshape(len(x), len(v), 2), tangents)
-        w = points[:, of]
-        depth = np.einsum("bsi,bi->bs", w, plane + x[:, :3])
-        return mine.misses(np.einsum("sij,bsj->bsi", frame.A[camera], w) - frame.a[camera] * depth[..., None])
+    def moved(x: F64) -> F64:
+        return np.asarray(v + np.einsum("bdk,dki->bdi", x[:, 3:].reshape(len(x), len(v), 2), tangents))
 
-    x, cost = descend(misses, np.zeros((1, 3 + 2 * len(v))), iterations=30, loss_scale=scale_px)
-    points = v + np.einsum("dk,dki->di", x[0, 3:].reshape(len(v), 2), tangents)
-    return plane + x[0, :3], points / np.linalg.norm(points, axis=1, keepdims=True), float(cost[0])
+    x, _ = descend(
+        lambda x: _plane_misses(frame, segments, of, plane + x[:, :3], moved(x)),
+        np.zeros((1, 3 + 2 * len(v))), iterations=30, loss_scale=noise,
+    )  # fmt: skip
+    points = moved(x)[0]
+    return plane + x[0, :3], points / np.linalg.norm(points, axis=1, keepdims=True)
