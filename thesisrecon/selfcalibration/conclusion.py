@@ -32,6 +32,12 @@ FOCAL_LIMITS = (0.02, 200.0)
 """No lens has a focal length outside of these, in long sides of the image: 178 deg to 0.3 deg of view."""
 
 
+def log_focals_of(frame: ReferenceFrame, K: F64) -> F64:
+    """Log focals (G,) of the camera groups of calibrations K (R, 3, 3), each the median of its views."""
+    log_f = 0.5 * np.log(K[:, 0, 0] * K[:, 1, 1])
+    return np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
+
+
 @dataclass(frozen=True)
 class Answer:
     """A plane at infinity (3,) and unit-free calibrations ``K`` (R, 3, 3) in a reference frame, the ``cost``
@@ -44,8 +50,7 @@ class Answer:
 
     def log_focals(self, frame: ReferenceFrame) -> F64:
         """Log focals (G,) of the camera groups, each the median of its views."""
-        log_f = 0.5 * np.log(self.K[:, 0, 0] * self.K[:, 1, 1])
-        return np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
+        return log_focals_of(frame, self.K)
 
 
 def guarded(calibrate: Callable[P, SelfCalibration]) -> Callable[P, SelfCalibration]:

@@ -24,6 +24,7 @@ from thesisrecon.selfcalibration.conclusion import (
     Answer,
     conclude,
     guarded,
+    log_focals_of,
     require_cameras,
     square_calibrations,
 )
@@ -113,9 +114,11 @@ class KruppaEquations:
     """The Kruppa equations alone, over the fundamental matrices of all camera pairs.
 
     One focal for all cameras is scanned (``focal_range`` in long sides, ``focal_steps``), its ``starts`` best
-    minima are refined over everything that is unknown, and the plane at infinity is fitted to the
-    calibrations. ``scale``: residual of a pair beyond which it counts linearly. ``min_common`` observations
-    make a pair; ``own_matches`` fits each F to the matches of its pair instead of taking it from the cameras.
+    minima are refined over everything that is unknown, and the plane at infinity is fitted to each. The one
+    whose cameras are nearest to rotations is the answer: of few pairs the equations have false solutions
+    without residual, focals near 0 among them. ``scale``: residual of a pair beyond which it counts linearly.
+    ``min_common`` observations make a pair; ``own_matches`` fits each F to the matches of its pair instead of
+    taking it from the cameras.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
@@ -144,12 +147,10 @@ class KruppaEquations:
         answers = []
         for log_f in self._scan(pairs, len(frame.views)):
             start = unknown.start(np.full((1, len(frame.views)), log_f))[0]
-            found = minimize_kruppa(pairs, unknown, start, scale=self.scale)
-            answers.append(Answer(np.full(3, np.nan), found.K, found.cost, "Kruppa equations"))
-        best = min(answers, key=lambda a: a.cost)
-        plane, _ = planes_for_focals(frame, self.criterion, best.log_focals(frame))
-        answer = Answer(plane, best.K, best.cost, best.method)
-        return conclude(frame, reconstruction, self.criterion, [answer], kept=1, min_positive=0.5)
+            K = minimize_kruppa(pairs, unknown, start, scale=self.scale).K
+            plane, cost = planes_for_focals(frame, self.criterion, log_focals_of(frame, K))
+            answers.append(Answer(plane, K, cost, "Kruppa equations"))
+        return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)
 
     def _scan(self, pairs: PairGeometry, n: int) -> list[float]:
         """The best local minima of one common focal; logarithms."""
