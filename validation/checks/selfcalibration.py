@@ -22,10 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.assumptions import IntrinsicsAssumption, assumptions_of_views
-from thesisrecon.config import KINDS
+from thesisrecon.config import KINDS, SelfCalibrator
 from thesisrecon.errors import StageFailure
 from thesisrecon.metric import UpgradeAndBundle
-from thesisrecon.selfcalibration import HypothesesAndRefinement
+from thesisrecon.selfcalibration import (
+    HypothesesAndRefinement,
+    ModulusConstraint,
+    PollefeysQuadric,
+    Stratified,
+)
 from thesisrecon.types import Assumptions, Reconstruction
 from validation.metrics.focal_bound import focal_bound
 from validation.metrics.record import Metric, markdown_table
@@ -36,6 +41,18 @@ F64 = NDArray[np.float64]
 
 WITH_BUNDLE = "the whole, with the metric stage"
 BOUND = "the bound"
+VARIANTS: dict[str, SelfCalibrator] = {
+    **{kind: variant() for kind, variant in KINDS["selfcalibration"].items()},
+    "stratified, closed form": Stratified(refined=False),
+    "stratified, Pollefeys' K, closed form": Stratified(calibration=PollefeysQuadric(), refined=False),
+    "modulus constraint": Stratified(ModulusConstraint()),
+    "modulus constraint, closed form": Stratified(ModulusConstraint(), refined=False),
+    "modulus constraint, Pollefeys' K, closed form": Stratified(
+        ModulusConstraint(), PollefeysQuadric(), refined=False
+    ),
+}
+"""Every kind of the table, and the stratified one (by default Hartley's search, then his K) in its parts."""
+
 SCENES = ("cube", "cloud")
 MODES = ("constant", "zooming")
 NOISES_PX = (0.0, 0.5, 1.0, 2.0)
@@ -159,7 +176,7 @@ def focals_of(method: str, projective: Reconstruction, assumed: Assumptions) -> 
         result = UpgradeAndBundle().refine(projective, calibration, assumed=assumed, rng=rng)
         assert result.reconstruction.K is not None
         return result.reconstruction.K, result.trusted
-    answer = KINDS["selfcalibration"][method]().calibrate(projective, assumed=assumed, rng=rng)
+    answer = VARIANTS[method].calibrate(projective, assumed=assumed, rng=rng)
     return answer.K, answer.identifiable
 
 
@@ -245,7 +262,7 @@ def read_trials(paths: Sequence[Path]) -> list[Trial]:
     lines = [line for path in paths for line in path.read_text(encoding="utf-8").splitlines()]
     trials = [Trial(**json.loads(line)) for line in lines]
     unique = {(t.scene, t.mode, t.sigma_px, t.views, t.seed, t.method): t for t in trials}
-    order = [*KINDS["selfcalibration"], WITH_BUNDLE, BOUND]
+    order = [*VARIANTS, WITH_BUNDLE, BOUND]
     return sorted(unique.values(), key=lambda t: order.index(t.method) if t.method in order else len(order))
 
 
@@ -258,7 +275,7 @@ def _quiet_cell(job: tuple[Cell, tuple[str, ...], int, int]) -> list[Trial]:
 
 def main() -> int:
     """Run the cells, append every trial to a file, print the tables."""
-    known = [*KINDS["selfcalibration"], WITH_BUNDLE, BOUND]
+    known = [*VARIANTS, WITH_BUNDLE, BOUND]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=SCENES, choices=SCENES)
     parser.add_argument("--modes", nargs="+", default=MODES, choices=MODES)
