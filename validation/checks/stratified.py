@@ -1,8 +1,8 @@
 """Each stratified method alone on photographs: focal error in closed form and after its refinement.
 
 `python -m validation.checks.stratified -o FOLDER [NAME ...]` reconstructs the named sets (a folder that holds
-them already is resumed) and calibrates their projective stratum by every way to the plane at infinity and both
-ways from it to K. Sets without truth are held against the metric result of the default pipeline.
+them already is resumed) and calibrates their projective stratum by every way to the plane at infinity and
+both ways from it to K. Sets without truth are held against the metric result of the default pipeline.
 """
 
 from __future__ import annotations
@@ -29,14 +29,17 @@ from thesisrecon.selfcalibration import (
 from thesisrecon.types import F64, Image, Reconstruction
 from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene
 
-PLANES = {
+PLANES: dict[str, CheiralitySearch | ModulusConstraint | ParallelLines] = {
     "cheirality, grid alone": CheiralitySearch(descent=0),
     "cheirality search": CheiralitySearch(),
     "modulus constraint": ModulusConstraint(),
     "parallel lines": ParallelLines(),
     "parallel lines, right angles": ParallelLines(right_angles=True),
 }
-WAYS = {"Hartley": HartleyLinear(), "Pollefeys": PollefeysQuadric()}
+WAYS: dict[str, HartleyLinear | PollefeysQuadric] = {
+    "Hartley": HartleyLinear(),
+    "Pollefeys": PollefeysQuadric(),
+}
 
 
 @dataclass(frozen=True)
