@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.levenberg_marquardt import invert_information
 from thesisrecon.optimize.metric_cameras import FOCAL, POSE_DOF
-from thesisrecon.optimize.reduced_solvers import ReducedSystem
+from thesisrecon.optimize.reduced_solvers import ReducedSystem, order_views
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 B8 = NDArray[np.bool_]
 SIMILARITY_DOF = 7
+# Unknowns up to which the whole matrix is inverted.
+DENSE = 1200
 MAD_TO_SIGMA = 1.4826
 # Variance of a standard normal variable cut at +-2.5.
 TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
@@ -53,34 +55,101 @@ class CovarianceInput:
 def bundle_covariances(found: CovarianceInput, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
     """Covariances of intrinsics (G, C, C), entry ``number`` (G, C) a column's, and of poses (V, 6, 6).
 
-    S is singular along the directions N of the frame's seven freedoms; (S + N N')^-1 is S's generalised
-    inverse with the freedoms at unit variance, which are then removed. N has no part in the intrinsics, so
-    their covariance does not depend on the frame. ``focal`` (G,) takes log f to f, ``scale`` the lengths.
+    Poses are taken with respect to the inner gauge: of all solutions that differ by a similarity, that which
+    moved the cameras least. The frame has no part in the intrinsics, so their covariance does not depend on
+    it. ``focal`` (G,) takes log f to f, ``scale`` the lengths.
     """
-    S = found.reduced.dense()
-    S = np.triu(S) + np.triu(S, 1).T
-    width = found.reduced.sums.border.shape[1]
+    b, C, e = found.reduced.sums.border.shape
+    width, edge = (C if b else 0), b * C
     views = np.flatnonzero(found.block >= 0)
-    columns = width * found.block[views, None] + np.arange(POSE_DOF)
-    if found.held or not len(views):
-        covariance = invert_information(S)
-    else:
-        N = np.zeros((len(S), SIMILARITY_DOF))
-        N[columns.ravel()] = gauge_directions(found.R[views], found.t[views])
-        weight = float(np.median(np.diag(S)))
-        covariance = invert_information(S + weight * N @ N.T)
-        covariance = covariance - N @ (N.T @ covariance @ N) @ N.T
+    blocks = _dense_blocks(found, views) if edge + e <= DENSE or not b else _band_blocks(found, views)
     poses = np.zeros((len(found.t), POSE_DOF, POSE_DOF))
     units = np.array([1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale, 1.0 / scale])
-    poses[views] = covariance[columns[:, :, None], columns[:, None, :]] * units * units[:, None]
+    if len(views):
+        poses[views] = blocks[found.block[views], :POSE_DOF, :POSE_DOF] * units * units[:, None]
     intrinsics = np.zeros((*number.shape, number.shape[1]))
     for g, row in enumerate(number):
         moves = np.flatnonzero(row >= 0)
+        own = row[moves][row[moves] < edge] // width if width else row[:0]
+        block = int(own[0]) if len(own) else 0
+        index = np.where(row[moves] < edge, row[moves] - width * block, row[moves] - edge + width)
         units = np.where(moves == FOCAL, focal[g], 1.0)
-        intrinsics[g][np.ix_(moves, moves)] = (
-            covariance[np.ix_(row[moves], row[moves])] * units * units[:, None]
-        )
+        intrinsics[g][np.ix_(moves, moves)] = blocks[block][np.ix_(index, index)] * units * units[:, None]
     return intrinsics, poses
+
+
+def _dense_blocks(found: CovarianceInput, views: I64) -> F64:
+    """(b, C + e, C + e) covariances of each view's columns with the border's, by the whole matrix.
+
+    S is singular along the directions N of the frame's seven freedoms; (S + N N')^-1 is S's generalised
+    inverse with the freedoms at unit variance, which are then removed. Directions that the data do not
+    determine get a huge variance.
+    """
+    b, C, e = found.reduced.sums.border.shape
+    S = found.reduced.dense()
+    S = np.triu(S) + np.triu(S, 1).T
+    if found.held or not len(views):
+        covariance = invert_information(S)
+    else:
+        N = _gauge(found, views)
+        weight = float(np.median(np.diag(S)))
+        covariance = invert_information(S + weight * N @ N.T)
+        covariance = covariance - N @ (N.T @ covariance @ N) @ N.T
+    index = np.concatenate(
+        [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
+    )
+    index = index if b else np.arange(e)[None]
+    return np.asarray(covariance[index[:, :, None], index[:, None, :]])
+
+
+def _band_blocks(found: CovarianceInput, views: I64) -> F64:
+    """The same from a banded factor: any seven coordinates hold the frame, then Baarda's S-transformation
+    takes the covariance Q to the inner gauge, (I - N N') Q (I - N N')."""
+    reduced = found.reduced
+    b, C, e = reduced.sums.border.shape
+    if not found.held:
+        _hold_frame(found, views)
+    factored = order_views(reduced.row, reduced.column, b).factor(reduced)
+    if factored is None:
+        return np.full((b, C + e, C + e), np.inf)
+    blocks = factored.inverse_blocks()
+    if found.held:
+        return blocks
+    N = _gauge(found, views)
+    moved = factored.solve(N)
+    if moved is None:
+        return np.full((b, C + e, C + e), np.inf)
+
+    def rows(matrix: F64) -> F64:
+        own = matrix[: b * C].reshape(b, C, -1)
+        return np.concatenate([own, np.broadcast_to(matrix[b * C :], (b, e, own.shape[2]))], axis=1)
+
+    n, m, middle = rows(N), rows(moved), N.T @ moved
+    cross = m @ np.swapaxes(n, 1, 2)
+    return np.asarray(blocks - cross - np.swapaxes(cross, 1, 2) + n @ middle @ np.swapaxes(n, 1, 2))
+
+
+def _hold_frame(found: CovarianceInput, views: I64) -> None:
+    """Weight on seven coordinates that fix the frame: one pose, and the position of the camera farthest from
+    it along the line between them."""
+    sums, C = found.reduced.sums, found.reduced.sums.border.shape[1]
+    centres = -np.einsum("vba,vb->va", found.R[views], found.t[views])
+    far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
+    line = found.R[views[far]] @ (centres[far] - centres[0])
+    held = (found.reduced.row == found.reduced.column).nonzero()[0]
+    weight = float(np.median(sums.blocks[held][:, np.arange(C), np.arange(C)]))
+    first, other = held[found.block[views[0]]], held[found.block[views[far]]]
+    sums.blocks[first, np.arange(POSE_DOF), np.arange(POSE_DOF)] += weight
+    sums.blocks[other, 3:6, 3:6] += weight * np.outer(line, line) / max(float(line @ line), 1e-300)
+
+
+def _gauge(found: CovarianceInput, views: I64) -> F64:
+    """Orthonormal (D, 7): how all columns move when the world is shifted, turned and scaled."""
+    width = found.reduced.sums.border.shape[1]
+    N = np.zeros((len(found.reduced.sums.rhs), SIMILARITY_DOF))
+    columns = width * found.block[views, None] + np.arange(POSE_DOF)
+    N[columns.ravel()] = gauge_directions(found.R[views], found.t[views])
+    return N
 
 
 def gauge_directions(R: F64, t: F64) -> F64:

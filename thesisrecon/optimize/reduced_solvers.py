@@ -67,6 +67,54 @@ class DenseCholesky:
 
 
 @dataclass(frozen=True)
+class BandedFactor:
+    """A reduced system taken apart.
+
+    LAPACK's lower banded ``factor`` (width, b C) of the views' part, views in the order ``place`` (b,);
+    ``border`` (b, C, e); ``moved`` (b C, e) = views^-1 border; ``complement`` (e, e) = corner - border'
+    moved."""
+
+    place: I64
+    factor: F64
+    border: F64
+    moved: F64
+    complement: F64
+
+    def solve_views(self, right: F64) -> F64:
+        """views^-1 right for right (b C, m)."""
+        b, C, _ = self.border.shape
+        ordered = right.reshape(b, C, -1)[np.argsort(self.place)].reshape(b * C, -1)
+        solved, _ = lapack.dpbtrs(self.factor, ordered, lower=1)
+        return np.asarray(solved.reshape(b, C, -1)[self.place].reshape(b * C, -1))
+
+    def solve(self, right: F64) -> F64 | None:
+        """S^-1 right for right (D, m); None where the complement is not positive."""
+        edge, flat = len(self.moved), self.border.reshape(len(self.moved), -1)
+        views = self.solve_views(right[:edge])
+        tail = solve_positive(self.complement, right[edge:] - flat.T @ views)
+        if tail is None or not np.isfinite(views).all():
+            return None
+        return np.concatenate([views - self.moved @ tail, tail])
+
+    def inverse_blocks(self) -> F64:
+        """(b, C + e, C + e): of S^-1 the rows and columns of each view and of the border."""
+        b, C, e = self.border.shape
+        band = np.zeros(self.factor.T.shape)
+        kernels.invert_band(np.ascontiguousarray(self.factor.T), band)
+        corner, moved = np.linalg.inv(self.complement), self.moved.reshape(b, C, e)
+        blocks = np.zeros((b, C + e, C + e))
+        first = self.place[:, None] * C + np.arange(C)
+        for a in range(C):
+            for c in range(a, C):
+                blocks[:, c, a] = blocks[:, a, c] = band[first[:, a], c - a]
+        blocks[:, :C, :C] += np.einsum("bae,ef,bcf->bac", moved, corner, moved)
+        blocks[:, :C, C:] = -moved @ corner
+        blocks[:, C:, :C] = np.swapaxes(blocks[:, :C, C:], 1, 2)
+        blocks[:, C:, C:] = corner
+        return blocks
+
+
+@dataclass(frozen=True)
 class BandedCholesky:
     """The views in the order ``place`` (b,), neighbours at most ``reach`` places apart, by LAPACK's banded
     factorisation; the border by its Schur complement."""
@@ -76,37 +124,24 @@ class BandedCholesky:
 
     def solve(self, system: ReducedSystem) -> F64 | None:
         """x (D,) or None."""
-        b, C, e = system.sums.border.shape
-        factor = self.factor(system)
-        if factor is None:
-            return None
-        order = np.argsort(self.place)
-        right = np.empty((b, C, e + 1))
-        right[..., 0] = system.sums.rhs[: b * C].reshape(b, C)
-        right[..., 1:] = system.sums.border
-        solved, info = lapack.dpbtrs(factor, right[order].reshape(b * C, e + 1), lower=1)
-        if info != 0 or not np.isfinite(solved).all():
-            return None
-        back = solved.reshape(b, C, e + 1)[self.place].reshape(b * C, e + 1)
-        tail = np.zeros(0)
-        if e:
-            border = system.sums.border.reshape(b * C, e)
-            corner = system.sums.corner - border.T @ back[:, 1:]
-            found = solve_positive(corner, system.sums.rhs[b * C :] - border.T @ back[:, 0])
-            if found is None:
-                return None
-            tail = found
-        return np.concatenate([back[:, 0] - back[:, 1:] @ tail, tail])
+        factored = self.factor(system)
+        found = None if factored is None else factored.solve(system.sums.rhs[:, None])
+        return None if found is None else found[:, 0]
 
-    def factor(self, system: ReducedSystem) -> F64 | None:
-        """LAPACK's lower banded Cholesky factor (width, b C) of the views' part; None if not positive."""
-        b, C, _ = system.sums.border.shape
+    def factor(self, system: ReducedSystem) -> BandedFactor | None:
+        """The system taken apart; None where it is not positive."""
+        s, (b, C, e) = system.sums, system.sums.border.shape
         band = np.zeros((b * C, (self.reach + 1) * C))
-        kernels.fill_band(system.sums.blocks, system.row, system.column, self.place, band)
+        kernels.fill_band(s.blocks, system.row, system.column, self.place, band)
         if not np.isfinite(band).all():
             return None
         factor, info = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
-        return factor if info == 0 else None
+        if info != 0:
+            return None
+        flat = s.border.reshape(b * C, e)
+        views = BandedFactor(self.place, factor, s.border, flat, s.corner)
+        moved = views.solve_views(flat) if e else flat
+        return BandedFactor(self.place, factor, s.border, moved, s.corner - flat.T @ moved)
 
 
 @dataclass(frozen=True)
@@ -161,15 +196,20 @@ def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) 
     D = float(n_views * width + border)
     if D <= SMALL:
         return DenseCholesky()
+    banded = order_views(row, column, n_views)
+    band, products = float((banded.reach + 1) * width), 4.0 * (len(row) * width**2 + D * border)
+    work: list[tuple[float, ReducedSolver]] = [
+        (D**3 / 3.0, DenseCholesky()),
+        (BAND_COST * D * band * (band + 4.0 * (border + 1)), banded),
+        (PRODUCT_COST * TYPICAL_PRODUCTS * products, ConjugateGradients()),
+    ]
+    return min(work, key=lambda choice: choice[0])[1]
+
+
+def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:
+    """The order of the views in which neighbours stand close (reverse Cuthill-McKee)."""
     graph = coo_array((np.ones(len(row)), (row, column)), shape=(n_views, n_views)).tocsr()
     order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
     place = np.empty(n_views, dtype=np.int64)
     place[order] = np.arange(n_views)
-    reach = int(np.abs(place[row] - place[column]).max(initial=0))
-    band, products = float((reach + 1) * width), 4.0 * (len(row) * width**2 + D * border)
-    work: list[tuple[float, ReducedSolver]] = [
-        (D**3 / 3.0, DenseCholesky()),
-        (BAND_COST * D * band * (band + 4.0 * (border + 1)), BandedCholesky(place, reach)),
-        (PRODUCT_COST * TYPICAL_PRODUCTS * products, ConjugateGradients()),
-    ]
-    return min(work, key=lambda choice: choice[0])[1]
+    return BandedCholesky(place, int(np.abs(place[row] - place[column]).max(initial=0)))

@@ -25,7 +25,7 @@ from thesisrecon.optimize.kernels.projective import (
     tangent_step,
 )
 from thesisrecon.optimize.kernels.records import Jacobians, Seen, Weighing
-from thesisrecon.optimize.kernels.reduced import fill_band, fill_dense, multiply_blocks
+from thesisrecon.optimize.kernels.reduced import fill_band, fill_dense, invert_band, multiply_blocks
 
 __all__ = [
     "Jacobians",
@@ -40,6 +40,7 @@ __all__ = [
     "fill_band",
     "fill_dense",
     "hold_flipping_points",
+    "invert_band",
     "linearize_metric",
     "linearize_projective",
     "mark_pairs",

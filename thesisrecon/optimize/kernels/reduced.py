@@ -53,3 +53,26 @@ def multiply_blocks(blocks: F64, row: I64, column: I64, x: F64, y: F64) -> None:
                 left = x[r, a]
                 for b in range(C):
                     y[c, b] += S[a, b] * left
+
+
+@njit(cache=True, nogil=True)
+def invert_band(L: F64, Z: F64) -> None:
+    """The entries inside the band of (L L')^-1, by the recursion of Takahashi (1973) from the last column on.
+
+    L and Z (D, width) hold column j from the diagonal down: L[j, i - j].
+    """
+    D, width = L.shape
+    for j in range(D - 1, -1, -1):
+        last = min(D - 1, j + width - 1)
+        pivot = 1.0 / L[j, 0]
+        for i in range(last, j, -1):
+            total = 0.0
+            for k in range(j + 1, i + 1):
+                total += L[j, k - j] * Z[k, i - k]
+            for k in range(i + 1, last + 1):
+                total += L[j, k - j] * Z[i, k - i]
+            Z[j, i - j] = -pivot * total
+        total = 0.0
+        for k in range(j + 1, last + 1):
+            total += L[j, k - j] * Z[j, k - j]
+        Z[j, 0] = pivot * (pivot - total)
