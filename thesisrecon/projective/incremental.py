@@ -58,7 +58,7 @@ class GatedIncremental:
     ----------
     points_per_view : tracks that take part, longest first, so that each view has about this many (the others
         are triangulated in the metric stage, where all are used).
-    min_points : matches a resection needs.
+    min_points : matches a resection needs: twice the six that always agree; the gate judges their worth.
     outlier_sigmas : residual gates in noise sigmas of the early and the late rounds.
     noise_floor_px : the noise is never taken to be below this (localisation of corners).
     max_spread : gate on a camera: the 80 % quantile of its predicted spread over all points, as a share of
@@ -73,7 +73,7 @@ class GatedIncremental:
     """
 
     points_per_view: int = 1500
-    min_points: int = 20
+    min_points: int = 12
     outlier_sigmas: tuple[float, float] = (12.0, 7.0)
     noise_floor_px: float = 0.3
     max_spread: float | None = 0.01
