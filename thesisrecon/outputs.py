@@ -163,6 +163,7 @@ def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: Stage
         reconstruction=result.projective,
         metric=result.metric,
         colours=colours,
+        affine=affine_of(result) if result.metric is not None else None,
         failure=failure,
     )
 

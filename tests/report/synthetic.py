@@ -133,6 +133,7 @@ def made_up_run(*, names: list[str] | None = None, points: int = 1500, seed: int
         unread=(("notes.jpg", "it is no image that Pillow can read"),),
         pairs=pairs,
         metric=metric,
+        affine=dataclasses.replace(metric.reconstruction, stratum="affine"),
         colours=colours,
     )
 

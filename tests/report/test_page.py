@@ -194,3 +194,14 @@ def test_writing_is_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         write_report(target, dataclasses.replace(data, title="other"))
     assert target.read_text(encoding="utf-8") == before
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_the_affine_stratum_is_drawn_where_there_is_one(page: str) -> None:
+    assert 'id="affine-figure"' in page
+    data = made_up_run()
+    without = render_report(dataclasses.replace(data, affine=None))
+    assert 'id="affine-figure"' not in without
+    assert data.affine is not None
+    fewer = dataclasses.replace(data.affine, X=data.affine.X[:-1])
+    with pytest.raises(ValueError, match="affine must have"):
+        dataclasses.replace(data, affine=fewer)

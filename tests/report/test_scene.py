@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 
 from tests.report.synthetic import made_up_cameras, made_up_run
-from thesisrecon.report import scene as scene_module
 from thesisrecon.report.scene import build_scene, upright_rotation
 
 
@@ -40,14 +39,13 @@ def test_parallel_cameras_and_cameras_that_look_down_have_an_up() -> None:
     assert (single @ [0, 0, 1])[1] > 0.999
 
 
-def test_strays_are_left_out_and_many_points_are_thinned(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_strays_are_left_out_and_many_points_are_thinned() -> None:
     data = made_up_run(points=600)
     assert data.metric is not None
     before = data.metric.reconstruction
     X = before.X.copy()
     X[5, :3] = 1e5
-    monkeypatch.setattr(scene_module, "MAX_POINTS", 200)
-    scene = build_scene(dataclasses.replace(before, X=X))
+    scene = build_scene(dataclasses.replace(before, X=X), max_points=200)
     assert scene is not None
     assert 150 <= len(scene.points) <= 200
     assert 5 not in scene.index

@@ -61,6 +61,7 @@ class ReportData:
     reconstruction : the projective reconstruction, where the run has one; ``metric`` goes before it.
     metric : the result of the metric stage.
     colours : (N, 3) uint8 of the points of the metric reconstruction (valid or not), or None.
+    affine : the affine stratum on the way to it, of the same points.
     until : the stage the user asked to end with, None where all were asked for.
     failure : why the run could not go on, None where it did.
 
@@ -82,6 +83,7 @@ class ReportData:
     reconstruction: Reconstruction | None = None
     metric: MetricResult | None = None
     colours: U8 | None = None
+    affine: Reconstruction | None = None
     until: str | None = None
     failure: StageFailure | None = None
 
@@ -98,6 +100,10 @@ class ReportData:
             )
         if any(not (0 <= pair.i < views and 0 <= pair.j < views) for pair in self.pairs):
             raise ValueError(f"pairs must name views below {views}, the number of photographs")
+        if self.affine is not None and self.metric is not None:
+            points, own = len(self.metric.reconstruction.X), len(self.affine.X)
+            if own != points:
+                raise ValueError(f"affine must have the {points} points of the metric stratum; got {own}")
         if self.colours is not None and self.metric is not None:
             points = len(self.metric.reconstruction.X)
             if self.colours.shape != (points, 3):

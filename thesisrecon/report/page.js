@@ -64,7 +64,7 @@
 
   Object.keys(figures).forEach(function (id) {
     const element = document.getElementById(id);
-    if (id === "scene-figure") {
+    if (element.classList.contains("scene")) {
       figures[id].layout.scene.camera = camera(element, figures[id], START);
       if (element.clientWidth < 600) { figures[id].data[0].marker.size = 1.2; figures[id].data[2].marker.size = 2.5; }
     }
@@ -82,14 +82,16 @@
     }
   });
 
+  // A wheel over a picture scrolls the page until the picture was clicked.
+  document.querySelectorAll(".plot.scene").forEach(function (scene) {
+    let active = false;
+    scene.addEventListener("pointerdown", function () { active = true; });
+    document.addEventListener("pointerdown", function (event) { if (!scene.contains(event.target)) { active = false; } });
+    scene.addEventListener("wheel", function (event) { if (!active) { event.stopPropagation(); } }, { capture: true });
+  });
+
   const scene = document.getElementById("scene-figure");
   if (scene === null) { return; }
-
-  // A wheel over the picture scrolls the page until the picture was clicked.
-  let active = false;
-  scene.addEventListener("pointerdown", function () { active = true; });
-  document.addEventListener("pointerdown", function (event) { if (!scene.contains(event.target)) { active = false; } });
-  scene.addEventListener("wheel", function (event) { if (!active) { event.stopPropagation(); } }, { capture: true });
 
   document.querySelectorAll("button[data-eye]").forEach(function (button) {
     button.addEventListener("click", function () {

@@ -48,6 +48,7 @@ from thesisrecon.types import F64, IntrinsicInterval, StageReport, TwoView
 
 HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 200.0, 44.0
 MAX_LISTED_PAIRS = 120
+AFFINE_POINTS = 5_000
 
 
 @dataclass(frozen=True)
@@ -156,6 +157,9 @@ def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
     scene = build_scene(data.metric.reconstruction) if data.metric is not None else None
     if scene is not None:
         figures["scene-figure"] = scene_figure(scene, names, data.colours)
+    affine = build_scene(data.affine, max_points=AFFINE_POINTS) if data.affine is not None else None
+    if scene is not None and affine is not None:
+        figures["affine-figure"] = scene_figure(affine, names, data.colours)
     if data.pairs:
         figures["matrix-figure"] = pair_matrix_figure(data.pairs, names)
     return figures, len(scene.points) if scene is not None else 0

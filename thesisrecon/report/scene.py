@@ -32,10 +32,10 @@ class Scene:
     high: F64
 
 
-def build_scene(reconstruction: Reconstruction) -> Scene | None:
-    """The drawable scene of a metric reconstruction; None without a registered camera.
+def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS) -> Scene | None:
+    """The drawable scene of a metric or affine reconstruction; None without a registered camera.
 
-    At most ``MAX_POINTS`` points, evenly thinned in the order of X, those beyond four times the 80 % distance
+    At most ``max_points`` points, evenly thinned in the order of X, those beyond four times the 80 % distance
     from the median left out. Lengths stay in the reconstruction's own (arbitrary) unit.
     """
     views = np.flatnonzero(reconstruction.registered).astype(np.int64)
@@ -45,7 +45,7 @@ def build_scene(reconstruction: Reconstruction) -> Scene | None:
     rotations = np.stack([R for _, R, _ in parts])
     centres = np.stack([dehomogenize(camera_centre(reconstruction.P[i])) for i in views])
     upright = upright_rotation(rotations)
-    index = _kept_points(reconstruction)
+    index = _kept_points(reconstruction, max_points)
     points = reconstruction.X[index, :3] @ upright.T
     centres_up = centres @ upright.T
     depth = _pyramid_depth(centres_up, points)
@@ -79,14 +79,14 @@ def upright_rotation(rotations: F64) -> F64:
     return np.stack([np.cross(ahead, up), ahead, up])
 
 
-def _kept_points(reconstruction: Reconstruction) -> I64:
+def _kept_points(reconstruction: Reconstruction, max_points: int) -> I64:
     valid = np.flatnonzero(reconstruction.valid & np.isfinite(reconstruction.X).all(axis=1))
     if len(valid) == 0:
         return valid.astype(np.int64)
     X = reconstruction.X[valid, :3]
     distance = np.linalg.norm(X - np.median(X, axis=0), axis=1)
     near: I64 = valid[distance <= 4.0 * np.quantile(distance, 0.8)].astype(np.int64)
-    step = max(1, int(np.ceil(len(near) / MAX_POINTS)))
+    step = max(1, int(np.ceil(len(near) / max_points)))
     return near[::step]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from thesisrecon.selfcalibration import (
 from thesisrecon.types import F64, Image, Reconstruction
 from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene
 
-PLANES: dict[str, CheiralitySearch | ModulusConstraint | ParallelLines] = {
+PLANES: Mapping[str, CheiralitySearch | ModulusConstraint | ParallelLines] = {
     "cheirality, grid alone": CheiralitySearch(descent=0),
     "cheirality search": CheiralitySearch(),
     "modulus constraint": ModulusConstraint(),
