@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.metric.model import MetricModel
-from thesisrecon.metric.start import FOCAL, K1, WIDTH
+from thesisrecon.metric.model import MetricModel, residual_norms
+from thesisrecon.metric.start import CENTRE, FOCAL, K1, WIDTH
 from thesisrecon.optimize.bundle_blocks import BlockScatter, block_scatter
 from thesisrecon.optimize.metric_bundle import (
     BundleOptions,
@@ -77,6 +77,11 @@ class Adjustment:
         std[:, K1 + 1 :] = np.where(self._shares_a_lens(model) & (std[:, K1] > 0.0), self.lens_std, 0.0)[
             :, None
         ]
+        # A photograph may be cut out of a larger one: a principal point far from where it is expected is held
+        # by its prior no more (the weight of a Cauchy distribution, (1 + (off / std)^2)^-1).
+        for column in CENTRE:
+            off = model.cameras.intrinsics[:, column] - mean[:, column]
+            std[:, column] = np.hypot(std[:, column], np.where(std[:, column] > 0.0, off, 0.0))
         silent = ~np.isfinite(mean)
         mean[silent] = model.cameras.intrinsics[silent]
         p = self.population
@@ -156,4 +161,15 @@ def tail_width(norms: F64, sigma: float) -> float:
     return float(np.clip(wide / sigma, 1.0, 3.0))
 
 
-FOCAL_ONLY = np.arange(WIDTH) == FOCAL
+def with_wide_gate(model: MetricModel) -> MetricModel:
+    """The model with a loss and gates as wide as the residuals that it has before any adjustment, while the
+    noise stays what it is: what is known beforehand must not outweigh the photographs meanwhile."""
+    norms = residual_norms(model)
+    norms = norms[np.isfinite(norms)]
+    if not len(norms):
+        return model
+    wider = max(1.0, noise_from_distances(norms) / model.sigma_px)
+    return replace(model, tail=wider, loss_sigmas=2.0 * wider)
+
+
+FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from thesisrecon.metric.adjustment import Adjustment, Population
 from thesisrecon.metric.model import MetricModel
-from thesisrecon.metric.start import FOCAL, K1, WIDTH
+from thesisrecon.metric.start import CENTRE, FOCAL, K1, WIDTH
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.types import B8, I64
 
 F64 = NDArray[np.float64]
 
 # Intrinsics that a kind may have in common: focal, principal point, k1.
-COLUMNS = (FOCAL, 3, 4, K1)
+COLUMNS = (FOCAL, *CENTRE, K1)
 LEAST_MEMBERS = 3
 OUTLIER_SIGMAS = 4.0
 # Cameras of one zoom setting are of one lens, whose k2 and k3 they share.

@@ -12,7 +12,7 @@ from thesisrecon.types import B8, I64, Assumptions, Reconstruction, Upgrade
 
 F64 = NDArray[np.float64]
 
-FOCAL, K1 = 0, 5
+FOCAL, CENTRE, K1 = 0, (3, 4), 5
 # f, aspect, skew, cx, cy, k1 and the two radial coefficients that nothing is assumed of in words.
 WIDTH = 8
 

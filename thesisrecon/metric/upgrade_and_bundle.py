@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.metric.adjustment import FOCAL_ONLY, Adjustment
+from thesisrecon.metric.adjustment import FOCAL_AND_CENTRE, Adjustment, with_wide_gate
 from thesisrecon.metric.completion import Completion
 from thesisrecon.metric.intervals import intrinsic_intervals
 from thesisrecon.metric.model import (
@@ -35,6 +35,9 @@ from thesisrecon.types import Assumptions, MetricResult, Reconstruction, SelfCal
 F64 = NDArray[np.float64]
 
 SETTLED = 0.002
+START_ROUNDS = 3
+# Zoomed photographs lie in a long valley: the last adjustment must reach its bottom.
+LAST_ITERATIONS = 25
 
 
 @dataclass(frozen=True)
@@ -107,20 +110,25 @@ class UpgradeAndBundle:
     def _start(
         self, reconstruction: Reconstruction, upgrade: Upgrade, adjustment: Adjustment
     ) -> MetricModel | None:
-        """The core cameras upgraded, on the points of the projective stage, with only the focals free."""
-        started = upgraded_model(reconstruction, upgrade, adjustment.assumed, self.max_rotation_residual)
-        if started is None:
+        """The core cameras upgraded, on the points and observations of the projective stage.
+
+        These explain the photographs with cameras of any principal point, and so do not say how far off an
+        image centre is: all of them are kept at first, the principal point is free with the focal, and the
+        gate narrows as the residuals shrink.
+        """
+        model = upgraded_model(reconstruction, upgrade, adjustment.assumed, self.max_rotation_residual)
+        if model is None:
             return None
         early, _ = self.outlier_sigmas
         # Without a lens the noise looks larger than it is: the gate must not be narrower than before.
         gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
-        model = mark(started, sigmas=2.0 * early, min_angle=0.0)
-        for _ in range(2):
+        model = with_wide_gate(model)
+        for _ in range(START_ROUNDS):
             if model.valid.sum() < 20:
                 return None
-            model = gentle.run(model, free=FOCAL_ONLY, iterations=10)[0]
             model = mark(model, sigmas=early, min_angle=0.0)
-        return model
+            model = gentle.run(model, free=FOCAL_AND_CENTRE, iterations=15)[0]
+        return mark(model, sigmas=early, min_angle=0.0)
 
     def _finish(
         self, model: MetricModel, adjustment: Adjustment
@@ -149,7 +157,7 @@ class UpgradeAndBundle:
             model = retriangulate(model, sigmas=late, min_angle=angle)
             if np.count_nonzero(before != model.ok) < SETTLED * len(before):
                 break
-        return adjustment.run(model, iterations=15)[0]
+        return adjustment.run(model, iterations=LAST_ITERATIONS)[0]
 
 
 NOTHING_SHARED = "shares no points with the model"
