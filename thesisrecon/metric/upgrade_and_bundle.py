@@ -26,6 +26,7 @@ from thesisrecon.metric.model import (
     truncated_cost,
 )
 from thesisrecon.metric.population import OwnValues, bind, borrowing, estimate_population, own_values
+from thesisrecon.metric.prior_check import contradicted_focals
 from thesisrecon.metric.self_check import self_check
 from thesisrecon.metric.start import K1, upgraded_model
 from thesisrecon.optimize.bundle_blocks import BlockScatter
@@ -103,6 +104,7 @@ class UpgradeAndBundle:
         )
         model = mark(model, sigmas=self.outlier_sigmas[1], min_angle=np.radians(self.min_angle_deg))
         check, doubts = self_check(model, calibration, intervals, sigmas=self.outlier_sigmas[1])
+        doubts += contradicted_focals(model, adjustment)
         final = _as_reconstruction(model, reasons)
         said = borrowed.warnings(np.flatnonzero(model.registered).tolist(), self.undetermined_rel / 1.96)
         return MetricResult(final, intervals, check, not doubts, tuple(doubts), said)

@@ -58,7 +58,8 @@ def judge_motion(reconstruction: Reconstruction, upgrade: Upgrade, assumed: Assu
     A metric bundle adjustment of part of the observations gives cameras, and the covariance of their focal
     lengths under ``assumed``; the same with nothing known of aspect and principal point tells what rests on
     knowing these. ``evidence`` holds the measures of
-    :data:`~thesisrecon.selfcalibration.critical_motions.TOLERANCES`, ``focal_std_rel`` (worst view),
+    :data:`~thesisrecon.selfcalibration.critical_motions.TOLERANCES`, ``focal_long_sides`` (median, adjusted),
+    ``focal_std_rel`` (worst view),
     ``focal_std_rel_median``, ``focal_std_rel_free`` (median, aspect and principal point free),
     ``principal_point_std_free`` (long sides), ``turn_significance``, ``spare_equations`` of the counting
     argument, and ``noise_px``.
@@ -235,6 +236,7 @@ def _verdict(
         np.diagonal(free.intrinsics_covariance, axis1=1, axis2=2)[cameras.group, 3:5].max(axis=1)
     )
     evidence |= {
+        "focal_long_sides": float(np.median(metric.focal)),
         "focal_std_rel": float(std.max()),
         "focal_std_rel_median": float(np.median(std)),
         "focal_std_rel_free": float(np.median(own)),

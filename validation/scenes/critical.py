@@ -110,7 +110,9 @@ def _planar(w: _Wishes, rng: np.random.Generator, climb: float = 0.0) -> tuple[F
     C = w.distance * np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=1)
     C *= rng.uniform(0.75, 1.25, (w.views, 1))
     C[:, 2] = w.distance * (rng.uniform(-0.1, 0.4) + climb * rng.uniform(-0.5, 0.5, w.views))
-    start = look_at(np.array([w.distance, 0.0, C[:, 2].mean()]), 0.1 * rng.normal(size=3), rng.uniform(-0.3, 0.3))
+    start = look_at(
+        np.array([w.distance, 0.0, C[:, 2].mean()]), 0.1 * rng.normal(size=3), rng.uniform(-0.3, 0.3)
+    )
     heading = azimuth + np.radians(rng.uniform(-8.0, 8.0, w.views))
     turn = Rotation.from_rotvec(heading[:, None] * UP).as_matrix()
     return start @ turn.swapaxes(1, 2), C
@@ -190,6 +192,9 @@ def projective_estimate(scene: Sequence, rng: np.random.Generator) -> Reconstruc
     seen = np.bincount(scene.tracks.point_index, minlength=len(scene.X)) >= 2
     Xh = np.column_stack([scene.X, np.ones(len(scene.X))]) @ G.T
     Xh /= np.linalg.norm(Xh, axis=1, keepdims=True)
+    if scene.X.std(axis=0).min() == 0.0:
+        # Points of a plane exactly leave the frame of bundle adjustment singular.
+        Xh += 1e-6 * rng.normal(size=Xh.shape)
     P = scene.P @ np.linalg.inv(G)
     P /= np.linalg.norm(P, axis=(1, 2))[:, None, None]
     t = scene.tracks

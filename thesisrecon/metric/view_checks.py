@@ -1,0 +1,103 @@
+"""What each photograph says of the model, alone: a wrong camera shows here and hides in averages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.metric.model import MetricModel, agreeing_observations, project_observations
+from thesisrecon.optimize.triangulation_refine import refine_pose
+from thesisrecon.robust.noise import noise_from_distances
+from thesisrecon.types import B8, I64
+
+F64 = NDArray[np.float64]
+
+OWN = np.array([True, True, False, False, False, False])
+"""Focal and aspect: what a camera that is right gives back when nothing but its points is believed."""
+MOST_OBSERVATIONS = 1500
+FEWEST_OBSERVATIONS = 30
+
+
+@dataclass(frozen=True)
+class ViewChecks:
+    """Per view (V,), NaN where not registered or nothing could be measured.
+
+    ``explained`` share of the observations that the model explains. ``confirmed`` share of the observations
+    of points that other views fix (two or more of them) which agree with the view too: points of two views
+    agree with any two cameras along their epipolar lines. ``behind`` share of the observations behind the
+    camera. ``noise_px``. ``focal_off`` and ``aspect_off``: the logarithm of the view's own focal over the
+    model's and of its own aspect, from its points alone, with their standard deviations ``focal_off_std`` and
+    ``aspect_off_std`` at the view's noise.
+    """
+
+    explained: F64
+    confirmed: F64
+    behind: F64
+    noise_px: F64
+    focal_off: F64
+    focal_off_std: F64
+    aspect_off: F64
+    aspect_off_std: F64
+
+
+def check_views(model: MetricModel, *, sigmas: float) -> ViewChecks:
+    """Measure every registered view; ``sigmas`` is the gate of an observation that agrees."""
+    t = model.tracks
+    n = t.n_views
+    agree = agreeing_observations(model, sigmas=sigmas)
+    near = model.registered[t.view_index]
+    fixed = _fixed_by_others(model, agree)
+    known = near & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
+    _, depth = project_observations(model.cameras, model.X, t.view_index, t.point_index)
+    own = [_own_camera(model, view, np.flatnonzero(agree & (t.view_index == view))) for view in range(n)]
+    return ViewChecks(
+        _share(t.view_index, agree, near, n),
+        _share(t.view_index, agree, near & fixed, n),
+        _share(t.view_index, depth <= 0, known, n),
+        *(np.array(column) for column in zip(*own, strict=True)),
+    )
+
+
+def _share(view: I64, good: B8, counted: B8, n: int) -> F64:
+    all_ = np.bincount(view[counted], minlength=n)
+    right = np.bincount(view[counted & good], minlength=n)
+    return np.where(all_ > 0, right / np.maximum(all_, 1), np.nan)
+
+
+def _fixed_by_others(model: MetricModel, agree: B8) -> B8:
+    """(K,) whether an observation's point is explained in two or more other views."""
+    t = model.tracks
+    count = np.bincount(t.point_index[agree], minlength=t.n_points)
+    return np.asarray(count[t.point_index] - agree >= 2)
+
+
+def _own_camera(model: MetricModel, view: int, index: I64) -> tuple[float, float, float, float, float]:
+    """Noise, own focal and aspect of a view with their deviations; NaN where it has too few observations."""
+    nothing = (np.nan,) * 5
+    if not model.registered[view] or len(index) < FEWEST_OBSERVATIONS:
+        return nothing
+    index = index[:: int(np.ceil(len(index) / MOST_OBSERVATIONS))]
+    t, cameras = model.tracks, model.cameras
+    X, xy = model.X[t.point_index[index]], t.xy[index]
+    seen, _ = project_observations(cameras, model.X, t.view_index[index], t.point_index[index])
+    noise = max(noise_from_distances(np.linalg.norm(seen - xy, axis=1)), 1e-3)
+    intrinsics = cameras.intrinsics[cameras.group[view]]
+    free = np.zeros(len(intrinsics), dtype=bool)
+    free[: len(OWN)] = OWN
+    try:
+        fit = refine_pose(
+            cameras.R[view], cameras.t[view], intrinsics, X, xy, free=free, loss_px=2.0 * noise, iterations=10
+        )
+    except ValueError:
+        return nothing
+    std = noise * np.sqrt(np.maximum(np.diag(fit.covariance)[6:8], 0.0))
+    focal = float(np.log(fit.intrinsics[0] / intrinsics[0]))
+    return (
+        noise,
+        focal,
+        float(std[0]),
+        float(np.log(max(fit.intrinsics[1] / intrinsics[1], 1e-9))),
+        float(std[1]),
+    )
