@@ -1,0 +1,75 @@
+"""Stated intervals hold the truth as often as they say; a floor stands only where the model is not true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.metric.test_population import true_calibration
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from thesisrecon.assumptions import assume
+from thesisrecon.metric import UpgradeAndBundle
+from thesisrecon.metric.adjustment import tail_width
+from thesisrecon.metric.intervals import model_error_share
+from thesisrecon.optimize.bundle_blocks import BlockScatter
+from thesisrecon.types import MetricResult
+
+
+def refine(scene: TrueScene) -> MetricResult:
+    start = projective_reconstruction(scene)
+    rng = np.random.default_rng(0)
+    return UpgradeAndBundle().refine(start, true_calibration(scene), assumed=assume(start), rng=rng)
+
+
+def test_deviations_are_of_the_stated_size_on_normal_noise() -> None:
+    deviations = []
+    for seed in range(8):
+        scene = make_scene(sigma_px=0.5, points=300, seed=seed, principal_shift=(5.0, -3.0))
+        found = refine(scene).intrinsics[0]
+        deviations += [
+            (found[name].value - truth) / found[name].std
+            for name, truth in (
+                ("focal_px", scene.K[0, 0, 0]),
+                ("principal_x_px", scene.K[0, 0, 2]),
+                ("principal_y_px", scene.K[0, 1, 2]),
+            )
+        ]
+    assert 0.6 < np.sqrt(np.mean(np.square(deviations))) < 1.5
+
+
+def test_less_noise_is_a_narrower_interval_without_a_floor() -> None:
+    stds = [
+        refine(make_scene(sigma_px=sigma, points=300, seed=1)).intrinsics[0]["focal_px"].std
+        for sigma in (0.5, 0.05)
+    ]
+    assert stds[1] < 0.2 * stds[0]
+    assert stds[1] < 5e-4 * 1500.0
+
+
+def test_heavy_tails_bring_the_floor() -> None:
+    scene = make_scene(sigma_px=0.05, points=300, seed=1)
+    rng = np.random.default_rng(0)
+    t = scene.tracks
+    wide = rng.random(len(t.xy)) < 0.25
+    xy = t.xy + np.where(wide[:, None], 0.25, 0.0) * rng.normal(size=t.xy.shape)
+    focal = refine(replace(scene, tracks=replace(t, xy=xy))).intrinsics[0]["focal_px"]
+    assert focal.std > 0.8e-3 * focal.value
+
+
+def test_the_share_of_model_error_follows_its_signs() -> None:
+    def scatter(contradiction: float, blocks: int = 32) -> BlockScatter:
+        return BlockScatter(np.ones((1, 8)), np.ones((1, 8)), contradiction, blocks)
+
+    assert model_error_share(scatter(1.0), 1.0) == 0.0
+    assert model_error_share(scatter(2.5), 1.0) == 1.0
+    assert model_error_share(scatter(1.0), 2.5) == 1.0
+    assert 0.0 < model_error_share(scatter(1.5), 1.0) < 1.0
+    assert model_error_share(scatter(1.0, blocks=1), 1.0) == 1.0
+
+
+def test_the_tail_of_normal_noise_is_one() -> None:
+    lengths = np.linalg.norm(np.random.default_rng(0).normal(size=(4000, 2)), axis=1)
+    assert tail_width(lengths, 1.0) == pytest.approx(1.0, abs=0.05)
+    assert tail_width(10.0 * lengths, 1.0) == 3.0

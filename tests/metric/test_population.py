@@ -1,0 +1,108 @@
+"""Cameras of one kind: how their scatter is measured, who borrows, and what is said of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from thesisrecon.assumptions import IntrinsicsAssumption, assume
+from thesisrecon.metric import UpgradeAndBundle
+from thesisrecon.metric.population import OwnValues, estimate_population, measured_spread, outlying
+from thesisrecon.types import MetricResult, SelfCalibration, Upgrade
+
+
+def true_calibration(scene: TrueScene) -> SelfCalibration:
+    """The truth as an upgrade of ``projective_reconstruction``, focals 2 % off."""
+    G = np.eye(4) + 0.3 * np.random.default_rng(0).normal(size=(4, 4))
+    K = scene.K * np.array([1.02, 1.02, 1.0])[:, None]
+    K[:, :2, 2] = (scene.sizes - 1) / 2
+    upgrade = Upgrade(np.linalg.inv(G), K, 0.0, "truth")
+    return SelfCalibration(upgrade.metric_from_projective, K, np.zeros_like(K), True, (), (upgrade,))
+
+
+def refine(scene: TrueScene, *, alike: bool = True) -> MetricResult:
+    start = projective_reconstruction(scene)
+    assumed = assume(start, IntrinsicsAssumption(cameras="per-image", alike=alike))
+    rng = np.random.default_rng(0)
+    return UpgradeAndBundle().refine(start, true_calibration(scene), assumed=assumed, rng=rng)
+
+
+def with_few_points(scene: TrueScene, view: int, count: int) -> TrueScene:
+    """The scene with ``count`` observations left in one view."""
+    t = scene.tracks
+    here = np.flatnonzero(t.view_index == view)
+    keep = np.ones(len(t.xy), dtype=bool)
+    keep[here[count:]] = False
+    return replace(
+        scene,
+        tracks=replace(t, view_index=t.view_index[keep], point_index=t.point_index[keep], xy=t.xy[keep]),
+    )
+
+
+def test_the_spread_of_values_that_agree_is_small_and_of_zoomed_ones_large() -> None:
+    rng = np.random.default_rng(1)
+    std = rng.uniform(0.002, 0.01, 30)
+    same = measured_spread(std * rng.normal(size=30), std)
+    assert same < 0.004
+    zoomed = measured_spread(rng.normal(0.0, 0.3, 30) + std * rng.normal(size=30), std)
+    assert zoomed == pytest.approx(0.3, rel=0.5)
+
+
+def test_the_spread_is_the_upper_end_of_what_the_values_allow() -> None:
+    rng = np.random.default_rng(2)
+    std = np.full(8, 0.01)
+    spreads = [measured_spread(0.01 * rng.normal(size=8) + std * rng.normal(size=8), std) for _ in range(200)]
+    assert np.mean(np.array(spreads) > 0.01) > 0.6
+    assert np.median(spreads) < 0.02
+    assert measured_spread(np.zeros(1), np.ones(1)) == np.inf
+
+
+def test_one_zoomed_camera_does_not_pull_the_rest() -> None:
+    rng = np.random.default_rng(3)
+    std = np.full((9, 8), 0.001)
+    value = 0.001 * rng.normal(size=(9, 8))
+    value[4, 0] += 0.4
+    shared = np.tile(np.arange(9)[:, None], (1, 8))
+    found = estimate_population(OwnValues(value, std, np.zeros(9, dtype=np.int64)), shared)
+    assert found is not None
+    np.testing.assert_array_equal(found.rows, np.where(np.arange(9) == 4, -1, 0))
+    assert found.spread[0] < 0.005
+    assert outlying(value[:, 0], std[:, 0]).sum() == 1
+
+
+def test_nothing_is_borrowed_where_all_is_shared_or_too_few_are_alike() -> None:
+    value, std = np.zeros((4, 8)), np.full((4, 8), 0.01)
+    kind = np.zeros(4, dtype=np.int64)
+    own = np.tile(np.arange(4)[:, None], (1, 8))
+    assert estimate_population(OwnValues(value, std, kind), np.zeros((4, 8), dtype=np.int64)) is None
+    assert estimate_population(OwnValues(value, std, np.array([0, 0, 1, 2])), own) is None
+    assert estimate_population(OwnValues(value, std, kind), own) is not None
+
+
+def test_a_badly_determined_focal_is_borrowed_and_named() -> None:
+    scene = with_few_points(make_scene(sigma_px=0.5, points=400, seed=11), 3, 30)
+    alone, together = refine(scene, alike=False), refine(scene)
+    assert alone.reconstruction.registered.all()
+    assert together.reconstruction.registered.all()
+    wide, narrow = alone.intrinsics[3]["focal_px"], together.intrinsics[3]["focal_px"]
+    assert narrow.std < 0.5 * wide.std
+    assert "borrowed from the other cameras" in narrow.source
+    assert "borrowed" not in wide.source
+    for result in (alone, together):
+        for view, intervals in enumerate(result.intrinsics):
+            focal = intervals["focal_px"]
+            assert abs(focal.value - scene.K[view, 0, 0]) < 4.0 * focal.std
+    if wide.std > 0.06 * wide.value:
+        assert any("view 3" in said for said in alone.warnings)
+
+
+def test_zoomed_photographs_keep_their_own_focals() -> None:
+    scene = make_scene(sigma_px=0.3, points=400, zoom=0.4, seed=12)
+    result = refine(scene)
+    K = result.reconstruction.K
+    assert K is not None
+    np.testing.assert_allclose(K[:, 0, 0] / scene.K[:, 0, 0], 1.0, atol=0.01)
+    assert not any("borrowed" in intervals["focal_px"].source for intervals in result.intrinsics)
