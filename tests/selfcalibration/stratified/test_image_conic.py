@@ -87,7 +87,7 @@ def test_the_score_of_the_right_plane_is_zero_and_grows_away_from_it() -> None:
 
 
 def test_right_angles_determine_the_calibration_of_cameras_that_do_not_turn() -> None:
-    """Section 7.5.1: with square pixels, three vanishing points at right angles give all of K."""
+    """With square pixels, three vanishing points at right angles give all of K."""
     scene = make_scene(seed=5, principal_shift=(40.0, 25.0))
     found, _, _ = setup(scene, NOTHING_BUT_CONSTANT, seed=5)
     reference = found.frame.reference

@@ -1,4 +1,4 @@
-"""Section 7.4 and 7.5, the stratified approach: the plane at infinity in three ways, then K in two."""
+"""Chapter 7, the stratified approach: the plane at infinity in three ways, then K in two."""
 
 from thesisrecon.selfcalibration.stratified.affine import affine_camera_centres, upgrade_to_affine
 from thesisrecon.selfcalibration.stratified.calibration import HartleyLinear, PollefeysQuadric

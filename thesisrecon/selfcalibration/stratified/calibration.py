@@ -1,4 +1,4 @@
-"""Section 7.4.2: the calibration when the plane at infinity is known, by Hartley's way and by Pollefeys'."""
+"""Chapter 7, stratified: the calibration under a known plane at infinity, Hartley's and Pollefeys' ways."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from thesisrecon.selfcalibration.stratified.image_conic import (
 )
 
 F64 = NDArray[np.float64]
+
+_DESCENTS = 3
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class PollefeysQuadric:
     """Pollefeys' way: the criterion of the absolute dual quadric with its plane held fixed.
 
     min sum |K_i K_i' / |.| - H_i w* H_i' / |.||^2 (IJCV 32(1), 1999) over all unknown intrinsics, started at
-    ``starts`` focals over ``focal_range`` (in long sides) and ended at the best of them.
+    the best of ``starts`` focals over ``focal_range`` (in long sides).
     """
 
     focal_range: tuple[float, float] = (0.3, 10.0)
@@ -93,7 +95,8 @@ class PollefeysQuadric:
             data = data.reshape(len(batch), -1)
             return np.asarray(np.concatenate([data, NOISE * unknown.deviations(batch)], axis=1))
 
-        found, cost = descend(residuals, starts, iterations=60, loss_scale=0.05)
+        nearest = np.argsort(np.sum(residuals(starts) ** 2, axis=1), kind="stable")[:_DESCENTS]
+        found, cost = descend(residuals, starts[nearest], iterations=60, loss_scale=0.05)
         best = found[cost.argmin()]
         s = np.linalg.svd(derivatives(residuals, best[None])[0], compute_uv=False)
         if len(s) and not s[-1] > 1e-5 * s[0]:

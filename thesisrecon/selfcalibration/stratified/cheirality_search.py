@@ -1,4 +1,4 @@
-"""Section 7.5.3, Hartley's way: cheirality bounds the plane at infinity, a search inside the bounds finds it.
+"""Chapter 7, stratified: cheirality bounds the plane at infinity, a search in the bounds finds it (Hartley).
 
 R. Hartley, E. Hayman, L. de Agapito, I. Reid, "Camera calibration and the search for infinity", ICCV 1999.
 Each plane of a grid gives infinite homographies, these give the image of the absolute conic linearly, and the

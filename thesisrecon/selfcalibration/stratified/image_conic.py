@@ -1,4 +1,4 @@
-"""Section 7.4.2, Hartley's way: the image of the absolute conic from infinite homographies, linearly.
+"""Chapter 7, stratified: Hartley's way: the image of the absolute conic from infinite homographies, linearly.
 
 A plane at infinity gives its homographies H_j from the reference view to the others (3.29), which are
 K_j R K_r^-1 up to scale (3.31). With det H_j = 1 the image of the absolute conic is carried by them exactly,

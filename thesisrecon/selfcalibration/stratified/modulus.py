@@ -1,4 +1,4 @@
-"""Section 7.5.2: the plane at infinity by the modulus constraint.
+"""Chapter 7, stratified: the plane at infinity by the modulus constraint.
 
 M. Pollefeys and L. Van Gool, "Stratified self-calibration with the modulus constraint", PAMI 21(8), 1999.
 Between views of one constant K the infinite homography is conjugate to a rotation times c, so its eigenvalues

@@ -1,4 +1,4 @@
-"""Section 7.5.1: the plane at infinity from parallel lines.
+"""Chapter 7, stratified: the plane at infinity from parallel lines.
 
 Parallel lines meet in a point at infinity, which is seen as their vanishing point; three such points that are
 not on a line span the plane. Directions at right angles determine the calibration as well: v_a' w v_b = 0.

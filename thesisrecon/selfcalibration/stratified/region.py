@@ -1,4 +1,4 @@
-"""Section 7.5.3: the planes that leave all points and camera centres on one side.
+"""Chapter 7, stratified: the planes that leave all points and camera centres on one side.
 
 Hartley, "Chirality", IJCV 26(1), 1998, and Hartley, Hayman, de Agapito, Reid, "Camera calibration and the
 search for infinity", ICCV 1999. The inequalities X'v > 0, delta C'v > 0 make a polytope, bounded in a

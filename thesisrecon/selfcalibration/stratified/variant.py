@@ -1,4 +1,4 @@
-"""Section 7.4, the stratified approach: first the plane at infinity, then the calibration."""
+"""Chapter 7, the stratified approach: first the plane at infinity, then the calibration."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ from thesisrecon.selfcalibration.stratified.scene import PlaneCandidates, Projec
 from thesisrecon.types import Assumptions, Image, Reconstruction, SelfCalibration
 
 F64 = NDArray[np.float64]
+
+REFINED = 3
+"""The best answers in closed form that are worth refining."""
 
 
 @dataclass(frozen=True)
@@ -89,19 +92,25 @@ class Stratified:
             except StageFailure as refusal:
                 refusals.append(refusal)
                 continue
-            answers.append(self._answer(scene.frame, unknown, plane, K))
+            answers.append(self._answer(scene.frame, plane, K))
         if not answers:
             raise refusals[0]
-        return answers
-
-    def _answer(self, frame: ReferenceFrame, unknown: UnknownIntrinsics, plane: F64, K: F64) -> Answer:
-        name = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
         if not self.refined:
-            r = dual_image_residuals(frame.A, frame.a, K[None], K[None, frame.reference], plane[None])
-            return Answer(plane, K, float(np.mean(np.sum(r**2, axis=-1))), name)
-        log_f = 0.5 * np.log(K[:, 0, 0] * K[:, 1, 1])
-        least = minimize_quadric(frame, unknown, plane, log_f)
-        return Answer(least.plane, least.K, least.cost, f"{name}, refined")
+            return answers
+        best = sorted(answers, key=lambda answer: answer.cost)[: max(self.kept, REFINED)]
+        return [refined_answer(scene.frame, unknown, answer) for answer in best]
+
+    def _answer(self, frame: ReferenceFrame, plane: F64, K: F64) -> Answer:
+        r = dual_image_residuals(frame.A, frame.a, K[None], K[None, frame.reference], plane[None])
+        name = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
+        return Answer(plane, K, float(np.mean(np.sum(r**2, axis=-1))), name)
+
+
+def refined_answer(frame: ReferenceFrame, unknown: UnknownIntrinsics, answer: Answer) -> Answer:
+    """The nearest minimum of the nonlinear criterion over plane and intrinsics."""
+    log_f = 0.5 * np.log(answer.K[:, 0, 0] * answer.K[:, 1, 1])
+    least = minimize_quadric(frame, unknown, answer.plane, log_f)
+    return Answer(least.plane, least.K, least.cost, f"{answer.method}, refined")
 
 
 def projective_scene(reconstruction: Reconstruction, assumed: Assumptions) -> ProjectiveScene:
