@@ -30,7 +30,7 @@ def test_iterations_come_near_the_optimum_and_every_start_leads_there(sigma_px):
 
 def test_the_error_in_space_does_not_know_the_frame():
     rng = np.random.default_rng(0)
-    rig = cube_rig()
+    rig = cube_rig().subset(np.array([4, 10, 13, 16, 22]))
     model = projective_from_truth(rig, noisy_tracks(rig, 0.0, rng), rng)
     seen = model.valid
     assert projective_error_pct(model.X[seen], rig.X[seen]) < 1e-6
