@@ -21,8 +21,9 @@ from thesisrecon.selfcalibration.focal_from_fundamental import (
     kruppa_whitening,
     pair_focals,
 )
-from thesisrecon.selfcalibration.focal_vote import focal_prior, independent_share, vote_on_focals
+from thesisrecon.selfcalibration.focal_vote import independent_share, vote_on_focals
 from thesisrecon.selfcalibration.frame import assumed_frame
+from thesisrecon.selfcalibration.intrinsics import focal_prior
 from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_residuals
 from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs, fit_fundamental
 

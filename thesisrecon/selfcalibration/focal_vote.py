@@ -24,7 +24,7 @@ from thesisrecon.selfcalibration.conclusion import (
 from thesisrecon.selfcalibration.focal_from_fundamental import kruppa_chi_square, kruppa_whitening
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
-from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
+from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, focal_prior, unknown_intrinsics
 from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_residuals, require_pairs
 from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs
 from thesisrecon.selfcalibration.refinement import RotationCriterion
@@ -32,6 +32,9 @@ from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+
+STRAYED = 4.0
+"""Standard deviations of the vote, beyond which the joint answer has left it."""
 
 WRONG_PAIR = 1e-2
 """Chance that a pair's F is wrong, so that no pair alone can forbid a focal."""
@@ -95,13 +98,6 @@ def _some(pairs: PairGeometry, chosen: NDArray[np.bool_]) -> PairGeometry:
     return PairGeometry(pairs.i[chosen], pairs.j[chosen], pairs.F[chosen], pairs.covariance[chosen])
 
 
-def focal_prior(mean: F64, std: F64) -> tuple[F64, F64]:
-    """Finite means and deviations (G,) of log focals: 1.2 long sides to a factor of 2.5 where nothing is
-    known."""
-    silent = ~(np.isfinite(mean) & np.isfinite(std))
-    return np.where(silent, np.log(1.2), mean), np.where(silent, np.log(2.5), std)
-
-
 def _marginal(table: F64) -> F64:
     """Log of the mean over the second axis of exp(table), best cell 0."""
     top = float(table.max())
@@ -132,7 +128,7 @@ def refine_focals(
     wrong with each view's by itself. The loss turns at three sigmas: first that of soft L1, which leads to
     the minimum from afar, then Cauchy's against wrong pairs.
     """
-    unknown = _with_weak_focals(unknown)
+    unknown = unknown.with_weak_focals()
     x, share = unknown.start(log_f[None])[0], independent_share(pairs)
     covariance = np.zeros((len(x), len(x)))
     for loss in ("soft_l1", "soft_l1", "cauchy", "cauchy") if len(x) else ():
@@ -157,17 +153,6 @@ def refine_focals(
         covariance = found.covariance / max(variance, 1e-300) * max(contradiction, 1.0)
     variances = np.append(np.maximum(covariance.diagonal(), 0.0), 0.0)
     return unknown.focals(x[None])[0], np.sqrt(variances[unknown.place[:, 0]])
-
-
-def _with_weak_focals(unknown: UnknownIntrinsics) -> UnknownIntrinsics:
-    """The unknowns, what is told of no focal replaced by :func:`focal_prior`."""
-    focals = np.unique(unknown.place[:, 0])
-    focals = focals[focals >= 0]
-    mean, std = unknown.mean.copy(), unknown.std.copy()
-    mean[focals], std[focals] = focal_prior(
-        np.where(np.isfinite(std[focals]), mean[focals], np.nan), std[focals]
-    )
-    return replace(unknown, mean=mean, std=std)
 
 
 def _central(residuals: Callable[[F64], F64], x: F64) -> F64:
@@ -217,8 +202,8 @@ class FocalsFromFundamental:
         """Log focals (R,) of the cameras, unit-free, and their standard deviations."""
         several = frame.n_groups > 1
         grid = log_grid(self.focal_range, self.focal_steps // 4 if several else self.focal_steps)
-        spread = np.median(assumed.std[frame.views, 3]) / frame.pixel_from_unit[frame.views[0], 0, 0]
-        principal_std = float(np.clip(np.nan_to_num(spread), self.min_principal_std, 0.1))
+        offset = np.median(assumed.std[frame.views, 3]) / frame.pixel_from_unit[frame.views[0], 0, 0]
+        principal_std = float(np.clip(np.nan_to_num(offset), self.min_principal_std, 0.1))
         nothing = np.full(frame.n_groups, np.nan), np.full(frame.n_groups, np.inf)
         known = nothing if frame.focal_mean is None or frame.focal_std is None else (
             frame.focal_mean, frame.focal_std,
@@ -226,8 +211,11 @@ class FocalsFromFundamental:
         prior = focal_prior(*known)
         vote = vote_on_focals(pairs, frame.group, grid, principal_std=principal_std, prior=prior)
         unknown = unknown_intrinsics(frame, assumed)
-        start = vote.log_f[frame.group]
-        return refine_focals(pairs, unknown, start, principal_std=self.min_principal_std)
+        start, spread = vote.log_f[frame.group], vote.std[frame.group]
+        log_f, std = refine_focals(pairs, unknown, start, principal_std=self.min_principal_std)
+        # Residuals also vanish where everything is blurred, at focals near 0: there the vote stands.
+        strayed = np.abs(log_f - start) > STRAYED * np.maximum(spread, 0.1)
+        return np.where(strayed, start, log_f), np.where(strayed, np.maximum(spread, self.max_std), std)
 
     def _with_own_deviations(
         self, found: SelfCalibration, frame: ReferenceFrame, std: F64
@@ -235,7 +223,7 @@ class FocalsFromFundamental:
         K_std = np.zeros_like(found.K_std)
         for k in (0, 1):
             K_std[frame.views, k, k] = found.K[frame.views, k, k] * std
-        open_views = frame.views[std > self.max_std]
+        open_views = frame.views[std >= self.max_std]
         if not len(open_views):
             return replace(found, K_std=K_std)
         names = ", ".join(str(v) for v in open_views[:10])

@@ -6,7 +6,7 @@ Every method of chapter 7 that solves for more than focals takes its unknowns fr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,15 @@ class UnknownIntrinsics:
         scale = np.where(known, self.std, 1.0)
         return np.where(known, (unknowns - self.mean) / scale, 0.0)
 
+    def with_weak_focals(self) -> UnknownIntrinsics:
+        """The same, what is told of no focal replaced by :func:`focal_prior`."""
+        focals = np.unique(self.place[:, 0])
+        focals = focals[focals >= 0]
+        mean, std = self.mean.copy(), self.std.copy()
+        told = np.where(np.isfinite(std[focals]), mean[focals], np.nan)
+        mean[focals], std[focals] = focal_prior(told, std[focals])
+        return replace(self, mean=mean, std=std)
+
     def start(self, log_f: F64) -> F64:
         """Unknowns (B, D) of log focals (B, R) of the cameras; what has no prior mean starts at 0.
 
@@ -73,6 +82,13 @@ class UnknownIntrinsics:
     def focals(self, unknowns: F64) -> F64:
         """Log focals (B, R)."""
         return np.asarray(np.log(self.calibrations(unknowns)[..., 0, 0]))
+
+
+def focal_prior(mean: F64, std: F64) -> tuple[F64, F64]:
+    """Finite means and deviations (G,) of log focals: 1.2 long sides to a factor of 2.5 where nothing is
+    known."""
+    silent = ~(np.isfinite(mean) & np.isfinite(std))
+    return np.where(silent, np.log(1.2), mean), np.where(silent, np.log(2.5), std)
 
 
 def unknown_intrinsics(

@@ -76,11 +76,13 @@ def minimize_quadric(
     The priors weigh against the residuals by their noise, which is estimated from the residuals themselves: a
     first pass supposes 1 %, each further one takes what the last one found until that no longer falls.
     """
+    # Both sides also come together where all focals go to 0, which must cost more than the noise.
+    unknown = unknown.with_weak_focals()
     theta, noise = np.concatenate([plane, unknown.start(log_f[None])[0]]), 0.01
     for _ in range(PASSES):
         supposed = noise
         theta, noise, covariance, cost = _minimize(frame, unknown, theta, noise, loss_scale)
-        if noise > 0.7 * supposed or not np.isfinite(unknown.std).any():
+        if noise > 0.7 * supposed:
             break
     K = unknown.calibrations(theta[None, 3:])[0]
     return QuadricMinimum(theta[:3], theta[3:], K, cost, noise, covariance)

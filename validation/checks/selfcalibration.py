@@ -32,6 +32,7 @@ from thesisrecon.selfcalibration import (
     Stratified,
 )
 from thesisrecon.types import Assumptions, Reconstruction
+from validation.checks.epipolar_cube import OFF_FACE
 from validation.metrics.focal_bound import focal_bound
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.cloud import make_cloud
@@ -97,14 +98,19 @@ class Trial:
 
 
 def make_rig(cell: Cell, rng: np.random.Generator) -> Rig:
-    """The cameras of one draw. Of the cube's, subsets leave out the six that see a single face."""
+    """The cameras of one draw. Of the cube's, subsets leave out the six that see a single face, and are such
+    that pairs whose common points are on more than one face tie all together: others have no projective
+    reconstruction."""
     if cell.scene == "cloud":
         rig = make_cloud(cell.views, rng)
     else:
         rig = cube_rig()
         if cell.views < len(rig.K):
             assert rig.flat is not None
-            rig = rig.subset(np.sort(rng.choice(np.flatnonzero(~rig.flat), cell.views, replace=False)))
+            usable, whole = np.flatnonzero(~rig.flat), rig
+            rig = whole.subset(np.sort(rng.choice(usable, cell.views, replace=False)))
+            while not rig.tied_off_planes(OFF_FACE):
+                rig = whole.subset(np.sort(rng.choice(usable, cell.views, replace=False)))
     return zoomed(rig, np.exp(rng.uniform(-ZOOM, ZOOM, len(rig.K)))) if cell.mode == "zooming" else rig
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from thesisrecon.geometry.camera import compose_camera, project_camera
 from thesisrecon.geometry.strata import random_transform
@@ -22,7 +23,8 @@ I64 = NDArray[np.int64]
 class Rig:
     """``K, R`` (V, 3, 3), R world-to-camera, ``C`` (V, 3), ``X`` (N, 3), ``seen`` (V, N) whether a view may
     see a point (the border of the image is checked besides), ``size`` of every image; ``flat`` (V,) views
-    whose points lie on one plane, which leaves a projective camera open."""
+    whose points lie on one plane, which leaves a projective camera open; ``plane`` (N,) number of the plane
+    that a point lies on, where points lie on planes."""
 
     K: F64
     R: F64
@@ -31,6 +33,7 @@ class Rig:
     seen: B8
     size: tuple[int, int]
     flat: B8 | None = None
+    plane: I64 | None = None
 
     def subset(self, views: I64) -> Rig:
         """The rig of these views."""
@@ -38,6 +41,18 @@ class Rig:
         return replace(
             self, K=self.K[views], R=self.R[views], C=self.C[views], seen=self.seen[views], flat=flat
         )
+
+    def tied_off_planes(self, least: int) -> bool:
+        """Whether pairs of views tie all views together, a pair being two that see ``least`` common points
+        off the plane with the most of them (``plane`` numbers the planes)."""
+        seen = np.isfinite(self.pixels()[..., 0])
+        planes = np.arange(len(self.X)) if self.plane is None else self.plane
+        tied = np.zeros((len(self.K), len(self.K)), dtype=bool)
+        for i in range(len(self.K)):
+            for j in range(i):
+                counts = np.bincount(planes[seen[i] & seen[j]], minlength=1)
+                tied[i, j] = counts.sum() - counts.max() >= least
+        return bool(connected_components(tied, directed=False)[0] == 1)
 
     def pixels(self) -> F64:
         """Exact pixels (V, N, 2), NaN where a view does not see a point."""
@@ -52,7 +67,7 @@ def cube_rig() -> Rig:
     cube = make_cube()
     facing = cube.C[:, cube.face] > 1.0
     K = np.tile(cube.K, (len(cube.R), 1, 1))
-    return Rig(K, cube.R, cube.C, cube.X, facing, SIZE, cube.faces_seen() == 1)
+    return Rig(K, cube.R, cube.C, cube.X, facing, SIZE, cube.faces_seen() == 1, cube.face)
 
 
 def zoomed(rig: Rig, factors: F64) -> Rig:
