@@ -13,6 +13,7 @@ import argparse
 import json
 import time
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -212,6 +213,9 @@ def report(trials: Sequence[Trial]) -> str:
 def _table(title: str, trials: Sequence[Trial], by: str, unit: str, **fixed: float) -> str:
     some = [t for t in trials if all(getattr(t, name) == value for name, value in fixed.items())]
     columns = sorted({getattr(t, by) for t in some})
+    counts = Counter((getattr(t, by), t.method) for t in some).values()
+    draws = f"{min(counts)}" if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
+    title += f", {draws} draws" if some else ""
     lines = [
         f"| {title} | {' | '.join(f'{c:g}{unit}' for c in columns)} |",
         f"| --- |{' --- |' * len(columns)}",
@@ -224,7 +228,7 @@ def _table(title: str, trials: Sequence[Trial], by: str, unit: str, **fixed: flo
 
 def _entry(trials: Sequence[Trial]) -> str:
     """Median error (those that refused count as infinite), success, and zoomed the share of worst cameras
-    within 5 %; the number of trials where it is not the usual one."""
+    within 5 %."""
     if not trials:
         return "-"
     error = np.array([t.median_pct if np.isfinite(t.median_pct) else np.inf for t in trials])
