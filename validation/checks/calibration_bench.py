@@ -156,7 +156,10 @@ class Rows:
             self.add(f"largest deviation, {name}", "stated sigmas", {OURS: scores.worst(columns)})
         width = 100.0 * scores.std_rel
         self.add("stated sigma of the focal, median", "%", {OURS: float(np.nanmedian(width))})
-        self.add("trusted by the self-check", "", {OURS: float(run.metric.trusted)})
+        sure = {OURS: float(run.metric.trusted)}
+        self.metrics.append(
+            Metric(self.title, "trusted by the self-check", "", sure, OURS, 1.0, at_most=False)
+        )
 
 
 def reduced(reduce: Callable[[np.ndarray], float], values: np.ndarray | None) -> float | None:

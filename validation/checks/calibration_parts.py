@@ -3,6 +3,7 @@ set with one photograph of which little is left, so that its matches do not dete
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -20,7 +21,6 @@ from validation.metrics.intervals import (
     focal_errors_pct,
     interval_scores,
     join_scores,
-    source_of_focal,
 )
 from validation.metrics.record import Metric
 
@@ -213,11 +213,12 @@ def _judge(weak: Weak, K: F64, alike: bool) -> tuple[float, float, float, bool, 
 
 
 def named(result: MetricResult, view: int) -> bool:
-    """Whether the result says of a view that its own focal length is hardly determined by its matches: the
-    view is not registered, its value is from elsewhere than those of the others, or its sigma is wide."""
+    """Whether the result says of a view that its own matches hardly determine its focal length: it is not
+    registered, a sentence names it, its value is said to be borrowed, or its stated sigma is wide."""
     if not result.reconstruction.registered[view]:
         return True
-    sources = [source_of_focal(intervals) for intervals in result.intrinsics]
-    others = {source for v, source in enumerate(sources) if v != view}
+    sentence = re.compile(rf"\bviews?\b[^;:]*\b{view}\b")
+    if any(sentence.search(said) for said in (*result.warnings, *result.doubts)):
+        return True
     interval = result.intrinsics[view]["focal_px"]
-    return interval.std / interval.value >= WIDE_REL or sources[view] not in others
+    return interval.source.startswith("borrowed") or interval.std / interval.value >= WIDE_REL

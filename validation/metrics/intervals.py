@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,8 +58,3 @@ def focal_errors_pct(K: F64, K_true: F64) -> F64:
     f = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
     truth = np.sqrt(K_true[:, 0, 0] * K_true[:, 1, 1])
     return np.where(f > 0, 100.0 * np.abs(f / truth - 1.0), np.nan)
-
-
-def source_of_focal(intervals: Mapping[str, object]) -> str:
-    """Where a view's focal is from, in the words of the result; empty where the view is not registered."""
-    return str(getattr(intervals.get("focal_px"), "source", ""))
