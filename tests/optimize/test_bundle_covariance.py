@@ -120,4 +120,4 @@ def test_errors_are_as_large_as_the_covariances_say(populations):
         sigmas.append(fit.sigma_px)
     assert np.sqrt(np.mean(z_intrinsics)) == pytest.approx(1.0, abs=0.08)
     assert np.sqrt(np.mean(z_poses)) == pytest.approx(1.0, abs=0.08)
-    assert np.mean(sigmas) == pytest.approx(sigma, rel=0.03)
+    assert np.mean(sigmas) == pytest.approx(sigma, rel=0.01)

@@ -273,3 +273,34 @@ def test_tangent_steps_keep_unit_norm_and_side():
     kernels.tangent_step(p, v, beta, 3.0 * rng.normal(size=(20, 3)), out)
     np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1.0, rtol=1e-12)
     assert (np.sum(p * out, axis=1) > 0.0).all()
+
+
+@pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
+def test_bending_losses_keep_the_gradient_and_bend_the_curvature(loss):
+    block = make_block()
+    c, n = block.cameras, len(block.xy)
+    xy = block.xy + np.random.default_rng(1).normal(size=block.xy.shape)
+    model = kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen, own, common = Seen(block.view, block.point, xy), np.array([0, 3]), np.array([4, 5])
+    plain, bent = _buffers(n, 8, 2), _buffers(n, 8, 2)
+    for J, least in ((plain, 1.0), (bent, 0.2)):
+        kernels.linearize_metric(model, seen, Weighing(1.0, LOSS_CODES[loss], 1.1, least), own, common, J)
+    for a, b in ((plain.A, bent.A), (plain.E, bent.E), (plain.B, bent.B)):
+        gradient = np.einsum("kic,ki->kc", a, plain.residual)
+        np.testing.assert_allclose(np.einsum("kic,ki->kc", b, bent.residual), gradient, rtol=1e-9, atol=1e-9)
+    # Curvature of rho along the residual e over that of plain reweighting, by differences of its slope in s.
+    e = project_block(c, block.X, block.view, block.point) - xy
+    s, rho = np.sum(e**2, axis=1), LOSSES[loss]
+    slope = (rho(s * 1.00001, 1.1)[1] - rho(s * 0.99999, 1.1)[1]) / (2e-5 * s)
+    expected = np.maximum(1.0 + 2.0 * s * slope / rho(s, 1.1)[1], 0.2)
+    along = np.einsum("kic,ki->kc", plain.A, e)[:, 4] ** 2, np.einsum("kic,ki->kc", bent.A, e)[:, 4] ** 2
+    np.testing.assert_allclose(along[1] / along[0], expected, rtol=2e-3, atol=2e-3)
+
+
+def test_leverages_are_the_diagonal_of_the_projection_onto_the_points():
+    rng = np.random.default_rng(0)
+    start, B, leverage = np.array([0, 3, 3, 7]), rng.normal(size=(7, 2, 3)), np.empty((7, 2))
+    kernels.sum_leverages(start, B, leverage)
+    for s, e in ((0, 3), (3, 7)):
+        J = B[s:e].reshape(-1, 3)
+        np.testing.assert_allclose(leverage[s:e].ravel(), np.diag(J @ np.linalg.pinv(J)), rtol=1e-9)

@@ -21,23 +21,31 @@ DENSE = 1200
 MAD_TO_SIGMA = 1.4826
 # Variance of a standard normal variable cut at +-2.5.
 TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
+# Coordinates that keep less than this share of their variance say little of the noise.
+LEAST_SHARE = 0.1
 
 
-def robust_sigma(residual: F64, parameters: int) -> float:
-    """Standard deviation of one coordinate of residuals (K, 2) that ``parameters`` freedoms were fitted to.
+def robust_sigma(residual: F64, leverage: F64, freedoms: int) -> float:
+    """Standard deviation of one image coordinate from residuals (K, 2) after a fit.
 
-    Root mean square within 2.5 sigma, sigma starting from the median, corrected for the trimming of a normal
-    distribution and for the fitted freedoms. 0 where nothing is left over.
+    ``leverage`` (K, 2) is the share of a coordinate's variance that the fit of its point took, ``freedoms``
+    those of the cameras, which take theirs from all alike. Of the residuals scaled up by what was left to
+    them the root mean square within 2.5 sigma, sigma starting from the median, corrected for the trimming of
+    a normal distribution. 0 where nothing is left over.
     """
-    size, count = np.abs(residual).ravel(), residual.size
-    if count <= max(parameters, 0):
+    if not len(residual):
         return 0.0
+    kept = 1.0 - leverage - max(freedoms, 0) / residual.size
+    told = kept > LEAST_SHARE
+    if not told.any():
+        return 0.0
+    size = np.abs(residual[told]) / np.sqrt(kept[told])
     sigma = MAD_TO_SIGMA * float(np.median(size))
     for _ in range(5):
-        kept = size[size <= TRIM * sigma]
-        if len(kept):
-            sigma = float(np.sqrt(np.mean(kept**2) / TRIMMED_VARIANCE))
-    return sigma * float(np.sqrt(count / (count - parameters)))
+        within = size[size <= TRIM * sigma]
+        if len(within):
+            sigma = float(np.sqrt(np.mean(within**2) / TRIMMED_VARIANCE))
+    return sigma
 
 
 @dataclass(frozen=True)

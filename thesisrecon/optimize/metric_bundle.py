@@ -18,7 +18,7 @@ from thesisrecon.optimize.intrinsic_values import (
     place_intrinsics,
 )
 from thesisrecon.optimize.kernels import Jacobians, MetricModel, Seen, Weighing
-from thesisrecon.optimize.levenberg_marquardt import run_levenberg_marquardt
+from thesisrecon.optimize.levenberg_marquardt import Solution, run_levenberg_marquardt
 from thesisrecon.optimize.losses import LossName, loss_code
 from thesisrecon.optimize.metric_cameras import (
     POSE_DOF,
@@ -50,6 +50,10 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 B8 = NDArray[np.bool_]
 SIMILARITY_DOF = 7
+# Where a robust loss bends, this share of the curvature along a residual is kept once the gain of a step has
+# fallen below CLOSE of the cost. Reweighting goes safely towards the minimum, but near it Newton is faster.
+LEAST, CLOSE = 0.3, 1e-3
+BENDING = ("huber", "soft_l1", "cauchy")
 
 
 @dataclass(frozen=True)
@@ -172,6 +176,15 @@ class _MetricProblem:
         self.layout.over_observations(work)
         return residual
 
+    def sigma(self, state: _State, residual: F64) -> float:
+        """The noise of one coordinate, px, from the residuals at the minimum."""
+        leverage = np.empty_like(residual)
+        self.linearize(state)
+        kernels.sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
+        held = not self.free_views[self.layout.observations.view_index].all()
+        poses = POSE_DOF * int(self.free_views.sum())
+        return robust_sigma(residual, leverage, poses + self.values.size - (0 if held else SIMILARITY_DOF))
+
     def cost(self, state: _State) -> float:
         def work(_: slice, seen: Seen) -> float:
             return float(kernels.metric_cost(state.model, seen, self.weighing))
@@ -223,11 +236,10 @@ def refine_metric_bundle(
         np.ascontiguousarray(cameras.group, dtype=np.int64),
         np.ascontiguousarray(scale * (X - origin)),
     )
-    solution = run_levenberg_marquardt(problem, _State(start, values), max_iterations=options.max_iterations)
+    solution = _minimize(problem, _State(start, values), options)
     end, moved = solution.state.model, problem.free_views
     residual = problem.residual(solution.state)
-    freedoms = POSE_DOF * int(moved.sum()) + problem.values.size + 3 * int(seen_points.sum())
-    sigma = robust_sigma(residual, freedoms - SIMILARITY_DOF)
+    sigma = problem.sigma(solution.state, residual)
     intrinsics_covariance, pose_covariance = np.zeros((*table.shape, table.shape[1])), None
     if options.covariance:
         intrinsics_covariance, pose_covariance = _covariances(
@@ -251,6 +263,19 @@ def refine_metric_bundle(
         pose_covariance,
         sigma,
     )
+
+
+def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Solution[_State]:
+    """Down to the minimum, by reweighting first and nearly Newton's steps at the end."""
+    if options.loss not in BENDING:
+        return run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations)
+    far = run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations, tolerance=CLOSE)
+    left = options.max_iterations - far.iterations
+    if left < 1:
+        return far
+    near = replace(problem, weighing=problem.weighing._replace(least=LEAST))
+    end = run_levenberg_marquardt(near, far.state, max_iterations=left)
+    return replace(end, initial_cost=far.initial_cost, iterations=far.iterations + end.iterations)
 
 
 def _metric_problem(

@@ -13,6 +13,7 @@ from thesisrecon.optimize.kernels.elimination import (
     eliminate_points,
     mark_pairs,
     substitute_points,
+    sum_leverages,
 )
 from thesisrecon.optimize.kernels.metric import MetricModel, linearize_metric, metric_cost, project_metric
 from thesisrecon.optimize.kernels.points import hold_flipping_points, refine_each_point
@@ -51,6 +52,7 @@ __all__ = [
     "projective_cost",
     "refine_each_point",
     "substitute_points",
+    "sum_leverages",
     "tangent_reflectors",
     "tangent_step",
 ]

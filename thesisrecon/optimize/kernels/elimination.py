@@ -312,6 +312,26 @@ def substitute_points(
 
 
 @njit(cache=True, nogil=True)
+def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
+    """Share of the variance of each coordinate (K, 2) that its point's own three freedoms take, B V^-1 B'."""
+    M = np.empty((3, 3))
+    for j in range(len(start) - 1):
+        v00 = v01 = v02 = v11 = v12 = v22 = 0.0
+        for k in range(start[j], start[j + 1]):
+            for i in range(2):
+                b0, b1, b2 = B[k, i, 0], B[k, i, 1], B[k, i, 2]
+                v00, v01, v02 = v00 + b0 * b0, v01 + b0 * b1, v02 + b0 * b2
+                v11, v12, v22 = v11 + b1 * b1, v12 + b1 * b2, v22 + b2 * b2
+        held = inverse_root(v00, v01, v02, v11, v12, v22, M)
+        for k in range(start[j], start[j + 1]):
+            for i in range(2):
+                b0, b1, b2 = B[k, i, 0], B[k, i, 1], B[k, i, 2]
+                t0, t1 = M[0, 0] * b0, M[1, 0] * b0 + M[1, 1] * b1
+                t2 = M[2, 0] * b0 + M[2, 1] * b1 + M[2, 2] * b2
+                leverage[k, i] = t0 * t0 + t1 * t1 + t2 * t2 if held else 1.0
+
+
+@njit(cache=True, nogil=True)
 def mark_pairs(start: I64, view: I64, block: I64, seen: NDArray[np.bool_]) -> None:
     """Mark in ``seen`` (b, b), upper triangle, the blocks of views that see a point together."""
     for j in range(len(start) - 1):

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from thesisrecon.optimize.kernels.records import Jacobians, Seen, Weighing
-from thesisrecon.optimize.kernels.scalars import away_from_zero, loss_value, loss_weight
+from thesisrecon.optimize.kernels.scalars import away_from_zero, loss_curvature, loss_value, loss_weight
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -90,9 +90,19 @@ def linearize_metric(
         s = e0 * e0 + e1 * e1
         cost += loss_value(weighing.code, s, weighing.delta)
         root = np.sqrt(loss_weight(weighing.code, s, weighing.delta))
+        n00, n01, n10, n11 = intrinsic_columns(q, x0 / w, x1 / w, root / weighing.sigma, D)
+        kept = max(loss_curvature(weighing.code, s, weighing.delta), weighing.least)
+        if kept < 1.0:
+            # (I - (1 - sqrt(kept)) e e' / s) J with the residual over sqrt(kept): the gradient is the same.
+            kept = np.sqrt(kept)
+            root /= kept
+            c00, c01, c11 = (1.0 - kept) * e0 * e0 / s, (1.0 - kept) * e0 * e1 / s, (1.0 - kept) * e1 * e1 / s
+            n00, n10 = n00 - c00 * n00 - c01 * n10, n10 - c01 * n00 - c11 * n10
+            n01, n11 = n01 - c00 * n01 - c01 * n11, n11 - c01 * n01 - c11 * n11
+            for c in range(8):
+                d0, d1 = D[0, c], D[1, c]
+                D[0, c], D[1, c] = d0 - c00 * d0 - c01 * d1, d1 - c01 * d0 - c11 * d1
         J.residual[k, 0], J.residual[k, 1] = root * e0, root * e1
-        root /= weighing.sigma
-        n00, n01, n10, n11 = intrinsic_columns(q, x0 / w, x1 / w, root, D)
         for c in range(len(own)):
             J.A[k, 0, 6 + c], J.A[k, 1, 6 + c] = D[0, own[c]], D[1, own[c]]
         for c in range(len(common)):

@@ -37,8 +37,14 @@ class Seen(NamedTuple):
 
 
 class Weighing(NamedTuple):
-    """Residuals are counted in units of ``sigma`` under loss number ``code``, which turns at ``delta``."""
+    """Residuals are counted in units of ``sigma`` under loss number ``code``, which turns at ``delta``.
+
+    ``least`` is the share of the curvature along a residual that is kept at least where its loss bends
+    (Triggs et al., Bundle Adjustment, 1999, equation 11): 1 is plain reweighting, less comes closer to
+    Newton's steps.
+    """
 
     sigma: float
     code: int
     delta: float
+    least: float = 1.0

@@ -45,6 +45,19 @@ def loss_weight(code: int, s: float, delta: float) -> float:
 
 
 @njit(cache=True, nogil=True, inline="always")
+def loss_curvature(code: int, s: float, delta: float) -> float:
+    """1 + 2 s rho'' / rho': how much of the curvature along a residual its loss leaves."""
+    u = s / (delta * delta)
+    if code == 1:
+        return 1.0 if u <= 1.0 else 0.0
+    if code == 2:
+        return 1.0 / (1.0 + u)
+    if code == 3:
+        return (1.0 - u) / (1.0 + u)
+    return 1.0
+
+
+@njit(cache=True, nogil=True, inline="always")
 def away_from_zero(w: float) -> float:
     """w, moved off 0: a point in the focal plane gets a huge residual instead of a division by zero."""
     if w >= 0.0:
