@@ -29,7 +29,7 @@ class ViewChecks:
     agree with any two cameras along their epipolar lines. ``behind`` share of the observations behind the
     camera. ``noise_px``. ``focal_off`` and ``aspect_off``: the logarithm of the view's own focal over the
     model's and of its own aspect, from its points alone, with their standard deviations ``focal_off_std`` and
-    ``aspect_off_std`` at the view's noise.
+    ``aspect_off_std`` at the noise that is left with them.
     """
 
     explained: F64
@@ -92,7 +92,8 @@ def _own_camera(model: MetricModel, view: int, index: I64) -> tuple[float, float
         )
     except ValueError:
         return nothing
-    std = noise * np.sqrt(np.maximum(np.diag(fit.covariance)[6:8], 0.0))
+    left = max(noise_from_distances(np.linalg.norm(fit.residual_px, axis=1)), 1e-3)
+    std = left * np.sqrt(np.maximum(np.diag(fit.covariance)[6:8], 0.0))
     focal = float(np.log(fit.intrinsics[0] / intrinsics[0]))
     return (
         noise,

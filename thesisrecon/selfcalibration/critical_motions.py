@@ -32,6 +32,8 @@ TOLERANCES: Mapping[str, float] = {
     "travel_over_distance": 0.03,
     "image_shift": 0.08,
     "image_shift_beyond_roll": 0.08,
+    "turn_rms_deg": 3.5,
+    "tilt_rms_deg": 3.5,
     "axis_spread_deg": 3.0,
     "axis_line_over_distance": 0.05,
     "climb_over_distance": 0.025,
@@ -52,6 +54,10 @@ _NAMED_BY: Mapping[str, tuple[str, ...]] = {
     PARALLEL_AXES: ("axis_spread_deg",),
 }
 """From what leaves most open to what leaves least; a motion is near where all its measures are."""
+
+_OR: Mapping[str, str] = {"image_shift": "turn_rms_deg", "image_shift_beyond_roll": "tilt_rms_deg"}
+"""A hand turns a long lens as far as a short one, which moves its picture further: either measure may be
+small. Where the focal is open the angle depends on the answer, the shift does not."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,8 @@ def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
         "image_shift": infinity_shift(H, roll=False),
         "image_shift_beyond_roll": infinity_shift(H, roll=True),
         "largest_turn_deg": turn,
+        "turn_rms_deg": rms_turn(metric.R),
+        "tilt_rms_deg": rms_tilt(metric.R),
         "axis_spread_deg": spread,
         "axis_line_over_distance": axis_line_residual(metric, axis) / metric.distance,
         "climb_over_distance": climb(metric.C, axis) / metric.distance,
@@ -105,10 +113,16 @@ def nearest_critical_motion(measures: Mapping[str, float]) -> tuple[str, float]:
     near: dict[str, float] = {}
     for name, needed in _NAMED_BY.items():
         if all(key in measures for key in needed):
-            near[name] = max(measures[key] / TOLERANCES[key] for key in needed)
+            near[name] = max(_nearness(measures, key) for key in needed)
     within = [name for name, distance in near.items() if distance < 1.0]
     chosen = within[0] if within else min(near, key=lambda name: near[name])
     return chosen, near[chosen]
+
+
+def _nearness(measures: Mapping[str, float], key: str) -> float:
+    """A measure over its tolerance, or that of its alternative where that is less."""
+    keys = [k for k in (key, _OR.get(key, key)) if k in measures]
+    return min(measures[k] / TOLERANCES[k] for k in keys)
 
 
 def infinity_shift(H: F64, *, roll: bool) -> float:
@@ -174,6 +188,21 @@ def common_axis(R: F64) -> tuple[F64, float, float]:
     value, vector = np.linalg.eigh(vectors.T @ vectors / len(vectors))
     turn = float(np.degrees(np.linalg.norm(vectors, axis=1).max()))
     return vector[:, 2], turn, float(np.degrees(np.sqrt(max(value[1], 0.0))))
+
+
+def rms_turn(R: F64) -> float:
+    """Rms angle (deg) of the turns between all pairs of views."""
+    i, j = np.triu_indices(len(R), 1)
+    angle = Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).magnitude()
+    return float(np.degrees(np.sqrt(np.mean(angle**2))))
+
+
+def rms_tilt(R: F64) -> float:
+    """Rms angle (deg) between the optical axes of all pairs of views."""
+    i, j = np.triu_indices(len(R), 1)
+    cosine = np.einsum("ka,ka->k", R[i, 2], R[j, 2])
+    sine = np.linalg.norm(np.cross(R[i, 2], R[j, 2]), axis=1)
+    return float(np.degrees(np.sqrt(np.mean(np.arctan2(sine, cosine) ** 2))))
 
 
 def travel(C: F64) -> float:

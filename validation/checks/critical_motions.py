@@ -157,6 +157,8 @@ def main() -> int:
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--zoom", choices=["no", "yes", "both"], default="both")
+    names = [motion.name.lower() for motion in Motion]
+    parser.add_argument("--motions", nargs="+", choices=names, default=names)
     wishes = parser.parse_args()
     rows: list[Metric] = []
     print("| motion | made | focal | named % | identifiable % | its focal error % | wrong % | names |")
@@ -164,7 +166,7 @@ def main() -> int:
     zooms = {"no": [0.0], "yes": [ZOOM], "both": [0.0, ZOOM]}[wishes.zoom]
     with ProcessPoolExecutor(wishes.workers) as pool:
         for zoom in zooms:
-            for motion in Motion:
+            for motion in (Motion[name.upper()] for name in wishes.motions):
                 for by_hand in (False, True) if motion is not Motion.GENERAL else (False,):
                     run = partial(run_trial, motion, by_hand=by_hand, zoom=zoom)
                     trials = list(pool.map(run, range(wishes.trials), chunksize=5))

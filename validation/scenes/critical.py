@@ -41,7 +41,8 @@ class Motion(Enum):
 
 @dataclass(frozen=True)
 class Sequence:
-    """``K, R`` (V, 3, 3), ``C`` (V, 3), ``X`` (N, 3), ``tracks`` with noise ``sigma_px``, ``sizes`` (V, 2)."""
+    """``K, R`` (V, 3, 3), ``C`` (V, 3), ``X`` (N, 3), ``tracks`` with noise ``sigma_px``, ``sizes`` (V,
+    2)."""
 
     K: F64
     R: F64
@@ -147,8 +148,9 @@ def make_sequence(
 ) -> Sequence:
     """5 to 15 cameras and 150 to 400 points in a box, 0.5 to 1 px noise, a focal of 0.7 to 2 long sides.
 
-    ``by_hand`` adds what a photographer cannot avoid; ``zoom``: focals vary by factors e^+-zoom. The principal
-    point is off by 0.5 % of the long side (rms), and a tenth of what is in the picture is not matched.
+    ``by_hand`` adds what a photographer cannot avoid; ``zoom``: focals vary by factors e^+-zoom. The
+    principal point is off by 0.5 % of the long side (rms), and a tenth of what is in the picture is not
+    matched.
     """
     wishes = _Wishes(int(rng.integers(5, 16)), rng.uniform(3.0, 6.0), rng.uniform(0.4, 0.8))
     R, C = _MOTIONS[motion](wishes, rng)

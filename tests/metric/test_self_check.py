@@ -1,0 +1,120 @@
+"""The self-check leaves right models alone, and names the photograph that is wrong and the word that was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from thesisrecon.assumptions import IntrinsicsAssumption, assume
+from thesisrecon.metric.adjustment import Adjustment
+from thesisrecon.metric.model import MetricModel, retriangulate
+from thesisrecon.metric.prior_check import contradicted_focals
+from thesisrecon.metric.self_check import self_check
+from thesisrecon.metric.start import camera_rows
+from thesisrecon.metric.view_checks import check_views
+from thesisrecon.optimize.metric_bundle import MetricCameras
+from thesisrecon.types import Assumptions, IntrinsicInterval, SelfCalibration
+
+SIGMAS, ANGLE = 7.0, 1e-3
+
+
+def true_model(scene: TrueScene, assumed: Assumptions) -> MetricModel:
+    group, shared = camera_rows(assumed)
+    rows = np.zeros((len(shared), 8))
+    first = [int(np.flatnonzero(group == g)[0]) for g in range(len(shared))]
+    rows[:, :5] = [[scene.K[v, 0, 0], 1.0, 0.0, scene.K[v, 0, 2], scene.K[v, 1, 2]] for v in first]
+    n = len(scene.R)
+    cameras = MetricCameras(scene.R, scene.t, rows, group, shared)
+    every = [np.ones(count, dtype=bool) for count in (n, len(scene.X), len(scene.tracks.xy))]
+    model = MetricModel(scene.tracks, scene.sizes, cameras, every[0], scene.X, every[1], every[2], 0.5)
+    return retriangulate(model, sigmas=SIGMAS, min_angle=ANGLE)
+
+
+def calibration_of(scene: TrueScene) -> SelfCalibration:
+    return SelfCalibration(np.eye(4), scene.K, np.zeros_like(scene.K), True, ())
+
+
+def doubts_of(model: MetricModel, scene: TrueScene) -> tuple[dict[str, float], list[str]]:
+    intervals = [
+        {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 1.0, "")}
+        for g in model.cameras.group
+    ]
+    return self_check(model, calibration_of(scene), intervals, sigmas=SIGMAS)
+
+
+def setting(**known: object) -> tuple[TrueScene, Assumptions, MetricModel]:
+    scene = make_scene(sigma_px=0.5, seed=3)
+    assumed = assume(projective_reconstruction(scene), IntrinsicsAssumption(**known))  # type: ignore[arg-type]
+    return scene, assumed, true_model(scene, assumed)
+
+
+def test_a_right_model_is_not_doubted() -> None:
+    scene, _, model = setting()
+    check, doubts = doubts_of(model, scene)
+    assert doubts == []
+    assert check["confirmed_share_worst_view"] > 0.95
+    assert check["noise_ratio_worst_view"] < 1.5
+
+
+@pytest.mark.parametrize("view", [0, 5])
+def test_a_camera_that_stands_elsewhere_is_named(view: int) -> None:
+    scene, _, model = setting()
+    t = model.cameras.t.copy()
+    t[view] += [0.4, -0.3, 0.2]
+    spoiled = retriangulate(model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE)
+    check, doubts = doubts_of(spoiled, scene)
+    assert check["confirmed_share_worst_view"] < 0.5
+    assert any(doubt.startswith(f"view {view}:") for doubt in doubts)
+
+
+def test_several_wrong_cameras_share_a_sentence() -> None:
+    scene, _, model = setting()
+    t = model.cameras.t.copy()
+    t[[1, 6]] += [0.4, -0.3, 0.2]
+    spoiled = retriangulate(model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE)
+    doubts = doubts_of(spoiled, scene)[1]
+    assert any("1" in doubt and "6" in doubt and doubt.startswith("views ") for doubt in doubts)
+
+
+def test_a_view_of_another_focal_asks_for_it() -> None:
+    scene = make_scene(sigma_px=0.3, seed=4)
+    view = scene.tracks.view_index == 2
+    centre = scene.K[2, :2, 2]
+    xy = np.where(view[:, None], centre + 1.08 * (scene.tracks.xy - centre), scene.tracks.xy)
+    assumed = assume(projective_reconstruction(scene))
+    model = true_model(scene, assumed)
+    # What the zoomed photograph shows, wherever it was explained before.
+    zoomed = replace(model, tracks=replace(scene.tracks, xy=xy), sigma_px=12.0)
+    off = check_views(zoomed, sigmas=SIGMAS).focal_off
+    assert off[2] == pytest.approx(np.log(1.08), abs=0.01)
+    assert np.abs(np.delete(off, 2)).max() < 0.01
+    assert any("view 2 alone asks for a focal length" in doubt for doubt in doubts_of(zoomed, scene)[1])
+
+
+def test_points_behind_a_camera_are_told() -> None:
+    scene, _, model = setting()
+    R, t = model.cameras.R.copy(), model.cameras.t.copy()
+    about = np.diag([-1.0, 1.0, -1.0])
+    R[4], t[4] = about @ R[4], about @ t[4]
+    behind = model.with_cameras(replace(model.cameras, R=R, t=t))
+    assert check_views(behind, sigmas=SIGMAS).behind[4] > 0.5
+    assert any("view 4" in doubt for doubt in doubts_of(behind, scene)[1])
+
+
+@pytest.mark.parametrize(("off", "deviation", "told"), [(1.0, 0.01, 0), (1.05, 0.003, 1), (1.05, 0.1, 0)])
+def test_a_focal_that_the_photographs_contradict_is_told(off: float, deviation: float, told: int) -> None:
+    _, assumed, model = setting(focal_px=1500.0 * off, focal_std_rel=deviation)
+    adjustment = Adjustment(assumed, 0.0, 0.02)
+    model = adjustment.run(model, iterations=10)[0]
+    model = retriangulate(model, sigmas=SIGMAS, min_angle=ANGLE)
+    doubts = contradicted_focals(model, adjustment)
+    assert len(doubts) == told
+    assert all("contradict the focal length" in doubt for doubt in doubts)
+
+
+def test_nothing_said_is_nothing_contradicted() -> None:
+    _, assumed, model = setting()
+    assert contradicted_focals(model, Adjustment(assumed, 0.0, 0.02)) == []

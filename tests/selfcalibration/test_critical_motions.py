@@ -1,0 +1,173 @@
+"""Critical motions by their measures and names, the counting argument, and the verdict with its sentences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic import make_scene, projective_reconstruction, with_poses
+from thesisrecon.assumptions import IntrinsicsAssumption, assume
+from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.geometry.multiview import fundamental_from_cameras
+from thesisrecon.selfcalibration import HypothesesAndRefinement
+from thesisrecon.selfcalibration.critical_motions import (
+    UpgradedCameras,
+    infinity_shift,
+    measure_motion,
+    nearest_critical_motion,
+    optical_axes_gap,
+    shifts_without_an_answer,
+    thickness,
+)
+from thesisrecon.selfcalibration.frame import assumed_frame
+from thesisrecon.selfcalibration.verdict import judge_motion, spare_equations, verdict_without_an_answer
+from thesisrecon.types import MotionVerdict, Upgrade
+from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
+
+CRITICAL = [motion for motion in Motion if motion is not Motion.GENERAL]
+
+
+def true_cameras(scene: Sequence) -> UpgradedCameras:
+    return UpgradedCameras(scene.K[:, 0, 0] / scene.sizes.max(axis=1), scene.R, scene.C, scene.X)
+
+
+def verdict_at_the_truth(scene: Sequence, cameras: str = "shared") -> MotionVerdict:
+    """The verdict when self-calibration found the true answer."""
+    rng = np.random.default_rng(0)
+    estimate = projective_estimate(scene, rng)
+    known = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")
+    assumed = assume(estimate, known)
+    answer = HypothesesAndRefinement(search=None, subsets=0, focal_steps=17).calibrate(
+        estimate, assumed=assumed, rng=rng
+    )
+    assert answer.verdict is not None
+    return answer.verdict
+
+
+@pytest.mark.parametrize("by_hand", [False, True], ids=["exact", "by hand"])
+@pytest.mark.parametrize("motion", CRITICAL, ids=lambda m: m.value)
+def test_a_critical_motion_is_named(motion: Motion, by_hand: bool) -> None:
+    for seed in range(5):
+        scene = make_sequence(motion, np.random.default_rng(seed), by_hand=by_hand)
+        name, nearness = nearest_critical_motion(measure_motion(true_cameras(scene)))
+        assert nearness < 1.0
+        alike = {Motion.TURNTABLE.value, Motion.PLANAR.value}
+        assert name == motion.value or {name, motion.value} == alike
+        assert by_hand or nearness < 1e-3
+
+
+def test_general_motions_are_far_from_all() -> None:
+    for seed in range(20):
+        scene = make_sequence(Motion.GENERAL, np.random.default_rng(seed))
+        assert nearest_critical_motion(measure_motion(true_cameras(scene)))[1] > 2.0
+
+
+@pytest.mark.parametrize("motion", [Motion.TRANSLATION, Motion.OPTICAL_AXIS])
+def test_cameras_that_did_not_tilt_show_it_whatever_focal_is_taken(motion: Motion) -> None:
+    scene = make_sequence(motion, np.random.default_rng(3), zoom=0.3)
+    cameras = true_cameras(scene)
+    for factor in (0.3, 1.0, 4.0):
+        H = replace(cameras, focal=factor * cameras.focal).infinite_homographies()
+        assert infinity_shift(H, roll=True) < 1e-9
+    assert (infinity_shift(H, roll=False) < 1e-9) == (motion is Motion.TRANSLATION)
+
+
+def test_the_projective_cameras_alone_tell_that_nothing_tilted() -> None:
+    scene = make_scene(seed=2)
+    still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
+    for some, small in ((still, True), (scene, False)):
+        estimate = projective_reconstruction(some, seed=2)
+        frame = assumed_frame(estimate, assume(estimate))
+        assert (shifts_without_an_answer(frame.A, frame.a)["image_shift"] < 1e-9) == small
+        verdict = verdict_without_an_answer(estimate, assume(estimate))
+        assert not verdict.identifiable
+        assert (verdict.motion == "pure translation") == small
+        assert any("pure translation" in sentence for sentence in verdict.sentences) == small
+
+
+def test_thickness_forgives_a_few_far_points() -> None:
+    rng = np.random.default_rng(0)
+    wall = rng.uniform(-1.0, 1.0, (300, 3)) * [1.0, 1.0, 0.005]
+    wall[:5] += 30.0 * rng.normal(size=(5, 3))
+    assert thickness(wall) < 0.01
+    assert thickness(rng.uniform(-1.0, 1.0, (300, 3))) > 0.5
+
+
+def test_two_cameras_that_look_at_one_point_have_no_gap_between_their_axes() -> None:
+    for seed in range(5):
+        scene = make_sequence(Motion.GENERAL, np.random.default_rng(seed))
+        aimed = make_scene(seed=seed)
+        T = pixel_from_unit(aimed.sizes)
+        z = aimed.R[:2, 2]
+        target = aimed.centres[0] + 7.0 * z[0]
+        R = aimed.R[1].copy()
+        forward = (target - aimed.centres[1]) / np.linalg.norm(target - aimed.centres[1])
+        right = np.cross(R[1], forward)
+        R = np.array([right, np.cross(forward, right), forward]) / np.linalg.norm(right)
+        R[2] = forward
+        pair = with_poses(aimed, np.stack([aimed.R[0], R, *aimed.R[2:]]), aimed.centres)
+        F = fundamental_from_cameras(np.linalg.inv(T[0]) @ pair.P[0], np.linalg.inv(T[1]) @ pair.P[1])
+        assert optical_axes_gap(F) < 1e-9
+        P = np.linalg.inv(pixel_from_unit(scene.sizes))[:2] @ scene.P[:2]
+        assert optical_axes_gap(fundamental_from_cameras(P[0], P[1])) > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("known", "views", "spare"),
+    [
+        # m n_known + (m - 1) n_constant - 8 (methods 2.0)
+        (IntrinsicsAssumption(), 8, 8 * 4 + 7 - 8),
+        (IntrinsicsAssumption(cameras="per-image"), 8, 8 * 4 - 8),
+        (IntrinsicsAssumption(principal_point_std_rel=None), 8, 8 * 2 + 7 * 3 - 8),
+        (IntrinsicsAssumption(cameras="per-image", principal_point_std_rel=None), 3, 3 * 2 - 8),
+        (
+            IntrinsicsAssumption(aspect="constant", skew="constant", principal_point_std_rel=None),
+            3,
+            2 * 5 - 8,
+        ),
+    ],
+)
+def test_the_counting_argument(known: IntrinsicsAssumption, views: int, spare: int) -> None:
+    estimate = projective_reconstruction(make_scene(views=8))
+    registered = np.arange(8) < views
+    assert spare_equations(assume(estimate, known), registered) == spare
+
+
+def test_a_turntable_is_settled_by_square_pixels_and_said_so() -> None:
+    verdict = verdict_at_the_truth(make_sequence(Motion.TURNTABLE, np.random.default_rng(4)))
+    assert verdict.identifiable
+    assert verdict.critical
+    assert verdict.motion == "turntable"
+    assert verdict.evidence["focal_std_rel_free"] > 3.0 * verdict.evidence["focal_std_rel_median"]
+    assert any("turntable" in sentence for sentence in verdict.sentences)
+    assert any("square pixels" in sentence for sentence in verdict.sentences)
+
+
+def test_a_camera_that_rolled_only_is_refused_and_told_what_to_do() -> None:
+    for cameras in ("shared", "per-image"):
+        scene = make_sequence(Motion.OPTICAL_AXIS, np.random.default_rng(5))
+        verdict = verdict_at_the_truth(scene, cameras)
+        assert not verdict.identifiable
+        assert verdict.motion == "rotation about the optical axis"
+        assert any("point the camera in different directions" in sentence for sentence in verdict.sentences)
+
+
+def test_a_general_motion_needs_no_words() -> None:
+    verdict = verdict_at_the_truth(make_sequence(Motion.GENERAL, np.random.default_rng(6)))
+    assert verdict.identifiable
+    assert not verdict.critical
+    assert verdict.sentences == ()
+    assert verdict.undetermined == ()
+
+
+def test_an_answer_that_explains_nothing_is_not_identifiable() -> None:
+    scene = make_sequence(Motion.GENERAL, np.random.default_rng(7))
+    estimate = projective_estimate(scene, np.random.default_rng(0))
+    assumed = assume(estimate)
+    G = np.eye(4)
+    G[3, :3] = np.linalg.svd(estimate.X[estimate.valid])[2][3][:3]
+    verdict = judge_motion(estimate, Upgrade(G, scene.K, 0.0, "made up"), assumed)
+    assert not verdict.identifiable
+    assert verdict.sentences

@@ -1,0 +1,145 @@
+"""Right metric models made wrong in the ways that reconstructions go wrong, for the self-check to find."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.metric.model import MetricModel
+from thesisrecon.metric.start import camera_rows
+from thesisrecon.optimize.metric_bundle import MetricCameras
+from thesisrecon.types import I64, Assumptions, Reconstruction
+
+F64 = NDArray[np.float64]
+
+
+def model_from_reconstruction(found: Reconstruction, assumed: Assumptions) -> MetricModel:
+    """The working model of a metric reconstruction."""
+    assert found.K is not None
+    views = found.registered
+    K = np.where(views[:, None, None], found.K, np.eye(3))
+    Q = np.linalg.inv(K) @ found.P
+    group, shared = camera_rows(assumed)
+    rows = np.zeros((len(shared), 8))
+    for g in range(len(rows)):
+        mine = np.flatnonzero((group == g) & views)
+        v = int(mine[0]) if len(mine) else int(np.flatnonzero(views)[0])
+        rows[g] = [K[v, 0, 0], K[v, 1, 1] / K[v, 0, 0], K[v, 0, 1], *K[v, :2, 2], *found.radial(v)]
+    cameras = MetricCameras(
+        np.where(views[:, None, None], Q[:, :, :3], np.eye(3)), Q[:, :, 3], rows, group, shared
+    )
+    return MetricModel(
+        found.tracks, found.sizes, cameras, views.copy(), found.X[:, :3].copy(), found.valid.copy(),
+        found.inlier.copy(), max(found.sigma_px, 0.02),
+    )  # fmt: skip
+
+
+def centres(model: MetricModel) -> F64:
+    """(V, 3)."""
+    return np.asarray(-np.einsum("vba,vb->va", model.cameras.R, model.cameras.t))
+
+
+def _spread(model: MetricModel) -> float:
+    C = centres(model)[model.registered]
+    return float(np.sqrt(np.mean(np.sum((C - C.mean(axis=0)) ** 2, axis=1))))
+
+
+def _direction(rng: np.random.Generator) -> F64:
+    v = rng.normal(size=3)
+    return np.asarray(v / np.linalg.norm(v))
+
+
+def _placed(model: MetricModel, R: F64, C: F64) -> MetricModel:
+    t = -np.einsum("vab,vb->va", R, C)
+    return model.with_cameras(replace(model.cameras, R=R, t=t))
+
+
+def move_cameras(model: MetricModel, rng: np.random.Generator, views: I64, degrees: float) -> MetricModel:
+    """Views turned by up to ``degrees`` (at least a quarter) and moved by a fifth to a half of the path."""
+    R, C = model.cameras.R.copy(), centres(model)
+    for v in views:
+        turn = np.radians(rng.uniform(degrees / 4.0, degrees)) * _direction(rng)
+        R[v] = Rotation.from_rotvec(turn).as_matrix() @ R[v]
+        C[v] += _spread(model) * rng.uniform(0.2, 0.5) * _direction(rng)
+    return _placed(model, R, C)
+
+
+def one_moved(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+    """One camera stands and looks elsewhere."""
+    return move_cameras(model, rng, rng.choice(np.flatnonzero(model.registered), 1), 20.0)
+
+
+def all_moved(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+    """Every camera does: what adjusts from there ends in some local minimum."""
+    return move_cameras(model, rng, np.flatnonzero(model.registered), 8.0)
+
+
+def two_swapped(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+    """Two cameras change places."""
+    i, j = rng.choice(np.flatnonzero(model.registered), 2, replace=False)
+    R, C = model.cameras.R.copy(), centres(model)
+    R[[i, j]], C[[i, j]] = R[[j, i]], C[[j, i]]
+    return _placed(model, R, C)
+
+
+def mirrored(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+    """The depth reversal of weak perspective: the scene mirrored at a plane across one optical axis, cameras
+    turned the other way."""
+    z = model.cameras.R[rng.choice(np.flatnonzero(model.registered)), 2]
+    o = np.median(model.X[model.valid], axis=0)
+    M = np.eye(3) - 2.0 * np.outer(z, z)
+    R = np.diag([1.0, 1.0, -1.0]) @ model.cameras.R @ M
+    # Mirrored with the scene the cameras would look away from it: they come back to their side.
+    C = o + (centres(model) - o) @ M
+    return _placed(model, R, C - 2.0 * ((C - o) @ z)[:, None] * z)
+
+
+def _transformed(model: MetricModel, H: F64, focal_factor: float) -> MetricModel:
+    """Cameras nearest to those of the model in the frame H X, all focals multiplied."""
+    intrinsics = model.cameras.intrinsics.copy()
+    intrinsics[:, 0] *= focal_factor
+    cameras = replace(model.cameras, intrinsics=intrinsics)
+    P = np.linalg.inv(cameras.K) @ model.cameras.P @ np.linalg.inv(H)
+    P *= np.where(np.linalg.det(P[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
+    U, _, Vt = np.linalg.svd(P[:, :, :3])
+    C = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
+    return _placed(model.with_cameras(cameras), U @ Vt, C)
+
+
+def wrong_infinity(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+    """The upgrade with a plane at infinity 2.5 to 10 path lengths away."""
+    H = np.eye(4)
+    H[3, :3] = _direction(rng) * rng.uniform(0.1, 0.4) / _spread(model)
+    H[3, 3] = 1.0 - H[3, :3] @ np.median(model.X[model.valid], axis=0)
+    return _transformed(model, H, 1.0)
+
+
+def wrong_focal(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+    """The bas-relief: half or double the focal, and the scene as deep as suits it."""
+    factor = float(rng.choice([0.5, 2.0]))
+    z = model.cameras.R[rng.choice(np.flatnonzero(model.registered)), 2]
+    H = np.eye(4)
+    H[:3, :3] += (factor - 1.0) * np.outer(z, z)
+    return _transformed(model, H, factor)
+
+
+@dataclass(frozen=True)
+class Spoiling:
+    """A way to go wrong: its ``name``, and what it makes of a model."""
+
+    name: str
+    spoil: Callable[[MetricModel, np.random.Generator], MetricModel]
+
+
+SPOILINGS = (
+    Spoiling("one camera moved", one_moved),
+    Spoiling("two cameras swapped", two_swapped),
+    Spoiling("all cameras moved", all_moved),
+    Spoiling("mirrored", mirrored),
+    Spoiling("wrong plane at infinity", wrong_infinity),
+    Spoiling("focal halved or doubled", wrong_focal),
+)
