@@ -12,7 +12,7 @@ from tests.synthetic import TrueScene, make_scene, projective_reconstruction
 from thesisrecon.assumptions import assume
 from thesisrecon.metric import UpgradeAndBundle
 from thesisrecon.metric.adjustment import tail_width
-from thesisrecon.metric.intervals import model_error_share
+from thesisrecon.metric.model_error import model_error_share
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.types import MetricResult
 
@@ -60,7 +60,7 @@ def test_heavy_tails_bring_the_floor() -> None:
 
 def test_the_share_of_model_error_follows_its_signs() -> None:
     def scatter(contradiction: float, blocks: int = 32) -> BlockScatter:
-        return BlockScatter(np.ones((1, 8)), np.ones((1, 8)), contradiction, blocks)
+        return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, blocks)
 
     assert model_error_share(scatter(1.0), 1.0) == 0.0
     assert model_error_share(scatter(2.5), 1.0) == 1.0

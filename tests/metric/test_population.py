@@ -45,19 +45,19 @@ def with_few_points(scene: TrueScene, view: int, count: int) -> TrueScene:
 def test_the_spread_of_values_that_agree_is_small_and_of_zoomed_ones_large() -> None:
     rng = np.random.default_rng(1)
     std = rng.uniform(0.002, 0.01, 30)
-    same = measured_spread(std * rng.normal(size=30), std)
+    same = measured_spread(std * rng.normal(size=30), std, std)
     assert same < 0.004
-    zoomed = measured_spread(rng.normal(0.0, 0.3, 30) + std * rng.normal(size=30), std)
+    zoomed = measured_spread(rng.normal(0.0, 0.3, 30) + std * rng.normal(size=30), std, std)
     assert zoomed == pytest.approx(0.3, rel=0.5)
 
 
-def test_the_spread_is_the_upper_end_of_what_the_values_allow() -> None:
+def test_the_spread_is_that_of_the_values_beyond_their_noise_and_the_error_of_the_model() -> None:
     rng = np.random.default_rng(2)
-    std = np.full(8, 0.01)
-    spreads = [measured_spread(0.01 * rng.normal(size=8) + std * rng.normal(size=8), std) for _ in range(200)]
-    assert np.mean(np.array(spreads) > 0.01) > 0.6
-    assert np.median(spreads) < 0.02
-    assert measured_spread(np.zeros(1), np.ones(1)) == np.inf
+    std = np.full(12, 0.01)
+    values = [0.02 * rng.normal(size=12) + std * rng.normal(size=12) for _ in range(200)]
+    assert np.median([measured_spread(v, std, std) for v in values]) == pytest.approx(0.02, rel=0.15)
+    assert np.median([measured_spread(v, std, 5.0 * std) for v in values]) < 0.005
+    assert measured_spread(np.zeros(1), np.ones(1), np.ones(1)) == np.inf
 
 
 def test_one_zoomed_camera_does_not_pull_the_rest() -> None:
@@ -66,7 +66,7 @@ def test_one_zoomed_camera_does_not_pull_the_rest() -> None:
     value = 0.001 * rng.normal(size=(9, 8))
     value[4, 0] += 0.4
     shared = np.tile(np.arange(9)[:, None], (1, 8))
-    found = estimate_population(OwnValues(value, std, np.zeros(9, dtype=np.int64)), shared)
+    found = estimate_population(OwnValues(value, std, 0.0 * std, np.zeros(9, dtype=np.int64)), shared)
     assert found is not None
     np.testing.assert_array_equal(found.rows, np.where(np.arange(9) == 4, -1, 0))
     assert found.spread[0] < 0.005
@@ -77,9 +77,11 @@ def test_nothing_is_borrowed_where_all_is_shared_or_too_few_are_alike() -> None:
     value, std = np.zeros((4, 8)), np.full((4, 8), 0.01)
     kind = np.zeros(4, dtype=np.int64)
     own = np.tile(np.arange(4)[:, None], (1, 8))
-    assert estimate_population(OwnValues(value, std, kind), np.zeros((4, 8), dtype=np.int64)) is None
-    assert estimate_population(OwnValues(value, std, np.array([0, 0, 1, 2])), own) is None
-    assert estimate_population(OwnValues(value, std, kind), own) is not None
+    assert (
+        estimate_population(OwnValues(value, std, 0.0 * std, kind), np.zeros((4, 8), dtype=np.int64)) is None
+    )
+    assert estimate_population(OwnValues(value, std, 0.0 * std, np.array([0, 0, 1, 2])), own) is None
+    assert estimate_population(OwnValues(value, std, 0.0 * std, kind), own) is not None
 
 
 def test_a_badly_determined_focal_is_borrowed_and_named() -> None:
@@ -88,7 +90,7 @@ def test_a_badly_determined_focal_is_borrowed_and_named() -> None:
     assert alone.reconstruction.registered.all()
     assert together.reconstruction.registered.all()
     wide, narrow = alone.intrinsics[3]["focal_px"], together.intrinsics[3]["focal_px"]
-    assert narrow.std < 0.5 * wide.std
+    assert narrow.std < 0.7 * wide.std
     assert "borrowed from the other cameras" in narrow.source
     assert "borrowed" not in wide.source
     for result in (alone, together):

@@ -52,8 +52,17 @@ def test_the_variance_is_that_of_bundle_adjustment():
     expected = scale**2 * np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2)
     expected[:, 0] /= fit.cameras.intrinsics[:, 0] ** 2
     np.testing.assert_allclose(scatter.model, expected, rtol=0.02)
+    np.testing.assert_allclose(scatter.tied, scatter.model[0], rtol=1e-6)
     assert np.isnan(scatter.ratio[0, 1])
     assert scatter.blocks >= 8
+
+
+def test_one_camera_behind_all_photographs_is_known_better_than_one_each():
+    one, many = make_block(points=200), make_block(points=200, groups=6)
+    noise = SIGMA * np.random.default_rng(0).normal(size=one.xy.shape)
+    shared, own = _scatter(one, one.xy + noise)[1], _scatter(many, many.xy + noise)[1]
+    np.testing.assert_allclose(own.tied[FREE], shared.model[0, FREE], rtol=0.1)
+    assert (own.model[:, 0] > 1.5 * own.tied[0]).all()
 
 
 def test_independent_noise_has_the_ratio_one_whatever_its_distribution():

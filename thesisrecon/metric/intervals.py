@@ -3,10 +3,8 @@
 The covariance of bundle adjustment is right for independent noise and a right model, and too small on
 photographs: matches err together, their noise has heavy tails, and lenses have more coefficients than ours.
 How much too small it is shows in how far parts of the scene pull the cameras in different directions
-(:mod:`thesisrecon.optimize.bundle_blocks`). What all parts have in common shows nowhere: a floor stands for
-it, but only where the data are seen to be more than a right model and normal noise. A value that one
-photograph holds alone feels an error of the model more than one that many average: its floor is higher by as
-much as its standard deviation is.
+(:mod:`thesisrecon.optimize.bundle_blocks`). What all parts have in common shows nowhere; a floor
+stands for it (:mod:`thesisrecon.metric.model_error`).
 """
 
 from __future__ import annotations
@@ -14,24 +12,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
 from thesisrecon.metric.model import MetricModel
+from thesisrecon.metric.model_error import LEAST_BLOCKS, model_error_floor
 from thesisrecon.metric.population import Borrowing
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.optimize.metric_bundle import IntrinsicsPrior
 from thesisrecon.types import IntrinsicInterval
 
-F64 = NDArray[np.float64]
-
 NORMAL_95 = 1.959964
 # What photographs need (covariances 4 to 10 times too small) where there are too few points to measure it.
-DEFAULT_INFLATION, LEAST_BLOCKS = 4.0, 4
-# The contradiction of noise alone keeps below the first; at the second the model is surely wrong somewhere.
-CONTRADICTION = (1.3, 1.8)
-# The same of the residuals' tail: normal noise has 1, matches of photographs 2 to 3.
-TAIL = (1.2, 1.6)
+DEFAULT_INFLATION = 4.0
 _COLUMNS = {"focal_px": 0, "principal_x_px": 3, "principal_y_px": 4, "k1": 5}
 
 
@@ -48,8 +40,7 @@ def intrinsic_intervals(
     ``scatter`` of the last adjustment under ``prior``; ``floor_rel`` is that of photographs, relative to the
     focal. The std is such that +- 1.96 of it hold 95 % although it was measured on few blocks.
     """
-    floor_rel *= model_error_share(scatter, model.tail)
-    together, typical = _together(model, borrowed), float(np.sqrt(max(scatter.typical_ratio, 1.0)))
+    floors = model_error_floor(model, scatter, floor_rel)
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for view in range(len(model.registered)):
         if not model.registered[view]:
@@ -64,37 +55,12 @@ def intrinsic_intervals(
                 intervals[name] = IntrinsicInterval(value, 0.0, "assumed")
                 continue
             inflation = _inflation(scatter, g, column)
-            alone = max(1.0, typical * float(np.sqrt(variance)) / together[column])
-            floor = floor_rel * alone * (row[0] if column in (3, 4) else 1.0)
-            std = float(np.hypot(inflation * np.sqrt(variance), floor))
+            std = float(np.hypot(inflation * np.sqrt(variance), floors[g, column]))
             std = min(std, float(prior.std[g, column])) * (row[0] if column == 0 else 1.0)
             how = _source(borrowed, view, column, inflation)
             intervals[name] = IntrinsicInterval(value, float(std), how)
         answer.append(intervals)
     return tuple(answer)
-
-
-def model_error_share(scatter: BlockScatter, tail: float) -> float:
-    """0 where nothing but normal noise is seen, 1 where the model of camera and noise is surely not the whole
-    truth."""
-    if scatter.blocks < LEAST_BLOCKS or not np.isfinite(scatter.contradiction):
-        return 1.0
-    signs = [(scatter.contradiction, CONTRADICTION), (tail, TAIL)]
-    return max(float(np.clip((sign - low) / (high - low), 0.0, 1.0)) for sign, (low, high) in signs)
-
-
-def _together(model: MetricModel, borrowed: Borrowing) -> F64:
-    """(8,) standard deviation of each intrinsic were it common to all cameras that have it on their own."""
-    assert model.cameras.shared is not None
-    own = borrowed.own.variance
-    answer = np.ones(own.shape[1])
-    for column in range(own.shape[1]):
-        first = np.unique(model.cameras.shared[:, column], return_index=True)[1]
-        variance = own[first, column]
-        variance = variance[variance > 0.0]
-        if len(variance):
-            answer[column] = float(np.sqrt(1.0 / np.sum(1.0 / variance)))
-    return answer
 
 
 def _inflation(scatter: BlockScatter, g: int, column: int) -> float:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.metric.adjustment import Adjustment, Population
 from thesisrecon.metric.model import MetricModel
+from thesisrecon.metric.model_error import model_error_floor
 from thesisrecon.metric.start import CENTRE, FOCAL, K1, WIDTH
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.types import B8, I64
@@ -30,24 +31,25 @@ OUTLIER_SIGMAS = 4.0
 # Cameras of one zoom setting are of one lens, whose k2 and k3 they share.
 SAME_ZOOM = 0.01
 LEAST_SPREAD = 1e-6
+# The part of their noise by which values may differ although they agree.
+BY_CHANCE = 0.3
 
 
 @dataclass(frozen=True)
 class OwnValues:
-    """What each row's own matches say: ``value``, ``std`` (G, 8) (log of the focal, its std relative), and
-    which rows are ``members`` of a kind (G,), -1 for none."""
+    """What each row's own matches say: ``value``, ``std`` (G, 8) (log of the focal, its std relative) by the
+    noise, ``floor`` (G, 8) std by errors of the model, and which rows are ``members`` of a kind (G,), -1 for
+    none."""
 
     value: F64
     std: F64
+    floor: F64
     members: I64
 
-    @property
-    def variance(self) -> F64:
-        """(G, 8) squared deviations."""
-        return self.std**2
 
-
-def own_values(model: MetricModel, adjustment: Adjustment, scatter: BlockScatter) -> OwnValues:
+def own_values(
+    model: MetricModel, adjustment: Adjustment, scatter: BlockScatter, floor_rel: float
+) -> OwnValues:
     """The model's intrinsics before a population binds them; rows without a registered view are no
     members."""
     group = model.cameras.group
@@ -58,7 +60,8 @@ def own_values(model: MetricModel, adjustment: Adjustment, scatter: BlockScatter
     registered = np.isin(np.arange(len(first)), group[model.registered])
     inflation = np.sqrt(np.maximum(scatter.typical_ratio, 1.0))
     members = np.where(registered, members, -1)
-    return OwnValues(value, inflation * np.sqrt(np.maximum(scatter.model, 0.0)), members)
+    std = inflation * np.sqrt(np.maximum(scatter.model, 0.0))
+    return OwnValues(value, std, model_error_floor(model, scatter, floor_rel), members)
 
 
 def estimate_population(own: OwnValues, shared: I64) -> Population | None:
@@ -77,10 +80,11 @@ def estimate_population(own: OwnValues, shared: I64) -> Population | None:
             value, std = own.value[index, column], own.std[index, column]
             if len(index) < LEAST_MEMBERS or not (std > 0.0).all():
                 continue
-            far = outlying(value, std)
+            total = np.hypot(std, own.floor[index, column])
+            far = outlying(value, total)
             if column == FOCAL:
                 outside |= np.isin(shared[:, column], shared[index[far], column]) & (rows == kind)
-            found.append(measured_spread(value[~far], std[~far]))
+            found.append(measured_spread(value[~far], std[~far], total[~far]))
         if found:
             spread[column] = max(found)
     rows[outside] = -1
@@ -94,24 +98,24 @@ def outlying(value: F64, std: F64) -> B8:
     return np.asarray(off > OUTLIER_SIGMAS * np.hypot(scatter, std))
 
 
-def measured_spread(value: F64, std: F64) -> float:
-    """Standard deviation tau of the true values behind n noisy ones: the largest within half a unit of the
-    restricted likelihood's maximum.
+def measured_spread(value: F64, std: F64, total: F64) -> float:
+    """Standard deviation tau of the true values behind n noisy ones, by restricted maximum likelihood.
 
-    The upper end, since a few values can agree by chance and a tau too small would state intervals too
-    narrow.
+    ``std`` (n,) is their noise, ``total`` their noise and the error of the model, which is no difference
+    between cameras. A few values can agree by chance: tau is never below a part of the noise.
     """
     if len(value) < 2:
         return np.inf
-    least = max(1e-2 * float(std.min()), LEAST_SPREAD)
-    most = max(10.0 * float(np.ptp(value)), 10.0 * least)
-    taus = np.geomspace(least, most, 200)
-    variance = taus[:, None] ** 2 + std**2
+    taus = np.concatenate(
+        [[0.0], np.geomspace(1e-2 * float(total.min()), 10.0 * float(np.ptp(value)) + 1e-9, 200)]
+    )
+    variance = taus[:, None] ** 2 + total**2
     weight = 1.0 / variance
     mean = (weight @ value) / weight.sum(axis=1)
     squares = np.sum(weight * (value - mean[:, None]) ** 2, axis=1)
     likelihood = -0.5 * (np.log(variance).sum(axis=1) + np.log(weight.sum(axis=1)) + squares)
-    return float(taus[np.flatnonzero(likelihood >= likelihood.max() - 0.5).max()])
+    tau = float(taus[int(likelihood.argmax())])
+    return max(float(np.hypot(tau, BY_CHANCE * np.median(std))), LEAST_SPREAD)
 
 
 def bind(
@@ -131,11 +135,10 @@ def bind(
 @dataclass(frozen=True)
 class Borrowing:
     """How far each view's focal stands on its own: ``own_std`` (V,) relative, what its own matches give, and
-    ``weight`` (V,) its part in the answer, 1 where nothing was borrowed; ``own`` values of all rows."""
+    ``weight`` (V,) its part in the answer, 1 where nothing was borrowed."""
 
     own_std: F64
     weight: F64
-    own: OwnValues
 
     def warnings(self, registered: Sequence[int], least: float) -> tuple[str, ...]:
         """A sentence for each focal that its own matches leave open by more than ``least`` (relative)."""
@@ -161,4 +164,4 @@ def borrowing(own: OwnValues, population: Population | None, group: I64) -> Borr
     if population is not None and np.isfinite(population.spread[FOCAL]):
         tau = population.spread[FOCAL]
         weight = np.where(population.rows >= 0, tau**2 / (tau**2 + std**2), 1.0)
-    return Borrowing(std[group], weight[group], own)
+    return Borrowing(std[group], weight[group])

@@ -139,7 +139,7 @@ class UpgradeAndBundle:
         to their kind."""
         model = self._settle(model, adjustment)
         scatter = adjustment.scatter(model)
-        own = own_values(model, adjustment, scatter)
+        own = own_values(model, adjustment, scatter, self.model_floor_rel)
         assert model.cameras.shared is not None
         population = estimate_population(own, model.cameras.shared)
         if population is None:

@@ -34,6 +34,7 @@ class BlockScatter:
     """Variances of the intrinsics after a bundle adjustment and how far the data contradict them.
 
     ``model`` (G, C) as the information matrix has it for noise of the given sigma, the focal's relative;
+    ``tied`` (C,) the same were one camera behind all photographs, 0 for what does not move;
     ``ratio`` (G, C) by how much the scatter between blocks of points exceeds it, NaN for what does not move;
     ``contradiction`` how much larger the scatter between blocks is, over all unknowns, than that between
     single points lets expect: 1 where the noise of different points is independent, whatever its
@@ -41,6 +42,7 @@ class BlockScatter:
     """
 
     model: F64
+    tied: F64
     ratio: F64
     contradiction: float
     blocks: int
@@ -122,6 +124,7 @@ def block_scatter(
     place = np.maximum(number, 0)
     return BlockScatter(
         np.where(number >= 0, np.diag(C)[first + place], 0.0),
+        _tied_variances(S, values, frame[0], views),
         np.where(number >= 0, ratio[len(poses) + place], np.nan),
         float(np.mean(ratio[judged]) / np.mean(alone[judged])) if judged.any() else np.nan,
         int(block.max()) + 1,
@@ -210,6 +213,20 @@ def _covariance(S: F64, cameras: MetricCameras, views: I64) -> F64:
     weight = float(np.median(np.diag(S)))
     C = invert_information(S + weight * N @ N.T)
     return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
+
+
+def _tied_variances(S: F64, values: IntrinsicValues, cameras: MetricCameras, views: I64) -> F64:
+    """(C,) variances of the intrinsics were all cameras one."""
+    first = len(S) - values.size
+    column = values.column[: values.seen]
+    T = np.zeros((len(S), first + values.number.shape[1]))
+    T[np.arange(first), np.arange(first)] = 1.0
+    T[first + np.arange(values.seen), first + column] = 1.0
+    moves = np.concatenate([np.ones(first, dtype=bool), np.isin(np.arange(values.number.shape[1]), column)])
+    C = _covariance(T[:, moves].T @ S @ T[:, moves], cameras, views)
+    tied = np.zeros(T.shape[1])
+    tied[moves] = np.diag(C)
+    return tied[first:]
 
 
 def _block_ratio(found: _Linearised, rows: F64, C: F64, block: I64) -> F64:
