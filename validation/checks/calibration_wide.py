@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thesisrecon.types import Reconstruction
+from thesisrecon.types import Reconstruction, RunResult
 from validation.checks.calibration_bench import Bench, Rows, model_of, reduced
 from validation.checks.calibration_parts import LEAST_HOLDING, MODES, SUCCESS_PCT, named
 from validation.checks.reconstruction import COLMAP, OURS
@@ -71,9 +71,10 @@ def check_against_shared(bench: Bench) -> list[list[Metric]]:
     run = runs["per-image"]
     if run is not None and run.metric is not None:
         result, shared = run.metric, float(np.nanmedian(focals["shared"][OURS]))
+        unsure = _stated(runs["shared"])
         there = np.flatnonzero(result.reconstruction.registered)
         stated = [result.intrinsics[v]["focal_px"] for v in there]
-        z = np.array([(f.value - shared) / f.std if f.std > 0 else np.inf for f in stated])
+        z = np.array([(f.value - shared) / max(np.hypot(f.std, unsure), 1e-12) for f in stated])
         held = float(np.mean(np.abs(z) <= LEVEL))
         silent = [
             v for v in there if abs(focals["per-image"][OURS][v] / shared - 1.0) > 0.01 * SUCCESS_PCT
@@ -84,6 +85,13 @@ def check_against_shared(bench: Bench) -> list[list[Metric]]:
         row = f"off by more than {SUCCESS_PCT:.0f} % and not named"
         metrics.append(Metric(title, row, "", {OURS: float(len(silent))}, OURS, 0.0))
     return [metrics]
+
+
+def _stated(run: RunResult | None) -> float:
+    """The sigma (px) that a run states of its focal length."""
+    if run is None or run.metric is None:
+        return 0.0
+    return float(np.median([view["focal_px"].std for view in run.metric.intrinsics if view]))
 
 
 def _focals_of(model: Reconstruction | None) -> np.ndarray:
