@@ -1,0 +1,47 @@
+"""The check on random subsets: what is taken of a set, and what its numbers mean."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tests.synthetic import make_scene, true_pairs
+from validation.checks.subsets import Matched, Trial, run_trial, table_row, take_views
+
+
+def matched_scene() -> Matched:
+    scene = make_scene(views=9, points=400, sigma_px=0.3, seed=4)
+    return Matched("synthetic", scene.tracks, true_pairs(scene), scene.sizes, scene.K[:, 0, 0])
+
+
+def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_see() -> None:
+    whole, views = matched_scene(), np.array([1, 4, 7])
+    kept = np.arange(400) < 250
+    part = take_views(whole, views, kept)
+    assert part.tracks.n_views == 3
+    assert np.bincount(part.tracks.point_index).min() >= 2
+    assert {(pair.i, pair.j) for pair in part.pairs} == {(0, 1), (0, 2), (1, 2)}
+    t = whole.tracks
+    seen = np.zeros((9, 400), dtype=bool)
+    seen[t.view_index, t.point_index] = True
+    assert part.tracks.n_points == int(((seen[views].sum(axis=0) >= 2) & kept).sum())
+    mine = part.tracks.xy[part.tracks.view_index == 1]
+    theirs = t.xy[t.view_index == 4]
+    assert all((np.abs(theirs - xy).max(axis=1) == 0.0).any() for xy in mine)
+
+
+def test_a_trial_finds_the_focal_length_and_is_the_same_twice() -> None:
+    first, again = (run_trial(matched_scene(), "shared", 3) for _ in range(2))
+    assert first.right
+    assert not first.doubts
+    assert first.registered == len(first.views)
+    assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
+
+
+def test_a_wrong_answer_that_is_trusted_and_a_crash_are_told_apart() -> None:
+    wrong = Trial(0, (0, 1), 2, 10.0, 12.0, (), 1, 1.0)
+    flagged = replace(wrong, doubts=("no",))
+    crash = replace(wrong, median_pct=np.nan, crash="ValueError: no")
+    assert [t.unflagged_failure for t in (wrong, flagged, crash)] == [True, False, False]
+    assert "| 0 / 3 |" in table_row("s", "shared", [wrong, flagged, crash])
