@@ -213,9 +213,9 @@ def report(trials: Sequence[Trial]) -> str:
 def _table(title: str, trials: Sequence[Trial], by: str, unit: str, **fixed: float) -> str:
     some = [t for t in trials if all(getattr(t, name) == value for name, value in fixed.items())]
     columns = sorted({getattr(t, by) for t in some})
-    counts = Counter((getattr(t, by), t.method) for t in some).values()
+    counts = Counter((getattr(t, by), t.method) for t in some).values() or [0]
     draws = f"{min(counts)}" if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
-    title += f", {draws} draws" if some else ""
+    title += f", {draws} draws"
     lines = [
         f"| {title} | {' | '.join(f'{c:g}{unit}' for c in columns)} |",
         f"| --- |{' --- |' * len(columns)}",
