@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from thesisrecon.metric.model import MetricModel, agreeing_observations, residual_norms
-from thesisrecon.metric.view_checks import ViewChecks, check_views
+from thesisrecon.metric.view_checks import ViewChecks, check_views, within_reach
 from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.types import B8, F64, I64, IntrinsicInterval, SelfCalibration
 
@@ -71,7 +71,7 @@ def _whole(
     views = [int(v) for v in np.flatnonzero(model.registered)]
     longest = model.sizes[views].max(axis=1)
     rows = model.cameras.intrinsics[model.cameras.group[views]]
-    near = model.registered[model.tracks.view_index]
+    near = within_reach(model)
     before = calibration.K[views, 0, 0]
     both = before > 0
     return {

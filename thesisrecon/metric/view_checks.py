@@ -24,7 +24,8 @@ FEWEST_OBSERVATIONS = 30
 class ViewChecks:
     """Per view (V,), NaN where not registered or nothing could be measured.
 
-    ``explained`` share of the observations that the model explains. ``confirmed`` share of the observations
+    ``explained`` share of the observations within reach
+    that the model explains. ``confirmed`` share of the observations
     of points that other views fix (two or more of them) which agree with the view too: points of two views
     agree with any two cameras along their epipolar lines. ``behind`` share of the observations behind the
     camera. ``noise_px``. ``focal_off`` and ``aspect_off``: the logarithm of the view's own focal over the
@@ -47,7 +48,7 @@ def check_views(model: MetricModel, *, sigmas: float) -> ViewChecks:
     t = model.tracks
     n = t.n_views
     agree = agreeing_observations(model, sigmas=sigmas)
-    near = model.registered[t.view_index]
+    near = within_reach(model)
     fixed = _fixed_by_others(model, agree)
     known = near & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
     _, depth = project_observations(model.cameras, model.X, t.view_index, t.point_index)
@@ -58,6 +59,15 @@ def check_views(model: MetricModel, *, sigmas: float) -> ViewChecks:
         _share(t.view_index, depth <= 0, known, n),
         *(np.array(column) for column in zip(*own, strict=True)),
     )
+
+
+def within_reach(model: MetricModel) -> B8:
+    """(K,) observations in registered views of points that two or more of these see: no others can be
+    explained."""
+    t = model.tracks
+    near = model.registered[t.view_index]
+    seen = np.bincount(t.point_index[near], minlength=t.n_points)
+    return np.asarray(near & (seen[t.point_index] >= 2))
 
 
 def _share(view: I64, good: B8, counted: B8, n: int) -> F64:

@@ -109,7 +109,9 @@ def spoiled_outcomes(result: RunResult, assumed: Assumptions, seeds: int) -> dic
     held, told = _focal_held(right, assumed)
     found["focal held 10 % off"].append(judge(held, right, result.calibration, Adjustment(told, 0.02, 0.02)))
     found["right, as it is"].append(judge(right, right, result.calibration, adjustment))
-    for seed in range(seeds):
+    # Few views with a focal of their own each leave these open, which their intervals say and not the rest.
+    one_camera = len(np.unique(assumed.shared[:, 0])) == 1
+    for seed in range(seeds if one_camera else 0):
         rng = np.random.default_rng([seed, 99])
         found["right, some views and points"].append(
             judge(_thinned(right, rng), right, result.calibration, adjustment)
