@@ -325,9 +325,11 @@ def _calibrate(work: _Work, attempt: int) -> None:
 
 
 def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
-    """The sentences on a critical motion that the assumptions make good for; what they do not is a doubt."""
+    """What is to be said of a critical motion that the assumptions make good for; the rest is a doubt."""
     verdict = calibration.verdict
-    return verdict.sentences if verdict is not None and verdict.critical and verdict.identifiable else ()
+    if verdict is None or not (verdict.critical and verdict.identifiable):
+        return ()
+    return ("; ".join(verdict.sentences),)
 
 
 def _refine(work: _Work, attempt: int) -> None:
