@@ -18,10 +18,10 @@ FREE = np.array([True, False, False, True, True, True])
 SIGMA = 0.5
 
 
-def _scatter(block, xy, *, free=FREE, loss=20.0):
+def _scatter(block, xy, *, free=FREE, loss=20.0, std=np.inf):
     seen = Observations(block.view, block.point, xy)
     q = block.cameras.intrinsics
-    prior = IntrinsicsPrior(q, np.full_like(q, np.inf))
+    prior = IntrinsicsPrior(q, np.full_like(q, 1.0) * std)
     options = BundleOptions(sigma_px=SIGMA, loss_px=loss * SIGMA, max_iterations=30, covariance=True)
     fit = refine_metric_bundle(block.cameras, block.X, seen, free=free, prior=prior, options=options)
     noise = (SIGMA, loss * SIGMA)
@@ -79,6 +79,16 @@ def test_independent_noise_has_the_ratio_one_whatever_its_distribution():
     assert np.mean([s.contradiction for s in heavy]) == pytest.approx(1.0, abs=0.15)
     # Four times as wide in a fifth of the matches: more than the size of the core says.
     assert np.mean([s.typical_ratio for s in heavy]) > 1.3
+
+
+def test_priors_do_not_pass_for_contradictions():
+    block = make_block(points=200, groups=6)
+    rng = np.random.default_rng(5)
+    free = _scatter(block, block.xy + SIGMA * rng.normal(size=block.xy.shape))[1]
+    std = 0.3 * np.sqrt(np.median(free.model, axis=0))
+    told = [_scatter(block, block.xy + SIGMA * rng.normal(size=block.xy.shape), std=std)[1] for _ in range(6)]
+    assert np.median([s.model[:, 3] / free.model[:, 3] for s in told]) < 0.15
+    assert np.mean([s.contradiction for s in told]) == pytest.approx(1.0, abs=0.25)
 
 
 def test_noise_that_neighbours_share_is_seen():

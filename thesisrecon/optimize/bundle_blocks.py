@@ -118,7 +118,7 @@ def block_scatter(
     block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
     curvature = _loss_correction(found.residual.reshape(-1, 2), noise[1] / noise[0])
     ratio = curvature * _block_ratio(found, C[chosen], C, block)
-    alone = curvature * _point_ratio(found, C[chosen], np.diag(C)[chosen])
+    alone = curvature * _point_ratio(found, C[chosen])
     judged = np.isfinite(ratio) & (alone > 0.0)
     number = values.number
     place = np.maximum(number, 0)
@@ -243,12 +243,14 @@ def _block_ratio(found: _Linearised, rows: F64, C: F64, block: I64) -> F64:
     return np.where(expected > 0.0, squares / np.maximum(expected, 1e-300), np.nan)
 
 
-def _point_ratio(found: _Linearised, rows: F64, variance: F64) -> F64:
+def _point_ratio(found: _Linearised, rows: F64) -> F64:
     """The same with every point a block of its own, whose part in the fit is nothing."""
     squares = np.zeros(len(rows))
     for n, c in enumerate(rows):
         squares[n] = np.sum(np.bincount(found.point, (found.J @ c) * found.residual) ** 2)
-    return np.asarray(squares / np.maximum(variance, 1e-300))
+    # Not the variance: priors and populations have a part in that, and no points that pull.
+    expected = np.sum((found.J @ rows.T) ** 2, axis=0) - np.sum((found.taken @ rows.T) ** 2, axis=0)
+    return np.asarray(squares / np.maximum(expected, 1e-300))
 
 
 def _loss_correction(weighted: F64, delta: float) -> float:
