@@ -1,12 +1,10 @@
 """The scatter between parts of a scene: 1 on independent noise, more where noise or model are otherwise."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from tests.optimize.bundle_scenes import make_block
-from thesisrecon.optimize.bundle_blocks import block_scatter, metric_jacobians, point_blocks
+from thesisrecon.optimize.bundle_blocks import block_scatter, point_blocks
 from thesisrecon.optimize.metric_bundle import (
     BundleOptions,
     IntrinsicsPrior,
@@ -26,22 +24,6 @@ def _scatter(block, xy, *, free=FREE, loss=20.0, std=np.inf):
     fit = refine_metric_bundle(block.cameras, block.X, seen, free=free, prior=prior, options=options)
     noise = (SIGMA, loss * SIGMA)
     return fit, block_scatter(fit.cameras, fit.X, seen, free=free, prior=prior, noise=noise)
-
-
-def test_jacobians_match_finite_differences():
-    block = make_block(k1=0.05, lens=(-0.03, 0.02), groups=2)
-    c, h = block.cameras, 1e-6
-    seen = Observations(block.view, block.point, block.xy + 1.0)
-    residual, _, G, B = metric_jacobians(c, block.X, seen)
-    np.testing.assert_allclose(residual, -1.0, atol=1e-8)
-    for column in range(8):
-        step = np.zeros(8)
-        step[column] = h * (c.intrinsics[0, 0] if column == 0 else 1.0)
-        moved = metric_jacobians(replace(c, intrinsics=c.intrinsics + step), block.X, seen)[0]
-        np.testing.assert_allclose(G[:, :, column], (moved - residual) / h, rtol=1e-3, atol=1e-3)
-    for column in range(3):
-        moved = metric_jacobians(c, block.X + h * np.eye(3)[column], seen)[0]
-        np.testing.assert_allclose(B[:, :, column], (moved - residual) / h, rtol=1e-3, atol=2e-3)
 
 
 def test_the_variance_is_that_of_bundle_adjustment():

@@ -29,14 +29,10 @@ from thesisrecon.optimize.reduced_solvers import (
 from thesisrecon.optimize.schur import BundleSystem, CameraPrior, lay_out
 
 
-def _buffers(n, own, common):
-    return Jacobians(*(np.empty((n, *shape)) for shape in [(2,), (2, own), (2, common), (2, 3)]))
-
-
 def _linearized_metric(block, xy, loss="squared", delta=1.0, sigma=1.0):
     c, n = block.cameras, len(xy)
     width = c.intrinsics.shape[1]
-    J = _buffers(n, 6, width)
+    J = Jacobians.empty(n, 6, width)
     model = kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     seen, weighing = Seen(block.view, block.point, xy), Weighing(sigma, LOSS_CODES[loss], delta)
     own = np.zeros(0, dtype=np.int64)
@@ -87,6 +83,18 @@ def test_metric_jacobians_match_finite_differences(lens):
         )
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-5, 1e-3, 1.0, 3.0])
+def test_poses_move_by_the_exponential_map(size):
+    rng = np.random.default_rng(3)
+    R, t = Rotation.random(9, rng=rng).as_matrix(), rng.normal(size=(9, 3))
+    step = size * rng.normal(size=(9, 6))
+    R_out, t_out = np.empty_like(R), np.empty_like(t)
+    kernels.move_poses(R, t, step, R_out, t_out)
+    turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+    np.testing.assert_allclose(R_out, turn @ R, atol=1e-15)
+    np.testing.assert_allclose(t_out, np.einsum("vab,vb->va", turn, t) + step[:, 3:], atol=2e-15)
+
+
 def test_projective_jacobians_match_finite_differences():
     rng = np.random.default_rng(4)
     P = rng.normal(size=(3, 12))
@@ -95,10 +103,7 @@ def test_projective_jacobians_match_finite_differences():
     X /= np.linalg.norm(X, axis=1, keepdims=True)
     view, point = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(7)))
     xy = rng.normal(size=(21, 2))
-    vP, bP, vX, bX = np.empty_like(P), np.empty(3), np.empty_like(X), np.empty(7)
-    kernels.tangent_reflectors(P, vP, bP)
-    kernels.tangent_reflectors(X, vX, bX)
-    J, state = _buffers(21, 11, 0), kernels.UnitState(P, X, vP, bP, vX, bX)
+    J, state = Jacobians.empty(21, 11, 0), kernels.UnitState.at(P, X)
     seen, weighing = Seen(view, point, xy), Weighing(1.0, 0, 1.0)
     cost = kernels.linearize_projective(state, seen, weighing, J)
     assert kernels.projective_cost(state, seen, weighing) == pytest.approx(cost, rel=1e-12)
@@ -108,8 +113,8 @@ def test_projective_jacobians_match_finite_differences():
 
     def residual(sP, sX):
         moved_P, moved_X = np.empty_like(P), np.empty_like(X)
-        kernels.tangent_step(P, vP, bP, sP, moved_P)
-        kernels.tangent_step(X, vX, bX, sX, moved_X)
+        kernels.tangent_step(P, state.vP, state.bP, sP, moved_P)
+        kernels.tangent_step(X, state.vX, state.bX, sX, moved_X)
         u = np.einsum("kab,kb->ka", moved_P.reshape(3, 3, 4)[view], moved_X[point])
         return u[:, :2] / u[:, 2:]
 
@@ -236,6 +241,11 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
     full = np.triu(dense) + np.triu(dense, 1).T
     system = ReducedSystem(row, column, Sums(blocks, border, corner, *np.zeros((3, 11))))
     np.testing.assert_array_equal(np.triu(system.dense()), np.triu(dense))
+    more, pair = np.arange(11.0), np.full((4, 4), -1)
+    pair[row, column] = np.arange(6)
+    kernels.add_diagonal(blocks, pair, corner, more)
+    full += np.diag(more)
+    np.testing.assert_array_equal(np.triu(system.dense()), np.triu(full))
     x = rng.normal(size=11)
     np.testing.assert_allclose(multiply(system, x), full @ x, rtol=1e-12)
     place = np.array([1, 3, 0, 2])
@@ -282,7 +292,7 @@ def test_bending_losses_keep_the_gradient_and_bend_the_curvature(loss):
     xy = block.xy + np.random.default_rng(1).normal(size=block.xy.shape)
     model = kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     seen, own, common = Seen(block.view, block.point, xy), np.array([0, 3]), np.array([4, 5])
-    plain, bent = _buffers(n, 8, 2), _buffers(n, 8, 2)
+    plain, bent = Jacobians.empty(n, 8, 2), Jacobians.empty(n, 8, 2)
     for J, least in ((plain, 1.0), (bent, 0.2)):
         kernels.linearize_metric(model, seen, Weighing(1.0, LOSS_CODES[loss], 1.1, least), own, common, J)
     for a, b in ((plain.A, bent.A), (plain.E, bent.E), (plain.B, bent.B)):

@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.optimize.bundle_covariance import gauge_directions
+from thesisrecon.optimize import kernels
+from thesisrecon.optimize.bundle_covariance import gauge_directions, invert_in_inner_gauge
+from thesisrecon.optimize.conditioning import scene_frame
 from thesisrecon.optimize.intrinsic_values import IntrinsicValues, number_values
-from thesisrecon.optimize.levenberg_marquardt import invert_information
+from thesisrecon.optimize.kernels import Jacobians, MetricModel, Seen, Weighing
+from thesisrecon.optimize.losses import LOSS_CODES
 from thesisrecon.optimize.metric_cameras import POSE_DOF, IntrinsicsPrior, MetricCameras
 from thesisrecon.optimize.observations import Observations
 
@@ -133,9 +135,7 @@ def block_scatter(
 
 def _centred(cameras: MetricCameras, X: F64, o: Observations) -> tuple[MetricCameras, F64]:
     """The same scene in the middle of the frame and of size 1, for the numbers' sake."""
-    points = X[np.unique(o.point_index)]
-    origin = np.median(points, axis=0)
-    scale = 1.0 / max(float(np.median(np.linalg.norm(points - origin, axis=1))), 1e-300)
+    origin, scale = scene_frame(X[np.unique(o.point_index)])
     t = scale * (cameras.t + cameras.R @ origin)
     return replace(cameras, t=t), scale * (X - origin)
 
@@ -148,52 +148,31 @@ def _linearise(
     noise: tuple[float, float],
 ) -> _Linearised:
     values, place = columns
-    residual, A, G, B = metric_jacobians(cameras, X, o)
-    sigma, loss = noise
-    size = np.linalg.norm(residual, axis=1)
-    root = np.sqrt(np.minimum(1.0, loss / np.maximum(size, 1e-300))) / sigma
-    residual, A, G, B = (a * root.reshape(-1, *[1] * (a.ndim - 1)) for a in (residual, A, G, B))
+    K, width, (sigma, loss) = len(o.xy), cameras.intrinsics.shape[1], noise
+    model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
+    seen, weighing = (
+        Seen(o.view_index, o.point_index, o.xy),
+        Weighing(sigma, LOSS_CODES["huber"], loss / sigma),
+    )
+    weighted, none = Jacobians.empty(K, POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
+    kernels.linearize_metric(model, seen, weighing, np.arange(width), none, weighted)
     first = POSE_DOF * (int(place.max()) + 1)
     number = values.number[cameras.group[o.view_index]]
     column = np.concatenate(
         [POSE_DOF * place[o.view_index][:, None] + np.arange(POSE_DOF), first + np.maximum(number, 0)], axis=1
     )
-    parts = np.concatenate([A, np.where(number[:, None] >= 0, G, 0.0)], axis=2)
-    K, n = len(residual), column.shape[1]
+    weighted.A[:, :, POSE_DOF:] *= (number >= 0)[:, None]
+    J = _sparse(weighted.A, column, first + values.size)
+    B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
+    E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
+    return _Linearised(residual - E @ (E.T @ residual), J, csr_matrix(E.T @ J), np.repeat(o.point_index, 2))
+
+
+def _sparse(values: F64, column: I64, width: int) -> csr_matrix:
+    """Rows (2K, width) with values (K, 2, n) in the columns (K, n)."""
+    K, _, n = values.shape
     rows = np.repeat(np.arange(2 * K), n)
-    J = csr_matrix(
-        (parts.ravel(), (rows, np.repeat(column, 2, axis=0).ravel())), (2 * K, first + values.size)
-    )
-    B, point = _orthonormal(B, o.point_index, len(X)), np.repeat(o.point_index, 2)
-    at = (3 * o.point_index[:, None, None] + np.arange(3)).repeat(2, axis=1)
-    E = csr_matrix((B.ravel(), (np.repeat(np.arange(2 * K), 3), at.ravel())), (2 * K, 3 * len(X)))
-    residual = residual.ravel()
-    return _Linearised(residual - E @ (E.T @ residual), J, csr_matrix(E.T @ J), point)
-
-
-def metric_jacobians(cameras: MetricCameras, X: F64, o: Observations) -> tuple[F64, F64, F64, F64]:
-    """Residuals (K, 2) px of calibrated cameras, and their derivatives by pose (K, 2, 6), x -> exp(w) x + d
-    in the camera's frame, by (log f, aspect, ..., k1, ...) (K, 2, C) and by the point (K, 2, 3)."""
-    R, q = cameras.R[o.view_index], cameras.intrinsics[cameras.group[o.view_index]]
-    Y = np.einsum("kab,kb->ka", R, X[o.point_index]) + cameras.t[o.view_index]
-    x = Y[:, :2] / Y[:, 2:]
-    f, aspect, skew = q[:, 0], q[:, 1], q[:, 2]
-    r2 = np.sum(x**2, axis=1)
-    powers = r2[:, None] ** np.arange(1, q.shape[1] - 4)
-    d = 1.0 + np.sum(q[:, 5:] * powers, axis=1)
-    slope = np.sum(q[:, 5:] * powers * np.arange(1, q.shape[1] - 4), axis=1) / np.maximum(r2, 1e-300)
-    M = np.zeros((len(x), 2, 2))
-    M[:, 0, 0], M[:, 0, 1], M[:, 1, 1] = f, skew, aspect * f
-    seen = np.einsum("kab,kb->ka", M, x * d[:, None])
-    residual = seen + q[:, 3:5] - o.xy
-    G = np.zeros((len(x), 2, q.shape[1]))
-    G[:, 0, 0], G[:, 1, 0] = f * x[:, 0] * d, aspect * f * x[:, 1] * d
-    G[:, 1, 1], G[:, 0, 2] = f * x[:, 1] * d, x[:, 1] * d
-    G[:, 0, 3], G[:, 1, 4] = 1.0, 1.0
-    G[:, :, 5:] = np.einsum("kab,kb->ka", M, x)[:, :, None] * powers[:, None]
-    by_x = M @ (d[:, None, None] * np.eye(2) + 2.0 * slope[:, None, None] * x[:, :, None] * x[:, None])
-    by_Y = np.concatenate([by_x, -np.einsum("kab,kb->ka", by_x, x)[:, :, None]], axis=2) / Y[:, 2, None, None]
-    return residual, np.concatenate([-by_Y @ cross_matrix(Y), by_Y], axis=2), G, by_Y @ R
+    return csr_matrix((values.ravel(), (rows, np.repeat(column, 2, axis=0).ravel())), (2 * K, width))
 
 
 def _orthonormal(B: F64, point: I64, n: int) -> F64:
@@ -210,9 +189,7 @@ def _covariance(S: F64, cameras: MetricCameras, views: I64) -> F64:
     poses = gauge_directions(cameras.R[views], cameras.t[views])
     N = np.zeros((len(S), poses.shape[1]))
     N[: len(poses)] = poses
-    weight = float(np.median(np.diag(S)))
-    C = invert_information(S + weight * N @ N.T)
-    return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
+    return invert_in_inner_gauge(S, N)
 
 
 def _tied_variances(S: F64, values: IntrinsicValues, cameras: MetricCameras, views: I64) -> F64:

@@ -89,9 +89,7 @@ def bundle_covariances(found: CovarianceInput, number: I64, focal: F64, scale: f
 def _dense_blocks(found: CovarianceInput, views: I64) -> F64:
     """(b, C + e, C + e) covariances of each view's columns with the border's, by the whole matrix.
 
-    S is singular along the directions N of the frame's seven freedoms; (S + N N')^-1 is S's generalised
-    inverse with the freedoms at unit variance, which are then removed. Directions that the data do not
-    determine get a huge variance.
+    Directions that the data do not determine get a huge variance.
     """
     b, C, e = found.reduced.sums.border.shape
     S = found.reduced.dense()
@@ -99,15 +97,23 @@ def _dense_blocks(found: CovarianceInput, views: I64) -> F64:
     if found.held or not len(views):
         covariance = invert_information(S)
     else:
-        N = _gauge(found, views)
-        weight = float(np.median(np.diag(S)))
-        covariance = invert_information(S + weight * N @ N.T)
-        covariance = covariance - N @ (N.T @ covariance @ N) @ N.T
+        covariance = invert_in_inner_gauge(S, _gauge(found, views))
     index = np.concatenate(
         [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
     )
     index = index if b else np.arange(e)[None]
     return np.asarray(covariance[index[:, :, None], index[:, None, :]])
+
+
+def invert_in_inner_gauge(information: F64, N: F64) -> F64:
+    """Covariance (D, D) of an information matrix singular along the orthonormal N (D, 7) of the frame.
+
+    (S + w N N')^-1 is S's generalised inverse with the frame's freedoms at variance 1 / w, which are then
+    removed.
+    """
+    weight = float(np.median(np.diag(information)))
+    C = invert_information(information + weight * N @ N.T)
+    return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
 
 
 def _band_blocks(found: CovarianceInput, views: I64) -> F64:

@@ -23,6 +23,18 @@ def pixel_conditioning(xy: F64) -> F64:
     return np.array([[s, 0.0, -s * cx], [0.0, s, -s * cy], [0.0, 0.0, 1.0]])
 
 
+def scene_frame(X: F64) -> tuple[F64, float]:
+    """Middle (3,) and inverse size of points X (N, 3) by medians, so that far points do not matter.
+
+    (0, 1) without points; the scale is 1 where all points are equal.
+    """
+    if len(X) == 0:
+        return np.zeros(3), 1.0
+    origin = np.median(X, axis=0)
+    size = float(np.median(np.linalg.norm(X - origin, axis=1)))
+    return origin, 1.0 / size if size > 0.0 else 1.0
+
+
 def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
     """M (4, 4) for which the unit vectors x = M X / |M X| have sum x x' proportional to I; X (N, 4)
     homogeneous.

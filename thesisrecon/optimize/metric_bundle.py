@@ -7,10 +7,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.optimize import kernels
-from thesisrecon.optimize.bundle_covariance import CovarianceInput, bundle_covariances, robust_sigma
+from thesisrecon.optimize.bundle_covariance import (
+    SIMILARITY_DOF,
+    CovarianceInput,
+    bundle_covariances,
+    robust_sigma,
+)
+from thesisrecon.optimize.conditioning import scene_frame
 from thesisrecon.optimize.intrinsic_values import (
     IntrinsicColumns,
     IntrinsicValues,
@@ -49,7 +54,6 @@ __all__ = [
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 B8 = NDArray[np.bool_]
-SIMILARITY_DOF = 7
 # Where a robust loss bends, this share of the curvature along a residual is kept once the gain of a step has
 # fallen below CLOSE of the cost. Reweighting goes safely towards the minimum, but near it Newton is faster.
 LEAST, CLOSE = 0.3, 1e-3
@@ -157,8 +161,8 @@ class _MetricProblem:
         poses[self.free_views] = step.cameras[:n_own].reshape(-1, layout.width)[
             layout.places.block[self.free_views], :POSE_DOF
         ]
-        turn = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-        R, t = turn @ m.R, np.einsum("vab,vb->va", turn, m.t) + poses[:, 3:]
+        R, t = np.empty_like(m.R), np.empty_like(m.t)
+        kernels.move_poses(m.R, m.t, poses, R, t)
         values = self.values.step(state.values, step.cameras[self.columns.place])
         X = m.X + step.points
         before, after = np.column_stack([m.R[:, 2], m.t[:, 2]]), np.column_stack([R[:, 2], t[:, 2]])
@@ -227,7 +231,7 @@ def refine_metric_bundle(
         observations.view_index, observations.point_index, observations.xy, len(cameras.R), len(X)
     )
     seen_points = np.diff(o.start) > 0
-    origin, scale = _frame(X[seen_points])
+    origin, scale = scene_frame(X[seen_points])
     problem, values, table = _metric_problem(cameras, o, np.asarray(free, dtype=bool), prior, options)
     start = MetricModel(
         np.array(cameras.R, dtype=np.float64),
@@ -237,23 +241,16 @@ def refine_metric_bundle(
         np.ascontiguousarray(scale * (X - origin)),
     )
     solution = _minimize(problem, _State(start, values), options)
-    end, moved = solution.state.model, problem.free_views
+    refined = _refined(cameras, problem.free_views, solution.state.model, origin, scale)
     residual = problem.residual(solution.state)
     sigma = problem.sigma(solution.state, residual)
     intrinsics_covariance, pose_covariance = np.zeros((*table.shape, table.shape[1])), None
     if options.covariance:
-        intrinsics_covariance, pose_covariance = _covariances(
-            problem, solution.state, max(sigma or options.sigma_px, options.noise_floor_px), scale
-        )
-    refined = replace(
-        cameras,
-        R=np.where(moved[:, None, None], end.R, cameras.R),
-        t=np.where(moved[:, None], end.t / scale - end.R @ origin, cameras.t),
-        intrinsics=end.intrinsics,
-    )
+        noise = max(sigma or options.sigma_px, options.noise_floor_px)
+        intrinsics_covariance, pose_covariance = _covariances(problem, solution.state, noise, scale)
     return MetricBundleResult(
         refined,
-        np.where(seen_points[:, None], end.X / scale + origin, X),
+        np.where(seen_points[:, None], solution.state.model.X / scale + origin, X),
         o.unsort(residual),
         solution.cost,
         solution.initial_cost,
@@ -262,6 +259,16 @@ def refine_metric_bundle(
         intrinsics_covariance,
         pose_covariance,
         sigma,
+    )
+
+
+def _refined(cameras: MetricCameras, moved: B8, end: MetricModel, origin: F64, scale: float) -> MetricCameras:
+    """The cameras at the end in the caller's frame; those that did not move as they were."""
+    return replace(
+        cameras,
+        R=np.where(moved[:, None, None], end.R, cameras.R),
+        t=np.where(moved[:, None], end.t / scale - end.R @ origin, cameras.t),
+        intrinsics=end.intrinsics,
     )
 
 
@@ -306,15 +313,6 @@ def _metric_problem(
     )
     problem = _MetricProblem(layout, columns, free_views, values, weighing, layout.jacobians())
     return problem, start, table
-
-
-def _frame(X: F64) -> tuple[F64, float]:
-    """Middle and inverse size of the scene by medians, so that far points do not matter."""
-    if len(X) == 0:
-        return np.zeros(3), 1.0
-    origin = np.median(X, axis=0)
-    size = float(np.median(np.linalg.norm(X - origin, axis=1)))
-    return origin, 1.0 / size if size > 0.0 else 1.0
 
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:

@@ -38,14 +38,6 @@ class ProjectiveBundleResult:
     converged: bool
 
 
-def _state(P: F64, X: F64) -> UnitState:
-    vP, vX = np.empty_like(P), np.empty_like(X)
-    bP, bX = np.empty(len(P)), np.empty(len(X))
-    kernels.tangent_reflectors(P, vP, bP)
-    kernels.tangent_reflectors(X, vX, bX)
-    return UnitState(P, X, vP, bP, vX, bX)
-
-
 @dataclass(frozen=True)
 class _ProjectiveProblem:
     """Reprojection in conditioned pixels; states hold unit vectors, steps lie in their tangent spaces."""
@@ -70,7 +62,7 @@ class _ProjectiveProblem:
         kernels.tangent_step(state.P, state.vP, state.bP, views, P)
         kernels.tangent_step(state.X, state.vX, state.bX, step.points, X)
         hold_flipping(self.layout, state.P[:, 8:], P[:, 8:], state.X, X)
-        return _state(P, X)
+        return UnitState.at(P, X)
 
     def residual(self, state: UnitState) -> F64:
         K = len(self.layout.observations.xy)
@@ -131,7 +123,8 @@ def refine_projective_bundle(
     conditioned, P_norms = _unit_rows((T @ P @ np.linalg.inv(M)).reshape(-1, 12), seen, "camera")
     points, X_norms = _unit_rows(X @ M.T, seen_points, "point")
     problem = _projective_problem(observations, T, free, loss_px)
-    solution = run_levenberg_marquardt(problem, _state(conditioned, points), max_iterations=max_iterations)
+    start = UnitState.at(conditioned, points)
+    solution = run_levenberg_marquardt(problem, start, max_iterations=max_iterations)
 
     scale = T[0, 0]
     P_back = np.linalg.inv(T) @ (solution.state.P * P_norms[:, None]).reshape(-1, 3, 4) @ M

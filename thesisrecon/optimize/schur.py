@@ -76,9 +76,7 @@ class BundleLayout:
 
     def jacobians(self) -> Jacobians:
         """Buffers of one linearisation."""
-        K = len(self.observations.xy)
-        shapes = [(2,), (2, self.width), (2, self.places.common.shape[1]), (2, 3)]
-        return Jacobians(*(np.empty((K, *shape)) for shape in shapes))
+        return Jacobians.empty(len(self.observations.xy), self.width, self.places.common.shape[1])
 
     def sums(self) -> Sums:
         """A reduced system of zeros."""
@@ -207,10 +205,7 @@ def _add_prior(layout: BundleLayout, total: Sums, prior: CameraPrior) -> None:
 
 def _add_diagonal(layout: BundleLayout, total: Sums, values: F64) -> None:
     """values (D,) on the diagonal of the reduced matrix."""
-    b, C = len(layout.places.pair), layout.width
-    own = np.diagonal(layout.places.pair)
-    total.blocks[own[:, None], np.arange(C), np.arange(C)] += values[: b * C].reshape(b, C)
-    total.corner[np.diag_indices_from(total.corner)] += values[b * C :]
+    kernels.add_diagonal(total.blocks, layout.places.pair, total.corner, values)
 
 
 def hold_flipping(layout: BundleLayout, before: F64, after: F64, X_before: F64, X_after: F64) -> None:

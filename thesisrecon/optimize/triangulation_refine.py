@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.optimize import kernels
 from thesisrecon.optimize.conditioning import pixel_conditioning, whitening_transform
@@ -111,18 +110,13 @@ class _CameraProblem:
     seen: Seen
     weighing: Weighing
 
-    def _state(self, P: F64) -> UnitState:
-        v, beta = np.empty_like(P), np.empty(1)
-        kernels.tangent_reflectors(P, v, beta)
-        return UnitState(P, self.X, v, beta, np.zeros_like(self.X), np.zeros(len(self.X)))
-
     def linearize(self, state: F64) -> DenseSystem:
-        J = _jacobians(len(self.X), 11, 0)
-        cost = kernels.linearize_projective(self._state(state), self.seen, self.weighing, J)
+        J = Jacobians.empty(len(self.X), 11, 0)
+        cost = kernels.linearize_projective(UnitState.at(state, self.X), self.seen, self.weighing, J)
         return _dense_system(cost, J)
 
     def retract(self, state: F64, step: F64) -> F64:
-        s, moved = self._state(state), np.empty_like(state)
+        s, moved = UnitState.at(state, self.X), np.empty_like(state)
         kernels.tangent_step(state, s.vP, s.bP, step[None], moved)
         return moved
 
@@ -132,16 +126,12 @@ class _CameraProblem:
         return residual
 
     def cost(self, state: F64) -> float:
-        return float(kernels.projective_cost(self._state(state), self.seen, self.weighing))
+        return float(kernels.projective_cost(UnitState.at(state, self.X), self.seen, self.weighing))
 
 
 def _seen_by_one(xy: F64) -> Seen:
     """Every point once, by the only view."""
     return Seen(np.zeros(len(xy), dtype=np.int64), np.arange(len(xy)), np.ascontiguousarray(xy))
-
-
-def _jacobians(n: int, own: int, common: int) -> Jacobians:
-    return Jacobians(*(np.empty((n, *shape)) for shape in [(2,), (2, own), (2, common), (2, 3)]))
 
 
 def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
@@ -208,18 +198,18 @@ class _PoseProblem:
     weighing: Weighing
 
     def linearize(self, state: MetricModel) -> DenseSystem:
-        J = _jacobians(len(state.X), 6 + len(self.free), 0)
+        J = Jacobians.empty(len(state.X), 6 + len(self.free), 0)
         cost = kernels.linearize_metric(state, self.seen, self.weighing, self.free, self.free[:0], J)
         return _dense_system(cost, J)
 
     def retract(self, state: MetricModel, step: F64) -> MetricModel:
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        R, t = np.empty_like(state.R), np.empty_like(state.t)
+        kernels.move_poses(state.R, state.t, step[None, :6], R, t)
         moves = np.zeros(state.intrinsics.shape[1])
         moves[self.free] = step[6:]
         intrinsics = state.intrinsics + moves
         intrinsics[0, 0] = state.intrinsics[0, 0] * np.exp(np.clip(moves[0], -3.0, 3.0))
-        t = state.t @ turn.T + step[3:6]
-        return state._replace(R=turn @ state.R, t=t, intrinsics=intrinsics)
+        return state._replace(R=R, t=t, intrinsics=intrinsics)
 
     def residual(self, state: MetricModel) -> F64:
         residual, depth = np.empty_like(self.seen.xy), np.empty(len(self.seen.xy))

@@ -15,7 +15,13 @@ from thesisrecon.optimize.kernels.elimination import (
     substitute_points,
     sum_leverages,
 )
-from thesisrecon.optimize.kernels.metric import MetricModel, linearize_metric, metric_cost, project_metric
+from thesisrecon.optimize.kernels.metric import (
+    MetricModel,
+    linearize_metric,
+    metric_cost,
+    move_poses,
+    project_metric,
+)
 from thesisrecon.optimize.kernels.points import hold_flipping_points, refine_each_point
 from thesisrecon.optimize.kernels.projective import (
     UnitState,
@@ -26,7 +32,13 @@ from thesisrecon.optimize.kernels.projective import (
     tangent_step,
 )
 from thesisrecon.optimize.kernels.records import Jacobians, Seen, Weighing
-from thesisrecon.optimize.kernels.reduced import fill_band, fill_dense, invert_band, multiply_blocks
+from thesisrecon.optimize.kernels.reduced import (
+    add_diagonal,
+    fill_band,
+    fill_dense,
+    invert_band,
+    multiply_blocks,
+)
 
 __all__ = [
     "Jacobians",
@@ -37,6 +49,7 @@ __all__ = [
     "Sums",
     "UnitState",
     "Weighing",
+    "add_diagonal",
     "eliminate_points",
     "fill_band",
     "fill_dense",
@@ -46,6 +59,7 @@ __all__ = [
     "linearize_projective",
     "mark_pairs",
     "metric_cost",
+    "move_poses",
     "multiply_blocks",
     "project_metric",
     "project_projective",

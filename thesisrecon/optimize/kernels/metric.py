@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,16 @@ class MetricModel(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline="always")
+def in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
+    """R x + t."""
+    return (
+        r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0],
+        r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1],
+        r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2],
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
 def image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
     """Pixel of a point in the camera's frame, w away from 0; q a row of intrinsics."""
     a, b = x0 / w, x1 / w
@@ -42,10 +53,7 @@ def project_metric(model: MetricModel, seen: Seen, residual: F64, depth: F64) ->
     """Fill residual (K, 2) px, projection minus observation, and depth (K,)."""
     for k in range(len(seen.xy)):
         v, x = seen.view_index[k], model.X[seen.point_index[k]]
-        r, t = model.R[v], model.t[v]
-        x0 = r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0]
-        x1 = r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1]
-        x2 = r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2]
+        x0, x1, x2 = in_camera(model.R[v], model.t[v], x)
         px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
         depth[k] = x2
         residual[k, 0] = px - seen.xy[k, 0]
@@ -58,14 +66,32 @@ def metric_cost(model: MetricModel, seen: Seen, weighing: Weighing) -> float:
     cost = 0.0
     for k in range(len(seen.xy)):
         v, x = seen.view_index[k], model.X[seen.point_index[k]]
-        r, t = model.R[v], model.t[v]
-        x0 = r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0]
-        x1 = r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1]
-        x2 = r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2]
+        x0, x1, x2 = in_camera(model.R[v], model.t[v], x)
         px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
         e0, e1 = (px - seen.xy[k, 0]) / weighing.sigma, (py - seen.xy[k, 1]) / weighing.sigma
         cost += loss_value(weighing.code, e0 * e0 + e1 * e1, weighing.delta)
     return 0.5 * cost
+
+
+@njit(cache=True, nogil=True)
+def move_poses(R: F64, t: F64, step: F64, R_out: F64, t_out: F64) -> None:
+    """Poses R (V, 3, 3), t (V, 3) followed by x -> exp(w) x + d for the steps (w, d) (V, 6)."""
+    for v in range(len(t)):
+        w = step[v, :3]
+        angle = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+        # Rodrigues: exp(w) = I + a [w]x + b [w]x^2, with their series where the quotients lose digits.
+        a, b = 1.0 - angle * angle / 6.0, 0.5 - angle * angle / 24.0
+        if angle > 1e-4:
+            a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+        for c in range(4):
+            x = R[v, :, c] if c < 3 else t[v]
+            y = R_out[v, :, c] if c < 3 else t_out[v]
+            u0, u1, u2 = w[1] * x[2] - w[2] * x[1], w[2] * x[0] - w[0] * x[2], w[0] * x[1] - w[1] * x[0]
+            y[0] = x[0] + a * u0 + b * (w[1] * u2 - w[2] * u1)
+            y[1] = x[1] + a * u1 + b * (w[2] * u0 - w[0] * u2)
+            y[2] = x[2] + a * u2 + b * (w[0] * u1 - w[1] * u0)
+        for c in range(3):
+            t_out[v, c] += step[v, 3 + c]
 
 
 @njit(cache=True, nogil=True)
@@ -78,38 +104,34 @@ def linearize_metric(
     that ``own`` lists of (log f, aspect, skew, cx, cy, k1, k2, k3); those that ``common`` lists make E.
     """
     cost = 0.0
-    D = np.empty((2, 8))
+    D = np.empty((2, 10))
     for k in range(len(seen.xy)):
         v, x = seen.view_index[k], model.X[seen.point_index[k]]
-        r, t, q = model.R[v], model.t[v], model.intrinsics[model.group[v]]
-        x0 = r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0]
-        x1 = r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1]
-        w = away_from_zero(r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2])
+        r, q = model.R[v], model.intrinsics[model.group[v]]
+        x0, x1, x2 = in_camera(r, model.t[v], x)
+        w = away_from_zero(x2)
         px, py = image_of(q, x0, x1, w)
         e0, e1 = (px - seen.xy[k, 0]) / weighing.sigma, (py - seen.xy[k, 1]) / weighing.sigma
         s = e0 * e0 + e1 * e1
         cost += loss_value(weighing.code, s, weighing.delta)
         root = np.sqrt(loss_weight(weighing.code, s, weighing.delta))
-        n00, n01, n10, n11 = intrinsic_columns(q, x0 / w, x1 / w, root / weighing.sigma, D)
+        a, b = x0 / w, x1 / w
+        fill_columns(q, a, b, root / weighing.sigma, D)
         kept = max(loss_curvature(weighing.code, s, weighing.delta), weighing.least)
         if kept < 1.0:
             # (I - (1 - sqrt(kept)) e e' / s) J with the residual over sqrt(kept): the gradient is the same.
             kept = np.sqrt(kept)
             root /= kept
-            c00, c01, c11 = (1.0 - kept) * e0 * e0 / s, (1.0 - kept) * e0 * e1 / s, (1.0 - kept) * e1 * e1 / s
-            n00, n10 = n00 - c00 * n00 - c01 * n10, n10 - c01 * n00 - c11 * n10
-            n01, n11 = n01 - c00 * n01 - c01 * n11, n11 - c01 * n01 - c11 * n11
-            for c in range(8):
-                d0, d1 = D[0, c], D[1, c]
-                D[0, c], D[1, c] = d0 - c00 * d0 - c01 * d1, d1 - c01 * d0 - c11 * d1
+            for c in range(10):
+                along = (1.0 - kept) * (e0 * D[0, c] + e1 * D[1, c]) / s
+                D[0, c], D[1, c] = D[0, c] - along * e0, D[1, c] - along * e1
         J.residual[k, 0], J.residual[k, 1] = root * e0, root * e1
         for c in range(len(own)):
             J.A[k, 0, 6 + c], J.A[k, 1, 6 + c] = D[0, own[c]], D[1, own[c]]
         for c in range(len(common)):
             J.E[k, 0, c], J.E[k, 1, c] = D[0, common[c]], D[1, common[c]]
-        a, b = x0 / w, x1 / w
-        j00, j01, j02 = n00 / w, n01 / w, -(n00 * a + n01 * b) / w
-        j10, j11, j12 = n10 / w, n11 / w, -(n10 * a + n11 * b) / w
+        j00, j01, j02 = D[0, 8] / w, D[0, 9] / w, -(D[0, 8] * a + D[0, 9] * b) / w
+        j10, j11, j12 = D[1, 8] / w, D[1, 9] / w, -(D[1, 8] * a + D[1, 9] * b) / w
         A = J.A[k]
         A[0, 0], A[0, 1], A[0, 2] = j02 * x1 - j01 * w, j00 * w - j02 * x0, j01 * x0 - j00 * x1
         A[1, 0], A[1, 1], A[1, 2] = j12 * x1 - j11 * w, j10 * w - j12 * x0, j11 * x0 - j10 * x1
@@ -122,11 +144,9 @@ def linearize_metric(
 
 
 @njit(cache=True, nogil=True)
-def intrinsic_columns(q: F64, a: float, b: float, root: float, D: F64) -> tuple[float, float, float, float]:
-    """Fill D (2, 8), derivatives of the pixel by the intrinsics at the normalised point (a, b), times root.
-
-    Returns d pixel / d (a, b), times root too, row by row.
-    """
+def fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
+    """Fill D (2, 10): derivatives of the pixel by the eight intrinsics and by the normalised point (a, b),
+    times root."""
     f, g, skew = root * q[0], root * q[0] * q[1], root * q[2]
     r2 = a * a + b * b
     # d is the distortion, slope its derivative over r^2.
@@ -143,4 +163,5 @@ def intrinsic_columns(q: F64, a: float, b: float, root: float, D: F64) -> tuple[
     D[0, 6], D[1, 6] = D[0, 5] * r2, D[1, 5] * r2
     D[0, 7], D[1, 7] = D[0, 6] * r2, D[1, 6] * r2
     m00, m01, m11 = d + 2.0 * slope * a * a, 2.0 * slope * a * b, d + 2.0 * slope * b * b
-    return f * m00 + skew * m01, f * m01 + skew * m11, g * m01, g * m11
+    D[0, 8], D[0, 9] = f * m00 + skew * m01, f * m01 + skew * m11
+    D[1, 8], D[1, 9] = g * m01, g * m11

@@ -26,6 +26,14 @@ class UnitState(NamedTuple):
     vX: F64
     bX: F64
 
+    @classmethod
+    def at(cls, P: F64, X: F64) -> UnitState:
+        """The state of unit cameras (V, 12) and points (N, 4)."""
+        vP, vX, bP, bX = np.empty_like(P), np.empty_like(X), np.empty(len(P)), np.empty(len(X))
+        tangent_reflectors(P, vP, bP)
+        tangent_reflectors(X, vX, bX)
+        return cls(P, X, vP, bP, vX, bX)
+
 
 @njit(cache=True, nogil=True)
 def tangent_reflectors(p: F64, v: F64, beta: F64) -> None:

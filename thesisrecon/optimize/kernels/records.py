@@ -19,6 +19,11 @@ class Jacobians(NamedTuple):
     E: F64
     B: F64
 
+    @classmethod
+    def empty(cls, n: int, own: int, common: int) -> Jacobians:
+        """Buffers of n observations with ``own`` columns in A and ``common`` ones in E."""
+        return cls(*(np.empty((n, *shape)) for shape in [(2,), (2, own), (2, common), (2, 3)]))
+
     def part(self, first: int, last: int) -> Jacobians:
         """Those of observations first..last, without a copy."""
         return Jacobians(*(a[first:last] for a in self))

@@ -22,6 +22,17 @@ def fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
+def add_diagonal(blocks: F64, pair: I64, corner: F64, values: F64) -> None:
+    """Add values (D,) to the diagonal of the reduced matrix; ``pair`` (b, b) numbers the blocks of views."""
+    C, b = blocks.shape[1], len(pair)
+    for v in range(b):
+        for a in range(C):
+            blocks[pair[v, v], a, a] += values[v * C + a]
+    for c in range(len(corner)):
+        corner[c, c] += values[b * C + c]
+
+
+@njit(cache=True, nogil=True)
 def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None:
     """Blocks into the lower band of LAPACK, band[j, i - j] = S[i, j], views in the order ``place`` (b,).
 
