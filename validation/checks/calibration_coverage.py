@@ -22,10 +22,22 @@ from thesisrecon.assumptions import assume
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.run import stream
-from thesisrecon.types import B8, MetricResult, Tracks
-from validation.checks.calibration_parts import MODES, Cameras, named, one_camera
-from validation.checks.reconstruction import OURS
-from validation.metrics.intervals import LEVEL, IntervalScores, interval_scores, join_scores
+from thesisrecon.types import B8, MetricResult
+from validation.checks.calibration_parts import (
+    MODES,
+    Cameras,
+    OwnRows,
+    keep_observations,
+    named,
+    one_camera,
+)
+from validation.metrics.intervals import (
+    LEVEL,
+    IntervalScores,
+    holding_std,
+    interval_scores,
+    join_scores,
+)
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
 
@@ -74,9 +86,7 @@ def run_weak_trial(number: int) -> tuple[IntervalScores, MetricResult] | None:
     rng = np.random.default_rng([number, 6])
     scene = make_sequence(Motion.GENERAL, rng, zoom=ZOOM)
     keep = _in_window(scene, rng) if number % 2 else _near_plane(scene)
-    t, kept = scene.tracks, keep | (scene.tracks.view_index != 0)
-    kept &= np.bincount(t.point_index[kept], minlength=t.n_points)[t.point_index] >= 2
-    tracks = Tracks(t.view_index[kept], t.point_index[kept], t.xy[kept], t.n_views, t.n_points)
+    tracks = keep_observations(scene.tracks, keep | (scene.tracks.view_index != 0))
     return _solve(replace(scene, tracks=tracks), "per-image", number, rng, postponed=(0,))
 
 
@@ -99,45 +109,38 @@ def check_weak_coverage(numbers: Iterable[int]) -> list[Metric]:
     error = np.array([100.0 * abs(s.z[0, 0]) * s.std_rel[0] for s in scores])
     told = np.array([named(result, 0) for _, result in found])
     z = np.array([abs(s.z[0, 0]) for s in scores])
-    rows = [
-        _row(title, f"registered of {len(found)}", float(there.sum())),
-        _row(title, "focal error, median, %", float(np.median(error[there]))),
-        _row(title, "focal error, worst, %", float(np.max(error[there]))),
-        _row(title, "95 % intervals of the focal that hold the truth", float(np.mean(z[there] <= LEVEL)),
-             COVERAGE[0], at_most=False),
-        _row(title, "largest deviation, stated sigmas", float(np.max(z[there]))),
-        _row(title, "off by more than 3 % and not named", float(np.sum(there & (error > 3.0) & ~told)), 0.0),
-        _row(title, "named", float(np.mean(told))),
-    ]  # fmt: skip
-    return rows
+    rows = OwnRows(title)
+    rows.add(f"registered of {len(found)}", float(there.sum()))
+    rows.add("focal error, median, %", float(np.median(error[there])))
+    rows.add("focal error, worst, %", float(np.max(error[there])))
+    held = float(np.mean(z[there] <= LEVEL))
+    rows.add("95 % intervals of the focal that hold the truth", held, COVERAGE[0], at_most=False)
+    rows.add("largest deviation, stated sigmas", float(np.max(z[there])))
+    rows.add("off by more than 3 % and not named", float(np.sum(there & (error > 3.0) & ~told)), 0.0)
+    rows.add("named", float(np.mean(told)))
+    return rows.metrics
 
 
 def check_coverage(cameras: Cameras, numbers: Iterable[int]) -> list[Metric]:
     """The rows of one mode over these trials; what the self-check does not trust states nothing."""
     found = [run_trial(cameras, number) for number in numbers]
     trusted = [part for part in found if part is not None and part[1].trusted]
-    title = f"synthetic, {cameras}"
-    rows = [
-        _row(title, f"calibrated of {len(found)}", float(sum(part is not None for part in found))),
-        _row(title, f"trusted of {len(found)}", float(len(trusted))),
-    ]
+    rows = OwnRows(f"synthetic, {cameras}")
+    rows.add(f"calibrated of {len(found)}", float(sum(part is not None for part in found)))
+    rows.add(f"trusted of {len(found)}", float(len(trusted)))
     if not trusted:
-        return rows
-    scores = join_scores([part[0] for part in trusted])
+        return rows.metrics
+    scores = [part[0] for part in trusted]
+    joined = join_scores(scores)
     for what, columns in COLUMNS.items():
-        z, share = scores.z[:, columns], scores.holding(columns)
+        z, share = joined.z[:, columns], joined.holding(columns)
         name = f"95 % intervals of the {what} that hold the truth"
-        rows.append(_row(title, name, share, COVERAGE[0], at_most=False))
-        rows.append(_row(title, f"{name} (no wider than needed)", share, COVERAGE[1]))
-        rows.append(_row(title, f"deviation, {what}, rms in stated sigmas", float(np.sqrt(np.nanmean(z**2)))))
-    rows.append(
-        _row(title, "stated sigma of the focal, median, %", float(100 * np.nanmedian(scores.std_rel)))
-    )
-    return rows
-
-
-def _row(title: str, name: str, value: float, target: float | None = None, *, at_most: bool = True) -> Metric:
-    return Metric(title, name, "", {OURS: value}, OURS, target, at_most=at_most)
+        rows.add(name, share, COVERAGE[0], at_most=False)
+        rows.add(f"{name} (no wider than needed)", share, COVERAGE[1])
+        rows.add(f"{name}, 95 % uncertainty of this share", LEVEL * holding_std(scores, columns))
+        rows.add(f"deviation, {what}, rms in stated sigmas", float(np.sqrt(np.nanmean(z**2))))
+    rows.add("stated sigma of the focal, median, %", float(100 * np.nanmedian(joined.std_rel)))
+    return rows.metrics
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -68,7 +68,7 @@ def check_subsets(title: str, matched: Matched, K: F64, cameras: Cameras) -> lis
         assert result.reconstruction.K is not None
         errors.append(float(np.nanmax(focal_errors_pct(result.reconstruction.K, K[views]))))
         scores.append(one_camera(interval_scores(result, K[views]), cameras))
-    rows = _Rows(title)
+    rows = OwnRows(title)
     rows.add(f"trusted of {SUBSETS}", float(len(scores)))
     if not scores:
         return rows.metrics
@@ -83,7 +83,7 @@ def check_subsets(title: str, matched: Matched, K: F64, cameras: Cameras) -> lis
     return rows.metrics
 
 
-class _Rows:
+class OwnRows:
     """The rows of one table of ours alone."""
 
     def __init__(self, title: str) -> None:
@@ -148,10 +148,15 @@ def weak_views(matched: Matched, model: Reconstruction) -> Iterator[Weak]:
 def without(matched: Matched, observations: B8, view: int) -> Matched:
     """The set without these ``observations`` (K,), all of one ``view``, and without its pairs, whose matches
     are no longer what they were."""
-    t, kept = matched.tracks, ~observations
-    kept = kept & (np.bincount(t.point_index[kept], minlength=t.n_points)[t.point_index] >= 2)
-    tracks = Tracks(t.view_index[kept], t.point_index[kept], t.xy[kept], t.n_views, t.n_points)
+    tracks = keep_observations(matched.tracks, ~observations)
     return replace(matched, tracks=tracks, pairs=[p for p in matched.pairs if view not in (p.i, p.j)])
+
+
+def keep_observations(tracks: Tracks, kept: B8) -> Tracks:
+    """The ``kept`` (K,) observations of the points that still have two of them."""
+    t = tracks
+    kept = kept & (np.bincount(t.point_index[kept], minlength=t.n_points)[t.point_index] >= 2)
+    return Tracks(t.view_index[kept], t.point_index[kept], t.xy[kept], t.n_views, t.n_points)
 
 
 def _in_window(matched: Matched, _: Reconstruction, mine: np.ndarray, rng: np.random.Generator) -> B8:
@@ -180,7 +185,7 @@ KINDS: dict[str, Callable[[Matched, Reconstruction, np.ndarray, np.random.Genera
 
 def check_weak(title: str, sets: Sequence[Weak], K: F64, *, alike: bool) -> list[Metric]:
     """What becomes of the weak photograph: its error, its interval, and whether it is named."""
-    rows = _Rows(title)
+    rows = OwnRows(title)
     for kind in KINDS:
         found = [_judge(weak, K, alike) for weak in sets if weak.kind == kind]
         error, width, z, named, others = (np.array(part) for part in zip(*found, strict=True))

@@ -53,6 +53,17 @@ def join_scores(scores: Sequence[IntervalScores]) -> IntervalScores:
     return IntervalScores(np.concatenate([s.z for s in scores]), np.concatenate([s.std_rel for s in scores]))
 
 
+def holding_std(scores: Sequence[IntervalScores], columns: Sequence[int]) -> float:
+    """Standard deviation of the share of intervals that hold the truth, of several scenes: the cameras of one
+    scene err together, so that it is scenes that count (Cochran 1977, the ratio estimate of clusters)."""
+    held = [np.abs(s.z[:, list(columns)]) for s in scores]
+    held = [z[np.isfinite(z)] <= LEVEL for z in held]
+    total, share = sum(map(len, held)), float(np.mean(np.concatenate(held)))
+    deviations = np.array([h.sum() - share * len(h) for h in held])
+    n = len(scores)
+    return float(np.sqrt(np.sum(deviations**2) * n / max(n - 1, 1))) / max(total, 1)
+
+
 def focal_errors_pct(K: F64, K_true: F64) -> F64:
     """|f / f_true - 1| (V,) in percent, f the geometric mean of fx and fy; NaN where K is zero."""
     f = np.sqrt(K[:, 0, 0] * K[:, 1, 1])

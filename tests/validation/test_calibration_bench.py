@@ -1,0 +1,93 @@
+"""The tables of self-calibration on photographs: rows of several methods, some of which failed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.validation.test_cameras import _reconstruction, _truth
+from thesisrecon.config import PipelineConfig
+from thesisrecon.types import Reconstruction
+from validation.checks.calibration_bench import Rows
+from validation.checks.calibration_parts import keep_observations, one_camera
+from validation.checks.calibration_real import _change_pct, _pooled, _told
+from validation.checks.reconstruction import COLMAP, OURS
+from validation.metrics.intervals import IntervalScores, holding_std
+from validation.metrics.record import Metric
+from validation.scenes.real import Scene
+
+
+def rows_of(models: dict[str, Reconstruction | None]) -> Rows:
+    truth = _truth()
+    return Rows("a set", Scene("a set", (), truth.K, truth.R, truth.C), models)
+
+
+def value(rows: list[Metric], name: str, method: str = OURS) -> float | None:
+    return next(row for row in rows if row.name == name).values[method]
+
+
+def one_off() -> Reconstruction:
+    """The truth but for a focal that is 1 % too long."""
+    model = _reconstruction(_truth())
+    assert model.K is not None
+    K = model.K.copy()
+    K[2, :2, :2] *= 1.01
+    return replace(model, K=K)
+
+
+def test_a_method_that_failed_has_no_camera_and_no_error() -> None:
+    rows = rows_of({OURS: one_off(), COLMAP: None})
+    rows.registered()
+    rows.focals(0.2, 0.5)
+    rows.poses(3.3, 0.05)
+    assert [metric.verdict for metric in rows.metrics] == [
+        "reached", "reached", "missed", "reached", "reached",
+    ]  # fmt: skip
+    assert value(rows.metrics, "focal error, median") == pytest.approx(0.0, abs=1e-9)
+    assert value(rows.metrics, "focal error, worst") == pytest.approx(1.0)
+    assert value(rows.metrics, "cameras registered of 6", COLMAP) == 0.0
+    assert value(rows.metrics, "focal error, worst", COLMAP) is None
+    assert np.isinf(rows.all_focals(None)).all()
+
+
+def test_cameras_that_are_missing_count_in_what_is_pooled_over_seeds() -> None:
+    errors = {OURS: [np.array([0.1, 0.3]), np.array([0.2, np.inf])]}
+    registered, median, worst = _pooled("all", errors)
+    assert registered.values[OURS] == 3.0
+    assert registered.verdict == "missed"
+    assert median.values[OURS] == pytest.approx(0.25)
+    assert worst.values[OURS] == pytest.approx(0.3)
+
+
+def test_a_change_is_relative_and_unknown_without_a_focal() -> None:
+    assert _change_pct(1010.0, 1000.0) == pytest.approx(1.0)
+    assert _change_pct(None, 1000.0) is None
+    told = _told(5000.0)(PipelineConfig()).intrinsics
+    assert told.focal_px == 5000.0
+    assert told.focal_std_rel == pytest.approx(np.log(5.0))
+
+
+def test_a_value_that_all_views_share_counts_once() -> None:
+    scores = IntervalScores(np.array([[np.nan] * 3, [1.0] * 3, [1.0] * 3]), np.array([np.nan, 0.1, 0.1]))
+    assert one_camera(scores, "shared").z.shape == (1, 3)
+    assert one_camera(scores, "per-image") is scores
+
+
+def test_cameras_that_err_together_make_a_share_as_unsure_as_scenes_do() -> None:
+    def scene(z: float, cameras: int) -> IntervalScores:
+        return IntervalScores(np.full((cameras, 3), z), np.full(cameras, 0.1))
+
+    alone = [scene(5.0 if n % 10 == 0 else 0.0, 1) for n in range(100)]
+    assert holding_std(alone, (0,)) == pytest.approx(np.sqrt(0.1 * 0.9 / 99))
+    together = [scene(5.0 if n % 10 == 0 else 0.0, 8) for n in range(100)]
+    assert holding_std(together, (0,)) == pytest.approx(holding_std(alone, (0,)))
+
+
+def test_points_that_one_photograph_sees_go_with_the_observations_taken() -> None:
+    tracks = _reconstruction(_truth()).tracks
+    kept = (tracks.view_index < 2) & ~((tracks.view_index == 0) & (tracks.point_index == 4))
+    less = keep_observations(tracks, kept)
+    assert 4 not in less.point_index
+    assert len(less.xy) == 2 * (tracks.n_points - 1)
