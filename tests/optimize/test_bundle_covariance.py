@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.optimize.bundle_scenes import make_block, project_block
 from thesisrecon.optimize import bundle_covariance, kernels
-from thesisrecon.optimize.bundle_covariance import gauge_directions
+from thesisrecon.optimize.bundle_covariance import gauge_directions, robust_sigma
 from thesisrecon.optimize.metric_bundle import (
     BundleOptions,
     IntrinsicsPrior,
@@ -74,6 +74,21 @@ def test_entries_of_the_inverse_inside_the_band():
     kernels.invert_band(packed, out)
     for j in range(20):
         np.testing.assert_allclose(out[j, : min(5, 20 - j)], inverse[j : j + 5, j], rtol=1e-9, atol=1e-12)
+
+
+def test_noise_is_found_beside_outliers_and_points_that_fit_anything():
+    rng = np.random.default_rng(0)
+    residual, leverage = 0.3 * rng.normal(size=(5000, 2)), np.zeros((5000, 2))
+    assert robust_sigma(residual, leverage, 0) == pytest.approx(0.3, rel=0.02)
+    residual[:100] *= 100.0
+    assert robust_sigma(residual, leverage, 0) == pytest.approx(0.3, rel=0.04)
+    # A coordinate keeps the share of its variance that neither its point nor the cameras took.
+    leverage[:] = 0.5
+    assert robust_sigma(np.sqrt(0.25) * residual, leverage, 2500) == pytest.approx(0.3, rel=0.04)
+    leverage[2500:], residual[2500:] = 1.0, 0.0
+    assert robust_sigma(np.sqrt(0.25) * residual, leverage, 2500) == pytest.approx(0.3, rel=0.05)
+    assert robust_sigma(residual, np.ones_like(leverage), 0) == 0.0
+    assert robust_sigma(np.zeros((0, 2)), np.zeros((0, 2)), 0) == 0.0
 
 
 @pytest.mark.parametrize("populations", [False, True])

@@ -75,6 +75,7 @@ def test_states_outside_the_domain_are_refused_not_raised():
 def test_guards_of_the_linear_algebra():
     assert solve_positive(-np.eye(2), np.ones(2)) is None
     assert solve_positive(np.array([[np.nan]]), np.ones(1)) is None
+    assert np.isinf(invert_information(np.array([[np.nan]]))).all()
     covariance = invert_information(np.diag([4.0, 0.0]))
     assert covariance[0, 0] == pytest.approx(0.25)
     assert np.isfinite(covariance).all()

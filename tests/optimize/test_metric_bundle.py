@@ -204,8 +204,31 @@ def test_degenerate_and_wrong_input_is_guarded():
     negative = MetricCameras(c.R, c.t, -c.intrinsics, c.group)
     with pytest.raises(ValueError, match="positive"):
         _refine(negative, block.X, _seen(block), free=FOCAL)
-    with pytest.raises(ValueError, match="sigma_px"):
-        BundleOptions(sigma_px=0.0)
+
+
+@pytest.mark.parametrize("field", ["sigma_px", "threads", "loss_px"])
+def test_options_that_mean_nothing_are_refused(field):
+    with pytest.raises(ValueError, match=r"positive|needs a thread"):
+        BundleOptions(**{field: 0})
+
+
+def test_wrong_calls_are_refused():
+    block = make_block(views=4, points=20)
+    c, q = block.cameras, block.cameras.intrinsics
+    seen, known = _seen(block), np.ones_like(q)
+
+    def refused(match, cameras=c, observations=seen, prior=None, **options):
+        with pytest.raises(ValueError, match=match):
+            _refine(cameras, block.X, observations, free=FOCAL, prior=prior, **options)
+
+    refused("metric bundle needs", MetricCameras(c.R, c.t[:2], q, c.group))
+    refused("shared has a number", MetricCameras(c.R, c.t, q, c.group, np.zeros(6, dtype=np.int64)))
+    refused("groups must lie", MetricCameras(c.R, c.t, q, c.group + 1))
+    refused("observations need", observations=Observations(block.view, block.point[1:], block.xy))
+    refused("fixed_views is one flag", fixed_views=np.zeros(3, bool))
+    refused("prior of shape", prior=IntrinsicsPrior(q, -known))
+    refused("population needs its spread", prior=IntrinsicsPrior(q, known, np.zeros(1, int)))
+    refused("above 0", prior=IntrinsicsPrior(q, known, np.zeros(1, int), np.zeros(6)))
 
 
 def _varied(block, focals, *, seed=4, sigma=0.0):

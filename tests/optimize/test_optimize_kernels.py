@@ -258,6 +258,24 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
             assert band[i, j - i] == moved[j, i]
 
 
+@pytest.mark.parametrize(
+    "solver", [DenseCholesky(), BandedCholesky(np.arange(3), 2), ConjugateGradients()], ids=lambda s: type(s)
+)
+@pytest.mark.parametrize("spoiled", ["views", "corner", "rhs"])
+@pytest.mark.parametrize("value", [-1.0, 0.0, np.nan])
+def test_every_solver_tells_a_system_that_is_not_positive(solver, spoiled, value):
+    row, column = np.array([0, 0, 1, 1, 2]), np.array([0, 1, 1, 2, 2])
+    blocks, border, corner = np.zeros((5, 2, 2)), np.full((3, 2, 1), 0.1), np.eye(1)
+    blocks[row == column] = np.eye(2)
+    sums = Sums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
+    system = ReducedSystem(row, column, sums)
+    np.testing.assert_allclose(multiply(system, solver.solve(system)), 1.0, atol=1e-2)
+    what = {"views": blocks, "corner": corner, "rhs": sums.rhs}[spoiled]
+    what *= value
+    if spoiled != "rhs" or np.isnan(value):
+        assert solver.solve(system) is None
+
+
 def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
     def chosen(n, pairs):
         i, j = (np.array(a) for a in zip(*sorted(pairs), strict=True))

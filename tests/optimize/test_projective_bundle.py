@@ -107,6 +107,8 @@ def test_degenerate_input_is_guarded():
     )
     assert np.isfinite(flat.P).all()
     assert flat.cost <= flat.initial_cost
+    with pytest.raises(ValueError, match="needs"):
+        refine_projective_bundle(P[0], X, block.view, block.point, block.xy)
     with pytest.raises(ValueError, match="finite"):
         refine_projective_bundle(P, X, block.view, block.point, block.xy * np.nan)
     with pytest.raises(ValueError, match="beyond"):

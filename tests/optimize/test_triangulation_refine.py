@@ -118,5 +118,12 @@ def test_wrong_calls_are_refused():
         refine_camera(P[0], np.zeros((0, 4)), np.zeros((0, 2)))
     with pytest.raises(ValueError, match="refine_pose"):
         refine_pose(np.eye(2), np.zeros(3), np.ones(6), block.X, np.zeros((8, 2)))
+    with pytest.raises(ValueError, match="not zero"):
+        refine_camera(P[0], 0.0 * block.Xh, block.xy[: len(block.Xh)])
+    with pytest.raises(ValueError, match="positive focal"):
+        refine_pose(np.eye(3), np.zeros(3), -np.ones(6), block.X, np.zeros((8, 2)))
+    once = block.view == 0
+    alone = refine_points(P, block.Xh, block.view[once], block.point[once], block.xy[once])
+    np.testing.assert_array_equal(alone, block.Xh)
     few = refine_camera(P[0], block.Xh[:3], _reproject(P[0], block.Xh[:3]) + 0.1)
     assert np.isfinite(few.covariance).all()

@@ -88,6 +88,10 @@ class BundleOptions:
         loss_code(self.loss, self.loss_px)
         if not self.sigma_px > 0.0:
             raise ValueError(f"sigma_px must be positive; got {self.sigma_px}")
+        if self.threads < 1 or self.max_iterations < 0:
+            raise ValueError(
+                f"a bundle needs a thread and iterations >= 0; got {self.threads}, {self.max_iterations}"
+            )
 
 
 @dataclass(frozen=True)
@@ -297,8 +301,10 @@ def _metric_problem(
     seen = np.bincount(o.view_index, minlength=len(group)) > 0
     used = np.bincount(group[seen], minlength=len(cameras.intrinsics)) > 0
     values, start, table = number_values(cameras, used, free, prior)
-    fixed = np.zeros(len(group), bool) if options.fixed_views is None else options.fixed_views
-    free_views = seen & ~np.asarray(fixed, bool)
+    fixed = np.zeros(len(group), bool) if options.fixed_views is None else np.asarray(options.fixed_views)
+    if fixed.shape != group.shape:
+        raise ValueError(f"fixed_views is one flag for each of {len(group)} views; got shape {fixed.shape}")
+    free_views = seen & ~fixed.astype(bool)
     columns = place_intrinsics(values, group, np.flatnonzero(free), seen, free_views)
     layout = lay_out(
         o,

@@ -155,9 +155,11 @@ class ConjugateGradients:
     def solve(self, system: ReducedSystem) -> F64 | None:
         """x (D,) or None."""
         s, (b, C, _) = system.sums, system.sums.border.shape
+        own = s.blocks[system.row == system.column]
         try:
-            inverse = np.linalg.inv(s.blocks[system.row == system.column])
-            corner = np.linalg.inv(s.corner)
+            # Inverses of what is not positive exist, but say nothing of descent: Cholesky refuses them.
+            np.linalg.cholesky(own), np.linalg.cholesky(s.corner)
+            inverse, corner = np.linalg.inv(own), np.linalg.inv(s.corner)
         except np.linalg.LinAlgError:
             return None
 
@@ -168,6 +170,8 @@ class ConjugateGradients:
         x, r = np.zeros_like(s.rhs), s.rhs.copy()
         z = precondition(r)
         p, energy = z, float(r @ z)
+        if not energy >= 0.0:
+            return None
         enough = self.tolerance**2 * energy
         for _ in range(self.max_products):
             if not energy > enough:
