@@ -188,57 +188,73 @@ def focals_of(method: str, projective: Reconstruction, assumed: Assumptions) -> 
 
 
 def cells(
-    scenes: Sequence[str], modes: Sequence[str], noises: Sequence[float], views: Sequence[int]
+    scenes: Sequence[str],
+    modes: Sequence[str],
+    noises: Sequence[float],
+    views: Sequence[int],
+    *,
+    grid: bool = False,
 ) -> list[Cell]:
-    """Noise at the most cameras, cameras at 1 px (or the noise nearest to it)."""
+    """Noise at the most cameras, cameras at 1 px (or the noise nearest to it); or every noise at each."""
     middle = min(noises, key=lambda s: abs(s - 1.0))
-    places = dict.fromkeys([(s, max(views)) for s in noises] + [(middle, v) for v in views])
+    cross = [(s, max(views)) for s in noises] + [(middle, v) for v in views]
+    places = dict.fromkeys([(s, v) for s in noises for v in views] if grid else cross)
     return [Cell(scene, mode, s, v) for scene in scenes for mode in modes for s, v in places]
 
 
 def report(trials: Sequence[Trial]) -> str:
-    """Markdown: for each scene and mode a table over noise and one over cameras."""
-    blocks = []
+    """Markdown: for each scene and mode a table over cameras at 1 px and over noise at the most cameras, and
+    after these one for every other noise that has more than one number of cameras."""
+    crosses, others = [], []
     for scene in dict.fromkeys(t.scene for t in trials):
         for mode in dict.fromkeys(t.mode for t in trials if t.scene == scene):
             here = [t for t in trials if (t.scene, t.mode) == (scene, mode)]
-            most = max(t.views for t in here)
-            blocks.append(
-                _table(f"{scene}, {mode}, {most} cameras: noise", here, "sigma_px", " px", views=most)
-            )
-            blocks.append(_table(f"{scene}, {mode}, 1 px: cameras", here, "views", "", sigma_px=1.0))
-    return "\n\n".join(blocks)
+            places = {(t.sigma_px, t.views) for t in here}
+            noises, most = sorted({s for s, _ in places}), max(v for _, v in places)
+            cross = sorted(p for p in places if p[0] == 1.0) + [(s, most) for s in noises if s != 1.0]
+            crosses.append(_table(f"{scene}, {mode}", here, cross))
+            for sigma in noises:
+                row = sorted(p for p in places if p[0] == sigma)
+                if sigma != 1.0 and len(row) > 1:
+                    others.append(_table(f"{scene}, {mode}, {sigma:g} px", here, row))
+    return "\n\n".join([*crosses, *others])
 
 
-def _table(title: str, trials: Sequence[Trial], by: str, unit: str, **fixed: float) -> str:
-    some = [t for t in trials if all(getattr(t, name) == value for name, value in fixed.items())]
-    columns = sorted({getattr(t, by) for t in some})
-    counts = Counter((getattr(t, by), t.method) for t in some).values() or [0]
-    draws = f"{min(counts)}" if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
-    title += f", {draws} draws"
+def _table(title: str, trials: Sequence[Trial], places: Sequence[tuple[float, int]]) -> str:
+    """A row a method, a column a place (noise, number of cameras); ``title`` tells what they share."""
+    cells = [[t for t in trials if (t.sigma_px, t.views) == place] for place in places]
     lines = [
-        f"| {title} | {' | '.join(f'{c:g}{unit}' for c in columns)} |",
-        f"| --- |{' --- |' * len(columns)}",
+        f"| {title} | {' | '.join(f'{v} cameras, {s:g} px' for s, v in places)} |",
+        f"| --- |{' --- |' * len(places)}",
     ]
-    for method in dict.fromkeys(t.method for t in some):
-        shown = [[t for t in some if t.method == method and getattr(t, by) == c] for c in columns]
-        lines.append(f"| {method} | {' | '.join(_entry(s) for s in shown)} |")
-    return "\n".join(lines)
+    for method in dict.fromkeys(t.method for t in trials):
+        shown = [[t for t in cell if t.method == method] for cell in cells]
+        if any(shown):
+            lines.append(f"| {method} | {' | '.join(map(_entry, shown))} |")
+    return "\n".join([*lines, f"| draws | {' | '.join(map(_draws, cells))} |"])
+
+
+def _draws(trials: Sequence[Trial]) -> str:
+    """The number of draws that the entries of one column rest on."""
+    counts = Counter(t.method for t in trials if t.method != BOUND).values() or [0]
+    return f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
 
 
 def _entry(trials: Sequence[Trial]) -> str:
-    """Median error (those that refused count as infinite), success, and zoomed the share of worst cameras
-    within 5 %."""
+    """Median error (those that refused count as infinite); where not all draws are near enough, the share
+    that is, and zoomed that of the worst cameras within 5 %."""
     if not trials:
         return "-"
     error = np.array([t.median_pct if np.isfinite(t.median_pct) else np.inf for t in trials])
     worst = np.array([t.worst_pct if np.isfinite(t.worst_pct) else np.inf for t in trials])
     middle = float(np.median(error))
-    text = "refused" if not np.isfinite(middle) else f"{0.0 if middle < 1e-6 else middle:.2g}"
-    shares = f"{100 * np.mean(error <= SUCCESS_PCT):.0f}"
+    text = "refused" if not np.isfinite(middle) else "0" if middle < 1e-4 else f"{middle:.2g}"
+    shares = [100.0 * np.mean(error <= SUCCESS_PCT)]
     if trials[0].mode == "zooming":
-        shares += f", {100 * np.mean(worst <= WORST_PCT):.0f}"
-    return f"{text} ({shares})"
+        shares.append(100.0 * np.mean(worst <= WORST_PCT))
+    if min(shares) == 100.0 or trials[0].method == BOUND or not np.isfinite(error).any():
+        return text
+    return f"{text} ({', '.join(f'{share:.0f}' for share in shares)})"
 
 
 def targets(trials: Sequence[Trial]) -> str:
@@ -292,6 +308,7 @@ def main() -> int:
     parser.add_argument("--noise", type=float, nargs="+", default=NOISES_PX)
     parser.add_argument("--views", type=int, nargs="+", default=VIEWS)
     parser.add_argument("--methods", nargs="+", default=known, choices=known, metavar="NAME")
+    parser.add_argument("--grid", action="store_true", help="every noise at every number of cameras")
     parser.add_argument("--trials", type=int, default=10)
     parser.add_argument("--first", type=int, default=0, help="number of the first draw")
     parser.add_argument("--workers", type=int, default=1)
@@ -305,7 +322,9 @@ def main() -> int:
     jobs = [
         (cell, tuple(arguments.methods), arguments.first + k, 1)
         for k in range(arguments.trials)
-        for cell in cells(arguments.scenes, arguments.modes, arguments.noise, arguments.views)
+        for cell in cells(
+            arguments.scenes, arguments.modes, arguments.noise, arguments.views, grid=arguments.grid
+        )
     ]
     trials = read_trials(arguments.read)
     with ProcessPoolExecutor(arguments.workers) as pool:
