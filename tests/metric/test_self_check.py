@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
 from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.model import MetricModel, retriangulate
+from thesisrecon.metric.model import MetricModel, project_observations, retriangulate
 from thesisrecon.metric.prior_check import contradicted_focals
 from thesisrecon.metric.self_check import self_check
 from thesisrecon.metric.start import camera_rows
@@ -118,3 +118,22 @@ def test_a_focal_that_the_photographs_contradict_is_told(off: float, deviation: 
 def test_nothing_said_is_nothing_contradicted() -> None:
     _, assumed, model = setting()
     assert contradicted_focals(model, Adjustment(assumed, 0.0, 0.02)) == []
+
+
+def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_doubted() -> None:
+    rng = np.random.default_rng(0)
+    row = make_scene(views=3, points=400, seed=1)
+    centres = row.centres[0] + np.outer([0.0, 1.0, 2.0], [1.0, 0.05, 0.0])
+    row = with_poses(row, np.repeat(row.R[:1], 3, axis=0), centres)
+    noisy = replace(row.tracks, xy=row.tracks.xy + rng.normal(0.0, 0.5, row.tracks.xy.shape))
+    scene = replace(row, tracks=noisy)
+    model = true_model(scene, assume(projective_reconstruction(scene)))
+    noise = check_views(model, sigmas=SIGMAS).noise_px
+    assert noise == pytest.approx(0.5, rel=0.2)
+    xy, _ = project_observations(
+        model.cameras, model.X, model.tracks.view_index[model.ok], model.tracks.point_index[model.ok]
+    )
+    left = np.linalg.norm(xy - model.tracks.xy[model.ok], axis=1)
+    kept = [np.median(left[model.tracks.view_index[model.ok] == v]) for v in range(3)]
+    assert kept[1] > 1.3 * min(kept[0], kept[2])
+    assert not any("noise" in doubt for doubt in doubts_of(model, scene)[1])

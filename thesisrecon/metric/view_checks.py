@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.metric.model import MetricModel, agreeing_observations, project_observations
 from thesisrecon.optimize.triangulation_refine import refine_pose
-from thesisrecon.robust.noise import noise_from_distances
+from thesisrecon.robust.noise import MAD_FACTOR, noise_from_distances
 from thesisrecon.types import B8, I64
 
 F64 = NDArray[np.float64]
@@ -18,19 +18,21 @@ OWN = np.array([True, True, False, False, False, False])
 """Focal and aspect: what a camera that is right gives back when nothing but its points is believed."""
 MOST_OBSERVATIONS = 1500
 FEWEST_OBSERVATIONS = 30
+LEAST_LEFT = 0.1
+"""Coordinates that keep less than this share of their variance say little of the noise."""
 
 
 @dataclass(frozen=True)
 class ViewChecks:
     """Per view (V,), NaN where not registered or nothing could be measured.
 
-    ``explained`` share of the observations within reach
-    that the model explains. ``confirmed`` share of the observations
-    of points that other views fix (two or more of them) which agree with the view too: points of two views
-    agree with any two cameras along their epipolar lines. ``behind`` share of the observations behind the
-    camera. ``noise_px``. ``focal_off`` and ``aspect_off``: the logarithm of the view's own focal over the
-    model's and of its own aspect, from its points alone, with their standard deviations ``focal_off_std`` and
-    ``aspect_off_std`` at the noise that is left with them.
+    ``explained`` share of the observations within reach that the model explains. ``confirmed`` share of the
+    observations of points that other views fix (two or more of them) which agree with the view too: points
+    of two views agree with any two cameras along their epipolar lines. ``behind`` share of the observations
+    behind the camera. ``noise_px`` of one coordinate, as it was before the points were fitted to it.
+    ``focal_off`` and ``aspect_off``: the logarithm of the view's own focal over the model's and of its own
+    aspect, from its points alone, with their standard deviations ``focal_off_std`` and ``aspect_off_std`` at
+    the noise that is left with them.
     """
 
     explained: F64
@@ -57,6 +59,7 @@ def check_views(model: MetricModel, *, sigmas: float) -> ViewChecks:
         _share(t.view_index, agree, near, n),
         _share(t.view_index, agree, near & fixed, n),
         _share(t.view_index, depth <= 0, known, n),
+        noise_of_views(model, agree),
         *(np.array(column) for column in zip(*own, strict=True)),
     )
 
@@ -83,9 +86,40 @@ def _fixed_by_others(model: MetricModel, agree: B8) -> B8:
     return np.asarray(count[t.point_index] - agree >= 2)
 
 
-def _own_camera(model: MetricModel, view: int, index: I64) -> tuple[float, float, float, float, float]:
-    """Noise, own focal and aspect of a view with their deviations; NaN where it has too few observations."""
-    nothing = (np.nan,) * 5
+def noise_of_views(model: MetricModel, agree: B8) -> F64:
+    """(V,) noise (px) of one coordinate of the observations ``agree`` (K,); NaN where too few tell it.
+
+    A point that few views see is fitted to their noise, more to that of some views than of others: of three
+    cameras in a row the outer ones keep hardly any residual. Each residual is hence taken over the root of
+    the share 1 - (B V^-1 B')_cc of its variance that the three freedoms of its point leave, B = dx / dX and
+    V = sum B'B.
+    """
+    t, cameras = model.tracks, model.cameras
+    k = np.flatnonzero(agree)
+    view, point = t.view_index[k], t.point_index[k]
+    seen, depth = project_observations(cameras, model.X, view, point)
+    R = cameras.R[view]
+    x = np.einsum("kab,kb->ka", R[:, :2], model.X[point]) + cameras.t[view, :2]
+    B = (R[:, :2] - (x / depth[:, None])[:, :, None] * R[:, 2:]) / depth[:, None, None]
+    B *= cameras.intrinsics[cameras.group[view], 0][:, None, None]
+    V = np.zeros((t.n_points, 3, 3))
+    np.add.at(V, point, np.einsum("kca,kcb->kab", B, B))
+    # The ridge keeps points of one view regular; nothing is left of their variance all the same.
+    V += (1e-12 * np.trace(V, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(3)
+    left = 1.0 - np.einsum("kca,kab,kcb->kc", B, np.linalg.inv(V)[point], B)
+    told = left > LEAST_LEFT
+    size = np.abs(seen - t.xy[k])[told] / np.sqrt(left[told])
+    whose = np.repeat(view[:, None], 2, axis=1)[told]
+    noise = np.full(t.n_views, np.nan)
+    for v in range(t.n_views):
+        if np.count_nonzero(whose == v) >= FEWEST_OBSERVATIONS:
+            noise[v] = MAD_FACTOR * np.median(size[whose == v])
+    return noise
+
+
+def _own_camera(model: MetricModel, view: int, index: I64) -> tuple[float, float, float, float]:
+    """Own focal and aspect of a view with their deviations; NaN where it has too few observations."""
+    nothing = (np.nan,) * 4
     if not model.registered[view] or len(index) < FEWEST_OBSERVATIONS:
         return nothing
     index = index[:: int(np.ceil(len(index) / MOST_OBSERVATIONS))]
@@ -106,7 +140,6 @@ def _own_camera(model: MetricModel, view: int, index: I64) -> tuple[float, float
     std = left * np.sqrt(np.maximum(np.diag(fit.covariance)[6:8], 0.0))
     focal = float(np.log(fit.intrinsics[0] / intrinsics[0]))
     return (
-        noise,
         focal,
         float(std[0]),
         float(np.log(max(fit.intrinsics[1] / intrinsics[1], 1e-9))),

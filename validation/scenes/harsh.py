@@ -1,0 +1,236 @@
+"""Sets of photographs as people bring them who know nothing of self-calibration: too few, hardly turned,
+cropped, zoomed while one camera is told, with lenses and pixels that the model does not have.
+
+Every kind is a random scene with the exact truth of each camera. What is told of the cameras goes with it,
+right or wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.types import I64, Tracks
+from validation.scenes.pose import look_at
+
+F64 = NDArray[np.float64]
+SIZE = np.array([1536, 1024])
+UP = np.array([0.0, 0.0, 1.0])
+SEEN = 0.85
+
+
+@dataclass(frozen=True)
+class HarshSet:
+    """True cameras ``K, R`` (V, 3, 3), ``C`` (V, 3), points ``X`` (N, 3); ``lens`` (k1, k2); what is done to
+    the observations (``sigma_px``, share of ``wrong`` matches, share of points that move with an object); and
+    what is ``told`` of the cameras."""
+
+    K: F64
+    R: F64
+    C: F64
+    X: F64
+    sigma_px: float = 0.5
+    lens: tuple[float, float] = (0.0, 0.0)
+    wrong: float = 0.0
+    moving: float = 0.0
+    told: Literal["shared", "per-image"] = "shared"
+
+    @property
+    def sizes(self) -> I64:
+        """(V, 2)."""
+        return np.tile(SIZE, (len(self.K), 1))
+
+    @property
+    def focal_px(self) -> F64:
+        """(V,) the geometric mean where pixels are not square."""
+        return np.asarray(np.sqrt(self.K[:, 0, 0] * self.K[:, 1, 1]))
+
+    def observe(self, rng: np.random.Generator) -> Tracks:
+        """Tracks of what lies in the pictures, with everything that is wrong with them."""
+        X = np.repeat(self.X[None], len(self.K), axis=0)
+        object_ = rng.random(len(self.X)) < self.moving
+        step = 0.15 * rng.normal(size=(len(self.K), 1, 3))
+        X = np.where(object_[None, :, None], X + step, X)
+        Y = np.einsum("vab,vnb->vna", self.R, X - self.C[:, None])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = Y[..., :2] / Y[..., 2:]
+        r2 = np.sum(x**2, axis=-1, keepdims=True)
+        x = x * (1.0 + self.lens[0] * r2 + self.lens[1] * r2**2)
+        # Beyond where it folds back the polynomial is no lens.
+        whole = 1.0 + 3.0 * self.lens[0] * r2[..., 0] + 5.0 * self.lens[1] * r2[..., 0] ** 2 > 0.1
+        xy = np.einsum("vab,vnb->vna", self.K[:, :2, :2], x) + self.K[:, None, :2, 2]
+        seen = (Y[..., 2] > 0.1) & whole & ((xy >= 0) & (xy <= SIZE - 1)).all(axis=2)
+        seen &= rng.random(seen.shape) < SEEN
+        seen &= seen.sum(axis=0) >= 2
+        point, view = np.nonzero(seen.T)
+        noisy = xy[view, point] + rng.normal(0.0, self.sigma_px, (len(view), 2))
+        lost = rng.random(len(view)) < self.wrong
+        noisy[lost] = rng.uniform(0.0, SIZE - 1.0, (int(lost.sum()), 2))
+        return Tracks(view.astype(np.int64), point.astype(np.int64), noisy, len(self.K), len(self.X))
+
+
+def _points(rng: np.random.Generator, n: int = 400) -> F64:
+    return rng.uniform(-1.0, 1.0, (n, 3)) * rng.uniform(0.6, 1.0, 3)
+
+
+def _cap(rng: np.random.Generator, views: int, half_deg: float = 30.0) -> tuple[F64, F64]:
+    """Cameras on a cap of the sphere, at several distances and rolls, not quite aimed."""
+    azimuth, height = np.radians(rng.uniform(-half_deg, half_deg, (2, views)))
+    C = np.stack([np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)], axis=1)
+    C *= 4.0 * rng.uniform(0.8, 1.25, (views, 1))
+    R = [look_at(c, 0.2 * rng.normal(size=3), float(rng.uniform(-0.3, 0.3))) for c in C]
+    return np.array(R), C
+
+
+def _path(rng: np.random.Generator, C: F64, turn_deg: float) -> tuple[F64, F64]:
+    """Cameras at C that look one way but for turns of ``turn_deg`` (rms about each axis)."""
+    start = look_at(C.mean(axis=0), 0.1 * rng.normal(size=3), float(rng.uniform(-0.2, 0.2)))
+    turns = Rotation.from_rotvec(np.radians(turn_deg) * rng.normal(size=(len(C), 3))).as_matrix()
+    return turns @ start, C
+
+
+def _orbit(rng: np.random.Generator, views: int) -> tuple[F64, F64]:
+    """A turntable of 40 to 300 degrees."""
+    height = np.radians(rng.uniform(-10.0, 40.0))
+    start = 4.0 * np.array([np.cos(height), 0.0, np.sin(height)])
+    R = look_at(start, 0.2 * rng.normal(size=3), float(rng.uniform(-0.3, 0.3)))
+    angle = np.sort(rng.uniform(0.0, np.radians(rng.uniform(40.0, 300.0)), views))
+    turn = Rotation.from_rotvec(angle[:, None] * UP).as_matrix()
+    return R @ turn.swapaxes(1, 2), turn @ start
+
+
+def _set(poses: tuple[F64, F64], X: F64, rng: np.random.Generator) -> HarshSet:
+    """One focal that fills the picture with the scene, the principal point off by half a hundredth."""
+    R, C = poses
+    Y = np.einsum("vab,vnb->vna", R, X[None] - C[:, None])
+    reach = np.quantile(np.abs(Y[..., 0] / np.maximum(Y[..., 2], 1e-3)), 0.9)
+    K = np.zeros((len(R), 3, 3))
+    K[:, 0, 0] = K[:, 1, 1] = 0.5 / reach * rng.uniform(0.8, 1.1) * SIZE.max()
+    K[:, :2, 2], K[:, 2, 2] = (SIZE - 1) / 2 + 0.0035 * SIZE.max() * rng.normal(size=2), 1.0
+    return HarshSet(K, R, C, X, float(rng.uniform(0.3, 0.8)))
+
+
+def _several(rng: np.random.Generator) -> int:
+    return int(rng.integers(5, 12))
+
+
+def _general(rng: np.random.Generator, views: int | None = None) -> HarshSet:
+    return _set(_cap(rng, views or _several(rng)), _points(rng), rng)
+
+
+def _zooming(scene: HarshSet, factors: F64, told: Literal["shared", "per-image"]) -> HarshSet:
+    K = scene.K.copy()
+    K[:, :2, :2] *= factors[:, None, None]
+    return replace(scene, K=K, told=told)
+
+
+def _cropped(scene: HarshSet, shift: F64) -> HarshSet:
+    """Principal points moved by ``shift`` (V, 2) or (2,), in width and height."""
+    K = scene.K.copy()
+    K[:, :2, 2] += shift * SIZE
+    return replace(scene, K=K)
+
+
+def _own_zooms(scene: HarshSet, rng: np.random.Generator, zoom: float = 0.3) -> HarshSet:
+    return _zooming(scene, np.exp(rng.uniform(-zoom, zoom, len(scene.K))), "per-image")
+
+
+def _two_zooms(rng: np.random.Generator, low: float, high: float) -> HarshSet:
+    scene = _general(rng)
+    factors = np.where(np.arange(len(scene.K)) % 2 == 0, 1.0, rng.uniform(low, high))
+    return _zooming(scene, factors, "shared")
+
+
+def _one_other(rng: np.random.Generator) -> HarshSet:
+    scene = _general(rng)
+    factors = np.ones(len(scene.K))
+    factors[rng.integers(len(factors))] = rng.uniform(1.05, 1.5)
+    return _zooming(scene, factors, "shared")
+
+
+def _sideways(rng: np.random.Generator) -> HarshSet:
+    C = np.stack([np.full(8, 4.0), np.linspace(-1.2, 1.2, 8), 0.02 * rng.normal(size=8)], axis=1)
+    return _set(_path(rng, C, rng.uniform(0.1, 2.0)), _points(rng), rng)
+
+
+def _forward(rng: np.random.Generator) -> HarshSet:
+    C = np.stack([np.linspace(6.0, 3.0, 8), *(0.03 * rng.normal(size=(2, 8)))], axis=1)
+    return _set(_path(rng, C, rng.uniform(0.1, 2.0)), _points(rng), rng)
+
+
+def _nearly_turning(rng: np.random.Generator) -> HarshSet:
+    start = np.array([4.0, 0.0, 0.0])
+    C = start + 4.0 * rng.uniform(0.003, 0.06) * rng.normal(size=(8, 3))
+    return _set(_path(rng, C, rng.uniform(4.0, 9.0)), _points(rng), rng)
+
+
+def _aspect(rng: np.random.Generator) -> HarshSet:
+    scene = _general(rng)
+    K = scene.K.copy()
+    K[:, 1, 1] *= rng.choice([-1.0, 1.0]) * rng.uniform(0.01, 0.06) + 1.0
+    return replace(scene, K=K)
+
+
+def _telephoto(rng: np.random.Generator) -> HarshSet:
+    R, C = _cap(rng, _several(rng))
+    factor = rng.uniform(3.0, 8.0)
+    return _set((R, factor * C), _points(rng), rng)
+
+
+def _shallow(rng: np.random.Generator) -> HarshSet:
+    X = _points(rng)
+    X[:, 0] = rng.uniform(0.005, 0.08) * rng.uniform(-1.0, 1.0, len(X))
+    return _set(_cap(rng, _several(rng)), X, rng)
+
+
+def _few_points(rng: np.random.Generator) -> HarshSet:
+    return _own_zooms(_set(_cap(rng, 5), _points(rng, int(rng.integers(70, 120))), rng), rng)
+
+
+def _zoomed_path(rng: np.random.Generator) -> HarshSet:
+    return _own_zooms(_sideways(rng) if rng.random() < 0.5 else _forward(rng), rng)
+
+
+KINDS: Mapping[str, Callable[[np.random.Generator], HarshSet]] = {
+    "three photographs": lambda rng: _general(rng, 3),
+    "four photographs, each its zoom": lambda rng: _own_zooms(_general(rng, 4), rng),
+    "a small arc of 5 to 10 degrees": lambda rng: _set(
+        _cap(rng, _several(rng), rng.uniform(2.5, 5.0)), _points(rng), rng
+    ),
+    "nearly pure rotation": _nearly_turning,
+    "sideways, turned by 0.1 to 2 degrees": _sideways,
+    "forward, turned by 0.1 to 2 degrees": _forward,
+    "sideways or forward, each its zoom": _zoomed_path,
+    "turntable": lambda rng: _set(_orbit(rng, _several(rng)), _points(rng), rng),
+    "turntable, cropped alike": lambda rng: _cropped(
+        _set(_orbit(rng, _several(rng)), _points(rng), rng), rng.uniform(-0.1, 0.1, 2)
+    ),
+    "turntable, each its zoom": lambda rng: _own_zooms(
+        _set(_orbit(rng, _several(rng)), _points(rng), rng), rng
+    ),
+    "two zooms by turns, one camera told": lambda rng: _two_zooms(rng, 1.1, 2.0),
+    "two near zooms by turns, one camera told": lambda rng: _two_zooms(rng, 1.02, 1.1),
+    "one photograph of another focal, one camera told": _one_other,
+    "cropped alike": lambda rng: _cropped(_general(rng), rng.uniform(-0.12, 0.12, 2)),
+    "each cropped for itself": lambda rng: _own_zooms(
+        _cropped(scene := _general(rng), rng.uniform(-0.1, 0.1, (len(scene.K), 2))), rng
+    ),
+    "each cropped for itself, one camera told": lambda rng: _cropped(
+        scene := _general(rng), rng.uniform(-0.1, 0.1, (len(scene.K), 2))
+    ),
+    "pixels not square": _aspect,
+    "strong lens": lambda rng: replace(
+        _general(rng), lens=(float(rng.uniform(-0.4, -0.1)), float(rng.uniform(0.0, 0.15)))
+    ),
+    "telephoto": _telephoto,
+    "shallow scene": _shallow,
+    "noise of 2 to 3 px": lambda rng: replace(_general(rng), sigma_px=float(rng.uniform(2.0, 3.0))),
+    "a fifth of the matches wrong": lambda rng: replace(_general(rng), wrong=0.2),
+    "an object moves with 30 % of the points": lambda rng: replace(_general(rng), moving=0.3),
+    "five photographs of few points, each its zoom": _few_points,
+}
