@@ -12,6 +12,7 @@ from thesisrecon.optimize.metric_bundle import BundleOptions, refine_metric_bund
 from thesisrecon.types import Reconstruction, Tracks
 from validation.checks.bundle import (
     FOCAL_K1,
+    Case,
     check_covariance,
     check_same_problem,
     measure_walk,
@@ -71,9 +72,10 @@ def test_a_model_is_perturbed_and_taken_several_times():
     assert 0.0 < np.abs(X[:N] - block.X).max() < 0.1
 
 
-def test_one_problem_is_told_with_costs_times_and_steps():
+@pytest.mark.parametrize("shared", [True, False])
+def test_one_problem_is_told_with_costs_times_and_steps(shared):
     block = make_block(k1=0.02, points=150)
-    rows = check_same_problem(_model(block, 0.3), copies=1, loss="squared", centre=True, threads=1, repeats=2)
+    rows = check_same_problem(_model(block, 0.3), Case(1, "squared", True, 1, shared), repeats=2)
     named = {row.name: row for row in rows}
     assert named["cost over Ceres' - 1"].verdict == "reached"
     assert named["final cost"].values["Ceres"] == pytest.approx(named["final cost"].values["ours"], rel=1e-4)

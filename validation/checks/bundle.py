@@ -1,21 +1,23 @@
 """Bundle adjustment beside Ceres: ``python -m validation.checks.bundle [same] [covariance] [growth]``.
 
 ``same``: the final model of fountain-P11, perturbed, and the same with every point twice (fresh noise), to
-the same optimum under each loss, principal point fixed and free. Ours and Ceres run in turn; times are
-medians. ``covariance``: against COLMAP's at one optimum, and against Monte Carlo. ``growth``: walks of 10 to
-1000 photographs, each in a process of its own, with Ceres' sparse and iterative solvers.
+the same optimum under each loss, principal point fixed and free, one camera for all and one each
+(``--cameras``). Ours and Ceres run in turn; times are medians. ``covariance``: against COLMAP's at one
+optimum, and against Monte Carlo. ``growth``: walks of 10 to 1000 photographs, each in a process of its own,
+with Ceres' sparse and iterative solvers.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import resource
 import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,11 +51,30 @@ ENOUGH_S = 1.0
 """Seconds after which a measurement is not repeated any more."""
 
 
+@dataclass(frozen=True)
+class Case:
+    """One problem: each point ``copies`` times, the ``loss``, whether the principal point moves (``centre``),
+    ``threads``, and whether all photographs share one camera (``shared``) or have one each."""
+
+    copies: int
+    loss: LossName
+    centre: bool
+    threads: int
+    shared: bool
+
+    def title(self, observations: int) -> str:
+        """In words."""
+        what = f"principal point {'free' if self.centre else 'fixed'}"
+        cameras = "one camera" if self.shared else "a camera each"
+        threads = f"{self.threads} thread{'s' * (self.threads > 1)}"
+        return f"{2 * observations} residuals, {self.loss}, {cameras}, {what}, {threads}"
+
+
 def perturbed_model(
-    model: Reconstruction, rng: np.random.Generator, *, copies: int = 1
+    model: Reconstruction, rng: np.random.Generator, *, copies: int = 1, shared: bool = True
 ) -> tuple[MetricCameras, F64, Observations]:
-    """One shared camera 2 % off in its focal, poses and points off by 0.3 % of the scene; each point
-    ``copies`` times, with fresh noise."""
+    """One camera, ``shared`` or for each photograph, 2 % off in its focal, poses and points off by 0.3 % of
+    the scene; each point ``copies`` times, with fresh noise."""
     tracks, R, t, X = model.tracks, *_poses(model), model.X[:, :3] / model.X[:, 3:]
     scale = float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1)))
     turn = Rotation.from_rotvec(0.003 * rng.normal(size=t.shape)).as_matrix()
@@ -61,9 +82,9 @@ def perturbed_model(
     assert model.k1 is not None
     K, k1 = model.K[0], float(np.atleast_1d(model.k1[0])[0])
     row = np.array([[1.02 * K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], k1]])
-    cameras = MetricCameras(
-        turn @ R, t + 0.003 * scale * rng.normal(size=t.shape), row, np.zeros(len(R), int)
-    )
+    moved = t + 0.003 * scale * rng.normal(size=t.shape)
+    group = np.zeros(len(R), int) if shared else np.arange(len(R))
+    cameras = MetricCameras(turn @ R, moved, np.repeat(row, group.max() + 1, axis=0), group)
     many = np.tile(X, (copies, 1))
     xy = np.tile(tracks.xy, (copies, 1))
     xy[len(tracks.xy) :] += model.sigma_px * rng.normal(size=xy[len(tracks.xy) :].shape)
@@ -108,24 +129,26 @@ def ours(
     return refine_metric_bundle(cameras, X, seen, free=free, options=options)
 
 
-def check_same_problem(
-    model: Reconstruction, *, copies: int, loss: LossName, centre: bool, threads: int, repeats: int
-) -> list[Metric]:
+def check_same_problem(model: Reconstruction, case: Case, *, repeats: int) -> list[Metric]:
     """Cost, times, steps and what the two optima differ in, on one problem."""
-    cameras, X, seen = perturbed_model(model, np.random.default_rng(0), copies=copies)
-    free = WITH_CENTRE if centre else FOCAL_K1
+    rng = np.random.default_rng(0)
+    cameras, X, seen = perturbed_model(model, rng, copies=case.copies, shared=case.shared)
     size = tuple(int(s) for s in model.sizes[0])
-    wishes = CeresOptions(loss, LOSS_PX, centre, threads)
+    wishes = CeresOptions(case.loss, LOSS_PX, case.centre, case.threads)
     times: dict[str, list[tuple[float, float]]] = {OURS: [], CERES: []}
-    ours(cameras, X, seen, free, loss=loss, threads=threads)
+
+    def once() -> MetricBundleResult:
+        free = WITH_CENTRE if case.centre else FOCAL_K1
+        return ours(cameras, X, seen, free, loss=case.loss, threads=case.threads)
+
+    once()
     for _ in range(repeats):
-        mine, *spent = timed(lambda: ours(cameras, X, seen, free, loss=loss, threads=threads))
+        mine, *spent = timed(once)
         times[OURS].append((spent[0], spent[1]))
         theirs = refine_with_ceres(cameras, X, seen, (size[0], size[1]), wishes)
         times[CERES].append((theirs.wall_s, theirs.cpu_s))
     wall, cpu = ({k: float(np.median([s[n] for s in v])) for k, v in times.items()} for n in (0, 1))
-    what = "principal point free" if centre else "principal point fixed"
-    title = f"{2 * len(seen.xy)} residuals, {loss}, {what}, {threads} thread{'s' * (threads > 1)}"
+    title = case.title(len(seen.xy))
     focal = {OURS: mine.cameras.intrinsics[0, 0], CERES: theirs.cameras.intrinsics[0, 0]}
     over = mine.cost / theirs.cost - 1.0
     return [
@@ -135,7 +158,7 @@ def check_same_problem(
         Metric(title, "processor time", "s", cpu, OURS, cpu[CERES]),
         Metric(title, "wall time over Ceres'", "", {OURS: wall[OURS] / wall[CERES]}, OURS, 1.0),
         Metric(title, "linear systems", "", {OURS: mine.iterations, CERES: theirs.steps}, OURS),
-        Metric(title, "focal", "px", focal, OURS),
+        Metric(title, "focal of the first photograph", "px", focal, OURS),
     ]
 
 
@@ -293,6 +316,13 @@ def final_model(folder: Path | None, place: Path) -> Reconstruction:
     return reconstruction_from_colmap(read_colmap_model(folder))
 
 
+def wished_cases(wishes: argparse.Namespace) -> list[Case]:
+    """All combinations of what is asked for."""
+    kinds = [kind == "shared" for kind in wishes.cameras]
+    every = itertools.product(wishes.copies, wishes.threads, kinds, (False, True), wishes.losses)
+    return [Case(copies, loss, centre, threads, shared) for copies, threads, shared, centre, loss in every]
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Print the tables; 1 where a target is missed."""
     parser = argparse.ArgumentParser(prog="python -m validation.checks.bundle", description=__doc__)
@@ -303,6 +333,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--losses", nargs="+", default=list(LOSSES))
+    parser.add_argument("--cameras", nargs="+", default=["shared", "per-image"])
     parser.add_argument("--copies", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--sizes", type=int, nargs="+", default=[10, 100, 300, 1000])
     parser.add_argument("--methods", nargs="+", default=[OURS, "sparse", "iterative"])
@@ -318,14 +350,8 @@ def main(arguments: list[str] | None = None) -> int:
     if "same" in wishes.parts:
         with tempfile.TemporaryDirectory() as place:
             model = final_model(wishes.model, wishes.out or Path(place))
-        cases = [
-            (c, t, p, x) for c in wishes.copies for t in wishes.threads for p in (False, True) for x in LOSSES
-        ]
-        for copies, threads, centre, loss in cases:
-            block = check_same_problem(
-                model, copies=copies, loss=loss, centre=centre, threads=threads, repeats=wishes.repeats
-            )
-            rows += block
+        for case in wished_cases(wishes):
+            rows += (block := check_same_problem(model, case, repeats=wishes.repeats))
             print(f"\n{block[0].scene}\n", markdown_table(block), sep="\n", flush=True)
     if "covariance" in wishes.parts:
         rows += (block := check_covariance(wishes.trials))
