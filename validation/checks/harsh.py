@@ -43,6 +43,11 @@ class Trial:
     quiet: int
     doubts: tuple[str, ...]
 
+    @property
+    def is_lie(self) -> bool:
+        """Whether it is trusted, off, and does not say so."""
+        return self.said == "trusted" and self.quiet > 0
+
 
 def run_trial(kind: str, number: int) -> Trial:
     """One set from tracks to the self-check."""
@@ -55,14 +60,18 @@ def run_trial(kind: str, number: int) -> Trial:
     config = replace(config, intrinsics=replace(config.intrinsics, cameras=scene.told))
     matched = Matched(kind, tracks, pairs, scene.sizes, scene.focal_px)
     result, failures, _ = solve(matched, config, seed=number, first=0)
+    return judge(number, result, failures, matched)
+
+
+def judge(number: int, result: MetricResult | None, failures: Sequence[str], matched: Matched) -> Trial:
+    """What came of a set whose focals are known."""
     if result is None:
-        return Trial(number, "refused", 0, np.nan, np.nan, 0, failures[-1:])
+        return Trial(number, "refused", 0, np.nan, np.nan, 0, tuple(failures[-1:]))
     error, stated = focal_errors(result, matched)
     quiet = int(((error > OFF) & (error > stated)).sum())
     said = "trusted" if result.trusted else "doubted"
-    return Trial(
-        number, said, len(error), float(error.max()), float(np.median(error)), quiet, tuple(result.doubts)
-    )
+    worst, median = float(error.max()), float(np.median(error))
+    return Trial(number, said, len(error), worst, median, quiet, tuple(result.doubts))
 
 
 def verified_tracks(t: Tracks, pairs: Sequence[TwoView]) -> Tracks:
@@ -82,6 +91,15 @@ def focal_errors(result: MetricResult, matched: Matched) -> tuple[F64, F64]:
     value = np.array([interval.value for interval in found])
     error = np.abs(np.log(value / matched.focal_px[views]))
     return error, LEVEL * np.array([interval.std for interval in found]) / value
+
+
+def print_head() -> None:
+    """The first two lines of the table."""
+    print(
+        "| set | refused | doubted | doubted though within 3 % | trusted | their worst focal, median, % | "
+        "off by more than 3 % | and by more than the interval |"
+    )
+    print("| --- |" + " --- |" * 7, flush=True)
 
 
 def line_of(kind: str, trials: Sequence[Trial]) -> str:
@@ -105,11 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--kinds", nargs="+", help="words; the kinds that have one of them")
     wishes = parser.parse_args(arguments)
     kinds = [k for k in KINDS if wishes.kinds is None or any(word in k for word in wishes.kinds)]
-    print(
-        "| set | refused | doubted | doubted though within 3 % | trusted | their worst focal, median, % | "
-        "off by more than 3 % | and by more than the interval |"
-    )
-    print("| --- |" + " --- |" * 7, flush=True)
+    print_head()
     lies: list[str] = []
     total = 0
     with ProcessPoolExecutor(wishes.workers) as pool:
@@ -117,7 +131,7 @@ def main(arguments: list[str] | None = None) -> int:
             trials = list(pool.map(partial(run_trial, kind), range(wishes.trials)))
             print(line_of(kind, trials), flush=True)
             total += sum(t.said == "trusted" for t in trials)
-            found = [f"{kind}, {t}" for t in trials if t.said == "trusted" and t.quiet]
+            found = [f"{kind}, {t}" for t in trials if t.is_lie]
             print(*found, sep="\n", end="\n" if found else "", file=sys.stderr, flush=True)
             lies += found
     rows = [Metric(f"{total} trusted", "trusted, off and not said", "", {OURS: float(len(lies))}, OURS, 0.0)]
