@@ -190,7 +190,7 @@ class FakeMetric:
             "principal_y_px": IntrinsicInterval(40.0, 0.5, "fake"),
             "k1": IntrinsicInterval(0.0, 0.0, "fake"),
         }
-        metric = replace(reconstruction, stratum="metric", K=calibration.K, k1=np.zeros(views))
+        metric = replace(reconstruction, stratum="metric", K=calibration.K, radial=np.zeros((views, 3)))
         trusted = attempt >= self.trusted_from
         return MetricResult(metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else self.doubts)
 

@@ -210,9 +210,9 @@ class Reconstruction:
 
     ``P`` (V, 3, 4) (zeros where not ``registered``), ``X`` (N, 4) homogeneous (zeros where not ``valid``);
     ``inlier`` (K,) bool per observation; ``reasons`` per view, empty where registered. In the metric stratum
-    ``P = K [R t]`` before distortion, ``K`` (V, 3, 3) and ``k1`` (V,): a normalised image point (x, y) is
-    seen at (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6), r^2 = x^2 + y^2, before K, with k2 and k3 in ``lens``
-    (V, 2), 0 where it is None; ``X[:, 3] = 1`` where valid.
+    ``P = K [R t]`` before distortion, with ``K`` (V, 3, 3) and the coefficients k1, k2, k3 of the lens in
+    ``radial`` (V, 3), no distortion where that is None: a normalised image point (x, y) is seen at (x, y) (1
+    + k1 r^2 + k2 r^4 + k3 r^6), r^2 = x^2 + y^2, before K; ``X[:, 3] = 1`` where valid.
     """
 
     stratum: Stratum
@@ -226,13 +226,7 @@ class Reconstruction:
     sigma_px: float
     reasons: tuple[str, ...]
     K: F64 | None = None
-    k1: F64 | None = None
-    lens: F64 | None = None
-
-    def radial(self, i: int) -> F64:
-        """(k1, k2, k3) of view i, zeros where they are not known."""
-        k1 = 0.0 if self.k1 is None else float(self.k1[i])
-        return np.array([k1, *([0.0, 0.0] if self.lens is None else self.lens[i])])
+    radial: F64 | None = None
 
 
 @dataclass(frozen=True)

@@ -49,11 +49,11 @@ def test_noise_free_scene_comes_back_with_its_lens() -> None:
     r = result.reconstruction
     assert r.stratum == "metric"
     assert r.K is not None
-    assert r.k1 is not None
+    assert r.radial is not None
     # The prior of the principal point and of k1 pulls a little, hence not to rounding.
     np.testing.assert_allclose(r.K[:, 0, 0], 1500.0, rtol=1e-3)
     np.testing.assert_allclose(r.K[:, :2, 2] - scene.K[:, :2, 2], 0.0, atol=1.0)
-    np.testing.assert_allclose(r.k1, 0.03, atol=1e-3)
+    np.testing.assert_allclose(r.radial[:, 0], 0.03, atol=1e-3)
     assert centre_error(result, scene) < 1e-3
 
 

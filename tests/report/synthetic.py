@@ -99,7 +99,7 @@ def made_up_run(*, names: list[str] | None = None, points: int = 1500, seed: int
     count = len(names)
     X, colours = made_up_points(rng, points)
     cameras = made_up_cameras(count)
-    xy = [project_camera(K, R, t, X, k1=K1) for R, t in zip(*cameras, strict=True)]
+    xy = [project_camera(K, R, t, X, radial=K1) for R, t in zip(*cameras, strict=True)]
     seen = [((p > 5) & (p < np.array(SIZE) - 6)).all(axis=1) & (rng.random(points) < 0.7) for p in xy]
     reconstruction = _reconstruction(X, cameras, xy, seen, rng)
     photographs = tuple(
@@ -143,7 +143,7 @@ def projective_run() -> ReportData:
     data = made_up_run()
     assert data.metric is not None
     before = data.metric.reconstruction
-    undistorted = dataclasses.replace(before, stratum="projective", K=None, k1=None)
+    undistorted = dataclasses.replace(before, stratum="projective", K=None, radial=None)
     return dataclasses.replace(
         data, metric=None, colours=None, reconstruction=undistorted, until="projective"
     )
@@ -170,7 +170,7 @@ def _reconstruction(
         sigma_px=NOISE_PX,
         reasons=(*[""] * (count - 1), "only 14 matches lead to known points (20 are needed)"),
         K=np.tile(K, (count, 1, 1)) * registered[:, None, None],
-        k1=np.full(count, K1),
+        radial=np.tile([K1, 0.0, 0.0], (count, 1)),
     )
 
 

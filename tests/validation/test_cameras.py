@@ -35,7 +35,7 @@ def _reconstruction(truth: TrueCameras, *, k1: float = 0.0) -> Reconstruction:
     X = np.column_stack([shrink * rng.normal(0, 1, (N, 3)) @ turn.T + move, np.ones(N)])
     view, point = (grid.ravel() for grid in np.meshgrid(np.arange(V), np.arange(N)))
     xy = np.concatenate(
-        [project_camera(K, r, s, X[:, :3], k1=k1) for K, r, s in zip(truth.K, R, t, strict=True)]
+        [project_camera(K, r, s, X[:, :3], radial=k1) for K, r, s in zip(truth.K, R, t, strict=True)]
     )
     tracks = Tracks(view, point, xy.reshape(V, N, 2).transpose(1, 0, 2).reshape(-1, 2), V, N)
     every = np.ones
@@ -52,7 +52,7 @@ def _reconstruction(truth: TrueCameras, *, k1: float = 0.0) -> Reconstruction:
         0.1,
         ("",) * V,
         truth.K.copy(),
-        np.full(V, k1),
+        np.tile([k1, 0.0, 0.0], (V, 1)),
     )
 
 

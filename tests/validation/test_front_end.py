@@ -106,7 +106,7 @@ def _model_and_pair(k1: float, moved: float) -> tuple[Reconstruction, TwoView]:
         np.eye(3),
         np.array([[0.0] * 3, [-0.8, 0.0, 0.1]]),
     )
-    xy1, xy2 = (project_camera(K, R, t[i], X, k1=k1) for i in range(2))
+    xy1, xy2 = (project_camera(K, R, t[i], X, radial=k1) for i in range(2))
     nothing = np.zeros(0, dtype=np.int64)
     P = np.stack([compose_camera(K, R, t[0]), compose_camera(K, R, t[1] + [0.0, moved, 0.0])])
     model = Reconstruction(
@@ -121,7 +121,7 @@ def _model_and_pair(k1: float, moved: float) -> tuple[Reconstruction, TwoView]:
         sigma_px=0.1,
         reasons=("", ""),
         K=np.stack([K, K]),
-        k1=np.full(2, k1),
+        radial=np.tile([k1, 0.0, 0.0], (2, 1)),
     )
     index = np.arange(50)
     affine = np.broadcast_to(np.eye(2), (50, 2, 2))

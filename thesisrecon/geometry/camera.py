@@ -150,7 +150,7 @@ def _radial_factor(radial: float | F64, r2: F64) -> F64:
     return 1.0 + factor
 
 
-def project_camera(K: F64, R: F64, t: F64, X: F64, *, k1: float | F64 = 0.0) -> F64:
-    """Pixels (N, 2) of X (N, 3) seen by a metric camera with radial distortion k1 or (C,) coefficients."""
+def project_camera(K: F64, R: F64, t: F64, X: F64, *, radial: float | F64 = 0.0) -> F64:
+    """Pixels (N, 2) of X (N, 3) seen by a metric camera with the ``radial`` distortion of :func:`distort`."""
     normalized = dehomogenize(X @ R.T + t)
-    return distort(normalized, k1) @ K[:2, :2].T + K[:2, 2]
+    return distort(normalized, radial) @ K[:2, :2].T + K[:2, 2]

@@ -120,13 +120,16 @@ def _reproject(
 ) -> F64:
     xy = np.empty((len(view), 2))
     assert reconstruction.K is not None
+    lens = _lens(reconstruction)
     for i, (R, t) in poses.items():
         here = view == i
         Xh = reconstruction.X[point[here]]
-        xy[here] = project_camera(
-            reconstruction.K[i], R, t, Xh[:, :3] / Xh[:, 3:], k1=reconstruction.radial(i)
-        )
+        xy[here] = project_camera(reconstruction.K[i], R, t, Xh[:, :3] / Xh[:, 3:], radial=lens[i])
     return xy
+
+
+def _lens(reconstruction: Reconstruction) -> F64:
+    return np.zeros((len(reconstruction.P), 3)) if reconstruction.radial is None else reconstruction.radial
 
 
 def _cameras(
@@ -134,11 +137,12 @@ def _cameras(
 ) -> tuple[tuple[ColmapCamera, ...], dict[int, int]]:
     """One camera for each group and set of intrinsics in it, and the camera's number of each view."""
     assert reconstruction.K is not None
+    lens = _lens(reconstruction)
     cameras: dict[tuple[object, ...], ColmapCamera] = {}
     numbers = {}
     for i in np.flatnonzero(reconstruction.registered).tolist():
         width, height = (int(size) for size in sizes[i])
-        model, params = _camera_params(reconstruction.K[i], reconstruction.radial(i), scales[i])
+        model, params = _camera_params(reconstruction.K[i], lens[i], scales[i])
         key = (int(groups[i]), width, height, params)
         camera = cameras.setdefault(key, ColmapCamera(len(cameras) + 1, model, width, height, params))
         numbers[i] = camera.camera_id
@@ -265,8 +269,7 @@ def _with_observations(
         sigma_px=0.0,
         reasons=tuple("" if known else "not in the COLMAP model" for known in registered),
         K=K,
-        k1=radial[:, 0],
-        lens=radial[:, 1:] if radial[:, 1:].any() else None,
+        radial=radial,
     )
     # A model from elsewhere may hold points in a camera's plane, or so far away that their squares overflow.
     with np.errstate(all="ignore"):

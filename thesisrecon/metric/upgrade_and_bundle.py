@@ -200,6 +200,5 @@ def _as_reconstruction(model: MetricModel, reasons: list[str]) -> Reconstruction
         sigma,
         tuple(reasons),
         K,
-        radial[:, 0],
-        radial[:, 1:] if radial[:, 1:].any() else None,
+        radial,
     )

@@ -62,11 +62,11 @@ def _distances_in_view(reconstruction: Reconstruction, i: int, observations: I64
 def predicted_pixels(reconstruction: Reconstruction, i: int, X: F64) -> F64:
     """Pixels of homogeneous points X (N, 4) in view i, radial distortion included where known; (N, 2)."""
     P = reconstruction.P[i]
-    if reconstruction.K is None or reconstruction.k1 is None:
+    if reconstruction.K is None or reconstruction.radial is None:
         return project(P, X)
     K = reconstruction.K[i]
     normalized = dehomogenize(X @ np.linalg.solve(K, P).T)
-    pixels: F64 = distort(normalized, reconstruction.radial(i)) @ K[:2, :2].T + K[:2, 2]
+    pixels: F64 = distort(normalized, reconstruction.radial[i]) @ K[:2, :2].T + K[:2, 2]
     return pixels
 
 

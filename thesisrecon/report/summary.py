@@ -121,10 +121,10 @@ def _median(distances: F64) -> float | None:
 
 
 def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> dict[str, Any]:
-    """``cameras.json``: K, R (world-to-camera), t, centre and k1 of every registered view, in original
+    """``cameras.json``: K, R (world-to-camera), t, centre and lens of every registered view, in original
     pixels.
     """
-    if reconstruction.K is None or reconstruction.k1 is None:
+    if reconstruction.K is None or reconstruction.radial is None:
         raise ValueError(f"cameras_table needs a metric reconstruction; got {reconstruction.stratum}")
     cameras = []
     for i in np.flatnonzero(reconstruction.registered).tolist():
@@ -136,8 +136,7 @@ def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
                 "width": image.original_size[0],
                 "height": image.original_size[1],
                 "K": original_from_working(image.scale) @ K,
-                "k1": float(reconstruction.k1[i]),
-                "radial": reconstruction.radial(i),
+                "radial": reconstruction.radial[i],
                 "R": Rt[:, :3],
                 "t": Rt[:, 3],
                 "centre": -Rt[:, :3].T @ Rt[:, 3],

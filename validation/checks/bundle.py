@@ -79,8 +79,8 @@ def perturbed_model(
     scale = float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1)))
     turn = Rotation.from_rotvec(0.003 * rng.normal(size=t.shape)).as_matrix()
     assert model.K is not None
-    assert model.k1 is not None
-    K, k1 = model.K[0], float(np.atleast_1d(model.k1[0])[0])
+    assert model.radial is not None
+    K, k1 = model.K[0], float(model.radial[0, 0])
     row = np.array([[1.02 * K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], k1]])
     moved = t + 0.003 * scale * rng.normal(size=t.shape)
     group = np.zeros(len(R), int) if shared else np.arange(len(R))

@@ -98,10 +98,10 @@ def disagreement(view: TwoView, model: Reconstruction) -> float:
 
 def _undistorted(xy: F64, model: Reconstruction, i: int) -> F64:
     assert model.K is not None
-    if model.k1 is None:
+    if model.radial is None:
         return xy
     normalized = dehomogenize(homogenize(xy) @ np.linalg.inv(model.K[i]).T)
-    return dehomogenize(homogenize(undistort(normalized, model.radial(i))) @ model.K[i].T)
+    return dehomogenize(homogenize(undistort(normalized, model.radial[i])) @ model.K[i].T)
 
 
 def check_kermit(run: KermitRun) -> list[Metric]:

@@ -94,8 +94,8 @@ def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:
     for i, R, t in zip(views, rotations, translations, strict=True):
         here = kept & (tracks.view_index == i)
         X = reconstruction.X[tracks.point_index[here]]
-        radial = reconstruction.radial(int(i))
-        seen = project_camera(reconstruction.K[i], R, t, X[:, :3] / X[:, 3:], k1=radial)
+        radial = 0.0 if reconstruction.radial is None else reconstruction.radial[i]
+        seen = project_camera(reconstruction.K[i], R, t, X[:, :3] / X[:, 3:], radial=radial)
         distances.append(np.linalg.norm(seen - tracks.xy[here], axis=1))
     d = np.concatenate([*distances, np.zeros(0)])
     if len(d) == 0:

@@ -20,6 +20,7 @@ F64 = NDArray[np.float64]
 def model_from_reconstruction(found: Reconstruction, assumed: Assumptions) -> MetricModel:
     """The working model of a metric reconstruction."""
     assert found.K is not None
+    assert found.radial is not None
     views = found.registered
     K = np.where(views[:, None, None], found.K, np.eye(3))
     Q = np.linalg.inv(K) @ found.P
@@ -28,7 +29,7 @@ def model_from_reconstruction(found: Reconstruction, assumed: Assumptions) -> Me
     for g in range(len(rows)):
         mine = np.flatnonzero((group == g) & views)
         v = int(mine[0]) if len(mine) else int(np.flatnonzero(views)[0])
-        rows[g] = [K[v, 0, 0], K[v, 1, 1] / K[v, 0, 0], K[v, 0, 1], *K[v, :2, 2], *found.radial(v)]
+        rows[g] = [K[v, 0, 0], K[v, 1, 1] / K[v, 0, 0], K[v, 0, 1], *K[v, :2, 2], *found.radial[v]]
     cameras = MetricCameras(
         np.where(views[:, None, None], Q[:, :, :3], np.eye(3)), Q[:, :, 3], rows, group, shared
     )
