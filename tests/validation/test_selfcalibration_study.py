@@ -75,7 +75,7 @@ def test_a_cell_measures_every_method_on_the_same_draws(tmp_path) -> None:  # ty
     text = report(trials)
     assert "| scanned-quadric |" in text
     assert "| cloud, constant | 5 cameras, 0 px |" in text
-    assert "| draws | 2 |" in text
+    assert "| draws of the others | 2 |" in text
     file = tmp_path / "trials.jsonl"
     file.write_text("".join(json.dumps(asdict(t)) + "\n" for t in [*trials, *trials]), encoding="utf-8")
     assert len(read_trials([file])) == len(trials)

@@ -231,12 +231,17 @@ def _table(title: str, trials: Sequence[Trial], places: Sequence[tuple[float, in
         shown = [[t for t in cell if t.method == method] for cell in cells]
         if any(shown):
             lines.append(f"| {method} | {' | '.join(map(_entry, shown))} |")
-    return "\n".join([*lines, f"| draws | {' | '.join(map(_draws, cells))} |"])
+    whole = [[t for t in cell if t.method == WITH_BUNDLE] for cell in cells]
+    alone = [[t for t in cell if t.method not in (WITH_BUNDLE, BOUND)] for cell in cells]
+    for name, parts in (("draws of the whole", whole), ("draws of the others", alone)):
+        if any(parts):
+            lines.append(f"| {name} | {' | '.join(map(_draws, parts))} |")
+    return "\n".join(lines)
 
 
 def _draws(trials: Sequence[Trial]) -> str:
     """The number of draws that the entries of one column rest on."""
-    counts = Counter(t.method for t in trials if t.method != BOUND).values() or [0]
+    counts = Counter(t.method for t in trials).values() or [0]
     return f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
 
 
