@@ -148,28 +148,17 @@ def conclude(
     """
     if frame.assumed is None:
         raise ValueError("a conclusion needs a frame that knows what is assumed: see assumed_frame")
-    upgrades: list[Upgrade] = []
-    chosen: list[Answer] = []
-    for answer in sorted(answers, key=lambda a: a.cost):
-        if len(upgrades) == kept or not np.isfinite(answer.cost):
-            break
-        log_f = answer.log_focals(frame)
-        if any(np.abs(log_f - other.log_focals(frame)).max() < SAME_ANSWER for other in chosen):
-            continue
-        upgrade = upgrade_from_answer(frame, reconstruction, answer, min_positive)
-        if upgrade is not None:
-            upgrades.append(upgrade)
-            chosen.append(answer)
-    if not upgrades:
+    chosen = _distinct_upgrades(frame, reconstruction, answers, kept, min_positive)
+    if not chosen:
         said = verdict_without_an_answer(reconstruction, frame.assumed).sentences
         raise StageFailure(
             "no camera calibration puts the scene in front of all cameras",
             f"{len(answers)} answers were tried over {len(frame.views)} cameras",
             "; ".join(said) or "photograph the scene from more directions, turning the camera between shots",
         )
-    theta = np.concatenate([chosen[0].plane, chosen[0].log_focals(frame)])
+    answer, best = chosen[0]
+    theta = np.concatenate([answer.plane, answer.log_focals(frame)])
     std_log_f, _ = focal_std(criterion, frame, theta)
-    best = upgrades[0]
     verdict = judge_motion(reconstruction, best, frame.assumed)
     K_std = np.zeros_like(best.K)
     relative = np.minimum(std_log_f[frame.group], MAX_LOG_STD)
@@ -177,8 +166,29 @@ def conclude(
         K_std[frame.views, k, k] = best.K[frame.views, k, k] * relative
     return SelfCalibration(
         best.metric_from_projective, best.K, K_std, verdict.identifiable,
-        () if verdict.identifiable else verdict.sentences, tuple(upgrades), verdict,
+        () if verdict.identifiable else verdict.sentences, tuple(upgrade for _, upgrade in chosen), verdict,
     )  # fmt: skip
+
+
+def _distinct_upgrades(
+    frame: ReferenceFrame,
+    reconstruction: Reconstruction,
+    answers: Sequence[Answer],
+    kept: int,
+    min_positive: float,
+) -> list[tuple[Answer, Upgrade]]:
+    """The ``kept`` best answers of different focals that can be carried out, with their upgrades."""
+    chosen: list[tuple[Answer, Upgrade]] = []
+    for answer in sorted(answers, key=lambda a: a.cost):
+        if len(chosen) == kept or not np.isfinite(answer.cost):
+            break
+        log_f = answer.log_focals(frame)
+        if any(np.abs(log_f - other.log_focals(frame)).max() < SAME_ANSWER for other, _ in chosen):
+            continue
+        upgrade = upgrade_from_answer(frame, reconstruction, answer, min_positive)
+        if upgrade is not None:
+            chosen.append((answer, upgrade))
+    return chosen
 
 
 def upgrade_from_answer(

@@ -155,12 +155,6 @@ def _unit_of(assumed: Assumptions, sizes: I64) -> F64:
     return unit
 
 
-def metric_from_reference(p: F64, focal: float) -> F64:
-    """The upgrade H^-1 of a plane at infinity p (3,) and the reference camera's unit-free focal; -> (4,
-    4)."""
-    return metric_from_calibration(p, np.diag([focal, focal, 1.0]))
-
-
 def metric_from_calibration(p: F64, K: F64) -> F64:
     """The upgrade H^-1 (4, 4) of a plane at infinity p (3,) and the reference camera's unit-free K (3, 3).
 
