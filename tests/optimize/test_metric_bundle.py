@@ -4,6 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.optimize.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.alignment import estimate_similarity
+from thesisrecon.optimize import schur
 from thesisrecon.optimize.intrinsic_values import number_values
 from thesisrecon.optimize.metric_bundle import (
     BundleOptions,
@@ -12,6 +13,7 @@ from thesisrecon.optimize.metric_bundle import (
     Observations,
     refine_metric_bundle,
 )
+from thesisrecon.optimize.reduced_solvers import BandedCholesky, ConjugateGradients
 
 FOCAL = np.array([True, False, False, False, False, False])
 FOCAL_CENTRE_RADIAL = np.array([True, False, False, True, True, True])
@@ -47,6 +49,22 @@ def test_a_lens_of_three_coefficients_comes_back():
     np.testing.assert_allclose(result.cameras.intrinsics, block.cameras.intrinsics, rtol=5e-3, atol=2e-3)
     assert result.intrinsics_covariance.shape == (1, 8, 8)
     assert (np.diag(result.intrinsics_covariance[0])[3:] > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    "solver", [BandedCholesky(np.arange(6), 5), ConjugateGradients()], ids=["band", "cg"]
+)
+@pytest.mark.parametrize("groups", [1, 6])
+def test_every_solver_leads_to_the_same_optimum(monkeypatch, solver, groups):
+    block = make_block(k1=0.03, groups=groups, points=150)
+    cameras, X = perturbed(block)
+    seen = _seen(block, block.xy + 0.3 * np.random.default_rng(0).normal(size=block.xy.shape))
+    dense = _refine(cameras, X, seen, free=FOCAL_CENTRE_RADIAL, max_iterations=100)
+    monkeypatch.setattr(schur, "choose_solver", lambda *_: solver)
+    other = _refine(cameras, X, seen, free=FOCAL_CENTRE_RADIAL, max_iterations=100)
+    assert other.converged
+    assert other.cost == pytest.approx(dense.cost, rel=1e-6)
+    np.testing.assert_allclose(other.cameras.intrinsics[:, 0], dense.cameras.intrinsics[:, 0], rtol=1e-3)
 
 
 def test_cost_does_not_depend_on_the_frame():
