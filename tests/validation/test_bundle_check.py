@@ -56,8 +56,10 @@ def _model(block, sigma_px):
     tracks = Tracks(block.view, block.point, xy, V, N)
     sizes = np.tile([1030, 760], (V, 1))
     ones = np.ones(V, bool), np.ones(N, bool), np.ones(len(xy), bool)
-    k1 = np.full(V, c.intrinsics[0, 5])
-    return Reconstruction("metric", c.P, block.Xh, *ones, tracks, sizes, sigma_px, ("",) * V, c.K, k1)
+    radial = np.tile([c.intrinsics[0, 5], 0.0, 0.0], (V, 1))
+    return Reconstruction(
+        "metric", c.P, block.Xh, *ones, tracks, sizes, sigma_px, ("",) * V, K=c.K, radial=radial
+    )
 
 
 def test_a_model_is_perturbed_and_taken_several_times():
