@@ -1,0 +1,159 @@
+"""Surfaces of depth maps, one by one and fused, against shapes that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import camera_from_centre
+from thesisrecon.model import VolumetricFusion, keep_large_parts, surface_from_depth
+from thesisrecon.model.mesh import face_areas, parts_of
+from thesisrecon.types import F64, DepthMap, TexturedMesh
+
+K = np.array([[150.0, 0.0, 79.5], [0.0, 150.0, 59.5], [0.0, 0.0, 1.0]])
+SHAPE = (120, 160)
+
+
+def looking_at_origin(angle: float, height: float, distance: float) -> F64:
+    """P of a camera that looks at the origin from ``angle`` (rad) about the vertical."""
+    centre = np.array([np.sin(angle) * distance, height, -np.cos(angle) * distance])
+    forward = -centre / np.linalg.norm(centre)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    return camera_from_centre(K, np.stack([right, np.cross(forward, right), forward]), centre)
+
+
+def sphere_map(view: int, P: F64, *, noise: float = 0.0, seed: int = 0) -> DepthMap:
+    """Depth of the unit sphere; std as the noise, at least 1e-4."""
+    y, x = np.indices(SHAPE)
+    M = P[:, :3]
+    centre = -np.linalg.solve(M, P[:, 3])
+    rays = np.stack([x, y, np.ones(SHAPE)], axis=-1) @ np.linalg.inv(M).T
+    a, b, c = (rays**2).sum(-1), rays @ centre, centre @ centre - 1.0
+    under = b**2 - a * c
+    with np.errstate(invalid="ignore"):
+        depth = np.where(under > 0.0, (-b - np.sqrt(under)) / a, np.nan)
+    depth += noise * np.random.default_rng(seed + view).normal(size=SHAPE)
+    std = np.full(SHAPE, max(noise, 1e-4), dtype=np.float32)
+    return DepthMap(view, P, depth.astype(np.float32), std, np.ones(SHAPE, dtype=np.uint8))
+
+
+@pytest.fixture(scope="module")
+def ring() -> list[DepthMap]:
+    cameras = [looking_at_origin(k * np.pi / 4, 1.5 * (-1) ** k, 3.5) for k in range(8)]
+    return [sphere_map(k, P) for k, P in enumerate(cameras)]
+
+
+def outward(mesh: TexturedMesh) -> F64:
+    """Cosine between each face's normal and the direction from the origin."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    middle = (a + b + c) / 3.0
+    return (normal * middle).sum(1) / np.linalg.norm(normal, axis=1) / np.linalg.norm(middle, axis=1)
+
+
+def test_the_fused_sphere_is_round_closed_and_outward(ring: list[DepthMap]) -> None:
+    mesh = VolumetricFusion().fuse(ring)
+    footprint = 2.5 / 150.0
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    assert np.abs(radius - 1.0).max() < 1.5 * footprint  # at the silhouettes
+    assert np.median(np.abs(radius - 1.0)) < 0.1 * footprint
+    assert np.quantile(outward(mesh), 0.002) > 0.3
+    assert np.median(outward(mesh)) > 0.99
+    seen = np.abs(mesh.vertices[:, 1]) < 0.8
+    assert seen.mean() > 0.5
+    # In the zone that all views cover no face lacks a neighbour across any of its sides.
+    sides = np.sort(
+        np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1
+    )
+    inner = sides[seen[sides].all(axis=1)]
+    _, count = np.unique(inner, axis=0, return_counts=True)
+    assert (count == 2).mean() > 0.999
+    assert face_areas(mesh.vertices, mesh.faces).sum() == pytest.approx(4 * np.pi, rel=0.05)
+
+
+def test_fusion_averages_noise(ring: list[DepthMap]) -> None:
+    noise = 0.01
+    noisy = [sphere_map(m.view, m.P, noise=noise) for m in ring]
+    mesh = VolumetricFusion().fuse(noisy)
+    error = np.linalg.norm(mesh.vertices, axis=1) - 1.0
+    assert np.sqrt(np.mean(error**2)) < 0.5 * noise
+    assert abs(np.mean(error)) < 0.2 * noise
+
+
+def test_threads_change_nothing(ring: list[DepthMap]) -> None:
+    one, two = (VolumetricFusion().fuse(ring[:3], threads=n) for n in (1, 2))
+    np.testing.assert_array_equal(one.vertices, two.vertices)
+    np.testing.assert_array_equal(one.faces, two.faces)
+
+
+def test_memory_is_kept_by_larger_voxels(ring: list[DepthMap]) -> None:
+    fine = VolumetricFusion().fuse(ring[:2])
+    coarse = VolumetricFusion(max_blocks=150).fuse(ring[:2])
+    assert 0 < len(coarse.faces) < 0.5 * len(fine.faces)
+
+
+def test_what_views_look_through_is_removed(ring: list[DepthMap]) -> None:
+    """A wrong blob in one view, in empty space that the others see the sphere through."""
+    depth = ring[0].depth.copy()
+    depth[50:60, 70:80] -= 0.3
+    spoiled = DepthMap(0, ring[0].P, depth, ring[0].std, ring[0].views)
+    alone, beside = VolumetricFusion(), sphere_map(8, looking_at_origin(0.25, 1.5, 3.5))
+    assert (np.linalg.norm(alone.fuse([spoiled]).vertices, axis=1) > 1.1).mean() > 0.01
+    mesh = alone.fuse([spoiled, beside])
+    assert (np.linalg.norm(mesh.vertices, axis=1) > 1.1).mean() < 1e-3
+
+
+def test_hopeless_maps_are_refused(ring: list[DepthMap]) -> None:
+    empty = DepthMap(0, ring[0].P, np.full(SHAPE, np.nan, np.float32), ring[0].std, ring[0].views)
+    with pytest.raises(StageFailure, match="no surface"):
+        VolumetricFusion().fuse([empty])
+    vague = DepthMap(0, ring[0].P, ring[0].depth, np.full(SHAPE, 10.0, np.float32), ring[0].views)
+    with pytest.raises(StageFailure, match="no surface"):
+        VolumetricFusion().fuse([vague])
+
+
+def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges() -> None:
+    P = looking_at_origin(0.3, 0.0, 3.5)
+    given = sphere_map(0, P)
+    behind = np.where(np.isnan(given.depth), np.float32(6.0), given.depth)
+    mesh = surface_from_depth(DepthMap(0, P, behind, given.std, given.views))
+    xyz = mesh.vertices @ P[:, :3].T + P[:, 3]
+    x, y = np.rint(xyz[:, 0] / xyz[:, 2]).astype(int), np.rint(xyz[:, 1] / xyz[:, 2]).astype(int)
+    np.testing.assert_allclose(xyz[:, 2], behind[y, x], rtol=1e-6)
+    on_sphere = np.linalg.norm(mesh.vertices, axis=1) < 1.01
+    mixed = on_sphere[mesh.faces].any(axis=1) & ~on_sphere[mesh.faces].all(axis=1)
+    assert not mixed.any()
+    # Seen by the camera every face is anticlockwise: its normal looks back.
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    centre = -np.linalg.solve(P[:, :3], P[:, 3])
+    assert ((np.cross(b - a, c - a) * (centre - a)).sum(1) > 0).all()
+    part = parts_of(mesh.faces, len(mesh.vertices))
+    assert len(np.unique(part)) == 2
+
+
+def test_holes_stay_holes_and_steps_thin_out() -> None:
+    P = looking_at_origin(0.0, 0.0, 3.5)
+    given = sphere_map(0, P)
+    full, coarse = surface_from_depth(given), surface_from_depth(given, step=3)
+    assert len(coarse.faces) == pytest.approx(len(full.faces) / 9, rel=0.15)
+    depth = given.depth.copy()
+    depth[55:65, 75:85] = np.nan
+    holed = surface_from_depth(DepthMap(0, P, depth, given.std, given.views))
+    assert len(full.faces) - len(holed.faces) == 2 * 11 * 11 - 4  # the corners keep a half
+    with pytest.raises(ValueError, match="step >= 1"):
+        surface_from_depth(given, step=0)
+
+
+def test_crumbs_are_dropped() -> None:
+    grid = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    vertices = np.concatenate([grid, 0.01 * grid + 5.0])
+    faces = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6]])
+    mesh = keep_large_parts(TexturedMesh(vertices, faces, colors=np.arange(24, dtype=np.uint8).reshape(8, 3)))
+    assert len(mesh.vertices) == 4
+    np.testing.assert_array_equal(mesh.faces, faces[:2])
+    assert mesh.colors is not None
+    np.testing.assert_array_equal(mesh.colors, np.arange(12).reshape(4, 3))
+    empty = TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    assert keep_large_parts(empty) is empty

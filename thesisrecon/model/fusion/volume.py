@@ -1,0 +1,204 @@
+"""Depth maps fused in a sparse grid of signed distances, and the surface in it.
+
+Each voxel holds the weighted mean of the distances that the views measure (Curless and Levoy 1996), views
+that look past it count as well, and the surface is where the mean is 0. Only blocks of voxels that a depth
+map comes near to exist. The surface is taken out as a net (Gibson 1998): one vertex a cell, which unlike
+the corners of marching cubes makes no slivers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import decompose_camera
+from thesisrecon.model.fusion.kernels import (
+    SIDE,
+    integrate_view,
+    join_vertices,
+    place_vertices,
+    touched_blocks,
+)
+from thesisrecon.model.mesh import keep_large_parts, without_unused_vertices
+from thesisrecon.types import F32, F64, I64, DepthMap, TexturedMesh
+
+FINER = 1.15
+"""Factor by which voxels grow until their blocks fit into the memory that is allowed."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where the blocks are: ``origin`` (3,) of the first voxel's centre, ``voxel`` side, ``blocks`` (B, 3)
+    grid places in their order, ``place`` (X, Y, Z) the number of the block at each place or -1."""
+
+    origin: F64
+    voxel: float
+    blocks: I64
+    place: I64
+
+
+@dataclass(frozen=True)
+class VolumetricFusion:
+    """One surface from several depth maps.
+
+    ``voxel_px``: side of a voxel in pixels of the depth maps, at the median over all their pixels.
+    ``truncation_voxels``: distances are cut at this many voxels; depths that are less certain take no part.
+    ``max_blocks``: of 8 x 8 x 8 voxels, 4 kB each; voxels grow until that is enough. ``grazing_deg``:
+    surfaces seen more flatly break. ``least_part``: connected parts below this share of the area are dropped.
+    """
+
+    voxel_px: float = 1.5
+    truncation_voxels: float = 4.0
+    max_blocks: int = 250_000
+    grazing_deg: float = 10.0
+    least_part: float = 0.002
+
+    def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
+        """The surface, without colours; faces anticlockwise seen from where the views look at it.
+
+        The result does not depend on ``threads``. Raises :class:`StageFailure` where the maps have no depth.
+        """
+        depth_maps = [_facing(depth_map, self._slope(depth_map)) for depth_map in depth_maps]
+        with ThreadPoolExecutor(max(threads, 1)) as pool:
+            grid, truncation = self._lay_out(depth_maps)
+            value = np.zeros((len(grid.blocks), SIDE, SIDE, SIDE), dtype=np.float32)
+            weight = np.zeros_like(value)
+            parts = np.array_split(np.arange(len(grid.blocks)), 4 * max(threads, 1))
+
+            def integrate(part: I64) -> None:
+                if len(part):
+                    some = slice(int(part[0]), int(part[-1]) + 1)
+                    for depth_map in depth_maps:
+                        self._integrate(grid, truncation, depth_map, some, value, weight)
+
+            list(pool.map(integrate, parts))
+        mesh = extract_surface(grid, value, weight)
+        if not len(mesh.faces):
+            raise _nothing()
+        return keep_large_parts(mesh, self.least_part)
+
+    def _lay_out(self, depth_maps: Sequence[DepthMap]) -> tuple[Grid, float]:
+        """The blocks that the surface may pass, and where distances are cut."""
+        footprints = [_footprint(m)[np.isfinite(m.depth)] for m in depth_maps]
+        if not sum(map(len, footprints)):
+            raise _nothing()
+        voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
+        while True:
+            truncation = self.truncation_voxels * voxel
+            sure = [_sure(m, truncation) for m in depth_maps]
+            grid = _grid(depth_maps, sure, voxel, truncation)
+            if grid is not None and len(grid.blocks) <= self.max_blocks:
+                return grid, truncation
+            voxel *= FINER
+
+    def _slope(self, depth_map: DepthMap) -> float:
+        """Largest step in depth from one pixel to the next on one surface, in units of the depth."""
+        return float(1.0 / (_focal(depth_map) * np.tan(np.radians(self.grazing_deg))))
+
+    def _integrate(
+        self, grid: Grid, truncation: float, depth_map: DepthMap, some: slice, value: F32, weight: F32
+    ) -> None:
+        K, R, t = decompose_camera(depth_map.P)
+        P = K @ np.column_stack([R, t + R @ grid.origin])
+        depth, slope = _sure(depth_map, truncation), self._slope(depth_map)
+        integrate_view(
+            grid.blocks[some],
+            P,
+            grid.voxel,
+            depth,
+            depth_map.std,
+            slope,
+            truncation,
+            value[some],
+            weight[some],
+        )
+
+
+def _nothing() -> StageFailure:
+    return StageFailure(
+        "no surface could be made",
+        "the depth maps have no depths that agree",
+        "take photographs of a scene with texture, from places nearer to each other",
+    )
+
+
+def _sure(depth_map: DepthMap, truncation: float) -> F32:
+    """Depths (H, W) without those whose deviation a grid of this resolution cannot hold."""
+    with np.errstate(invalid="ignore"):
+        return np.where(depth_map.std <= truncation, depth_map.depth, np.float32(np.nan))
+
+
+def _footprint(depth_map: DepthMap) -> F32:
+    """(H, W) width of a pixel at its depth."""
+    return np.asarray(depth_map.depth / np.float32(_focal(depth_map)))
+
+
+def _focal(depth_map: DepthMap) -> float:
+    K = decompose_camera(depth_map.P)[0]
+    return float(np.sqrt(K[0, 0] * K[1, 1]))
+
+
+def _facing(depth_map: DepthMap, slope: float) -> DepthMap:
+    """The map without pixels whose surface is seen too flatly: their depths blend into what lies behind.
+
+    The gentler of the steps to the two neighbours counts, so that the border of something in front stays.
+    """
+    depth = depth_map.depth
+    steepest = np.zeros_like(depth)
+    for axis in (0, 1):
+        step = np.abs(np.diff(depth, axis=axis))
+        before = np.insert(step, 0, np.nan, axis=axis)
+        after = np.insert(step, step.shape[axis], np.nan, axis=axis)
+        steepest = np.hypot(steepest, np.nan_to_num(np.fmin(before, after)))
+    with np.errstate(invalid="ignore"):
+        flat = steepest > np.maximum(slope * depth, 3.0 * depth_map.std)
+    return replace(depth_map, depth=np.where(flat, np.float32(np.nan), depth))
+
+
+def _grid(depth_maps: Sequence[DepthMap], sure: Sequence[F32], voxel: float, reach: float) -> Grid | None:
+    """The blocks within ``reach`` of any depth; None where the box about them is too large to be listed."""
+    rays = [_rays(m.P) for m in depth_maps]
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for depth, (directions, centre) in zip(sure, rays, strict=True):
+        y, x = np.nonzero(np.isfinite(depth))
+        xyz = centre + depth[y, x, None] * (np.stack([x, y, np.ones_like(x)], axis=1) @ directions.T)
+        if len(xyz):
+            low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
+    if not np.isfinite(low).all():
+        raise _nothing()
+    edge = SIDE * voxel
+    origin = low - 2.0 * reach
+    shape = np.ceil((high - low + 4.0 * reach) / edge).astype(int) + 1
+    if np.prod(shape.astype(float)) > 2e8:
+        return None
+    marked = np.zeros(tuple(shape), dtype=np.uint8)
+    for depth, (directions, centre) in zip(sure, rays, strict=True):
+        touched_blocks(depth, directions, centre - origin, reach, edge, marked)
+    blocks = np.argwhere(marked).astype(np.int64)
+    place = np.full(marked.shape, -1, dtype=np.int64)
+    place[tuple(blocks.T)] = np.arange(len(blocks))
+    return Grid(origin, voxel, blocks, place)
+
+
+def _rays(P: F64) -> tuple[F64, F64]:
+    """What takes (x, y, 1) to the point at depth 1 less the centre (3, 3), and the centre (3,)."""
+    K, R, t = decompose_camera(P)
+    return np.ascontiguousarray(R.T @ np.linalg.inv(K)), -R.T @ t
+
+
+def extract_surface(grid: Grid, value: F32, weight: F32) -> TexturedMesh:
+    """The zero of ``value`` (B, 8, 8, 8) where ``weight`` is positive, as a net of triangles."""
+    vertex = np.empty(value.shape, dtype=np.int64)
+    count = place_vertices(grid.blocks, grid.place, value, weight, vertex, np.zeros((0, 3)))
+    points = np.zeros((count, 3))
+    place_vertices(grid.blocks, grid.place, value, weight, vertex, points)
+    nothing = np.zeros((0, 3), dtype=np.int64)
+    faces = np.zeros(
+        (join_vertices(grid.blocks, grid.place, value, weight, vertex, points, nothing), 3), np.int64
+    )
+    join_vertices(grid.blocks, grid.place, value, weight, vertex, points, faces)
+    return without_unused_vertices(TexturedMesh(grid.origin + grid.voxel * points, faces))
