@@ -1,7 +1,6 @@
 """Sections 1.2, 1.3 and 2.6: new views of a model or between photographs."""
 
-from thesisrecon.views.camera import PinholeCamera
 from thesisrecon.views.render import render
 from thesisrecon.views.shading import Light, Shading
 
-__all__ = ["Light", "PinholeCamera", "Shading", "render"]
+__all__ = ["Light", "Shading", "render"]

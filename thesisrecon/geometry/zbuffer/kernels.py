@@ -1,4 +1,4 @@
-"""Compiled loops of the renderer; each has a plain twin in the tests."""
+"""Compiled loops of the z-buffer; each has a plain twin in the tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera that a view is rendered from."""
+"""A camera without distortion, with the size of its picture."""
 
 from __future__ import annotations
 
