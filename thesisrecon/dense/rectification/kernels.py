@@ -1,0 +1,89 @@
+"""Compiled resampling of an image at given places; its NumPy twin stands in the tests."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.types import F32, F64
+
+MOST_TAPS = 24
+"""Taps along an axis: images that shrink more than sixfold are undersampled from there on."""
+
+
+@njit(cache=True, nogil=True)
+def _cubic(x: float) -> float:
+    """Keys' cubic convolution kernel, a = -1/2: third-order accurate, 0 beyond 2."""
+    x = abs(x)
+    if x < 1.0:
+        return (1.5 * x - 2.5) * x * x + 1.0
+    if x < 2.0:
+        return ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0
+    return 0.0
+
+
+@njit(cache=True, nogil=True)
+def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
+    """Weights of the pixels around ``at``, the kernel ``spread`` times as wide; the first, how many."""
+    reach = min(2.0 * spread, 0.5 * MOST_TAPS - 1.0)
+    first = int(np.ceil(at - reach))
+    count = int(np.floor(at + reach)) - first + 1
+    total = 0.0
+    for k in range(count):
+        weights[k] = _cubic((first + k - at) / spread)
+        total += weights[k]
+    for k in range(count):
+        weights[k] /= total
+    return first, count
+
+
+@njit(cache=True, nogil=True)
+def sample_image(image: F32, xy: F64, out: F32) -> None:
+    """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C); NaN outside.
+
+    ``xy`` holds the places of neighbouring pixels, and may have a row more than ``out``: where neighbours lie
+    farther apart than a pixel the kernel is widened along each axis of the image by as much, so that nothing
+    finer than what ``out`` can show passes. NaN where xy is NaN, beyond the centres of the border pixels, or
+    where one of the four pixels around is NaN; others that are NaN are left out.
+    """
+    height, width, channels = image.shape
+    rows, columns = xy.shape[0], xy.shape[1]
+    wx, wy = np.empty(MOST_TAPS), np.empty(MOST_TAPS)
+    total = np.empty(channels)
+    for i in range(out.shape[0]):
+        for j in range(columns):
+            out[i, j] = np.nan
+            x, y = xy[i, j, 0], xy[i, j, 1]
+            # Rounding of the lookup must not cut off the border pixels.
+            if not (x > -1e-6 and y > -1e-6 and x < width - 1 + 1e-6 and y < height - 1 + 1e-6):
+                continue
+            di = 1 if i + 1 < rows else -1
+            dj = 1 if j + 1 < columns else -1
+            across = xy[i, j + dj] - xy[i, j] if j + dj >= 0 else xy[i, j] * 0.0
+            down = xy[i + di, j] - xy[i, j] if i + di >= 0 else xy[i, j] * 0.0
+            spread_x = np.hypot(across[0], down[0])
+            spread_y = np.hypot(across[1], down[1])
+            # The comparison is false for NaN, too: at the rim of the lookup.
+            spread_x = spread_x if spread_x > 1.0 else 1.0
+            spread_y = spread_y if spread_y > 1.0 else 1.0
+            left, n_x = _taps(x, spread_x, wx)
+            top, n_y = _taps(y, spread_y, wy)
+            x0, y0 = min(max(int(x), 0), width - 1), min(max(int(y), 0), height - 1)
+            x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
+            near = image[y0, x0, 0] + image[y0, x1, 0] + image[y1, x0, 0] + image[y1, x1, 0]
+            if np.isnan(near):
+                continue
+            weight = 0.0
+            total[:] = 0.0
+            for k in range(n_y):
+                v = min(max(top + k, 0), height - 1)
+                for l in range(n_x):
+                    u = min(max(left + l, 0), width - 1)
+                    if np.isnan(image[v, u, 0]):
+                        continue
+                    w = wy[k] * wx[l]
+                    weight += w
+                    for c in range(channels):
+                        total[c] += w * image[v, u, c]
+            for c in range(channels):
+                out[i, j, c] = total[c] / weight

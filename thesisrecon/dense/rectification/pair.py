@@ -1,0 +1,308 @@
+"""What a pair of views gives to every way of rectifying it, and the refusal of pairs that cannot be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thesisrecon.dense.rectification.pencil import EpipolarPencil, orient, pencil_of_fundamental
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import camera_centre, project
+from thesisrecon.geometry.cheirality import depth
+from thesisrecon.geometry.homogeneous import require_finite
+from thesisrecon.geometry.homographies import infinite_homography
+from thesisrecon.geometry.multiview import (
+    canonical_cameras,
+    estimate_homography,
+    fundamental_from_cameras,
+    homography_residuals,
+    rotation_planes,
+    sampson_residuals,
+)
+from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.types import F64
+
+Size = tuple[int, int]
+
+LEAST_MATCHES = 8
+SAME_HALF = 0.8
+"""Share of matches that must lie on the same half of their epipolar lines: wrong ones do by chance."""
+PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
+"""Displacements that no homography explains, 90 % quantile, over the distances from the epipolar lines."""
+SAMPLES = 24
+"""Places along either side of a photograph at which distortion is measured."""
+
+
+@dataclass(frozen=True)
+class EpipolarPair:
+    """A pair ready for rectification.
+
+    ``pencil`` oriented, and turned such that larger disparities are nearer; ``xy1``, ``xy2`` (N, 2) px
+    matches, perhaps none; ``arc`` the half-planes, in increasing phi, that both photographs see; ``regions``
+    two (M, 2) px samples of what either photograph shows of them, first the corners of that polygon;
+    ``cameras`` (2, 3, 4) where they are known.
+    """
+
+    pencil: EpipolarPencil
+    xy1: F64
+    xy2: F64
+    arc: tuple[float, float]
+    regions: tuple[F64, F64]
+    cameras: F64 | None = None
+
+    @property
+    def sizes(self) -> tuple[Size, Size]:
+        """(width, height) of the photographs."""
+        return self.pencil.sizes
+
+    @property
+    def matches(self) -> tuple[F64, F64]:
+        """Matches of either side."""
+        return self.xy1, self.xy2
+
+
+def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
+    """The pair of F (3, 3) and its inliers (N, 2) px.
+
+    Which disparities are nearer follows from cameras with a usual focal length (quasi-Euclidean frame), with
+    every point in front. Raises ``ValueError`` for wrong shapes, numbers that are not finite and sizes below
+    2 px; ``StageFailure`` for fewer than 8 matches, an F of rank 1, matches that a homography explains and
+    matches on opposite halves of their epipolar lines.
+    """
+    sizes = _checked_sizes(size1, size2)
+    xy1, xy2 = _checked_matches(xy1, xy2)
+    F = np.asarray(F, dtype=np.float64)
+    if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
+        raise ValueError(f"rectification needs a finite F (3, 3) that is not zero; got shape {F.shape}")
+    if len(xy1) < LEAST_MATCHES:
+        raise StageFailure(
+            "the pair has too few matches to rectify it",
+            f"{len(xy1)} matches, needed at least {LEAST_MATCHES}",
+            "match the photographs anew, or rectify from cameras",
+        )
+    pencil, ratio = pencil_of_fundamental(F, sizes)
+    if not ratio > 1e-9:
+        raise StageFailure(
+            "the fundamental matrix has rank 1 and no epipolar lines",
+            f"its second singular value is {ratio:.1g} of the first",
+            "estimate it from more matches",
+        )
+    _require_parallax(F, xy1, xy2, None)
+    return _complete(pencil, xy1, xy2, None)
+
+
+def pair_of_cameras(
+    P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
+) -> EpipolarPair:
+    """The pair of two metric cameras (3, 4), P = K [R t] with points in front where P[2] X > 0.
+
+    Matches (N, 2) px are of use for the range of disparities but need not be given. Raises ``ValueError`` as
+    :func:`pair_of_fundamental`; ``StageFailure`` where the centres coincide or the matches do not move but
+    by the noise, and where nothing is in front of both cameras.
+    """
+    sizes = _checked_sizes(size1, size2)
+    none = np.empty((0, 2))
+    xy1, xy2 = _checked_matches(none if xy1 is None else xy1, none if xy2 is None else xy2)
+    P = np.stack([np.asarray(P1, dtype=np.float64), np.asarray(P2, dtype=np.float64)])
+    if P.shape != (2, 3, 4):
+        raise ValueError(f"rectification needs two cameras (3, 4); got {P.shape[1:]}")
+    require_finite("rectification", P)
+    det = np.linalg.det(P[:, :, :3])
+    if not (np.abs(det) > 1e-14 * np.linalg.norm(P[:, :, :3], axis=(1, 2)) ** 3).all():
+        raise ValueError("rectification needs finite cameras; the left part of one is singular")
+    P = P * np.sign(det)[:, None, None]
+    F = _fundamental(P)
+    if len(xy1) >= LEAST_MATCHES:
+        _require_parallax(F, xy1, xy2, infinite_homography(P[0], P[1]))
+    return _complete(pencil_of_fundamental(F, sizes)[0], xy1, xy2, P)
+
+
+def _fundamental(P: F64) -> F64:
+    centres = np.stack([camera_centre(camera) for camera in P])
+    places = centres[:, :3] / centres[:, 3:]
+    apart = float(np.linalg.norm(places[1] - places[0]))
+    if not apart > 1e-12 * (1.0 + float(np.abs(places).max())):
+        raise StageFailure(
+            "the cameras have one centre and no epipolar lines",
+            f"their centres are {apart:.1g} apart",
+            "take photographs from different places, or other views",
+        )
+    return fundamental_from_cameras(P[0], P[1])
+
+
+def _checked_sizes(size1: Size, size2: Size) -> tuple[Size, Size]:
+    sizes = []
+    for size in (size1, size2):
+        if len(size) != 2 or not all(float(side).is_integer() and side >= 2 for side in size):
+            raise ValueError(f"a photograph to rectify is at least 2 x 2 px; got {tuple(size)}")
+        sizes.append((int(size[0]), int(size[1])))
+    return sizes[0], sizes[1]
+
+
+def _checked_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
+    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
+    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
+        raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
+    require_finite("rectification, for its matches,", xy1, xy2)
+    return xy1, xy2
+
+
+def _require_parallax(F: F64, xy1: F64, xy2: F64, at_infinity: F64 | None) -> None:
+    """Refuse matches that one homography takes to each other: F is then any, and no depth is to be had."""
+    noise = float(np.quantile(np.abs(sampson_residuals(F, xy1, xy2)), 0.9))
+    H, kept = at_infinity, np.ones(len(xy1), dtype=bool)
+    residuals = np.zeros(len(xy1))
+    for _ in range(1 if at_infinity is not None else 3):
+        if at_infinity is None:
+            H = estimate_homography(xy1[kept], xy2[kept])
+        assert H is not None
+        residuals = homography_residuals(H, xy1, xy2)
+        kept = residuals <= np.quantile(residuals, 0.9)
+    parallax = float(np.quantile(residuals, 0.9))
+    if parallax > PARALLAX_PER_NOISE * noise + LEAST_PARALLAX_PX:
+        return
+    what = "a scene at infinity" if at_infinity is not None else "one homography"
+    raise StageFailure(
+        "the photographs show no parallax: the camera only turned, or the scene is a plane or too far away",
+        f"{what} explains 90 % of {len(xy1)} matches to {parallax:.2g} px, the noise being {noise:.2g} px",
+        "take photographs from places farther apart"
+        + ("" if at_infinity is not None else ", or rectify from cameras if the scene is a plane"),
+    )
+
+
+def _complete(pencil: EpipolarPencil, xy1: F64, xy2: F64, P: F64 | None) -> EpipolarPair:
+    """Orientation, direction of disparities, and what both photographs see."""
+    seen1, seen2, P_z = (xy1, xy2, None) if P is None else _virtual_matches(pencil, P)
+    pencil, share = orient(pencil, seen1, seen2)
+    if share < SAME_HALF:
+        raise StageFailure(
+            "matches lie on opposite halves of their epipolar lines, which no scene shows",
+            f"only {100.0 * share:.0f} % of {len(seen1)} agree on the halves",
+            "the fundamental matrix or the matches are wrong; estimate them anew",
+        )
+    P_z = _quasi_euclidean(pencil, xy1, xy2) if P_z is None else P_z
+    pencil = replace(pencil, turned=not _farther_is_along(pencil, P_z, seen1, seen2))
+    arc = _common_arc(pencil, xy1)
+    regions = (_region(pencil, 0, arc), _region(pencil, 1, arc))
+    return EpipolarPair(pencil, xy1, xy2, arc, regions, P)
+
+
+def _places_from_pixels(pencil: EpipolarPencil, side: int) -> F64:
+    s, c = 1.0 / pencil.units[side], pencil.centres[side]
+    return np.array([[s, 0.0, -s * c[0]], [0.0, s, -s * c[1]], [0.0, 0.0, 1.0]])
+
+
+def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[F64, F64, F64]:
+    """Pixels of points at many depths in front of both cameras, and the cameras in places."""
+    (width, height), centres = pencil.sizes[0], np.stack([camera_centre(camera) for camera in P])
+    C = centres[:, :3] / centres[:, 3:]
+    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 7), np.linspace(0, height - 1, 7)), -1).reshape(
+        -1, 2
+    )
+    rays = np.linalg.solve(P[0, :, :3], np.column_stack([grid, np.ones(len(grid))]).T).T
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    steps = np.linalg.norm(C[1] - C[0]) * np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0, 256.0])
+    X = (C[0] + steps[:, None, None] * rays).reshape(-1, 3)
+    X = X[np.column_stack([X, np.ones(len(X))]) @ P[1, 2] > 0.0]
+    if len(X) == 0:
+        raise StageFailure(
+            "nothing is in front of both cameras", "they look away from each other", "choose another pair"
+        )
+    z = np.stack([_places_from_pixels(pencil, side) @ P[side] for side in (0, 1)])
+    return project(P[0], X), project(P[1], X), z
+
+
+def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
+    """Two cameras (2, 3, 4) in places with the pencil's F: of four candidates the one with most in front."""
+    z = np.stack([pencil.places(0, xy1), pencil.places(1, xy2)])
+    L1, L2 = pencil.lines
+    F = L2 @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ L1.T
+    best, most = np.empty((2, 3, 4)), -1
+    for plane in rotation_planes(F):
+        for scale in (1.0, -1.0):
+            P = np.stack(canonical_cameras(F, plane=plane, scale=scale))
+            X = triangulate_linear(P, z)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                front = int(np.sum((depth(X, P[0]) > 0.0) & (depth(X, P[1]) > 0.0)))
+            if front > most:
+                best, most = P, front
+    return best
+
+
+def _farther_is_along(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> bool:
+    """Whether points that recede along their rays of view 1 move along the half-lines of view 2."""
+    z = np.stack([pencil.places(0, xy1), pencil.places(1, xy2)])
+    X = triangulate_linear(P, z)
+    centre = camera_centre(P[0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        point, C = X[:, :3] / X[:, 3:], centre[:3] / centre[3]
+        moved = project(P[1], C + 1.001 * (point - C)) - project(P[1], point)
+        direction = pencil.half_lines(1, pencil.angles(1, xy2)).direction
+        steps = np.sum(moved * direction, axis=1)
+    return bool(np.nansum(np.sign(steps)) >= 0.0)
+
+
+def _common_arc(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
+    """The interval of phi that both photographs see."""
+    arcs = [_arc(pencil, side) for side in (0, 1)]
+    if arcs[0] is None and arcs[1] is None:
+        return _full_circle(pencil, xy1)
+    if arcs[0] is None or arcs[1] is None:
+        one = arcs[0] if arcs[0] is not None else arcs[1]
+        assert one is not None
+        return one
+    (a, b), (c, d) = arcs[0], arcs[1]
+    turn = 2.0 * np.pi * np.round((0.5 * (a + b) - 0.5 * (c + d)) / (2.0 * np.pi))
+    low, high = max(a, c + turn), min(b, d + turn)
+    if not high > low:
+        raise StageFailure(
+            "the photographs share no epipolar line",
+            "no half-plane through the baseline is seen in both",
+            "the fundamental matrix is wrong, or the views do not overlap; choose another pair",
+        )
+    return low, high
+
+
+def _arc(pencil: EpipolarPencil, side: int) -> tuple[float, float] | None:
+    """The interval of phi that a photograph sees, None for all of the circle (the epipole is inside)."""
+    width, height = pencil.sizes[side]
+    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
+    e = pencil.epipole(side)
+    if abs(e[2]) > 1e-12 * np.hypot(e[0], e[1]):
+        inside = pencil.pixels(side, e[:2] / e[2])
+        if (inside >= 0.0).all() and (inside <= corners[2]).all():
+            return None
+    # Half-lines away from an epipole outside sweep a convex photograph within half a turn.
+    about = float(pencil.angles(side, pencil.centres[side][None])[0])
+    phi = pencil.angles(side, corners, about=about)
+    return float(phi.min()), float(phi.max())
+
+
+def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
+    """All half-planes, beginning in the widest gap between matches."""
+    phi = np.sort(pencil.angles(0, xy1))
+    if len(phi) == 0:
+        return -np.pi, np.pi
+    gaps = np.diff(phi, append=phi[0] + 2.0 * np.pi)
+    k = int(np.argmax(gaps))
+    start = float(phi[k] + 0.5 * gaps[k])
+    return start, start + 2.0 * np.pi
+
+
+def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
+    """Samples of the part of a photograph within the arc: the corners of that polygon, then a grid."""
+    width, height = pencil.sizes[side]
+    x, y = np.linspace(0.0, width - 1.0, SAMPLES), np.linspace(0.0, height - 1.0, SAMPLES)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    middle, half = 0.5 * (arc[0] + arc[1]), 0.5 * (arc[1] - arc[0])
+    inside = np.abs(pencil.angles(side, grid, about=middle) - middle) <= half
+    low, high = (
+        pencil.places(side, np.array(corner)) for corner in ((0.0, 0.0), (width - 1.0, height - 1.0))
+    )
+    rim = pencil.half_lines(side, np.array(arc))
+    enter, leave = rim.chord(low, high)
+    met = leave >= enter
+    ends = [pencil.pixels(side, rim.foot + t[:, None] * rim.direction)[met] for t in (enter, leave)]
+    corners = grid[[0, SAMPLES - 1, -SAMPLES, -1]][inside[[0, SAMPLES - 1, -SAMPLES, -1]]]
+    return np.concatenate([*ends, corners, grid[inside]])
