@@ -28,6 +28,7 @@ from thesisrecon.metric.model import (
 from thesisrecon.metric.population import OwnValues, bind, borrowing, estimate_population, own_values
 from thesisrecon.metric.prior_check import contradicted_focals
 from thesisrecon.metric.self_check import self_check
+from thesisrecon.metric.sharing_check import contradicted_sharing
 from thesisrecon.metric.start import K1, upgraded_model
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.robust.noise import noise_from_distances
@@ -105,6 +106,7 @@ class UpgradeAndBundle:
         model = mark(model, sigmas=self.outlier_sigmas[1], min_angle=np.radians(self.min_angle_deg))
         check, doubts = self_check(model, calibration, intervals, sigmas=self.outlier_sigmas[1])
         doubts += contradicted_focals(model, adjustment)
+        doubts += contradicted_sharing(model, adjustment)
         final = _as_reconstruction(model, reasons)
         said = borrowed.warnings(np.flatnonzero(model.registered).tolist(), self.undetermined_rel / 1.96)
         return MetricResult(final, intervals, check, not doubts, tuple(doubts), said)
