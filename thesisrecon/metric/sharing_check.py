@@ -26,7 +26,7 @@ from thesisrecon.optimize.metric_cameras import FOCAL
 from thesisrecon.types import B8, F64, I64
 
 CENTRE = (3, 4)
-ALARM = 1e-4
+ALARM = 1e-3
 """Chance of a false alarm where the deviations are right."""
 INFLATION, FLOOR = 4.0, 2e-3
 """Covariances are this many times too small on photographs, and never below the floor."""
