@@ -253,7 +253,8 @@ def _entry(trials: Sequence[Trial]) -> str:
     error = np.array([t.median_pct if np.isfinite(t.median_pct) else np.inf for t in trials])
     worst = np.array([t.worst_pct if np.isfinite(t.worst_pct) else np.inf for t in trials])
     middle = float(np.median(error))
-    text = "refused" if not np.isfinite(middle) else "0" if middle < 1e-4 else f"{middle:.2g}"
+    text = f"{middle:.2g}" if middle < 99.5 else f"{middle:.0f}" if np.isfinite(middle) else "refused"
+    text = "0" if middle < 1e-4 else text
     shares = [100.0 * np.mean(error <= SUCCESS_PCT)]
     if trials[0].mode == "zooming":
         shares.append(100.0 * np.mean(worst <= WORST_PCT))
