@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.metric.model import MetricModel, residual_norms
-from thesisrecon.metric.start import CENTRE, FOCAL, K1, WIDTH
+from thesisrecon.metric.model import CENTRE, FOCAL, K1, WIDTH, MetricModel, residual_norms
 from thesisrecon.optimize.bundle_blocks import BlockScatter, block_scatter
 from thesisrecon.optimize.metric_bundle import (
     BundleOptions,

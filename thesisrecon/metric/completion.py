@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.model import MetricModel, explained_shares, retriangulate
+from thesisrecon.metric.model import K1, WIDTH, MetricModel, explained_shares, retriangulate
 from thesisrecon.metric.resection import add_missing_cameras
-from thesisrecon.metric.start import K1, WIDTH
 from thesisrecon.types import B8
 
 # Lenses are freed early: a camera taken for a pinhole is fitted to its distortion, and its gate then lets

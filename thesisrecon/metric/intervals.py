@@ -14,17 +14,15 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.stats import t as student_t
 
-from thesisrecon.metric.model import MetricModel
-from thesisrecon.metric.model_error import LEAST_BLOCKS, model_error_floor
+from thesisrecon.metric.model import CENTRE, FOCAL, K1, MetricModel
+from thesisrecon.metric.model_error import LEAST_BLOCKS, USUAL_INFLATION, model_error_floor
 from thesisrecon.metric.population import Borrowing
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.optimize.metric_bundle import IntrinsicsPrior
 from thesisrecon.types import IntrinsicInterval
 
 NORMAL_95 = 1.959964
-# What photographs need (covariances 4 to 10 times too small) where there are too few points to measure it.
-DEFAULT_INFLATION = 4.0
-_COLUMNS = {"focal_px": 0, "principal_x_px": 3, "principal_y_px": 4, "k1": 5}
+_COLUMNS = {"focal_px": FOCAL, "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1], "k1": K1}
 
 
 def intrinsic_intervals(
@@ -56,7 +54,7 @@ def intrinsic_intervals(
                 continue
             inflation = _inflation(scatter, g, column)
             std = float(np.hypot(inflation * np.sqrt(variance), floors[g, column]))
-            std = min(std, float(prior.std[g, column])) * (row[0] if column == 0 else 1.0)
+            std = min(std, float(prior.std[g, column])) * (row[FOCAL] if column == FOCAL else 1.0)
             how = _source(borrowed, view, column, inflation)
             intervals[name] = IntrinsicInterval(value, float(std), how)
         answer.append(intervals)
@@ -66,12 +64,12 @@ def intrinsic_intervals(
 def _inflation(scatter: BlockScatter, g: int, column: int) -> float:
     ratio = float(scatter.ratio[g, column])
     if scatter.blocks < LEAST_BLOCKS or not np.isfinite(ratio):
-        return DEFAULT_INFLATION
+        return USUAL_INFLATION
     return float(np.sqrt(ratio) * student_t.ppf(0.975, scatter.blocks - 1) / NORMAL_95)
 
 
 def _source(borrowed: Borrowing, view: int, column: int, inflation: float) -> str:
-    if column == 0 and borrowed.weight[view] < 0.5:
+    if column == FOCAL and borrowed.weight[view] < 0.5:
         own = 1.96 * float(borrowed.own_std[view])
         return f"borrowed from the other cameras; its own matches leave it open by {own:.2%}"
     return f"bundle adjustment, covariance x {inflation:.1f} from the scatter between parts of the scene"

@@ -15,8 +15,9 @@ from thesisrecon.optimize.triangulation_refine import refine_points
 from thesisrecon.types import B8, I64, Tracks
 
 F64 = NDArray[np.float64]
-# The first column of radial distortion in a table of intrinsics.
-RADIAL = 5
+# Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1 and the two radial coefficients that nothing
+# is assumed of in words.
+FOCAL, CENTRE, K1, WIDTH = 0, (3, 4), 5, 8
 
 
 @dataclass(frozen=True)
@@ -54,23 +55,23 @@ def project_observations(cameras: MetricCameras, X: F64, view: I64, point: I64) 
     Y = np.einsum("kab,kb->ka", cameras.R[view], X[point]) + cameras.t[view]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         xy = Y[:, :2] / Y[:, 2:]
-        radial = cameras.intrinsics[cameras.group[view], RADIAL:]
+        radial = cameras.intrinsics[cameras.group[view], K1:]
         return apply_calibration(cameras, view, distort(xy, radial)), Y[:, 2]
 
 
 def apply_calibration(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     """Normalised image points to pixels."""
-    f, aspect, skew, cx, cy = cameras.intrinsics[cameras.group[view], :RADIAL].T
+    f, aspect, skew, cx, cy = cameras.intrinsics[cameras.group[view], :K1].T
     return np.column_stack([f * xy[:, 0] + skew * xy[:, 1] + cx, aspect * f * xy[:, 1] + cy])
 
 
 def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     """Pixels to normalised image points without distortion (K, 2)."""
     rows = cameras.intrinsics[cameras.group[view]]
-    f, aspect, skew, cx, cy = rows[:, :RADIAL].T
+    f, aspect, skew, cx, cy = rows[:, :K1].T
     y = (xy[:, 1] - cy) / (aspect * f)
     distorted = np.column_stack([(xy[:, 0] - cx - skew * y) / f, y])
-    radial = rows[:, RADIAL:]
+    radial = rows[:, K1:]
     return undistort(distorted, radial, iterations=10) if radial.any() else distorted
 
 

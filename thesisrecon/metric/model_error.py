@@ -11,12 +11,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.metric.model import MetricModel
-from thesisrecon.metric.start import CENTRE
+from thesisrecon.metric.model import CENTRE, MetricModel
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 
 F64 = NDArray[np.float64]
 
+USUAL_INFLATION = 4.0
+"""By how much the standard deviations of a bundle adjustment are too small on photographs (4 to 10 was seen),
+where nothing measures it."""
 # Below this the blocks of a scene say nothing.
 LEAST_BLOCKS = 4
 # The contradiction of noise alone keeps below the first; at the second the model is surely wrong somewhere.

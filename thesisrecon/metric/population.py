@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.metric.adjustment import Adjustment, Population
-from thesisrecon.metric.model import MetricModel
+from thesisrecon.metric.model import CENTRE, FOCAL, K1, WIDTH, MetricModel
 from thesisrecon.metric.model_error import model_error_floor
-from thesisrecon.metric.start import CENTRE, FOCAL, K1, WIDTH
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.types import B8, I64
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.model import MetricModel
+from thesisrecon.metric.model import FOCAL, MetricModel
+from thesisrecon.metric.model_error import USUAL_INFLATION
 from thesisrecon.optimize.metric_bundle import (
     IntrinsicsPrior,
     Observations,
@@ -18,8 +19,8 @@ from thesisrecon.types import F64
 MAX_SIGMAS = 3.0
 LEAST_DIFFERENCE = 0.01
 """A prior wrong by less than a hundredth does no harm that a person would mend."""
-INFLATION, FLOOR = 4.0, 2e-3
-"""Covariances are this many times too small on photographs, and never below the floor."""
+FLOOR = 2e-3
+"""Of the relative standard deviation of a focal that was left open."""
 MOST_OBSERVATIONS = 15000
 ROUNDS = 12
 
@@ -60,7 +61,7 @@ def _free_focals(model: MetricModel, adjustment: Adjustment) -> tuple[F64, F64]:
     index = index[chosen[t.point_index[index]]]
     prior = adjustment.prior(model)
     std, free = prior.std.copy(), adjustment.free(model)
-    std[:, 0], free[0] = np.inf, True
+    std[:, FOCAL], free[FOCAL] = np.inf, True
     result = refine_metric_bundle(
         cameras, model.X, Observations(t.view_index[index], t.point_index[index], t.xy[index]), free=free,
         prior=IntrinsicsPrior(prior.mean, std),
@@ -68,7 +69,7 @@ def _free_focals(model: MetricModel, adjustment: Adjustment) -> tuple[F64, F64]:
             adjustment.options(model, iterations=ROUNDS), covariance=True, noise_floor_px=model.sigma_px
         ),
     )  # fmt: skip
-    focal = result.cameras.intrinsics[:, 0]
-    variance = np.maximum(result.intrinsics_covariance[:, 0, 0], 0.0)
-    deviation = np.hypot(INFLATION * np.sqrt(variance) / focal, FLOOR)
+    focal = result.cameras.intrinsics[:, FOCAL]
+    variance = np.maximum(result.intrinsics_covariance[:, FOCAL, FOCAL], 0.0)
+    deviation = np.hypot(USUAL_INFLATION * np.sqrt(variance) / focal, FLOOR)
     return focal[cameras.group], deviation[cameras.group]

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from thesisrecon.metric.model import MetricModel, agreeing_observations, residual_norms
+from thesisrecon.metric.model_error import USUAL_INFLATION
 from thesisrecon.metric.view_checks import ViewChecks, check_views, within_reach
 from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.types import B8, F64, I64, IntrinsicInterval, SelfCalibration
@@ -31,8 +32,6 @@ MAX_BEHIND = 0.05
 MAX_NOISE_RATIO = 3.0
 MAX_OWN_FOCAL = 0.03
 MAX_OWN_SIGMAS = 5.0
-INFLATION = 4.0
-"""How many times too small covariances are on photographs."""
 
 
 def self_check(
@@ -105,7 +104,7 @@ def _noise_ratio(views: ViewChecks) -> F64:
 
 
 def _own_focal_sigmas(views: ViewChecks) -> F64:
-    return np.asarray(np.abs(views.focal_off) / np.maximum(INFLATION * views.focal_off_std, 1e-9))
+    return np.asarray(np.abs(views.focal_off) / np.maximum(USUAL_INFLATION * views.focal_off_std, 1e-9))
 
 
 def _doubts_of_views(views: ViewChecks, model: MetricModel) -> list[str]:

@@ -6,15 +6,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.metric.model import MetricModel
+from thesisrecon.metric.model import FOCAL, K1, WIDTH, MetricModel
 from thesisrecon.optimize.metric_bundle import MetricCameras
 from thesisrecon.types import B8, I64, Assumptions, Reconstruction, Upgrade
 
 F64 = NDArray[np.float64]
-
-FOCAL, CENTRE, K1 = 0, (3, 4), 5
-# f, aspect, skew, cx, cy, k1 and the two radial coefficients that nothing is assumed of in words.
-WIDTH = 8
 
 
 def camera_rows(assumed: Assumptions) -> tuple[I64, I64]:

@@ -19,6 +19,7 @@ from thesisrecon.metric.adjustment import FOCAL_AND_CENTRE, Adjustment, with_wid
 from thesisrecon.metric.completion import Completion
 from thesisrecon.metric.intervals import intrinsic_intervals
 from thesisrecon.metric.model import (
+    K1,
     MetricModel,
     mark,
     residual_norms,
@@ -29,7 +30,7 @@ from thesisrecon.metric.population import OwnValues, bind, borrowing, estimate_p
 from thesisrecon.metric.prior_check import contradicted_focals
 from thesisrecon.metric.self_check import self_check
 from thesisrecon.metric.sharing_check import contradicted_sharing
-from thesisrecon.metric.start import K1, upgraded_model
+from thesisrecon.metric.start import upgraded_model
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.types import Assumptions, MetricResult, Reconstruction, SelfCalibration, Upgrade
