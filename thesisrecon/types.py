@@ -359,6 +359,17 @@ class DepthMap:
 
 
 @dataclass(frozen=True)
+class PinholeView:
+    """A photograph with its distortion removed: ``P`` = K [R t] (3, 4), ``rgb`` (H, W, 3) uint8, ``seen``
+    (H, W) the pixels that the photograph has."""
+
+    view: int
+    P: F64
+    rgb: NDArray[np.uint8]
+    seen: B8
+
+
+@dataclass(frozen=True)
 class TexturedMesh:
     """A triangulated surface, by itself or with colours.
 

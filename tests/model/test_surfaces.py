@@ -5,44 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.model.sphere import SHAPE, looking_at_origin, ring_of, sphere_map
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import camera_from_centre
 from thesisrecon.model import VolumetricFusion, keep_large_parts, surface_from_depth
 from thesisrecon.model.mesh import face_areas, parts_of
 from thesisrecon.types import F64, DepthMap, TexturedMesh
 
-K = np.array([[150.0, 0.0, 79.5], [0.0, 150.0, 59.5], [0.0, 0.0, 1.0]])
-SHAPE = (120, 160)
-
-
-def looking_at_origin(angle: float, height: float, distance: float) -> F64:
-    """P of a camera that looks at the origin from ``angle`` (rad) about the vertical."""
-    centre = np.array([np.sin(angle) * distance, height, -np.cos(angle) * distance])
-    forward = -centre / np.linalg.norm(centre)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    return camera_from_centre(K, np.stack([right, np.cross(forward, right), forward]), centre)
-
-
-def sphere_map(view: int, P: F64, *, noise: float = 0.0, seed: int = 0) -> DepthMap:
-    """Depth of the unit sphere; std as the noise, at least 1e-4."""
-    y, x = np.indices(SHAPE)
-    M = P[:, :3]
-    centre = -np.linalg.solve(M, P[:, 3])
-    rays = np.stack([x, y, np.ones(SHAPE)], axis=-1) @ np.linalg.inv(M).T
-    a, b, c = (rays**2).sum(-1), rays @ centre, centre @ centre - 1.0
-    under = b**2 - a * c
-    with np.errstate(invalid="ignore"):
-        depth = np.where(under > 0.0, (-b - np.sqrt(under)) / a, np.nan)
-    depth += noise * np.random.default_rng(seed + view).normal(size=SHAPE)
-    std = np.full(SHAPE, max(noise, 1e-4), dtype=np.float32)
-    return DepthMap(view, P, depth.astype(np.float32), std, np.ones(SHAPE, dtype=np.uint8))
-
 
 @pytest.fixture(scope="module")
 def ring() -> list[DepthMap]:
-    cameras = [looking_at_origin(k * np.pi / 4, 1.5 * (-1) ** k, 3.5) for k in range(8)]
-    return [sphere_map(k, P) for k, P in enumerate(cameras)]
+    return ring_of()
 
 
 def outward(mesh: TexturedMesh) -> F64:

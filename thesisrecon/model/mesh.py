@@ -43,6 +43,22 @@ def parts_of(faces: I64, vertices: int) -> I64:
     return np.asarray(label[faces[:, 0]], dtype=np.int64)
 
 
+def face_neighbours(faces: I64) -> I64:
+    """(M, 3) number of the face across the side from corner k to corner k + 1, -1 where there is none.
+
+    Where more than two faces meet in a side, each has one of the others.
+    """
+    start, stop = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    low, high = np.minimum(start, stop), np.maximum(start, stop)
+    order = np.lexsort((np.arange(len(low)), high, low))
+    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
+    neighbour = np.full(len(order), -1, dtype=np.int64)
+    first, second = order[:-1][same], order[1:][same]
+    neighbour[second] = first // 3
+    neighbour[first] = second // 3
+    return neighbour.reshape(-1, 3)
+
+
 def keep_large_parts(mesh: TexturedMesh, least_share: float = 0.002) -> TexturedMesh:
     """Without connected parts of less than ``least_share`` of the whole area: crumbs of wrong depths."""
     if not len(mesh.faces):

@@ -1,0 +1,6 @@
+"""Section 2.6: the graphics of the photographs mapped onto the surface."""
+
+from thesisrecon.model.texture.atlas import TextureAtlas
+from thesisrecon.model.texture.visibility import color_vertices
+
+__all__ = ["TextureAtlas", "color_vertices"]
