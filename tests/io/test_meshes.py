@@ -1,0 +1,78 @@
+"""Meshes written and read again by another library."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+import trimesh
+
+from thesisrecon.io.meshes import unmerged, write_mesh
+from thesisrecon.types import TexturedMesh
+
+
+def roof() -> TexturedMesh:
+    """Two faces with a common ridge at different places of the texture."""
+    vertices = np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1.5], [1, 1, 2]])
+    faces = np.array([[0, 1, 2], [1, 3, 2]])
+    uv = np.array([[[0, 0], [9, 0], [0, 9]], [[19, 0], [19, 9], [10, 9]]], dtype=float)
+    texture = np.zeros((10, 20, 3), dtype=np.uint8)
+    texture[:, :10], texture[:, 10:] = [200, 30, 10], [10, 40, 220]
+    return TexturedMesh(vertices, faces, uv=uv, texture=texture)
+
+
+def color_of(mesh: trimesh.Trimesh, face: int) -> np.ndarray:
+    """Colour in the middle of a face, by the texture coordinates of the file."""
+    image = getattr(mesh.visual.material, "baseColorTexture", None) or mesh.visual.material.image
+    u, v = mesh.visual.uv[mesh.faces[face]].mean(axis=0)
+    picture = np.asarray(image.convert("RGB"))
+    return picture[int((1.0 - v) * picture.shape[0]), int(u * picture.shape[1])]
+
+
+def test_seams_have_a_vertex_for_each_place() -> None:
+    mesh = roof()
+    vertices, faces, uv = unmerged(mesh)
+    assert len(vertices) == 6
+    np.testing.assert_array_equal(vertices[faces], mesh.vertices[mesh.faces])
+    np.testing.assert_array_equal(uv[faces], mesh.uv)
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj"])
+def test_textures_are_where_they_were(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"model.{kind}"
+    write_mesh(path, roof())
+    read = trimesh.load(path, process=False, force="mesh")
+    turn = [1.0, -1.0, -1.0] if kind == "glb" else [1.0, 1.0, 1.0]
+    np.testing.assert_allclose(read.triangles, roof().vertices[roof().faces] * turn, atol=1e-6)
+    assert np.abs(color_of(read, 0).astype(int) - [200, 30, 10]).max() <= 6
+    assert np.abs(color_of(read, 1).astype(int) - [10, 40, 220]).max() <= 6
+    assert not list(tmp_path.glob(".*"))
+    if kind == "obj":
+        with PIL.Image.open(tmp_path / "model.png") as picture:
+            np.testing.assert_array_equal(np.asarray(picture), roof().texture)
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
+def test_colours_of_vertices_are_kept(kind: str, tmp_path: Path) -> None:
+    colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 102, 204]], dtype=np.uint8)
+    path = tmp_path / f"model.{kind}"
+    write_mesh(path, TexturedMesh(roof().vertices, roof().faces, colors=colors))
+    read = trimesh.load(path, process=False, force="mesh")
+    assert len(read.faces) == 2
+    np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], colors)
+
+
+def test_a_bare_mesh_is_written_and_the_bytes_are_the_same_again(tmp_path: Path) -> None:
+    mesh = TexturedMesh(roof().vertices, roof().faces)
+    for kind in ("glb", "obj", "ply"):
+        for name in ("one", "two"):
+            write_mesh(tmp_path / f"{name}.{kind}", mesh)
+        assert (tmp_path / f"one.{kind}").read_bytes() == (tmp_path / f"two.{kind}").read_bytes()
+        assert len(trimesh.load(tmp_path / f"one.{kind}", process=False, force="mesh").faces) == 2
+
+
+def test_other_formats_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"\.glb, \.obj or \.ply"):
+        write_mesh(tmp_path / "model.stl", roof())
