@@ -71,8 +71,7 @@ def test_no_pixel_shrinks_by_more_than_is_stated_and_none_is_mirrored(method, mo
     pair = both_pairs(scene)[1]
     rectified = method.rectify(pair)
     quality = measure_quality(rectified, pair)
-    allowed = 1.0 if isinstance(method, Polar) else method.limits.most_shrink
-    assert quality.least_scale >= 1.0 / allowed - 1e-2
+    assert quality.least_scale >= 1.0 / method.limits.most_shrink - 1e-2
     assert quality.growth <= method.limits.most_growth
     for side in (0, 1):
         inside = np.isfinite(rectified.rectified_from_original(side, pair.regions[side])).all(axis=1)

@@ -13,7 +13,7 @@ from thesisrecon.dense.rectification.from_fundamental import Hartley, LeastDisto
 from thesisrecon.dense.rectification.pair import EpipolarPair, Size, pair_of_cameras, pair_of_fundamental
 from thesisrecon.dense.rectification.planar import FrameLimits, PlanarRectification, disparity_bounds
 from thesisrecon.dense.rectification.polar import Polar, PolarRectification
-from thesisrecon.dense.rectification.quality import measure_quality
+from thesisrecon.dense.rectification.quality import RectificationQuality, measure_quality
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import F64
 
@@ -32,12 +32,15 @@ class Rectifier(Protocol):
 class LeastDistorted:
     """The one of several methods that distorts a pair least, measured by ``RectificationQuality.distortion``.
 
-    Methods that fail for a pair are passed over. Polar frames bend straight lines, so that the best planar
-    one is preferred unless it distorts ``bending`` more.
+    To that is added by how much the angle of a photograph's midlines is off a right one beyond
+    ``angle_deg`` (in radians) and their ratio off its own beyond ``aspect``, and, for polar frames,
+    ``bending``: they bend straight lines. Methods that fail for a pair are passed over.
     """
 
     methods: tuple[Rectifier, ...]
-    bending: float = 0.05
+    angle_deg: float = 5.0
+    aspect: float = 0.1
+    bending: float = 0.03
 
     def rectify(self, pair: EpipolarPair) -> AnyRectification:
         """The best of those that succeed; the last one's ``StageFailure`` where none does."""
@@ -49,13 +52,23 @@ class LeastDistorted:
             except StageFailure as reason:
                 failure = reason
                 continue
-            cost = measure_quality(found, pair).distortion
-            cost += self.bending if isinstance(found, PolarRectification) else 0.0
+            cost = self._cost(found, measure_quality(found, pair))
             if cost < least:
                 best, least = found, cost
         if best is None:
             raise failure if failure is not None else ValueError("a choice needs methods to choose from")
         return best
+
+    def _cost(self, found: AnyRectification, quality: RectificationQuality) -> float:
+        # A midline through the epipole of a polar frame has no angle.
+        turned = max((abs(a - 90.0) for a in quality.orthogonality_deg if np.isfinite(a)), default=0.0)
+        aspect = max((abs(a - 1.0) for a in quality.aspect if np.isfinite(a)), default=0.0)
+        cost = (
+            quality.distortion
+            + np.radians(max(turned - self.angle_deg, 0.0))
+            + max(aspect - self.aspect, 0.0)
+        )
+        return float(cost + (self.bending if isinstance(found, PolarRectification) else 0.0))
 
 
 def _methods(limits: FrameLimits) -> Mapping[Method, Rectifier]:

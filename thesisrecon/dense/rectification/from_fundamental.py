@@ -101,21 +101,25 @@ class LoopZhang:
 
 @dataclass(frozen=True)
 class LeastDistortion:
-    """The planar rectification of least ``RectificationQuality.distortion``, all its freedom used.
+    """The planar rectification of least ``RectificationQuality.distortion``.
 
-    Line at infinity, scale and shear of either side (5 unknowns; Levenberg-Marquardt from those of
+    Line at infinity, scale along the rows and shear of either side (5 unknowns; least squares from those of
     :class:`LoopZhang`): the variance of the log singular values of both homographies, symmetric in growing
     and shrinking, and a quarter of the squared gradient of the plane fitted to the disparities. Between
-    Hartley, who makes the second photograph like the first, and Loop and Zhang, who spare either by itself.
+    Hartley, who makes the first photograph like the second, and Loop and Zhang, who spare either by itself:
+    ``most_scale`` (log) and ``most_shear`` say by how much a photograph may give up its aspect and its right
+    angles so that both sides become alike.
     """
 
     limits: FrameLimits = field(default_factory=FrameLimits)
+    most_scale: float = 0.06
+    most_shear: float = 0.06
 
     def rectify(self, pair: EpipolarPair) -> PlanarRectification:
         """The two homographies; ``StageFailure`` where they cannot be."""
         start = np.array([calmest_line(pair), 0.0, 0.0, 0.0, 0.0])
         low, high = planes_in_reach(pair)
-        bound = np.array([1.0, 1.0, 2.0, 1.0, 2.0])
+        bound = np.array([0.0, self.most_scale, self.most_shear, self.most_scale, self.most_shear])
         found = least_squares(
             lambda q: _distortion_residuals(pair, *_adjusted(pair, q)),
             start,
@@ -129,8 +133,7 @@ class LeastDistortion:
 def _adjusted(pair: EpipolarPair, q: F64) -> tuple[F64, F64]:
     """First rows (2, 3) and the others (2, 2, 3) of phi, log scale and shear of either side (5,)."""
     rows = pencil_rows(pair, float(q[0]))
-    scale, shear = np.exp(q[1::2]), q[2::2]
-    return scale[:, None] * undistorting_rows(pair, rows) + shear[:, None] * rows[:, 0], rows
+    return np.exp(q[1::2])[:, None] * undistorting_rows(pair, rows) + q[2::2, None] * rows[:, 0], rows
 
 
 def _distortion_residuals(pair: EpipolarPair, first: F64, rows: F64) -> F64:

@@ -19,8 +19,8 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.types import B8, F32, F64
 
-MARGIN = 0.15
-"""How far disparities may go beyond those of the matches, as a share of their range."""
+CROP_MARGIN = 0.75
+"""How far disparities may go beyond those of the matches in a crop, as a share of their range."""
 
 
 @dataclass(frozen=True)
@@ -210,14 +210,14 @@ def common_crop(samples: list[F64], matches: tuple[F64, F64]) -> tuple[F64, F64]
     low, high = (np.stack([f(xy, axis=0) for xy in samples]) for f in (np.min, np.max))
     low[:, 1], high[:, 1] = low[:, 1].max(), high[:, 1].min()
     if len(matches[0]):
-        near, far = disparity_bounds(matches[0][:, 0] - matches[1][:, 0])
+        near, far = disparity_bounds(matches[0][:, 0] - matches[1][:, 0], margin=CROP_MARGIN)
         least, most = low[:, 0].copy(), high[:, 0].copy()
         low[0, 0], high[0, 0] = max(least[0], least[1] + near), min(most[0], most[1] + far)
         low[1, 0], high[1, 0] = max(least[1], least[0] - far), min(most[1], most[0] - near)
     return low, high
 
 
-def disparity_bounds(disparities: F64, *, margin: float = MARGIN) -> tuple[float, float]:
+def disparity_bounds(disparities: F64, *, margin: float) -> tuple[float, float]:
     """Least and greatest disparity to be expected of those of the matches (N,).
 
     Their 1 and 99 % quantiles, for a few matches are wrong along their lines, with a margin of ``margin``

@@ -1,7 +1,7 @@
 """Polar rectification: rows are half epipolar lines, columns the distance from the epipole.
 
-Pollefeys, Koch and Van Gool, "A simple and efficient rectification method for general motion", ICCV 1999. No
-pixel shrinks, the frame is never larger than some times the photograph, and epipoles may lie anywhere.
+Pollefeys, Koch and Van Gool, "A simple and efficient rectification method for general motion", ICCV 1999:
+epipoles may lie anywhere, and the frame is never larger than a few times the photograph.
 """
 
 from __future__ import annotations
@@ -95,11 +95,12 @@ class PolarRectification:
 
 @dataclass(frozen=True)
 class Polar:
-    """Half epipolar lines in either photograph, no pixel shrinking (by more than 1 %, at corners).
+    """Half epipolar lines in either photograph, no pixel shrinking by more than ``limits.most_shrink``.
 
-    Rows are as near as the farthest visible point of the half-lines demands: at least one per pixel that it
-    moves in either view. Pollefeys et al. walk from line to line; here the spacing is a function of the
-    angle whose integral counts the rows, so that both directions give the same ones.
+    Neighbouring rows are at most a pixel apart at the middle of what either view shows of them, and nearer
+    where a far end would shrink by more (up to 1 % more just at corners). With ``most_shrink`` 1 no pixel is
+    lost, as Pollefeys et al. have it, at the price of rows that are too near elsewhere. They walk from line
+    to line; here the spacing is a function of the angle whose integral counts the rows.
     """
 
     limits: FrameLimits = field(default_factory=FrameLimits)
@@ -109,7 +110,7 @@ class Polar:
         pencil, sign = pair.pencil, -1.0 if pair.pencil.turned else 1.0
         phi = _half_planes(pair)
         chords = [_chord(pencil, side, phi) for side in (0, 1)]
-        angles = _rows_of(pencil, phi, chords)[:: int(sign)]
+        angles = _rows_of(pencil, phi, chords, self.limits.most_shrink)[:: int(sign)]
         whole = PolarRectification(pencil, angles, np.zeros(2), (1, len(angles)))
         ends = []
         for side, (lines, enter, leave) in enumerate(chords):
@@ -148,15 +149,17 @@ def _chord(pencil: EpipolarPencil, side: int, phi: F64) -> tuple[HalfLines, F64,
     return lines, *lines.chord(low, high)
 
 
-def _rows_of(pencil: EpipolarPencil, phi: F64, chords: list[tuple[HalfLines, F64, F64]]) -> F64:
+def _rows_of(
+    pencil: EpipolarPencil, phi: F64, chords: list[tuple[HalfLines, F64, F64]], most_shrink: float
+) -> F64:
     """Half-planes of the rows, increasing (H,)."""
     per_radian = np.zeros(len(phi))
     for side, (lines, enter, leave) in enumerate(chords):
         met = leave >= enter
-        for t in (enter, leave):
+        for t, shrink in ((0.5 * (enter + leave), 1.0), (enter, most_shrink), (leave, most_shrink)):
             at = np.where(met, t, 0.0)[:, None]
             swept = pencil.swept(side, phi, lines.foot + at * lines.direction) * pencil.units[side]
-            per_radian = np.maximum(per_radian, np.where(met, swept, 0.0))
+            per_radian = np.maximum(per_radian, np.where(met, swept / shrink, 0.0))
     # The most that neighbours need, so that nothing shrinks between the sampled half-planes either.
     each = np.maximum(per_radian[:-1], per_radian[1:]) * np.diff(phi)
     rows = np.concatenate([[0.0], np.cumsum(np.maximum(each, 1e-12))])

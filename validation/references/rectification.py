@@ -1,0 +1,40 @@
+"""Rectification by OpenCV as ours is called: homographies of both photographs and a common frame."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from thesisrecon.dense.rectification import PlanarRectification
+from thesisrecon.geometry.camera import decompose_camera
+from thesisrecon.types import F64
+
+Size = tuple[int, int]
+
+
+def opencv_uncalibrated(F: F64, xy1: F64, xy2: F64, size: Size) -> PlanarRectification | None:
+    """``cv2.stereoRectifyUncalibrated`` (Hartley), the frame as large as the photograph as it is used there;
+    None where it refuses."""
+    done, H1, H2 = cv2.stereoRectifyUncalibrated(xy1.copy(), xy2.copy(), F, size)
+    if not done:
+        return None
+    return PlanarRectification(_positive(np.asarray(H1), size), _positive(np.asarray(H2), size), size)
+
+
+def opencv_calibrated(P1: F64, P2: F64, size: Size) -> PlanarRectification:
+    """``cv2.stereoRectify`` of two metric cameras without distortion, its defaults, the frame of the
+    photograph's size."""
+    (K1, R1, t1), (K2, R2, t2) = decompose_camera(P1), decompose_camera(P2)
+    R = R2 @ R1.T
+    none = np.zeros(5)
+    found = cv2.stereoRectify(K1, none, K2, none, size, R, (t2 - R @ t1)[:, None])
+    turn1, turn2, new1, new2 = (np.asarray(part, dtype=np.float64) for part in found[:4])
+    H1 = new1[:, :3] @ turn1 @ np.linalg.inv(K1)
+    H2 = new2[:, :3] @ turn2 @ np.linalg.inv(K2)
+    return PlanarRectification(_positive(H1, size), _positive(H2, size), size)
+
+
+def _positive(H: F64, size: Size) -> F64:
+    """H scaled such that the third coordinate is positive at the photograph's centre."""
+    third = float(H[2] @ [0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0), 1.0])
+    return np.asarray(H * np.sign(third), dtype=np.float64)
