@@ -259,7 +259,7 @@ def check_hand_made(names: Sequence[str]) -> list[Metric]:
         folder = root / "kusvod2" / name if root else None
         if folder is None or not folder.is_dir():
             continue
-        sizes = [Image.open(folder / f"{side}.jpg").size for side in "AB"]
+        sizes = [_size(folder / f"{side}.jpg") for side in "AB"]
         found = thesisrecon.match_pair(str(folder / "A.jpg"), str(folder / "B.jpg"))
         try:
             pair = pair_of_fundamental(found.F, found.xy1, found.xy2, sizes[0], sizes[1])
@@ -279,6 +279,11 @@ def check_hand_made(names: Sequence[str]) -> list[Metric]:
         kind = "planar" if isinstance(chosen, PlanarRectification) else "polar"
         rows.append(Metric("kusvod2", name, "", values, "RMS |dy|", note=kind))
     return rows
+
+
+def _size(path: Path) -> Size:
+    with Image.open(path) as photograph:
+        return photograph.size
 
 
 def draw_pair(rectified: AnyRectification, images: Sequence[np.ndarray], to: Path) -> None:

@@ -12,7 +12,17 @@ from thesisrecon.geometry.multiview import fundamental_from_cameras
 from thesisrecon.types import F64
 
 SIZE = (640, 480)
-MOTIONS = ("beside", "toed in", "rolled", "upwards", "parallel", "behind", "forward", "diagonal")
+MOTIONS = (
+    "beside",
+    "toed in",
+    "rolled",
+    "upwards",
+    "parallel",
+    "behind",
+    "forward",
+    "diagonal",
+    "half forward",
+)
 PLANAR = MOTIONS[:6]
 
 
@@ -44,6 +54,7 @@ def make_pair(
         "parallel": ((1.5, 0.0, 0.0), (0.0, 0.0, 0.0)),
         "behind": ((-2.0, 0.0, -0.5), (0.0, 0.15, 0.0)),
         "forward": ((0.1, 0.05, 2.0), (0.01, 0.02, 0.05)),
+        "half forward": ((1.2, 0.1, 2.0), (0.0, -0.3, 0.0)),
         "diagonal": ((0.8, 0.1, 2.0), (0.0, -0.05, 0.1)),
     }[motion]
     size2 = SIZE if motion == "parallel" else (600, 500)

@@ -175,7 +175,7 @@ def test_noise_of_matches_is_the_noise_of_rows():
         assert 0.2 < quality.rms_dy_px / np.sqrt(2.0) / quality.greatest_scale + 0.1 < 0.35
 
 
-@pytest.mark.parametrize("motion", ["forward", "diagonal"])
+@pytest.mark.parametrize("motion", ["forward", "diagonal", "half forward"])
 def test_epipoles_inside_are_for_polar_frames_alone(motion):
     scene = make_pair(motion, np.random.default_rng(8))
     pair = both_pairs(scene)[1]

@@ -18,6 +18,7 @@ from thesisrecon.dense.rectification.planar import (
     homography_jacobians,
     pencil_rows,
     planes_in_reach,
+    require_in_front,
     singular_values,
     undistorting_rows,
 )
@@ -52,6 +53,7 @@ class Hartley:
         phi = float(pair.pencil.angles(1, pair.pencil.centres[1][None], about=0.5 * (low + high))[0])
         phi, phi_infinite = _perpendicular(pair.pencil.lines[1], phi, e)
         rows = _skew_rows(pair, phi, phi_infinite)
+        require_in_front(pair, rows)
         v, w = rows[1]
         # With v a similarity about the centre, the origin of places.
         second = np.array([v[1], -v[0], 0.0])
@@ -112,18 +114,22 @@ class LeastDistortion:
     """
 
     limits: FrameLimits = field(default_factory=FrameLimits)
-    most_scale: float = 0.06
+    most_scale: float = 0.05
     most_shear: float = 0.06
 
     def rectify(self, pair: EpipolarPair) -> PlanarRectification:
         """The two homographies; ``StageFailure`` where they cannot be."""
-        start = np.array([calmest_line(pair), 0.0, 0.0, 0.0, 0.0])
         low, high = planes_in_reach(pair)
+        # Off the lines that touch what both see, where derivatives grow without bound.
+        inset = 0.01 * (high - low)
+        start = np.array(
+            [np.clip(calmest_line(pair), low + 2.0 * inset, high - 2.0 * inset), 0.0, 0.0, 0.0, 0.0]
+        )
         bound = np.array([0.0, self.most_scale, self.most_shear, self.most_scale, self.most_shear])
         found = least_squares(
             lambda q: _distortion_residuals(pair, *_adjusted(pair, q)),
             start,
-            bounds=(np.append(low, -bound[1:]), np.append(high, bound[1:])),
+            bounds=(np.append(low + inset, -bound[1:]), np.append(high - inset, bound[1:])),
             max_nfev=40,
         )
         first, rows = _adjusted(pair, found.x)
@@ -153,14 +159,19 @@ def _distortion_residuals(pair: EpipolarPair, first: F64, rows: F64) -> F64:
 
 
 def calmest_line(pair: EpipolarPair) -> float:
-    """The phi of Loop and Zhang's line at infinity, phi + pi/2: least variation of the third coordinate."""
+    """The phi of Loop and Zhang's line at infinity, phi + pi/2: least variation of the third coordinate.
+
+    ``StageFailure`` where every line crosses what both photographs see.
+    """
     z = [homogenize(pair.pencil.places(s, pair.regions[s])) for s in (0, 1)]
 
     def variation(phi: float) -> float:
         third = [z[s] @ w for s, w in enumerate(pencil_rows(pair, phi)[:, 1])]
         return float(sum(np.var(t) / np.mean(t) ** 2 for t in third))
 
-    return _search(pair, variation)
+    phi = _search(pair, variation)
+    require_in_front(pair, pencil_rows(pair, phi))
+    return phi
 
 
 def _search(pair: EpipolarPair, cost: Callable[[float], float]) -> float:

@@ -130,6 +130,18 @@ def planes_in_reach(pair: EpipolarPair) -> tuple[float, float]:
     return high - 0.5 * np.pi, low + 0.5 * np.pi
 
 
+def require_in_front(pair: EpipolarPair, rows: F64) -> None:
+    """``StageFailure`` unless the line at infinity of rows (2, 2, 3) passes beside all that both see."""
+    for side, (xy, samples) in enumerate(zip(pair.matches, pair.regions, strict=True)):
+        third = homogenize(pair.pencil.places(side, np.concatenate([samples, xy]))) @ rows[side, 1]
+        if not third.min() > 1e-6 * third.max():
+            raise StageFailure(
+                "the line sent to infinity crosses the photographs",
+                "an epipole lies in one of them or at its border",
+                "rectify in polar coordinates",
+            )
+
+
 def undistorting_rows(pair: EpipolarPair, rows: F64) -> F64:
     """First rows (2, 3) for which the affine part of either homography is a similarity (Loop and Zhang 1999).
 
