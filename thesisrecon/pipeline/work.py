@@ -1,0 +1,48 @@
+"""What the steps of one run hand on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.assumptions import assumptions_of_views
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.images import PhotographSet
+from thesisrecon.run import Run
+from thesisrecon.types import Assumptions, RunResult
+
+
+@dataclass
+class Work:
+    """What the steps of one run hand on: ``result`` grows, the rest is what they need beside it."""
+
+    run: Run
+    photographs: PhotographSet
+    result: RunResult
+    until: str
+    prepared: dict[int, Any] | None = None
+
+    @property
+    def config(self) -> PipelineConfig:
+        return self.run.config
+
+    @property
+    def assumed(self) -> Assumptions:
+        """What the user lets us assume of the cameras."""
+        scales = np.array([image.scale for image in self.result.images])
+        sizes = [image.original_size for image in self.result.images]
+        return assumptions_of_views(self.config.intrinsics, sizes, self.photographs.exif_focal_px, scales)
+
+    def check_photographs(self) -> None:
+        """Refuse what is too little before anything is computed."""
+        found, needed = len(self.result.images), 1 if self.until == "features" else 2
+        if found < needed:
+            why = "; ".join(f"{name} {reason}" for name, reason in list(self.result.refused.items())[:3])
+            raise StageFailure(
+                f"{found or 'no'} usable photograph{'s' if found != 1 else ''}",
+                f"at least {needed} different ones are needed{'; ' + why if why else ''}",
+                "take more photographs of the scene from other places",
+            )
