@@ -9,7 +9,7 @@ import pytest
 
 from tests.textures import texture
 from thesisrecon.dense.rectification import PlanarRectification
-from thesisrecon.dense.rectification.kernels import sample_image
+from thesisrecon.dense.rectification.kernels import NOT_SHRUNK, sample_image
 from thesisrecon.dense.rectification.sampling import STRIP_ROWS, warp_image
 from thesisrecon.types import F32, F64
 
@@ -26,7 +26,8 @@ def sample_plainly(image: F32, xy: F64, rows: int) -> F64:
     padded = np.pad(image.astype(np.float64), ((12, 12), (12, 12), (0, 0)), mode="edge")
     down = np.concatenate([np.diff(xy, axis=0), xy[-2:-1] - xy[-1:]])
     across = np.concatenate([np.diff(xy, axis=1), xy[:, -2:-1] - xy[:, -1:]], axis=1)
-    spread = np.fmax(1.0, np.hypot(across, down))
+    spread = np.hypot(across, down)
+    spread = np.where(spread > NOT_SHRUNK, spread, 1.0)
     out = np.full((rows, xy.shape[1], image.shape[2]), np.nan)
     for i, j in np.ndindex(rows, xy.shape[1]):
         x, y = xy[i, j]

@@ -9,6 +9,8 @@ from thesisrecon.types import F32, F64
 
 MOST_TAPS = 24
 """Taps along an axis: images that shrink more than sixfold are undersampled from there on."""
+NOT_SHRUNK = 1.1
+"""Distances of neighbours up to this are taken for 1: what aliases is next to nothing."""
 
 
 @njit(cache=True, nogil=True)
@@ -38,6 +40,27 @@ def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True)
+def _spread(xy: F64, i: int, j: int, axis: int) -> float:
+    """How far neighbours of ``xy[i, j]`` are apart along an axis of the image, at least 1."""
+    i1 = i + 1 if i + 1 < xy.shape[0] else i - 1
+    j1 = j + 1 if j + 1 < xy.shape[1] else j - 1
+    across = xy[i, j1, axis] - xy[i, j, axis] if j1 >= 0 else 0.0
+    down = xy[i1, j, axis] - xy[i, j, axis] if i1 >= 0 else 0.0
+    squared = across * across + down * down
+    # The comparison is false for NaN, too: at the rim of the lookup.
+    return np.sqrt(squared) if squared > NOT_SHRUNK * NOT_SHRUNK else 1.0
+
+
+@njit(cache=True, nogil=True)
+def _four_taps(share: float, weights: F64) -> None:
+    """The weights of an unwidened kernel at ``share`` in [0, 1] between the second and the third pixel."""
+    weights[0] = ((-0.5 * share + 1.0) * share - 0.5) * share
+    weights[1] = (1.5 * share - 2.5) * share * share + 1.0
+    weights[2] = ((-1.5 * share + 2.0) * share + 0.5) * share
+    weights[3] = (0.5 * share - 0.5) * share * share
+
+
+@njit(cache=True, nogil=True)
 def sample_image(image: F32, xy: F64, out: F32) -> None:
     """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C); NaN outside.
 
@@ -47,32 +70,41 @@ def sample_image(image: F32, xy: F64, out: F32) -> None:
     where one of the four pixels around is NaN; others that are NaN are left out.
     """
     height, width, channels = image.shape
-    rows, columns = xy.shape[0], xy.shape[1]
     wx, wy = np.empty(MOST_TAPS), np.empty(MOST_TAPS)
     total = np.empty(channels)
     for i in range(out.shape[0]):
-        for j in range(columns):
+        for j in range(xy.shape[1]):
             out[i, j] = np.nan
             x, y = xy[i, j, 0], xy[i, j, 1]
             # Rounding of the lookup must not cut off the border pixels.
             if not (x > -1e-6 and y > -1e-6 and x < width - 1 + 1e-6 and y < height - 1 + 1e-6):
                 continue
-            di = 1 if i + 1 < rows else -1
-            dj = 1 if j + 1 < columns else -1
-            across = xy[i, j + dj] - xy[i, j] if j + dj >= 0 else xy[i, j] * 0.0
-            down = xy[i + di, j] - xy[i, j] if i + di >= 0 else xy[i, j] * 0.0
-            spread_x = np.hypot(across[0], down[0])
-            spread_y = np.hypot(across[1], down[1])
-            # The comparison is false for NaN, too: at the rim of the lookup.
-            spread_x = spread_x if spread_x > 1.0 else 1.0
-            spread_y = spread_y if spread_y > 1.0 else 1.0
-            left, n_x = _taps(x, spread_x, wx)
-            top, n_y = _taps(y, spread_y, wy)
             x0, y0 = min(max(int(x), 0), width - 1), min(max(int(y), 0), height - 1)
             x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
-            near = image[y0, x0, 0] + image[y0, x1, 0] + image[y1, x0, 0] + image[y1, x1, 0]
-            if np.isnan(near):
+            if np.isnan(image[y0, x0, 0] + image[y0, x1, 0] + image[y1, x0, 0] + image[y1, x1, 0]):
                 continue
+            spread_x, spread_y = _spread(xy, i, j, 0), _spread(xy, i, j, 1)
+            inner = x0 >= 1 and x0 + 2 < width and y0 >= 1 and y0 + 2 < height
+            if inner and spread_x == 1.0 and spread_y == 1.0:
+                _four_taps(x - x0, wx)
+                _four_taps(y - y0, wy)
+                for c in range(channels):
+                    value = 0.0
+                    for k in range(4):
+                        row = image[y0 - 1 + k]
+                        value += wy[k] * (
+                            wx[0] * row[x0 - 1, c]
+                            + wx[1] * row[x0, c]
+                            + wx[2] * row[x0 + 1, c]
+                            + wx[3] * row[x0 + 2, c]
+                        )
+                    total[c] = value
+                if not np.isnan(total[0]):
+                    for c in range(channels):
+                        out[i, j, c] = total[c]
+                    continue
+            left, n_x = _taps(x, spread_x, wx)
+            top, n_y = _taps(y, spread_y, wy)
             weight = 0.0
             total[:] = 0.0
             for k in range(n_y):

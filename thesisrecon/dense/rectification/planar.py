@@ -90,9 +90,12 @@ class PlanarRectification:
 
     def lookup(self, side: int, rows: range) -> F64:
         """(len(rows), width, 2) px in the photograph for the pixels of these rows."""
-        x, y = np.meshgrid(np.arange(float(self.size[0])), np.arange(rows.start, rows.stop, dtype=np.float64))
-        places = np.stack([x, y], axis=-1)
-        return self.original_from_rectified(side, places.reshape(-1, 2)).reshape(places.shape)
+        G = np.linalg.inv(self.homography(side))
+        x, y = np.arange(float(self.size[0])), np.arange(rows.start, rows.stop, dtype=np.float64)
+        u, v, w = (np.add.outer(row[1] * y + row[2], row[0] * x) for row in G)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            w = np.where(w > 0.0, 1.0 / w, np.nan)
+        return np.stack([u * w, v * w], axis=-1)
 
     def warp(self, image: F32, side: int) -> F32:
         """``image`` (H, W) or (H, W, C) in the frame: float32, NaN outside."""
