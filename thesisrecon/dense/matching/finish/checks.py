@@ -1,0 +1,69 @@
+"""Left-right check, peak filter, pinholes, smoothing, confidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.dense.matching.finish.kernels import (
+    check_left_right,
+    fill_pinholes,
+    remove_peaks,
+    smooth_alike,
+)
+from thesisrecon.types import DisparityMap
+
+F32 = NDArray[np.float32]
+
+STEP_PX = np.float32(1.0)
+"""Neighbours on one surface differ by no more."""
+SURROUNDED = 5
+"""Of eight neighbours that must be known for a pinhole to be closed."""
+
+
+@dataclass(frozen=True)
+class Finish:
+    """What is believed of the best disparities.
+
+    ``left_right_px``: the partner's own best disparity may differ by as much. ``smallest_piece``: connected
+    pieces of fewer pixels are peaks and go. ``least_confidence``: less is unknown. ``radius``: every
+    disparity becomes the mean of those within so many pixels that differ from it by a pixel at most, which
+    takes the noise of the sub-pixel fit from a surface and leaves its edges.
+    """
+
+    left_right_px: float = 1.0
+    smallest_piece: int = 60
+    least_confidence: float = 0.02
+    radius: int = 2
+
+    def __post_init__(self) -> None:
+        if not (self.left_right_px >= 0.0 and self.smallest_piece >= 0 and self.radius >= 0):
+            raise ValueError("left_right_px, smallest_piece and radius must not be negative")
+        if not 0.0 <= self.least_confidence < 1.0:
+            raise ValueError(f"least_confidence must be in [0, 1); got {self.least_confidence}")
+
+    def apply(self, left: F32, right: F32, confidence: F32) -> DisparityMap:
+        """The map of disparities (H, W) of the left pixels, given those of the right ones, NaN = none.
+
+        Takes possession of ``left`` and ``confidence``.
+        """
+        check_left_right(left, right, np.float32(self.left_right_px))
+        left[confidence < np.float32(self.least_confidence)] = np.nan
+        remove_peaks(left, STEP_PX, self.smallest_piece)
+        closed = np.empty_like(left)
+        fill_pinholes(left, SURROUNDED, closed)
+        # A pinhole was not confirmed by the other side: its neighbours speak for it.
+        confidence[np.isnan(left)] *= np.float32(0.5)
+        smooth = np.empty_like(left)
+        smooth_alike(closed, STEP_PX, self.radius, smooth)
+        confidence[np.isnan(smooth)] = 0.0
+        return DisparityMap(smooth, confidence, _noise(closed, smooth))
+
+
+def _noise(raw: F32, smooth: F32) -> float:
+    """Deviation of the disparities about the smooth ones, from the median; NaN where nothing is known."""
+    apart = np.abs(raw - smooth)
+    known = apart[np.isfinite(apart)]
+    return float(1.4826 * np.median(known)) if len(known) else float("nan")

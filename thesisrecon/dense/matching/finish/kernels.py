@@ -1,0 +1,171 @@
+"""Compiled last steps: the best disparity of both sides, sub-pixel fit, checks, smoothing."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+I16 = NDArray[np.int16]
+I32 = NDArray[np.int32]
+U16 = NDArray[np.uint16]
+
+NONE = np.uint16(65535)
+
+
+@njit(cache=True, nogil=True)
+def _keep_best(total: U16, q: np.int16, best: U16, index: I16) -> None:
+    for x in range(len(best)):
+        # Read before the choice: a read inside of it would be a branch, and no vector instruction.
+        value, least, at = total[x], best[x], index[x]
+        index[x] = q if value < least else at
+        best[x] = value if value < least else least
+
+
+@njit(cache=True, nogil=True)
+def _keep_rival(total: U16, q: np.int16, index: I16, rival: U16) -> None:
+    """Least total of a disparity that is no neighbour of the best one."""
+    for x in range(len(rival)):
+        apart = np.int16(index[x] - q)
+        apart = np.int16(-apart) if apart < 0 else apart
+        value, least = total[x], rival[x]
+        value = value if apart > 1 else NONE
+        rival[x] = value if value < least else least
+
+
+@njit(cache=True, nogil=True)
+def best_disparities(total: U16, first: int, left: F32, right: F32, margin: F32) -> None:
+    """From ``total`` (H, D, W) the disparities of the left pixels, sub-pixel, and those of the right ones,
+    whole, NaN where the range leaves the image; ``margin`` by how much the best rival costs more.
+
+    The sub-pixel place is the corner of two lines of equal and opposite slope through the best three totals;
+    at an end of the range there is none.
+    """
+    height, n, width = total.shape
+    best, index = np.empty(width, np.uint16), np.empty(width, np.int16)
+    rival = np.empty(width, np.uint16)
+    best_r, index_r = np.empty(width, np.uint16), np.empty(width, np.int16)
+    for y in range(height):
+        best[:], index[:], rival[:] = NONE, 0, NONE
+        best_r[:], index_r[:] = NONE, -1
+        for q in range(n):
+            d = first + q
+            _keep_best(total[y, q], np.int16(q), best, index)
+            lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
+            if hi > lo:
+                _keep_best(total[y, q, lo:hi], np.int16(q), best_r[lo - d : hi - d], index_r[lo - d : hi - d])
+        for q in range(n):
+            _keep_rival(total[y, q], np.int16(q), index, rival)
+        for x in range(width):
+            q = int(index[x])
+            value = np.float32(first + q)
+            if 0 < q < n - 1:
+                a = np.float32(total[y, q - 1, x]) - np.float32(best[x])
+                b = np.float32(total[y, q + 1, x]) - np.float32(best[x])
+                steep = max(a, b)
+                if steep > 0:
+                    value += np.float32(0.5) * (a - b) / steep
+            left[y, x] = value
+            margin[y, x] = np.float32(rival[x]) - np.float32(best[x])
+            right[y, x] = np.float32(first + index_r[x]) if index_r[x] >= 0 else np.float32(np.nan)
+
+
+@njit(cache=True, nogil=True)
+def check_left_right(left: F32, right: F32, tolerance: np.float32) -> None:
+    """NaN to the disparities (H, W) of left pixels whose partner in the right image has another one."""
+    height, width = left.shape
+    for y in range(height):
+        for x in range(width):
+            partner = int(np.floor(np.float32(x) - left[y, x] + np.float32(0.5)))
+            if not (0 <= partner < width and abs(right[y, partner] - left[y, x]) <= tolerance):
+                left[y, x] = np.nan
+
+
+@njit(cache=True, nogil=True)
+def remove_peaks(disparity: F32, step: np.float32, smallest: int) -> None:
+    """NaN to connected pieces of fewer than ``smallest`` pixels; neighbours are connected where their
+    disparities differ by no more than ``step``."""
+    height, width = disparity.shape
+    seen = np.zeros((height, width), np.bool_)
+    queue = np.empty((height * width, 2), np.int32)
+    for y in range(height):
+        for x in range(width):
+            if seen[y, x] or np.isnan(disparity[y, x]):
+                continue
+            seen[y, x] = True
+            queue[0, 0], queue[0, 1] = y, x
+            at, n = 0, 1
+            while at < n:
+                v, u = queue[at, 0], queue[at, 1]
+                at += 1
+                here = disparity[v, u]
+                for k in range(4):
+                    b = v + (1 if k == 0 else -1 if k == 1 else 0)
+                    a = u + (1 if k == 2 else -1 if k == 3 else 0)
+                    if b < 0 or b >= height or a < 0 or a >= width or seen[b, a]:
+                        continue
+                    if abs(disparity[b, a] - here) <= step:
+                        seen[b, a] = True
+                        queue[n, 0], queue[n, 1] = b, a
+                        n += 1
+            if n < smallest:
+                for k in range(n):
+                    disparity[queue[k, 0], queue[k, 1]] = np.nan
+
+
+@njit(cache=True, nogil=True)
+def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
+    """Unknown pixels with at least ``least`` of 8 neighbours known take the median of these; (H, W)."""
+    height, width = disparity.shape
+    around = np.empty(8, np.float32)
+    out[:] = disparity
+    for y in range(height):
+        for x in range(width):
+            if not np.isnan(disparity[y, x]):
+                continue
+            n = 0
+            for b in range(max(y - 1, 0), min(y + 2, height)):
+                for a in range(max(x - 1, 0), min(x + 2, width)):
+                    value = disparity[b, a]
+                    if not np.isnan(value):
+                        place = n
+                        while place > 0 and around[place - 1] > value:
+                            around[place] = around[place - 1]
+                            place -= 1
+                        around[place] = value
+                        n += 1
+            if n >= least:
+                out[y, x] = np.float32(0.5) * (around[(n - 1) // 2] + around[n // 2])
+
+
+@njit(cache=True, nogil=True)
+def _gather_alike(centre: F32, other: F32, step: np.float32, total: F32, count: F32) -> None:
+    for x in range(len(centre)):
+        # A comparison with NaN is false: unknown pixels neither give nor take.
+        alike = abs(other[x] - centre[x]) <= step
+        total[x] += other[x] if alike else np.float32(0.0)
+        count[x] += np.float32(1.0) if alike else np.float32(0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def smooth_alike(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
+    """Mean over the square window of the disparities that differ from the centre's by no more than ``step``,
+    (H, W): what varies on one surface is averaged, an edge is left."""
+    height, width = disparity.shape
+    total, count = np.empty(width, np.float32), np.empty(width, np.float32)
+    for y in range(height):
+        total[:], count[:] = 0.0, 0.0
+        for b in range(max(y - radius, 0), min(y + radius + 1, height)):
+            for dx in range(-radius, radius + 1):
+                lo, hi = min(max(-dx, 0), width), max(min(width, width - dx), 0)
+                if hi > lo:
+                    _gather_alike(
+                        disparity[y, lo:hi],
+                        disparity[b, lo + dx : hi + dx],
+                        step,
+                        total[lo:hi],
+                        count[lo:hi],
+                    )
+        for x in range(width):
+            out[y, x] = total[x] / count[x] if count[x] > 0 else np.float32(np.nan)

@@ -1,0 +1,148 @@
+"""Matching by path sums: the scanlines tied together by the columns (the default), and semi-global matching.
+
+The dynamic programming of the thesis' reference decides every row by itself and shows it: rows of different
+opinion make streaks. Here a pixel adds up the least costs of the scanline that reaches it from the left and
+from the right, and of the column that reaches it from above and from below; where the diagonals join in it is
+semi-global matching (Hirschmüller, PAMI 2008). Occlusion is no state of the program but what the check of
+both sides against each other finds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thesisrecon.dense.matching.costs import CensusAndColour
+from thesisrecon.dense.matching.costs.volume import DEAREST
+from thesisrecon.dense.matching.finish import Finish
+from thesisrecon.dense.matching.finish.kernels import best_disparities
+from thesisrecon.dense.matching.pair import estimate_noise, prepare_pair
+from thesisrecon.dense.matching.paths import PathPenalties
+from thesisrecon.dense.matching.ranges import checked_range
+from thesisrecon.dense.matching.strips import Strip, row_strips, run_strips
+from thesisrecon.types import DisparityMap
+
+F32 = NDArray[np.float32]
+
+BYTES_PER_CELL = 3
+"""Of one disparity of one pixel: its cost, and two for the sum of the paths."""
+LEAST_NOISE = 1.0
+"""Grey levels that corresponding pixels differ by besides the noise: digitisation, another point of view."""
+
+
+@dataclass(frozen=True)
+class PathSum:
+    """What the variants share: costs, penalties, checks, memory and threads.
+
+    ``diagonals`` adds the four diagonal paths to the rows and columns. ``memory_mb`` bounds what the costs
+    and sums of one strip take; every thread has a strip of its own.
+    """
+
+    costs: CensusAndColour
+    penalties: PathPenalties
+    finish: Finish
+    diagonals: bool
+    memory_mb: float
+    threads: int
+
+    def match(self, left: ArrayLike, right: ArrayLike, disparity_range: tuple[int, int]) -> DisparityMap:
+        """See :meth:`CohesiveScanlines.match`."""
+        first, last = checked_range(disparity_range)
+        sides = prepare_pair(left, right)
+        noise = float(np.hypot(LEAST_NOISE, np.mean([estimate_noise(side) for side in sides])))
+        height, width = sides[0].valid.shape
+        costed = [self.costs.side(side) for side in sides]
+        support = self.costs.support_of(sides[0], noise)
+        jumps = self.penalties.jumps(sides[0], noise)
+        found = np.empty((3, height, width), np.float32)
+
+        def work(strip: Strip) -> None:
+            start, stop, top, bottom = strip
+            volume = self.costs.volume(
+                costed[0], costed[1], support, rows=(top, bottom), disparity_range=(first, last), noise=noise
+            )
+            totals = self.penalties.totals(volume, jumps[:, top:bottom], diagonals=self.diagonals)
+            rows = slice(start, stop)
+            best_disparities(totals[start - top : stop - top], first, *found[:, rows])
+
+        per_row = BYTES_PER_CELL * width * (last - first + 1)
+        run_strips(work, row_strips(height, per_row, 1e6 * self.memory_mb), self.threads)
+        left_px, right_px, margin = found
+        left_px[sides[0].valid == 0] = np.nan
+        return self.finish.apply(left_px, right_px, self._confidence(margin))
+
+    def _confidence(self, margin: F32) -> F32:
+        """By how much the best rival costs more, against what a step on every path costs."""
+        paths = 8 if self.diagonals else 4
+        half = np.float32(paths * self.penalties.step * DEAREST)
+        confidence: F32 = margin / (margin + half)
+        return confidence
+
+
+@dataclass(frozen=True)
+class CohesiveScanlines:
+    """The default: path sums along rows and columns over census and colour costs with adaptive support.
+
+    Four paths do better than eight here: over costs averaged over a support the diagonals add little
+    evidence, and they carry the disparity of a foreground past its corners.
+    """
+
+    costs: CensusAndColour = field(default_factory=CensusAndColour)
+    penalties: PathPenalties = field(default_factory=PathPenalties)
+    finish: Finish = field(default_factory=Finish)
+    diagonals: bool = False
+    memory_mb: float = 256.0
+    threads: int = 1
+
+    def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
+        """Disparities of the left image.
+
+        Parameters
+        ----------
+        left, right
+            (H, W) or (H, W, K <= 4) grey levels 0 .. 255 of a rectified pair, NaN = no pixel.
+        disparity_range
+            First and last disparity in pixels, both included; x_right = x_left - d, so they are positive for
+            parallel cameras and of either sign where these converge.
+
+        Returns
+        -------
+        DisparityMap
+            NaN where the pixel is hidden in the right image, where the two sides contradict each other, and
+            where nothing tells one disparity from another. The same bytes whatever the number of threads.
+
+        Raises
+        ------
+        ValueError
+            Images of different or impossible shape, an empty range.
+        """
+        return _path_sum(self).match(left, right, disparity_range)
+
+
+@dataclass(frozen=True)
+class SemiGlobal:
+    """Semi-global matching as published, on census costs: eight paths, no support, the same checks."""
+
+    costs: CensusAndColour = field(default_factory=lambda: CensusAndColour(census_share=1.0, support=False))
+    penalties: PathPenalties = field(default_factory=PathPenalties)
+    finish: Finish = field(default_factory=lambda: Finish(radius=0))
+    diagonals: bool = True
+    memory_mb: float = 256.0
+    threads: int = 1
+
+    def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
+        """See :meth:`CohesiveScanlines.match`."""
+        return _path_sum(self).match(left, right, disparity_range)
+
+
+def _path_sum(variant: CohesiveScanlines | SemiGlobal) -> PathSum:
+    return PathSum(
+        variant.costs,
+        variant.penalties,
+        variant.finish,
+        variant.diagonals,
+        variant.memory_mb,
+        variant.threads,
+    )
