@@ -1,0 +1,28 @@
+"""Sections 2.5 and 2.6: depth maps of every view from all photographs.
+
+Undistorted views, the choice of neighbours, pairwise correspondence through rectification, linking through
+the sequence or robust fusion, and consistency between the maps.
+"""
+
+from thesisrecon.dense.multiview.consistency import Consistency
+from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching
+from thesisrecon.dense.multiview.linking import InverseDepth, Linker, RobustFusion, SequenceLinking
+from thesisrecon.dense.multiview.neighbours import NeighbourChoice, SparsePoints, sparse_points
+from thesisrecon.dense.multiview.stage import MultiViewScene, MultiViewStereo
+from thesisrecon.dense.multiview.undistort import pinhole_view
+
+__all__ = [
+    "Consistency",
+    "Correspondence",
+    "InverseDepth",
+    "Linker",
+    "MultiViewScene",
+    "MultiViewStereo",
+    "NeighbourChoice",
+    "PairMatching",
+    "RobustFusion",
+    "SequenceLinking",
+    "SparsePoints",
+    "pinhole_view",
+    "sparse_points",
+]

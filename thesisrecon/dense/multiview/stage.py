@@ -1,0 +1,122 @@
+"""Depth maps of all views: each from its neighbours, then held against the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from thesisrecon.dense.multiview.consistency import Consistency
+from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching
+from thesisrecon.dense.multiview.linking import InverseDepth, Linker, RobustFusion
+from thesisrecon.dense.multiview.neighbours import (
+    NeighbourChoice,
+    SparsePoints,
+    shared_projections,
+    sparse_points,
+)
+from thesisrecon.dense.multiview.undistort import pinhole_view
+from thesisrecon.errors import StageFailure
+from thesisrecon.types import DepthMap, Image, PinholeView, Reconstruction
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class MultiViewScene:
+    """What the views share: ``views`` without distortion by number, the sparse ``points``, and the
+    ``neighbours`` of each view, the best first."""
+
+    views: Mapping[int, PinholeView]
+    points: SparsePoints
+    neighbours: Mapping[int, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class MultiViewStereo:
+    """Depth maps from undistorted views (thesis, section 2.6: dense depth from all photographs).
+
+    ``pairs`` finds correspondences, ``choice`` the neighbours, ``linker`` makes one inverse depth of what
+    they say, ``consistency`` holds the maps against each other. ``max_side`` px bounds the working size. One
+    view's map depends on nothing but the photographs and cameras, so views can be done in any order, by any
+    number of threads and in several runs: :meth:`prepare`, :meth:`depth_map` of each, :meth:`confirm` of
+    each.
+    """
+
+    pairs: PairMatching = field(default_factory=PairMatching)
+    choice: NeighbourChoice = field(default_factory=NeighbourChoice)
+    linker: Linker = field(default_factory=RobustFusion)
+    consistency: Consistency = field(default_factory=Consistency)
+    max_side: int = 1024
+
+    def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
+        """Undistorted views, sparse points and neighbours of V photographs with a metric reconstruction.
+
+        Raises ``ValueError`` for reconstructions that are not metric or of other photographs.
+        """
+        if len(images) != len(reconstruction.P):
+            raise ValueError(f"{len(reconstruction.P)} cameras need as many photographs; got {len(images)}")
+        points = sparse_points(reconstruction)
+        views = {
+            i: pinhole_view(image, reconstruction, i, max_side=self.max_side)
+            for i, image in enumerate(images)
+            if reconstruction.registered[i]
+        }
+        chosen = {i: tuple(self.choice.choose(points, views, i)) for i in views}
+        return MultiViewScene(views, points, chosen)
+
+    def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
+        """Depths of one view from its neighbours, before other depth maps are asked.
+
+        NaN where unknown; nothing but NaN for a view without neighbours or whose pairs all fail. ``views``
+        counts the neighbours that agree. ``ValueError`` for a view without a camera.
+        """
+        if view not in scene.views:
+            raise ValueError(f"view {view} has no camera; those with one are {sorted(scene.views)}")
+
+        def correspond(i: int, j: int) -> Correspondence | None:
+            a, b = scene.views[i], scene.views[j]
+            try:
+                return self.pairs.correspond(a, b, *shared_projections(scene.points, a, b))
+            except StageFailure:
+                return None
+
+        found = self.linker.link(view, scene.views, scene.neighbours[view], correspond)
+        return self.consistency.clean(_depth_map(scene.views[view], found))
+
+    def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
+        """The map of ``view`` with what the maps of other views confirm; see :class:`Consistency`."""
+        others = [depth_maps[j] for j in self.partners(scene, view) if j in depth_maps]
+        return self.consistency.confirm(depth_maps[view], others)
+
+    def partners(self, scene: MultiViewScene, view: int) -> tuple[int, ...]:
+        """Views whose maps are held against that of ``view``: its neighbours and those it is one of."""
+        mutual = {j for j, chosen in scene.neighbours.items() if view in chosen}
+        return tuple(sorted(mutual | set(scene.neighbours[view])))
+
+    def map_all(
+        self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
+    ) -> dict[int, DepthMap]:
+        """Confirmed depth maps of all registered views by number; the same whatever the number of threads."""
+        scene = self.prepare(images, reconstruction)
+        order = sorted(scene.views)
+        found = dict(zip(order, _run(lambda i: self.depth_map(scene, i), order, threads), strict=True))
+        return dict(zip(order, _run(lambda i: self.confirm(scene, found, i), order, threads), strict=True))
+
+
+def _depth_map(view: PinholeView, found: InverseDepth) -> DepthMap:
+    known = np.isfinite(found.value) & view.seen
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(known, 1.0 / found.value, np.nan).astype(np.float32)
+        std = np.where(known, found.std * depth * depth, np.nan).astype(np.float32)
+    return DepthMap(view.view, view.P, depth, std, np.where(known, found.views, 0).astype(np.uint8))
+
+
+def _run(work: Callable[[int], Result], items: Iterable[int], threads: int) -> list[Result]:
+    if threads < 2:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(work, items))
