@@ -32,9 +32,9 @@ class Rectifier(Protocol):
 class LeastDistorted:
     """The one of several methods that distorts a pair least, measured by ``RectificationQuality.distortion``.
 
-    To that is added by how much the angle of a photograph's midlines is off a right one beyond
-    ``angle_deg`` (in radians) and their ratio off its own beyond ``aspect``, and, for polar frames,
-    ``bending``: they bend straight lines. Methods that fail for a pair are passed over.
+    Methods that keep the angle of a photograph's midlines within ``angle_deg`` of a right one and their ratio
+    within ``aspect`` of its own come before the others, methods that fail for a pair are passed over, and
+    ``bending`` is added for polar frames: they bend straight lines.
     """
 
     methods: tuple[Rectifier, ...]
@@ -45,7 +45,7 @@ class LeastDistorted:
     def rectify(self, pair: EpipolarPair) -> AnyRectification:
         """The best of those that succeed; the last one's ``StageFailure`` where none does."""
         best: AnyRectification | None = None
-        least, failure = np.inf, None
+        least, failure = (True, np.inf), None
         for method in self.methods:
             try:
                 found = method.rectify(pair)
@@ -53,22 +53,18 @@ class LeastDistorted:
                 failure = reason
                 continue
             cost = self._cost(found, measure_quality(found, pair))
-            if cost < least:
+            if best is None or cost < least:
                 best, least = found, cost
         if best is None:
             raise failure if failure is not None else ValueError("a choice needs methods to choose from")
         return best
 
-    def _cost(self, found: AnyRectification, quality: RectificationQuality) -> float:
+    def _cost(self, found: AnyRectification, quality: RectificationQuality) -> tuple[bool, float]:
         # A midline through the epipole of a polar frame has no angle.
         turned = max((abs(a - 90.0) for a in quality.orthogonality_deg if np.isfinite(a)), default=0.0)
         aspect = max((abs(a - 1.0) for a in quality.aspect if np.isfinite(a)), default=0.0)
-        cost = (
-            quality.distortion
-            + np.radians(max(turned - self.angle_deg, 0.0))
-            + max(aspect - self.aspect, 0.0)
-        )
-        return float(cost + (self.bending if isinstance(found, PolarRectification) else 0.0))
+        bent = self.bending if isinstance(found, PolarRectification) else 0.0
+        return turned > self.angle_deg or aspect > self.aspect, quality.distortion + bent
 
 
 def _methods(limits: FrameLimits) -> Mapping[Method, Rectifier]:
@@ -88,9 +84,11 @@ def rectify(
 
     Raises ``ValueError`` for an unknown method, ``StageFailure`` for a pair that it cannot rectify.
     """
-    methods = _methods(FrameLimits() if limits is None else limits)
+    limits = FrameLimits() if limits is None else limits
+    methods = _methods(limits)
     if method == "best":
-        return LeastDistorted(tuple(methods.values())).rectify(pair)
+        bare = Polar(limits, most_scale=0.0, most_shear=0.0)
+        return LeastDistorted((*methods.values(), bare)).rectify(pair)
     if method not in methods:
         raise ValueError(f"a method of rectification is one of {['best', *methods]}; got {method!r}")
     return methods[method].rectify(pair)

@@ -12,7 +12,7 @@ from thesisrecon.dense.rectification.pair import LEAST_MATCHES, EpipolarPair
 from thesisrecon.dense.rectification.planar import (
     FrameLimits,
     PlanarRectification,
-    disparity_gradient,
+    disparity_gradients,
     frame,
     homographies_of_rows,
     homography_jacobians,
@@ -107,7 +107,7 @@ class LeastDistortion:
 
     Line at infinity, scale along the rows and shear of either side (5 unknowns; least squares from those of
     :class:`LoopZhang`): the variance of the log singular values of both homographies, symmetric in growing
-    and shrinking, and a quarter of the squared gradient of the plane fitted to the disparities. Between
+    and shrinking, and a quarter of the mean squared gradient of the disparities. Between
     Hartley, who makes the first photograph like the second, and Loop and Zhang, who spare either by itself:
     ``most_scale`` (log) and ``most_shear`` say by how much a photograph may give up its aspect and its right
     angles so that both sides become alike.
@@ -155,7 +155,8 @@ def _distortion_residuals(pair: EpipolarPair, first: F64, rows: F64) -> F64:
         return np.asarray(residuals)
     moved = [homogenize(pair.pencil.places(s, xy)) @ H[s].T for s, xy in enumerate(pair.matches)]
     left, right = (xh[:, :2] / xh[:, 2:] for xh in moved)
-    return np.concatenate([residuals, 0.5 * disparity_gradient(left, right)])
+    slopes = disparity_gradients(left, right)
+    return np.concatenate([residuals, 0.5 * slopes.ravel() / np.sqrt(len(slopes))])
 
 
 def calmest_line(pair: EpipolarPair) -> float:

@@ -19,8 +19,11 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.types import B8, F32, F64
 
-CROP_MARGIN = 0.75
+CROP_MARGIN = 1.0
 """How far disparities may go beyond those of the matches in a crop, as a share of their range."""
+
+MOST_MATCHES = 300
+"""Matches that disparities are fitted to."""
 
 
 @dataclass(frozen=True)
@@ -242,12 +245,22 @@ def disparity_bounds(disparities: F64, *, margin: float) -> tuple[float, float]:
     return float(low - margin * (high - low)), float(high + margin * (high - low))
 
 
-def disparity_gradient(left: F64, right: F64) -> F64:
-    """Gradient (2,) of the plane fitted to x_left - x_right over the means of both places (N, 2), (N, 2)."""
+def disparity_gradients(left: F64, right: F64) -> F64:
+    """Gradients (M, 2) of x_left - x_right by the means of both places (N, 2), (N, 2), at M <= 300 of these.
+
+    Of the quadratic polynomial that fits best: what either side is stretched, sheared and bent against the
+    other on the whole, relief left out.
+    """
+    every = max(len(left) // MOST_MATCHES, 1)
+    left, right = left[::every], right[::every]
     middle = 0.5 * (left + right)
-    design = np.column_stack([middle - middle.mean(axis=0), np.ones(len(middle))])
-    plane: F64 = np.linalg.lstsq(design, left[:, 0] - right[:, 0], rcond=None)[0]
-    return plane[:2]
+    middle = middle - middle.mean(axis=0)
+    unit = float(np.abs(middle).max(initial=1e-12))
+    x, y = (middle / unit).T
+    design = np.stack([x, y, x * x, x * y, y * y, np.ones_like(x)], axis=1)
+    # Of few matches, or of matches on a line, the least polynomial is as good.
+    c = np.linalg.lstsq(design, (left[:, 0] - right[:, 0]) / unit, rcond=1e-6)[0]
+    return np.stack([c[0] + 2.0 * c[2] * x + c[3] * y, c[1] + c[3] * x + 2.0 * c[4] * y], axis=1)
 
 
 def homography_jacobians(H: F64, xy: F64) -> F64:

@@ -6,13 +6,13 @@ epipoles may lie anywhere, and the frame is never larger than a few times the ph
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thesisrecon.dense.rectification.pair import EpipolarPair
+from thesisrecon.dense.rectification.pair import LEAST_MATCHES, EpipolarPair
 from thesisrecon.dense.rectification.pencil import EpipolarPencil, HalfLines
-from thesisrecon.dense.rectification.planar import FrameLimits, common_crop
+from thesisrecon.dense.rectification.planar import FrameLimits, common_crop, disparity_gradients
 from thesisrecon.dense.rectification.sampling import require_side, warp_image
 from thesisrecon.types import F32, F64
 
@@ -22,16 +22,19 @@ ANGLES = 4096
 
 @dataclass(frozen=True)
 class PolarRectification:
-    """Rows of half-planes and columns of equal distance from the epipole.
+    """Rows of half-planes and columns of equal distance from the epipole, or nearly so.
 
     Row r shows the half-plane ``angles[r]`` (H,) of ``pencil``, rows between are interpolated linearly in
-    the angle; column c of a side is c + ``origins[side]`` px farther along the half-line than the centre of
-    that photograph is from the epipole (and against it where the pencil is turned). ``size`` (width, height)
-    is common to both. The same convention holds as for planar rectification: side 0 is the left one.
+    the angle. Its point that is s px farther along the half-line than the centre of that photograph is from
+    the epipole (nearer where the pencil is turned) stands in column ``scales[side]`` s + ``shears[side]`` r -
+    ``origins[side]``. ``size`` (width, height) is common to both. The same convention holds as for planar
+    rectification: side 0 is the left one.
     """
 
     pencil: EpipolarPencil
     angles: F64
+    scales: F64
+    shears: F64
     origins: F64
     size: tuple[int, int]
 
@@ -39,27 +42,31 @@ class PolarRectification:
         """Pixels (N, 2) of the photograph at places (N, 2) of the frame; NaN outside the frame and beyond the
         epipole. With ``within`` False columns may be any."""
         lines = self.pencil.half_lines(require_side(side), self._angle_of(xy[:, 1]))
-        return self._on_lines(side, lines, xy[:, 0], within)
+        return self._on_lines(side, lines, xy, within)
 
-    def _on_lines(self, side: int, lines: HalfLines, columns: F64, within: bool) -> F64:
-        sign = -1.0 if self.pencil.turned else 1.0
-        t = sign * (columns + self.origins[side]) / self.pencil.units[side] + lines.sagitta
+    def _on_lines(self, side: int, lines: HalfLines, xy: F64, within: bool) -> F64:
+        along = (xy[:, 0] + self.origins[side] - self.shears[side] * xy[:, 1]) / self.scales[side]
+        t = self._sign * along / self.pencil.units[side] + lines.sagitta
         valid = lines.on_half(t)
         if within:
-            valid = np.logical_and(valid, (columns >= -0.5) & (columns <= self.size[0] - 0.5))
-        xy = self.pencil.pixels(side, lines.foot + t[:, None] * lines.direction)
-        return np.where(valid[:, None], xy, np.nan)
+            valid = np.logical_and(valid, (xy[:, 0] >= -0.5) & (xy[:, 0] <= self.size[0] - 0.5))
+        pixels = self.pencil.pixels(side, lines.foot + t[:, None] * lines.direction)
+        return np.where(valid[:, None], pixels, np.nan)
 
     def rectified_from_original(self, side: int, xy: F64, *, within: bool = True) -> F64:
         """The inverse of :meth:`original_from_rectified`, for pixels (N, 2) of the photograph."""
         middle = 0.5 * float(self.angles[0] + self.angles[-1])
         phi = self.pencil.angles(require_side(side), xy, about=middle)
-        lines = self.pencil.half_lines(side, phi)
-        sign = -1.0 if self.pencil.turned else 1.0
+        lines, rows = self.pencil.half_lines(side, phi), self._row_of(phi)
         t = np.sum(self.pencil.places(side, xy) * lines.direction, axis=1)
-        columns = sign * self.pencil.units[side] * (t - lines.sagitta) - self.origins[side]
+        along = self._sign * self.pencil.units[side] * (t - lines.sagitta)
+        columns = self.scales[side] * along + self.shears[side] * rows - self.origins[side]
         valid = (columns >= -0.5) & (columns <= self.size[0] - 0.5) if within else np.full(len(xy), True)
-        return np.where(valid[:, None], np.stack([columns, self._row_of(phi)], axis=1), np.nan)
+        return np.where(valid[:, None], np.stack([columns, rows], axis=1), np.nan)
+
+    @property
+    def _sign(self) -> float:
+        return -1.0 if self.pencil.turned else 1.0
 
     def lookup(self, side: int, rows: range) -> F64:
         """(len(rows), width, 2) px in the photograph for the pixels of these rows."""
@@ -69,8 +76,13 @@ class PolarRectification:
             np.repeat(part, width, axis=0) for part in (lines.foot, lines.direction, lines.distance)
         )
         every = HalfLines(foot, direction, distance, lines.epipole)
-        columns = np.tile(np.arange(float(width)), len(rows))
-        return self._on_lines(side, every, columns, True).reshape(len(rows), width, 2)
+        columns, row = (
+            np.tile(np.arange(float(width)), len(rows)),
+            np.repeat(np.array(rows, dtype=np.float64), width),
+        )
+        return self._on_lines(side, every, np.stack([columns, row], axis=1), True).reshape(
+            len(rows), width, 2
+        )
 
     def warp(self, image: F32, side: int) -> F32:
         """``image`` (H, W) or (H, W, C) in the frame: float32, NaN outside."""
@@ -87,8 +99,9 @@ class PolarRectification:
     def _row_of(self, phi: F64) -> F64:
         """The inverse of :meth:`_angle_of`."""
         last = len(self.angles) - 1
-        sign = -1.0 if self.pencil.turned else 1.0
-        k = np.clip(np.searchsorted(sign * self.angles, sign * phi, side="right") - 1, 0, last - 1)
+        k = np.clip(
+            np.searchsorted(self._sign * self.angles, self._sign * phi, side="right") - 1, 0, last - 1
+        )
         rows = k + (phi - self.angles[k]) / (self.angles[k + 1] - self.angles[k])
         return np.where((rows >= -0.5) & (rows <= last + 0.5), rows, np.nan)
 
@@ -101,30 +114,49 @@ class Polar:
     where a far end would shrink by more (up to 1 % more just at corners). With ``most_shrink`` 1 no pixel is
     lost, as Pollefeys et al. have it, at the price of rows that are too near elsewhere. They walk from line
     to line; here the spacing is a function of the angle whose integral counts the rows.
+
+    Shear, and scale along the rows where a side has less than a pixel for a pixel of the other, make both
+    sides as alike as ``most_scale`` (log) and ``most_shear`` allow, judged by the matches.
     """
 
     limits: FrameLimits = field(default_factory=FrameLimits)
+    most_scale: float = 0.1
+    most_shear: float = 0.06
 
     def rectify(self, pair: EpipolarPair) -> PolarRectification:
         """The polar frame; ``StageFailure`` where it would be too large or the views share nothing."""
-        pencil, sign = pair.pencil, -1.0 if pair.pencil.turned else 1.0
+        pencil, sign = pair.pencil, -1 if pair.pencil.turned else 1
         phi = _half_planes(pair)
         chords = [_chord(pencil, side, phi) for side in (0, 1)]
-        angles = _rows_of(pencil, phi, chords, self.limits.most_shrink)[:: int(sign)]
-        whole = PolarRectification(pencil, angles, np.zeros(2), (1, len(angles)))
+        angles = _rows_of(pencil, phi, chords, self.limits.most_shrink)[::sign]
+        bare = PolarRectification(pencil, angles, np.ones(2), np.zeros(2), np.zeros(2), (1, len(angles)))
+        alike = self._made_alike(bare, pair)
         ends = []
         for side, (lines, enter, leave) in enumerate(chords):
             met = leave >= enter
-            t = np.concatenate([enter[met] - lines.sagitta[met], leave[met] - lines.sagitta[met]])
-            columns = sign * pencil.units[side] * t
-            ends.append(np.stack([columns, np.zeros(len(columns))], axis=1))
-        matches = tuple(
-            whole.rectified_from_original(side, xy, within=False) for side, xy in enumerate(pair.matches)
-        )
-        seen = np.isfinite(matches[0]).all(axis=1) & np.isfinite(matches[1]).all(axis=1)
-        low, high = common_crop(ends, (matches[0][seen], matches[1][seen]))
-        width, height = self.limits.require(np.array([(high - low)[:, 0].max() + 1.0, len(angles)]), pair)
-        return PolarRectification(pencil, angles, low[:, 0].copy(), (width, height))
+            rim = [(lines.foot + t[:, None] * lines.direction)[met] for t in (enter, leave)]
+            xy = alike.rectified_from_original(side, pencil.pixels(side, np.concatenate(rim)), within=False)
+            ends.append(xy[np.isfinite(xy).all(axis=1)])
+        low, high = common_crop(ends, _matches_in(alike, pair))
+        extent = np.array([(high - low)[:, 0].max() + 1.0, len(angles)])
+        return replace(alike, origins=low[:, 0].copy(), size=self.limits.require(extent, pair))
+
+    def _made_alike(self, bare: PolarRectification, pair: EpipolarPair) -> PolarRectification:
+        left, right = _matches_in(bare, pair)
+        if len(left) < LEAST_MATCHES:
+            return bare
+        # d changes by the difference of both scales along x and of both shears along y.
+        slope = disparity_gradients(left, right).mean(axis=0)
+        scale = np.exp(np.clip(-slope[0], -self.most_scale, self.most_scale))
+        shear = np.clip(-0.5 * slope[1], -self.most_shear, self.most_shear)
+        scales = np.array([max(scale, 1.0), max(1.0 / scale, 1.0)])
+        return replace(bare, scales=scales, shears=np.array([shear, -shear]))
+
+
+def _matches_in(frame: PolarRectification, pair: EpipolarPair) -> tuple[F64, F64]:
+    left, right = (frame.rectified_from_original(s, xy, within=False) for s, xy in enumerate(pair.matches))
+    seen = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
+    return left[seen], right[seen]
 
 
 def _half_planes(pair: EpipolarPair) -> F64:

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from thesisrecon.dense.rectification.pair import EpipolarPair
-from thesisrecon.dense.rectification.planar import disparity_bounds, disparity_gradient, singular_values
+from thesisrecon.dense.rectification.planar import disparity_bounds, disparity_gradients, singular_values
 from thesisrecon.types import F64
 
 STEP_PX = 0.01
@@ -38,8 +38,8 @@ class RectificationQuality:
     finite. ``kept`` share of each photograph inside the frame, ``growth`` pixels of the frame over those of
     the larger photograph. ``least_scale, greatest_scale`` pixels of the frame per pixel along any direction.
     ``stretch`` is the typical factor by which lengths change, exp of the RMS log singular value about their
-    mean, 1 for similarities. ``slant`` (gradient of the plane fitted to the disparities of the matches)
-    says how unlike both sides are, and ``disparities`` their least and greatest.
+    mean, 1 for similarities. ``slant`` (RMS gradient of the quadratic polynomial fitted to the
+    disparities of the matches) says how unlike both sides are, and ``disparities`` their least and greatest.
     """
 
     rms_dy_px: float
@@ -136,5 +136,5 @@ def _matches(rectification: Rectification, pair: EpipolarPair) -> tuple[float, f
         return float("nan"), float("nan"), (float("nan"), float("nan"))
     left, right = left[seen], right[seen]
     dy = float(np.sqrt(np.mean((left[:, 1] - right[:, 1]) ** 2)))
-    slant = float(np.hypot(*disparity_gradient(left, right)))
+    slant = float(np.sqrt(np.mean(np.sum(disparity_gradients(left, right) ** 2, axis=1))))
     return dy, slant, disparity_bounds(left[:, 0] - right[:, 0], margin=0.0)
