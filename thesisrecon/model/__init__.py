@@ -2,6 +2,7 @@
 
 from thesisrecon.model.depth_surface import surface_from_depth
 from thesisrecon.model.fusion import VolumetricFusion
-from thesisrecon.model.mesh import keep_large_parts
+from thesisrecon.model.mesh import coarser, keep_large_parts
+from thesisrecon.model.stage import SurfaceModel
 
-__all__ = ["VolumetricFusion", "keep_large_parts", "surface_from_depth"]
+__all__ = ["SurfaceModel", "VolumetricFusion", "coarser", "keep_large_parts", "surface_from_depth"]

@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import (
+    B8,
+    F32,
     IntrinsicInterval,
     MetricResult,
     PairChoice,
     Reconstruction,
     StageReport,
+    TexturedMesh,
     TwoView,
 )
 
@@ -44,6 +47,38 @@ class Photograph:
 
 
 @dataclass(frozen=True)
+class HeldOut:
+    """A photograph that gave the model no texture, beside the model as its camera sees it.
+
+    ``name`` of the photograph; ``real, rendered`` (H, W, 3) uint8, the photograph without its distortion and
+    the picture of the model; ``compared`` (H, W) the pixels that both have and the numbers are of;
+    ``psnr_db`` peak signal-to-noise ratio in dB; ``ssim`` structural similarity, 1 = the same.
+
+    Raises
+    ------
+    ValueError
+        where the pictures and the mask are not of one size.
+    """
+
+    name: str
+    real: U8
+    rendered: U8
+    compared: B8
+    psnr_db: float
+    ssim: float
+
+    def __post_init__(self) -> None:
+        shapes = (self.real.shape, self.rendered.shape, (*self.compared.shape, 3))
+        if len(set(shapes)) > 1:
+            raise ValueError(f"a held-out comparison needs pictures and a mask of one size; got {shapes}")
+
+    @property
+    def share(self) -> float:
+        """Part of the pixels that were compared."""
+        return float(self.compared.mean()) if self.compared.size else 0.0
+
+
+@dataclass(frozen=True)
 class ReportData:
     """Everything ``report.html`` says, for a run that ended well, ended early or failed.
 
@@ -62,6 +97,12 @@ class ReportData:
     metric : the result of the metric stage.
     colours : (N, 3) uint8 of the points of the metric reconstruction (valid or not), or None.
     affine : the affine stratum on the way to it, of the same points.
+    model : the surface of ``metric``, in its coordinates, as the page carries it: best made ``coarser`` to
+        150,000 faces with a texture of at most 2048 x 2048 texels (the page then grows by about 6 MB). With
+        a texture, colours of its vertices, or neither; None or without faces = the page has no model.
+    depth_pictures : view -> depth (H, W) float32, NaN where unknown, in units of the scene; any size (a long
+        side of 400 px is enough), of as many views as have one.
+    held_out : a photograph beside the model, or None.
     until : the stage the user asked to end with, None where all were asked for.
     failure : why the run could not go on, None where it did.
 
@@ -84,6 +125,9 @@ class ReportData:
     metric: MetricResult | None = None
     colours: U8 | None = None
     affine: Reconstruction | None = None
+    model: TexturedMesh | None = None
+    depth_pictures: Mapping[int, F32] = field(default_factory=dict)
+    held_out: HeldOut | None = None
     until: str | None = None
     failure: StageFailure | None = None
 
@@ -108,6 +152,11 @@ class ReportData:
             points = len(self.metric.reconstruction.X)
             if self.colours.shape != (points, 3):
                 raise ValueError(f"colours must be ({points}, 3), one per point; got {self.colours.shape}")
+
+        if self.model is not None and not (self.metric and self.metric.reconstruction.registered.any()):
+            raise ValueError("a model needs the metric reconstruction that it was made from")
+        if any(not 0 <= view < views for view in self.depth_pictures):
+            raise ValueError(f"depth_pictures must name views below {views}, the number of photographs")
 
     @property
     def original_intrinsics(self) -> tuple[Mapping[str, IntrinsicInterval], ...]:

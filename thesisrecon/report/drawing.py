@@ -1,4 +1,5 @@
-"""Pictures of the page, drawn with Pillow: thumbnails, and two photographs with their epipolar geometry."""
+"""Pictures of the page, drawn with Pillow: thumbnails, two photographs with their epipolar geometry, depth
+maps, and a photograph beside the model."""
 
 from __future__ import annotations
 
@@ -7,11 +8,12 @@ import io
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
-from thesisrecon.report.data import Photograph
-from thesisrecon.types import F64, I64, TwoView
+from thesisrecon.report.data import HeldOut, Photograph
+from thesisrecon.types import F32, F64, I64, TwoView
 
 THUMBNAIL_BYTES = 2_000_000
 PANEL_LONG_SIDE = 640
@@ -21,6 +23,19 @@ HUES = (
     "#ffd166", "#06d6a0", "#4cc9f0", "#ff7096", "#f9844a", "#b8f35a",
     "#c77dff", "#80ffdb", "#ffadad", "#72b0ff", "#fdffb6", "#ff9ff3",
 )  # fmt: skip
+
+DEPTH_BYTES = 1_500_000
+DEPTH_SIDE = 360
+HELD_OUT_SIDE = 640
+DIFFERENCE_LIMIT = 64.0
+"""Grey levels; larger differences look alike."""
+
+# Lightness rises by about 10 of 100 from colour to colour (CIELAB), so that equal steps look equal and their
+# order survives grey printing and colour blindness: hue runs from violet to yellow in Oklch (Ottosson 2020).
+SCALE = (
+    "#290372", "#073390", "#055a85", "#02788f", "#019696", "#0cb693", "#5ed27d", "#b3e369", "#fbf163",
+)  # fmt: skip
+UNKNOWN = (201, 208, 214)
 
 
 @dataclass(frozen=True)
@@ -156,3 +171,62 @@ def _faded(photograph: Photograph) -> tuple[PillowImage.Image, float]:
 def _to_drawing(xy: F64, s: float) -> list[tuple[float, float]]:
     """Pixels of the photograph as Pillow's drawing coordinates at scale s."""
     return [(float(x), float(y)) for x, y in (xy + 0.5) * s - 0.5]
+
+
+@dataclass(frozen=True)
+class DepthPicture:
+    """A coloured depth map: ``near`` (the brightest) and ``far`` (the darkest) in units of the scene, NaN
+    where there is no depth at all; ``share`` of the pixels that have one."""
+
+    picture: EmbeddedPicture
+    near: float
+    far: float
+    share: float
+
+
+def draw_depth(depth: F32, *, side: int = DEPTH_SIDE) -> DepthPicture:
+    """A depth map (H, W), NaN where unknown, as a small picture: near is bright, far dark, unknown grey.
+
+    The scale runs from the 1 % to the 99 % quantile of the known depths, so that strays do not take it all.
+    """
+    known = np.isfinite(depth)
+    near, far = np.quantile(depth[known], (0.01, 0.99)).tolist() if known.any() else (np.nan, np.nan)
+    closeness = (far - depth.astype(np.float64)) / max(far - near, 1e-12 * abs(far), 1e-300)
+    colored = PillowImage.fromarray(paint_scale(closeness))
+    return DepthPicture(_small(colored, side), float(near), float(far), float(known.mean()))
+
+
+def paint_scale(values: F64) -> NDArray[np.uint8]:
+    """Colours (..., 3) of numbers (...) from 0 (dark) to 1 (bright); beyond is cut, NaN is grey."""
+    table = np.array([[int(code[k : k + 2], 16) for k in (1, 3, 5)] for code in SCALE], dtype=np.float64)
+    at = np.linspace(0.0, 1.0, len(table))
+    known = np.isfinite(values)
+    place = np.where(known, values, 0.0)
+    colors = np.stack([np.interp(place, at, table[:, d]) for d in range(3)], axis=-1)
+    colors[~known] = UNKNOWN
+    return np.asarray(np.rint(colors), dtype=np.uint8)
+
+
+def depth_side(how_many: int) -> int:
+    """Long side of each of so many depth pictures, all of which together take about ``DEPTH_BYTES``."""
+    return int(np.clip(np.sqrt(DEPTH_BYTES / max(how_many, 1) / 0.33), 96, DEPTH_SIDE))
+
+
+def draw_held_out(held_out: HeldOut) -> tuple[EmbeddedPicture, EmbeddedPicture, EmbeddedPicture]:
+    """The photograph, the model in its place, and the mean difference of their channels (dark = alike).
+
+    What is not compared is grey in the last two.
+    """
+    difference = np.abs(held_out.real.astype(np.float64) - held_out.rendered).mean(axis=2)
+    difference = np.where(held_out.compared, difference / DIFFERENCE_LIMIT, np.nan)
+    rendered = np.where(held_out.compared[..., None], held_out.rendered, np.array(UNKNOWN, np.uint8))
+    real, model, apart = (
+        _small(PillowImage.fromarray(pixels), HELD_OUT_SIDE)
+        for pixels in (held_out.real, rendered, paint_scale(difference))
+    )
+    return real, model, apart
+
+
+def _small(picture: PillowImage.Image, side: int) -> EmbeddedPicture:
+    picture.thumbnail((side, side), PillowImage.Resampling.BOX)
+    return embed_jpeg(picture, quality=86)

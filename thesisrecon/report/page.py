@@ -1,7 +1,7 @@
 """``report.html``: one file that opens from disk, with its scripts, style and pictures inside.
 
 Nothing on the page may come from elsewhere, and nothing a file is named may run: the template escapes all
-text, data for the scripts is JSON that cannot close its element, and a content security policy names the two
+text, data for the scripts is JSON that cannot close its element, and a content security policy names the
 scripts by their hash and forbids every address but ``data:``.
 """
 
@@ -23,7 +23,17 @@ from plotly.offline import get_plotlyjs
 
 from thesisrecon.io.run_directory import write_atomically
 from thesisrecon.report.data import ReportData
-from thesisrecon.report.drawing import EmbeddedPicture, draw_pair, thumbnail
+from thesisrecon.report.drawing import (
+    DIFFERENCE_LIMIT,
+    SCALE,
+    DepthPicture,
+    EmbeddedPicture,
+    depth_side,
+    draw_depth,
+    draw_held_out,
+    draw_pair,
+    thumbnail,
+)
 from thesisrecon.report.figures import histogram_path, pair_matrix_figure, scene_figure
 from thesisrecon.report.residuals import (
     ResidualSummary,
@@ -33,6 +43,7 @@ from thesisrecon.report.residuals import (
     summarize_distances,
 )
 from thesisrecon.report.scene import MAX_POINTS, build_scene
+from thesisrecon.report.viewer import viewer_data
 from thesisrecon.report.wording import (
     chosen_pairs,
     count_of,
@@ -41,8 +52,10 @@ from thesisrecon.report.wording import (
     first_glance,
     grouped,
     judge,
+    model_words,
     named_numbers,
     plus_minus,
+    significant,
 )
 from thesisrecon.types import F64, IntrinsicInterval, StageReport, TwoView
 
@@ -95,8 +108,11 @@ def render_report(data: ReportData) -> str:
     everything = np.concatenate([np.zeros(0), *distances])
     overall = summarize_distances(everything)
     limit_px = common_limit_px(everything)
-    plotly, script = get_plotlyjs().replace("</script", "<\\/script"), _resource("page.js")
     figures, shown = _figures(data)
+    model = _model(data)
+    plotly = get_plotlyjs().replace("</script", "<\\/script")
+    figure_scripts = [plotly, _resource("page.js")] if figures else []
+    model_scripts = [_resource("viewer.js")] if model is not None else []
     return (
         _environment()
         .from_string(_resource("template.html.j2"))
@@ -107,6 +123,8 @@ def render_report(data: ReportData) -> str:
             overall=overall,
             cards=_cards(data, distances, limit_px),
             limit_px=limit_px,
+            model=model,
+            **_pictures_of_the_model(data),
             figures=figures,
             shown_points=shown,
             most_points=MAX_POINTS,
@@ -119,9 +137,10 @@ def render_report(data: ReportData) -> str:
             self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
             summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
             style=_resource("style.css"),
-            plotly=plotly,
-            script=script,
-            script_hashes=" ".join(f"'{_hash(text)}'" for text in (plotly, script)),
+            figure_scripts=figure_scripts,
+            model_scripts=model_scripts,
+            script_hashes=" ".join(f"'{_hash(text)}'" for text in (*figure_scripts, *model_scripts))
+            or "'none'",
             histogram_size=(HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT),
         )
     )
@@ -131,7 +150,7 @@ def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters.update(grouped=grouped, decimals=decimals)
+    environment.filters.update(grouped=grouped, decimals=decimals, significant=significant)
     environment.globals.update(count_of=count_of)
     # NaN is no JSON: better an error here than a page whose script cannot read its data.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
@@ -163,6 +182,33 @@ def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
     if data.pairs:
         figures["matrix-figure"] = pair_matrix_figure(data.pairs, names)
     return figures, len(scene.points) if scene is not None else 0
+
+
+def _model(data: ReportData) -> dict[str, Any] | None:
+    """What the viewer draws, None without a surface."""
+    if data.model is None or not len(data.model.faces) or data.metric is None:
+        return None
+    return viewer_data(data.model, data.metric.reconstruction, [photo.name for photo in data.photographs])
+
+
+def _pictures_of_the_model(data: ReportData) -> dict[str, Any]:
+    """What the page says of the model beside the viewer, and the pictures of depth and of comparison."""
+    return {
+        "model_words": model_words(data.model) if data.model is not None else "",
+        "depths": _depths(data),
+        "held_out": draw_held_out(data.held_out) if data.held_out is not None else None,
+        "scale": SCALE,
+        "difference_limit": round(DIFFERENCE_LIMIT),
+    }
+
+
+def _depths(data: ReportData) -> list[tuple[int, str, DepthPicture]]:
+    """(number, name, picture) of every view with a depth map."""
+    side = depth_side(len(data.depth_pictures))
+    return [
+        (view + 1, data.photographs[view].name, draw_depth(depth, side=side))
+        for view, depth in sorted(data.depth_pictures.items())
+    ]
 
 
 def _cards(data: ReportData, distances: list[F64], limit_px: float) -> list[Card]:

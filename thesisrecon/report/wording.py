@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon.report.data import ReportData
 from thesisrecon.report.residuals import ResidualSummary
-from thesisrecon.types import IntrinsicInterval, TwoView
+from thesisrecon.types import IntrinsicInterval, TexturedMesh, TwoView
 
 Level = Literal["good", "doubt", "open", "bad"]
 THIN = "\u202f"  # a narrow space that does not break groups thousands in any language
@@ -134,6 +134,19 @@ def chosen_pairs(data: ReportData) -> str:
     return f"{grouped(tried)} of {grouped(possible)} pairs were tried: {data.pair_choice.how}."
 
 
+def model_words(mesh: TexturedMesh) -> str:
+    """How large the model on the page is, and what of it nobody saw."""
+    words = count_of(len(mesh.faces), "triangle")
+    if mesh.texture is not None and mesh.uv is not None:
+        words += f" with a texture of {mesh.texture.shape[1]} × {mesh.texture.shape[0]} texels"
+    elif mesh.colors is not None:
+        words += " with coloured corners"
+    unseen = float(mesh.untextured.mean()) if mesh.untextured is not None and len(mesh.untextured) else 0.0
+    if unseen >= 0.001:
+        words += f"; {100 * unseen:.1f} % of them are in no photograph and coloured like their surroundings"
+    return words
+
+
 def _point_fact(points: int, overall: ResidualSummary | None) -> Fact:
     seen = f"seen in {overall.count / points:.1f} photographs on average" if overall and points else ""
     return Fact("Points", grouped(points), seen)
@@ -210,6 +223,11 @@ def grouped(number: int) -> str:
 def decimals(value: float, digits: int) -> str:
     """A number with so many decimals, a dash where it is not known."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+
+
+def significant(value: float) -> str:
+    """A length in three digits, a dash where it is not known."""
+    return f"{value:.3g}" if np.isfinite(value) else "–"
 
 
 def duration(seconds: float) -> str:

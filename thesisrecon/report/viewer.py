@@ -1,0 +1,131 @@
+"""The model as numbers for ``viewer.js``: turned upright, quantised, packed as text."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from thesisrecon.geometry.camera import decompose_camera
+from thesisrecon.report.drawing import embed_jpeg
+from thesisrecon.report.scene import upright_rotation
+from thesisrecon.types import F64, I64, Reconstruction, TexturedMesh
+
+LEVELS = 65535
+"""Steps a side of the box about the model, and a side of the texture."""
+
+MAX_FACES = 150_000
+MAX_TEXELS = 2100 * 2100
+"""What the page carries is kept below about 8 MB by these; texture beyond the limit is reduced."""
+
+PLAIN = (200, 200, 200)
+"""Colour of a model that has none."""
+
+TURNS = (
+    ("Behind the cameras", (0.35, -1.45, 0.6)),
+    ("From above", (0.0, -0.01, 1.9)),
+    ("From the left", (-1.3, -0.9, 0.5)),
+    ("From the right", (1.3, -0.9, 0.5)),
+)
+"""Directions to look from, z up and the cameras' mean gaze along y."""
+
+
+def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Sequence[str]) -> dict[str, Any]:
+    """What ``viewer.js`` draws, ready for JSON.
+
+    ``positions`` (N, 3) uint16 in the box from ``low`` to ``high``, ``uv`` (N, 2) uint16 over the texture or
+    ``colors`` (N, 3) uint8, and ``indices`` (M, 3) uint32, each in base64 with the lowest byte first;
+    ``texture`` a JPEG in a ``data:`` address; ``stands`` of the photographs (see :func:`stands`), the
+    one in their middle as ``start``; ``turns`` the directions of :data:`TURNS`. z is up. Faces without an
+    area at this resolution are left out.
+    """
+    views = np.flatnonzero(reconstruction.registered).tolist()
+    rotations = np.stack([decompose_camera(reconstruction.P[i])[1] for i in views])
+    upright = upright_rotation(rotations)
+    vertices = mesh.vertices @ upright.T
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    steps = np.where(high > low, high - low, 1.0) / LEVELS
+    positions = np.rint((vertices - low) / steps).astype("<u2")
+    paint, faces, vertex = _painted(mesh)
+    places = stands(mesh, reconstruction, upright, names)
+    eyes = np.array([place["eye"] for place in places])
+    middle = int(np.argmin(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1)))
+    return {
+        "low": low.tolist(),
+        "high": (low + steps * LEVELS).tolist(),
+        "positions": _packed(positions[vertex]),
+        "indices": _packed(faces.astype("<u4")),
+        **paint,
+        "stands": places,
+        "start": middle,
+        "turns": [{"name": name, "direction": list(direction)} for name, direction in TURNS],
+    }
+
+
+def _painted(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
+    """The paint by its names, the faces (M, 3), and the vertex of each corner they name."""
+    every = np.arange(len(mesh.vertices))
+    if mesh.texture is None or mesh.uv is None:
+        colors = mesh.colors
+        if colors is None:
+            colors = np.tile(np.array(PLAIN, dtype=np.uint8), (len(mesh.vertices), 1))
+        return {"colors": _packed(colors)}, mesh.faces, every
+    height, width = mesh.texture.shape[:2]
+    # (0, 0) is the centre of the first texel, while graphics cards count from its corner.
+    uv = np.clip((mesh.uv + 0.5) / (width, height), 0.0, 1.0)
+    corners = np.column_stack([mesh.faces.ravel(), np.rint(LEVELS * uv.reshape(-1, 2)).astype(np.int64)])
+    # One number per corner instead of three: whole rows sort ten times slower.
+    key = (corners[:, 0] * (LEVELS + 1) + corners[:, 1]) * (LEVELS + 1) + corners[:, 2]
+    _, first, index = np.unique(key, return_index=True, return_inverse=True)
+    paint = {
+        "uv": _packed(corners[first, 1:].astype("<u2")),
+        "texture": embed_jpeg(_within(mesh.texture), quality=82).uri,
+    }
+    return paint, index.reshape(-1, 3).astype(np.int64), corners[first, 0]
+
+
+def _within(texture: NDArray[np.uint8]) -> PillowImage.Image:
+    """The texture with at most ``MAX_TEXELS``."""
+    picture = PillowImage.fromarray(texture)
+    scale = np.sqrt(MAX_TEXELS / (picture.width * picture.height))
+    if scale >= 1.0:
+        return picture
+    size = max(1, int(scale * picture.width)), max(1, int(scale * picture.height))
+    return picture.resize(size, PillowImage.Resampling.BOX)
+
+
+def stands(
+    mesh: TexturedMesh, reconstruction: Reconstruction, upright: F64, names: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Where each registered photograph was taken, after the turn ``upright`` (3, 3).
+
+    ``eye`` (3,), ``target`` (3,) the point of its optical axis as deep as the middle of what it sees of the
+    model, ``field`` the tangents of half its angles to the side and upwards.
+    """
+    found = []
+    for i in np.flatnonzero(reconstruction.registered).tolist():
+        K, R, t = decompose_camera(reconstruction.P[i])
+        size = reconstruction.sizes[i].astype(np.float64)
+        field = size / 2 / np.diag(K)[:2]
+        local = mesh.vertices @ R.T + t
+        with np.errstate(divide="ignore", invalid="ignore"):
+            seen = (local[:, 2] > 0) & (np.abs(local[:, :2] / local[:, 2:]) < field).all(axis=1)
+        depth = float(np.median(local[seen, 2])) if seen.any() else float(np.linalg.norm(t)) or 1.0
+        eye = upright @ (-R.T @ t)
+        found.append(
+            {
+                "name": f"{i + 1} · {names[i]}",
+                "eye": eye.tolist(),
+                "target": (eye + depth * (upright @ R[2])).tolist(),
+                "field": field.tolist(),
+            }
+        )
+    return found
+
+
+def _packed(values: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
