@@ -35,6 +35,7 @@ STAGE_WORDS = {
     "projective": "projective cameras",
     "selfcalibration": "self-calibration",
     "metric": "metric refinement",
+    "views": "views of the model",
 }
 
 app = typer.Typer(
@@ -58,6 +59,21 @@ class Cameras(StrEnum):
 
     shared = "shared"
     per_image = "per-image"
+
+
+class Way(StrEnum):
+    """Where the camera of ``views`` goes."""
+
+    orbit = "orbit"
+    interpolate = "interpolate"
+
+
+class Lamp(StrEnum):
+    """The light of ``views``."""
+
+    none = "none"
+    camera = "camera"
+    sun = "sun"
 
 
 Threads = Annotated[int, typer.Option("--threads", min=0, help="Workers; 0 = one per processor.")]
@@ -114,7 +130,7 @@ def reconstruct(
         ),
     ] = None,
     until: Annotated[
-        str, typer.Option("--until", help="The last stage: features, matches, projective or metric.")
+        str, typer.Option("--until", help="The last stage: features, matches, projective, metric, dense or model.")
     ] = "metric",
     executor: Annotated[
         str, typer.Option("--executor", help="Workers are threads (local) or processes.")
@@ -163,6 +179,53 @@ def inspect(
         _print_summary(summary, out)
     except (KeyError, TypeError, AttributeError):
         raise UsageError(f"{out / 'summary.json'} is not a summary of this program") from None
+
+
+@app.command()
+def views(
+    out: Annotated[Path, typer.Argument(parser=_folder, metavar="OUT", help="The output folder of a run.")],
+    path: Annotated[
+        Way,
+        typer.Option("--path", help="Around the model, or from photograph to photograph in their order."),
+    ] = Way.orbit,
+    frames: Annotated[int, typer.Option("--frames", help="How many pictures.")] = 90,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            "--size", metavar="WxH", help="Of the pictures (px); by default the first photograph's shape."
+        ),
+    ] = None,
+    light: Annotated[
+        Lamp, typer.Option("--light", help="none: as photographed; a lamp at the camera; from above.")
+    ] = Lamp.none,
+    background: Annotated[str, typer.Option("--background", help="A colour: white, #20304f.")] = "black",
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", parser=_folder, metavar="FOLDER", help="For the pictures (OUT/views/PATH)."
+        ),
+    ] = None,
+    threads: Threads = 0,
+) -> None:
+    """Render pictures of a run's model along the way of a camera, and an animated file of them."""
+    _cap_threads(threads)
+    from thesisrecon.view_command import ViewWishes, color_from_text, size_from_text, write_views
+
+    wanted = size_from_text(size) if size is not None else None
+    wishes = ViewWishes(path.value, frames, wanted, light.value, color_from_text(background))
+    with _progress_bars() as progress:
+        written = write_views(
+            out,
+            folder or out / "views" / path.value,
+            wishes,
+            threads=threads or available_threads(),
+            progress=progress,
+        )
+    width, height = written.size
+    typer.echo(
+        f"{len(written.frames)} pictures of {width} x {height} px and {written.animation.name} are in "
+        f"{written.folder}"
+    )
 
 
 @app.callback(invoke_without_command=True)

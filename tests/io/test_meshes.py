@@ -9,7 +9,8 @@ import PIL.Image
 import pytest
 import trimesh
 
-from thesisrecon.io.meshes import unmerged, write_mesh
+from thesisrecon.errors import UsageError
+from thesisrecon.io.meshes import read_mesh, unmerged, write_mesh
 from thesisrecon.types import TexturedMesh
 
 
@@ -76,3 +77,61 @@ def test_a_bare_mesh_is_written_and_the_bytes_are_the_same_again(tmp_path: Path)
 def test_other_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\.glb, \.obj or \.ply"):
         write_mesh(tmp_path / "model.stl", roof())
+
+
+def test_a_textured_glb_is_read_as_it_was_written(tmp_path: Path) -> None:
+    mesh = roof()
+    write_mesh(tmp_path / "model.glb", mesh)
+    read = read_mesh(tmp_path / "model.glb")
+    np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-7)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    assert read.uv is not None
+    assert mesh.uv is not None
+    np.testing.assert_allclose(read.uv, mesh.uv, atol=1e-4)
+    assert read.texture is not None
+    assert mesh.texture is not None
+    assert np.abs(read.texture.astype(int) - mesh.texture).max() <= 70  # JPEG, at the edge of the colours
+    assert np.abs(read.texture.astype(int) - mesh.texture).mean() <= 8
+    write_mesh(tmp_path / "again.glb", read)
+    again = read_mesh(tmp_path / "again.glb")
+    np.testing.assert_array_equal(again.vertices, read.vertices)
+    np.testing.assert_array_equal(again.faces, read.faces)
+
+
+def test_a_large_glb_keeps_its_surface_and_its_order(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    vertices = rng.normal(size=(500, 3)) * [1, 10, 100] + [0, 0, 1000]
+    faces = rng.permuted(np.tile(np.arange(500), (4000, 1)), axis=1)[:, :3]
+    uv = rng.uniform(-0.5, [299.5, 199.5], (4000, 3, 2))
+    mesh = TexturedMesh(vertices, faces, uv=uv, texture=np.zeros((200, 300, 3), np.uint8))
+    write_mesh(tmp_path / "model.glb", mesh)
+    read = read_mesh(tmp_path / "model.glb")
+    np.testing.assert_array_equal(read.vertices, vertices.astype(np.float32))
+    np.testing.assert_array_equal(read.faces, faces)
+    assert read.uv is not None
+    np.testing.assert_allclose(read.uv, uv, atol=1e-4)
+
+
+def test_colours_of_vertices_and_bare_meshes_are_read(tmp_path: Path) -> None:
+    colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 102, 204]], dtype=np.uint8)
+    for given in (colors, None):
+        write_mesh(tmp_path / "model.glb", TexturedMesh(roof().vertices, roof().faces, colors=given))
+        read = read_mesh(tmp_path / "model.glb")
+        np.testing.assert_allclose(read.vertices, roof().vertices)
+        np.testing.assert_array_equal(read.faces, roof().faces)
+        assert read.uv is read.texture is None
+        np.testing.assert_array_equal(read.colors, given)
+
+
+def test_a_glb_that_cannot_be_read_is_told_in_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "model.glb"
+    with pytest.raises(UsageError, match="there is no mesh"):
+        read_mesh(path)
+    write_mesh(path, roof())
+    whole = path.read_bytes()
+    for damaged in (b"", b"glTF", whole[:40], whole[: len(whole) // 2], b"x" + whole[1:]):
+        path.write_bytes(damaged)
+        with pytest.raises(UsageError, match=r"model\.glb (cannot be read|holds no surface)"):
+            read_mesh(path)
+    with pytest.raises(ValueError, match=r"read from \.glb; got model\.ply"):
+        read_mesh(path.with_suffix(".ply"))

@@ -1,4 +1,6 @@
-"""Meshes as files: GLB for browsers, OBJ with MTL and PNG for modelling programs, PLY with vertex colours."""
+"""Meshes as files: GLB for browsers, OBJ with MTL and PNG for modelling programs, PLY with vertex colours.
+
+A GLB can be read again."""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ import trimesh
 from trimesh.visual import material as materials
 from trimesh.visual import texture as textures
 
+from thesisrecon.errors import UsageError
 from thesisrecon.io.run_directory import write_atomically
 from thesisrecon.types import F64, I64, TexturedMesh
 
@@ -19,6 +22,9 @@ JPEG_QUALITY = 92
 """Of the texture inside a GLB: a quarter of the size of PNG, and no difference that one sees."""
 
 FORMATS = ("glb", "obj", "ply")
+
+TURN = np.array([1.0, -1.0, -1.0])
+"""Half a turn about x, between the axes of cameras and those of glTF; its own inverse."""
 
 
 def write_mesh(path: Path, mesh: TexturedMesh) -> None:
@@ -33,6 +39,59 @@ def write_mesh(path: Path, mesh: TexturedMesh) -> None:
     if kind not in FORMATS:
         raise ValueError(f"a mesh is written as .glb, .obj or .ply; got {path.name}")
     {"glb": _write_glb, "obj": _write_obj, "ply": _write_ply}[kind](path, mesh)
+
+
+def read_mesh(path: Path) -> TexturedMesh:
+    """The mesh of a GLB that :func:`write_mesh` wrote, in the coordinates that it had.
+
+    Vertices that differ in their place in the texture alone are one again, in their old order, without those
+    that no face names; coordinates have the precision of float32, and the texture went through JPEG. Which
+    faces no view had seen is not kept. Raises ``ValueError`` for other endings, :class:`UsageError` where the
+    file is absent, damaged, or holds no mesh.
+    """
+    if path.suffix.lower() != ".glb":
+        raise ValueError(f"a mesh is read from .glb; got {path.name}")
+    loaded = _loaded(path)
+    vertices = np.asarray(loaded.vertices, dtype=np.float64) * TURN
+    faces = np.asarray(loaded.faces, dtype=np.int64)
+    uv = getattr(loaded.visual, "uv", None)
+    image = getattr(getattr(loaded.visual, "material", None), "baseColorTexture", None)
+    if uv is not None and image is not None:
+        texture = np.asarray(image.convert("RGB"))
+        corners = _texels(np.asarray(uv, dtype=np.float64), texture)[faces]
+        vertices, faces = _merged(vertices, faces)
+        return TexturedMesh(vertices, faces, uv=corners, texture=texture)
+    colors = None
+    if loaded.visual.kind == "vertex":
+        colors = np.array(loaded.visual.vertex_colors[:, :3], dtype=np.uint8)
+    return TexturedMesh(vertices, faces, colors=colors)
+
+
+def _loaded(path: Path) -> Any:
+    """trimesh's own record of the file."""
+    if not path.is_file():
+        raise UsageError(f"there is no mesh {path}")
+    try:
+        loaded: Any = trimesh.load(path, process=False, force="mesh")
+        whole = len(loaded.faces) > 0 and np.isfinite(loaded.vertices).all()
+    except Exception as error:
+        # What a damaged file makes the parser raise is of any kind.
+        raise UsageError(f"the mesh {path} cannot be read: {error}") from None
+    if not whole:
+        raise UsageError(f"the mesh {path} holds no surface")
+    return loaded
+
+
+def _merged(vertices: F64, faces: I64) -> tuple[F64, I64]:
+    """One vertex for each place (N, 3), in the order in which they first stand, and the faces of those."""
+    used = np.unique(faces)
+    _, first, number = np.unique(vertices[used], axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    of_vertex = np.full(len(vertices), -1, dtype=np.int64)
+    of_vertex[used] = rank[number.ravel()]
+    return vertices[used[first[order]]], of_vertex[faces]
 
 
 def unmerged(mesh: TexturedMesh) -> tuple[F64, I64, F64]:
@@ -51,8 +110,14 @@ def _normalized(uv: F64, texture: np.ndarray) -> F64:
     return np.column_stack([(uv[:, 0] + 0.5) / width, 1.0 - (uv[:, 1] + 0.5) / height])
 
 
+def _texels(uv: F64, texture: np.ndarray) -> F64:
+    """The inverse of :func:`_normalized`."""
+    height, width = texture.shape[:2]
+    return np.column_stack([uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5])
+
+
 def _trimesh(mesh: TexturedMesh, *, turned: bool) -> Any:
-    turn = np.array([1.0, -1.0, -1.0]) if turned else np.ones(3)
+    turn = TURN if turned else np.ones(3)
     if mesh.texture is None or mesh.uv is None:
         colors = None
         if mesh.colors is not None:

@@ -1,0 +1,252 @@
+"""Ways of a camera: even, upright, clear of the model, and right at their ends."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from tests.model.sphere import K, looking_at_origin
+from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.types import F64, TexturedMesh
+from thesisrecon.views.paths import fitted, geometric_median, interpolate, orbit, surface_points, upward
+
+SIZE = (160, 120)
+UP = np.array([0.0, -1.0, 0.0])  # of cameras whose y axis points down
+
+
+def ring(angles: F64, height: float = -1.0, distance: float = 3.5) -> list[PinholeCamera]:
+    """Upright cameras about the origin."""
+    return [PinholeCamera.from_matrix(looking_at_origin(a, height, distance), SIZE) for a in angles]
+
+
+def ball(count: int = 2000, seed: int = 0) -> F64:
+    """Points on the unit sphere."""
+    X = np.random.default_rng(seed).normal(size=(count, 3))
+    return X / np.linalg.norm(X, axis=1, keepdims=True)
+
+
+def moved(cameras: list[PinholeCamera], turn: F64, shift: F64) -> list[PinholeCamera]:
+    """The same cameras in a world that is turned and shifted."""
+    return [PinholeCamera(c.K, c.R @ turn.T, c.t - c.R @ turn.T @ shift, c.size) for c in cameras]
+
+
+def centres_of(path: list[PinholeCamera]) -> F64:
+    return np.array([camera.centre for camera in path])
+
+
+def project(camera: PinholeCamera, X: F64) -> F64:
+    x = camera.K @ (camera.R @ X + camera.t)
+    return np.asarray(x[:2] / x[2])
+
+
+def test_all_round_the_scene_the_orbit_is_a_circle_at_constant_speed() -> None:
+    cameras = ring(np.linspace(0, 2 * np.pi, 10)[:-1])
+    path = orbit(cameras, ball(), 40)
+    centres = centres_of(path)
+    np.testing.assert_allclose(centres[:, 1], centres[0, 1])
+    steps = np.linalg.norm(np.roll(centres, -1, axis=0) - centres, axis=1)
+    np.testing.assert_allclose(steps, steps.mean(), rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(centres[:, [0, 2]], axis=1), 3.5, atol=0.1)
+    np.testing.assert_allclose(centres[0], cameras[0].centre, atol=0.1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    arc = rng.uniform(0.3, 2 * np.pi)
+    cameras = ring(np.sort(rng.uniform(0, arc, 8)), rng.uniform(-1.2, 0.5), rng.uniform(3.0, 5.0))
+    turn = Rotation.random(random_state=seed).as_matrix()
+    shift, X = rng.normal(size=3), ball(800, seed)
+    path = orbit(moved(cameras, turn, shift), X @ turn.T + shift, 12)
+    middle, up = geometric_median(X @ turn.T + shift), turn @ UP
+    for camera in path:
+        np.testing.assert_allclose(project(camera, middle), [79.5, 59.5], atol=1e-6)
+        assert abs(camera.R[0] @ up) < 0.06
+        assert -camera.R[1] @ up > 0.1
+        assert np.linalg.norm(camera.centre - shift) > 1.2
+    # A swing has no first camera to start from, but what it passes is the same.
+    same = orbit(cameras, X, 12)
+    np.testing.assert_allclose((centres_of(path) - shift) @ turn, centres_of(same), atol=1e-6)
+
+
+def test_an_orbit_of_one_side_stays_on_that_side_and_closes() -> None:
+    angles = np.radians([-50.0, -20.0, 5.0, 45.0])
+    path = orbit(ring(angles), ball(), 61)
+    centres = centres_of(path)
+    seen = np.degrees(np.arctan2(centres[:, 0], -centres[:, 2]))
+    assert seen.min() == pytest.approx(-50.0, abs=2.0)
+    assert seen.max() == pytest.approx(45.0, abs=2.0)
+    steps = np.linalg.norm(np.roll(centres, -1, axis=0) - centres, axis=1)
+    assert steps[-1] < 1.1 * steps.max()
+
+
+def test_an_orbit_goes_round_what_is_in_its_way_and_shows_the_model() -> None:
+    """A long wall: at its ends the cameras' median distance would lead through it."""
+    wall = np.random.default_rng(0).uniform([-6, -1, -0.2], [6, 1, 0.2], (3000, 3))
+    cameras = ring(np.radians(np.arange(0, 360, 30.0)), -0.5, 5.0)
+    for camera in orbit(cameras, wall, 36):
+        assert cKDTree(wall).query(camera.centre)[0] > 0.5
+        inside = np.array([project(camera, X) for X in wall[::50]])
+        front = (camera.R @ wall[::50].T + camera.t[:, None])[2] > 0
+        shown = front & (inside > -0.5).all(axis=1) & (inside < np.array(SIZE) - 0.5).all(axis=1)
+        assert shown.mean() > 0.4
+
+
+def test_far_points_and_points_without_a_number_do_not_move_the_middle() -> None:
+    X = np.vstack([ball(), np.full((300, 3), 500.0), np.full((5, 3), np.nan)])
+    path = orbit(ring(np.linspace(0, 6, 9)), X, 5)
+    assert max(np.abs(project(camera, np.zeros(3)) - [79.5, 59.5]).max() for camera in path) < 25
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7])
+def test_one_camera_swings_a_little(frames: int) -> None:
+    (camera,) = ring(np.array([0.4]))
+    path = orbit([camera], ball(), frames)
+    assert len(path) == frames
+    np.testing.assert_allclose(path[0].centre, camera.centre, atol=0.1)
+    if frames == 7:
+        spread = np.ptp(centres_of(path) @ camera.R[0])
+        assert 1.0 < spread < 3.0
+
+
+def test_cameras_in_the_middle_that_look_away_see_their_surroundings() -> None:
+    """Photographs from the middle of a room, outwards."""
+    room = 5.0 * ball()
+    away = [PinholeCamera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 5, 7), 0.0)]
+    for camera in orbit(away, room, 10):
+        assert 0.1 < np.linalg.norm(camera.centre) < 2.5
+        assert abs(camera.R[0] @ UP) < 1e-6
+    behind = [
+        PinholeCamera(c.K, np.diag([-1.0, 1, -1]) @ c.R, np.diag([-1.0, 1, -1]) @ c.t, SIZE)
+        for c in ring(np.zeros(3))
+    ]
+    for camera in orbit(behind, ball(), 4):
+        np.testing.assert_allclose(
+            camera.R @ np.zeros(3) + camera.t, [0, 0, 1] @ np.diag([0, 0, np.linalg.norm(camera.t)]), atol=0.2
+        )
+
+
+def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled() -> None:
+    rng = np.random.default_rng(1)
+    cameras = []
+    for camera in ring(np.linspace(-1, 1, 12), -6.0):
+        roll = Rotation.from_rotvec([0, 0, rng.normal(0.0, 0.06)]).as_matrix()
+        cameras.append(PinholeCamera(K, roll @ camera.R, roll @ camera.t, SIZE))
+    assert np.degrees(np.arccos(upward(cameras) @ UP)) < 4.0
+    (one,) = ring(np.array([0.7]))
+    np.testing.assert_allclose(upward([one]), -one.R[1], atol=1e-9)
+
+
+def test_of_cameras_that_look_straight_down_up_is_behind_them() -> None:
+    down = []
+    for k in range(8):
+        a = 2 * np.pi * k / 8
+        R = np.array([[np.cos(a), 0, np.sin(a)], [np.sin(a), 0, -np.cos(a)], [0, 1.0, 0]])
+        down.append(PinholeCamera(K, R, -R @ np.array([0.5 * np.cos(a), -4.0, 0.5 * np.sin(a)]), SIZE))
+    np.testing.assert_allclose(upward(down), UP, atol=1e-9)
+    assert all(camera.centre[1] < -3.0 for camera in orbit(down, ball(), 6))
+
+
+def test_interpolation_ends_at_the_real_cameras_and_passes_all() -> None:
+    cameras = ring(np.array([0.0, 0.3, 0.5, 1.1, 1.3]), -1.0)
+    cameras[2] = PinholeCamera(1.2 * K * [[1], [1], [1 / 1.2]], cameras[2].R, cameras[2].t, SIZE)
+    path = interpolate(cameras, 400)
+    for real, frame in ((cameras[0], path[0]), (cameras[-1], path[-1])):
+        np.testing.assert_allclose(frame.P, real.P)
+    centres = centres_of(path)
+    for camera in cameras:
+        nearest = int(np.argmin(np.linalg.norm(centres - camera.centre, axis=1)))
+        np.testing.assert_allclose(centres[nearest], camera.centre, atol=0.02)
+        np.testing.assert_allclose(path[nearest].R, camera.R, atol=0.02)
+        np.testing.assert_allclose(path[nearest].K, camera.K, rtol=0.02, atol=1e-9)
+
+
+def test_interpolation_has_a_constant_speed_whatever_the_spacing() -> None:
+    path = interpolate(ring(np.array([0.0, 0.05, 0.5, 0.6, 2.0])), 200)
+    steps = np.linalg.norm(np.diff(centres_of(path), axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps.mean(), rtol=0.02)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed: int) -> None:
+    angles = np.cumsum(np.random.default_rng(seed).uniform(0.02, 0.8, 6))
+    for camera in interpolate(ring(angles, 0.0), 30):
+        np.testing.assert_allclose(camera.R[1], -UP, atol=1e-9)
+        np.testing.assert_allclose(camera.centre[1], 0.0, atol=1e-9)
+        assert np.linalg.det(camera.R) == pytest.approx(1.0)
+
+
+def test_turning_on_the_spot_takes_its_time() -> None:
+    still = [PinholeCamera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 1, 4), 0.0)]
+    path = interpolate(still, 31)
+    turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
+    np.testing.assert_allclose(turns, 1.0 / 30, rtol=1e-6)
+    # Half a turn at one place of a way: no frame jumps.
+    far = [PinholeCamera(K, c.R, -c.R @ np.array([3.0 * k, 0, 0]), SIZE) for k, c in enumerate(still)]
+    path = interpolate(
+        [*far[:2], PinholeCamera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE), *far[2:]],
+        100,
+    )
+    turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
+    assert max(turns) < 0.25
+
+
+def test_coincident_cameras_and_one_camera_stand_still() -> None:
+    camera = ring(np.array([0.3]))[0]
+    for cameras in ([camera], [camera] * 3):
+        path = interpolate(cameras, 5)
+        assert len(path) == 5
+        for frame in path:
+            np.testing.assert_allclose(frame.P, camera.P, atol=1e-12)
+    moving = ring(np.array([0.0, 0.0, 0.5, 0.5, 1.0]))
+    steps = np.linalg.norm(np.diff(centres_of(interpolate(moving, 50)), axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps.mean(), rtol=0.05)
+
+
+def test_other_shapes_of_pictures_show_all_that_the_camera_saw() -> None:
+    camera = ring(np.array([0.3]))[0]
+    for size in ((320, 240), (400, 100), (30, 90)):
+        other = fitted(camera, size)
+        rays = np.linalg.inv(camera.K) @ np.array(
+            [[-0.5, 159.5, -0.5, 159.5], [-0.5, -0.5, 119.5, 119.5], [1, 1, 1, 1]]
+        )
+        x = other.K @ rays
+        assert (x[:2] > -0.5 - 1e-9).all()
+        assert (x[:2].T - size < -0.5 + 1e-9).all()
+        assert min(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) <= 1.0 + 1e-9
+        assert max(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) == pytest.approx(1.0)
+    turned = PinholeCamera(K, camera.R, camera.t, (120, 160))
+    assert {frame.size for frame in interpolate([camera, turned], 5)} == {SIZE}
+    assert {frame.size for frame in orbit([camera, turned], ball(), 5, size=(70, 50))} == {(70, 50)}
+
+
+def test_points_lie_on_the_surface_by_its_area() -> None:
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [5, 3, 0], [8, 0, 0]])
+    mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [3, 4, 5], [0, 0, 1]]))
+    X = surface_points(mesh, 1000)
+    small = X[:, 0] < 2
+    assert small.mean() == pytest.approx(0.1, abs=0.005)
+    assert (X[small, :2].sum(axis=1) <= 1.0 + 1e-12).all()
+    np.testing.assert_allclose(X[small].mean(axis=0), [1 / 3, 1 / 3, 0], atol=0.02)
+    assert len(surface_points(TexturedMesh(vertices, np.array([[0, 0, 1]])))) == 0
+
+
+def test_wrong_calls_are_refused() -> None:
+    cameras = ring(np.array([0.0]))
+    for path in (lambda c, n: orbit(c, ball(), n), interpolate):
+        with pytest.raises(ValueError, match="at least one camera"):
+            path([], 5)
+        with pytest.raises(ValueError, match="at least one frame; got 0"):
+            path(cameras, 0)
+    with pytest.raises(ValueError, match="none that is finite"):
+        orbit(cameras, np.full((4, 3), np.nan), 5)
+    with pytest.raises(ValueError, match="all points and cameras are in one place"):
+        orbit(cameras, np.tile(cameras[0].centre, (4, 1)), 5)

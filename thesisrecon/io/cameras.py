@@ -1,0 +1,35 @@
+"""The cameras of a finished run, read from its ``cameras.json``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.errors import UsageError
+from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.io.run_directory import read_json
+
+
+def read_cameras(path: Path) -> dict[str, PinholeCamera]:
+    """Name -> camera of every registered photograph in the order of the file, in original pixels.
+
+    The lens' distortion is left out: these are the cameras of the photographs after their distortion was
+    removed. Raises :class:`UsageError` where the file is absent, damaged or without cameras.
+    """
+    if not path.is_file():
+        raise UsageError(f"there is no {path.name} in {path.parent}; has a run ended there?")
+    content = read_json(path)
+    try:
+        cameras = {str(entry["name"]): _camera(entry) for entry in content["cameras"]}
+    except (TypeError, KeyError, ValueError):
+        raise UsageError(f"{path} does not hold cameras of this program") from None
+    if not cameras:
+        raise UsageError(f"{path} holds no camera; no photograph of this run was registered")
+    return cameras
+
+
+def _camera(entry: Any) -> PinholeCamera:
+    K, R, t = (np.array(entry[name], dtype=np.float64) for name in ("K", "R", "t"))
+    return PinholeCamera(K, R, t, (int(entry["width"]), int(entry["height"])))

@@ -1,0 +1,206 @@
+"""The work of ``thesisrecon views``: pictures of the model of a finished run, on the way of a camera."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import PIL.ImageColor
+
+from thesisrecon.errors import UsageError
+from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.io.cameras import read_cameras
+from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
+from thesisrecon.io.meshes import read_mesh
+from thesisrecon.io.run_directory import read_json, write_json
+from thesisrecon.settings import unknown_word
+from thesisrecon.types import F64, TexturedMesh
+from thesisrecon.views import Light, Shading, interpolate, orbit, render, surface_points, upward
+from thesisrecon.workers import Workers
+
+MODEL, CAMERAS, FRAMES = "model.glb", "cameras.json", "frames.json"
+PATHS, LIGHTS = ("orbit", "interpolate"), ("none", "camera", "sun")
+LARGEST_PX = 8192
+LONG_SIDE_PX = 1000
+"""Of the pictures where no size is asked for."""
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class ViewWishes:
+    """What pictures are wanted.
+
+    ``path``: "orbit" around the model, or "interpolate" from photograph to photograph. ``size`` (width,
+    height), None = the shape of the first photograph, its long side at most 1000 px. ``light``: "none" shows
+    the colours of the photographs, "camera" has a lamp at the camera, "sun" one from above. A model without
+    colours is always lit. ``background`` (red, green, blue), 0 to 255.
+
+    Raises :class:`UsageError` for anything else.
+    """
+
+    path: str = "orbit"
+    frames: int = 90
+    size: tuple[int, int] | None = None
+    light: str = "none"
+    background: tuple[int, int, int] = (0, 0, 0)
+
+    def __post_init__(self) -> None:
+        for kind, word, words in (("path", self.path, PATHS), ("light", self.light, LIGHTS)):
+            if word not in words:
+                raise UsageError(unknown_word(kind, word, list(words)))
+        if self.frames < 1:
+            raise UsageError(f"--frames takes a whole number of at least 1; got {self.frames}")
+        if self.size is not None and not all(1 <= side <= LARGEST_PX for side in self.size):
+            width, height = self.size
+            raise UsageError(f"--size takes sides of 1 to {LARGEST_PX} pixels; got {width}x{height}")
+
+
+@dataclass(frozen=True)
+class ViewFiles:
+    """What was written: ``frames`` in ``folder``, of ``size`` (width, height), and the ``animation``."""
+
+    folder: Path
+    frames: tuple[Path, ...]
+    animation: Path
+    size: tuple[int, int]
+
+
+def size_from_text(text: str) -> tuple[int, int]:
+    """(width, height) of ``WIDTHxHEIGHT``; :class:`UsageError` for other text."""
+    found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
+    if found is None:
+        raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def color_from_text(text: str) -> tuple[int, int, int]:
+    """(red, green, blue) of a name ("white"), "#rrggbb" or "rgb(...)"; :class:`UsageError` for other text."""
+    try:
+        return PIL.ImageColor.getrgb(text.strip())[:3]
+    except ValueError:
+        raise UsageError(f"--background takes a colour as white or #20304f; got {text!r}") from None
+
+
+def write_views(
+    out: Path, folder: Path, wishes: ViewWishes, *, threads: int = 1, progress: Progress | None = None
+) -> ViewFiles:
+    """Render the model of the run in ``out`` into ``folder``.
+
+    Writes ``frame-0001.png`` and so on, an animated file named after the path, and ``frames.json`` with the
+    cameras of the frames. Frames of an earlier call that this one does not replace are removed. The files do
+    not depend on ``threads``; ``progress`` hears (stage, done, total). Raises :class:`UsageError` where the
+    run, its model or its cameras are absent, where ``folder`` holds what is not of this command, and where
+    it cannot be written.
+    """
+    mesh, cameras = _run_of(out)
+    _claim(folder)
+    path = _cameras_on_path(mesh, list(cameras.values()), wishes)
+    # Written first: from now on the folder is known as one of this command.
+    write_json(folder / FRAMES, _description(path, wishes))
+    _remove_old(folder, len(path))
+    files = [folder / frame_name(k + 1) for k in range(len(path))]
+    shading = _shading(mesh, list(cameras.values()), wishes.light)
+    tell, done = progress or (lambda *_: None), 0
+
+    def draw(k: int) -> None:
+        view = render(mesh, path[k], shading=shading(path[k]), background=wishes.background)
+        write_frame(folder, k + 1, view.color)
+
+    def finished(_: int, __: Any) -> None:
+        nonlocal done
+        done += 1
+        tell("views", done, len(path))
+
+    Workers(threads).run(draw, [(k,) for k in range(len(path))], finished)
+    animation = write_animation(folder / f"{wishes.path}{animation_suffix()}", files)
+    return ViewFiles(folder, tuple(files), animation, path[0].size)
+
+
+def _run_of(out: Path) -> tuple[TexturedMesh, dict[str, PinholeCamera]]:
+    """The model and the cameras of a finished run."""
+    if not out.is_dir() or not any((out / name).is_file() for name in (MODEL, CAMERAS, "run.json")):
+        raise UsageError(f"{out} holds no run; make one with thesisrecon reconstruct PHOTOGRAPHS -o {out}")
+    if not (out / MODEL).is_file():
+        raise UsageError(
+            f"the run in {out} has no model yet ({MODEL}); run thesisrecon reconstruct PHOTOGRAPHS -o {out} "
+            "--until model"
+        )
+    return read_mesh(out / MODEL), read_cameras(out / CAMERAS)
+
+
+def _claim(folder: Path) -> None:
+    """Refuse a folder with files that this command did not make: photographs may be called frame-0001.png,
+    too."""
+    if isinstance(read_json(folder / FRAMES), dict):
+        return
+    try:
+        strange = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+    except OSError as error:
+        raise UsageError(f"the folder {folder} cannot be used: {error.strerror}") from None
+    if strange:
+        raise UsageError(
+            f"the folder {folder} holds {strange[0]!r}, which is not of this command; choose an empty or a "
+            "new folder"
+        )
+
+
+def _remove_old(folder: Path, frames: int) -> None:
+    names = {frame_name(k + 1) for k in range(frames)}
+    old = [p for p in folder.glob("frame-*.png") if p.name not in names]
+    old += [folder / f"{path}{suffix}" for path in PATHS for suffix in (".webp", ".png")]
+    try:
+        for path in old:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UsageError(f"old frames in {folder} cannot be removed: {error.strerror}") from None
+
+
+def _cameras_on_path(
+    mesh: TexturedMesh, cameras: list[PinholeCamera], wishes: ViewWishes
+) -> list[PinholeCamera]:
+    size = wishes.size or _default_size(cameras[0])
+    if wishes.path == "interpolate":
+        return interpolate(cameras, wishes.frames, size=size)
+    points = surface_points(mesh)
+    return orbit(cameras, points if len(points) else mesh.vertices, wishes.frames, size=size)
+
+
+def _default_size(camera: PinholeCamera) -> tuple[int, int]:
+    width, height = camera.resized(min(1.0, LONG_SIDE_PX / max(camera.size))).size
+    return width, height
+
+
+def _shading(
+    mesh: TexturedMesh, cameras: list[PinholeCamera], light: str
+) -> Callable[[PinholeCamera], Shading | None]:
+    """The light of each frame."""
+    plain = mesh.colors is None and (mesh.texture is None or mesh.uv is None)
+    if light == "none" and not plain:
+        return lambda _: None
+    if light == "sun":
+        # From above, from the left and a little from where the first photograph was taken.
+        towards = upward(cameras) - 0.5 * cameras[0].R[0] - 0.5 * cameras[0].R[2]
+        sun = Shading(ambient=0.45, lights=(Light(direction=_triple(towards), color=(0.75,) * 3),))
+        return lambda _: sun
+    return lambda camera: Shading(
+        ambient=0.3, lights=(Light(position=_triple(camera.centre), color=(0.8,) * 3),)
+    )
+
+
+def _triple(vector: F64) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def _description(path: list[PinholeCamera], wishes: ViewWishes) -> dict[str, Any]:
+    """``frames.json``: what was asked for, and the camera of each frame as in ``cameras.json``."""
+    frames = [
+        {"name": frame_name(k + 1), "K": camera.K, "R": camera.R, "t": camera.t, "centre": camera.centre}
+        for k, camera in enumerate(path)
+    ]
+    asked = {"path": wishes.path, "light": wishes.light, "background": list(wishes.background)}
+    return {**asked, "width": path[0].size[0], "height": path[0].size[1], "frames": frames}
