@@ -13,23 +13,18 @@ F32 = NDArray[np.float32]
 I16 = NDArray[np.int16]
 U8 = NDArray[np.uint8]
 
-ROWS_FOR_NOISE = 64
+ROWS_FOR_NOISE = 24
 """About as many rows, evenly spread, suffice for a median."""
 
 
 @dataclass(frozen=True)
 class Side:
     """One image of the pair: ``channels`` (K, H, W) in quarters of a grey level, ``valid`` (H, W) 255 where
-    there is a pixel and 0 elsewhere, where the channels are 0."""
+    there is a pixel and 0 elsewhere, where the channels are 0; ``grey`` (H, W) their sum."""
 
     channels: I16
+    grey: I16
     valid: U8
-
-    @property
-    def grey(self) -> I16:
-        """(H, W) sum of the channels."""
-        total: I16 = self.channels.sum(axis=0, dtype=np.int16)
-        return total
 
 
 def prepare_pair(left: ArrayLike, right: ArrayLike) -> tuple[Side, Side]:
@@ -54,8 +49,9 @@ def _side(image: NDArray[np.generic]) -> Side:
     levels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None], dtype=np.float32)
     height, width, n = levels.shape
     channels, valid = np.empty((n, height, width), np.int16), np.empty((height, width), np.uint8)
-    split_channels(levels, channels, valid)
-    return Side(channels, valid)
+    grey = np.empty((height, width), np.int16)
+    split_channels(levels, channels, grey, valid)
+    return Side(channels, grey, valid)
 
 
 def estimate_noise(side: Side) -> float:
@@ -69,7 +65,7 @@ def estimate_noise(side: Side) -> float:
         return 0.0
     step = max(side.valid.shape[0] // ROWS_FOR_NOISE, 1)
     top = np.arange(0, side.valid.shape[0] - 2, step)
-    rows = [side.channels[:, top + k].astype(np.int32) for k in range(3)]
+    rows = [side.channels[:, top + k].copy() for k in range(3)]
     mixed = rows[0] - 2 * rows[1] + rows[2]
     response = mixed[..., :-2] - 2 * mixed[..., 1:-1] + mixed[..., 2:]
     whole = np.minimum(np.minimum(side.valid[top], side.valid[top + 1]), side.valid[top + 2]) > 0

@@ -15,19 +15,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.dense.matching.costs import CensusAndColour
-from thesisrecon.dense.matching.costs.volume import DEAREST
 from thesisrecon.dense.matching.finish import Finish
 from thesisrecon.dense.matching.finish.kernels import best_disparities
 from thesisrecon.dense.matching.pair import estimate_noise, prepare_pair
 from thesisrecon.dense.matching.paths import PathPenalties
+from thesisrecon.dense.matching.paths.kernels import scratch_size
 from thesisrecon.dense.matching.ranges import checked_range
 from thesisrecon.dense.matching.strips import Strip, row_strips, run_strips
 from thesisrecon.types import DisparityMap
 
 F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
 
-BYTES_PER_CELL = 3
-"""Of one disparity of one pixel: its cost, and two for the sum of the paths."""
 LEAST_NOISE = 1.0
 """Grey levels that corresponding pixels differ by besides the noise: digitisation, another point of view."""
 
@@ -57,28 +56,44 @@ class PathSum:
         support = self.costs.support_of(sides[0], noise)
         jumps = self.penalties.jumps(sides[0], noise)
         found = np.empty((3, height, width), np.float32)
+        # Half confidence where the rival costs as much more as a step on every path.
+        half = float(2 * self._pairs * self.penalties.step * self.penalties.dearest)
 
         def work(strip: Strip) -> None:
             start, stop, top, bottom = strip
-            volume = self.costs.volume(
-                costed[0], costed[1], support, rows=(top, bottom), disparity_range=(first, last), noise=noise
+            volume, sums, scratch = self._workspace(bottom - top, last - first + 1, width)
+            self.costs.fill(
+                volume,
+                costed[0],
+                costed[1],
+                support,
+                rows=(top, bottom),
+                first=first,
+                noise=noise,
+                dearest=self.penalties.dearest,
             )
-            totals = self.penalties.totals(volume, jumps[:, top:bottom], diagonals=self.diagonals)
-            rows = slice(start, stop)
-            best_disparities(totals[start - top : stop - top], first, *found[:, rows])
+            self.penalties.sum_into(sums, volume, jumps[:, top:bottom], scratch)
+            own = found[:, start:stop]
+            best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
 
-        per_row = BYTES_PER_CELL * width * (last - first + 1)
+        # A byte for the cost of a disparity of a pixel, and one for each pair of opposite paths.
+        per_row = (1 + self._pairs) * width * (last - first + 1)
         run_strips(work, row_strips(height, per_row, 1e6 * self.memory_mb), self.threads)
-        left_px, right_px, margin = found
+        left_px, right_px, confidence = found
         left_px[sides[0].valid == 0] = np.nan
-        return self.finish.apply(left_px, right_px, self._confidence(margin))
+        return self.finish.apply(left_px, right_px, confidence)
 
-    def _confidence(self, margin: F32) -> F32:
-        """By how much the best rival costs more, against what a step on every path costs."""
-        paths = 8 if self.diagonals else 4
-        half = np.float32(paths * self.penalties.step * DEAREST)
-        confidence: F32 = margin / (margin + half)
-        return confidence
+    @property
+    def _pairs(self) -> int:
+        return 4 if self.diagonals else 2
+
+    def _workspace(self, height: int, disparities: int, width: int) -> tuple[U8, U8, U8]:
+        """Costs, path sums and scratch of a strip in one piece: large pieces come in large pages."""
+        cells, turned = height * disparities * width, scratch_size(height, disparities, width)
+        whole = np.empty((1 + self._pairs) * cells + 2 * turned, np.uint8)
+        costs, sums, scratch = np.split(whole, [cells, (1 + self._pairs) * cells])
+        shape = (height, disparities, width)
+        return costs.reshape(shape), sums.reshape(self._pairs, *shape), scratch.reshape(2, turned)
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ REACH = 2
 """Of the census window: 5 x 5 pixels, 24 comparisons."""
 ARM = 2
 """Pixels to each side in the support of a pixel."""
-WEIGHT_SHIFT = 6
-"""Weights are given in 1 / 64."""
+WEIGHT_SHIFT = 8
+"""Weights are given in 1 / 256."""
 
 
 @njit(cache=True, nogil=True)
@@ -39,20 +39,23 @@ def count_ones(word: np.int32) -> np.uint32:
 
 
 @njit(cache=True, nogil=True)
-def split_channels(image: F32, channels: I16, valid: U8) -> None:
-    """(H, W, K) grey levels, NaN = no pixel, as ``channels`` (K, H, W) of quarter levels and ``valid`` 0 or
-    255."""
+def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
+    """(H, W, K) grey levels, NaN = no pixel, as ``channels`` (K, H, W) of quarter levels, their sum ``grey``
+    (H, W), and ``valid`` (H, W) 0 or 255."""
     height, width, n = image.shape
     top = np.float32(255.0 * LEVELS)
     for y in range(height):
         for x in range(width):
-            valid[y, x] = 255
+            valid[y, x], total = 255, 0
             for k in range(n):
                 level = image[y, x, k] * np.float32(LEVELS)
                 if not np.isfinite(level):
                     valid[y, x] = 0
                     level = np.float32(0.0)
-                channels[k, y, x] = np.int16(min(max(level, np.float32(0.0)), top) + np.float32(0.5))
+                whole = np.int16(min(max(level, np.float32(0.0)), top) + np.float32(0.5))
+                channels[k, y, x] = whole
+                total += whole
+            grey[y, x] = total
 
 
 @njit(cache=True, nogil=True)

@@ -22,8 +22,6 @@ I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 
-DEAREST = 140
-"""The cost of a match that could not be worse: a byte holds it, and 16 bits a path."""
 CENSUS_BITS = 24
 
 
@@ -103,38 +101,37 @@ class CensusAndColour:
             support_masks(side.channels, side.valid, tolerance, masks)
         return masks
 
-    def volume(
+    def fill(
         self,
+        out: U8,
         left: CostedSide,
         right: CostedSide,
         support: U8,
         *,
         rows: tuple[int, int],
-        disparity_range: tuple[int, int],
+        first: int,
         noise: float,
-    ) -> U8:
-        """(rows, D, W) costs of the rows [a, b) at all disparities of the range, both ends included.
+        dearest: int,
+    ) -> None:
+        """Costs of the rows [a, b) at D disparities from ``first`` on, ``out`` (rows, D, W).
 
-        ``support`` is that of the whole left image, ``noise`` the standard deviation of a grey level.
+        ``support`` is that of the whole left image, ``noise`` the standard deviation of a grey level,
+        ``dearest`` the cost of a match that could not be worse.
         """
         start, stop = rows
-        first, last = disparity_range
-        out = np.empty((stop - start, last - first + 1, left.valid.shape[1]), np.uint8)
         cost_volume(
             left.rows(start, stop),
             right.rows(start, stop),
             np.ascontiguousarray(support[:, :, start:stop]),
             first,
-            self._weights(len(left.channels), noise),
-            np.uint8(round(self.outside * DEAREST)),
+            self._weights(len(left.channels), noise, dearest),
+            np.uint8(round(self.outside * dearest)),
             out,
         )
-        return out
 
-    def _weights(self, channels: int, noise: float) -> I16:
-        one = DEAREST << WEIGHT_SHIFT
+    def _weights(self, channels: int, noise: float, dearest: int) -> I16:
+        one = dearest << WEIGHT_SHIFT
         cap = min(max(round(self.truncation * noise * LEVELS * channels), channels), 255 * LEVELS * channels)
         of_bit = round(self.census_share * one / CENSUS_BITS)
-        # With few colours to tell, a level weighs more than 16 bits hold a cost of: 3.6 bits are enough.
         of_level = max(round((1.0 - self.census_share) * one / cap), int(self.census_share < 1.0))
         return np.array([of_bit, of_level, cap, self.sampling_insensitive], np.int16)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 
 NONE = np.uint16(65535)
@@ -35,39 +36,66 @@ def _keep_rival(total: U16, q: np.int16, index: I16, rival: U16) -> None:
 
 
 @njit(cache=True, nogil=True)
-def best_disparities(total: U16, first: int, left: F32, right: F32, margin: F32) -> None:
-    """From ``total`` (H, D, W) the disparities of the left pixels, sub-pixel, and those of the right ones,
-    whole, NaN where the range leaves the image; ``margin`` by how much the best rival costs more.
+def _set_sum(a: U8, b: U8, out: U16) -> None:
+    for x in range(len(out)):
+        out[x] = np.uint16(np.uint16(a[x]) + np.uint16(b[x]))
+
+
+@njit(cache=True, nogil=True)
+def _add_bytes(values: U8, total: U16) -> None:
+    for x in range(len(total)):
+        total[x] = np.uint16(total[x] + np.uint16(values[x]))
+
+
+@njit(cache=True, nogil=True)
+def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tuple[U16, I16]) -> None:
+    """Least totals and their places for the pixels of both sides, and the left one's rivals."""
+    n, width = total.shape
+    best, index, rival = left
+    best[:], index[:], rival[:] = NONE, 0, NONE
+    right[0][:], right[1][:] = NONE, -1
+    for q in range(n):
+        d = first + q
+        _keep_best(total[q], np.int16(q), best, index)
+        lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
+        if hi > lo:
+            _keep_best(total[q, lo:hi], np.int16(q), right[0][lo - d : hi - d], right[1][lo - d : hi - d])
+    for q in range(n):
+        _keep_rival(total[q], np.int16(q), index, rival)
+
+
+@njit(cache=True, nogil=True)
+def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32], half: float) -> None:
+    """From path sums (P, N, D, W), row ``start`` and those below, to ``out``, each (H, W): the disparities of
+    the left pixels, sub-pixel; those of the right ones, whole, NaN where the range leaves the image; and the
+    confidence m / (m + ``half``), m by how much the best rival costs more.
 
     The sub-pixel place is the corner of two lines of equal and opposite slope through the best three totals;
     at an end of the range there is none.
     """
-    height, n, width = total.shape
-    best, index = np.empty(width, np.uint16), np.empty(width, np.int16)
-    rival = np.empty(width, np.uint16)
+    pairs, _, n, width = sums.shape
+    left, right, confidence = out
+    total = np.empty((n, width), np.uint16)
+    best, index, rival = np.empty(width, np.uint16), np.empty(width, np.int16), np.empty(width, np.uint16)
     best_r, index_r = np.empty(width, np.uint16), np.empty(width, np.int16)
-    for y in range(height):
-        best[:], index[:], rival[:] = NONE, 0, NONE
-        best_r[:], index_r[:] = NONE, -1
+    for y in range(len(left)):
         for q in range(n):
-            d = first + q
-            _keep_best(total[y, q], np.int16(q), best, index)
-            lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
-            if hi > lo:
-                _keep_best(total[y, q, lo:hi], np.int16(q), best_r[lo - d : hi - d], index_r[lo - d : hi - d])
-        for q in range(n):
-            _keep_rival(total[y, q], np.int16(q), index, rival)
+            _set_sum(sums[0, start + y, q], sums[1, start + y, q], total[q])
+            for k in range(2, pairs):
+                _add_bytes(sums[k, start + y, q], total[q])
+        _best_of_row(total, first, (best, index, rival), (best_r, index_r))
         for x in range(width):
             q = int(index[x])
             value = np.float32(first + q)
             if 0 < q < n - 1:
-                a = np.float32(total[y, q - 1, x]) - np.float32(best[x])
-                b = np.float32(total[y, q + 1, x]) - np.float32(best[x])
+                a = np.float32(total[q - 1, x]) - np.float32(best[x])
+                b = np.float32(total[q + 1, x]) - np.float32(best[x])
                 steep = max(a, b)
                 if steep > 0:
                     value += np.float32(0.5) * (a - b) / steep
             left[y, x] = value
-            margin[y, x] = np.float32(rival[x]) - np.float32(best[x])
+            margin = np.float32(rival[x]) - np.float32(best[x])
+            confidence[y, x] = margin / (margin + np.float32(half))
             right[y, x] = np.float32(first + index_r[x]) if index_r[x] >= 0 else np.float32(np.nan)
 
 
@@ -77,6 +105,8 @@ def check_left_right(left: F32, right: F32, tolerance: np.float32) -> None:
     height, width = left.shape
     for y in range(height):
         for x in range(width):
+            if np.isnan(left[y, x]):
+                continue
             partner = int(np.floor(np.float32(x) - left[y, x] + np.float32(0.5)))
             if not (0 <= partner < width and abs(right[y, partner] - left[y, x]) <= tolerance):
                 left[y, x] = np.nan
@@ -87,31 +117,32 @@ def remove_peaks(disparity: F32, step: np.float32, smallest: int) -> None:
     """NaN to connected pieces of fewer than ``smallest`` pixels; neighbours are connected where their
     disparities differ by no more than ``step``."""
     height, width = disparity.shape
-    seen = np.zeros((height, width), np.bool_)
-    queue = np.empty((height * width, 2), np.int32)
-    for y in range(height):
-        for x in range(width):
-            if seen[y, x] or np.isnan(disparity[y, x]):
-                continue
-            seen[y, x] = True
-            queue[0, 0], queue[0, 1] = y, x
-            at, n = 0, 1
-            while at < n:
-                v, u = queue[at, 0], queue[at, 1]
-                at += 1
-                here = disparity[v, u]
-                for k in range(4):
-                    b = v + (1 if k == 0 else -1 if k == 1 else 0)
-                    a = u + (1 if k == 2 else -1 if k == 3 else 0)
-                    if b < 0 or b >= height or a < 0 or a >= width or seen[b, a]:
-                        continue
-                    if abs(disparity[b, a] - here) <= step:
-                        seen[b, a] = True
-                        queue[n, 0], queue[n, 1] = b, a
-                        n += 1
-            if n < smallest:
-                for k in range(n):
-                    disparity[queue[k, 0], queue[k, 1]] = np.nan
+    flat = disparity.reshape(height * width)
+    queue = np.empty(height * width, np.int32)
+    open_ = ~np.isnan(flat)
+    for seed in range(height * width):
+        if not open_[seed]:
+            continue
+        open_[seed] = False
+        queue[0] = seed
+        at, n = 0, 1
+        while at < n:
+            place = queue[at]
+            at += 1
+            here, column = flat[place], place % width
+            for k in range(4):
+                other = place + (1 if k == 0 else -1 if k == 1 else width if k == 2 else -width)
+                if (k == 0 and column == width - 1) or (k == 1 and column == 0):
+                    continue
+                if other < 0 or other >= height * width or not open_[other]:
+                    continue
+                if abs(flat[other] - here) <= step:
+                    open_[other] = False
+                    queue[n] = other
+                    n += 1
+        if n < smallest:
+            for k in range(n):
+                flat[queue[k]] = np.nan
 
 
 @njit(cache=True, nogil=True)

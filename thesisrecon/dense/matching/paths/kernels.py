@@ -9,29 +9,34 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 I16 = NDArray[np.int16]
 U8 = NDArray[np.uint8]
-U16 = NDArray[np.uint16]
+U64 = NDArray[np.uint64]
+Word8 = tuple[np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64]
 
-UNREACHABLE = np.int16(16000)
-"""Cost of a disparity beyond the range: more than any path, and no overflow with a penalty on top."""
+TOP = 127
+"""The dearest match and the largest penalty together, at most: then two paths that meet in a pixel cost no
+more than a byte holds."""
 BLOCK = 192
-"""Rows that go through the horizontal passes together, at most."""
-TILE = 32
-"""Columns that are transposed together."""
+"""Rows that go through the horizontal passes together, at most: a multiple of 8."""
+TILE = 64
+"""Columns that are transposed together: a multiple of 8."""
+ODD = np.uint64(0x00FF00FF00FF00FF)
+ODD_PAIRS = np.uint64(0x0000FFFF0000FFFF)
+ODD_FOURS = np.uint64(0x00000000FFFFFFFF)
 
 
 @njit(cache=True, nogil=True)
 def _jumps_between(
-    a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.float32, out: I16
+    a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8
 ) -> None:
     for x in range(len(out)):
         apart = np.float32(a[x]) - np.float32(b[x])
         apart = -apart if apart < 0 else apart
         jump = largest * scale / (scale + apart)
-        out[x] = np.int16(least if jump < least else jump)
+        out[x] = np.uint8(least if jump < least else jump)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def jump_penalties(grey: I16, largest: np.float32, least: np.float32, scale: np.float32, out: I16) -> None:
+def jump_penalties(grey: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
     """The penalty of a large change of disparity between neighbours, ``out`` (4, H, W): of (y, x) and its
     neighbour at the left, above, above left and above right.
 
@@ -39,7 +44,7 @@ def jump_penalties(grey: I16, largest: np.float32, least: np.float32, scale: np.
     (Hirschmüller 2008, section 2.2).
     """
     height, width = grey.shape
-    out[:] = np.int16(largest)
+    out[:] = np.uint8(largest)
     for y in range(height):
         _jumps_between(grey[y, 1:], grey[y, : width - 1], largest, least, scale, out[0, y, 1:])
         if y > 0:
@@ -52,132 +57,231 @@ def jump_penalties(grey: I16, largest: np.float32, least: np.float32, scale: np.
 @njit(cache=True, nogil=True)
 def _extend(
     cost: U8,
-    previous: tuple[I16, I16, I16],
-    least: I16,
-    jump: I16,
-    step: np.int16,
-    path: I16,
-    path_least: I16,
-    total: U16,
+    before: tuple[U8, U8, U8],
+    base: U8,
+    jump: U8,
+    step: np.uint8,
+    path: U8,
+    least: U8,
 ) -> None:
     """One disparity of a row of pixels: L = C + min(L'(d), L'(d +- 1) + P1, min L' + P2) - min L'.
 
-    ``previous`` are the rows L'(d - 1), L'(d), L'(d + 1) of the pixels before on the path; ``path_least``
-    takes the minimum and ``total`` the sum.
+    ``before`` are the rows L'(d - 1), L'(d), L'(d + 1) of the pixels before on the path, ``base`` their
+    minimum over d; ``least`` takes that of this row.
     """
-    below, same, above = previous
+    below, same, above = before
     for x in range(len(cost)):
-        beside = below[x]
-        other = above[x]
-        beside = np.int16((other if other < beside else beside) + step)
-        value = same[x]
+        # Read before the choices: a read inside of one would be a branch, and no vector instruction.
+        beside, other, value, floor = below[x], above[x], same[x], base[x]
+        beside = other if other < beside else beside
+        beside = np.uint8(beside + step)
         value = beside if beside < value else value
-        base = least[x]
-        far = np.int16(base + jump[x])
+        far = np.uint8(floor + jump[x])
         value = far if far < value else value
-        value = np.int16(np.int16(value - base) + np.int16(cost[x]))
+        value = np.uint8(np.uint8(value - floor) + cost[x])
         path[x] = value
-        so_far = path_least[x]
-        path_least[x] = value if value < so_far else so_far
-        total[x] = np.uint16(total[x] + np.uint16(value))
+        so_far = least[x]
+        least[x] = value if value < so_far else so_far
 
 
 @njit(cache=True, nogil=True)
-def _sweep_rows(costs: U8, jumps: I16, step: np.int16, shift: int, down: bool, total: U16) -> None:
-    """Paths that come from the row above (or below, not ``down``), ``shift`` columns aside, through
-    ``costs`` (N, D, W), added to ``total``; ``jumps`` (N, W) of each pixel and the one above."""
-    rows, n, width = costs.shape
-    paths = np.zeros((2, n + 2, width + 2), np.int16)
-    paths[:, 0], paths[:, n + 1] = UNREACHABLE, UNREACHABLE
-    least = np.zeros((2, width + 2), np.int16)
-    lo, hi = 1 + shift, 1 + shift + width
-    for i in range(rows):
-        y = i if down else rows - 1 - i
-        new, old = i & 1, 1 - (i & 1)
-        least[new, 1 : width + 1] = UNREACHABLE
-        # The penalty between two pixels is kept with the lower of them.
-        of = y if down else min(y + 1, rows - 1)
-        jump = np.empty(width, np.int16)
-        jump[:] = jumps[of]
-        if not down and shift != 0:
-            jump[:] = UNREACHABLE
-            # A path from the lower right is the upper-left penalty of the pixel it comes from.
-            if shift > 0:
-                jump[: width - 1] = jumps[of, 1:]
-            else:
-                jump[1:] = jumps[of, : width - 1]
-        for q in range(n):
+def _extend_row(
+    cost: U8, before: U8, base: U8, jump: U8, steps: tuple[np.uint8, int, U8], path: U8, least: U8
+) -> None:
+    """Paths (D, W) of a row of pixels from those of the row before, a column aside where shifted.
+
+    ``jump`` (W,) belongs to the pixel where the path comes from. ``steps``: the penalty of a step, the shift,
+    and a row of costs that no path reaches.
+    """
+    step, shift, unreachable = steps
+    n, width = cost.shape
+    a, b = max(0, -shift), width - max(0, shift)
+    c, d = a + shift, b + shift
+    least[:] = 255
+    for q in range(n):
+        if b > a:
+            below = before[q - 1, c:d] if q > 0 else unreachable[c:d]
+            above = before[q + 1, c:d] if q < n - 1 else unreachable[c:d]
             _extend(
-                costs[y, q],
-                (paths[old, q, lo:hi], paths[old, q + 1, lo:hi], paths[old, q + 2, lo:hi]),
-                least[old, lo:hi],
-                jump,
+                cost[q, a:b],
+                (below, before[q, c:d], above),
+                base[c:d],
+                jump[c:d],
                 step,
-                paths[new, q + 1, 1 : width + 1],
-                least[new, 1 : width + 1],
-                total[y, q],
+                path[q, a:b],
+                least[a:b],
             )
+        for x in range(a):
+            path[q, x] = cost[q, x]
+            least[x] = min(least[x], cost[q, x])
+        for x in range(b, width):
+            path[q, x] = cost[q, x]
+            least[x] = min(least[x], cost[q, x])
 
 
 @njit(cache=True, nogil=True)
-def _copy(source: U8 | U16, out: U8 | U16) -> None:
+def _start_row(cost: U8, path: U8, least: U8) -> None:
+    least[:] = 255
+    for q in range(len(cost)):
+        for x in range(len(least)):
+            value = cost[q, x]
+            path[q, x] = value
+            least[x] = min(least[x], value)
+
+
+@njit(cache=True, nogil=True)
+def _add(values: U8, total: U8) -> None:
+    for x in range(len(total)):
+        total[x] = np.uint8(total[x] + values[x])
+
+
+@njit(cache=True, nogil=True)
+def _shifted(jump: U8, shift: int, out: U8) -> None:
+    """Penalties of pixels that lie ``shift`` columns from where they are wanted."""
+    width = len(jump)
+    for x in range(width):
+        out[x] = jump[min(max(x - shift, 0), width - 1)]
+
+
+@njit(cache=True, nogil=True)
+def sum_opposite(costs: U8, jumps: U8, step: np.uint8, shift: int, total: U8) -> None:
+    """Paths through the rows of ``costs`` (N, D, W) from above and ``shift`` columns aside, and the opposite
+    ones from below; their sum to ``total`` (N, D, W). ``jumps`` (N, W) of a pixel and the one above it."""
+    rows, n, width = costs.shape
+    unreachable = np.full(width, np.uint8(255 - step), np.uint8)
+    least, jump = np.empty((2, width), np.uint8), np.empty(width, np.uint8)
+    _start_row(costs[0], total[0], least[0])
+    for y in range(1, rows):
+        # The sum is still the path from above alone, so it is where the next one starts.
+        _shifted(jumps[y], shift, jump)
+        steps = (step, shift, unreachable)
+        old, new = least[(y - 1) & 1], least[y & 1]
+        _extend_row(costs[y], total[y - 1], old, jump, steps, total[y], new)
+    paths = np.empty((2, n, width), np.uint8)
+    _start_row(costs[rows - 1], paths[(rows - 1) & 1], least[(rows - 1) & 1])
+    for y in range(rows - 1, -1, -1):
+        path = paths[y & 1]
+        if y < rows - 1:
+            steps = (step, -shift, unreachable)
+            old = least[(y + 1) & 1]
+            _extend_row(costs[y], paths[(y + 1) & 1], old, jumps[y + 1], steps, path, least[y & 1])
+        for q in range(n):
+            _add(path[q], total[y, q])
+
+
+@njit(cache=True, nogil=True)
+def _swap(a: np.uint64, b: np.uint64, shift: np.uint64, mask: np.uint64) -> tuple[np.uint64, np.uint64]:
+    apart = ((a >> shift) ^ b) & mask
+    return a ^ (apart << shift), b ^ apart
+
+
+@njit(cache=True, nogil=True)
+def _transposed(rows: Word8) -> Word8:
+    """8 x 8 bytes, a row a word, transposed: bytes are swapped, then pairs, then fours."""
+    one, two, four = np.uint64(8), np.uint64(16), np.uint64(32)
+    a, b, c, d, e, f, g, h = rows
+    a, b = _swap(a, b, one, ODD)
+    c, d = _swap(c, d, one, ODD)
+    e, f = _swap(e, f, one, ODD)
+    g, h = _swap(g, h, one, ODD)
+    a, c = _swap(a, c, two, ODD_PAIRS)
+    b, d = _swap(b, d, two, ODD_PAIRS)
+    e, g = _swap(e, g, two, ODD_PAIRS)
+    f, h = _swap(f, h, two, ODD_PAIRS)
+    a, e = _swap(a, e, four, ODD_FOURS)
+    b, f = _swap(b, f, four, ODD_FOURS)
+    c, g = _swap(c, g, four, ODD_FOURS)
+    d, h = _swap(d, h, four, ODD_FOURS)
+    return a, b, c, d, e, f, g, h
+
+
+@njit(cache=True, nogil=True)
+def _load(words: U64, first: int, column: int) -> Word8:
+    """Words of eight rows from ``first`` on."""
+    part = words[first : first + 8, column]
+    return part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7]
+
+
+@njit(cache=True, nogil=True)
+def _store(square: Word8, words: U64, first: int, column: int) -> None:
+    part = words[first : first + 8, column]
+    part[0], part[1], part[2], part[3] = square[0], square[1], square[2], square[3]
+    part[4], part[5], part[6], part[7] = square[4], square[5], square[6], square[7]
+
+
+@njit(cache=True, nogil=True)
+def _copy(source: U8, out: U8) -> None:
     for x in range(len(out)):
         out[x] = source[x]
 
 
 @njit(cache=True, nogil=True)
-def _transpose_bytes(source: U8, out: U8) -> None:
-    """(N, D, W) to (W, D, N), N <= BLOCK, tile by tile: read column by column from where it lies, a row
-    length that is a multiple of a large power of two would use a few places of the cache only."""
+def turn_rows(source: U8, out: U8) -> None:
+    """(N, D, W) to (W', D, N'), N <= BLOCK, W' and N' the next multiples of 8; what is added is left as it is
+    or arbitrary.
+
+    Tile by tile: read column by column from where it lies, a row length that is a multiple of a large power
+    of two would use a few places of the cache only.
+    """
     rows, n, width = source.shape
-    tile = np.empty((BLOCK, TILE + 16), np.uint8)
+    words = out.view(np.uint64)
+    tile = np.zeros((BLOCK, TILE // 8 + 1), np.uint64)
+    bytes_of = tile.view(np.uint8)
     for q in range(n):
+        plane = words[:, q]
         for start in range(0, width, TILE):
             size = min(TILE, width - start)
             for y in range(rows):
-                _copy(source[y, q, start : start + size], tile[y, :size])
-            for x in range(size):
-                line = out[start + x, q]
-                for y in range(rows):
-                    line[y] = tile[y, x]
+                _copy(source[y, q, start : start + size], bytes_of[y, :size])
+            for x in range(0, size, 8):
+                for y in range(0, rows, 8):
+                    _store(_transposed(_load(tile, y, x >> 3)), plane, start + x, y >> 3)
 
 
 @njit(cache=True, nogil=True)
-def _set_transposed(source: U16, out: U16) -> None:
-    """(W, D, N) to (N, D, W), N <= BLOCK, tile by tile."""
-    width, n, rows = source.shape
-    tile = np.empty((BLOCK, TILE + 16), np.uint16)
+def turn_back(source: U8, out: U8) -> None:
+    """(W', D, N') to (N, D, W): the inverse of :func:`turn_rows`."""
+    rows, n, width = out.shape
+    words = source.view(np.uint64)
+    tile = np.zeros((BLOCK, TILE // 8 + 1), np.uint64)
+    bytes_of = tile.view(np.uint8)
     for q in range(n):
+        plane = words[:, q]
         for start in range(0, width, TILE):
             size = min(TILE, width - start)
-            for x in range(size):
-                line = source[start + x, q]
-                for y in range(rows):
-                    tile[y, x] = line[y]
+            for x in range(0, size, 8):
+                for y in range(0, rows, 8):
+                    _store(_transposed(_load(plane, start + x, y >> 3)), tile, y, x >> 3)
             for y in range(rows):
-                _copy(tile[y, :size], out[y, q, start : start + size])
+                _copy(bytes_of[y, :size], out[y, q, start : start + size])
+
+
+def scratch_size(height: int, disparities: int, width: int) -> int:
+    """Bytes of a block of transposed costs."""
+    return (width + 7) // 8 * 8 * disparities * ((min(height, BLOCK) + 7) // 8 * 8)
 
 
 @njit(cache=True, nogil=True)
-def sum_paths(costs: U8, jumps: I16, step: np.int16, diagonals: bool, total: U16) -> None:
-    """Sum over the paths that end in a pixel of their least costs, ``total`` (H, D, W), from ``costs``
-    (H, D, W) (Hirschmüller 2008): along its row and column from both sides, and along the diagonals.
+def sum_paths(costs: U8, jumps: U8, step: np.uint8, total: U8, scratch: U8) -> None:
+    """Sums of the least costs of opposite paths that end in a pixel (Hirschmüller 2008), ``total``
+    (P, H, D, W), from ``costs`` (H, D, W): P = 2 along its row and column, P = 4 also along the diagonals.
 
-    ``jumps`` (4, H, W) from :func:`jump_penalties`, ``step`` the penalty of a change by one.
+    ``jumps`` (4, H, W) from :func:`jump_penalties`, ``step`` the penalty of a change by one; ``scratch``
+    (2, :func:`scratch_size`).
     """
     height, n, width = costs.shape
     # Along a row every pixel waits for the one before: many rows together, transposed, fill the vectors.
     for start in range(0, height, BLOCK):
         rows = min(BLOCK, height - start)
-        part, added = np.empty((width, n, rows), np.uint8), np.zeros((width, n, rows), np.uint16)
-        _transpose_bytes(costs[start : start + rows], part)
-        turned = np.ascontiguousarray(jumps[0, start : start + rows].T)
-        _sweep_rows(part, turned, step, 0, True, added)
-        _sweep_rows(part, turned, step, 0, False, added)
-        _set_transposed(added, total[start : start + rows])
-    for down in (True, False):
-        _sweep_rows(costs, jumps[1], step, 0, down, total)
-        if diagonals:
-            sign = -1 if down else 1
-            _sweep_rows(costs, jumps[2], step, sign, down, total)
-            _sweep_rows(costs, jumps[3], step, -sign, down, total)
+        wide, high = (width + 7) // 8 * 8, (rows + 7) // 8 * 8
+        turned = scratch[0, : wide * n * high].reshape((wide, n, high))
+        summed = scratch[1, : wide * n * high].reshape((wide, n, high))
+        turn_rows(costs[start : start + rows], turned)
+        jump = np.zeros((width, high), np.uint8)
+        jump[:, :rows] = jumps[0, start : start + rows].T
+        sum_opposite(turned[:width], jump, step, 0, summed[:width])
+        turn_back(summed, total[0, start : start + rows])
+    sum_opposite(costs, jumps[1], step, 0, total[1])
+    if len(total) == 4:
+        sum_opposite(costs, jumps[2], step, -1, total[2])
+        sum_opposite(costs, jumps[3], step, 1, total[3])

@@ -8,16 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.dense.matching.costs.kernels import LEVELS
-from thesisrecon.dense.matching.costs.volume import DEAREST
 from thesisrecon.dense.matching.pair import Side
-from thesisrecon.dense.matching.paths.kernels import jump_penalties, sum_paths
+from thesisrecon.dense.matching.paths.kernels import TOP, jump_penalties, sum_paths
 
-I16 = NDArray[np.int16]
 U8 = NDArray[np.uint8]
-U16 = NDArray[np.uint16]
 
-LARGEST = 30.0
-"""Of a penalty, in dearest costs: path costs have 16 bits, and so has the sum of eight."""
+LARGEST = 15.0
+"""Of a penalty, in dearest costs: they share a byte, and a cost needs a few steps of its own."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +40,24 @@ class PathPenalties:
         if not self.edge > 0.0:
             raise ValueError(f"edge must be above 0; got {self.edge}")
 
-    def jumps(self, side: Side, noise: float) -> I16:
+    @property
+    def dearest(self) -> int:
+        """The dearest cost of a match as a whole number: as large as the penalties leave room for."""
+        return int(TOP / (1.0 + self.jump))
+
+    def jumps(self, side: Side, noise: float) -> U8:
         """(4, H, W) penalties of a jump from the pixel at the left, above, above left and above right."""
-        out = np.empty((4, *side.valid.shape), np.int16)
-        scale = self.edge * noise * LEVELS * len(side.channels)
-        largest, least = np.float32(self.jump * DEAREST), np.float32(self.least_jump * DEAREST)
-        jump_penalties(side.grey, largest, least, np.float32(scale), out)
+        out = np.empty((4, *side.valid.shape), np.uint8)
+        scale = np.float32(self.edge * noise * LEVELS * len(side.channels))
+        largest, least = np.float32(self.jump * self.dearest), np.float32(self.least_jump * self.dearest)
+        jump_penalties(side.grey, largest, least, scale, out)
         return out
 
-    def totals(self, costs: U8, jumps: I16, *, diagonals: bool) -> U16:
-        """(H, D, W) sums of the least costs of the paths that end in a pixel, four or, with ``diagonals``,
-        eight, from ``costs`` (H, D, W) and ``jumps`` (4, H, W) of the same rows."""
-        out = np.empty(costs.shape, np.uint16)
-        step = np.int16(round(self.step * DEAREST))
-        sum_paths(costs, np.ascontiguousarray(jumps), step, diagonals, out)
-        return out
+    def sum_into(self, out: U8, costs: U8, jumps: U8, scratch: U8) -> None:
+        """Sums of the least costs of the paths that end in a pixel, two by two, ``out`` (P, H, D, W).
+
+        P = 2 along its row and column, P = 4 also along the diagonals; from ``costs`` (H, D, W) and
+        ``jumps`` (4, H, W) of the same rows; ``scratch`` (2, ``scratch_size(H, D, W)``).
+        """
+        step = np.uint8(round(self.step * self.dearest))
+        sum_paths(costs, np.ascontiguousarray(jumps), step, out, scratch)
