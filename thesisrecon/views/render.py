@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.geometry.zbuffer import Raster, rasterize, sample_texture
-from thesisrecon.types import F32, RenderedView, TexturedMesh
+from thesisrecon.geometry.zbuffer import Raster, in_strips, rasterize, sample_texture
+from thesisrecon.types import F32, F64, I64, RenderedView, TexturedMesh
+from thesisrecon.views.kernels import average_blocks
 from thesisrecon.views.shading import Shading, vertex_normals
+
+STRIP = 16
+"""Rows that are coloured at a time."""
 
 BARE = (200, 200, 200)
 """Colour of a mesh that has none."""
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """A mesh as the kernels take it: ``points``, ``normals``, ``colors`` (N, 3) of its vertices, ``uv``
+    (M, 3, 2); what is not drawn is None."""
+
+    faces: I64
+    points: F32 | None
+    normals: F32 | None
+    colors: F32 | None
+    uv: F32 | None
+    texture: NDArray[np.uint8] | None
 
 
 def render(
@@ -50,13 +68,21 @@ def render(
         fine = centre
     else:
         fine = rasterize(mesh.vertices, mesh.faces, camera.resized(samples), threads=threads)
-    color = _colors(mesh, fine)
-    if shading is not None:
-        color = _lit(mesh, fine, color, camera, shading)
-    color[fine.face < 0] = background
-    width, height = camera.size
-    color = color.reshape(height, samples, width, samples, 3).mean(axis=(1, 3))
-    rgb = np.clip(np.rint(color), 0, 255).astype(np.uint8)
+    rgb = np.empty((*valid.shape, 3), dtype=np.uint8)
+    behind = np.asarray(background, dtype=np.float32)
+    surface = _prepared(mesh, lit=shading is not None)
+
+    def paint(rows: tuple[int, int]) -> None:
+        # A few rows at a time: what lies between is soon used, and little.
+        for first in range(rows[0], rows[1], STRIP):
+            last = min(first + STRIP, rows[1])
+            part = fine.rows(samples * first, samples * last)
+            color = _colors(surface, part)
+            if shading is not None:
+                _light(surface, part, color, camera.centre, shading)
+            average_blocks(color, part.face, samples, behind, rgb[first:last])
+
+    in_strips(paint, len(rgb), threads)
     return RenderedView(rgb, depth, valid)
 
 
@@ -69,25 +95,36 @@ def _check(mesh: TexturedMesh) -> None:
         raise ValueError(f"colors must be {mesh.vertices.shape}; got {mesh.colors.shape}")
 
 
-def _colors(mesh: TexturedMesh, raster: Raster) -> F32:
+def _prepared(mesh: TexturedMesh, *, lit: bool) -> _Surface:
+    textured = mesh.texture is not None and mesh.uv is not None
+    return _Surface(
+        mesh.faces,
+        points=mesh.vertices.astype(np.float32) if lit else None,
+        normals=vertex_normals(mesh).astype(np.float32) if lit else None,
+        colors=None if mesh.colors is None or textured else mesh.colors.astype(np.float32),
+        uv=None if mesh.uv is None or not textured else np.ascontiguousarray(mesh.uv, dtype=np.float32),
+        texture=mesh.texture if textured else None,
+    )
+
+
+def _colors(surface: _Surface, raster: Raster) -> F32:
     """(H, W, 3) 0..255 before any light."""
-    if mesh.texture is not None and mesh.uv is not None:
+    if surface.texture is not None and surface.uv is not None:
         color = np.zeros((*raster.face.shape, 3), dtype=np.float32)
-        sample_texture(mesh.texture.astype(np.float32), raster.interpolate(mesh.uv), raster.face, color)
+        sample_texture(surface.texture, raster.interpolate(surface.uv), raster.face, color)
         return color
-    if mesh.colors is not None:
-        return raster.interpolate(mesh.colors[mesh.faces].astype(np.float32))
+    if surface.colors is not None:
+        return raster.interpolate_vertices(surface.faces, surface.colors)
     return np.tile(np.asarray(BARE, dtype=np.float32), (*raster.face.shape, 1))
 
 
-def _lit(mesh: TexturedMesh, raster: Raster, color: F32, camera: PinholeCamera, shading: Shading) -> F32:
-    drawn = raster.face >= 0
-    points = raster.interpolate(mesh.vertices[mesh.faces])[drawn]
-    normals = raster.interpolate(vertex_normals(mesh)[mesh.faces])[drawn]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-20))
-    color = color.copy()
-    color[drawn] = shading.shade(color[drawn], points, normals, camera.centre)
-    return color
+def _light(surface: _Surface, raster: Raster, color: F32, eye: F64, shading: Shading) -> None:
+    """Shade the colours (H, W, 3) in place."""
+    assert surface.points is not None
+    assert surface.normals is not None
+    points = raster.interpolate_vertices(surface.faces, surface.points).reshape(-1, 3)
+    normals = raster.interpolate_vertices(surface.faces, surface.normals).reshape(-1, 3)
+    shading.shade(color.reshape(-1, 3), points, normals, eye)
 
 
 def bare(mesh: TexturedMesh) -> TexturedMesh:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.types import F32, F64, TexturedMesh
+from thesisrecon.views.kernels import shade_points, sum_face_normals
 
 
 @dataclass(frozen=True)
@@ -24,13 +25,12 @@ class Light:
         if self.direction is not None and not np.linalg.norm(self.direction) > 0.0:
             raise ValueError("the direction of a Light must not be zero")
 
-    def towards(self, points: F32) -> F32:
-        """Unit vectors (N, 3) from points (N, 3) to the lamp."""
-        if self.direction is not None:
-            unit = np.asarray(self.direction) / np.linalg.norm(self.direction)
-            return np.broadcast_to(unit.astype(np.float32), points.shape)
-        offset = np.asarray(self.position, dtype=np.float32) - points
-        return _unit(offset)
+    @property
+    def row(self) -> list[float]:
+        """As :func:`~thesisrecon.views.kernels.shade_points` takes it."""
+        if self.position is not None:
+            return [1.0, *self.position, *self.color]
+        return [0.0, *(self.direction or (0.0, 0.0, 0.0)), *self.color]
 
 
 @dataclass(frozen=True)
@@ -44,37 +44,16 @@ class Shading:
     specular: float = 0.0
     shininess: float = 30.0
 
-    def shade(self, color: F32, points: F32, normals: F32, eye: F64) -> F32:
-        """Colours (N, 3) 0..255 of points (N, 3) with unit normals (N, 3) seen from ``eye`` (3,)."""
-        to_eye = _unit(eye.astype(np.float32) - points)
-        normals = normals * np.where((normals * to_eye).sum(axis=1) < 0.0, -1.0, 1.0)[:, None].astype(
-            np.float32
-        )
-        light = np.full_like(color, self.ambient)
-        shine = np.zeros_like(color)
-        for lamp in self.lights:
-            to_lamp = lamp.towards(points)
-            strength = np.asarray(lamp.color, dtype=np.float32)
-            cosine = np.maximum((normals * to_lamp).sum(axis=1), 0.0)
-            light += cosine[:, None] * strength
-            half = np.maximum((normals * _unit(to_lamp + to_eye)).sum(axis=1), 0.0) * (cosine > 0.0)
-            shine += (255.0 * self.specular * half**self.shininess)[:, None] * strength
-        shaded: F32 = color * light + shine
-        return shaded
+    def shade(self, color: F32, points: F32, normals: F32, eye: F64) -> None:
+        """Light colours (P, 3), 0 to 255, in place, of points (P, 3) seen from ``eye`` (3,), with
+        normals (P, 3) of any length."""
+        lamps = np.array([light.row for light in self.lights], dtype=np.float64).reshape(-1, 7)
+        surface = (float(self.ambient), float(self.specular), float(self.shininess))
+        shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lamps, surface)
 
 
 def vertex_normals(mesh: TexturedMesh) -> F64:
     """Unit normals (N, 3): the mean over the faces at a vertex, by their area."""
-    corners = mesh.vertices[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(mesh.vertices)
-    for k in range(3):
-        for axis in range(3):
-            total[:, axis] += np.bincount(mesh.faces[:, k], across[:, axis], minlength=len(total))
+    sum_face_normals(mesh.vertices, mesh.faces, total)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])
-
-
-def _unit(vectors: F32) -> F32:
-    length = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.float32(1e-20))
-    unit: F32 = (vectors / length).astype(np.float32)
-    return unit

@@ -10,10 +10,15 @@ from itertools import pairwise
 import numpy as np
 
 from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.geometry.zbuffer.kernels import interpolate_corners, rasterize_rows, sample_texture
+from thesisrecon.geometry.zbuffer.kernels import (
+    interpolate_corners,
+    interpolate_vertices,
+    rasterize_rows,
+    sample_texture,
+)
 from thesisrecon.types import F32, F64, I64
 
-__all__ = ["Raster", "rasterize", "sample_texture"]
+__all__ = ["Raster", "in_strips", "rasterize", "sample_texture"]
 
 NEAR = 1e-6
 """Nearest depth that is drawn, in units of the distance from the camera to the farthest vertex."""
@@ -35,6 +40,16 @@ class Raster:
         interpolate_corners(self.face, self.weights, np.ascontiguousarray(values, dtype=np.float32), out)
         return out
 
+    def interpolate_vertices(self, faces: I64, values: F32) -> F32:
+        """Values (N, C) of the vertices of the faces (M, 3), at every pixel (H, W, C); 0 where no face is."""
+        out = np.zeros((*self.face.shape, values.shape[1]), dtype=np.float32)
+        interpolate_vertices(self.face, self.weights, faces, values, out)
+        return out
+
+    def rows(self, first: int, last: int) -> Raster:
+        """Rows [first, last) alone."""
+        return Raster(self.depth[first:last], self.face[first:last], self.weights[first:last])
+
 
 def rasterize(vertices: F64, faces: I64, camera: PinholeCamera, *, threads: int = 1) -> Raster:
     """Which face is seen at the centre of each pixel.
@@ -53,11 +68,12 @@ def rasterize(vertices: F64, faces: I64, camera: PinholeCamera, *, threads: int 
     def draw(rows: tuple[int, int]) -> None:
         rasterize_rows(corners, near, rows, depth, face, weights)
 
-    _in_strips(draw, height, threads)
+    in_strips(draw, height, threads)
     return Raster(depth, face, weights)
 
 
-def _in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
+def in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
+    """Call ``work`` with the first and last + 1 row of as many strips as there are threads, one in each."""
     edges = np.linspace(0, height, max(threads, 1) + 1).round().astype(int)
     strips = [(int(a), int(b)) for a, b in pairwise(edges)]
     if len(strips) == 1:

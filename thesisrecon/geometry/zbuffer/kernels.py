@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from thesisrecon.types import F32, F64, I64
+
+U8 = NDArray[np.uint8]
 
 SLACK = 1e-7
 """Pixels by which a triangle reaches beyond its edges, so that no rounding opens a crack between two."""
@@ -118,7 +121,23 @@ def interpolate_corners(face: I64, weights: F32, values: F32, out: F32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def sample_texture(texture: F32, uv: F32, drawn: I64, out: F32) -> None:
+def interpolate_vertices(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> None:
+    """Values (N, C) of the vertices of ``faces`` (M, 3) at each pixel (H, W, C); pixels without a face
+    stay."""
+    for y in range(face.shape[0]):
+        for x in range(face.shape[1]):
+            m = face[y, x]
+            if m < 0:
+                continue
+            i, j, l = faces[m, 0], faces[m, 1], faces[m, 2]
+            b, c = weights[y, x, 0], weights[y, x, 1]
+            a = np.float32(1.0) - b - c
+            for k in range(values.shape[1]):
+                out[y, x, k] = a * values[i, k] + b * values[j, k] + c * values[l, k]
+
+
+@njit(cache=True, nogil=True)
+def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
     """Bilinear texels (H, W, 3) at uv (H, W, 2) where ``drawn`` >= 0; beyond the border its own texel."""
     height, width = texture.shape[:2]
     for y in range(uv.shape[0]):
@@ -131,6 +150,8 @@ def sample_texture(texture: F32, uv: F32, drawn: I64, out: F32) -> None:
             right, below = min(left + 1, width - 1), min(top + 1, height - 1)
             s, t = u - np.float32(left), v - np.float32(top)
             for k in range(3):
-                upper = texture[top, left, k] + s * (texture[top, right, k] - texture[top, left, k])
-                lower = texture[below, left, k] + s * (texture[below, right, k] - texture[below, left, k])
+                # Differences of whole numbers without a sign would wrap around.
+                a, b = np.float32(texture[top, left, k]), np.float32(texture[top, right, k])
+                c, d = np.float32(texture[below, left, k]), np.float32(texture[below, right, k])
+                upper, lower = a + s * (b - a), c + s * (d - c)
                 out[y, x, k] = upper + t * (lower - upper)
