@@ -281,5 +281,7 @@ def test_wrong_calls_are_value_errors(change):
         rectify_pair(**call)
     with pytest.raises(ValueError, match="most_shrink"):
         FrameLimits(most_shrink=0.5)
+    with pytest.raises(ValueError, match="most_shear"):
+        LeastDistortion(most_shear=0.0)
     with pytest.raises(ValueError, match="side"):
         rectify_cameras(*scene.P, SIZE, SIZE).rectified_from_original(2, scene.xy1)

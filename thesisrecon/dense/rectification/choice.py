@@ -33,14 +33,16 @@ class LeastDistorted:
     """The one of several methods that distorts a pair least, measured by ``RectificationQuality.distortion``.
 
     Methods that keep the angle of a photograph's midlines within ``angle_deg`` of a right one and their ratio
-    within ``aspect`` of its own come before the others, methods that fail for a pair are passed over, and
-    ``bending`` is added for polar frames: they bend straight lines.
+    within ``aspect`` of its own come before the others, and methods that fail for a pair are passed over.
+    Added are ``bending`` for polar frames, which bend straight lines, and ``size`` times the log of the
+    frame's pixels over the photograph's, which cost time and tell nothing new.
     """
 
     methods: tuple[Rectifier, ...]
     angle_deg: float = 5.0
     aspect: float = 0.1
     bending: float = 0.03
+    size: float = 0.05
 
     def rectify(self, pair: EpipolarPair) -> AnyRectification:
         """The best of those that succeed; the last one's ``StageFailure`` where none does."""
@@ -64,7 +66,8 @@ class LeastDistorted:
         turned = max((abs(a - 90.0) for a in quality.orthogonality_deg if np.isfinite(a)), default=0.0)
         aspect = max((abs(a - 1.0) for a in quality.aspect if np.isfinite(a)), default=0.0)
         bent = self.bending if isinstance(found, PolarRectification) else 0.0
-        return turned > self.angle_deg or aspect > self.aspect, quality.distortion + bent
+        cost = quality.distortion + bent + self.size * np.log(quality.growth)
+        return turned > self.angle_deg or aspect > self.aspect, float(cost)
 
 
 def _methods(limits: FrameLimits) -> Mapping[Method, Rectifier]:

@@ -48,11 +48,9 @@ class Hartley:
         if len(pair.xy1) < LEAST_MATCHES:
             raise StageFailure("Hartley's rectification needs matches", f"{len(pair.xy1)} are given", "")
         low, high = planes_in_reach(pair)
-        e = pair.pencil.epipole(1)
-        # The line through the centre, (0, 0) in places, and the one perpendicular to it.
-        phi = float(pair.pencil.angles(1, pair.pencil.centres[1][None], about=0.5 * (low + high))[0])
-        phi, phi_infinite = _perpendicular(pair.pencil.lines[1], phi, e)
-        rows = _skew_rows(pair, phi, phi_infinite)
+        middle = pair.pencil.centres[1][None]
+        phi = float(pair.pencil.angles(1, middle, about=0.5 * (low + high))[0])
+        rows = pencil_rows(pair, phi, infinite=_perpendicular(pair, phi))
         require_in_front(pair, rows)
         v, w = rows[1]
         # With v a similarity about the centre, the origin of places.
@@ -63,24 +61,14 @@ class Hartley:
         return frame(pair, homographies_of_rows(pair, np.stack([first, second]), rows), self.limits)
 
 
-def _perpendicular(L: F64, phi: float, e: F64) -> tuple[float, float]:
-    """phi, and that of the line of the pencil L perpendicular to the line from the epipole to the origin."""
-    if abs(e[2]) < 1e-12 * np.hypot(e[0], e[1]):
-        # The line at infinity itself is of the pencil.
-        line = np.array([0.0, 0.0, 1.0])
-    else:
-        line = np.array([e[0], e[1], -(e[0] ** 2 + e[1] ** 2) / e[2]])
-    p = np.linalg.lstsq(L, line, rcond=None)[0]
-    found = float(np.arctan2(p[1], p[0]))
-    return phi, phi + float(np.mod(found - phi, np.pi))
-
-
-def _skew_rows(pair: EpipolarPair, phi: float, phi_infinite: float) -> F64:
-    """Rows (2, 2, 3) as of :func:`pencil_rows` with a line at infinity that is not phi + pi/2."""
-    rows = pencil_rows(pair, phi)
-    w = np.array([np.cos(phi_infinite), np.sin(phi_infinite)])
-    rows[:, 1] = np.stack([L @ w for L in pair.pencil.lines])
-    return rows
+def _perpendicular(pair: EpipolarPair, phi: float) -> float:
+    """The plane above phi that view 2 sees as the line through the epipole square to that to its centre."""
+    e = pair.pencil.epipole(1)
+    at_infinity = abs(e[2]) < 1e-12 * np.hypot(e[0], e[1])
+    # The centre is the origin of places. Of an epipole at infinity it is the line at infinity itself.
+    line = np.array([0.0, 0.0, 1.0] if at_infinity else [e[0], e[1], -(e[0] ** 2 + e[1] ** 2) / e[2]])
+    p = np.linalg.lstsq(pair.pencil.lines[1], line, rcond=None)[0]
+    return phi + float(np.mod(np.arctan2(p[1], p[0]) - phi, np.pi))
 
 
 @dataclass(frozen=True)
@@ -107,15 +95,21 @@ class LeastDistortion:
 
     Line at infinity, scale along the rows and shear of either side (5 unknowns; least squares from those of
     :class:`LoopZhang`): the variance of the log singular values of both homographies, symmetric in growing
-    and shrinking, and a quarter of the mean squared gradient of the disparities. Between
-    Hartley, who makes the first photograph like the second, and Loop and Zhang, who spare either by itself:
-    ``most_scale`` (log) and ``most_shear`` say by how much a photograph may give up its aspect and its right
-    angles so that both sides become alike.
+    and shrinking, and a quarter of the mean squared gradient of the disparities. Between Hartley, who makes
+    the first photograph like the second, and Loop and Zhang, who spare either by itself: ``most_scale`` (log)
+    and ``most_shear`` say by how much a photograph may give up its aspect and its right angles so that both
+    sides become alike.
     """
 
     limits: FrameLimits = field(default_factory=FrameLimits)
     most_scale: float = 0.05
     most_shear: float = 0.06
+
+    def __post_init__(self) -> None:
+        if not (self.most_scale > 0.0 and self.most_shear > 0.0):
+            raise ValueError(
+                f"most_scale and most_shear must be positive; got {self.most_scale} and {self.most_shear}"
+            )
 
     def rectify(self, pair: EpipolarPair) -> PlanarRectification:
         """The two homographies; ``StageFailure`` where they cannot be."""

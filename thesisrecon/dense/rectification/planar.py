@@ -118,9 +118,13 @@ def _within(xy: F64, size: tuple[int, int]) -> F64:
     return np.where(inside[:, None], xy, np.nan)
 
 
-def pencil_rows(pair: EpipolarPair, phi: float) -> F64:
-    """The other rows (2, 2, 3) of both homographies in places, for the line at infinity phi + pi/2."""
-    v, w = plane_of(np.array([phi, phi + 0.5 * np.pi]))
+def pencil_rows(pair: EpipolarPair, phi: float, *, infinite: float | None = None) -> F64:
+    """The second and third rows (2, 2, 3) of both homographies, in places.
+
+    Row 0 of the frame is the plane ``phi``; the line at infinity is the plane ``infinite``, phi + pi/2 where
+    that is None.
+    """
+    v, w = plane_of(np.array([phi, phi + 0.5 * np.pi if infinite is None else infinite]))
     return np.stack([np.stack([-L @ v, L @ w]) for L in pair.pencil.lines])
 
 
