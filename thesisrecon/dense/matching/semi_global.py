@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.dense.matching.costs import CensusAndColour
-from thesisrecon.dense.matching.finish import Finish
+from thesisrecon.dense.matching.finish import Finish, texture_of
 from thesisrecon.dense.matching.finish.kernels import best_disparities
 from thesisrecon.dense.matching.pair import estimate_noise, prepare_pair
 from thesisrecon.dense.matching.paths import PathPenalties
@@ -50,7 +50,8 @@ class PathSum:
         """See :meth:`CohesiveScanlines.match`."""
         first, last = checked_range(disparity_range)
         sides = prepare_pair(left, right)
-        noise = float(np.hypot(LEAST_NOISE, np.mean([estimate_noise(side) for side in sides])))
+        measured = float(np.mean([estimate_noise(side) for side in sides]))
+        noise = float(np.hypot(LEAST_NOISE, measured))
         height, width = sides[0].valid.shape
         costed = [self.costs.side(side) for side in sides]
         support = self.costs.support_of(sides[0], noise)
@@ -81,7 +82,7 @@ class PathSum:
         run_strips(work, row_strips(height, per_row, 1e6 * self.memory_mb), self.threads)
         left_px, right_px, confidence = found
         left_px[sides[0].valid == 0] = np.nan
-        return self.finish.apply(left_px, right_px, confidence)
+        return self.finish.apply(left_px, right_px, confidence, texture_of(sides[0], measured))
 
     @property
     def _pairs(self) -> int:

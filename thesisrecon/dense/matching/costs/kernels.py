@@ -46,7 +46,8 @@ def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
     top = np.float32(255.0 * LEVELS)
     for y in range(height):
         for x in range(width):
-            valid[y, x], total = 255, 0
+            valid[y, x] = 255
+            total = np.int16(0)
             for k in range(n):
                 level = image[y, x, k] * np.float32(LEVELS)
                 if not np.isfinite(level):
@@ -54,7 +55,7 @@ def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
                     level = np.float32(0.0)
                 whole = np.int16(min(max(level, np.float32(0.0)), top) + np.float32(0.5))
                 channels[k, y, x] = whole
-                total += whole
+                total = np.int16(total + whole)
             grey[y, x] = total
 
 

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.dense.matching.costs.kernels import LEVELS
 from thesisrecon.dense.matching.finish.kernels import (
     check_left_right,
     fill_pinholes,
     remove_peaks,
     smooth_alike,
+    squared_gradient,
 )
+from thesisrecon.dense.matching.pair import Side
 from thesisrecon.types import DisparityMap
 
 F32 = NDArray[np.float32]
@@ -21,6 +24,14 @@ STEP_PX = np.float32(1.0)
 """Neighbours on one surface differ by no more."""
 SPARSE = 3
 """Every third pixel of every third row suffices for a median."""
+AROUND = 4
+"""Pixels to each side that speak for the texture of a pixel: as far as its costs look."""
+DIGITISATION = float(1.0 / np.sqrt(12.0))
+"""Noise of whole grey levels."""
+TEXTURED = np.float32(1.7)
+"""Texture that noise does not make, in units of its own."""
+BLANK = np.float32(0.05)
+"""What is left of the confidence where there is no texture."""
 SURROUNDED = 5
 """Of eight neighbours that must be known for a pinhole to be closed."""
 
@@ -30,7 +41,8 @@ class Finish:
     """What is believed of the best disparities.
 
     ``left_right_px``: the partner's own best disparity may differ by as much. ``smallest_piece``: connected
-    pieces of fewer pixels are peaks and go. ``least_confidence``: less is unknown. ``radius``: every
+    pieces of fewer pixels are peaks and go, as do larger ones all but without texture. ``least_confidence``:
+    less is unknown. ``radius``: every
     disparity becomes the mean of those within so many pixels that differ from it by a pixel at most, which
     takes the noise of the sub-pixel fit from a surface and leaves its edges.
     """
@@ -46,22 +58,34 @@ class Finish:
         if not 0.0 <= self.least_confidence < 1.0:
             raise ValueError(f"least_confidence must be in [0, 1); got {self.least_confidence}")
 
-    def apply(self, left: F32, right: F32, confidence: F32) -> DisparityMap:
+    def apply(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
         """The map of disparities (H, W) of the left pixels, given those of the right ones, NaN = none.
 
-        Takes possession of ``left`` and ``confidence``.
+        ``texture`` (H, W) from :func:`texture_of`: what surfaces without any inherit from their rims is kept,
+        with little confidence. Takes possession of ``left`` and ``confidence``.
         """
         check_left_right(left, right, np.float32(self.left_right_px))
         left[confidence < np.float32(self.least_confidence)] = np.nan
-        remove_peaks(left, STEP_PX, self.smallest_piece)
+        remove_peaks(left, texture > TEXTURED, STEP_PX, self.smallest_piece)
         closed = np.empty_like(left)
         fill_pinholes(left, SURROUNDED, closed)
         # A pinhole was not confirmed by the other side: its neighbours speak for it.
         confidence[np.isnan(left)] *= np.float32(0.5)
         smooth = np.empty_like(left)
         smooth_alike(closed, STEP_PX, self.radius, smooth)
+        excess = np.maximum(texture - np.float32(1.0), np.float32(0.0))
+        confidence *= np.maximum(excess / (excess + np.float32(1.0)), BLANK)
         confidence[np.isnan(smooth)] = 0.0
         return DisparityMap(smooth, confidence, _noise(closed, smooth))
+
+
+def texture_of(side: Side, noise: float) -> F32:
+    """(H, W) squared horizontal gradient about each pixel in units of what noise alone, of a standard
+    deviation of so many grey levels, makes of it: 1 where there is nothing to match."""
+    out = np.empty(side.valid.shape, np.float32)
+    squared_gradient(side.channels, AROUND, out)
+    out /= np.float32(2.0 * LEVELS**2 * np.hypot(noise, DIGITISATION) ** 2)
+    return out
 
 
 def _noise(raw: F32, smooth: F32) -> float:

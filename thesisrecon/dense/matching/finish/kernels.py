@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
+B8 = NDArray[np.bool_]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 
 NONE = np.uint16(65535)
+EVIDENT = 20
+"""At least one pixel in so many of a surface must have texture."""
 
 
 @njit(cache=True, nogil=True)
@@ -113,11 +116,42 @@ def check_left_right(left: F32, right: F32, tolerance: np.float32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def remove_peaks(disparity: F32, step: np.float32, smallest: int) -> None:
-    """NaN to connected pieces of fewer than ``smallest`` pixels; neighbours are connected where their
-    disparities differ by no more than ``step``."""
+def _add_squares(before: I16, after: I16, sign: int, out: I32) -> None:
+    for x in range(len(out)):
+        apart = np.int32(after[x]) - np.int32(before[x])
+        out[x] = np.int32(out[x] + np.int32(sign) * apart * apart)
+
+
+@njit(cache=True, nogil=True)
+def squared_gradient(channels: I16, radius: int, out: F32) -> None:
+    """Mean over channels and a square window of (I(x + 1) - I(x - 1))^2, (H, W); beyond the image there is
+    nothing."""
+    n, height, width = channels.shape
+    columns = np.zeros(width, np.int32)
+    share = np.float32(1.0) / np.float32(n * (2 * radius + 1) ** 2)
+    for y in range(-radius, height):
+        # The window goes down: a row comes, another goes.
+        for row, sign in ((y + radius, 1), (y - radius - 1, -1)):
+            if 0 <= row < height and width > 2:
+                for k in range(n):
+                    line = channels[k, row]
+                    _add_squares(line[: width - 2], line[2:], sign, columns[1 : width - 1])
+        if y < 0:
+            continue
+        total = np.int64(0)
+        for x in range(-radius, width):
+            total += columns[x + radius] if x + radius < width else 0
+            total -= columns[x - radius - 1] if x - radius - 1 >= 0 else 0
+            if x >= 0:
+                out[y, x] = np.float32(total) * share
+
+
+@njit(cache=True, nogil=True)
+def remove_peaks(disparity: F32, evident: B8, step: np.float32, smallest: int) -> None:
+    """NaN to connected pieces of fewer than ``smallest`` pixels, or with fewer ``evident`` ones, in them and
+    around them, than one in twenty; neighbours are connected where their disparities differ by no more than ``step``."""
     height, width = disparity.shape
-    flat = disparity.reshape(height * width)
+    flat, counted = disparity.reshape(height * width), evident.reshape(height * width)
     queue = np.empty(height * width, np.int32)
     open_ = ~np.isnan(flat)
     for seed in range(height * width):
@@ -125,22 +159,25 @@ def remove_peaks(disparity: F32, step: np.float32, smallest: int) -> None:
             continue
         open_[seed] = False
         queue[0] = seed
-        at, n = 0, 1
+        at, n, size = 0, 1, 0
         while at < n:
             place = queue[at]
             at += 1
+            size += counted[place]
             here, column = flat[place], place % width
             for k in range(4):
                 other = place + (1 if k == 0 else -1 if k == 1 else width if k == 2 else -width)
                 if (k == 0 and column == width - 1) or (k == 1 and column == 0):
                     continue
-                if other < 0 or other >= height * width or not open_[other]:
+                if other < 0 or other >= height * width:
                     continue
-                if abs(flat[other] - here) <= step:
+                if not abs(flat[other] - here) <= step:
+                    size += counted[other]
+                elif open_[other]:
                     open_[other] = False
                     queue[n] = other
                     n += 1
-        if n < smallest:
+        if n < smallest or EVIDENT * size < n:
             for k in range(n):
                 flat[queue[k]] = np.nan
 
