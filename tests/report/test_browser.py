@@ -3,53 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import io
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image as PillowImage
 
+from tests.report.opened import Witness
 from tests.report.synthetic import made_up_run
 from thesisrecon.report import write_report
 
 pytestmark = pytest.mark.browser
 
-ARGUMENTS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    # The 3D view needs WebGL; without a graphics card Chromium draws it in software only when told so.
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 EVIL = [
     "<img src=x onerror=alert(1)>.jpg",
     "\"quote'&.png",
     "</script><script>alert(2)</script>.jpg",
     "c.jpg",
 ]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-    if path is None:
-        pytest.skip("no chromium on this machine (Debian: apt-get install chromium)")
-    with playwright.sync_playwright() as running:
-        opened = running.chromium.launch(executable_path=path, args=ARGUMENTS)
-        yield opened
-        opened.close()
 
 
 @pytest.fixture(scope="module")
@@ -60,36 +32,11 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-class Witness:
-    """An opened page with all it complained of and asked for."""
-
-    def __init__(self, browser: Any, path: Path, width: int) -> None:
-        self.errors: list[str] = []
-        self.requests: list[str] = []
-        self.page = browser.new_page(viewport={"width": width, "height": 900})
-        self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("dialog", self._dialog)
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(path.as_uri())
-        self.page.wait_for_selector("#matrix-figure[data-drawn]", timeout=60_000)
-        self.page.wait_for_selector("#scene-figure[data-drawn]", timeout=60_000)
-
-    def _dialog(self, dialog: Any) -> None:
-        self.errors.append(f"dialog {dialog.message}")
-        dialog.dismiss()
-
-    def pixels(self, selector: str) -> np.ndarray:
-        """(H, W, 3) of an element as it is shown."""
-        shot = self.page.locator(selector).screenshot()
-        return np.asarray(PillowImage.open(io.BytesIO(shot)).convert("RGB"))
-
-
 @pytest.fixture(scope="module", params=[1400, 420], ids=["desktop", "narrow"])
 def witness(request: pytest.FixtureRequest, browser: Any, report: Path) -> Iterator[Witness]:
-    opened = Witness(browser, report, request.param)
+    opened = Witness(browser, report, request.param, drawn=("matrix-figure", "scene-figure"))
     yield opened
-    opened.page.close()
+    opened.context.close()
 
 
 def test_nothing_complains_runs_or_reaches_out(witness: Witness) -> None:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from tests.report.synthetic import made_up_run, projective_run
+from thesisrecon.report import HeldOut
+from thesisrecon.types import TexturedMesh
 
 
 def test_the_metric_reconstruction_goes_before_the_projective_one() -> None:
@@ -40,3 +42,19 @@ def test_intrinsics_are_told_in_pixels_of_the_file() -> None:
     assert original["k1"] == working["k1"]
     assert data.original_intrinsics[-1] == {}
     assert dataclasses.replace(data, metric=None, colours=None).original_intrinsics == ({},) * 9
+
+
+def test_a_model_and_its_pictures_must_belong_to_the_run() -> None:
+    data = made_up_run(points=100)
+    mesh = TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))
+    assert dataclasses.replace(data, model=mesh).model is mesh
+    with pytest.raises(ValueError, match="model needs the metric reconstruction"):
+        dataclasses.replace(projective_run(), model=mesh)
+    with pytest.raises(ValueError, match="depth_pictures must name views below 9"):
+        dataclasses.replace(data, depth_pictures={9: np.ones((3, 4), dtype=np.float32)})
+    pixels = np.zeros((4, 6, 3), dtype=np.uint8)
+    compared = np.zeros((4, 6), dtype=bool)
+    compared[:2] = True
+    assert HeldOut("a.jpg", pixels, pixels, compared, 30.0, 0.9).share == 0.5
+    with pytest.raises(ValueError, match="of one size"):
+        HeldOut("a.jpg", pixels, pixels[:3], compared, 30.0, 0.9)

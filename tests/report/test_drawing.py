@@ -9,7 +9,21 @@ import pytest
 from PIL import Image as PillowImage
 
 from tests.report.synthetic import SIZE, made_up_run
-from thesisrecon.report.drawing import HUES, clip_line, draw_pair, spread_matches, thumbnail
+from thesisrecon.report import HeldOut
+from thesisrecon.report.drawing import (
+    DIFFERENCE_LIMIT,
+    HUES,
+    SCALE,
+    UNKNOWN,
+    clip_line,
+    depth_side,
+    draw_depth,
+    draw_held_out,
+    draw_pair,
+    paint_scale,
+    spread_matches,
+    thumbnail,
+)
 
 
 def opened(uri: str) -> PillowImage.Image:
@@ -84,3 +98,68 @@ def test_odd_pictures_have_thumbnails(shape: tuple[int, int, int]) -> None:
         made_up_run(points=50).photographs[0], rgb=np.zeros(shape, dtype=np.uint8)
     )
     assert thumbnail(photograph, 3) is not None
+
+
+def lightness(rgb: np.ndarray) -> np.ndarray:
+    """CIE L* (...) of sRGB (..., 3)."""
+    v = rgb / 255.0
+    linear = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+    return np.asarray(116.0 * np.cbrt(linear @ (0.2126, 0.7152, 0.0722)) - 16.0)
+
+
+def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness() -> None:
+    steps = np.diff(lightness(paint_scale(np.linspace(0, 1, 33)).astype(float)))
+    assert steps.min() > 1.8
+    assert steps.max() < 1.6 * steps.min()
+    ends = paint_scale(np.array([-3.0, 0.0, 1.0, 7.0, np.nan]))
+    assert ["#" + bytes(c).hex() for c in ends[:4]] == [SCALE[0], SCALE[0], SCALE[-1], SCALE[-1]]
+    assert tuple(ends[4]) == UNKNOWN
+
+
+def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown() -> None:
+    depth = np.tile(np.linspace(2.0, 6.0, 300, dtype=np.float32), (200, 1))
+    depth[:, 200:250] = np.nan
+    depth[0, 0] = 1e4  # a stray takes none of the scale
+    drawn = draw_depth(depth)
+    assert (drawn.picture.width, drawn.picture.height) == (300, 200)
+    assert drawn.near == pytest.approx(2.0, abs=0.06)
+    assert drawn.far == pytest.approx(6.0, abs=0.06)
+    assert drawn.share == pytest.approx(250 / 300)
+    pixels = np.asarray(opened(drawn.picture.uri)).astype(float)
+    light = lightness(pixels[100])
+    assert light[2] > 90
+    assert light[190] < 55
+    assert light[290] < 20
+    assert (np.diff(light[5:190:20]) < -2).all()
+    assert np.abs(pixels[100, 210:240] - UNKNOWN).max() < 8
+
+
+@pytest.mark.parametrize("value", [np.nan, 3.0])
+def test_depth_maps_without_depth_or_relief_are_no_error(value: float) -> None:
+    drawn = draw_depth(np.full((30, 40), value, dtype=np.float32))
+    assert drawn.share == float(np.isfinite(value))
+    np.testing.assert_equal((drawn.near, drawn.far), (value, value))
+
+
+def test_depth_pictures_shrink_when_there_are_many() -> None:
+    rng = np.random.default_rng(1)
+    noise = rng.uniform(1, 5, (480, 640)).astype(np.float32)  # the hardest picture for a JPEG
+    assert draw_depth(noise, side=depth_side(10)).picture.width == 360
+    assert 300 * len(draw_depth(noise, side=depth_side(300)).picture.uri) < 4_000_000
+
+
+def test_the_comparison_shows_what_differs() -> None:
+    real = np.full((300, 400, 3), 120, dtype=np.uint8)
+    rendered, compared = real.copy(), np.ones((300, 400), dtype=bool)
+    rendered[:, 200:] += np.uint8(DIFFERENCE_LIMIT)
+    compared[200:] = False
+    pictures = draw_held_out(HeldOut("a.jpg", real, rendered, compared, 20.0, 0.9))
+    photo, model, apart = (np.asarray(opened(p.uri)).astype(float) for p in pictures)
+    assert np.abs(photo - 120).max() < 4
+    assert np.abs(model[:190, 210:] - 184).max() < 4
+    for picture in (model, apart):
+        assert np.abs(picture[210:] - UNKNOWN).max() < 8
+    assert lightness(apart[100, 100]) < 20
+    assert lightness(apart[100, 300]) > 90
+    large = [np.zeros((900, 1200, 3), dtype=np.uint8)] * 2
+    assert draw_held_out(HeldOut("", *large, np.ones((900, 1200), dtype=bool), 0.0, 0.0))[2].width == 640

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import base64
 import dataclasses
+import hashlib
 import html
 import json
 import re
@@ -9,11 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image as PillowImage
 
+from tests.report.sphere_run import NAMES, sphere_run
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.report import Photograph, ReportData, write_report
 from thesisrecon.report.page import render_report
+from thesisrecon.types import TexturedMesh
 
 EVIL = [
     "<img src=x onerror=alert(1)>.jpg",
@@ -205,3 +210,66 @@ def test_the_affine_stratum_is_drawn_where_there_is_one(page: str) -> None:
     fewer = dataclasses.replace(data.affine, X=data.affine.X[:-1])
     with pytest.raises(ValueError, match="affine must have"):
         dataclasses.replace(data, affine=fewer)
+
+
+def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison() -> None:
+    data = sphere_run()
+    page = render_report(data)
+    structure = structure_of(page)
+    assert {"model", "depth", "held-out", "model-data", "model-figure"} <= set(structure.ids)
+    assert len(structure.ids) == len(set(structure.ids))
+    wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
+    assert wanted <= set(structure.ids)
+    assert all(address.startswith(("data:", "#")) for address in structure.addresses)
+    assert structure.handlers == []
+    assert structure.tags.count("img") == 8 + 7 + 3
+    assert structure.tags.count("option") == 8 + 1
+    assert data.model is not None
+    assert data.model.texture is not None
+    texels = f"{data.model.texture.shape[1]} × {data.model.texture.shape[0]} texels"
+    for text in (texels, "27.3 dB", "0.912", html.escape(NAMES[2])):
+        assert text in page
+    assert "<b>.jpg" not in page
+    assert render_report(sphere_run()) == page
+
+
+def test_only_the_scripts_of_the_page_may_run() -> None:
+    for data, scripts in ((sphere_run(), 3), (made_up_run(points=50), 2)):
+        page = render_report(data)
+        policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
+        assert policy is not None
+        allowed = re.findall(r"'(sha256-[^']+)'", html.unescape(policy.group(1)))
+        bodies = re.findall(r"<script>(.*?)</script>", page, re.S)
+        digests = [hashlib.sha256(body.encode()).digest() for body in bodies]
+        assert len(allowed) == len(bodies) == scripts
+        assert sorted(allowed) == sorted("sha256-" + base64.b64encode(d).decode() for d in digests)
+    nothing = render_report(dataclasses.replace(projective_run(), reconstruction=None, pairs=()))
+    assert "script-src 'none'" in html.unescape(nothing)
+    assert "<script" not in nothing
+
+
+def test_without_a_model_nothing_of_it_is_on_the_page(page: str) -> None:
+    for trace in ('id="model', 'id="depth"', 'id="held-out"', "model.glb", "WebGL 2"):
+        assert trace not in page
+    empty = dataclasses.replace(sphere_run().model, faces=np.zeros((0, 3), dtype=np.int64))
+    bare = render_report(dataclasses.replace(sphere_run(), model=empty, held_out=None, depth_pictures={}))
+    for trace in ("model-data", 'id="model"', 'id="depth"', 'id="held-out"'):
+        assert trace not in bare
+
+
+def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page() -> None:
+    rng = np.random.default_rng(3)
+    steps = 274
+    n = (np.arange(steps)[:, None] * (steps + 1) + np.arange(steps)).ravel()
+    faces = np.concatenate(
+        [np.stack([n, n + 1, n + steps + 2], 1), np.stack([n, n + steps + 2, n + steps + 1], 1)]
+    )
+    vertices = rng.normal(size=((steps + 1) ** 2, 3))
+    coarse = rng.integers(0, 255, (512, 512, 3), dtype=np.uint8)  # as busy as a photograph at its finest
+    texture = np.asarray(PillowImage.fromarray(coarse).resize((2048, 2048), PillowImage.Resampling.BICUBIC))
+    uv = rng.uniform(0, 2047, (len(vertices), 2))[faces]
+    data = sphere_run()
+    large = TexturedMesh(vertices, faces, uv=uv, texture=texture)
+    assert 149_000 < len(faces) <= 151_000
+    grown = len(render_report(dataclasses.replace(data, model=large)))
+    assert grown - len(render_report(dataclasses.replace(data, model=None))) < 8_000_000

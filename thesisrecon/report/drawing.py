@@ -30,10 +30,11 @@ HELD_OUT_SIDE = 640
 DIFFERENCE_LIMIT = 64.0
 """Grey levels; larger differences look alike."""
 
-# Lightness rises by about 10 of 100 from colour to colour (CIELAB), so that equal steps look equal and their
-# order survives grey printing and colour blindness: hue runs from violet to yellow in Oklch (Ottosson 2020).
+# Lightness rises by 5 of 100 from colour to colour (CIELAB), so that equal steps look equal and their order
+# survives grey printing and colour blindness; hue runs from violet to yellow in Oklch (Ottosson 2020).
 SCALE = (
-    "#290372", "#073390", "#055a85", "#02788f", "#019696", "#0cb693", "#5ed27d", "#b3e369", "#fbf163",
+    "#290272", "#201c81", "#05308d", "#02457e", "#04557e", "#006483", "#057287", "#00818d", "#058f90",
+    "#019f91", "#00b08e", "#04c082", "#58cc78", "#87d86f", "#b1e167", "#d7e962", "#fcf265",
 )  # fmt: skip
 UNKNOWN = (201, 208, 214)
 
