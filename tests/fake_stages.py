@@ -164,10 +164,12 @@ class FakeProjective:
 @dataclass(frozen=True)
 class FakeCalibrator:
     identifiable: bool = True
+    skew_px: float = 0.0
 
     def calibrate(self, reconstruction: Reconstruction, *, assumed: Any, rng: Any) -> SelfCalibration:
         CALLS.append(f"calibrate prior={assumed.focal_known.any()}")
         Ks = np.broadcast_to(K, (len(assumed.mean), 3, 3)).copy()
+        Ks[:, 0, 1] = self.skew_px
         upgrade = Upgrade(np.eye(4), Ks, 0.0, "fake")
         why = () if self.identifiable else ("the camera only rotates",)
         return SelfCalibration(np.eye(4), Ks, np.zeros_like(Ks), self.identifiable, why, (upgrade,))

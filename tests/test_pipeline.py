@@ -102,6 +102,20 @@ def test_summary_and_cameras_are_in_original_pixels(tmp_path: Path) -> None:
     np.testing.assert_allclose(table["centre"], [0.5, 0.02, 0.0], atol=1e-12)
 
 
+def test_cameras_with_skew_are_written_where_they_can_be(tmp_path: Path) -> None:
+    """COLMAP has no camera with skew; everything else is there, and nothing of an older model stays."""
+    assert (run(tmp_path).out / "sparse" / "0" / "cameras.bin").is_file()
+    wish = IntrinsicsAssumption(skew="constant", skew_std_px=5.0)
+    config = fake_config(intrinsics=wish, selfcalibration=fakes.FakeCalibrator(skew_px=2.0))
+    result = run(tmp_path, config=config, overwrite=True)
+    (sentence,) = (w for w in result.summary["warnings"] if "sparse/0" in w)
+    assert "COLMAP has no camera with skew" in sentence
+    assert sentence in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert not (tmp_path / "sparse").exists()
+    assert (tmp_path / "points.ply").is_file()
+    assert [view["K"][0][1] for view in read(tmp_path / "cameras.json")["cameras"]] == [2.0] * 4
+
+
 def test_a_second_run_computes_nothing(tmp_path: Path) -> None:
     first = run(tmp_path)
     before = kept_bytes(tmp_path)

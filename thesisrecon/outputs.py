@@ -15,9 +15,9 @@ from thesisrecon import __version__
 from thesisrecon.affine import affine_of, write_affine
 from thesisrecon.config import toml_from_config
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.colmap import colmap_from_reconstruction, write_colmap_model
+from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views, write_colmap_model
 from thesisrecon.io.pointcloud import write_point_cloud
-from thesisrecon.io.run_directory import read_json, write_atomically, write_json
+from thesisrecon.io.run_directory import RunDirectory, read_json, write_atomically, write_json
 from thesisrecon.report import Photograph, ReportData, write_report
 from thesisrecon.report.summary import cameras_table, point_colours, summarize
 from thesisrecon.run import Run, Until
@@ -25,8 +25,9 @@ from thesisrecon.types import Image, Reconstruction, RunResult
 
 THUMBNAIL_PX = 800
 SUMMARY, PAGE = "summary.json", "report.html"
+COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
 MODEL_FILES = (
-    *(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D")),
+    *COLMAP_FILES,
     *("points.ply", "affine.ply", "cameras.json"),
 )
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
@@ -79,7 +80,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
     with run.clock("outputs"):
         if result.metric is not None:
             colours = point_colours(result.metric.reconstruction, result.images)
-            write_model(out, result, result.metric.reconstruction, colours)
+            run.warnings.extend(write_model(run.directory, result, result.metric.reconstruction, colours))
             write_affine(out / "affine.ply", affine_of(result), colours)
         else:
             run.directory.remove(MODEL_FILES)
@@ -110,20 +111,35 @@ def _doubts(result: RunResult) -> list[str]:
     return doubts
 
 
-def write_model(out: Path, result: RunResult, reconstruction: Reconstruction, colours: U8) -> None:
-    """``sparse/0``, ``points.ply`` and ``cameras.json`` of a metric reconstruction, in original pixels."""
-    model = colmap_from_reconstruction(
-        reconstruction,
-        [image.name for image in result.images],
-        colors=colours,
-        groups=result.groups,
-        scales=np.array([1 / image.scale for image in result.images]),
-        original_sizes=np.array([image.original_size for image in result.images]),
-    )
-    write_colmap_model(out / "sparse" / "0", model)
+def write_model(
+    directory: RunDirectory, result: RunResult, reconstruction: Reconstruction, colours: U8
+) -> list[str]:
+    """``sparse/0``, ``points.ply`` and ``cameras.json`` of a metric reconstruction, in original pixels.
+
+    Returns what is to be said of a file that could not be written: COLMAP has no camera with skew.
+    """
+    said: list[str] = []
+    skewed = skewed_views(reconstruction)
+    if len(skewed):
+        directory.remove(COLMAP_FILES)
+        said.append(
+            f"sparse/0 is not written: COLMAP has no camera with skew, and {len(skewed)} of the "
+            f"{int(reconstruction.registered.sum())} cameras have it; cameras.json holds them"
+        )
+    else:
+        model = colmap_from_reconstruction(
+            reconstruction,
+            [image.name for image in result.images],
+            colors=colours,
+            groups=result.groups,
+            scales=np.array([1 / image.scale for image in result.images]),
+            original_sizes=np.array([image.original_size for image in result.images]),
+        )
+        write_colmap_model(directory.path / "sparse" / "0", model)
     X = reconstruction.X[reconstruction.valid]
-    write_point_cloud(out / "points.ply", X[:, :3] / X[:, 3:], colours[reconstruction.valid])
-    write_json(out / "cameras.json", cameras_table(reconstruction, result.images))
+    write_point_cloud(directory.path / "points.ply", X[:, :3] / X[:, 3:], colours[reconstruction.valid])
+    write_json(directory.path / "cameras.json", cameras_table(reconstruction, result.images))
+    return said
 
 
 def _run_facts(run: Run, until: str) -> dict[str, Any]:

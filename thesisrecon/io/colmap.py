@@ -28,10 +28,13 @@ __all__ = [
     "colmap_from_reconstruction",
     "read_colmap_model",
     "reconstruction_from_colmap",
+    "skewed_views",
     "write_colmap_model",
 ]
 
 _PIXEL_CENTRE = 0.5
+SKEW_REL = 1e-9
+"""Skew below this share of the focal length is rounding."""
 
 
 def colmap_from_reconstruction(
@@ -75,6 +78,14 @@ def colmap_from_reconstruction(
     distance = np.linalg.norm((seen - xy) * scales[view], axis=1)
     images, row = _images(names, poses, camera_ids, (view, point, (xy + _PIXEL_CENTRE) * scales[view]))
     return ColmapModel(cameras, images, _points(reconstruction.X, colors, (view, point, row), distance))
+
+
+def skewed_views(reconstruction: Reconstruction) -> I64:
+    """Numbers of the registered views whose K has skew, for which COLMAP has no camera."""
+    if reconstruction.K is None:
+        raise ValueError(f"skew is in K, and this {reconstruction.stratum} reconstruction has none")
+    K = reconstruction.K
+    return np.flatnonzero(reconstruction.registered & (np.abs(K[:, 0, 1]) > SKEW_REL * K[:, 0, 0]))
 
 
 def _check_export(
@@ -151,7 +162,7 @@ def _cameras(
 
 def _camera_params(K: F64, radial: F64, scale: F64) -> tuple[str, tuple[float, ...]]:
     """The smallest COLMAP model that holds K and (k1, k2, k3), and its parameters in original pixels."""
-    if abs(K[0, 1]) > 1e-9 * K[0, 0]:
+    if abs(K[0, 1]) > SKEW_REL * K[0, 0]:
         raise ValueError(
             f"COLMAP has no camera with skew; K has {K[0, 1]:.3g} px, set it to 0 before the export"
         )
