@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,8 +44,56 @@ def test_depth_is_that_of_the_scene_and_its_deviation_tells_the_error(walled, li
 def test_the_same_bytes_whatever_the_number_of_threads_and_one_by_one(walled):
     together = STEREO.map_all(walled.images, walled.reconstruction, threads=2)
     scene = STEREO.prepare(walled.images, walled.reconstruction)
-    raw = {i: STEREO.depth_map(scene, i) for i in reversed(sorted(scene.views))}
+    raw = {i: STEREO.depth_map(scene, i) for i in sorted(scene.views, reverse=True)}
     for i in scene.views:
         one = STEREO.confirm(scene, raw, i)
         for field in ("depth", "std", "views", "P"):
             assert getattr(one, field).tobytes() == getattr(together[i], field).tobytes()
+
+
+def known_share(maps):
+    return float(np.mean([np.isfinite(found.depth).mean() for found in maps.values()]))
+
+
+def test_one_baseline_gives_depth_though_nothing_is_seen_by_a_third_view():
+    walled = make_walled(on_arc((-5.0, 5.0)))
+    error, known = errors(walled, STEREO.map_all(walled.images, walled.reconstruction))
+    assert known > 0.5
+    assert np.median(error) < 0.003
+
+
+def test_no_baseline_gives_no_depth():
+    walled = make_walled(on_arc((0.0, 0.0)))
+    still = replace(walled.reconstruction, P=np.stack([walled.reconstruction.P[0]] * 2))
+    maps = STEREO.map_all(walled.images, still)
+    assert known_share(maps) == 0.0
+    assert all((found.views == 0).all() for found in maps.values())
+
+
+def test_a_wall_without_texture_is_unknown():
+    plain = make_walled(on_arc((-9.0, 0.0, 9.0)), plain=True)
+    maps = STEREO.map_all(plain.images, plain.reconstruction)
+    assert known_share(maps) < 0.3
+    textured = make_walled(on_arc((-9.0, 0.0, 9.0)))
+    assert known_share(STEREO.map_all(textured.images, textured.reconstruction)) > 0.7
+
+
+def test_forward_motion_is_right_where_it_is_known():
+    P = np.concatenate([on_arc((0.0,), distance=d) for d in (6.0, 5.3, 4.6)])
+    walled = make_walled(P)
+    error, known = errors(walled, STEREO.map_all(walled.images, walled.reconstruction))
+    assert known > 0.1
+    assert np.median(error) < 0.01
+
+
+def test_views_without_a_camera_are_left_out_and_asking_for_them_is_wrong(walled):
+    reconstruction = replace(walled.reconstruction, registered=np.array([True, True, False, False]))
+    scene = STEREO.prepare(walled.images, reconstruction)
+    assert sorted(scene.views) == [0, 1]
+    assert scene.neighbours == {0: (1,), 1: (0,)}
+    with pytest.raises(ValueError, match="no camera"):
+        STEREO.depth_map(scene, 2)
+    with pytest.raises(ValueError, match="as many photographs"):
+        STEREO.prepare(walled.images[:2], reconstruction)
+    with pytest.raises(ValueError, match="metric"):
+        STEREO.prepare(walled.images, replace(reconstruction, stratum="projective"))

@@ -8,6 +8,7 @@ from thesisrecon.dense.multiview.consistency import Consistency
 from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching
 from thesisrecon.dense.multiview.linking import InverseDepth, Linker, RobustFusion, SequenceLinking
 from thesisrecon.dense.multiview.neighbours import NeighbourChoice, SparsePoints, sparse_points
+from thesisrecon.dense.multiview.refinement import PlaneRefinement
 from thesisrecon.dense.multiview.stage import MultiViewScene, MultiViewStereo
 from thesisrecon.dense.multiview.undistort import pinhole_view
 
@@ -20,6 +21,7 @@ __all__ = [
     "MultiViewStereo",
     "NeighbourChoice",
     "PairMatching",
+    "PlaneRefinement",
     "RobustFusion",
     "SequenceLinking",
     "SparsePoints",

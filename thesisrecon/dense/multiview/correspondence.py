@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thesisrecon.dense.matching import CohesiveScanlines, PairMatcher
+from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, SemiGlobal
 from thesisrecon.dense.rectification import AnyRectification, disparity_range, rectify_cameras
 from thesisrecon.types import B8, F32, F64, DisparityMap, PinholeView
 
@@ -45,7 +45,9 @@ class PairMatching:
     rectified frame, and larger where its confidence is low.
     """
 
-    matcher: PairMatcher = field(default_factory=CohesiveScanlines)
+    matcher: CohesiveScanlines | SemiGlobal | MaximumLikelihoodScanline = field(
+        default_factory=CohesiveScanlines
+    )
     range_margin: float = 0.25
     least_sigma_px: float = 0.2
 

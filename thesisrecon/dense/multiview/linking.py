@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from thesisrecon.dense.multiview.correspondence import Correspondence
 from thesisrecon.dense.multiview.kernels import fuse_inverse_depths, inverse_depths, update_kalman
 from thesisrecon.geometry.camera import camera_centre
-from thesisrecon.types import F32, F64, PinholeView
+from thesisrecon.types import B8, F32, F64, PinholeView
 
 U8 = NDArray[np.uint8]
 Correspond = Callable[[int, int], Correspondence | None]
@@ -29,6 +29,17 @@ class InverseDepth:
     std: F32
     views: U8
     rivals: U8
+
+    @property
+    def divided(self) -> B8:
+        """(H, W) where no two agree although two or more speak."""
+        return np.asarray((self.views < 2) & (self.rivals > 0))
+
+    def where(self, keep: B8) -> InverseDepth:
+        """What is kept, unknown elsewhere."""
+        value, std = (np.where(keep, part, np.float32(np.nan)) for part in (self.value, self.std))
+        views, rivals = (np.where(keep, part, np.uint8(0)) for part in (self.views, self.rivals))
+        return InverseDepth(value, std, views, rivals)
 
 
 class Linker(Protocol):
@@ -48,9 +59,9 @@ class Linker(Protocol):
 class RobustFusion:
     """Every neighbour gives an inverse depth with a deviation; those that agree are averaged.
 
-    Estimates within ``gate`` deviations of each other agree, and the largest party wins. A pixel about which
-    no two agree although two or more speak is unknown; one about which a single neighbour speaks is kept, for
-    another view's depth map to confirm.
+    Estimates within ``gate`` deviations of each other agree, and the largest party wins, the
+    more certain one among equals. A pixel about which a single neighbour speaks is kept, for another view's
+    depth map to confirm.
     """
 
     gate: float = 3.0
@@ -73,10 +84,6 @@ class RobustFusion:
         if found:
             rho, std = (np.stack([one[k] for one in found]) for k in (0, 1))
             fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.rivals)
-        divided = (result.views < 2) & (result.rivals > 0)
-        result.value[divided] = np.nan
-        result.std[divided] = np.nan
-        result.views[divided] = 0
         return result
 
 

@@ -11,13 +11,14 @@ import numpy as np
 
 from thesisrecon.dense.multiview.consistency import Consistency
 from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching
-from thesisrecon.dense.multiview.linking import InverseDepth, Linker, RobustFusion
+from thesisrecon.dense.multiview.linking import InverseDepth, RobustFusion, SequenceLinking
 from thesisrecon.dense.multiview.neighbours import (
     NeighbourChoice,
     SparsePoints,
     shared_projections,
     sparse_points,
 )
+from thesisrecon.dense.multiview.refinement import PlaneRefinement
 from thesisrecon.dense.multiview.undistort import pinhole_view
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import DepthMap, Image, PinholeView, Reconstruction
@@ -40,15 +41,16 @@ class MultiViewStereo:
     """Depth maps from undistorted views (thesis, section 2.6: dense depth from all photographs).
 
     ``pairs`` finds correspondences, ``choice`` the neighbours, ``linker`` makes one inverse depth of what
-    they say, ``consistency`` holds the maps against each other. ``max_side`` px bounds the working size. One
-    view's map depends on nothing but the photographs and cameras, so views can be done in any order, by any
-    number of threads and in several runs: :meth:`prepare`, :meth:`depth_map` of each, :meth:`confirm` of
-    each.
+    they say, ``refinement`` (None: none) makes it agree with the photographs, ``consistency`` holds the maps
+    against each other. ``max_side`` px bounds the working size. One view's map depends on nothing but the
+    photographs and cameras, so views can be done in any order, by any number of threads and in several runs:
+    :meth:`prepare`, :meth:`depth_map` of each, :meth:`confirm` of each.
     """
 
     pairs: PairMatching = field(default_factory=PairMatching)
     choice: NeighbourChoice = field(default_factory=NeighbourChoice)
-    linker: Linker = field(default_factory=RobustFusion)
+    linker: RobustFusion | SequenceLinking = field(default_factory=RobustFusion)
+    refinement: PlaneRefinement | None = field(default_factory=PlaneRefinement)
     consistency: Consistency = field(default_factory=Consistency)
     max_side: int = 1024
 
@@ -85,6 +87,11 @@ class MultiViewStereo:
                 return None
 
         found = self.linker.link(view, scene.views, scene.neighbours[view], correspond)
+        if self.refinement is None:
+            found = found.where(~found.divided)
+        else:
+            others = [scene.views[j] for j in scene.neighbours[view]]
+            found = self.refinement.refine(scene.views[view], others, found)
         return self.consistency.clean(_depth_map(scene.views[view], found))
 
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:

@@ -1,0 +1,137 @@
+"""Slanted windows: every pixel's inverse depth and its gradient made to agree with the neighbours' pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.dense.multiview.linking import InverseDepth
+from thesisrecon.dense.multiview.refinement.kernels import (
+    UNKNOWN,
+    begin_planes,
+    fit_planes,
+    rate_planes,
+    sweep_planes,
+)
+from thesisrecon.geometry.camera import camera_centre
+from thesisrecon.types import F32, F64, I64, PinholeView
+
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class PlaneRefinement:
+    """Planes are handed from pixel to pixel where they explain the photographs better, and tuned.
+
+    Rectified matching compares upright windows and takes steps between neighbouring disparities for unlikely:
+    ground that is seen at a slant is lost to it. A plane of space is linear in the inverse depth of a view,
+    so a pixel keeps that and its gradient; its window is carried to the neighbours by the homography of the
+    plane and compared by normalised correlation, samples unlike the centre counting less (Bleyer, Rhemann
+    and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al., ECCV 2016). Nothing is drawn at random:
+    what the matching found is the beginning, and ``sweeps`` passes, there and back, spread and tune it with
+    steps that halve from ``first_step_px``; planes of cost (1 - correlation) up to ``settled`` are left.
+
+    A pixel is kept with two neighbours of cost up to ``accepted``, with one of up to half of it, or if two of
+    the matches that it began with agree. The window is ``radius`` px wide to either side, sampled every
+    ``spacing``; a grey difference of ``likeness`` levels weighs 1/e. ``sigma_px`` is the deviation of a place
+    in the neighbours; the plane counts for what the matching found too within ``gate`` deviations.
+    """
+
+    sweeps: int = 4
+    first_step_px: float = 0.5
+    radius: int = 4
+    spacing: int = 2
+    likeness: float = 15.0
+    accepted: float = 0.4
+    settled: float = 0.1
+    gate: float = 3.0
+    sigma_px: float = 0.3
+
+    def refine(
+        self, reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth
+    ) -> InverseDepth:
+        """The inverse depths of ``reference`` with those of more pixels, from its neighbours ``others``."""
+        if not others or not np.isfinite(found.value).any():
+            return found
+        setting = _Setting.of(reference, others, self._offsets(), self.likeness)
+        planes = np.empty((*found.value.shape, 3), dtype=np.float32)
+        gradients = np.empty((2, *found.value.shape), dtype=np.float32)
+        fit_planes(found.value, self.radius, 0.03, gradients[0], gradients[1])
+        planes[..., 0], planes[..., 1], planes[..., 2] = found.value, gradients[0], gradients[1]
+        cost = np.empty(found.value.shape, dtype=np.float32)
+        begin_planes(*setting.views, setting.offsets, setting.likeness, planes, cost)
+        for k in range(self.sweeps):
+            step = self.first_step_px * 0.5**k
+            sweep_planes(
+                *setting.views,
+                setting.offsets,
+                setting.likeness,
+                step,
+                self.settled,
+                k % 2 == 1,
+                planes,
+                cost,
+            )
+        return self._kept(found, planes[..., 0], setting.rate(planes, self.accepted))
+
+    def _kept(self, found: InverseDepth, rho: F32, rating: tuple[F32, U8, F32]) -> InverseDepth:
+        least, support, slope = rating
+        with np.errstate(divide="ignore", invalid="ignore"):
+            std = (self.sigma_px / slope).astype(np.float32)
+            near = np.abs(rho - found.value) <= self.gate * np.hypot(found.std, std)
+        seen = (support >= 2) | ((support == 1) & (least <= 0.5 * self.accepted))
+        matched = ~seen & (found.views >= 2)
+        # Where windows say nothing (no texture) the matching has the word.
+        with np.errstate(invalid="ignore"):
+            both = seen & near & (found.views >= 2)
+        value = np.where(seen, rho, np.where(matched, found.value, np.nan)).astype(np.float32)
+        std = np.where(seen, std, np.where(matched, found.std, np.nan)).astype(np.float32)
+        views = np.where(both, np.maximum(support, found.views), np.where(seen, support, found.views))
+        return InverseDepth(value, std, np.where(np.isfinite(value), views, 0).astype(np.uint8), found.rivals)
+
+    def _offsets(self) -> I64:
+        """(S, 2) samples of the window."""
+        one = np.arange(-self.radius, self.radius + 1, self.spacing)
+        return np.stack(np.meshgrid(one, one), axis=-1).reshape(-1, 2).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """The grey levels of a view and its neighbours, and how pixels go from one to the others."""
+
+    views: tuple[F32, F32, I64, F64, F64]
+    offsets: I64
+    likeness: F32
+
+    @classmethod
+    def of(
+        cls, reference: PinholeView, others: Sequence[PinholeView], offsets: I64, likeness: float
+    ) -> _Setting:
+        gray = [_gray(view) for view in (reference, *others)]
+        sizes = np.array([one.shape[::-1] for one in gray[1:]], dtype=np.int64)
+        stack = np.full((len(others), *sizes.max(axis=0)[::-1]), np.nan, dtype=np.float32)
+        for k, one in enumerate(gray[1:]):
+            stack[k, : one.shape[0], : one.shape[1]] = one
+        M = np.linalg.inv(reference.P[:, :3])
+        centre = camera_centre(reference.P)
+        H = np.stack([other.P[:, :3] @ M for other in others])
+        e = np.stack([other.P @ (centre / centre[3]) for other in others])
+        table = np.exp(-np.arange(256.0) / likeness).astype(np.float32)
+        return cls((gray[0], stack, sizes, H, e), offsets, table)
+
+    def rate(self, planes: F32, accepted: float) -> tuple[F32, U8, F32]:
+        """Least cost, support and slope (H, W) of planes (H, W, 3)."""
+        shape = planes.shape[:2]
+        least, slope = np.full(shape, UNKNOWN, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+        support = np.zeros(shape, dtype=np.uint8)
+        rate_planes(*self.views, self.offsets, self.likeness, planes, accepted, least, support, slope)
+        return least, support, slope
+
+
+def _gray(view: PinholeView) -> F32:
+    """(H, W) grey levels, NaN where the photograph has no pixel."""
+    gray = view.rgb.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    return np.where(view.seen, gray, np.float32(np.nan)).astype(np.float32)
