@@ -15,15 +15,18 @@ import numpy as np
 import PIL.Image
 
 from thesisrecon.config import PipelineConfig
+from thesisrecon.dense import MultiViewScene
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import compose_camera, project
 from thesisrecon.types import (
+    DepthMap,
     Features,
     FundamentalFit,
     Image,
     IntrinsicInterval,
     Matches,
     MetricResult,
+    PinholeView,
     Reconstruction,
     SelfCalibration,
     Tracks,
@@ -197,6 +200,35 @@ class FakeMetric:
         return MetricResult(metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else self.doubts)
 
 
+@dataclass(frozen=True)
+class FakeDense:
+    """A wall across the scene, 8 from the first camera."""
+
+    confirmed: bool = True
+
+    def prepare(self, images: Any, reconstruction: Reconstruction) -> MultiViewScene:
+        CALLS.append("prepare dense")
+        P = reconstruction.P
+        views = {
+            i: PinholeView(i, P[i], image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
+            for i, image in enumerate(images)
+            if reconstruction.registered[i]
+        }
+        return MultiViewScene(views, None, dict.fromkeys(views, ()))  # type: ignore[arg-type]
+
+    def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
+        CALLS.append(f"depth {view}")
+        shape, P = scene.views[view].rgb.shape[:2], scene.views[view].P
+        y, x = np.indices(shape)
+        rays = np.stack([x, y, np.ones(shape)], axis=-1) @ np.linalg.inv(P[:, :3]).T
+        depth = ((8.0 + np.linalg.solve(P[:, :3], P[:, 3])[2]) / rays[..., 2]).astype(np.float32)
+        return DepthMap(view, P, depth, np.full_like(depth, 0.01), np.ones(shape, dtype=np.uint8))
+
+    def confirm(self, scene: Any, depth_maps: Any, view: int) -> DepthMap:
+        depth = depth_maps[view].depth
+        return replace(depth_maps[view], depth=depth if self.confirmed else np.full_like(depth, np.nan))
+
+
 def fake_config(**changes: Any) -> PipelineConfig:
     """A pipeline of fakes."""
     config = PipelineConfig(
@@ -208,6 +240,7 @@ def fake_config(**changes: Any) -> PipelineConfig:
         projective=FakeProjective(),
         selfcalibration=FakeCalibrator(),
         metric=FakeMetric(),
+        dense=FakeDense(),
     )
     return replace(config, **changes)
 

@@ -14,16 +14,19 @@ from typing import Any
 import numpy as np
 import PIL.Image
 import pytest
+import trimesh
 
 from tests import fake_stages as fakes
 from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
 from thesisrecon.assumptions import IntrinsicsAssumption, camera_groups, prior_warnings
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline import reconstruct
 from thesisrecon.run import stream
 from thesisrecon.types import Image, RunResult
+from thesisrecon.views import render
 from thesisrecon.workers import Workers
 
 
@@ -142,6 +145,44 @@ def test_a_run_stopped_anywhere_goes_on_and_ends_the_same(tmp_path: Path, stage:
     assert kept_bytes(tmp_path / "cut") == kept_bytes(tmp_path / "whole")
     computed = [call for call in CALLS if not call.startswith(("prepare", "metric"))]
     assert sorted(computed) == sorted(call for call in whole if not call.startswith(("prepare", "metric")))
+
+
+def test_a_run_to_its_end_leaves_a_textured_model(tmp_path: Path) -> None:
+    result = run(tmp_path / "a", until="model", threads=1)
+    assert result.mesh is not None
+    np.testing.assert_allclose(result.mesh.vertices[:, 2], 8.0, atol=0.02)
+    assert [m.view for m in result.depth_maps] == [0, 1, 2, 3]
+    model = trimesh.load(tmp_path / "a" / "model.glb", force="mesh", process=False)
+    assert len(model.faces) == len(result.mesh.faces)
+    assert model.visual.kind == "texture"
+    seen = render(result.mesh, PinholeCamera.from_matrix(result.views[1].P, (fakes.WIDTH, fakes.HEIGHT)))
+    assert seen.valid[8:-8, 8:-8].mean() > 0.9
+    assert {"dense", "model"} <= set(result.summary["seconds"])
+    for options in ({"threads": 3}, {"threads": 2, "executor": "processes"}):
+        other = tmp_path / f"{options}"
+        run(other, until="model", **options)
+        assert (other / "model.glb").read_bytes() == (tmp_path / "a" / "model.glb").read_bytes()
+
+
+def test_a_run_stopped_between_depth_maps_goes_on(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, until="model", threads=1, progress=interrupt_at("dense", 2))
+    CALLS.clear()
+    run(tmp_path, until="model", threads=1)
+    assert [call for call in CALLS if call.startswith("depth")] == ["depth 2", "depth 3"]
+    CALLS.clear()
+    assert run(tmp_path).mesh is None
+    assert (tmp_path / "model.glb").exists()
+    assert run(tmp_path, until="model").mesh is not None
+    assert not [call for call in CALLS if call.startswith("depth")]
+
+
+def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path: Path) -> None:
+    config = fake_config(dense=fakes.FakeDense(confirmed=False))
+    with pytest.raises(StageFailure, match="no depths were found"):
+        run(tmp_path, until="model", config=config)
+    assert (tmp_path / "cameras.json").exists()
+    assert "no depths" in read(tmp_path / "summary.json")["failure"]
 
 
 def test_a_damaged_result_is_computed_again(tmp_path: Path) -> None:
@@ -381,7 +422,7 @@ class NamelessDetector(fakes.FakeDetector):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"until": "dense"}, "does not exist yet"),
+        ({"until": "surface"}, "unknown stage"),
         ({"until": "metrik"}, "did you mean metric"),
         ({"threads": -1}, "at least 1"),
         ({"executor": "dask://there"}, "does not exist yet"),

@@ -16,6 +16,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from thesisrecon.assumptions import IntrinsicsAssumption
+from thesisrecon.dense import MultiViewScene, MultiViewStereo
 from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification, ThesisRansac
 from thesisrecon.errors import UsageError
 from thesisrecon.features import HarrisCorners, MultiScaleCorners
@@ -28,6 +29,7 @@ from thesisrecon.matching.pair_selection import (
     SequenceWindow,
 )
 from thesisrecon.metric import UpgradeAndBundle
+from thesisrecon.model import SurfaceModel
 from thesisrecon.projective import Factorization, GatedIncremental, SequentialProjective
 from thesisrecon.selfcalibration import (
     FocalScan,
@@ -52,14 +54,17 @@ from thesisrecon.types import (
     F64,
     I64,
     Assumptions,
+    DepthMap,
     Features,
     FundamentalFit,
     Image,
     Matches,
     MetricResult,
     PairChoice,
+    PinholeView,
     Reconstruction,
     SelfCalibration,
+    TexturedMesh,
     Tracks,
     TwoView,
 )
@@ -172,6 +177,24 @@ class MetricRefiner(Protocol):
     ) -> MetricResult: ...
 
 
+class DepthEstimator(Protocol):
+    """Section 2.5: depth of every pixel of every view; one view at a time, so that a run can go on."""
+
+    def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene: ...
+
+    def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap: ...
+
+    def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap: ...
+
+
+class ModelBuilder(Protocol):
+    """Section 2.6: a surface with the graphics of the photographs."""
+
+    def build(
+        self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
+    ) -> TexturedMesh: ...
+
+
 @dataclass(frozen=True)
 class ImageOptions:
     """How photographs are read: a long side above ``max_size_px`` is reduced to it."""
@@ -202,6 +225,8 @@ class PipelineConfig:
     projective: ProjectiveReconstructor = field(default_factory=GatedIncremental)
     selfcalibration: SelfCalibrator = field(default_factory=HypothesesAndRefinement)
     metric: MetricRefiner = field(default_factory=UpgradeAndBundle)
+    dense: DepthEstimator = field(default_factory=MultiViewStereo)
+    model: ModelBuilder = field(default_factory=SurfaceModel)
 
 
 # One table per stage: the word of the text and the class it means. A new variant is one line here.
@@ -233,6 +258,8 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
         "focal-scan": FocalScan,
     },
     "metric": {"upgrade-and-bundle": UpgradeAndBundle},
+    "dense": {"multi-view-stereo": MultiViewStereo},
+    "model": {"surface-model": SurfaceModel},
 }
 
 PRESETS: Mapping[str, PipelineConfig] = {

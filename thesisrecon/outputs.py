@@ -16,6 +16,7 @@ from thesisrecon.affine import affine_of, write_affine
 from thesisrecon.config import toml_from_config
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views, write_colmap_model
+from thesisrecon.io.meshes import write_mesh
 from thesisrecon.io.pointcloud import write_point_cloud
 from thesisrecon.io.run_directory import RunDirectory, read_json, write_atomically, write_json
 from thesisrecon.report import Photograph, ReportData, write_report
@@ -28,7 +29,7 @@ SUMMARY, PAGE = "summary.json", "report.html"
 COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
 MODEL_FILES = (
     *COLMAP_FILES,
-    *("points.ply", "affine.ply", "cameras.json"),
+    *("points.ply", "affine.ply", "cameras.json", "model.glb"),
 )
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 U8 = NDArray[np.uint8]
@@ -82,6 +83,8 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             colours = point_colours(result.metric.reconstruction, result.images)
             run.warnings.extend(write_model(run.directory, result, result.metric.reconstruction, colours))
             write_affine(out / "affine.ply", affine_of(result), colours)
+            if result.mesh is not None:
+                write_mesh(out / "model.glb", result.mesh)
         else:
             run.directory.remove(MODEL_FILES)
         result = _described(run, result, until, failure)

@@ -32,11 +32,12 @@ FOLDERS: Mapping[str, str] = {
     "projective": "04-projective",
     "selfcalibration": "05-selfcalibration",
     "metric": "06-metric",
+    "dense": "07-dense",
+    "model": "08-model",
 }
 
 
-Until = Literal["features", "matches", "projective", "metric"]
-LATER_STAGES = ("dense", "model")
+Until = Literal["features", "matches", "projective", "metric", "dense", "model"]
 
 
 class RunOptions(TypedDict, total=False):
@@ -189,8 +190,6 @@ def start_run(
     if unknown:
         raise TypeError(unknown_word("option of reconstruct", unknown[0], RunOptions.__annotations__))
     until = options.get("until", "metric")
-    if until in LATER_STAGES:
-        raise UsageError(f"the stage {until} does not exist yet; --until metric is the end for now")
     if until not in get_args(Until):
         raise UsageError(unknown_word("stage", str(until), get_args(Until)))
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:

@@ -462,6 +462,9 @@ class RunResult:
     projective: Reconstruction | None = None
     calibration: SelfCalibration | None = None
     metric: MetricResult | None = None
+    views: tuple[PinholeView, ...] = ()
+    depth_maps: tuple[DepthMap, ...] = ()
+    mesh: TexturedMesh | None = None
     reports: tuple[StageReport, ...] = ()
     warnings: tuple[str, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)

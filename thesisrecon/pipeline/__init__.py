@@ -1,4 +1,4 @@
-"""Algorithm 1 of the thesis, from photographs to metric cameras: the only place that composes stages."""
+"""Algorithm 1 of the thesis, from photographs to a textured model: the only place that composes stages."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from thesisrecon.pipeline.pairs import (
     match_pairs,
     match_views,
 )
+from thesisrecon.pipeline.surface import build_model, match_densely
 from thesisrecon.pipeline.work import Work
 from thesisrecon.run import Progress, RunOptions, start_run
 from thesisrecon.types import RunResult
@@ -31,6 +32,8 @@ STEPS = {
     "projective": (find_features, choose_pairs, match_pairs, build_tracks, reconstruct_projective),
     "metric": (find_features, choose_pairs, match_pairs, build_tracks, reconstruct_metric),
 }
+STEPS["dense"] = (*STEPS["metric"], match_densely)
+STEPS["model"] = (*STEPS["dense"], build_model)
 
 
 def reconstruct(

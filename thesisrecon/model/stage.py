@@ -1,0 +1,39 @@
+"""The model of a scene: one surface of all depth maps, with the graphics of the photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from thesisrecon.model.fusion import VolumetricFusion
+from thesisrecon.model.texture import TextureAtlas, color_vertices
+from thesisrecon.types import DepthMap, PinholeView, TexturedMesh
+
+
+@dataclass(frozen=True)
+class SurfaceModel:
+    """Depth maps fused to a surface, with a texture or with colours of its vertices.
+
+    ``fusion`` makes the surface, ``atlas`` its texture; ``colors`` "texture" or "vertices".
+    """
+
+    fusion: VolumetricFusion = field(default_factory=VolumetricFusion)
+    atlas: TextureAtlas = field(default_factory=TextureAtlas)
+    colors: Literal["texture", "vertices"] = "texture"
+
+    def __post_init__(self) -> None:
+        if self.colors not in ("texture", "vertices"):
+            raise ValueError(f'colors must be "texture" or "vertices"; got {self.colors!r}')
+
+    def build(
+        self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
+    ) -> TexturedMesh:
+        """The textured surface; :class:`StageFailure` where the maps have no depths or no view sees any.
+
+        The result does not depend on ``threads``.
+        """
+        surface = self.fusion.fuse(depth_maps, threads=threads)
+        if self.colors == "vertices":
+            return color_vertices(surface, views, threads=threads)
+        return self.atlas.texture(surface, views, threads=threads)

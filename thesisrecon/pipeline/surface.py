@@ -1,0 +1,73 @@
+"""Sections 2.5 and 2.6: depth maps of all views, and the model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.dense import MultiViewScene
+from thesisrecon.errors import StageFailure
+from thesisrecon.pipeline.work import Work
+from thesisrecon.types import DepthMap, Image, Reconstruction
+
+
+def depth_of_view(config: PipelineConfig, scene: MultiViewScene, view: int) -> DepthMap:
+    return config.dense.depth_map(scene, view)
+
+
+def match_densely(work: Work) -> None:
+    run, result = work.run, work.result
+    assert result.metric is not None
+    reconstruction = result.metric.reconstruction
+    with run.clock("dense"):
+        scene = work.config.dense.prepare(result.images, reconstruction)
+    order = sorted(scene.views)
+    given = _given(reconstruction, result.images)
+    keys = {f"{i:05d}": run.key("dense", run.variant_key("dense"), given, i) for i in order}
+    found = run.kept_all(
+        "dense", keys, depth_of_view, lambda missing: [(work.config, scene, order[n]) for n in missing]
+    )
+    maps = dict(zip(order, found, strict=True))
+    with run.clock("dense"):
+        confirmed = run.workers.map_all(lambda i: work.config.dense.confirm(scene, maps, i), order)
+    work.result = replace(result, depth_maps=tuple(confirmed), views=tuple(scene.views[i] for i in order))
+    known = [float(np.isfinite(m.depth).mean()) for m in confirmed]
+    counts = {"views": len(order), "depths": int(sum(np.isfinite(m.depth).sum() for m in confirmed))}
+    empty = [i for i, share in zip(order, known, strict=True) if not share]
+    run.finish(
+        "dense",
+        counts=counts,
+        metrics={"median_share_known": float(np.median(known))},
+        warnings=[f"{result.images[i].name} has no depths" for i in empty],
+    )
+    if not counts["depths"]:
+        raise StageFailure(
+            "no depths were found",
+            f"none of {len(order)} views agrees with another on any surface",
+            "take photographs with more overlap of a scene with texture",
+        )
+
+
+def _given(reconstruction: Reconstruction, images: tuple[Image, ...]) -> list[object]:
+    """What depths are made from: cameras, points and pixels."""
+    r = reconstruction
+    return [r.P, r.K, r.radial, r.X, r.registered, r.valid, r.inlier, [image.rgb for image in images]]
+
+
+def build_model(work: Work) -> None:
+    run, result = work.run, work.result
+    key = run.key("model", run.variant_key("model"), list(run.logs["dense"].keys.values()))
+    run.progress("model", 0, 1)
+    mesh = run.kept(
+        "model",
+        "model",
+        key,
+        lambda: work.config.model.build(result.depth_maps, result.views, threads=run.workers.threads),
+    )
+    work.result = replace(work.result, mesh=mesh)
+    bare = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())
+    counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    run.finish("model", counts=counts, metrics={"share_untextured": bare})
+    run.progress("model", 1, 1)
