@@ -211,7 +211,8 @@ def test_pictures_of_depth_and_comparison_are_shown(witness: Witness) -> None:
 
 def test_a_fine_screen_gets_at_most_twice_the_pixels_and_the_eye_glides(browser: Any, report: Path) -> None:
     drawn = ("model-figure", "scene-figure")
-    witness = Witness(browser, report, 420, drawn=drawn, script=RECORD_VIEWS, device_scale_factor=3)
+    screen = {"device_scale_factor": 3, "has_touch": True}
+    witness = Witness(browser, report, 420, drawn=drawn, script=RECORD_VIEWS, **screen)
     canvas = witness.page.locator(CANVAS)
     assert canvas.evaluate("c => c.width") == 2 * canvas.evaluate("c => c.clientWidth")
     ways = []
@@ -223,7 +224,24 @@ def test_a_fine_screen_gets_at_most_twice_the_pixels_and_the_eye_glides(browser:
         ways.append(witness.page.evaluate("views.size"))
     assert ways[0] > 3
     assert ways[1] == 1  # at once where motion is unwelcome
+    before = shown(witness)
+    spread_fingers(witness)
+    assert apart(shown(witness), before) > 0.1
+    awake = "document.querySelector('#model-figure').classList.contains('awake')"
+    assert witness.page.evaluate(awake)
+    witness.page.locator("#model h2").tap()
+    assert not witness.page.evaluate(awake)
     witness.context.close()
+
+
+def spread_fingers(witness: Witness) -> None:
+    """Two fingers on the middle of the canvas go apart."""
+    hand = witness.context.new_cdp_session(witness.page)
+    box = witness.page.locator(CANVAS).bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for kind, reach in (("touchStart", 30), ("touchMove", 40), ("touchMove", 60), ("touchEnd", 0)):
+        points = [{"x": x + side * reach, "y": y, "id": side + 1} for side in (-1, 1)] if reach else []
+        hand.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
 
 def test_without_webgl_a_sentence_says_so(browser: Any, report: Path) -> None:

@@ -29,7 +29,7 @@
       float lit = 0.18 + 0.82 * max(dot(normal, normalize(vec3(-0.35, 0.5, 0.8))), 0.0);
       vec3 own = textured ? texture(picture, at).rgb : paint;
       vec3 colour = shape ? vec3(0.86, 0.88, 0.90) * lit : own;
-      // Backs, which no photograph saw, are a veil: one looks into a yard from outside.
+      // Backs, which no photograph saw, are a veil, so that one looks into a yard from outside.
       shown = gl_FrontFacing ? vec4(colour, 1.0) : vec4(vec3(0.42, 0.52, 0.62) * lit, 0.25);
     }`;
   const EYES = Math.tan(Math.PI / 8);  // of half the angle from top to bottom
@@ -53,7 +53,6 @@
     values.sort(function (a, b) { return a - b; });
     return values[Math.round(share * (values.length - 1))];
   }
-
   function share(points, d, part) { return quantile(points.map(function (p) { return p[d]; }), part); }
 
   // ---- the model ----
