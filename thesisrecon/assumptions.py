@@ -9,17 +9,31 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon.errors import UsageError
 from thesisrecon.types import F64, I64, INTRINSICS, Assumptions, Reconstruction
 
 Mode = Literal["known", "constant", "free"]
 """``known``: has the given value; ``constant``: one unknown value per camera; ``free``: another in every
 photograph."""
 
+FARTHEST_CENTRE = 1.0
+"""No principal point lies farther outside of its picture than this many long sides: a crop has its own, but
+of a picture that far off the axis nothing would be left sharp."""
+_DEVIATIONS = {
+    "focal_std_rel": "focal",
+    "aspect_std": "aspect",
+    "skew_std_px": "skew",
+    "principal_point_std_rel": "principal_point",
+    "k1_std": "k1",
+}
+"""The setting of each standard deviation, and that of the mode it belongs to."""
+
 
 @dataclass(frozen=True)
 class IntrinsicsAssumption:
     """What is assumed of the intrinsics. By default nothing of the focal length; square pixels without skew;
-    a principal point within a few hundredths of the image's middle; a moderate radial distortion.
+    a principal point within about a hundredth of the long side of the image's middle; a moderate radial
+    distortion.
 
     Every intrinsic has a mode (:data:`Mode`), a value and, where it is not known exactly, the value's
     standard deviation; ``none`` for the deviation: the value is only a place to start.
@@ -33,7 +47,7 @@ class IntrinsicsAssumption:
     focal, focal_px, focal_std_rel : the focal length in pixels of the original photographs and its relative
         standard deviation, which must be given with it (unless the mode is known).
     exif : take the focal length of the EXIF header (35 mm equivalent) where there is one and ``focal_px`` is
-        not given.
+        not given. Where a known focal is to come from a header that is silent, it is constant instead.
     aspect, aspect_ratio, aspect_std : height over width of a pixel, fy / fx.
     skew, skew_px, skew_std_px : in pixels of the original photographs.
     principal_point, principal_point_px, principal_point_std_rel : in pixels of the original photographs
@@ -72,12 +86,33 @@ class IntrinsicsAssumption:
             value = getattr(self, name)
             if value is not None and not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"{name} must be above 0; got {value}")
-        for name in ("focal_std_rel", "aspect_std", "skew_std_px", "principal_point_std_rel", "k1_std"):
+        for name in ("skew_px", "k1_value"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be a number; got {getattr(self, name)}")
+        if not all(math.isfinite(value) for value in self.principal_point_px or ()):
+            raise ValueError(f"principal_point_px must be two numbers; got {self.principal_point_px}")
+        self._check_deviations(wanted)
+
+    def _check_deviations(self, focal_wanted: bool) -> None:
+        """Refuse deviations that are no number, and those that would say nothing."""
+        for name, intrinsic in _DEVIATIONS.items():
             value = getattr(self, name)
-            if value is not None and not value > 0:
+            if value is None:
+                continue
+            if not value > 0:
                 raise ValueError(
                     f"{name} must be above 0; got {value} (what is known exactly has the mode known)"
                 )
+            if math.isinf(value):
+                raise ValueError(f"{name} must be finite; got {value} (none means that nothing is known)")
+            # A default that the mode makes idle was not asked for by anybody.
+            if getattr(self, intrinsic) == "known" and value != type(self).__dataclass_fields__[name].default:
+                raise ValueError(f"{name} = {value} says nothing where {intrinsic} is known: leave one out")
+        if self.focal_std_rel is not None and not focal_wanted:
+            raise ValueError(
+                f"focal_std_rel = {self.focal_std_rel} says nothing without a focal length: set focal_px, or "
+                "exif = true"
+            )
 
     @property
     def modes(self) -> tuple[Mode, ...]:
@@ -95,9 +130,24 @@ def camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I6
     return np.array([distinct.index(size) for size in original_sizes], dtype=np.int64)
 
 
-def camera_numbers(original_sizes: Sequence[tuple[int, int]], wish: IntrinsicsAssumption) -> I64:
-    """(V,) numbers of the cameras: views of one number agree in all intrinsics."""
-    return camera_groups(original_sizes, "per-image" if "free" in wish.modes else wish.cameras)
+def camera_numbers(
+    original_sizes: Sequence[tuple[int, int]], wish: IntrinsicsAssumption, exif_focal_px: F64 | None = None
+) -> I64:
+    """(V,) numbers of the cameras, 0-based in the order of the views: views of one number agree in all
+    intrinsics, by being tied or by being known to be the same.
+
+    exif_focal_px (V,) as for :func:`assumptions_of_views`; None where no header is there.
+    """
+    n = len(original_sizes)
+    exif = np.full(n, np.nan) if exif_focal_px is None else exif_focal_px
+    assumed = assumptions_of_views(wish, original_sizes, exif, np.ones(n))
+    known = assumed.std == 0.0
+    tied = np.where(known, -1, assumed.shared).tolist()
+    values = np.where(known, assumed.mean, 0.0).tolist()
+    group = camera_groups(original_sizes, wish.cameras).tolist()
+    keys = [(g, *t, *v) for g, t, v in zip(group, tied, values, strict=True)]
+    distinct = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    return np.array([distinct[key] for key in keys], dtype=np.int64)
 
 
 def assumptions_of_views(
@@ -106,9 +156,10 @@ def assumptions_of_views(
     """The wish as the stages take it, in pixels at working size.
 
     original_sizes: V pairs (width, height); exif_focal_px (V,) original px, NaN = not said; scales (V,)
-    working over original size.
+    working over original size. Raises :class:`UsageError` for a principal point far outside of a picture.
     """
     n = len(original_sizes)
+    check_sizes(wish, original_sizes)
     group, own = camera_groups(original_sizes, wish.cameras), np.arange(n, dtype=np.int64)
     # A known value is known for every view by itself: nothing is gained by tying it.
     shared = np.stack([group if mode == "constant" else own for mode in wish.modes], axis=1)
@@ -126,7 +177,26 @@ def assumptions_of_views(
             std[:, column] *= scales
     silent = ~np.isfinite(mean[:, 0])
     std[silent, 0] = np.inf
+    if wish.focal == "known":
+        # What its header was to say and does not is constant: one number for the silent views of a camera.
+        first = {g: i for i, g in reversed(list(enumerate(group.tolist()))) if silent[i]}
+        shared[silent, 0] = [first[g] for g in group[silent].tolist()]
     return Assumptions(shared, mean, std, alike)
+
+
+def check_sizes(wish: IntrinsicsAssumption, original_sizes: Sequence[tuple[int, int]]) -> None:
+    """:class:`UsageError` where the principal point that is given lies far outside of a picture."""
+    if wish.principal_point_px is None:
+        return
+    x, y = wish.principal_point_px
+    for width, height in dict.fromkeys(original_sizes):
+        outside = max(-x, x - width, -y, y - height)
+        if outside > FARTHEST_CENTRE * max(width, height):
+            raise UsageError(
+                f"principal_point_px = ({x:g}, {y:g}) is {outside:.0f} px outside of a picture of "
+                f"{width} x {height} px, more than its long side: it is meant in pixels of the original "
+                "photographs"
+            )
 
 
 def assume(reconstruction: Reconstruction, wish: IntrinsicsAssumption | None = None) -> Assumptions:
@@ -164,8 +234,11 @@ def prior_warnings(wish: IntrinsicsAssumption, exif_focal_px: F64) -> list[str]:
     if not wish.exif or wish.focal_px is not None or not len(exif_focal_px):
         return []
     silent, total = int((~np.isfinite(exif_focal_px)).sum()), len(exif_focal_px)
+    if not silent:
+        return []
+    # A focal that was to be known is estimated instead: that is another wish, and must be said.
+    instead = ", so it is not known: it is taken to be one value per camera (constant), and estimated"
+    rest = instead if wish.focal == "known" else ""
     if silent == total:
-        return [f"none of the {total} photographs names its focal length; no prior was used"]
-    if silent:
-        return [f"{silent} of the {total} photographs name no focal length and have no prior"]
-    return []
+        return [f"none of the {total} photographs names its focal length{rest or '; no prior was used'}"]
+    return [f"{silent} of the {total} photographs name no focal length{rest or ' and have no prior'}"]

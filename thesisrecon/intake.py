@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from thesisrecon.assumptions import camera_numbers, prior_warnings
+from thesisrecon.assumptions import camera_numbers, check_sizes, prior_warnings
 from thesisrecon.config import tables_from_config
 from thesisrecon.errors import UsageError
 from thesisrecon.io.images import ImageSource, PhotographSet, read_photographs
@@ -19,6 +19,7 @@ def read_set(run: Run, images: ImageSource) -> PhotographSet:
     found, refused = len(photographs.photographs), len(photographs.refused)
     if found + refused == 0:
         raise UsageError("no images")
+    check_sizes(run.config.intrinsics, [image.original_size for image in photographs.images])
     notes = [f"{p.image.name}: {p.note}" for p in photographs.photographs if p.note]
     refusals = [f"{name} is left out: it {reason}" for name, reason in photographs.refused.items()]
     warnings = [*notes, *refusals, *prior_warnings(run.config.intrinsics, photographs.exif_focal_px)]
@@ -47,7 +48,7 @@ def identity(run: Run, photographs: PhotographSet) -> dict[str, Any]:
 
 def empty_result(run: Run, photographs: PhotographSet) -> RunResult:
     sizes = [image.original_size for image in photographs.images]
-    groups = camera_numbers(sizes, run.config.intrinsics)
+    groups = camera_numbers(sizes, run.config.intrinsics, photographs.exif_focal_px)
     return RunResult(
         out=run.directory.path,
         images=photographs.images,
