@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,7 +47,9 @@ def prepare_pair(left: ArrayLike, right: ArrayLike) -> tuple[Side, Side]:
 def _side(image: NDArray[np.generic]) -> Side:
     if image.ndim not in (2, 3) or 0 in image.shape or (image.ndim == 3 and image.shape[2] > 4):
         raise ValueError(f"an image must be (H, W) or (H, W, K) with K <= 4; got {image.shape}")
-    levels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None], dtype=np.float32)
+    # Bytes need no detour by floating numbers.
+    dtype = np.uint8 if image.dtype == np.uint8 else np.float32
+    levels: NDArray[Any] = np.ascontiguousarray(image if image.ndim == 3 else image[..., None], dtype=dtype)
     height, width, n = levels.shape
     channels, valid = np.empty((n, height, width), np.int16), np.empty((height, width), np.uint8)
     grey = np.empty((height, width), np.int16)

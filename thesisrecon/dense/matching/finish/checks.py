@@ -11,6 +11,7 @@ from thesisrecon.dense.matching.costs.kernels import LEVELS
 from thesisrecon.dense.matching.finish.kernels import (
     check_left_right,
     fill_pinholes,
+    rate,
     remove_peaks,
     smooth_alike,
     squared_gradient,
@@ -30,8 +31,8 @@ DIGITISATION = float(1.0 / np.sqrt(12.0))
 """Noise of whole grey levels."""
 TEXTURED = np.float32(1.7)
 """Texture that noise does not make, in units of its own."""
-BLANK = np.float32(0.05)
-"""What is left of the confidence where there is no texture."""
+LOCKING_PX = 0.17
+"""What pixels draw a sub-pixel fit towards them: measured on pairs whose disparity is known."""
 SURROUNDED = 5
 """Of eight neighbours that must be known for a pinhole to be closed."""
 
@@ -64,32 +65,31 @@ class Finish:
         ``texture`` (H, W) from :func:`texture_of`: what surfaces without any inherit from their rims is kept,
         with little confidence. Takes possession of ``left`` and ``confidence``.
         """
-        check_left_right(left, right, np.float32(self.left_right_px))
-        left[confidence < np.float32(self.least_confidence)] = np.nan
+        limits = np.array([self.left_right_px, self.least_confidence], np.float32)
+        check_left_right(left, right, confidence, limits)
         remove_peaks(left, texture > TEXTURED, STEP_PX, self.smallest_piece)
         closed = np.empty_like(left)
         fill_pinholes(left, SURROUNDED, closed)
-        # A pinhole was not confirmed by the other side: its neighbours speak for it.
-        confidence[np.isnan(left)] *= np.float32(0.5)
+        closed[np.isnan(texture)] = np.nan
         smooth = np.empty_like(left)
         smooth_alike(closed, STEP_PX, self.radius, smooth)
-        excess = np.maximum(texture - np.float32(1.0), np.float32(0.0))
-        confidence *= np.maximum(excess / (excess + np.float32(1.0)), BLANK)
-        confidence[np.isnan(smooth)] = 0.0
+        rate(confidence, left, smooth, texture)
         return DisparityMap(smooth, confidence, _noise(closed, smooth))
 
 
 def texture_of(side: Side, noise: float) -> F32:
     """(H, W) squared horizontal gradient about each pixel in units of what noise alone, of a standard
-    deviation of so many grey levels, makes of it: 1 where there is nothing to match."""
+    deviation of so many grey levels, makes of it: 1 where there is nothing to match. NaN = no pixel."""
     out = np.empty(side.valid.shape, np.float32)
     squared_gradient(side.channels, AROUND, out)
     out /= np.float32(2.0 * LEVELS**2 * np.hypot(noise, DIGITISATION) ** 2)
+    out[side.valid == 0] = np.nan
     return out
 
 
 def _noise(raw: F32, smooth: F32) -> float:
-    """Deviation of the disparities about the smooth ones, from the median; NaN where nothing is known."""
+    """Deviation of a disparity: about the smooth ones, from the median, and what smoothness does not show;
+    NaN where nothing is known."""
     apart = np.abs(raw[::SPARSE, ::SPARSE] - smooth[::SPARSE, ::SPARSE])
     known = apart[np.isfinite(apart)]
-    return float(1.4826 * np.median(known)) if len(known) else float("nan")
+    return float(np.hypot(1.4826 * np.median(known), LOCKING_PX)) if len(known) else float("nan")

@@ -14,6 +14,8 @@ U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 
 NONE = np.uint16(65535)
+BLANK = np.float32(0.05)
+"""What is left of the confidence where there is no texture."""
 EVIDENT = 20
 """At least one pixel in so many of a surface must have texture."""
 
@@ -103,16 +105,32 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
 
 
 @njit(cache=True, nogil=True)
-def check_left_right(left: F32, right: F32, tolerance: np.float32) -> None:
-    """NaN to the disparities (H, W) of left pixels whose partner in the right image has another one."""
+def check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> None:
+    """NaN to the disparities (H, W) of left pixels whose partner in the right image has one that differs by
+    more than ``limits[0]``, and to those of less confidence than ``limits[1]``."""
     height, width = left.shape
     for y in range(height):
         for x in range(width):
             if np.isnan(left[y, x]):
                 continue
             partner = int(np.floor(np.float32(x) - left[y, x] + np.float32(0.5)))
-            if not (0 <= partner < width and abs(right[y, partner] - left[y, x]) <= tolerance):
+            if not (0 <= partner < width and abs(right[y, partner] - left[y, x]) <= limits[0]):
                 left[y, x] = np.nan
+            if confidence[y, x] < limits[1]:
+                left[y, x] = np.nan
+
+
+@njit(cache=True, nogil=True)
+def rate(confidence: F32, confirmed: F32, disparity: F32, texture: F32) -> None:
+    """Confidence (H, W) once all is known: 0 where there is no disparity, half where it was filled in and
+    the neighbours alone speak for it, and less where ``texture`` is little more than 1."""
+    height, width = confidence.shape
+    for y in range(height):
+        for x in range(width):
+            excess = max(texture[y, x] - np.float32(1.0), np.float32(0.0))
+            share = max(excess / (excess + np.float32(1.0)), BLANK)
+            share = share * np.float32(0.5) if np.isnan(confirmed[y, x]) else share
+            confidence[y, x] = np.float32(0.0) if np.isnan(disparity[y, x]) else confidence[y, x] * share
 
 
 @njit(cache=True, nogil=True)
@@ -149,7 +167,8 @@ def squared_gradient(channels: I16, radius: int, out: F32) -> None:
 @njit(cache=True, nogil=True)
 def remove_peaks(disparity: F32, evident: B8, step: np.float32, smallest: int) -> None:
     """NaN to connected pieces of fewer than ``smallest`` pixels, or with fewer ``evident`` ones, in them and
-    around them, than one in twenty; neighbours are connected where their disparities differ by no more than ``step``."""
+    around them, than one in twenty; neighbours are connected where their disparities differ by no more than
+    ``step``."""
     height, width = disparity.shape
     flat, counted = disparity.reshape(height * width), evident.reshape(height * width)
     queue = np.empty(height * width, np.int32)

@@ -1,0 +1,95 @@
+"""Rectified pairs with dense truth, and which of their pixels both cameras see."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from validation.scenes.real import data_root
+
+B8 = NDArray[np.bool_]
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+
+STEREO_PAIRS = ("Tsukuba", "Teddy", "Cones", "Motorcycle")
+
+
+@dataclass(frozen=True)
+class StereoPair:
+    """``left, right`` (H, W, 3), ``truth`` (H, W) disparity of the left image, NaN where there is none,
+    ``judged`` (H, W) pixels that have truth and are seen by both cameras; the range is
+    0 .. ``disparities`` - 1."""
+
+    name: str
+    left: U8
+    right: U8
+    truth: F32
+    judged: B8
+    disparities: int
+
+
+def load_stereo_pair(name: str) -> StereoPair | None:
+    """One of ``STEREO_PAIRS``, None where its files are not on this machine.
+
+    The motorcycle comes with scikit-image, whose files are read without importing it.
+    """
+    if name == "Motorcycle":
+        return _motorcycle()
+    root = data_root()
+    folder = None if root is None else root / "stereo" / ("Cones9" if name == "Cones" else name)
+    if folder is None or not folder.is_dir():
+        return None
+    if name == "Cones":
+        truth, other = (_truth(folder / f"disp{k}.png", 4.0) for k in (2, 6))
+        judged = seen_by_both(truth, other)
+        return StereoPair(name, _rgb(folder / "im2.png"), _rgb(folder / "im6.png"), truth, judged, 64)
+    truth = _truth(folder / "disparity.png", 16.0 if name == "Tsukuba" else 4.0)
+    left, right = _rgb(folder / "left.png"), _rgb(folder / "right.png")
+    return StereoPair(name, left, right, truth, seen_by_both(truth, None), 16 if name == "Tsukuba" else 64)
+
+
+def seen_by_both(truth: F32, other: F32 | None) -> B8:
+    """(H, W) pixels whose partner has the same disparity, to a pixel.
+
+    ``other`` is the truth of the right image; without it the truth of the left one is warped there, the
+    nearest surface in front.
+    """
+    height, width = truth.shape
+    rows, columns = np.mgrid[0:height, 0:width]
+    known = np.isfinite(truth)
+    partner = np.rint(columns - np.where(known, truth, 0.0)).astype(np.int64)
+    inside = known & (partner >= 0)
+    if other is None:
+        other = np.full(truth.shape, -np.inf, np.float32)
+        np.maximum.at(other, (rows[inside], partner[inside]), truth[inside])
+    with np.errstate(invalid="ignore"):
+        same = np.abs(other[rows, np.maximum(partner, 0)] - truth) <= 1.0
+    judged: B8 = inside & same
+    return judged
+
+
+def _motorcycle() -> StereoPair | None:
+    found = importlib.util.find_spec("skimage")
+    if found is None or found.origin is None:
+        return None
+    folder = Path(found.origin).parent / "data"
+    if not (folder / "motorcycle_disp.npz").is_file():
+        return None
+    stored = np.load(folder / "motorcycle_disp.npz")["arr_0"].astype(np.float32)
+    truth = np.where(np.isfinite(stored), stored, np.float32(np.nan)).astype(np.float32)
+    left, right = (_rgb(folder / f"motorcycle_{side}.png") for side in ("left", "right"))
+    return StereoPair("Motorcycle", left, right, truth, seen_by_both(truth, None), 64)
+
+
+def _rgb(path: Path) -> U8:
+    return np.asarray(Image.open(path).convert("RGB"))
+
+
+def _truth(path: Path, scale: float) -> F32:
+    values = np.asarray(Image.open(path).convert("L")).astype(np.float32)
+    return np.where(values > 0.0, values / np.float32(scale), np.float32(np.nan)).astype(np.float32)
