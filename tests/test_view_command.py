@@ -12,6 +12,7 @@ import pytest
 
 from tests.model.sphere import SHAPE, photograph, ring_of
 from thesisrecon.cli import run_command
+from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera import decompose_camera
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.io.run_directory import write_json
@@ -19,6 +20,7 @@ from thesisrecon.model import VolumetricFusion
 from thesisrecon.model.texture import TextureAtlas
 from thesisrecon.report.summary import cameras_table
 from thesisrecon.types import Image, Reconstruction, TexturedMesh, Tracks
+from thesisrecon.view_command import ViewWishes, write_views
 
 SIZE = SHAPE[::-1]
 COUNT = 8
@@ -199,3 +201,13 @@ def test_a_folder_of_photographs_is_not_written_over(run: Path, capsys: pytest.C
     assert (photographs / "frame-0001.png").read_bytes() == b"dear"
     assert run_command(["views", str(run), "-o", str(photographs / "frame-0001.png")]) == 2
     assert "cannot be used" in capsys.readouterr().err
+
+
+def test_progress_is_told_to_its_end(run: Path) -> None:
+    heard: list[tuple[str, int, int]] = []
+    wishes = ViewWishes(frames=3, size=(40, 30))
+    written = write_views(run, run / "film", wishes, threads=2, progress=lambda *step: heard.append(step))
+    assert heard == [("views", k, 4) for k in range(1, 5)]
+    assert [path.is_file() for path in (*written.frames, written.animation)] == [True] * 4
+    with pytest.raises(UsageError, match="unknown path"):
+        ViewWishes(path="spiral")

@@ -113,10 +113,12 @@ def write_views(
     def finished(_: int, __: Any) -> None:
         nonlocal done
         done += 1
-        tell("views", done, len(path))
+        # The last step is the animation.
+        tell("views", done, len(path) + 1)
 
     Workers(threads).run(draw, [(k,) for k in range(len(path))], finished)
     animation = write_animation(folder / f"{wishes.path}{animation_suffix()}", files)
+    finished(len(path), animation)
     return ViewFiles(folder, tuple(files), animation, path[0].size)
 
 

