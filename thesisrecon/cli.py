@@ -130,7 +130,10 @@ def reconstruct(
         ),
     ] = None,
     until: Annotated[
-        str, typer.Option("--until", help="The last stage: features, matches, projective, metric, dense or model.")
+        str,
+        typer.Option(
+            "--until", help="The last stage: features, matches, projective, metric, dense or model."
+        ),
     ] = "metric",
     executor: Annotated[
         str, typer.Option("--executor", help="Workers are threads (local) or processes.")
