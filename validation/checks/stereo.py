@@ -79,12 +79,10 @@ def check_pair(pair: StereoPair, runs: int) -> tuple[list[Metric], dict[str, F32
     off = {px: {name: bad_pixels(found, pair, px) for name, found in maps.items()} for px in (1.0, 2.0)}
     known = {name: np.isfinite(found) & pair.judged for name, found in maps.items()}
     share = {name: float(100.0 * k[pair.judged].mean()) for name, k in known.items()}
-    wrong = {
-        name: float(100.0 * np.mean(np.abs(maps[name] - pair.truth)[k] > 1.0)) for name, k in known.items()
-    }
-    spread = {
-        name: float(1.4826 * np.median(np.abs(maps[name] - pair.truth)[k])) for name, k in known.items()
-    }
+    errors = {name: np.abs(maps[name] - pair.truth)[k] for name, k in known.items()}
+    # A method that knows nothing has no errors to speak of.
+    wrong = {n: float(100.0 * np.mean(e > 1.0)) if len(e) else None for n, e in errors.items()}
+    spread = {n: float(1.4826 * np.median(e)) if len(e) else None for n, e in errors.items()}
     time_ms = processor_time({name: calls[name] for name in (*OURS, THREE_WAY, f"{HH}, as called")}, runs)
     hh = time_ms[f"{HH}, as called"]
     better = {px: min(off[px][name] for name in THEIRS) for px in off}

@@ -1,0 +1,75 @@
+"""Dense matching of real pairs stays as good as it was measured to be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline
+from validation.checks.stereo import DEFAULT, THESIS, bad_pixels, check_pair
+from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
+
+LIMITS_PCT = {
+    "Tsukuba": (3.13, 4.1),
+    "Teddy": (8.4, 14.0),
+    "Cones": (4.1, 10.5),
+    "Motorcycle": (5.6, 16.0),
+}
+"""Of pixels off by more than one: OpenCV's better mode for the default, the literature's scanline program for
+the thesis variant (the motorcycle, which it has not: what was reached)."""
+
+
+def pair_or_skip(name: str) -> StereoPair:
+    pair = load_stereo_pair(name)
+    if pair is None:
+        pytest.skip(f"the pair {name} is not on this machine (THESISRECON_DATA, or scikit-image)")
+    return pair
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", LIMITS_PCT)
+def test_real_pairs_are_matched_as_well_as_the_references_do(name: str) -> None:
+    pair = pair_or_skip(name)
+    limits = (0, pair.disparities - 1)
+    for variant, limit in zip(
+        (CohesiveScanlines(), MaximumLikelihoodScanline()), LIMITS_PCT[name], strict=True
+    ):
+        found = variant.match(pair.left, pair.right, disparity_range=limits)
+        assert bad_pixels(found.disparity, pair, 1.0) <= limit
+        known = np.isfinite(found.disparity) & pair.judged
+        assert known[pair.judged].mean() > 0.87
+        wrong = np.abs(found.disparity - pair.truth)[known] > 1.0
+        confidence = found.confidence[known]
+        assert np.median(confidence[~wrong]) > np.median(confidence[wrong])
+
+
+def small_pair() -> StereoPair:
+    """A textured plane at disparity 5, a nearer square at 9."""
+    rng = np.random.default_rng(0)
+    base, square = (rng.integers(0, 256, (60, 120, 3)).astype(np.uint8) for _ in range(2))
+    left, right = base[:, 20:110].copy(), base[:, 25:115].copy()
+    truth = np.full((60, 90), 5.0, np.float32)
+    left[20:40, 40:60], right[20:40, 31:51] = square[:20, :20], square[:20, :20]
+    truth[20:40, 40:60] = 9.0
+    return StereoPair("small", left, right, truth, seen_by_both(truth, None), 16)
+
+
+def test_pixels_hidden_by_the_square_or_beyond_the_image_are_not_judged() -> None:
+    judged = small_pair().judged
+    assert not judged[:, :5].any()
+    # At the left of the square lie the four columns of the plane that it covers in the right image.
+    assert not judged[20:40, 36:40].any()
+    assert judged[20:40, 40:60].all()
+    assert judged[:20, 5:].all()
+
+
+def test_rows_of_a_pair_name_every_method() -> None:
+    rows, maps = check_pair(small_pair(), 1)
+    off = rows[0]
+    assert off.name == "off by more than 1 px"
+    assert set(off.values) == set(maps)
+    assert off.values[DEFAULT] is not None
+    assert off.values[DEFAULT] < 3.0
+    assert off.values[THESIS] is not None
+    assert off.values[THESIS] < 3.0
+    assert all(value is not None and value > 0.0 for value in rows[6].values.values())
