@@ -112,3 +112,21 @@ def test_a_flat_model_has_a_box() -> None:
     data = data_of(mesh)
     assert np.isfinite(corners(data)).all()
     assert (np.array(data["high"]) > data["low"]).all()
+
+
+def test_a_stray_does_not_take_the_resolution_of_the_rest() -> None:
+    mesh = sphere_model()
+    assert mesh.uv is not None
+    far = np.array([[500.0, 0, 0], [501, 0, 0], [500, 1, 0]])
+    n = len(mesh.vertices)
+    spoiled = replace(
+        mesh,
+        vertices=np.concatenate([mesh.vertices, far]),
+        faces=np.concatenate([mesh.faces, [[n, n + 1, n + 2]]]),
+        uv=np.concatenate([mesh.uv, mesh.uv[:1]]),
+    )
+    assert data_of(spoiled) == data_of(mesh)
+    bare = replace(spoiled, uv=None, texture=None)
+    np.testing.assert_array_equal(
+        corners(data_of(bare)), corners(data_of(replace(mesh, uv=None, texture=None)))
+    )

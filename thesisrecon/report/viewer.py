@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,11 @@ from thesisrecon.types import F64, I64, Reconstruction, TexturedMesh
 LEVELS = 65535
 """Steps a side of the box about the model, and a side of the texture."""
 
-MAX_FACES = 150_000
 MAX_TEXELS = 2100 * 2100
-"""What the page carries is kept below about 8 MB by these; texture beyond the limit is reduced."""
+"""A texture beyond this is reduced: with 150,000 faces the page then grows by less than 8 MB."""
+
+STRAY = 8.0
+"""How many times further out than nearly all of the model a face may be."""
 
 PLAIN = (200, 200, 200)
 """Colour of a model that has none."""
@@ -40,16 +43,17 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     ``positions`` (N, 3) uint16 in the box from ``low`` to ``high``, ``uv`` (N, 2) uint16 over the texture or
     ``colors`` (N, 3) uint8, and ``indices`` (M, 3) uint32, each in base64 with the lowest byte first;
     ``texture`` a JPEG in a ``data:`` address; ``stands`` of the photographs (see :func:`stands`), the
-    one in their middle as ``start``; ``turns`` the directions of :data:`TURNS`. z is up. Faces without an
-    area at this resolution are left out.
+    one in their middle as ``start``; ``turns`` the directions of :data:`TURNS`. z is up. Faces further from
+    the middle than ``STRAY`` times the distance that holds 95 % of the model are left out.
     """
+    mesh = _without_strays(mesh)
     views = np.flatnonzero(reconstruction.registered).tolist()
     rotations = np.stack([decompose_camera(reconstruction.P[i])[1] for i in views])
     upright = upright_rotation(rotations)
     vertices = mesh.vertices @ upright.T
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = (end(vertices[mesh.faces], axis=(0, 1)) for end in (np.min, np.max))
     steps = np.where(high > low, high - low, 1.0) / LEVELS
-    positions = np.rint((vertices - low) / steps).astype("<u2")
+    positions = np.rint(np.clip((vertices - low) / steps, 0, LEVELS)).astype("<u2")
     paint, faces, vertex = _painted(mesh)
     places = stands(mesh, reconstruction, upright, names)
     eyes = np.array([place["eye"] for place in places])
@@ -64,6 +68,13 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
         "start": middle,
         "turns": [{"name": name, "direction": list(direction)} for name, direction in TURNS],
     }
+
+
+def _without_strays(mesh: TexturedMesh) -> TexturedMesh:
+    """Without faces so far away that the rest would have few steps of the box."""
+    distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
+    keep = (distance <= STRAY * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
+    return replace(mesh, faces=mesh.faces[keep], uv=None if mesh.uv is None else mesh.uv[keep])
 
 
 def _painted(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
