@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.textures import texture
 from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline
 from validation.checks.stereo import DEFAULT, THESIS, bad_pixels, check_pair
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
@@ -45,8 +46,8 @@ def test_real_pairs_are_matched_as_well_as_the_references_do(name: str) -> None:
 
 def small_pair() -> StereoPair:
     """A textured plane at disparity 5, a nearer square at 9."""
-    rng = np.random.default_rng(0)
-    base, square = (rng.integers(0, 256, (60, 120, 3)).astype(np.uint8) for _ in range(2))
+    colors = [[texture(60, 120, 3 * kind + k) for k in range(3)] for kind in range(2)]
+    base, square = (np.stack(channels, axis=2).astype(np.uint8) for channels in colors)
     left, right = base[:, 20:110].copy(), base[:, 25:115].copy()
     truth = np.full((60, 90), 5.0, np.float32)
     left[20:40, 40:60], right[20:40, 31:51] = square[:20, :20], square[:20, :20]
