@@ -266,8 +266,10 @@ class SelfCalibration:
     """The answer of chapter 7: the best upgrade, its rivals (best first, the best included), and how sure it
     is.
 
-    ``K_std`` (V, 3, 3) standard deviations; ``identifiable`` False where the motion does not determine the
-    answer, with ``reasons``; ``verdict`` is the evidence for that, None where none was gathered.
+    ``K_std`` (V, 3, 3) standard deviations of the entries of K by the method's own residuals: 0 where an
+    entry is known, that of the assumption where the method left it as assumed, NaN where nothing is known of
+    it. ``identifiable`` False where the motion does not determine the answer, with ``reasons``; ``verdict``
+    is the evidence for that, None where none was gathered.
     """
 
     metric_from_projective: F64

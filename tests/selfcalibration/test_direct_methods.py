@@ -21,6 +21,7 @@ from thesisrecon.selfcalibration import (
     NonlinearQuadric,
     RotationCriterion,
     ScannedQuadric,
+    Stratified,
 )
 from thesisrecon.selfcalibration.focal_scan import calibrations_of, scan_cost
 from thesisrecon.selfcalibration.frame import assumed_frame
@@ -127,6 +128,50 @@ def test_all_intrinsics_of_a_constant_camera_are_found(method: object) -> None:
     free = assume(scene, stds=(np.inf, np.inf, np.inf))
     answer = method.calibrate(reconstruction, assumed=free, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
     np.testing.assert_allclose(answer.K[0], K, rtol=1e-7, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", [NonlinearQuadric(), KruppaEquations()], ids=name)
+def test_what_is_solved_for_has_a_deviation_of_the_size_of_its_error(method: object) -> None:
+    scaled = []
+    for seed in range(4):
+        scene = make_scene(sigma_px=0.3, seed=seed, principal_shift=(20.0, -12.0))
+        answer = calibrate(method, scene, assume(scene, stds=(0.0, 0.0, 30.0)), seed=seed)
+        K, K_std, truth = answer.K[0], answer.K_std[0], scene.K[0]
+        moved = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=bool)
+        assert (K_std[moved] > 0.0).all()
+        assert not K_std[~moved].any()
+        scaled.append((K - truth)[moved] / K_std[moved])
+    # The noise of cameras is not independent, which the residuals do not know.
+    assert 0.3 < np.sqrt(np.mean(np.square(scaled))) < 4.0
+
+
+def test_what_is_left_as_assumed_is_as_sure_as_the_assumption() -> None:
+    scene = make_scene(sigma_px=0.3, seed=1)
+    told = calibrate(ScannedQuadric(), scene, assume(scene, stds=(0.05, 0.0, 10.0)), seed=1)
+    np.testing.assert_allclose(told.K_std[:, 0, 2], 10.0)
+    np.testing.assert_allclose(told.K_std[:, 1, 2], 10.0)
+    assert not told.K_std[:, 0, 1].any()
+    relative = told.K_std / np.where(told.K == 0.0, 1.0, told.K)
+    np.testing.assert_allclose(relative[:, 1, 1], np.hypot(relative[:, 0, 0], 0.05))
+    untold = calibrate(ScannedQuadric(), scene, assume(scene, stds=(0.0, 0.0, np.inf)), seed=1)
+    assert np.isnan(untold.K_std[:, :2, 2]).all()
+    assert (untold.K_std[:, 0, 0] > 0.0).all()
+
+
+def test_a_bias_is_no_deviation() -> None:
+    scene = make_scene(sigma_px=0.3, seed=1)
+    answer = calibrate(LinearQuadric(), scene, assume(scene), seed=1)
+    assert np.isnan(answer.K_std[:, (0, 1), (0, 1)]).all()
+    assert not answer.K_std[:, 0, 1:].any()
+
+
+def test_a_principal_point_of_a_closed_form_has_no_deviation() -> None:
+    scene = make_scene(sigma_px=0.3, seed=1)
+    answer = calibrate(Stratified(refined=False), scene, assume(scene, stds=(0.0, 0.0, 30.0)), seed=1)
+    assert np.abs(answer.K[:, :2, 2] - scene.K[:, :2, 2]).max() > 1e-6
+    assert np.isnan(answer.K_std[:, :2, 2]).all()
+    refined = calibrate(Stratified(), scene, assume(scene, stds=(0.0, 0.0, 30.0)), seed=1)
+    assert (refined.K_std[:, :2, 2] > 0.0).all()
 
 
 def test_a_known_aspect_and_principal_point_are_normalised_away() -> None:

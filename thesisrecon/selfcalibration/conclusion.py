@@ -41,12 +41,14 @@ def log_focals_of(frame: ReferenceFrame, K: F64) -> F64:
 @dataclass(frozen=True)
 class Answer:
     """A plane at infinity (3,) and unit-free calibrations ``K`` (R, 3, 3) in a reference frame, the ``cost``
-    by which answers are ordered, and the ``method`` they come from."""
+    by which answers are ordered, the ``method`` they come from, and the deviations ``K_std`` (R, 3, 3) of K,
+    None where the method has none."""
 
     plane: F64
     K: F64
     cost: float
     method: str
+    K_std: F64 | None = None
 
     def log_focals(self, frame: ReferenceFrame) -> F64:
         """Log focals (G,) of the camera groups, each the median of its views."""
@@ -160,14 +162,43 @@ def conclude(
     theta = np.concatenate([answer.plane, answer.log_focals(frame)])
     std_log_f, _ = focal_std(criterion, frame, theta)
     verdict = judge_motion(reconstruction, best, frame.assumed)
-    K_std = np.zeros_like(best.K)
-    relative = np.minimum(std_log_f[frame.group], MAX_LOG_STD)
-    for k in (0, 1):
-        K_std[frame.views, k, k] = best.K[frame.views, k, k] * relative
+    K_std = _deviations(frame, best.K, answer, np.minimum(std_log_f[frame.group], MAX_LOG_STD))
     return SelfCalibration(
         best.metric_from_projective, best.K, K_std, verdict.identifiable,
         () if verdict.identifiable else verdict.sentences, tuple(upgrade for _, upgrade in chosen), verdict,
     )  # fmt: skip
+
+
+def _deviations(frame: ReferenceFrame, K: F64, answer: Answer, focal_std: F64) -> F64:
+    """(V, 3, 3) deviations of K (V, 3, 3): those of the answer; else those of the focals and of what was
+    assumed, where nothing but the focals was solved for; else NaN."""
+    if answer.K_std is not None:
+        unit = frame.pixel_from_unit[frame.views]
+        K_std = np.zeros_like(K)
+        # The last row of K is known, so that rows of the answer are rows of K in other units.
+        K_std[frame.views] = np.diagonal(unit, axis1=1, axis2=2)[:, :, None] * answer.K_std
+        return K_std
+    K_std = square_std(frame, K, focal_std)
+    focals_only = np.allclose(answer.K, square_calibrations(np.log(answer.K[:, 0, 0])), atol=1e-12)
+    if not focals_only:
+        K_std[frame.views[:, None], (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)] = np.nan
+    return K_std
+
+
+def square_std(frame: ReferenceFrame, K: F64, focal_std: F64) -> F64:
+    """(V, 3, 3) deviations of calibrations K (V, 3, 3) of which the focals alone were solved for.
+
+    ``focal_std`` (R,) of the log focals; the rest has the deviation that was assumed of it, NaN where nothing
+    was.
+    """
+    if frame.assumed is None:
+        raise ValueError("deviations need a frame that knows what is assumed: see assumed_frame")
+    K_std, rows = np.zeros_like(K), frame.views
+    assumed = np.where(np.isfinite(frame.assumed.std), frame.assumed.std, np.nan)[rows]
+    K_std[rows, 0, 0] = K[rows, 0, 0] * focal_std
+    K_std[rows, 1, 1] = K[rows, 1, 1] * np.hypot(focal_std, assumed[:, 1] / frame.assumed.mean[rows, 1])
+    K_std[rows, 0, 1], K_std[rows, 0, 2], K_std[rows, 1, 2] = assumed[:, 2:5].T
+    return K_std
 
 
 def _distinct_upgrades(

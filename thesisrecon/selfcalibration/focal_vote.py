@@ -20,6 +20,7 @@ from thesisrecon.selfcalibration.conclusion import (
     guarded,
     require_cameras,
     square_calibrations,
+    square_std,
 )
 from thesisrecon.selfcalibration.focal_from_fundamental import kruppa_chi_square, kruppa_whitening
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
@@ -220,9 +221,7 @@ class FocalsFromFundamental:
     def _with_own_deviations(
         self, found: SelfCalibration, frame: ReferenceFrame, std: F64
     ) -> SelfCalibration:
-        K_std = np.zeros_like(found.K_std)
-        for k in (0, 1):
-            K_std[frame.views, k, k] = found.K[frame.views, k, k] * std
+        K_std = square_std(frame, found.K, std)
         open_views = frame.views[std >= self.max_std]
         if not len(open_views):
             return replace(found, K_std=K_std)

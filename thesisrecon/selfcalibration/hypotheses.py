@@ -93,7 +93,9 @@ class HypothesesAndRefinement:
         for answer in distinct_answers(frame, answers, self.freed):
             log_f = answer.log_focals(frame)[frame.group]
             best = minimize_quadric(frame, unknown, answer.plane, log_f, loss_scale=self.criterion.scale)
-            found.append(Answer(best.plane, best.K, best.cost, "hypotheses and nonlinear quadric"))
+            found.append(
+                Answer(best.plane, best.K, best.cost, "hypotheses and nonlinear quadric", best.K_std)
+            )
         return found
 
     def _propose(

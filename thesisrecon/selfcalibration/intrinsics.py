@@ -54,6 +54,14 @@ class UnknownIntrinsics:
         K[..., 2, 2] = 1.0
         return K
 
+    def calibration_std(self, unknowns: F64, covariance: F64) -> F64:
+        """Standard deviations (R, 3, 3) of the entries of the calibrations at unknowns (D,) with their
+        ``covariance`` (D, D), to first order; 0 where an entry is known."""
+        steps = np.diag(np.full(len(unknowns), 1e-6))
+        slope = (self.calibrations(unknowns + steps) - self.calibrations(unknowns - steps)) / 2e-6
+        variance = np.einsum("drij,de,erij->rij", slope, covariance, slope)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
     def deviations(self, unknowns: F64) -> F64:
         """(unknowns - mean) / std (B, D), 0 where nothing is known."""
         known = np.isfinite(self.std)

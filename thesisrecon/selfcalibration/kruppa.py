@@ -147,9 +147,10 @@ class KruppaEquations:
         answers = []
         for log_f in self._scan(pairs, len(frame.views)):
             start = unknown.start(np.full((1, len(frame.views)), log_f))[0]
-            K = minimize_kruppa(pairs, unknown, start, scale=self.scale).K
-            plane, cost = planes_for_focals(frame, self.criterion, log_focals_of(frame, K))
-            answers.append(Answer(plane, K, cost, "Kruppa equations"))
+            found = minimize_kruppa(pairs, unknown, start, scale=self.scale)
+            plane, cost = planes_for_focals(frame, self.criterion, log_focals_of(frame, found.K))
+            K_std = unknown.calibration_std(found.unknowns, found.covariance)
+            answers.append(Answer(plane, found.K, cost, "Kruppa equations", K_std))
         return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)
 
     def _scan(self, pairs: PairGeometry, n: int) -> list[float]:

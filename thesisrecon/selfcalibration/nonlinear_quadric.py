@@ -40,7 +40,7 @@ PASSES = 6
 class QuadricMinimum:
     """``plane`` (3,) p of the plane at infinity (p, 1), ``unknowns`` (D,), unit-free ``K`` (R, 3, 3), the
     ``cost`` (mean squared residual of a camera), the ``noise`` of one residual entry, ``covariance``
-    (3 + D, 3 + D)."""
+    (3 + D, 3 + D) and what it means for the entries of K, ``K_std`` (R, 3, 3)."""
 
     plane: F64
     unknowns: F64
@@ -48,6 +48,7 @@ class QuadricMinimum:
     cost: float
     noise: float
     covariance: F64
+    K_std: F64
 
 
 def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -> F64:
@@ -85,7 +86,8 @@ def minimize_quadric(
         if noise > 0.7 * supposed:
             break
     K = unknown.calibrations(theta[None, 3:])[0]
-    return QuadricMinimum(theta[:3], theta[3:], K, cost, noise, covariance)
+    K_std = unknown.calibration_std(theta[3:], covariance[3:, 3:])
+    return QuadricMinimum(theta[:3], theta[3:], K, cost, noise, covariance, K_std)
 
 
 def _minimize(
@@ -152,5 +154,5 @@ class NonlinearQuadric:
         answers = []
         for b in best[np.isfinite(cost[best])]:
             found = minimize_quadric(frame, unknown, p[b], log_f[b][frame.group], loss_scale=self.loss_scale)
-            answers.append(Answer(found.plane, found.K, found.cost, "nonlinear quadric"))
+            answers.append(Answer(found.plane, found.K, found.cost, "nonlinear quadric", found.K_std))
         return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)

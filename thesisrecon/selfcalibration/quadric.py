@@ -7,7 +7,7 @@ normalising focal over the plausible range makes them right for one of the scann
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +109,8 @@ class LinearQuadric:
     """The linear quadric alone: one normalising focal, no refinement.
 
     ``normalising_focal`` in long sides; 1.67 is the 60 mm lens of Pollefeys et al. on 36 mm film. The
-    equation that expects it pulls the answer even without noise, by tens of percent with another lens.
+    equation that expects it pulls the answer even without noise, by tens of percent with another lens: its
+    focals have no standard deviation (NaN).
     """
 
     normalising_focal: float = 1.67
@@ -128,7 +129,11 @@ class LinearQuadric:
         require_cameras(reconstruction)
         frame = assumed_frame(reconstruction, assumed)
         p, log_f = _with_cameras(frame, *quadric_hypotheses(frame, np.array([self.normalising_focal])))
-        return _conclude_best(frame, reconstruction, self.criterion, p, log_f)
+        found = _conclude_best(frame, reconstruction, self.criterion, p, log_f)
+        # What pulls the answer is no noise: nothing here tells how far off it is.
+        K_std = found.K_std.copy()
+        K_std[frame.views[:, None], (0, 1), (0, 1)] = np.nan
+        return replace(found, K_std=K_std)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.selfcalibration.conclusion import Answer, conclude, require_cameras
+from thesisrecon.selfcalibration.conclusion import Answer, conclude, guarded, require_cameras
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
 from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
 from thesisrecon.selfcalibration.nonlinear_quadric import dual_image_residuals, minimize_quadric
@@ -50,6 +50,7 @@ class Stratified:
             return self
         return replace(self, plane=self.plane.with_photographs(photographs))
 
+    @guarded
     def calibrate(
         self,
         reconstruction: Reconstruction,
@@ -110,7 +111,7 @@ def refined_answer(frame: ReferenceFrame, unknown: UnknownIntrinsics, answer: An
     """The nearest minimum of the nonlinear criterion over plane and intrinsics."""
     log_f = 0.5 * np.log(answer.K[:, 0, 0] * answer.K[:, 1, 1])
     least = minimize_quadric(frame, unknown, answer.plane, log_f)
-    return Answer(least.plane, least.K, least.cost, f"{answer.method}, refined")
+    return Answer(least.plane, least.K, least.cost, f"{answer.method}, refined", least.K_std)
 
 
 def projective_scene(reconstruction: Reconstruction, assumed: Assumptions) -> ProjectiveScene:
