@@ -184,9 +184,10 @@ def _shading(
     if light == "none" and not plain:
         return lambda _: None
     if light == "sun":
-        # From above, from the left and a little from where the first photograph was taken.
-        towards = upward(cameras) - 0.5 * cameras[0].R[0] - 0.5 * cameras[0].R[2]
-        sun = Shading(ambient=0.45, lights=(Light(direction=_triple(towards), color=(0.75,) * 3),))
+        # From above, the left and where the first photograph was taken: walls and ground keep their
+        # brightness.
+        towards = upward(cameras) - 0.5 * cameras[0].R[0] - cameras[0].R[2]
+        sun = Shading(ambient=0.4, lights=(Light(direction=_triple(towards), color=(0.9,) * 3),))
         return lambda _: sun
     return lambda camera: Shading(
         ambient=0.3, lights=(Light(position=_triple(camera.centre), color=(0.8,) * 3),)
