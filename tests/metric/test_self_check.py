@@ -115,6 +115,15 @@ def test_a_focal_that_the_photographs_contradict_is_told(off: float, deviation: 
     assert all("contradict the focal length" in doubt for doubt in doubts)
 
 
+def test_a_known_focal_that_is_contradicted_is_told_once_and_no_weight_is_advised() -> None:
+    _, assumed, model = setting(focal="known", focal_px=1600.0)
+    doubts = contradicted_focals(model, Adjustment(assumed, 0.0, 0.02))
+    assert len(doubts) == 1
+    assert "shorter" in doubts[0]
+    assert "px" not in doubts[0]
+    assert "focal_std_rel" not in doubts[0]
+
+
 def test_nothing_said_is_nothing_contradicted() -> None:
     _, assumed, model = setting()
     assert contradicted_focals(model, Adjustment(assumed, 0.0, 0.02)) == []

@@ -9,7 +9,7 @@ stands for it (:mod:`thesisrecon.metric.model_error`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.stats import t as student_t
@@ -19,8 +19,9 @@ from thesisrecon.metric.model_error import LEAST_BLOCKS, USUAL_INFLATION, model_
 from thesisrecon.metric.population import Borrowing
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.optimize.metric_bundle import IntrinsicsPrior
-from thesisrecon.types import IntrinsicInterval
+from thesisrecon.types import F64, IntrinsicInterval
 
+UNCHECKED = "the photographs cannot tell whether they share one focal: as of zooms that differ a little"
 NORMAL_95 = 1.959964
 _COLUMNS = {"focal_px": FOCAL, "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1], "k1": K1}
 
@@ -58,6 +59,20 @@ def intrinsic_intervals(
             how = _source(borrowed, view, column, inflation)
             intervals[name] = IntrinsicInterval(value, float(std), how)
         answer.append(intervals)
+    return tuple(answer)
+
+
+def with_open_sharing(
+    intervals: Sequence[Mapping[str, IntrinsicInterval]], focal_std: F64
+) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+    """The intervals, those of focals widened to ``focal_std`` (V,) relative, where it is not NaN: of
+    photographs that cannot tell whether their focal is one."""
+    answer: list[Mapping[str, IntrinsicInterval]] = []
+    for of_view, rel in zip(intervals, focal_std, strict=True):
+        if of_view and np.isfinite(rel) and rel * of_view["focal_px"].value > of_view["focal_px"].std:
+            focal = of_view["focal_px"]
+            of_view = {**of_view, "focal_px": IntrinsicInterval(focal.value, rel * focal.value, UNCHECKED)}
+        answer.append(of_view)
     return tuple(answer)
 
 

@@ -9,20 +9,20 @@ import numpy as np
 from thesisrecon.metric.adjustment import Adjustment
 from thesisrecon.metric.model import FOCAL, MetricModel
 from thesisrecon.metric.model_error import USUAL_INFLATION
+from thesisrecon.metric.own_fit import ROUNDS, part_of_explained
 from thesisrecon.optimize.metric_bundle import (
     IntrinsicsPrior,
     Observations,
     refine_metric_bundle,
 )
-from thesisrecon.types import F64
+from thesisrecon.types import F64, I64
 
 MAX_SIGMAS = 3.0
 LEAST_DIFFERENCE = 0.01
 """A prior wrong by less than a hundredth does no harm that a person would mend."""
 FLOOR = 2e-3
 """Of the relative standard deviation of a focal that was left open."""
-MOST_OBSERVATIONS = 15000
-ROUNDS = 12
+WIDEN = "leave it out, or give it a larger focal_std_rel"
 
 
 def contradicted_focals(model: MetricModel, adjustment: Adjustment) -> list[str]:
@@ -35,35 +35,48 @@ def contradicted_focals(model: MetricModel, adjustment: Adjustment) -> list[str]
     said = np.flatnonzero(assumed.focal_known & model.registered)
     if len(said) == 0:
         return []
-    focal, std = _free_focals(model, adjustment)
+    number = _numbers_when_free(model, adjustment)
+    focal, std = _free_focals(model, adjustment, number)
+    number = number[model.cameras.group]
     doubts = []
-    for number in np.unique(assumed.shared[said, 0]):
-        view = int(said[assumed.shared[said, 0] == number][0])
+    for k in np.unique(number[said]):
+        view = int(said[number[said] == k][0])
         mean, deviation = float(assumed.mean[view, 0]), float(assumed.std[view, 0])
         off = float(np.log(focal[view] / mean))
         if abs(off) > LEAST_DIFFERENCE and abs(off) > MAX_SIGMAS * float(np.hypot(std[view], deviation)):
-            whose = "" if len(np.unique(assumed.shared[said, 0])) == 1 else f" of view {view}"
+            whose = "" if len(np.unique(number[said])) == 1 else f" of view {view}"
             doubts.append(
-                f"the photographs contradict the focal length{whose} that was given: they ask for "
-                f"{focal[view]:.0f} px (within {std[view]:.1%}) where {mean:.0f} px was given; leave it out, "
-                "or give it a larger focal_std_rel"
+                f"the photographs contradict the focal length{whose} that was given: they ask for one "
+                f"{abs(np.expm1(off)):.1%} {'longer' if off > 0 else 'shorter'} (within {std[view]:.1%}, one "
+                f"standard deviation); {'leave it out' if deviation == 0.0 else WIDEN}"
             )
     return doubts
 
 
-def _free_focals(model: MetricModel, adjustment: Adjustment) -> tuple[F64, F64]:
-    """Focals (V,) and relative deviations (V,) when nothing is known of them."""
+def _numbers_when_free(model: MetricModel, adjustment: Adjustment) -> I64:
+    """(G,) numbers of the focals when nothing is known of them: known ones, which are not tied, are one where
+    one value was given for them."""
+    assert model.cameras.shared is not None
+    prior, number = adjustment.prior(model), model.cameras.shared[:, FOCAL].copy()
+    known = np.flatnonzero(prior.std[:, FOCAL] == 0.0)
+    number[known] = number.max() + 1 + np.unique(prior.mean[known, FOCAL], return_inverse=True)[1].reshape(-1)
+    return np.asarray(number)
+
+
+def _free_focals(model: MetricModel, adjustment: Adjustment, number: I64) -> tuple[F64, F64]:
+    """Focals (V,) and relative deviations (V,) when nothing is known of them; rows of one ``number`` share
+    theirs."""
     t, cameras = model.tracks, model.cameras
-    index = np.flatnonzero(model.ok)
-    points = np.unique(t.point_index[index])
-    chosen = np.zeros(t.n_points, dtype=bool)
-    chosen[points[:: int(np.ceil(len(index) / MOST_OBSERVATIONS))]] = True
-    index = index[chosen[t.point_index[index]]]
+    index = part_of_explained(model)
+    assert cameras.shared is not None
+    shared = cameras.shared.copy()
+    shared[:, FOCAL] = number
     prior = adjustment.prior(model)
     std, free = prior.std.copy(), adjustment.free(model)
     std[:, FOCAL], free[FOCAL] = np.inf, True
     result = refine_metric_bundle(
-        cameras, model.X, Observations(t.view_index[index], t.point_index[index], t.xy[index]), free=free,
+        replace(cameras, shared=shared), model.X,
+        Observations(t.view_index[index], t.point_index[index], t.xy[index]), free=free,
         prior=IntrinsicsPrior(prior.mean, std),
         options=replace(
             adjustment.options(model, iterations=ROUNDS), covariance=True, noise_floor_px=model.sigma_px

@@ -132,15 +132,15 @@ def _doubts_of_views(views: ViewChecks, model: MetricModel) -> list[str]:
     if len(wrong := take(views.behind > MAX_BEHIND)):
         doubts.append(f"{_named(wrong)}: {_range(views.behind[wrong])} of the points lie behind the camera")
     for view in take((np.abs(views.focal_off) > MAX_OWN_FOCAL) & (own > MAX_OWN_SIGMAS)):
-        focal = float(model.cameras.intrinsics[model.cameras.group[view], 0])
+        off = float(np.expm1(views.focal_off[view]))
         doubts.append(
-            f"view {view} alone asks for a focal length of {focal * np.exp(views.focal_off[view]):.0f} px, "
-            f"not {focal:.0f} px: it is of another camera or zoomed, or the model is bent"
+            f"view {view} alone asks for a focal length {abs(off):.1%} "
+            f"{'longer' if off > 0.0 else 'shorter'} than the model's: it is of another camera or zoomed, "
+            "or the model is bent"
         )
     if len(wrong := take(ratio > MAX_NOISE_RATIO)):
         doubts.append(
-            f"{_named(wrong)}: explained with {ratio[wrong].max():.1f} times the noise of the others "
-            f"({views.noise_px[wrong].max():.2f} px)"
+            f"{_named(wrong)}: explained with {ratio[wrong].max():.1f} times the noise of the others"
         )
     return doubts
 

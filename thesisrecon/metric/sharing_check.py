@@ -1,142 +1,177 @@
-"""Whether the photographs contradict that they share a camera: zooms that differ by a few percent, and crops,
-bend a model quietly, since each photograph fits points that were bent with it.
+"""Whether the photographs contradict that they share a camera, and whether they can tell at all: zooms that
+differ by a few percent, and crops, bend a model quietly, since each photograph fits points that were bent
+with it.
 
-The word is hence tested as a hypothesis: the model is adjusted once more with a focal length, and once with a
-focal length and a principal point, for every photograph of its own; whether these agree is a sum of squares
-in units of their deviations, chi-square with V - 1 degrees of freedom where they do.
+The word is hence tested as a hypothesis: the model is adjusted once more as it is, with a focal length, and
+with a principal point of its own for every photograph that shares one, column by column. Twice the cost that
+the freedom saves is chi-square where the word is true (a likelihood ratio, which holds in the long valleys
+where a bent model lies and single values and their deviations mean little). Where own focal lengths stay open
+the photographs cannot tell, and the shared one is as uncertain as that of cameras that were zoomed a little.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
 
 from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.model import MetricModel
-from thesisrecon.optimize.metric_bundle import (
-    IntrinsicsPrior,
-    MetricBundleResult,
-    MetricCameras,
-    Observations,
-    refine_metric_bundle,
-)
-from thesisrecon.optimize.metric_cameras import FOCAL
-from thesisrecon.types import B8, F64, I64
+from thesisrecon.metric.model import CENTRE, FOCAL, MetricModel
+from thesisrecon.metric.model_error import USUAL_INFLATION
+from thesisrecon.metric.own_fit import OwnFit
+from thesisrecon.optimize.metric_bundle import MetricBundleResult
+from thesisrecon.types import F64, I64
 
-CENTRE = (3, 4)
 ALARM = 1e-3
 """Chance of a false alarm where the deviations are right."""
-INFLATION, FLOOR = 4.0, 2e-3
-"""Covariances are this many times too small on photographs, and never below the floor."""
-LEAST_APART = {"focal": 0.01, "centre": 0.03}
+FLOOR = 2e-3
+"""Of the deviation of an own focal, relative, or principal point, long sides."""
+LEAST_APART = {"focal": 0.01, "centre": 0.015}
 """Relative and in long sides: what differs by less does no harm that a person would mend."""
-CENTRE_STD = 0.1
-"""Long sides; a photograph may be cut out of a larger one anywhere."""
-MOST_OBSERVATIONS = 15000
-ROUNDS = 12
+OPEN = 0.03
+"""Own focals that are open by more (relative, one deviation) cannot tell whether they are one."""
+ZOOM_STD = 0.03
+"""Relative scatter of the focals of photographs that somebody took for those of one zoom, where they cannot
+tell."""
 
 
-def contradicted_sharing(model: MetricModel, adjustment: Adjustment) -> list[str]:
-    """A sentence for every camera that is said to have taken several photographs whose own focal lengths or
-    principal points do not agree. Empty where nothing is shared, or three views are too few to tell."""
+@dataclass(frozen=True)
+class SharingCheck:
+    """``doubts``: a sentence for every set of photographs that contradict what they are said to share.
+    ``warnings``: one for every set that cannot tell, whose views have in ``focal_std`` (V,) the relative
+    standard deviation of a focal length that may differ between them; NaN elsewhere."""
+
+    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
+    focal_std: F64
+
+
+@dataclass(frozen=True)
+class _Set:
+    """``places`` among the registered views of those that share a value, or of which one is ``known``."""
+
+    places: I64
+    known: bool = False
+
+    @property
+    def freedoms(self) -> int:
+        return len(self.places) - (0 if self.known else 1)
+
+
+def check_sharing(model: MetricModel, adjustment: Adjustment) -> SharingCheck:
+    """Hold shared focals, and shared or known principal points, against the photographs.
+
+    Sets of less than three views are not looked at. Empty where nothing is shared.
+    """
     views = np.flatnonzero(model.registered)
+    focal_std = np.full(len(model.registered), np.nan)
+    focals, centres = _sets(model, adjustment, views, FOCAL), _sets(model, adjustment, views, CENTRE[0])
+    if not focals and not centres:
+        return SharingCheck((), (), focal_std)
+    fit = OwnFit(model, adjustment, views)
+    freed: tuple[int, ...] = (FOCAL,) if focals else ()
+    before, doubts, warnings = fit.adjusted(()), list[str](), list[str]()
+    if focals:
+        alone = fit.adjusted(freed)
+        apart = [s for s in _contradicted(before, alone, focals, 1) if _focals_apart(alone, s)]
+        doubts += [_focals_differ(views, alone, s) for s in apart]
+        for s in [s for s in focals if s not in apart and _focal_std(alone, s).max() > OPEN]:
+            focal_std[views[s.places]] = _std_of_a_kind(model, fit, s)
+            warnings.append(_cannot_tell(float(_focal_std(alone, s).max())))
+        before = alone
+        bent = [set(s.places.tolist()) for s in apart]
+        centres = [s for s in centres if not any(b & set(s.places.tolist()) for b in bent)]
+    if centres:
+        both = fit.adjusted((*freed, *CENTRE))
+        for s in _contradicted(before, both, centres, 2):
+            off = _centres_off(model, adjustment, views, both, s)
+            if np.abs(off).max() > LEAST_APART["centre"]:
+                doubts.append(_centres_differ(s, off))
+    return SharingCheck(tuple(doubts), tuple(warnings), focal_std)
+
+
+def _sets(model: MetricModel, adjustment: Adjustment, views: I64, column: int) -> list[_Set]:
+    """Views that share a column; those whose principal point is known."""
     assert model.cameras.shared is not None
-    number = model.cameras.shared[model.cameras.group[views]]
-    sets = [np.flatnonzero(number[:, FOCAL] == k) for k in np.unique(number[:, FOCAL])]
-    sets = [places for places in sets if len(places) >= 3]
-    if not sets:
-        return []
-    doubts = []
-    alone = _with_own(model, adjustment, views, (FOCAL,))
-    both = None
-    for places in sets:
-        focal = alone.cameras.intrinsics[places, FOCAL]
-        std = _deviation(alone, places, FOCAL, focal)
-        if _apart(np.log(focal), std, LEAST_APART["focal"]):
-            doubts.append(_focals_differ(views[places], focal, std))
-            continue
-        both = both or _with_own(model, adjustment, views, (FOCAL, *CENTRE))
-        longest = model.sizes[views[places]].max(axis=1).astype(np.float64)
-        shared = [c for c in CENTRE if len(np.unique(number[places, c])) == 1]
-        at = [both.cameras.intrinsics[places, c] / longest for c in shared]
-        if any(
-            _apart(x, _deviation(both, places, c, longest), LEAST_APART["centre"])
-            for x, c in zip(at, shared, strict=True)
-        ):
-            doubts.append(_centres_differ(views[places], max(float(np.ptp(x)) for x in at)))
-    return doubts
+    rows = model.cameras.group[views]
+    held = adjustment.prior(model).std[rows, column] == 0.0
+    number = model.cameras.shared[rows, column]
+    sets = [_Set(np.flatnonzero((number == k) & ~held)) for k in np.unique(number)]
+    if column != FOCAL:
+        sets.append(_Set(np.flatnonzero(held), known=True))
+    return [s for s in sets if len(s.places) >= 3]
 
 
-def _with_own(
-    model: MetricModel, adjustment: Adjustment, views: I64, columns: tuple[int, ...]
-) -> MetricBundleResult:
-    """The model adjusted with a value of its own in ``columns`` for every one of the ``views``, of which
-    nothing is known; rows of the answer are in their order."""
-    t, cameras = model.tracks, model.cameras
-    assert cameras.shared is not None
-    index = _some(model)
-    rows = cameras.group[views]
-    shared = cameras.shared[rows].copy()
-    prior, free = adjustment.prior(model), adjustment.free(model)
-    std = prior.std[rows].copy()
-    for column in columns:
-        shared[:, column] = np.arange(len(views))
-        longest = model.sizes[views].max(axis=1)
-        std[:, column] = np.inf if column == FOCAL else CENTRE_STD * longest
-        free[column] = True
-    own = np.arange(len(views), dtype=np.int64)
-    return refine_metric_bundle(
-        MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared), model.X,
-        Observations(np.searchsorted(views, t.view_index[index]), t.point_index[index], t.xy[index]),
-        free=free, prior=IntrinsicsPrior(prior.mean[rows], std),
-        options=replace(
-            adjustment.options(model, iterations=ROUNDS), covariance=True, noise_floor_px=model.sigma_px
-        ),
-    )  # fmt: skip
+def _contradicted(
+    before: MetricBundleResult, after: MetricBundleResult, sets: list[_Set], values: int
+) -> list[_Set]:
+    """All sets where values of their own explain more than chance lets expect, else none."""
+    saved = 2.0 * (before.cost - after.cost) / USUAL_INFLATION**2
+    return sets if saved > chi2.isf(ALARM, values * sum(s.freedoms for s in sets)) else []
 
 
-def _some(model: MetricModel) -> I64:
-    """Explained observations, those of every n-th point where they are many."""
-    index = np.flatnonzero(model.ok)
-    point = model.tracks.point_index[index]
-    chosen = np.zeros(model.tracks.n_points, dtype=bool)
-    chosen[np.unique(point)[:: int(np.ceil(len(index) / MOST_OBSERVATIONS))]] = True
-    return np.asarray(index[chosen[point]], dtype=np.int64)
-
-
-def _deviation(result: MetricBundleResult, places: I64, column: int, unit: F64) -> F64:
-    """Standard deviations as photographs need them, in ``unit``; infinite where nothing is told."""
-    variance = result.intrinsics_covariance[places, column, column]
-    std = np.hypot(INFLATION * np.sqrt(np.maximum(variance, 0.0)) / unit, FLOOR)
+def _focal_std(alone: MetricBundleResult, s: _Set) -> F64:
+    """Relative deviations of own focals as photographs need them; infinite where nothing is told."""
+    variance = alone.intrinsics_covariance[s.places, FOCAL, FOCAL]
+    focal = alone.cameras.intrinsics[s.places, FOCAL]
+    std = np.hypot(USUAL_INFLATION * np.sqrt(np.maximum(variance, 0.0)) / focal, FLOOR)
     return np.where(np.isfinite(std) & (variance > 0.0), std, np.inf)
 
 
-def _apart(value: F64, std: F64, least: float) -> bool:
-    """Whether values do not agree, and by more than ``least``."""
-    told: B8 = np.isfinite(std) & np.isfinite(value)
-    if told.sum() < 3:
-        return False
-    value, weight = value[told], std[told] ** -2.0
-    off = value - (weight @ value) / weight.sum()
-    squares = float(weight @ off**2)
-    return bool(np.abs(off).max() > least and squares > chi2.isf(ALARM, len(off) - 1))
+def _focals_apart(alone: MetricBundleResult, s: _Set) -> bool:
+    log = np.log(alone.cameras.intrinsics[s.places, FOCAL])
+    return bool(np.abs(log - np.median(log)).max() > LEAST_APART["focal"])
 
 
-def _focals_differ(views: I64, focal: F64, std: F64) -> str:
+def _std_of_a_kind(model: MetricModel, fit: OwnFit, s: _Set) -> float:
+    """Relative deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
+    # The scatter is not inflated as the deviations are.
+    alike = fit.adjusted((FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
+    rows = model.cameras.group[fit.views[s.places]]
+    off = np.log(alike.cameras.intrinsics[s.places, FOCAL] / model.cameras.intrinsics[rows, FOCAL])
+    return float(np.hypot(_focal_std(alike, s), off).max())
+
+
+def _centres_off(
+    model: MetricModel, adjustment: Adjustment, views: I64, both: MetricBundleResult, s: _Set
+) -> F64:
+    """(n, 2) long sides: own principal points from the known one, or from the median of the set."""
+    rows = model.cameras.group[views[s.places]]
+    off = (both.cameras.intrinsics[s.places] - adjustment.prior(model).mean[rows])[:, CENTRE]
+    off /= model.sizes[views[s.places]].max(axis=1, keepdims=True)
+    return np.asarray(off if s.known else off - np.median(off, axis=0))
+
+
+def _focals_differ(views: I64, alone: MetricBundleResult, s: _Set) -> str:
+    focal, std = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s)
     low, high = int(focal.argmin()), int(focal.argmax())
     return (
-        f"the photographs contradict that they have one focal length: view {views[low]} asks for "
-        f"{focal[low]:.0f} px (within {std[low]:.1%}), view {views[high]} for {focal[high]:.0f} px (within "
-        f"{std[high]:.1%}); let every photograph have its own (cameras = per-image), or leave out those that "
-        "were zoomed"
+        f"the photographs contradict that they have one focal length: view {views[s.places[high]]} asks for "
+        f"one {focal[high] / focal[low] - 1.0:.1%} longer than view {views[s.places[low]]} (each within "
+        f"{max(std[low], std[high]):.1%}, one standard deviation); let every photograph have its own "
+        "(cameras = per-image), or leave out those that were zoomed"
     )
 
 
-def _centres_differ(views: I64, apart: float) -> str:
+def _centres_differ(s: _Set, off: F64) -> str:
+    if s.known:
+        return (
+            "the photographs contradict the principal point that was given: those of "
+            f"{len(s.places)} views lie up to {np.abs(off).max():.1%} of the long side off; leave it out, or "
+            "where they were cropped one by one let every photograph have its own (cameras = per-image)"
+        )
     return (
-        f"the photographs contradict that they have one principal point: those of {len(views)} views lie up "
-        f"to {apart:.0%} of the long side apart, as of photographs cropped one by one; let every photograph "
-        "have its own (cameras = per-image)"
+        f"the photographs contradict that they have one principal point: those of {len(s.places)} views lie "
+        f"up to {np.ptp(off, axis=0).max():.1%} of the long side apart, as of photographs cropped one by "
+        "one; let every photograph have its own (cameras = per-image)"
+    )
+
+
+def _cannot_tell(std: float) -> str:
+    alone = f"open by {std:.0%} (one standard deviation)" if np.isfinite(std) and std < 1.0 else "wide open"
+    return (
+        f"that they share one focal length cannot be checked from these photographs: alone each leaves its "
+        f"own {alone}; the interval allows for zooms that differ by {ZOOM_STD:.0%}; more photographs, from "
+        "more directions, would tell"
     )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from thesisrecon.errors import StageFailure
 from thesisrecon.metric.adjustment import FOCAL_AND_CENTRE, Adjustment, with_wide_gate
 from thesisrecon.metric.completion import Completion
-from thesisrecon.metric.intervals import intrinsic_intervals
+from thesisrecon.metric.intervals import intrinsic_intervals, with_open_sharing
 from thesisrecon.metric.model import (
     K1,
     MetricModel,
@@ -29,7 +29,7 @@ from thesisrecon.metric.model import (
 from thesisrecon.metric.population import OwnValues, bind, borrowing, estimate_population, own_values
 from thesisrecon.metric.prior_check import contradicted_focals
 from thesisrecon.metric.self_check import self_check
-from thesisrecon.metric.sharing_check import contradicted_sharing
+from thesisrecon.metric.sharing_check import check_sharing
 from thesisrecon.metric.start import upgraded_model
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.robust.noise import noise_from_distances
@@ -96,6 +96,8 @@ class UpgradeAndBundle:
             for v in range(len(model.registered))
         ]
         model, adjustment, own, scatter = self._finish(model, adjustment)
+        model = mark(model, sigmas=self.outlier_sigmas[1], min_angle=np.radians(self.min_angle_deg))
+        sharing = check_sharing(model, adjustment)
         borrowed = borrowing(own, adjustment.population, model.cameras.group)
         intervals = intrinsic_intervals(
             model,
@@ -104,12 +106,12 @@ class UpgradeAndBundle:
             floor_rel=self.model_floor_rel,
             borrowed=borrowed,
         )
-        model = mark(model, sigmas=self.outlier_sigmas[1], min_angle=np.radians(self.min_angle_deg))
+        intervals = with_open_sharing(intervals, sharing.focal_std)
         check, doubts = self_check(model, calibration, intervals, sigmas=self.outlier_sigmas[1])
-        doubts += contradicted_focals(model, adjustment)
-        doubts += contradicted_sharing(model, adjustment)
+        doubts += [*contradicted_focals(model, adjustment), *sharing.doubts]
         final = _as_reconstruction(model, reasons)
         said = borrowed.warnings(np.flatnonzero(model.registered).tolist(), self.undetermined_rel / 1.96)
+        said += sharing.warnings
         return MetricResult(final, intervals, check, not doubts, tuple(doubts), said)
 
     def _start(

@@ -24,7 +24,7 @@ from thesisrecon.metric.adjustment import Adjustment
 from thesisrecon.metric.model import MetricModel, retriangulate
 from thesisrecon.metric.prior_check import contradicted_focals
 from thesisrecon.metric.self_check import self_check
-from thesisrecon.metric.sharing_check import contradicted_sharing
+from thesisrecon.metric.sharing_check import check_sharing
 from thesisrecon.types import Assumptions, IntrinsicInterval, RunResult, SelfCalibration
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import load_fixture_scene, load_real_scene
@@ -82,7 +82,7 @@ def is_doubted(model: MetricModel, calibration: SelfCalibration, adjustment: Adj
         for g in model.cameras.group
     ]
     doubts = self_check(model, calibration, said, sigmas=LATE)[1]
-    return bool(doubts or contradicted_focals(model, adjustment) or contradicted_sharing(model, adjustment))
+    return bool(doubts or contradicted_focals(model, adjustment) or check_sharing(model, adjustment).doubts)
 
 
 def judge(
