@@ -230,6 +230,22 @@ def test_the_focal_length_is_given_as_the_readme_says(
     assert (asked[0].focal_px, asked[0].focal_std_rel) == (1200.0, 0.05)
 
 
+def test_every_camera_has_a_line_with_what_was_estimated_of_it() -> None:
+    def view(camera: int, focal: float, **more: float) -> dict[str, Any]:
+        values = {"focal_px": focal, "principal_x_px": 5.0, "principal_y_px": 4.0, **more}
+        return {"camera": camera} | {
+            name: {"value": value, "std": 0.0 if value == 1.0 else 0.5, "source": "x"}
+            for name, value in values.items()
+        }
+
+    square, other = view(0, 900.0, aspect=1.0), view(1, 800.0, aspect=1.2, skew_px=2.0)
+    lines = cli._intrinsic_lines([square, square, other, {"camera": 0, "registered": False}])
+    assert len(lines) == 2
+    assert lines[0].startswith("camera 0: focal 900.0 +- 0.5 px")
+    assert "aspect" not in lines[0]
+    assert lines[1].endswith("aspect 1.20000 +- 0.50000, skew 2.00 +- 0.50 px")
+
+
 def test_ctrl_c_says_how_to_go_on(
     photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -379,7 +379,8 @@ def _found(summary: Mapping[str, Any]) -> str:
 
 
 def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
-    """One line per camera: focal length and principal point with their standard deviations."""
+    """One line per camera: focal length, principal point and what else of K was estimated, with their standard
+    deviations."""
     lines: dict[tuple[int, float], str] = {}
     for view in views:
         if "focal_px" not in view:
@@ -389,9 +390,20 @@ def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
             (view["camera"], focal["value"]),
             f"camera {view['camera']}: "
             f"focal {focal['value']:.1f} +- {focal['std']:.1f} px ({focal['source']}), "
-            f"principal point ({x['value']:.1f} +- {x['std']:.1f}, {y['value']:.1f} +- {y['std']:.1f}) px",
+            f"principal point ({x['value']:.1f} +- {x['std']:.1f}, {y['value']:.1f} +- {y['std']:.1f}) px"
+            + _shape_of_pixels(view),
         )
     return list(lines.values())
+
+
+def _shape_of_pixels(view: Mapping[str, Any]) -> str:
+    """Aspect and skew, where they were estimated."""
+    words = ""
+    for name, text, digits, unit in (("aspect", "aspect", 5, ""), ("skew_px", "skew", 2, " px")):
+        interval = view.get(name)
+        if interval is not None and interval["std"] != 0.0:
+            words += f", {text} {interval['value']:.{digits}f} +- {interval['std']:.{digits}f}{unit}"
+    return words
 
 
 def run_command(arguments: list[str]) -> int:

@@ -289,9 +289,7 @@ class SelfCalibration:
 
 @dataclass(frozen=True)
 class IntrinsicInterval:
-    """One intrinsic of one view: value and standard deviation (px, or pure number for k1) and where it is
-    from.
-    """
+    """One intrinsic of one view: value and standard deviation (px, or a pure number) and where it is from."""
 
     value: float
     std: float
@@ -303,10 +301,11 @@ class MetricResult:
     """The end of the metric stage: the reconstruction, the intrinsics of each view with intervals, the
     self-check.
 
-    ``intrinsics[i]`` maps "focal_px", "principal_x_px", "principal_y_px", "k1" to an interval (empty where
-    view i is not registered); ``self_check`` holds measured numbers; ``trusted`` False with ``doubts`` where
-    it failed; ``warnings`` what should be known of a result that is trusted all the same (a focal that is
-    borrowed, a prior that the photographs contradict).
+    ``intrinsics[i]`` maps "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px",
+    "k1", "k2" and "k3" to an interval (empty where view i is not registered; std 0: as assumed).
+    ``self_check`` holds measured numbers; ``trusted`` False with ``doubts`` where it failed; ``warnings``
+    what should be known of a result that is trusted all the same (a focal that is borrowed, a prior that the
+    photographs contradict).
     """
 
     reconstruction: Reconstruction

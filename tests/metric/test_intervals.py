@@ -9,7 +9,7 @@ import pytest
 
 from tests.metric.test_population import true_calibration
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
-from thesisrecon.assumptions import assume
+from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.metric import UpgradeAndBundle
 from thesisrecon.metric.adjustment import tail_width
 from thesisrecon.metric.model_error import model_error_share
@@ -73,3 +73,21 @@ def test_the_tail_of_normal_noise_is_one() -> None:
     lengths = np.linalg.norm(np.random.default_rng(0).normal(size=(4000, 2)), axis=1)
     assert tail_width(lengths, 1.0) == pytest.approx(1.0, abs=0.05)
     assert tail_width(10.0 * lengths, 1.0) == 3.0
+
+
+def test_what_else_is_estimated_has_an_interval_that_holds_it() -> None:
+    """Aspect, skew and the whole lens; what is assumed is told as assumed."""
+    scene = make_scene(sigma_px=0.5, points=300, seed=2)
+    start = projective_reconstruction(scene)
+    wish = IntrinsicsAssumption(aspect="constant", skew="constant", skew_std_px=50.0)
+    found = UpgradeAndBundle().refine(
+        start, true_calibration(scene), assumed=assume(start, wish), rng=np.random.default_rng(0)
+    )
+    for name, truth in (("aspect", 1.0), ("skew_px", 0.0), ("k2", 0.0), ("k3", 0.0)):
+        interval = found.intrinsics[0][name]
+        assert interval.std > 0.0
+        assert abs(interval.value - truth) < 5.0 * interval.std
+    assert found.intrinsics[0]["aspect"].std < 0.01
+    assert 0.01 < found.intrinsics[0]["skew_px"].std < 50.0
+    usual = refine(scene).intrinsics[0]
+    assert [(usual[n].value, usual[n].std) for n in ("aspect", "skew_px")] == [(1.0, 0.0), (0.0, 0.0)]

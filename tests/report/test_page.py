@@ -18,7 +18,7 @@ from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.report import Photograph, ReportData, write_report
 from thesisrecon.report.page import render_report
-from thesisrecon.types import TexturedMesh
+from thesisrecon.types import IntrinsicInterval, TexturedMesh
 
 EVIL = [
     "<img src=x onerror=alert(1)>.jpg",
@@ -273,3 +273,25 @@ def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page() -> Non
     assert 149_000 < len(faces) <= 151_000
     grown = len(render_report(dataclasses.replace(data, model=large)))
     assert grown - len(render_report(dataclasses.replace(data, model=None))) < 8_000_000
+
+
+def test_the_table_of_cameras_has_a_column_for_whatever_was_estimated() -> None:
+    data = made_up_run()
+    assert data.metric is not None
+    square = {
+        "aspect": IntrinsicInterval(1.0, 0.0, "assumed"),
+        "skew_px": IntrinsicInterval(0.0, 0.0, "assumed"),
+    }
+    own = {"aspect": IntrinsicInterval(1.0023, 0.0004, "b"), "skew_px": IntrinsicInterval(0.5, 0.1, "b")}
+
+    def told(more: dict[str, IntrinsicInterval]) -> str:
+        views = tuple({**view, **more} if view else {} for view in data.metric.intrinsics)  # type: ignore[union-attr]
+        metric = dataclasses.replace(data.metric, intrinsics=views)  # type: ignore[type-var]
+        return render_report(dataclasses.replace(data, metric=metric))
+
+    assert "Aspect (fy/fx)" not in told(square)
+    page = told(own)
+    assert page.index("Aspect (fy/fx)") < page.index("Skew (px)") < page.index("Principal x (px)")
+    assert "1.0023 ± 0.0004" in page
+    # At a quarter of the size: four times as much in the photograph.
+    assert "2.0 ± 0.4" in page

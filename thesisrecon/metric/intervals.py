@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.stats import t as student_t
 
-from thesisrecon.metric.model import CENTRE, FOCAL, K1, MetricModel
+from thesisrecon.metric.model import ASPECT, CENTRE, FOCAL, K1, SKEW, MetricModel
 from thesisrecon.metric.model_error import LEAST_BLOCKS, USUAL_INFLATION, model_error_floor
 from thesisrecon.metric.population import Borrowing
 from thesisrecon.optimize.bundle_blocks import BlockScatter
@@ -23,7 +23,11 @@ from thesisrecon.types import F64, IntrinsicInterval
 
 UNCHECKED = "the photographs cannot tell whether they share one focal: as of zooms that differ a little"
 NORMAL_95 = 1.959964
-_COLUMNS = {"focal_px": FOCAL, "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1], "k1": K1}
+_COLUMNS = {
+    "focal_px": FOCAL, "aspect": ASPECT, "skew_px": SKEW,
+    "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1],
+    "k1": K1, "k2": K1 + 1, "k3": K1 + 2,
+}  # fmt: skip
 
 
 def intrinsic_intervals(

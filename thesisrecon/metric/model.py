@@ -17,7 +17,7 @@ from thesisrecon.types import B8, I64, Tracks
 F64 = NDArray[np.float64]
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1 and the two radial coefficients that nothing
 # is assumed of in words.
-FOCAL, CENTRE, K1, WIDTH = 0, (3, 4), 5, 8
+FOCAL, ASPECT, SKEW, CENTRE, K1, WIDTH = 0, 1, 2, (3, 4), 5, 8
 
 
 @dataclass(frozen=True)

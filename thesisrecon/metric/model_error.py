@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.metric.model import CENTRE, MetricModel
+from thesisrecon.metric.model import CENTRE, SKEW, MetricModel
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 
 F64 = NDArray[np.float64]
@@ -44,5 +44,5 @@ def model_error_floor(model: MetricModel, scatter: BlockScatter, floor_rel: floa
     with np.errstate(divide="ignore", invalid="ignore"):
         alone = np.maximum(np.nan_to_num(scatter.model / scatter.tied), 1.0) ** 0.25
     units = np.ones_like(model.cameras.intrinsics)
-    units[:, CENTRE] = model.cameras.intrinsics[:, :1]
+    units[:, (SKEW, *CENTRE)] = model.cameras.intrinsics[:, :1]
     return np.asarray(floor_rel * model_error_share(scatter, model.tail) * alone * units)

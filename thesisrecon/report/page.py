@@ -63,6 +63,18 @@ HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 200.0, 44.0
 MAX_LISTED_PAIRS = 120
 AFFINE_POINTS = 5_000
 
+INTRINSICS = {
+    "focal_px": "Focal (px)",
+    "aspect": "Aspect (fy/fx)",
+    "skew_px": "Skew (px)",
+    "principal_x_px": "Principal x (px)",
+    "principal_y_px": "Principal y (px)",
+    "k1": "k1",
+    "k2": "k2",
+    "k3": "k3",
+}
+ALWAYS_TOLD = ("focal_px", "principal_x_px", "principal_y_px", "k1")
+
 
 @dataclass(frozen=True)
 class Card:
@@ -122,6 +134,7 @@ def render_report(data: ReportData) -> str:
             facts=first_glance(data, overall),
             overall=overall,
             cards=_cards(data, distances, limit_px),
+            intrinsic_columns=_intrinsic_columns(data),
             limit_px=limit_px,
             model=model,
             **_pictures_of_the_model(data),
@@ -233,6 +246,15 @@ def _cards(data: ReportData, distances: list[F64], limit_px: float) -> list[Card
             )
         )
     return cards
+
+
+def _intrinsic_columns(data: ReportData) -> list[tuple[str, str]]:
+    """(name, heading) of the columns of the table of cameras: what is always told, and what else was
+    estimated."""
+    estimated = {
+        name for view in data.original_intrinsics for name, interval in view.items() if interval.std != 0.0
+    }
+    return [(name, text) for name, text in INTRINSICS.items() if name in ALWAYS_TOLD or name in estimated]
 
 
 def _state(data: ReportData, i: int) -> tuple[str, str, str]:
