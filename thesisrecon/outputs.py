@@ -19,12 +19,16 @@ from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views, writ
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.io.pointcloud import write_point_cloud
 from thesisrecon.io.run_directory import RunDirectory, read_json, write_atomically, write_json
+from thesisrecon.model import coarser
+from thesisrecon.model.texture import TextureAtlas
 from thesisrecon.report import Photograph, ReportData, write_report
 from thesisrecon.report.summary import cameras_table, point_colours, summarize
 from thesisrecon.run import Run, Until
-from thesisrecon.types import Image, Reconstruction, RunResult
+from thesisrecon.types import F32, Image, Reconstruction, RunResult, TexturedMesh
 
 THUMBNAIL_PX = 800
+DEPTH_PX = 400
+PAGE_FACES, PAGE_TEXELS = 150_000, 2048 * 2048
 SUMMARY, PAGE = "summary.json", "report.html"
 COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
 MODEL_FILES = (
@@ -184,7 +188,23 @@ def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: Stage
         colours=colours,
         affine=affine_of(result) if result.metric is not None else None,
         failure=failure,
+        model=_model_for_page(run, result),
+        depth_pictures={m.view: _thinned(m.depth) for m in result.depth_maps},
     )
+
+
+def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:
+    """The model in a size that a page can carry."""
+    if result.mesh is None:
+        return None
+    coarse = coarser(result.mesh, PAGE_FACES)
+    return TextureAtlas(max_texels=PAGE_TEXELS).texture(coarse, result.views, threads=run.workers.threads)
+
+
+def _thinned(depth: F32) -> F32:
+    """Every n-th pixel, as many as a picture on the page has."""
+    step = max(1, -(-max(depth.shape) // DEPTH_PX))
+    return depth[::step, ::step]
 
 
 def _thumbnail(image: Image) -> U8:
