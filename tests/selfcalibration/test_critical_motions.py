@@ -22,8 +22,9 @@ from thesisrecon.selfcalibration.critical_motions import (
     thickness,
 )
 from thesisrecon.selfcalibration.frame import assumed_frame
+from thesisrecon.selfcalibration.limits import MOST_NOISE
 from thesisrecon.selfcalibration.verdict import judge_motion, spare_equations, verdict_without_an_answer
-from thesisrecon.types import MotionVerdict, Upgrade
+from thesisrecon.types import MotionVerdict, Reconstruction, Upgrade
 from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
 
 CRITICAL = [motion for motion in Motion if motion is not Motion.GENERAL]
@@ -171,3 +172,51 @@ def test_an_answer_that_explains_nothing_is_not_identifiable() -> None:
     verdict = judge_motion(estimate, Upgrade(G, scene.K, 0.0, "made up"), assumed)
     assert not verdict.identifiable
     assert verdict.sentences
+
+
+def bent_by_zooms() -> tuple[MotionVerdict, MotionVerdict]:
+    """Verdicts on zoomed photographs that are said to have one focal length, and each its own."""
+    scene = make_sequence(Motion.GENERAL, np.random.default_rng(8), zoom=0.15)
+    t = scene.tracks
+    X = np.column_stack([scene.X, np.ones(len(scene.X))])
+    x = np.einsum("kij,kj->ki", scene.P[t.view_index], X[t.point_index])
+    exact = x[:, :2] / x[:, 2:]
+    scene = replace(scene, tracks=replace(t, xy=exact + 0.1 * (t.xy - exact)))
+    # The floor of the stage that makes projective cameras, whatever their residuals are.
+    estimate = replace(projective_estimate(scene, np.random.default_rng(0)), sigma_px=0.3)
+    upgrade = Upgrade(metric_frame(estimate, scene), scene.K, 0.0, "truth")
+    shared, own = (
+        judge_motion(estimate, upgrade, assume(estimate, IntrinsicsAssumption(cameras=how)))
+        for how in ("shared", "per-image")
+    )
+    return shared, own
+
+
+def metric_frame(estimate: Reconstruction, scene: Sequence) -> np.ndarray:
+    """The projective transform that takes the estimate to the true cameras: rows of P T = lambda P_true."""
+    registered = np.flatnonzero(estimate.registered)
+    rows = []
+    for place, v in enumerate(registered):
+        scale = np.zeros((12, len(registered)))
+        scale[:, place] = -scene.P[v].ravel() / np.linalg.norm(scene.P[v])
+        rows.append(np.hstack([np.kron(estimate.P[v] / np.linalg.norm(estimate.P[v]), np.eye(4)), scale]))
+    T = np.linalg.svd(np.vstack(rows))[2][-1][:16].reshape(4, 4)
+    return np.asarray(np.linalg.inv(T))
+
+
+def test_noise_is_compared_with_what_the_projective_cameras_leave_not_with_a_floor() -> None:
+    shared, own = bent_by_zooms()
+    assert shared.evidence["noise_over_projective"] > MOST_NOISE
+    assert not shared.identifiable
+    assert any("zoomed" in sentence for sentence in shared.sentences)
+    assert not any("turn the camera" in sentence or "px" in sentence for sentence in shared.sentences)
+    assert own.evidence["noise_over_projective"] < 1.3
+    assert own.identifiable
+
+
+def test_no_sentence_promises_a_focal_that_the_self_check_may_doubt() -> None:
+    for motion in (Motion.TURNTABLE, Motion.PLANAR, Motion.TRANSLATION):
+        scene = make_sequence(motion, np.random.default_rng(4), by_hand=True)
+        for sentence in verdict_at_the_truth(scene).sentences:
+            assert "all the same" not in sentence
+            assert "focal length is known" not in sentence or "if the cameras are" in sentence

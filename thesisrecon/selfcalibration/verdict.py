@@ -23,6 +23,7 @@ from thesisrecon.optimize.metric_bundle import (
     Observations,
     refine_metric_bundle,
 )
+from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.selfcalibration.critical_motions import (
     UpgradedCameras,
     measure_motion,
@@ -30,21 +31,16 @@ from thesisrecon.selfcalibration.critical_motions import (
     shifts_without_an_answer,
 )
 from thesisrecon.selfcalibration.frame import build_frame
+from thesisrecon.selfcalibration.limits import MAX_FOCAL_STD, MIN_SIGNIFICANCE, MOST_NOISE
 from thesisrecon.selfcalibration.wording import motion_sentences
 from thesisrecon.types import B8, I64, Assumptions, MotionVerdict, Reconstruction, Upgrade
 
 F64 = NDArray[np.float64]
 
-MAX_FOCAL_STD = 0.15
-"""A focal length that is not known to this relative deviation is not known."""
-MIN_SIGNIFICANCE = 4.0
-"""Noise alone turns cameras that did not turn, and what it feigns looks like information: a turn counts where
-it stands out of its own deviation by so much."""
-MOST_NOISE = 3.0
-"""Metric cameras leave this much more noise than the projective ones where they are not what was seen: a
-principal point or distortion that the projective cameras took in costs less."""
 NOISE_FLOOR_PX = 0.05
 """Corners are not found better than this, however well a few of them agree."""
+NOISE_FLOOR_REL = 3e-5
+"""The same in long sides, below which no ratio of noises means anything."""
 MOST_OBSERVATIONS = 12000
 ROUNDS = 12
 NEEDED_EQUATIONS = 8
@@ -104,7 +100,8 @@ def spare_equations(assumed: Assumptions, registered: B8) -> int:
 @dataclass(frozen=True)
 class _Problem:
     """The registered ``views``, each with a row of intrinsics of its own; ``share`` of the observations that
-    is taken; ``longest`` (V,) side in px."""
+    is taken; ``longest`` (V,) side in px; ``projective_px`` the noise that the projective cameras leave in
+    the same observations."""
 
     cameras: MetricCameras
     X: F64
@@ -114,6 +111,7 @@ class _Problem:
     share: float
     longest: F64
     views: I64
+    projective_px: float
 
     def adjust(self, *, rounds: int) -> MetricBundleResult:
         """Focal, aspect and principal point as far as the prior lets them, with their covariance."""
@@ -167,7 +165,22 @@ def _core_problem(reconstruction: Reconstruction, upgrade: Upgrade, assumed: Ass
         Observations(np.searchsorted(views, t.view_index[index]), point.astype(np.int64), t.xy[index]),
         IntrinsicsPrior(mean, std), max(reconstruction.sigma_px, 1e-3), len(index) / max(total, 1),
         reconstruction.sizes[views].max(axis=1).astype(np.float64), views,
+        _projective_noise(reconstruction, index),
     )  # fmt: skip
+
+
+def _projective_noise(reconstruction: Reconstruction, index: I64) -> float:
+    """Noise (px) of one coordinate of the observations ``index`` about the projective cameras and points.
+
+    Measured, and corrected for the 3 N + 11 V - 15 freedoms that fitted it: what the stage that made the
+    cameras worked with is never below a floor, and says little of photographs whose noise is.
+    """
+    t = reconstruction.tracks
+    view, point = t.view_index[index], t.point_index[index]
+    x = np.einsum("kij,kj->ki", reconstruction.P[view], reconstruction.X[point])
+    noise = noise_from_distances(np.linalg.norm(x[:, :2] / x[:, 2:] - t.xy[index], axis=1))
+    left = 2 * len(index) - 3 * len(np.unique(point)) - 11 * len(np.unique(view)) + 15
+    return noise * float(np.sqrt(2.0 * len(index) / max(left, 1)))
 
 
 def _usable_observations(reconstruction: Reconstruction, cameras: MetricCameras, X: F64, usable: B8) -> I64:
@@ -245,7 +258,8 @@ def _verdict(
         / float(np.sqrt(problem.share)),
         "spare_equations": float(spare),
         "noise_px": fit.sigma_px,
-        "noise_over_projective": fit.sigma_px / max(problem.sigma_px, NOISE_FLOOR_PX),
+        "noise_over_projective": fit.sigma_px
+        / max(problem.projective_px, NOISE_FLOOR_REL * float(np.median(problem.longest))),
     }
     undetermined = views[std >= MAX_FOCAL_STD]
     # A prior that fixes the focal does so whatever the cameras did.

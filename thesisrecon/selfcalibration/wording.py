@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from thesisrecon.selfcalibration import critical_motions as critical
+from thesisrecon.selfcalibration.limits import MAX_FOCAL_STD, MIN_SIGNIFICANCE, MOST_NOISE
 
 _FOUND: Mapping[str, str] = {
     critical.PLANE: (
@@ -86,10 +87,12 @@ def motion_sentences(motion: str, evidence: Mapping[str, float], *, identifiable
     if is_critical:
         found = (_FOUND if answered else _FOUND_WITHOUT_AN_ANSWER)[motion]
         told.append(found.format(**evidence))
-    if answered and evidence["noise_over_projective"] >= 3.0:
+    if _bent(evidence):
         told.append(
-            f"no metric cameras explain what the projective ones do: the noise grows from "
-            f"{evidence['noise_px'] / evidence['noise_over_projective']:.2f} to {evidence['noise_px']:.2f} px"
+            f"cameras as they are said to be explain the photographs with "
+            f"{evidence['noise_over_projective']:.1f} times the noise of projective ones: photographs were "
+            "zoomed or cropped one by one, or belong to other cameras; let every photograph have its own "
+            "(cameras = per-image)"
         )
     if identifiable:
         return (*told, *_what_holds(motion, evidence)) if is_critical else tuple(told)
@@ -100,14 +103,20 @@ def _what_holds(motion: str, evidence: Mapping[str, float]) -> list[str]:
     std, alone = evidence["focal_std_rel_median"], evidence["focal_std_rel_free"]
     if motion in _SHAPE_SETTLES and alone > 2.0 * std:
         return [
-            f"square pixels and a principal point near the middle of the image settle it: the focal length "
-            f"is "
-            f"known to {_percent(std)} with them and to {_percent(alone)} without; to rest on less, "
+            f"square pixels and a principal point near the middle of the image settle it if the cameras are "
+            f"what they are said to be: the focal length is known to {_percent(std)} with them and to "
+            f"{_percent(alone)} without; to rest on less, "
             f"{_ADVICE[motion]}"
         ]
     if motion in (critical.PLANE, critical.ROTATION):
-        return [f"the focal length is known to {_percent(std)}; for depths that hold, {_ADVICE[motion]}"]
-    return [f"what departs from it fixes the focal length all the same, to {_percent(std)}"]
+        return [
+            f"the focal length is known to {_percent(std)} if the cameras are what they are said to be; for "
+            f"depths that hold, {_ADVICE[motion]}"
+        ]
+    return [
+        f"if the cameras are what they are said to be, what departs from it fixes the focal length to "
+        f"{_percent(std)}"
+    ]
 
 
 def _what_fails(motion: str, evidence: Mapping[str, float], *, is_critical: bool) -> list[str]:
@@ -115,11 +124,16 @@ def _what_fails(motion: str, evidence: Mapping[str, float], *, is_critical: bool
     if "focal_std_rel" not in evidence:
         return [advice]
     std = evidence["focal_std_rel_median"]
-    if evidence["turn_significance"] < 4.0 and std < 0.15:
+    if evidence["turn_significance"] < MIN_SIGNIFICANCE and std < MAX_FOCAL_STD:
         return [f"the turns cannot be told from noise, and no focal length can be had from them; {advice}"]
-    if std >= 0.15:
+    if std >= MAX_FOCAL_STD:
         return [f"the cameras fix the focal length only to {_percent(std)}; {advice}"]
-    return [advice]
+    # No turn of the camera mends cameras that are not what they are said to be.
+    return [] if _bent(evidence) else [advice]
+
+
+def _bent(evidence: Mapping[str, float]) -> bool:
+    return evidence.get("noise_over_projective", 0.0) >= MOST_NOISE
 
 
 def _percent(share: float) -> str:
