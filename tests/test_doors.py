@@ -78,6 +78,12 @@ def test_self_calibration_groups_views_by_size_and_takes_a_prior() -> None:
     assert heard[1].mean[:, 0].tolist() == [50.0, 50.0]
 
 
+def test_only_a_projective_reconstruction_is_calibrated() -> None:
+    metric = replace(small_reconstruction(), stratum="metric")
+    with pytest.raises(ValueError, match="takes a projective reconstruction; got metric"):
+        thesisrecon.self_calibrate(metric)
+
+
 def test_triangulate_and_estimate_fundamental_are_front_doors() -> None:
     X, P = fakes.scene_points(), np.stack([fakes.scene_camera(0), fakes.scene_camera(2)])
     xy = np.stack([(X @ camera.T)[:, :2] / (X @ camera.T)[:, 2:] for camera in P])

@@ -49,8 +49,12 @@ def self_calibrate(
     """The metric frame and the intrinsics of a projective reconstruction (chapter 7).
 
     Cameras of one image size are taken for one camera, unless ``config.intrinsics.cameras`` says otherwise.
-    ``photographs``, one per view, are what a variant looks at that finds parallel lines in them.
+    ``photographs``, one per view, are what a variant looks at that finds parallel lines in them. Raises
+    ``ValueError`` for a reconstruction of another stratum, :class:`StageFailure` where the views do not
+    determine a calibration.
     """
+    if reconstruction.stratum != "projective":
+        raise ValueError(f"self_calibrate takes a projective reconstruction; got {reconstruction.stratum}")
     config = config or PipelineConfig()
     variant = seeing(config.selfcalibration, photographs) if photographs else config.selfcalibration
     assumed = assume(reconstruction, config.intrinsics)

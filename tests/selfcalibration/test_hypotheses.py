@@ -113,3 +113,15 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
     scene = make_scene(seed=8, sigma_px=0.5)
     first, second = (calibrate(HypothesesAndRefinement(), scene, seed=8) for _ in range(2))
     assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()
+
+
+def test_a_focal_that_leaves_no_answer_is_named_and_not_asked_for() -> None:
+    scene = make_scene(seed=3)
+    reconstruction = projective_reconstruction(scene)
+    assumed = assume(reconstruction, IntrinsicsAssumption(focal_px=1.0, focal_std_rel=0.05))
+    with pytest.raises(StageFailure) as failure:
+        HypothesesAndRefinement().calibrate(reconstruction, assumed=assumed, rng=np.random.default_rng(0))
+    assert "near the focal length that was given" in str(failure.value)
+    assert "1 px (+- 5.0%)" in failure.value.evidence
+    assert "the photographs contradict it" in failure.value.advice
+    assert "give the focal length" not in str(failure.value)

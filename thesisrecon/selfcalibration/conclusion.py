@@ -152,12 +152,7 @@ def conclude(
         raise ValueError("a conclusion needs a frame that knows what is assumed: see assumed_frame")
     chosen = _distinct_upgrades(frame, reconstruction, answers, kept, min_positive)
     if not chosen:
-        said = verdict_without_an_answer(reconstruction, frame.assumed).sentences
-        raise StageFailure(
-            "no camera calibration puts the scene in front of all cameras",
-            f"{len(answers)} answers were tried over {len(frame.views)} cameras",
-            "; ".join(said) or "photograph the scene from more directions, turning the camera between shots",
-        )
+        raise _nothing_in_front(frame, reconstruction, len(answers))
     answer, best = chosen[0]
     theta = np.concatenate([answer.plane, answer.log_focals(frame)])
     std_log_f, _ = focal_std(criterion, frame, theta)
@@ -167,6 +162,28 @@ def conclude(
         best.metric_from_projective, best.K, K_std, verdict.identifiable,
         () if verdict.identifiable else verdict.sentences, tuple(upgrade for _, upgrade in chosen), verdict,
     )  # fmt: skip
+
+
+def _nothing_in_front(frame: ReferenceFrame, reconstruction: Reconstruction, tried: int) -> StageFailure:
+    """The failure of a method none of whose answers can be carried out."""
+    assert frame.assumed is not None
+    evidence = f"{tried} answers were tried over {len(frame.views)} cameras"
+    given = frame.views[frame.assumed.focal_known[frame.views]]
+    if len(given):
+        # All answers were drawn to it: whoever gave a focal length cannot mend this by giving one.
+        focal = frame.assumed.mean[given, 0]
+        few = f"{focal.min():.0f}" if np.ptp(focal) < 0.5 else f"{focal.min():.0f} to {focal.max():.0f}"
+        return StageFailure(
+            "no calibration near the focal length that was given puts the scene in front of all cameras",
+            f"{few} px (+- {frame.assumed.std[given, 0].max():.1%}) at working size was given; {evidence}",
+            "the photographs contradict it: leave it out, or give it a larger focal_std_rel",
+        )
+    said = verdict_without_an_answer(reconstruction, frame.assumed).sentences
+    return StageFailure(
+        "no camera calibration puts the scene in front of all cameras",
+        evidence,
+        "; ".join(said) or "photograph the scene from more directions, turning the camera between shots",
+    )
 
 
 def _deviations(frame: ReferenceFrame, K: F64, answer: Answer, focal_std: F64) -> F64:
