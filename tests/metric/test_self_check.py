@@ -14,9 +14,9 @@ from thesisrecon.metric.model import MetricModel, project_observations, retriang
 from thesisrecon.metric.prior_check import contradicted_focals
 from thesisrecon.metric.self_check import self_check
 from thesisrecon.metric.start import camera_rows
-from thesisrecon.metric.view_checks import check_views
+from thesisrecon.metric.view_checks import check_views, within_reach
 from thesisrecon.optimize.metric_bundle import MetricCameras
-from thesisrecon.types import Assumptions, IntrinsicInterval, SelfCalibration
+from thesisrecon.types import Assumptions, IntrinsicInterval, SelfCalibration, Tracks
 
 SIGMAS, ANGLE = 7.0, 1e-3
 
@@ -146,3 +146,22 @@ def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_d
     kept = [np.median(left[model.tracks.view_index[model.ok] == v]) for v in range(3)]
     assert kept[1] > 1.3 * min(kept[0], kept[2])
     assert not any("noise" in doubt for doubt in doubts_of(model, scene)[1])
+
+
+def test_two_photographs_from_one_place_are_not_doubted_for_what_only_they_share() -> None:
+    scene = make_scene(points=400, sigma_px=0.0, seed=3)
+    R, centres = scene.R.copy(), scene.centres.copy()
+    R[1], centres[1] = R[0], centres[0] + 1e-4
+    scene = with_poses(scene, R, centres)
+    t, rng = scene.tracks, np.random.default_rng(0)
+    # What both show and no other: most of their points lose their other views, and matches err together.
+    alone = np.isin(t.point_index, np.flatnonzero(rng.random(t.n_points) < 0.7))
+    keep = ~alone | (t.view_index < 2)
+    xy = t.xy + np.where((alone & (t.view_index == 1))[:, None], 30.0, 0.3) * rng.normal(size=t.xy.shape)
+    seen = [values[keep] for values in (t.view_index, t.point_index, xy)]
+    scene = replace(scene, tracks=Tracks(*seen, t.n_views, t.n_points))
+    model = true_model(scene, assume(projective_reconstruction(scene)))
+    check, doubts = doubts_of(model, scene)
+    assert doubts == []
+    assert check["explained_share_worst_view"] > 0.9
+    assert 0.2 < within_reach(model).mean() < 0.9

@@ -79,7 +79,9 @@ def _whole(
         "focal_std_rel_max": max(
             intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views
         ),
-        "explained_share": float(agreeing_observations(model, sigmas=sigmas)[near].mean()),
+        "explained_share": float(agreeing_observations(model, sigmas=sigmas)[near].mean())
+        if near.any()
+        else 0.0,
         "sigma_rel": float(noise_from_distances(residual_norms(model)) / np.median(longest))
         if model.ok.any()
         else np.inf,

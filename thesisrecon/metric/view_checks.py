@@ -18,6 +18,8 @@ OWN = np.array([True, True, False, False, False, False])
 """Focal and aspect: what a camera that is right gives back when nothing but its points is believed."""
 MOST_OBSERVATIONS = 1500
 FEWEST_OBSERVATIONS = 30
+ONE_PLACE = 2e-3
+"""Of the distance to the scene: photographs taken nearer together have no parallax to speak of."""
 LEAST_LEFT = 0.1
 """Coordinates that keep less than this share of their variance say little of the noise."""
 
@@ -65,12 +67,28 @@ def check_views(model: MetricModel, *, sigmas: float) -> ViewChecks:
 
 
 def within_reach(model: MetricModel) -> B8:
-    """(K,) observations in registered views of points that two or more of these see: no others can be
-    explained."""
+    """(K,) observations in registered views of points that two or more of these see from different places:
+    no others can be explained. Photographs taken from one place share many, which have no depth."""
     t = model.tracks
     near = model.registered[t.view_index]
     seen = np.bincount(t.point_index[near], minlength=t.n_points)
-    return np.asarray(near & (seen[t.point_index] >= 2))
+    return np.asarray(near & (seen >= 2)[t.point_index] & _from_two_places(model, near)[t.point_index])
+
+
+def _from_two_places(model: MetricModel, near: B8) -> B8:
+    """(N,) whether the views that see a point stand apart by more than ``ONE_PLACE`` of the distance to the
+    scene."""
+    t = model.tracks
+    centres = -np.einsum("vba,vb->va", model.cameras.R, model.cameras.t)
+    view, point = t.view_index[near], t.point_index[near]
+    known = model.ok[near]
+    if not known.any():
+        return np.ones(t.n_points, dtype=bool)
+    distance = np.median(np.linalg.norm(model.X[point[known]] - centres[view[known]], axis=1))
+    first, apart = np.zeros(t.n_points, dtype=np.int64), np.zeros(t.n_points)
+    first[point[::-1]] = view[::-1]
+    np.maximum.at(apart, point, np.linalg.norm(centres[view] - centres[first[point]], axis=1))
+    return np.asarray(apart > ONE_PLACE * float(distance))
 
 
 def _share(view: I64, good: B8, counted: B8, n: int) -> F64:
