@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 
 import thesisrecon
@@ -14,7 +15,7 @@ from thesisrecon.assumptions import IntrinsicsAssumption
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.report.summary import original_from_working, point_colours
-from thesisrecon.types import Image, Reconstruction, Tracks
+from thesisrecon.types import Image, Reconstruction, TexturedMesh, Tracks
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 
@@ -111,3 +112,32 @@ def test_pixels_go_back_to_the_original_as_they_came() -> None:
     original = np.array([123.0, 45.0])
     working = (original + 0.5) * scale - 0.5
     np.testing.assert_allclose(original_from_working(scale) @ [*working, 1.0], [*original, 1.0])
+
+
+def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    wall = np.asarray(
+        PIL.Image.fromarray(rng.integers(0, 256, (20, 40), dtype=np.uint8)).resize((160, 80)), dtype=np.uint8
+    )
+    left, right = (np.repeat(wall[:, a:b, None], 3, axis=2) for a, b in ((0, 150), (6, 156)))
+    found = thesisrecon.match_rectified(left, right, max_disparity_px=12)
+    inner = found.disparity[8:-8, 20:-8]
+    assert np.isfinite(inner).mean() > 0.9
+    assert np.nanmedian(np.abs(inner - 6.0)) < 0.2
+    for name, image in (("left", left), ("right", right)):
+        PIL.Image.fromarray(image).save(tmp_path / f"{name}.png")
+    again = thesisrecon.match_rectified(tmp_path / "left.png", tmp_path / "right.png", max_disparity_px=12)
+    np.testing.assert_array_equal(again.disparity, found.disparity)
+    with pytest.raises(StageFailure, match="nothing"):
+        thesisrecon.match_rectified(tmp_path / "nothing.png", right, max_disparity_px=12)
+    with pytest.raises(ValueError, match="one shape"):
+        thesisrecon.match_rectified(left, right[:-2], max_disparity_px=12)
+
+
+def test_a_model_is_rendered_through_the_front_door() -> None:
+    triangle = np.array([[-1.0, -1.0, 2.0], [-1.0, 1.0, 2.0], [1.0, 0.0, 2.0]])
+    mesh = TexturedMesh(triangle, np.array([[0, 1, 2]]))
+    K = np.array([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])
+    seen = thesisrecon.render(mesh, thesisrecon.PinholeCamera(K, np.eye(3), np.zeros(3), (32, 24)))
+    assert seen.valid[12, 12]
+    assert seen.depth[12, 12] == pytest.approx(2.0)

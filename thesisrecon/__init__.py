@@ -10,28 +10,42 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from thesisrecon.config import PipelineConfig
-    from thesisrecon.doors import estimate_fundamental, match_pair, self_calibrate, upgrade_affine
+    from thesisrecon.doors import (
+        estimate_fundamental,
+        match_pair,
+        match_rectified,
+        render,
+        self_calibrate,
+        upgrade_affine,
+    )
+    from thesisrecon.geometry.pinhole import PinholeCamera
     from thesisrecon.geometry.triangulation import triangulate
     from thesisrecon.pipeline import reconstruct
 
 __version__ = "0.1.0"
 
 _HOME_OF = {
+    "PinholeCamera": "geometry.pinhole",
     "PipelineConfig": "config",
     "estimate_fundamental": "doors",
     "match_pair": "doors",
+    "match_rectified": "doors",
     "reconstruct": "pipeline",
+    "render": "doors",
     "self_calibrate": "doors",
     "triangulate": "geometry.triangulation",
     "upgrade_affine": "doors",
 }
 
 __all__ = [
+    "PinholeCamera",
     "PipelineConfig",
     "__version__",
     "estimate_fundamental",
     "match_pair",
+    "match_rectified",
     "reconstruct",
+    "render",
     "self_calibrate",
     "triangulate",
     "upgrade_affine",

@@ -5,17 +5,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from thesisrecon.affine import upgrade_affine
 from thesisrecon.assumptions import assume
 from thesisrecon.config import PipelineConfig, seeing
+from thesisrecon.dense import MultiViewStereo
+from thesisrecon.dense.matching import match_rectified as match_pair_of_rows
 from thesisrecon.epipolar import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.images import read_photographs
 from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.run import stream
-from thesisrecon.types import Image, Reconstruction, SelfCalibration, TwoView
+from thesisrecon.types import DisparityMap, Image, Reconstruction, SelfCalibration, TwoView
+from thesisrecon.views import render
 
-__all__ = ["estimate_fundamental", "match_pair", "self_calibrate", "upgrade_affine"]
+__all__ = [
+    "estimate_fundamental",
+    "match_pair",
+    "match_rectified",
+    "render",
+    "self_calibrate",
+    "upgrade_affine",
+]
 
 
 def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0) -> TwoView:
@@ -37,6 +49,29 @@ def _read_one(image: Any, config: PipelineConfig) -> Image:
     for name, reason in photographs.refused.items():
         raise StageFailure(f"{name} {reason}")
     return photographs.images[0]
+
+
+def match_rectified(
+    left: Any, right: Any, *, max_disparity_px: float, config: PipelineConfig | None = None
+) -> DisparityMap:
+    """Disparities of a rectified pair: files, or arrays (H, W) or (H, W, 3) of levels 0 to 255, NaN = no
+    pixel.
+
+    By the matcher of ``config.dense.pairs``; x_right = x_left - d with d from 0 to ``max_disparity_px``.
+    Files are taken at their own size. Raises :class:`StageFailure` for a file that cannot be read,
+    ``ValueError`` for sizes that differ.
+    """
+    dense = (config or PipelineConfig()).dense
+    matcher = dense.pairs.matcher if isinstance(dense, MultiViewStereo) else None
+    images = [side if isinstance(side, np.ndarray) else _full_size(side) for side in (left, right)]
+    return match_pair_of_rows(images[0], images[1], max_disparity_px=max_disparity_px, config=matcher)
+
+
+def _full_size(path: Any) -> Any:
+    photographs = read_photographs([path], max_size_px=np.iinfo(np.int32).max)
+    for name, reason in photographs.refused.items():
+        raise StageFailure(f"{name} {reason}")
+    return photographs.images[0].rgb
 
 
 def self_calibrate(
