@@ -13,6 +13,7 @@ from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.metric import UpgradeAndBundle
 from thesisrecon.metric.adjustment import tail_width
 from thesisrecon.metric.model_error import model_error_share
+from thesisrecon.metric.population import Borrowing
 from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.types import MetricResult
 
@@ -56,6 +57,7 @@ def test_heavy_tails_bring_the_floor() -> None:
     xy = t.xy + np.where(wide[:, None], 0.25, 0.0) * rng.normal(size=t.xy.shape)
     focal = refine(replace(scene, tracks=replace(t, xy=xy))).intrinsics[0]["focal_px"]
     assert focal.std > 0.8e-3 * focal.value
+    assert "leaves out" in focal.source
 
 
 def test_the_share_of_model_error_follows_its_signs() -> None:
@@ -91,3 +93,9 @@ def test_what_else_is_estimated_has_an_interval_that_holds_it() -> None:
     assert 0.01 < found.intrinsics[0]["skew_px"].std < 50.0
     usual = refine(scene).intrinsics[0]
     assert [(usual[n].value, usual[n].std) for n in ("aspect", "skew_px")] == [(1.0, 0.0), (0.0, 0.0)]
+
+
+def test_a_focal_is_borrowed_only_where_its_own_matches_say_less_than_is_stated() -> None:
+    lent = Borrowing(np.array([0.02, 0.001, 0.02]), np.array([0.1, 0.1, 0.9]))
+    assert [lent.lends(view, 0.005) for view in range(3)] == [True, False, False]
+    assert "8%, one standard deviation" in Borrowing(np.array([0.08]), np.ones(1)).warnings([0], 0.05)[0]

@@ -93,6 +93,11 @@ def test_a_badly_determined_focal_is_borrowed_and_named() -> None:
     assert narrow.std < 0.7 * wide.std
     assert "borrowed from the other cameras" in narrow.source
     assert "borrowed" not in wide.source
+    assert "one standard deviation" in narrow.source
+    for interval in (
+        i for views in (alone, together) for of_view in views.intrinsics for i in of_view.values()
+    ):
+        assert "x 1.0 " not in interval.source or "covariance" not in interval.source
     for result in (alone, together):
         for view, intervals in enumerate(result.intrinsics):
             focal = intervals["focal_px"]

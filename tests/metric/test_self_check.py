@@ -11,10 +11,11 @@ from tests.synthetic import TrueScene, make_scene, projective_reconstruction, wi
 from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.metric.adjustment import Adjustment
 from thesisrecon.metric.model import MetricModel, project_observations, retriangulate
-from thesisrecon.metric.prior_check import contradicted_focals
+from thesisrecon.metric.prior_check import centre_of_a_bent_model, contradicted_focals
 from thesisrecon.metric.self_check import self_check
 from thesisrecon.metric.start import camera_rows
 from thesisrecon.metric.view_checks import check_views, within_reach
+from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.optimize.metric_bundle import MetricCameras
 from thesisrecon.types import Assumptions, IntrinsicInterval, SelfCalibration, Tracks
 
@@ -165,3 +166,17 @@ def test_two_photographs_from_one_place_are_not_doubted_for_what_only_they_share
     assert doubts == []
     assert check["explained_share_worst_view"] > 0.9
     assert 0.2 < within_reach(model).mean() < 0.9
+
+
+def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself_too() -> None:
+    scene = make_scene(sigma_px=0.3, principal_shift=(140.0, 0.0), seed=3)
+    assumed = assume(projective_reconstruction(scene))
+    model, adjustment = true_model(scene, assumed), Adjustment(assumed, 0.0, 0.02)
+
+    def scatter(contradiction: float) -> BlockScatter:
+        return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, 32)
+
+    assert centre_of_a_bent_model(model, adjustment, scatter(3.0)) == []
+    assert len(centre_of_a_bent_model(model, adjustment, scatter(12.0))) == 1
+    middle = true_model(make_scene(seed=3), assumed)
+    assert centre_of_a_bent_model(middle, adjustment, scatter(12.0)) == []

@@ -37,11 +37,14 @@ def intrinsic_intervals(
     *,
     floor_rel: float,
     borrowed: Borrowing,
+    noise_inflation: float = 1.0,
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
     """Per view the intervals named in ``MetricResult`` (empty where not registered).
 
     ``scatter`` of the last adjustment under ``prior``; ``floor_rel`` is that of photographs, relative to the
-    focal. The std is such that +- 1.96 of it hold 95 % although it was measured on few blocks.
+    focal; ``noise_inflation`` by how much the noise counted for more than
+    its size in ``scatter``. The std is such that +- 1.96 of it hold 95 % although it was measured on few
+    blocks.
     """
     floors = model_error_floor(model, scatter, floor_rel)
     answer: list[Mapping[str, IntrinsicInterval]] = []
@@ -57,10 +60,13 @@ def intrinsic_intervals(
             if not variance > 0.0:
                 intervals[name] = IntrinsicInterval(value, 0.0, "assumed")
                 continue
-            inflation = _inflation(scatter, g, column)
-            std = float(np.hypot(inflation * np.sqrt(variance), floors[g, column]))
-            std = min(std, float(prior.std[g, column])) * (row[FOCAL] if column == FOCAL else 1.0)
-            how = _source(borrowed, view, column, inflation)
+            inflation, floor = _inflation(scatter, g, column), float(floors[g, column])
+            measured = float(inflation * np.sqrt(variance))
+            std = min(float(np.hypot(measured, floor)), float(prior.std[g, column]))
+            how = _source(measured, floor, inflation * noise_inflation)
+            if column == FOCAL and borrowed.lends(view, std):
+                how = f"borrowed from the other cameras; its own matches {_open(borrowed.own_std[view])}"
+            std *= row[FOCAL] if column == FOCAL else 1.0
             intervals[name] = IntrinsicInterval(value, float(std), how)
         answer.append(intervals)
     return tuple(answer)
@@ -87,8 +93,12 @@ def _inflation(scatter: BlockScatter, g: int, column: int) -> float:
     return float(np.sqrt(ratio) * student_t.ppf(0.975, scatter.blocks - 1) / NORMAL_95)
 
 
-def _source(borrowed: Borrowing, view: int, column: int, inflation: float) -> str:
-    if column == FOCAL and borrowed.weight[view] < 0.5:
-        own = 1.96 * float(borrowed.own_std[view])
-        return f"borrowed from the other cameras; its own matches leave it open by {own:.2%}"
-    return f"bundle adjustment, covariance x {inflation:.1f} from the scatter between parts of the scene"
+def _source(measured: float, floor: float, factor: float) -> str:
+    """Where a deviation comes from: what was ``measured``, the ``factor`` in it, or the floor above it."""
+    if floor > measured:
+        return "bundle adjustment; what a model of a camera leaves out, which is more than the scatter shows"
+    return f"bundle adjustment, deviation x {factor:.1f} from the scatter between parts of the scene"
+
+
+def _open(own_std: float) -> str:
+    return f"leave it open by {own_std:.2%} (one standard deviation)"

@@ -133,11 +133,16 @@ def bind(
 
 @dataclass(frozen=True)
 class Borrowing:
-    """How far each view's focal stands on its own: ``own_std`` (V,) relative, what its own matches give, and
-    ``weight`` (V,) its part in the answer, 1 where nothing was borrowed."""
+    """How far each view's focal stands on its own: ``own_std`` (V,) relative, what its own matches give (one
+    deviation, with the error of the model as in every stated one), and ``weight`` (V,) its part in the
+    answer, 1 where nothing was borrowed."""
 
     own_std: F64
     weight: F64
+
+    def lends(self, view: int, std: float) -> bool:
+        """Whether the others tell more of a view's focal than its own matches; ``std`` is stated of it."""
+        return bool(self.weight[view] < 0.5 and self.own_std[view] > std)
 
     def warnings(self, registered: Sequence[int], least: float) -> tuple[str, ...]:
         """A sentence for each focal that its own matches leave open by more than ``least`` (relative)."""
@@ -151,7 +156,7 @@ class Borrowing:
                 )
                 said.append(
                     f"the focal length of view {view} is not determined by its own matches "
-                    f"(+- {1.96 * self.own_std[view]:.0%}); {end}"
+                    f"(open by {self.own_std[view]:.0%}, one standard deviation); {end}"
                 )
         return tuple(said)
 
@@ -163,4 +168,4 @@ def borrowing(own: OwnValues, population: Population | None, group: I64) -> Borr
     if population is not None and np.isfinite(population.spread[FOCAL]):
         tau = population.spread[FOCAL]
         weight = np.where(population.rows >= 0, tau**2 / (tau**2 + std**2), 1.0)
-    return Borrowing(std[group], weight[group])
+    return Borrowing(np.hypot(std, own.floor[:, FOCAL])[group], weight[group])

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.model import FOCAL, MetricModel
-from thesisrecon.metric.model_error import USUAL_INFLATION
+from thesisrecon.metric.model import CENTRE, FOCAL, MetricModel
+from thesisrecon.metric.model_error import LEAST_BLOCKS, USUAL_INFLATION
 from thesisrecon.metric.own_fit import ROUNDS, part_of_explained
+from thesisrecon.optimize.bundle_blocks import BlockScatter
 from thesisrecon.optimize.metric_bundle import (
     IntrinsicsPrior,
     Observations,
@@ -20,6 +21,9 @@ from thesisrecon.types import F64, I64
 MAX_SIGMAS = 3.0
 LEAST_DIFFERENCE = 0.01
 """A prior wrong by less than a hundredth does no harm that a person would mend."""
+MAX_CENTRE_SIGMAS = 5.0
+MOST_CONTRADICTION = 8.0
+"""Variance ratio of blocks over points; right models of photographs have 1.5 to 5, bent ones 11 to 28."""
 FLOOR = 2e-3
 """Of the relative standard deviation of a focal that was left open."""
 WIDEN = "leave it out, or give it a larger focal_std_rel"
@@ -51,6 +55,28 @@ def contradicted_focals(model: MetricModel, adjustment: Adjustment) -> list[str]
                 f"standard deviation); {'leave it out' if deviation == 0.0 else WIDEN}"
             )
     return doubts
+
+
+def centre_of_a_bent_model(model: MetricModel, adjustment: Adjustment, scatter: BlockScatter) -> list[str]:
+    """A sentence where a principal point lies far off what was said of it and parts of the scene contradict
+    each other as well: photographs cropped alike do the first, but not the second."""
+    views = np.flatnonzero(model.registered)
+    if scatter.blocks < LEAST_BLOCKS or not scatter.contradiction > MOST_CONTRADICTION:
+        return []
+    said = adjustment.assumed.std[views][:, CENTRE]
+    values = model.cameras.intrinsics[model.cameras.group[views]][:, CENTRE]
+    off = np.abs(values - adjustment.assumed.mean[views][:, CENTRE])
+    sigmas = np.where(said > 0.0, off / np.where(said > 0.0, said, 1.0), 0.0).max(axis=1)
+    worst = int(sigmas.argmax())
+    if not sigmas[worst] > MAX_CENTRE_SIGMAS:
+        return []
+    share = float(off[worst].max() / model.sizes[views[worst]].max())
+    return [
+        f"the principal point lies {share:.0%} of the long side off ({sigmas[worst]:.0f} standard deviations "
+        f"of what is said of it) and parts of the scene contradict each other by {scatter.contradiction:.0f} "
+        "times what their points let expect: photographs were zoomed or cropped one by one, or the model is "
+        "bent"
+    ]
 
 
 def _numbers_when_free(model: MetricModel, adjustment: Adjustment) -> I64:

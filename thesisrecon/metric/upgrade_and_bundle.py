@@ -27,7 +27,7 @@ from thesisrecon.metric.model import (
     truncated_cost,
 )
 from thesisrecon.metric.population import OwnValues, bind, borrowing, estimate_population, own_values
-from thesisrecon.metric.prior_check import contradicted_focals
+from thesisrecon.metric.prior_check import centre_of_a_bent_model, contradicted_focals
 from thesisrecon.metric.self_check import self_check
 from thesisrecon.metric.sharing_check import check_sharing
 from thesisrecon.metric.start import upgraded_model
@@ -105,10 +105,12 @@ class UpgradeAndBundle:
             adjustment.prior(model),
             floor_rel=self.model_floor_rel,
             borrowed=borrowed,
+            noise_inflation=adjustment.inflation,
         )
         intervals = with_open_sharing(intervals, sharing.focal_std)
         check, doubts = self_check(model, calibration, intervals, sigmas=self.outlier_sigmas[1])
         doubts += [*contradicted_focals(model, adjustment), *sharing.doubts]
+        doubts += centre_of_a_bent_model(model, adjustment, scatter)
         final = _as_reconstruction(model, reasons)
         said = borrowed.warnings(np.flatnonzero(model.registered).tolist(), self.undetermined_rel / 1.96)
         said += sharing.warnings
