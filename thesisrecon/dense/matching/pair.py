@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thesisrecon.dense.matching.costs.kernels import LEVELS, split_channels
+from thesisrecon.dense.matching.costs.kernels import LEVELS, split_bytes, split_channels
 
 F32 = NDArray[np.float32]
 I16 = NDArray[np.int16]
@@ -47,13 +46,14 @@ def prepare_pair(left: ArrayLike, right: ArrayLike) -> tuple[Side, Side]:
 def _side(image: NDArray[np.generic]) -> Side:
     if image.ndim not in (2, 3) or 0 in image.shape or (image.ndim == 3 and image.shape[2] > 4):
         raise ValueError(f"an image must be (H, W) or (H, W, K) with K <= 4; got {image.shape}")
-    # Bytes need no detour by floating numbers.
-    dtype = np.uint8 if image.dtype == np.uint8 else np.float32
-    levels: NDArray[Any] = np.ascontiguousarray(image if image.ndim == 3 else image[..., None], dtype=dtype)
-    height, width, n = levels.shape
-    channels, valid = np.empty((n, height, width), np.int16), np.empty((height, width), np.uint8)
-    grey = np.empty((height, width), np.int16)
-    split_channels(levels, channels, grey, valid)
+    height, width, n = (*image.shape, 1)[:3]
+    channels, grey = np.empty((n, height, width), np.int16), np.empty((height, width), np.int16)
+    valid = np.full((height, width), 255, np.uint8)
+    if image.dtype == np.uint8:
+        split_bytes(np.ascontiguousarray(image.reshape(height, width, n), dtype=np.uint8), channels, grey)
+    else:
+        levels = np.ascontiguousarray(image.reshape(height, width, n), dtype=np.float32)
+        split_channels(levels, channels, grey, valid)
     return Side(channels, grey, valid)
 
 
@@ -75,5 +75,7 @@ def estimate_noise(side: Side) -> float:
     inside = whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:]
     if not inside.any():
         return 0.0
-    # The mask has the squares 1, 4, 1, 4, 16, 4, 1, 4, 1: 36.
-    return float(1.4826 * np.median(np.abs(response[:, inside])) / 6.0 / LEVELS)
+    # A median of whole numbers by counting them. The mask has the squares 1, 4, 1, 4, 16, 4, 1, 4, 1: 36.
+    below = np.cumsum(np.bincount(np.abs(response[:, inside]).ravel()))
+    median = int(np.searchsorted(below, 0.5 * below[-1]))
+    return 1.4826 * median / 6.0 / LEVELS

@@ -39,7 +39,7 @@ def count_ones(word: np.int32) -> np.uint32:
 
 
 @njit(cache=True, nogil=True)
-def split_channels(image: F32 | U8, channels: I16, grey: I16, valid: U8) -> None:
+def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
     """(H, W, K) grey levels, NaN = no pixel, as ``channels`` (K, H, W) of quarter levels, their sum ``grey``
     (H, W), and ``valid`` (H, W) 0 or 255."""
     height, width, n = image.shape
@@ -49,7 +49,7 @@ def split_channels(image: F32 | U8, channels: I16, grey: I16, valid: U8) -> None
             valid[y, x] = 255
             total = np.int16(0)
             for k in range(n):
-                level = np.float32(image[y, x, k]) * np.float32(LEVELS)
+                level = image[y, x, k] * np.float32(LEVELS)
                 if not np.isfinite(level):
                     valid[y, x] = 0
                     level = np.float32(0.0)
@@ -57,6 +57,21 @@ def split_channels(image: F32 | U8, channels: I16, grey: I16, valid: U8) -> None
                 channels[k, y, x] = whole
                 total = np.int16(total + whole)
             grey[y, x] = total
+
+
+@njit(cache=True, nogil=True)
+def split_bytes(image: U8, channels: I16, grey: I16) -> None:
+    """The same of an image of bytes, of which every pixel is one."""
+    height, width, n = image.shape
+    for y in range(height):
+        total = grey[y]
+        total[:] = 0
+        for k in range(n):
+            channel = channels[k, y]
+            for x in range(width):
+                whole = np.int16(np.int16(image[y, x, k]) * np.int16(LEVELS))
+                channel[x] = whole
+                total[x] = np.int16(total[x] + whole)
 
 
 @njit(cache=True, nogil=True)

@@ -23,8 +23,8 @@ F32 = NDArray[np.float32]
 
 STEP_PX = np.float32(1.0)
 """Neighbours on one surface differ by no more."""
-SPARSE = 3
-"""Every third pixel of every third row suffices for a median."""
+SPARSE = 5
+"""Every fifth pixel of every fifth row suffices for a median."""
 AROUND = 4
 """Pixels to each side that speak for the texture of a pixel: as far as its costs look."""
 DIGITISATION = float(1.0 / np.sqrt(12.0))

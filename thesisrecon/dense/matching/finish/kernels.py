@@ -214,6 +214,12 @@ def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
             n = 0
             for b in range(max(y - 1, 0), min(y + 2, height)):
                 for a in range(max(x - 1, 0), min(x + 2, width)):
+                    n += not np.isnan(disparity[b, a])
+            if n < least:
+                continue
+            n = 0
+            for b in range(max(y - 1, 0), min(y + 2, height)):
+                for a in range(max(x - 1, 0), min(x + 2, width)):
                     value = disparity[b, a]
                     if not np.isnan(value):
                         place = n
@@ -222,17 +228,17 @@ def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
                             place -= 1
                         around[place] = value
                         n += 1
-            if n >= least:
-                out[y, x] = np.float32(0.5) * (around[(n - 1) // 2] + around[n // 2])
+            out[y, x] = np.float32(0.5) * (around[(n - 1) // 2] + around[n // 2])
 
 
 @njit(cache=True, nogil=True)
 def _gather_alike(centre: F32, other: F32, step: np.float32, total: F32, count: F32) -> None:
     for x in range(len(centre)):
+        value, summed, counted = other[x], total[x], count[x]
         # A comparison with NaN is false: unknown pixels neither give nor take.
-        alike = abs(other[x] - centre[x]) <= step
-        total[x] += other[x] if alike else np.float32(0.0)
-        count[x] += np.float32(1.0) if alike else np.float32(0.0)
+        alike = abs(value - centre[x]) <= step
+        total[x] = summed + (value if alike else np.float32(0.0))
+        count[x] = counted + (np.float32(1.0) if alike else np.float32(0.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -136,11 +136,19 @@ def _add(values: U8, total: U8) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _copy(source: U8, out: U8) -> None:
+    for x in range(len(out)):
+        out[x] = source[x]
+
+
+@njit(cache=True, nogil=True)
 def _shifted(jump: U8, shift: int, out: U8) -> None:
     """Penalties of pixels that lie ``shift`` columns from where they are wanted."""
     width = len(jump)
-    for x in range(width):
-        out[x] = jump[min(max(x - shift, 0), width - 1)]
+    a, b = min(max(0, shift), width), max(width + min(0, shift), 0)
+    out[:a], out[b:] = 0, 0
+    if b > a:
+        _copy(jump[a - shift : b - shift], out[a:b])
 
 
 @njit(cache=True, nogil=True)
@@ -207,12 +215,6 @@ def _store(square: Word8, words: U64, first: int, column: int) -> None:
     part = words[first : first + 8, column]
     part[0], part[1], part[2], part[3] = square[0], square[1], square[2], square[3]
     part[4], part[5], part[6], part[7] = square[4], square[5], square[6], square[7]
-
-
-@njit(cache=True, nogil=True)
-def _copy(source: U8, out: U8) -> None:
-    for x in range(len(out)):
-        out[x] = source[x]
 
 
 @njit(cache=True, nogil=True)
