@@ -34,7 +34,8 @@ VIEWS_OF_A_LENS = 3
 @dataclass(frozen=True)
 class Population:
     """Cameras of one kind: ``rows`` (G,) number of the kind of each row of intrinsics, -1 for none, and
-    ``spread`` (8,) of each intrinsic about the kind's mean (relative for the focal, inf = not bound)."""
+    ``spread`` (G, 8) of each intrinsic about the mean of its row's kind (relative for the focal, inf = not
+    bound)."""
 
     rows: I64
     spread: F64

@@ -44,7 +44,8 @@ class OwnFit:
 
     def adjusted(self, columns: tuple[int, ...], *, focal_spread: float = np.inf) -> MetricBundleResult:
         """With a value of its own in ``columns`` for every view, of which nothing is known but, where it is
-        finite, the ``focal_spread`` (relative) of the focals about a common one that is not known."""
+        finite, the ``focal_spread`` (relative) of the focals that were shared about one that is not
+        known."""
         model, views, adjustment = self.model, self.views, replace(self.adjustment, population=None)
         t, cameras, index = model.tracks, model.cameras, part_of_explained(model)
         assert cameras.shared is not None
@@ -59,7 +60,7 @@ class OwnFit:
         known = IntrinsicsPrior(prior.mean[rows], std)
         if np.isfinite(focal_spread):
             spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
-            known = replace(known, population=np.zeros(len(views), dtype=np.int64), spread=spread)
+            known = replace(known, population=cameras.shared[rows, FOCAL], spread=spread)
         options = replace(adjustment, inflation=1.0).options(model, iterations=ROUNDS)
         return refine_metric_bundle(
             MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),

@@ -69,10 +69,9 @@ def estimate_population(own: OwnValues, shared: I64) -> Population | None:
     Raises nothing: kinds with fewer than ``LEAST_MEMBERS`` distinct values are left alone.
     """
     rows = own.members.copy()
-    spread = np.full(WIDTH, np.inf)
+    spread = np.full((len(rows), WIDTH), np.inf)
     outside = np.zeros(len(rows), dtype=bool)
     for column in COLUMNS:
-        found: list[float] = []
         for kind in np.unique(rows[rows >= 0]):
             index = np.flatnonzero(rows == kind)
             index = index[np.unique(shared[index, column], return_index=True)[1]]
@@ -83,9 +82,7 @@ def estimate_population(own: OwnValues, shared: I64) -> Population | None:
             far = outlying(value, total)
             if column == FOCAL:
                 outside |= np.isin(shared[:, column], shared[index[far], column]) & (rows == kind)
-            found.append(measured_spread(value[~far], std[~far], total[~far]))
-        if found:
-            spread[column] = max(found)
+            spread[rows == kind, column] = measured_spread(value[~far], std[~far], total[~far])
     rows[outside] = -1
     return Population(rows, spread) if np.isfinite(spread).any() else None
 
@@ -122,12 +119,12 @@ def bind(
 ) -> tuple[MetricModel, Adjustment]:
     """The adjustment with the population, and the model with the lens shared where the zoom is one."""
     assert model.cameras.shared is not None
-    if population.spread[FOCAL] < SAME_ZOOM:
-        shared = model.cameras.shared.copy()
-        for kind in np.unique(population.rows[population.rows >= 0]):
-            rows = np.flatnonzero(population.rows == kind)
+    shared = model.cameras.shared.copy()
+    for kind in np.unique(population.rows[population.rows >= 0]):
+        rows = np.flatnonzero(population.rows == kind)
+        if population.spread[rows[0], FOCAL] < SAME_ZOOM:
             shared[rows, K1 + 1 :] = shared[rows[0], K1 + 1 :]
-        model = replace(model, cameras=replace(model.cameras, shared=shared))
+    model = replace(model, cameras=replace(model.cameras, shared=shared))
     return model, replace(adjustment, population=population)
 
 
@@ -165,7 +162,9 @@ def borrowing(own: OwnValues, population: Population | None, group: I64) -> Borr
     """Who borrows a focal: weight tau^2 / (tau^2 + s_i^2) on a camera's own matches."""
     std = own.std[:, FOCAL]
     weight = np.ones(len(std))
-    if population is not None and np.isfinite(population.spread[FOCAL]):
-        tau = population.spread[FOCAL]
-        weight = np.where(population.rows >= 0, tau**2 / (tau**2 + std**2), 1.0)
+    if population is not None:
+        tau = population.spread[:, FOCAL]
+        bound = (population.rows >= 0) & np.isfinite(tau)
+        tau = np.where(bound, tau, 1.0)
+        weight = np.where(bound, tau**2 / (tau**2 + std**2), 1.0)
     return Borrowing(np.hypot(std, own.floor[:, FOCAL])[group], weight[group])

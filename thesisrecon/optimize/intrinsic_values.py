@@ -108,12 +108,15 @@ def number_values(
         table[:, c], number[:, c] = _number_column(int(c), value, (table[:, c], used), prior, parts)
     seen = len(parts.start)
     if prior.population is not None and prior.spread is not None:
-        for c in np.flatnonzero(free & np.isfinite(prior.spread)):
+        spread = np.broadcast_to(prior.spread, table.shape)
+        for c in np.flatnonzero(free):
             for kind in np.unique(prior.population[prior.population >= 0]):
                 rows = np.flatnonzero((prior.population == kind) & used)
+                if not len(rows) or not np.isfinite(spread[rows[0], c]):
+                    continue
                 sharing = rows if cameras.shared is None else cameras.shared[rows, c]
                 rows = rows[np.unique(sharing, return_index=True)[1]]
-                parts.bind_population(int(c), number[rows, c], table[rows, c], float(prior.spread[c]))
+                parts.bind_population(int(c), number[rows, c], table[rows, c], float(spread[rows[0], c]))
     table[:, FOCAL] = np.exp(table[:, FOCAL])
     table = np.where(np.asarray(free), table, cameras.intrinsics)
     column = np.array(parts.column, dtype=np.int64)

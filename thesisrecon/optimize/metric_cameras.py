@@ -56,9 +56,9 @@ class IntrinsicsPrior:
     share a value have one prior for it: the tightest of theirs.
 
     ``population`` (G,): rows of equal number are cameras of one kind, whose values scatter about a common
-    mean that is not known, with standard deviation ``spread`` (C,) (relative for the focal; inf = no such
-    assumption): a camera whose own photographs do not determine a value borrows it from the others. -1: of
-    no kind.
+    mean that is not known, with standard deviation ``spread`` (C,), or (G, C) where each kind has its own
+    (that of its first row counts; relative for the focal; inf = no such assumption): a camera whose own
+    photographs do not determine a value borrows it from the others. -1: of no kind.
     """
 
     mean: F64
@@ -106,5 +106,7 @@ def check_prior(prior: IntrinsicsPrior, shape: tuple[int, ...]) -> None:
         raise ValueError("a population needs its spread, and a spread its population")
     if prior.population is not None and prior.spread is not None:
         shapes = (np.shape(prior.population), np.shape(prior.spread))
-        if shapes != (shape[:1], shape[1:]) or not (prior.spread > 0.0).all():
-            raise ValueError(f"population is (G,) and spread (C,) above 0; got {shapes}, {prior.spread}")
+        if shapes not in ((shape[:1], shape[1:]), (shape[:1], shape)) or not (prior.spread > 0.0).all():
+            raise ValueError(
+                f"population is (G,) and spread (C,) or (G, C) above 0; got {shapes}, {prior.spread}"
+            )
