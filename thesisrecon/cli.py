@@ -379,8 +379,8 @@ def _found(summary: Mapping[str, Any]) -> str:
 
 
 def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
-    """One line per camera: focal length, principal point and what else of K was estimated, with their standard
-    deviations."""
+    """One line per camera: focal length, principal point and what else of K was estimated, with their
+    standard deviations."""
     lines: dict[tuple[int, float], str] = {}
     for view in views:
         if "focal_px" not in view:

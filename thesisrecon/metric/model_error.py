@@ -17,8 +17,8 @@ from thesisrecon.optimize.bundle_blocks import BlockScatter
 F64 = NDArray[np.float64]
 
 USUAL_INFLATION = 4.0
-"""By how much the standard deviations of a bundle adjustment are too small on photographs (4 to 10 was seen),
-where nothing measures it."""
+"""By how much the standard deviations of a bundle adjustment are taken to be too small on photographs where
+nothing measures it: 2 to 5 is what the scatter shows where it does."""
 # Below this the blocks of a scene say nothing.
 LEAST_BLOCKS = 4
 # The contradiction of noise alone keeps below the first; at the second the model is surely wrong somewhere.
