@@ -230,6 +230,13 @@ def test_the_focal_length_is_given_as_the_readme_says(
     assert (asked[0].focal_px, asked[0].focal_std_rel) == (1200.0, 0.05)
 
 
+def test_the_last_line_tells_the_time_of_this_run() -> None:
+    whole = {"seconds": {"total": 40.0}, "elapsed_seconds": 41.5, "resumed": []}
+    assert cli._time_taken(whole) == "41.5 s"
+    again = {**whole, "elapsed_seconds": 1.5, "resumed": ["features"]}
+    assert cli._time_taken(again) == "1.5 s (40.0 s with what was kept of an earlier run)"
+
+
 def test_every_camera_has_a_line_with_what_was_estimated_of_it() -> None:
     def view(camera: int, focal: float, **more: float) -> dict[str, Any]:
         values = {"focal_px": focal, "principal_x_px": 5.0, "principal_y_px": 4.0, **more}

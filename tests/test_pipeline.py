@@ -128,6 +128,7 @@ def test_a_second_run_computes_nothing(tmp_path: Path) -> None:
     assert kept_bytes(tmp_path) == before
     assert second.summary["resumed"] == list(read(tmp_path / "summary.json")["resumed"])
     assert set(second.summary["resumed"]) == set(first.summary["seconds"]) - {"images", "outputs", "total"}
+    assert second.summary["elapsed_seconds"] > 0.0
     assert second.summary["seconds"]["matches"] == first.summary["seconds"]["matches"]
 
 

@@ -355,8 +355,15 @@ def _print_summary(summary: Mapping[str, Any], out: Path) -> None:
     lines += [f"warning: {warning}" for warning in summary["warnings"]]
     if summary["failure"]:
         lines.append(f"failed: {summary['failure']}")
-    lines.append(f"{summary['seconds']['total']:.1f} s; the page is {out / 'report.html'}")
+    lines.append(f"{_time_taken(summary)}; the page is {out / 'report.html'}")
     typer.echo("\n".join(lines))
+
+
+def _time_taken(summary: Mapping[str, Any]) -> str:
+    """What this run took; where stages were kept, also what all of them took when they were computed."""
+    total = summary["seconds"]["total"]
+    took = f"{summary.get('elapsed_seconds', total):.1f} s"
+    return f"{took} ({total:.1f} s with what was kept of an earlier run)" if summary["resumed"] else took
 
 
 def _found(summary: Mapping[str, Any]) -> str:

@@ -159,6 +159,7 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         "threads": run.workers.threads,
         "executor": run.workers.executor,
         "seconds": seconds | {"total": round(sum(seconds.values()), 3)},
+        "elapsed_seconds": round(run.elapsed_s, 3),
         "resumed": list(run.resumed),
         "peak_memory_mb": round(_peak_memory_mb(), 1),
     }

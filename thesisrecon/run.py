@@ -81,6 +81,12 @@ class Run:
     reports: dict[str, StageReport] = field(default_factory=dict)
     resumed: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    started: float = field(default_factory=time.perf_counter)
+
+    @property
+    def elapsed_s(self) -> float:
+        """Wall time (s) since the start of this run; the clocks of stages that were kept tell of older ones."""
+        return time.perf_counter() - self.started
 
     @contextmanager
     def clock(self, stage: str) -> Iterator[StageLog]:
