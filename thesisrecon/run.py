@@ -85,7 +85,7 @@ class Run:
 
     @property
     def elapsed_s(self) -> float:
-        """Wall time (s) since the start of this run; the clocks of stages that were kept tell of older ones."""
+        """Wall time (s) since the run was started; the clocks of kept stages tell of older ones."""
         return time.perf_counter() - self.started
 
     @contextmanager
