@@ -11,7 +11,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -141,7 +141,7 @@ def check_scene(name: str, out: Path, options: argparse.Namespace) -> list[Metri
     if run.metric is None:
         raise RuntimeError(f"{name}: {run.failure}")
     model = run.metric.reconstruction
-    stereo = VARIANTS[options.variant]
+    stereo = replace(VARIANTS[options.variant], max_side=options.max_side)
     wall, cpu = time.perf_counter(), time.process_time()
     prepared = stereo.prepare(run.images, model)
     maps = stereo.map_all(run.images, model, threads=options.threads)
@@ -191,6 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-o", "--out", type=Path, help="where reconstructions and pictures are kept")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=SCENES)
     parser.add_argument("--variant", default="default", choices=list(VARIANTS))
+    parser.add_argument("--max-side", type=int, default=MultiViewStereo().max_side, help="px")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--pictures", action="store_true", help="draw the depth maps into OUT")
     options = parser.parse_args(arguments)

@@ -26,8 +26,8 @@ class Consistency:
     go.
     """
 
-    reprojection_px: float = 1.0
-    relative: float = 0.005
+    reprojection_px: float = 1.5
+    relative: float = 0.01
     deviations: float = 2.0
     least_views: int = 1
     smallest_piece: float = 1e-4
