@@ -79,7 +79,9 @@ class PathSum:
 
         # A byte for the cost of a disparity of a pixel, and one for each pair of opposite paths.
         per_row = (1 + self._pairs) * width * (last - first + 1)
-        run_strips(work, row_strips(height, per_row, 1e6 * self.memory_mb), self.threads)
+        memory = 1e6 * self.memory_mb
+        room = max(memory - 2 * scratch_size(height, last - first + 1, width), 0.5 * memory)
+        run_strips(work, row_strips(height, per_row, room), self.threads)
         left_px, right_px, confidence = found
         left_px[sides[0].valid == 0] = np.nan
         return self.finish.apply(left_px, right_px, confidence, texture_of(sides[0], measured))

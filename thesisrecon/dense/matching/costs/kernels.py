@@ -290,13 +290,21 @@ def _mean_along_column(ring: U16, y: int, masks: U16, share: F32, out: U8) -> No
 
 
 @njit(cache=True, nogil=True)
+def _widen_mask(mask: U8, out: U16) -> None:
+    for x in range(len(out)):
+        out[x] = np.uint16(np.uint16(mask[x]) * np.uint16(257))
+
+
+@njit(cache=True, nogil=True)
 def _shares(counts: U16, y: int, masks: U16, share: F32) -> None:
     """1 / number of pixels in the support of every pixel of row y."""
     n = len(counts)
+    far_a, above, here = counts[(y - 2) % n], counts[(y - 1) % n], counts[y % n]
+    below, far_b = counts[(y + 1) % n], counts[(y + 2) % n]
+    mask_a, mask_far_a, mask_b, mask_far_b = masks[0], masks[1], masks[2], masks[3]
     for x in range(len(share)):
-        total = int(counts[y % n, x])
-        for k, dy in enumerate((-1, -2, 1, 2)):
-            total += int(counts[(y + dy) % n, x] & masks[k, x])
+        total = np.int32(here[x]) + np.int32(above[x] & mask_a[x]) + np.int32(far_a[x] & mask_far_a[x])
+        total += np.int32(below[x] & mask_b[x]) + np.int32(far_b[x] & mask_far_b[x])
         share[x] = np.float32(1.0) / np.float32(total)
 
 
@@ -334,8 +342,7 @@ def cost_volume(
                 _sum_along_row(costs[q], masks, summed, ring[q, summed % span])
             summed += 1
         for k in range(2 * ARM):
-            for x in range(width):
-                wide[k, x] = np.uint16(masks[2 + k // ARM, k % ARM, y, x]) * np.uint16(257)
+            _widen_mask(masks[2 + k // ARM, k % ARM, y], wide[k])
         _shares(counts, y, wide, share)
         for q in range(n):
             _mean_along_column(ring[q], y, wide, share, volume[y, q])

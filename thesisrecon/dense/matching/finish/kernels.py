@@ -170,10 +170,17 @@ def remove_peaks(disparity: F32, evident: B8, step: np.float32, smallest: int) -
     around them, than one in twenty; neighbours are connected where their disparities differ by no more than
     ``step``."""
     height, width = disparity.shape
-    flat, counted = disparity.reshape(height * width), evident.reshape(height * width)
-    queue = np.empty(height * width, np.int32)
+    # A frame of unknown pixels, one column for both sides: every pixel then has four neighbours.
+    line = width + 1
+    flat = np.full((height + 2) * line, np.float32(np.nan), np.float32)
+    counted = np.zeros((height + 2) * line, np.bool_)
+    for y in range(height):
+        start = (y + 1) * line
+        flat[start : start + width] = disparity[y]
+        counted[start : start + width] = evident[y]
     open_ = ~np.isnan(flat)
-    for seed in range(height * width):
+    queue = np.empty(height * width, np.int32)
+    for seed in range(line, (height + 1) * line):
         if not open_[seed]:
             continue
         open_[seed] = False
@@ -183,13 +190,9 @@ def remove_peaks(disparity: F32, evident: B8, step: np.float32, smallest: int) -
             place = queue[at]
             at += 1
             size += counted[place]
-            here, column = flat[place], place % width
+            here = flat[place]
             for k in range(4):
-                other = place + (1 if k == 0 else -1 if k == 1 else width if k == 2 else -width)
-                if (k == 0 and column == width - 1) or (k == 1 and column == 0):
-                    continue
-                if other < 0 or other >= height * width:
-                    continue
+                other = place + (1 if k == 0 else -1 if k == 1 else line if k == 2 else -line)
                 if not abs(flat[other] - here) <= step:
                     size += counted[other]
                 elif open_[other]:
@@ -198,6 +201,8 @@ def remove_peaks(disparity: F32, evident: B8, step: np.float32, smallest: int) -
                     n += 1
         if n < smallest or EVIDENT * size < n:
             for k in range(n):
+                y, x = queue[k] // line - 1, queue[k] % line
+                disparity[y, x] = np.nan
                 flat[queue[k]] = np.nan
 
 
