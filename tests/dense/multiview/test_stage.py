@@ -42,8 +42,9 @@ def test_depth_is_that_of_the_scene_and_its_deviation_tells_the_error(walled, li
 
 
 def test_the_same_bytes_whatever_the_number_of_threads_and_one_by_one(walled):
-    together = STEREO.map_all(walled.images, walled.reconstruction, threads=2)
-    scene = STEREO.prepare(walled.images, walled.reconstruction)
+    reconstruction = replace(walled.reconstruction, registered=np.array([True, True, True, False]))
+    together = STEREO.map_all(walled.images, reconstruction, threads=2)
+    scene = STEREO.prepare(walled.images, reconstruction)
     raw = {i: STEREO.depth_map(scene, i) for i in sorted(scene.views, reverse=True)}
     for i in scene.views:
         one = STEREO.confirm(scene, raw, i)
@@ -71,11 +72,8 @@ def test_no_baseline_gives_no_depth():
 
 
 def test_a_wall_without_texture_is_unknown():
-    plain = make_walled(on_arc((-9.0, 0.0, 9.0)), plain=True)
-    maps = STEREO.map_all(plain.images, plain.reconstruction)
-    assert known_share(maps) < 0.3
-    textured = make_walled(on_arc((-9.0, 0.0, 9.0)))
-    assert known_share(STEREO.map_all(textured.images, textured.reconstruction)) > 0.7
+    plain = make_walled(on_arc((-5.0, 5.0)), plain=True)
+    assert known_share(STEREO.map_all(plain.images, plain.reconstruction)) < 0.3
 
 
 def test_forward_motion_is_right_where_it_is_known():

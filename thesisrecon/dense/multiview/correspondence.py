@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, SemiGlobal
+from thesisrecon.dense.matching.ranges import LARGEST
 from thesisrecon.dense.rectification import AnyRectification, disparity_range, rectify_cameras
+from thesisrecon.errors import StageFailure
 from thesisrecon.types import B8, F32, F64, DisparityMap, PinholeView
 
 STRIP_ROWS = 128
@@ -60,7 +62,7 @@ class PairMatching:
         """
         sizes = [(v.seen.shape[1], v.seen.shape[0]) for v in (reference, other)]
         frame = rectify_cameras(reference.P, other.P, sizes[0], sizes[1], xy1=xy1, xy2=xy2)
-        wanted = disparity_range(frame, xy1, xy2, margin=self.range_margin)
+        wanted = _searched(frame, disparity_range(frame, xy1, xy2, margin=self.range_margin))
         left = frame.warp(_levels(reference), 0)
         right = frame.warp(_levels(other) * brightness_gain(reference, other, xy1, xy2), 1)
         found = self.matcher.match(left, right, disparity_range=wanted)
@@ -90,6 +92,19 @@ class PairMatching:
             # Half the confidence is what a pixel has whose rival costs a step on every path more.
             sigma[at] = deviation * scale * np.sqrt(0.5 / np.clip(sure[inside], 0.05, 0.5))
         return Correspondence(xy, sigma, confidence)
+
+
+def _searched(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int]:
+    """What of a range can be inside the frame; ``StageFailure`` where that is nothing or too much."""
+    reach = frame.size[0] - 1
+    first, last = max(wanted[0], -reach), min(wanted[1], reach)
+    if not 0 <= last - first < LARGEST:
+        raise StageFailure(
+            "the disparities of the pair cannot be searched",
+            f"they run from {first} to {last} px",
+            "choose neighbours nearer to each other, or a smaller size",
+        )
+    return first, last
 
 
 def sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
