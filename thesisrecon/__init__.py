@@ -14,13 +14,13 @@ if TYPE_CHECKING:
         estimate_fundamental,
         match_pair,
         match_rectified,
-        render,
         self_calibrate,
         upgrade_affine,
     )
     from thesisrecon.geometry.pinhole import PinholeCamera
     from thesisrecon.geometry.triangulation import triangulate
     from thesisrecon.pipeline import reconstruct
+    from thesisrecon.views import render
 
 __version__ = "0.1.0"
 
@@ -31,7 +31,7 @@ _HOME_OF = {
     "match_pair": "doors",
     "match_rectified": "doors",
     "reconstruct": "pipeline",
-    "render": "doors",
+    "render": "views",
     "self_calibrate": "doors",
     "triangulate": "geometry.triangulation",
     "upgrade_affine": "doors",

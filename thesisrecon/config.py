@@ -55,6 +55,7 @@ from thesisrecon.types import (
     I64,
     Assumptions,
     DepthMap,
+    DisparityMap,
     Features,
     FundamentalFit,
     Image,
@@ -178,7 +179,11 @@ class MetricRefiner(Protocol):
 
 
 class DepthEstimator(Protocol):
-    """Section 2.5: depth of every pixel of every view; one view at a time, so that a run can go on."""
+    """Section 2.5: depth of every pixel of every view; one view at a time, so that a run can go on.
+
+    ``match_rectified`` is its matcher alone, on a rectified pair of arrays."""
+
+    def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap: ...
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene: ...
 

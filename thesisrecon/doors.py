@@ -10,24 +10,14 @@ import numpy as np
 from thesisrecon.affine import upgrade_affine
 from thesisrecon.assumptions import assume
 from thesisrecon.config import PipelineConfig, seeing
-from thesisrecon.dense import MultiViewStereo
-from thesisrecon.dense.matching import match_rectified as match_pair_of_rows
 from thesisrecon.epipolar import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.images import read_photographs
 from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.run import stream
 from thesisrecon.types import DisparityMap, Image, Reconstruction, SelfCalibration, TwoView
-from thesisrecon.views import render
 
-__all__ = [
-    "estimate_fundamental",
-    "match_pair",
-    "match_rectified",
-    "render",
-    "self_calibrate",
-    "upgrade_affine",
-]
+__all__ = ["estimate_fundamental", "match_pair", "match_rectified", "self_calibrate", "upgrade_affine"]
 
 
 def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0) -> TwoView:
@@ -61,10 +51,9 @@ def match_rectified(
     Files are taken at their own size. Raises :class:`StageFailure` for a file that cannot be read,
     ``ValueError`` for sizes that differ.
     """
-    dense = (config or PipelineConfig()).dense
-    matcher = dense.pairs.matcher if isinstance(dense, MultiViewStereo) else None
     images = [side if isinstance(side, np.ndarray) else _full_size(side) for side in (left, right)]
-    return match_pair_of_rows(images[0], images[1], max_disparity_px=max_disparity_px, config=matcher)
+    dense = (config or PipelineConfig()).dense
+    return dense.match_rectified(images[0], images[1], max_disparity_px=max_disparity_px)
 
 
 def _full_size(path: Any) -> Any:

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from thesisrecon.dense.matching import match_rectified
 from thesisrecon.dense.multiview.consistency import Consistency
 from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching
 from thesisrecon.dense.multiview.linking import InverseDepth, RobustFusion, SequenceLinking
@@ -21,7 +23,7 @@ from thesisrecon.dense.multiview.neighbours import (
 from thesisrecon.dense.multiview.refinement import PlaneRefinement
 from thesisrecon.dense.multiview.undistort import pinhole_view
 from thesisrecon.errors import StageFailure
-from thesisrecon.types import DepthMap, Image, PinholeView, Reconstruction
+from thesisrecon.types import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 
 Result = TypeVar("Result")
 
@@ -53,6 +55,10 @@ class MultiViewStereo:
     refinement: PlaneRefinement | None = field(default_factory=PlaneRefinement)
     consistency: Consistency = field(default_factory=Consistency)
     max_side: int = 1024
+
+    def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
+        """Disparities of a rectified pair of arrays by the matcher of ``pairs``."""
+        return match_rectified(left, right, max_disparity_px=max_disparity_px, config=self.pairs.matcher)
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
         """Undistorted views, sparse points and neighbours of V photographs with a metric reconstruction.
