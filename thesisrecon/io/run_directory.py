@@ -34,7 +34,7 @@ except ImportError:  # pragma: no cover - only where there is no POSIX
 FORMAT = 1
 RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
 _DESCRIPTION = "description"
-_CODE_OF_ALL_STAGES = ("types.py", "geometry", "robust", "optimize")
+_CODE_OF_ALL_STAGES = ("types", "geometry", "robust", "optimize")
 
 
 def key_of(*parts: Any) -> str:
