@@ -245,16 +245,3 @@ def thickness(X: F64, *, kept: float = 0.95) -> float:
         centred = centred[order] - centred[order].mean(axis=0)
     s = np.linalg.svd(centred, compute_uv=False)
     return float(s[2] / max(float(s[1]), 1e-300))
-
-
-def optical_axes_gap(F: F64) -> float:
-    """How far two cameras are from looking at one point: the distance (long sides) of one image's centre from
-    the epipolar line of the other's, the larger of the two. F (3, 3) in unit-free pixels.
-
-    At zero the optical axes meet or are parallel, and two focal lengths cannot be had from F alone (Bougnoux,
-    ICCV 1998; Sturm, BMVC 1999).
-    """
-    lines = np.stack([F[:, 2], F[2]])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gap = np.abs(F[2, 2]) / np.linalg.norm(lines[:, :2], axis=1)
-    return float(np.nan_to_num(gap, nan=0.0, posinf=np.inf).max())

@@ -79,9 +79,9 @@ def verdict_without_an_answer(reconstruction: Reconstruction, assumed: Assumptio
         "nearness": nearness,
         "spare_equations": float(spare_equations(assumed, reconstruction.registered)),
     }
-    return MotionVerdict(
-        False, motion, nearness < 1.0, evidence, motion_sentences(motion, evidence, identifiable=False)
-    )
+    given = _given_focal_std(assumed.std[reconstruction.registered, 0])
+    sentences = motion_sentences(motion, evidence, identifiable=False, focal_std=given)
+    return MotionVerdict(False, motion, nearness < 1.0, evidence, sentences)
 
 
 def spare_equations(assumed: Assumptions, registered: B8) -> int:
@@ -271,10 +271,16 @@ def _verdict(
         and (turned or settled)
         and evidence["noise_over_projective"] < MOST_NOISE
     )
-    sentences = motion_sentences(motion, evidence, identifiable=identifiable)
+    given = _given_focal_std(problem.prior.std[:, 0])
+    sentences = motion_sentences(motion, evidence, identifiable=identifiable, focal_std=given)
     return MotionVerdict(
         identifiable, motion, nearness < 1.0, evidence, sentences, tuple(int(v) for v in undetermined)
     )
+
+
+def _given_focal_std(std: F64) -> float:
+    """The largest of the deviations of focal lengths beforehand, inf without any view."""
+    return float(std.max(initial=0.0)) if len(std) else float("inf")
 
 
 def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:

@@ -56,25 +56,26 @@ _FOUND_WITHOUT_AN_ANSWER: Mapping[str, str] = {
         "length open (the picture of infinity moves by {image_shift_beyond_roll:.1%} of the image)"
     ),
 }
-_TURN_MORE = (
-    "turn the camera by 10 degrees and more between photographs, about the vertical and sideways, "
-    "or give the focal length"
-)
+_TURN_MORE = "turn the camera by 10 degrees and more between photographs, about the vertical and sideways"
 _ADVICE: Mapping[str, str] = {
     critical.PLANE: "have things at different depths in the picture",
     critical.ROTATION: "walk around the scene between photographs",
     critical.TRANSLATION: _TURN_MORE,
-    critical.OPTICAL_AXIS: "point the camera in different directions, or give the focal length",
+    critical.OPTICAL_AXIS: "point the camera in different directions",
     critical.TURNTABLE: "take some photographs from higher or lower, or with the camera turned on its side",
     critical.PLANAR: "take some photographs from higher or lower, or with the camera turned on its side",
     critical.PARALLEL_AXES: "tilt the camera up and down too, or turn it on its side",
 }
+_FOCAL_SETTLES = (_TURN_MORE, _ADVICE[critical.OPTICAL_AXIS])
 _SHAPE_SETTLES = (critical.TURNTABLE, critical.PLANAR, critical.PARALLEL_AXES)
 
 
-def motion_sentences(motion: str, evidence: Mapping[str, float], *, identifiable: bool) -> tuple[str, ...]:
+def motion_sentences(
+    motion: str, evidence: Mapping[str, float], *, identifiable: bool, focal_std: float
+) -> tuple[str, ...]:
     """What a person is told of a verdict; empty where there is nothing to say (a general motion that
-    determines all)."""
+    determines all). ``focal_std`` is the largest relative deviation of the focal lengths that were given, inf
+    where one was not."""
     is_critical = bool(motion) and evidence["nearness"] < 1.0
     answered = "focal_std_rel" in evidence
     told = []
@@ -96,7 +97,7 @@ def motion_sentences(motion: str, evidence: Mapping[str, float], *, identifiable
         )
     if identifiable:
         return (*told, *_what_holds(motion, evidence)) if is_critical else tuple(told)
-    return (*told, *_what_fails(motion, evidence, is_critical=is_critical))
+    return (*told, *_what_fails(motion, evidence, is_critical, focal_std))
 
 
 def _what_holds(motion: str, evidence: Mapping[str, float]) -> list[str]:
@@ -119,8 +120,11 @@ def _what_holds(motion: str, evidence: Mapping[str, float]) -> list[str]:
     ]
 
 
-def _what_fails(motion: str, evidence: Mapping[str, float], *, is_critical: bool) -> list[str]:
+def _what_fails(motion: str, evidence: Mapping[str, float], is_critical: bool, focal_std: float) -> list[str]:
     advice = _ADVICE.get(motion, _TURN_MORE) if is_critical else _TURN_MORE
+    if advice in _FOCAL_SETTLES and focal_std > 0.0:
+        given = " more exactly" if focal_std < float("inf") else ""
+        advice += f", or give the focal length{given}"
     if "focal_std_rel" not in evidence:
         return [advice]
     std = evidence["focal_std_rel_median"]
