@@ -17,7 +17,7 @@ import pytest
 from thesisrecon.cli import run_command
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
-SMALL = ["--max-size", "480", "--threads", "2"]
+SMALL = ["--max-size", "480", "--threads", "2", "--until", "metric"]
 
 
 @pytest.fixture

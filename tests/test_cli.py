@@ -23,7 +23,7 @@ from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, Seque
 ROOT = Path(__file__).parent.parent
 COURTYARD = ROOT / "fixtures" / "courtyard"
 VIEWS = 6
-SMALL = ["--max-size", "640", "--threads", "2"]
+SMALL = ["--max-size", "640", "--threads", "2", "--until", "metric"]
 
 
 @pytest.fixture(scope="module")

@@ -38,6 +38,7 @@ def _forget_calls() -> None:
 def run(out: Path, n: int = 4, **given: Any) -> RunResult:
     given.setdefault("config", fake_config())
     given.setdefault("threads", 2)
+    given.setdefault("until", "metric")
     return reconstruct(photographs(n), out, **given)
 
 
@@ -92,7 +93,7 @@ def test_a_run_leaves_everything_it_promises(tmp_path: Path) -> None:
 def test_summary_and_cameras_are_in_original_pixels(tmp_path: Path) -> None:
     """Photographs at half size: (x + 0.5) / s - 0.5, focal and residuals by 1 / s."""
     images = [Image(i.name, i.rgb, (2 * fakes.WIDTH, 2 * fakes.HEIGHT)) for i in photographs(3)]
-    result = reconstruct(images, tmp_path, config=fake_config())
+    result = reconstruct(images, tmp_path, config=fake_config(), until="metric")
     camera = result.summary["cameras"][0]
     assert camera["focal_px"]["value"] == pytest.approx(200.0)
     assert camera["focal_px"]["std"] == pytest.approx(2.0)
@@ -184,6 +185,28 @@ def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path: Path) -> None:
         run(tmp_path, until="model", config=config)
     assert (tmp_path / "cameras.json").exists()
     assert "no depths" in read(tmp_path / "summary.json")["failure"]
+
+
+def test_who_asks_for_no_surface_by_name_is_content_with_the_cameras(tmp_path: Path) -> None:
+    config = fake_config(dense=fakes.FakeDense(confirmed=False))
+    result = run(tmp_path, until=None, config=config)
+    assert result.mesh is None
+    summary = read(tmp_path / "summary.json")
+    assert (summary["failure"], summary["model"], summary["registered"]) == (None, None, 4)
+    assert any(
+        warning.startswith("there is no model: no depths were found") for warning in summary["warnings"]
+    )
+
+
+def test_the_end_is_a_model_unless_told_otherwise(tmp_path: Path) -> None:
+    result = run(tmp_path, until=None)
+    assert result.mesh is not None
+    summary = read(tmp_path / "summary.json")
+    assert summary["until"] == "model"
+    assert summary["model"]["faces"] == len(result.mesh.faces)
+    assert [m["share_known"] for m in summary["depth_maps"]] == [
+        pytest.approx(np.isfinite(m.depth).mean()) for m in result.depth_maps
+    ]
 
 
 def test_a_damaged_result_is_computed_again(tmp_path: Path) -> None:

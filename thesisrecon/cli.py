@@ -130,17 +130,18 @@ def reconstruct(
         ),
     ] = None,
     until: Annotated[
-        str,
+        str | None,
         typer.Option(
-            "--until", help="The last stage: features, matches, projective, metric, dense or model."
+            "--until",
+            help="The last stage: features, matches, projective, metric, dense or model (the default).",
         ),
-    ] = "metric",
+    ] = None,
     executor: Annotated[
         str, typer.Option("--executor", help="Workers are threads (local) or processes.")
     ] = "local",
     overwrite: Overwrite = False,
 ) -> None:
-    """Reconstruct metric cameras and points from a folder of photographs."""
+    """Reconstruct metric cameras, points and a textured model from a folder of photographs."""
     _cap_threads(threads)
     wishes = _option_tables(cameras, max_size, pairs)
     chosen = _config(preset.value if preset else None, config, wishes, settings or [])
@@ -351,6 +352,8 @@ def _print_summary(summary: Mapping[str, Any], out: Path) -> None:
             f"{summary['reprojection_median_px']:.3f} px median"
         )
     lines += _intrinsic_lines(summary["cameras"])
+    if summary.get("model"):
+        lines.append(f"model of {summary['model']['faces']} triangles: {out / 'model.glb'}")
     lines += [f"refused: {refused['name']}: {refused['reason']}" for refused in summary["refused"]]
     lines += [f"warning: {warning}" for warning in summary["warnings"]]
     if summary["failure"]:

@@ -89,12 +89,14 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             write_affine(out / "affine.ply", affine_of(result), colours)
             if result.mesh is not None:
                 write_mesh(out / "model.glb", result.mesh)
+            else:
+                run.directory.remove(("model.glb",))
         else:
             run.directory.remove(MODEL_FILES)
         result = _described(run, result, until, failure)
         write_atomically(out / "config.toml", toml_from_config(run.config).encode())
         page = _report_data(run, result, colours, failure)
-        write_report(out / PAGE, replace(page, until=None if until == "metric" else until))
+        write_report(out / PAGE, replace(page, until=None if until == "model" else until))
     run.finish("outputs", counts={})
     result = replace(
         result, reports=tuple(run.reports.values()), summary={**result.summary, **_run_facts(run, until)}

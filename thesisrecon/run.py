@@ -43,11 +43,12 @@ Until = Literal["features", "matches", "projective", "metric", "dense", "model"]
 class RunOptions(TypedDict, total=False):
     """How a run is carried out, none of which changes what it finds.
 
-    ``until`` : the last stage ("metric"). ``threads`` : workers (all processors). ``executor`` : "local"
-    threads or "processes". ``overwrite`` : take over a folder that holds another run (False).
+    ``until`` : the last stage. None = "model", and a run that finds cameras and points but no surface ends
+    well, with a warning. ``threads`` : workers (all processors). ``executor`` : "local" threads or
+    "processes". ``overwrite`` : take over a folder that holds another run (False).
     """
 
-    until: Until
+    until: Until | None
     threads: int | None
     executor: str
     overwrite: bool
@@ -195,7 +196,7 @@ def start_run(
     unknown = sorted(set(options) - set(RunOptions.__annotations__))
     if unknown:
         raise TypeError(unknown_word("option of reconstruct", unknown[0], RunOptions.__annotations__))
-    until = options.get("until", "metric")
+    until: Until = options.get("until") or "model"
     if until not in get_args(Until):
         raise UsageError(unknown_word("stage", str(until), get_args(Until)))
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:

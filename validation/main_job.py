@@ -101,6 +101,7 @@ def run_method(method: str, scene: Scene, out: Path, *, threads: int, environmen
 def _command(method: str, images: Path, out: Path, threads: int) -> list[str]:
     if method in (OURS, THESIS):
         ours = [sys.executable, "-m", "thesisrecon", "reconstruct", str(images), "-o", str(out)]
+        ours += ["--until", "metric"]  # as far as the mappings of the references go
         return [*ours, "--preset", METHODS[method], "--cameras", "shared", "--threads", str(threads)]
     theirs = [sys.executable, "-m", "validation.references.pycolmap_reference", str(images), str(out)]
     extra = ["--refine-principal-point"] if method == COLMAP_PP else []

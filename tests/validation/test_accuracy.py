@@ -71,7 +71,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     def once(name: str, cameras: Mode = "shared") -> RunResult:
         config = PipelineConfig(intrinsics=IntrinsicsAssumption(cameras=cameras))
         paths = list(scene_or_skip(name).image_paths)
-        return thesisrecon.reconstruct(paths, folder / name, config=config, seed=0, overwrite=True)
+        return thesisrecon.reconstruct(
+            paths, folder / name, config=config, seed=0, overwrite=True, until="metric"
+        )
 
     return once
 
@@ -164,7 +166,9 @@ def test_intervals_of_the_courtyard_hold_its_camera(run: Run) -> None:
 def test_zoomed_and_cropped_photographs_are_calibrated_each_for_itself(tmp_path: Path) -> None:
     scene = rezoom_scene(scene_or_skip("Herz-Jesus-P8"), tmp_path / "images", seed=0)
     config = PipelineConfig(intrinsics=IntrinsicsAssumption(cameras="per-image"))
-    result = thesisrecon.reconstruct(list(scene.image_paths), tmp_path / "out", config=config, seed=0)
+    result = thesisrecon.reconstruct(
+        list(scene.image_paths), tmp_path / "out", config=config, seed=0, until="metric"
+    )
     assert result.metric is not None
     assert result.metric.trusted, result.metric.doubts
     found = result.metric.reconstruction

@@ -32,8 +32,9 @@ STEPS = {
     "projective": (find_features, choose_pairs, match_pairs, build_tracks, reconstruct_projective),
     "metric": (find_features, choose_pairs, match_pairs, build_tracks, reconstruct_metric),
 }
-STEPS["dense"] = (*STEPS["metric"], match_densely)
-STEPS["model"] = (*STEPS["dense"], build_model)
+SURFACE_STEPS = (match_densely, build_model)
+STEPS["dense"] = (*STEPS["metric"], *SURFACE_STEPS[:1])
+STEPS["model"] = (*STEPS["metric"], *SURFACE_STEPS)
 
 
 def reconstruct(
@@ -45,7 +46,7 @@ def reconstruct(
     progress: Progress | None = None,
     **options: Unpack[RunOptions],
 ) -> RunResult:
-    """Reconstruct metric cameras and points from photographs of one scene.
+    """Reconstruct metric cameras, points and a textured model from photographs of one scene.
 
     Parameters
     ----------
@@ -82,9 +83,20 @@ def reconstruct(
         work = Work(run, photographs, empty_result(run, photographs), until)
         try:
             work.check_photographs()
-            for step in STEPS[until]:
-                step(work)
+            _take_steps(work, surface_asked=options.get("until") is not None)
         except StageFailure as failure:
             write_outputs(run, work.result, until=until, failure=failure)
             raise
         return write_outputs(run, work.result, until=until, failure=None)
+
+
+def _take_steps(work: Work, *, surface_asked: bool) -> None:
+    """Cameras and points are a result by themselves: only who asks for a surface is refused without it."""
+    for step in STEPS[work.until]:
+        try:
+            step(work)
+        except StageFailure as failure:
+            if surface_asked or step not in SURFACE_STEPS:
+                raise
+            work.run.warnings.append(f"there is no model: {failure}")
+            return

@@ -47,6 +47,8 @@ def summarize(result: RunResult) -> dict[str, Any]:
             "verified_matches": sum(pair.inliers for pair in result.pairs if pair.accepted),
             "undetermined": sum(pair.undetermined for pair in result.pairs if pair.accepted),
         },
+        "depth_maps": _depth_maps(result),
+        "model": _model(result),
         "cameras": views,
         "refused": _refused(result, views),
         "warnings": list(result.warnings),
@@ -63,6 +65,33 @@ def _motion(result: RunResult) -> dict[str, Any] | None:
         "critical": verdict.critical,
         "evidence": dict(verdict.evidence),
         "sentences": list(verdict.sentences),
+    }
+
+
+def _depth_maps(result: RunResult) -> list[dict[str, Any]] | None:
+    """How much of each view has a depth, and how sure it is; None where no depths were sought."""
+    if not result.depth_maps:
+        return None
+    return [
+        {
+            "name": result.images[m.view].name,
+            "share_known": float(np.isfinite(m.depth).mean()),
+            "median_std_rel": _median((m.std / m.depth)[np.isfinite(m.depth)].astype(np.float64)),
+        }
+        for m in result.depth_maps
+    ]
+
+
+def _model(result: RunResult) -> dict[str, Any] | None:
+    mesh = result.mesh
+    if mesh is None:
+        return None
+    texture = None if mesh.texture is None else [mesh.texture.shape[1], mesh.texture.shape[0]]
+    return {
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        "texture_px": texture,
+        "share_untextured": None if mesh.untextured is None else float(mesh.untextured.mean()),
     }
 
 

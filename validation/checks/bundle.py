@@ -312,7 +312,7 @@ def final_model(folder: Path | None, place: Path) -> Reconstruction:
         scene = load_real_scene("fountain-P11")
         if scene is None:
             raise SystemExit("fountain-P11 is not on this machine: give a COLMAP model with --model")
-        thesisrecon.reconstruct(scene.image_paths[0].parent, place)
+        thesisrecon.reconstruct(scene.image_paths[0].parent, place, until="metric")
         folder = place / "sparse" / "0"
     return reconstruction_from_colmap(read_colmap_model(folder))
 

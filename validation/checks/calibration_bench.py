@@ -49,7 +49,13 @@ class Bench:
         images = list(self.scene.image_paths)
         try:
             return reconstruct(
-                images, self.out / "ours", config=config, seed=self.seed, threads=self.threads, overwrite=True
+                images,
+                self.out / "ours",
+                config=config,
+                seed=self.seed,
+                threads=self.threads,
+                until="metric",
+                overwrite=True,
             )
         except StageFailure as failure:
             print(f"{self.scene.name}: {cameras}: {failure}", flush=True)

@@ -64,7 +64,7 @@ def measure_kermit() -> KermitRun | None:
         return None
     photographs = scene.image_paths[0].parent
     with tempfile.TemporaryDirectory() as folder:
-        result = reconstruct(photographs, Path(folder) / "ours")
+        result = reconstruct(photographs, Path(folder) / "ours", until="metric")
         reference = reconstruct_with_pycolmap(photographs, Path(folder) / "colmap")
     assert result.metric is not None
     models = {OUR_MODEL: result.metric.reconstruction, COLMAP: reference.reconstruction}

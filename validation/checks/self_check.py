@@ -157,7 +157,7 @@ def main() -> int:
         scene = load_fixture_scene() if name == "courtyard" else load_real_scene(name)
         if scene is None:
             continue
-        result = thesisrecon.reconstruct(scene.image_paths[0].parent, wishes.runs / name)
+        result = thesisrecon.reconstruct(scene.image_paths[0].parent, wishes.runs / name, until="metric")
         assert result.metric is not None
         for cameras in ("shared", "per-image"):
             wish = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")

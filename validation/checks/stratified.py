@@ -106,7 +106,7 @@ def main() -> int:
     for name in arguments.names:
         scene = load_fixture_scene(name) if name == "courtyard" else load_real_scene(name)
         assert scene is not None, f"{name} is not there; set THESISRECON_DATA"
-        run = thesisrecon.reconstruct(scene.image_paths[0].parent, arguments.out / name)
+        run = thesisrecon.reconstruct(scene.image_paths[0].parent, arguments.out / name, until="metric")
         assert run.projective is not None
         K = scene.K
         if K is None:
