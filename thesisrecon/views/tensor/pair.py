@@ -1,0 +1,260 @@
+"""Section 1.3: the two cameras that the seed of view synthesis is made of, from F and intrinsics.
+
+Intrinsics are fixed to a guess where nothing better is known, as the thesis has it: the new views are then
+right up to a projective transform of space. The rotation between the two cameras is read off F, small as
+Avidan and Shashua (CVPR 1997, PAMI 1998) take it, or any.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera import calibration_matrix
+from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, require_finite
+from thesisrecon.geometry.multiview import (
+    enforce_rank_two,
+    epipoles,
+    estimate_homography,
+    homography_residuals,
+    sampson_residuals,
+)
+from thesisrecon.types import F64
+
+USUAL_FOCAL = 1.0
+"""Focal length over the long side of the picture: between a telephoto (2) and a wide-angle lens (0.6)."""
+LEAST_MATCHES = 8
+LARGEST_RESIDUAL = 0.005
+"""Median distance of matches from their epipolar lines, over the long side, beyond which F is not theirs."""
+PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
+"""Displacements that no homography explains, 90 % quantile, over the distances from the epipolar lines."""
+RANK_ONE = 1e-9
+IN_FRONT = 0.75
+"""Share of matches in front of both cameras, the rotation being the right one."""
+
+
+@dataclass(frozen=True)
+class CalibratedPair:
+    """Two cameras, X_2 = R X_1 + t: ``K1``, ``K2``, ``R`` (3, 3), ``t`` (3,).
+
+    Of two photographs |t| is not to be known: it is the unit of length, 1.
+    """
+
+    K1: F64
+    K2: F64
+    R: F64
+    t: F64
+
+    def __post_init__(self) -> None:
+        require_intrinsics(self.K1)
+        require_intrinsics(self.K2)
+        require_rotation(self.R)
+        require_finite("CalibratedPair", self.t)
+        if np.shape(self.t) != (3,) or not np.linalg.norm(self.t) > 0.0:
+            raise ValueError("CalibratedPair needs a translation (3,) other than 0")
+
+    @property
+    def P2(self) -> F64:
+        """[a, a_4] = [K2 R K1^-1, K2 t] (3, 4) beside P1 = [I 0].
+
+        Space is X_1 multiplied by K1, so that a point is (x, 1 / depth) for its pixel x in view 1, and a is
+        the homography of the plane at infinity.
+        """
+        return np.column_stack([self.K2 @ self.R @ np.linalg.inv(self.K1), self.K2 @ self.t])
+
+    @property
+    def centre2(self) -> F64:
+        """The second centre (3,) in the frame of the first camera."""
+        return np.asarray(-self.R.T @ self.t)
+
+    def swapped(self) -> CalibratedPair:
+        """The same cameras in the other order."""
+        return CalibratedPair(self.K2, self.K1, self.R.T, self.centre2)
+
+
+class Orientation(Protocol):
+    """A way from an essential matrix to rotations and directions of the baseline."""
+
+    def candidates(self, E: F64) -> list[tuple[F64, F64]]:
+        """Pairs of R (3, 3) and unit t (3,) of E (3, 3)."""
+        ...
+
+
+@dataclass(frozen=True)
+class AnyRotation:
+    """The four decompositions of an essential matrix (HZ 9.6.2)."""
+
+    def candidates(self, E: F64) -> list[tuple[F64, F64]]:
+        """R = U W V' or U W' V', t the last column of U or its opposite."""
+        U, _, Vt = np.linalg.svd(E)
+        quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        turns = [U @ W @ Vt for W in (quarter, quarter.T)]
+        turns = [R * np.sign(np.linalg.det(R)) for R in turns]
+        return [(R, sign * U[:, 2]) for R in turns for sign in (1.0, -1.0)]
+
+
+@dataclass(frozen=True)
+class SmallRotation:
+    """R = I + [w]x to first order, as Avidan and Shashua take it (after Rousso et al., CVPR 1996).
+
+    E ~ [t]x (I + [w]x) is linear in the scale s of E and in s w: nine equations for four unknowns (least
+    squares). The rotation of the vector w is returned, for I + [w]x is none.
+    """
+
+    def candidates(self, E: F64) -> list[tuple[F64, F64]]:
+        """One rotation, with t and its opposite."""
+        _, t = epipoles(E)
+        across = cross_matrix(t)
+        columns = [across, *(across @ cross_matrix(axis) for axis in np.eye(3))]
+        design = np.stack([column.ravel() for column in columns], axis=1)
+        solution = np.linalg.lstsq(design, E.ravel(), rcond=None)[0]
+        if not abs(solution[0]) > 1e-6 * np.linalg.norm(solution):
+            raise StageFailure(
+                "the rotation between the two photographs is not small",
+                "no rotation near none explains the fundamental matrix",
+                "take the rotation for any instead",
+            )
+        R = Rotation.from_rotvec(solution[1:] / solution[0]).as_matrix()
+        return [(R, t), (R, -t)]
+
+
+def guessed_intrinsics(size: tuple[int, int], *, focal: float = USUAL_FOCAL) -> F64:
+    """K (3, 3) with square pixels, the principal point in the middle of ``size`` (width, height) and a focal
+    length of ``focal`` long sides.
+
+    Raises ``ValueError`` for a focal length that is not positive.
+    """
+    f = focal * max(size)
+    return calibration_matrix(f, f, 0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0))
+
+
+def pair_from_fundamental(
+    F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64, orientation: Orientation | None = None
+) -> CalibratedPair:
+    """The two cameras of F and its matches, seen through K1 and K2 (section 1.3).
+
+    Parameters
+    ----------
+    F : (3, 3), x2' F x1 = 0.
+    xy1, xy2 : (N >= 8, 2) px matches that obey F; they say which camera looks where, and whether F is theirs.
+    K1, K2 : (3, 3) intrinsics, guessed (:func:`guessed_intrinsics`) or known.
+    orientation : :class:`AnyRotation` by default, or :class:`SmallRotation`.
+
+    Returns
+    -------
+    Cameras with a baseline of length 1. With wrong intrinsics R and t are those that come nearest.
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, numbers that are not finite, K that are no intrinsics.
+    StageFailure
+        Too few matches, an F of rank 1 or of other matches, no parallax, and matches that lie behind the
+        cameras.
+    """
+    F, xy1, xy2 = _checked(F, xy1, xy2)
+    require_intrinsics(K1)
+    require_intrinsics(K2)
+    _require_theirs(F, xy1, xy2)
+    E = K2.T @ F @ K1
+    rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
+    candidates = (orientation or AnyRotation()).candidates(E / np.linalg.norm(E))
+    shares = [share_in_front(R, t, rays1, rays2) for R, t in candidates]
+    best = int(np.argmax(shares))
+    if not shares[best] >= IN_FRONT:
+        raise StageFailure(
+            "the scene is not in front of both photographs",
+            f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, for the best of {len(shares)} cameras",
+            "the fundamental matrix or the intrinsics are wrong; estimate them anew",
+        )
+    return CalibratedPair(
+        np.asarray(K1, dtype=np.float64), np.asarray(K2, dtype=np.float64), *candidates[best]
+    )
+
+
+def share_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
+    """Share of the rays (N, 3), (N, 3) that meet, at their nearest, in front of both cameras."""
+    turned = rays1 @ R.T
+    normal = np.cross(turned, rays2)
+    first = -np.sum(np.cross(t, rays2) * normal, axis=1)
+    second = -np.sum(np.cross(t, turned) * normal, axis=1)
+    return float(np.mean((first > 0.0) & (second > 0.0)))
+
+
+def require_rotation(R: F64) -> None:
+    """``ValueError`` unless R (3, 3) is a rotation: R'R = I, det R = 1, to 1e-6."""
+    R = np.asarray(R, dtype=np.float64)
+    if R.shape != (3, 3) or not np.isfinite(R).all():
+        raise ValueError(f"a rotation is a finite matrix (3, 3); got shape {R.shape}")
+    off, det = float(np.abs(R.T @ R - np.eye(3)).max()), float(np.linalg.det(R))
+    if not (off <= 1e-6 and det > 0.0):
+        raise ValueError(f"a rotation has R'R = I and det R = 1; this one is off by {off:.2g}, det {det:.3g}")
+
+
+def require_intrinsics(K: F64) -> None:
+    """``ValueError`` unless K (3, 3) is upper triangular with positive focals and K33 = 1."""
+    K = np.asarray(K, dtype=np.float64)
+    if K.shape != (3, 3) or not np.isfinite(K).all():
+        raise ValueError(f"intrinsics are a finite matrix (3, 3); got shape {K.shape}")
+    lower = float(np.abs(np.tril(K, -1)).max())
+    if not (min(K[0, 0], K[1, 1]) > 0.0 and K[2, 2] == 1.0 and lower == 0.0):
+        raise ValueError("intrinsics are [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]] with positive focals")
+
+
+def _checked(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64, F64]:
+    F, xy1, xy2 = (np.asarray(a, dtype=np.float64) for a in (F, xy1, xy2))
+    if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
+        raise ValueError(f"a fundamental matrix is finite, (3, 3) and not zero; got shape {F.shape}")
+    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
+        raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
+    require_finite("view synthesis, for its matches,", xy1, xy2)
+    if len(xy1) < LEAST_MATCHES:
+        raise StageFailure(
+            "the two photographs have too few matches",
+            f"{len(xy1)}, needed at least {LEAST_MATCHES}",
+            "choose photographs that overlap more",
+        )
+    return F, xy1, xy2
+
+
+def _require_theirs(F: F64, xy1: F64, xy2: F64) -> None:
+    """Refuse an F without epipolar lines, matches that are not on them, and matches without parallax."""
+    s = np.linalg.svd(F, compute_uv=False)
+    if not s[1] > RANK_ONE * s[0]:
+        raise StageFailure(
+            "the fundamental matrix has rank 1 and no epipolar lines",
+            f"its second singular value is {s[1] / s[0]:.1g} of the first",
+            "estimate it from more matches",
+        )
+    distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
+    extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
+    if not np.median(distance) <= LARGEST_RESIDUAL * extent:
+        raise StageFailure(
+            "the fundamental matrix is not that of the matches",
+            f"half of them are more than {np.median(distance):.3g} px off their epipolar lines",
+            "estimate it from these matches",
+        )
+    apart = homography_residuals(_best_homography(xy1, xy2), xy1, xy2)
+    parallax, noise = float(np.quantile(apart, 0.9)), float(np.quantile(distance, 0.9))
+    if not parallax > PARALLAX_PER_NOISE * noise + LEAST_PARALLAX_PX:
+        raise StageFailure(
+            "the two photographs show no parallax: the camera only turned, or the scene is a plane or too far "
+            "away",
+            f"one homography explains 90 % of {len(xy1)} matches to {parallax:.2g} px, the noise being "
+            f"{noise:.2g} px",
+            "take photographs from places farther apart",
+        )
+
+
+def _best_homography(xy1: F64, xy2: F64) -> F64:
+    """The homography of most matches (N, 2): least squares, twice more without the worst tenth."""
+    H = estimate_homography(xy1, xy2)
+    for _ in range(2):
+        residuals = homography_residuals(H, xy1, xy2)
+        kept = residuals <= np.quantile(residuals, 0.9)
+        H = estimate_homography(xy1[kept], xy2[kept])
+    return H
