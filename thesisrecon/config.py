@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from thesisrecon.assumptions import IntrinsicsAssumption
-from thesisrecon.dense import MultiViewScene, MultiViewStereo
+from thesisrecon.dense import MultiViewScene, MultiViewStereo, RectifiedPair
 from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification, ThesisRansac
 from thesisrecon.errors import UsageError
 from thesisrecon.features import HarrisCorners, MultiScaleCorners
@@ -181,9 +181,12 @@ class MetricRefiner(Protocol):
 class DepthEstimator(Protocol):
     """Section 2.5: depth of every pixel of every view; one view at a time, so that a run can go on.
 
-    ``match_rectified`` is its matcher alone, on a rectified pair of arrays."""
+    ``match_rectified`` is its matcher alone, on a rectified pair of arrays; ``match_two_views`` rectifies two
+    photographs by their F and matches them from either side."""
 
     def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap: ...
+
+    def match_two_views(self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64) -> RectifiedPair: ...
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene: ...
 

@@ -10,6 +10,7 @@ from thesisrecon.dense.multiview.linking import InverseDepth, Linker, RobustFusi
 from thesisrecon.dense.multiview.neighbours import NeighbourChoice, SparsePoints, sparse_points
 from thesisrecon.dense.multiview.refinement import PlaneRefinement
 from thesisrecon.dense.multiview.stage import MultiViewScene, MultiViewStereo
+from thesisrecon.dense.multiview.two_views import RectifiedPair, match_two_views
 from thesisrecon.dense.multiview.undistort import pinhole_view
 
 __all__ = [
@@ -22,9 +23,11 @@ __all__ = [
     "NeighbourChoice",
     "PairMatching",
     "PlaneRefinement",
+    "RectifiedPair",
     "RobustFusion",
     "SequenceLinking",
     "SparsePoints",
+    "match_two_views",
     "pinhole_view",
     "sparse_points",
 ]

@@ -62,7 +62,7 @@ class PairMatching:
         """
         sizes = [(v.seen.shape[1], v.seen.shape[0]) for v in (reference, other)]
         frame = rectify_cameras(reference.P, other.P, sizes[0], sizes[1], xy1=xy1, xy2=xy2)
-        wanted = _searched(frame, disparity_range(frame, xy1, xy2, margin=self.range_margin))
+        wanted = searched(frame, disparity_range(frame, xy1, xy2, margin=self.range_margin))
         left = frame.warp(_levels(reference), 0)
         right = frame.warp(_levels(other) * brightness_gain(reference, other, xy1, xy2), 1)
         found = self.matcher.match(left, right, disparity_range=wanted)
@@ -94,7 +94,7 @@ class PairMatching:
         return Correspondence(xy, sigma, confidence)
 
 
-def _searched(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int]:
+def searched(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int]:
     """What of a range can be inside the frame; ``StageFailure`` where that is nothing or too much."""
     reach = frame.size[0] - 1
     first, last = max(wanted[0], -reach), min(wanted[1], reach)

@@ -21,9 +21,10 @@ from thesisrecon.dense.multiview.neighbours import (
     sparse_points,
 )
 from thesisrecon.dense.multiview.refinement import PlaneRefinement
+from thesisrecon.dense.multiview.two_views import RectifiedPair, match_two_views
 from thesisrecon.dense.multiview.undistort import pinhole_view
 from thesisrecon.errors import StageFailure
-from thesisrecon.types import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
+from thesisrecon.types import F64, DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 
 Result = TypeVar("Result")
 
@@ -59,6 +60,10 @@ class MultiViewStereo:
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
         """Disparities of a rectified pair of arrays by the matcher of ``pairs``."""
         return match_rectified(left, right, max_disparity_px=max_disparity_px, config=self.pairs.matcher)
+
+    def match_two_views(self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64) -> RectifiedPair:
+        """Dense correspondence of two photographs with F and its inliers; see :func:`match_two_views`."""
+        return match_two_views(image1.rgb, image2.rgb, F, xy1, xy2, pairs=self.pairs)
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
         """Undistorted views, sparse points and neighbours of V photographs with a metric reconstruction.

@@ -242,8 +242,7 @@ def _require_theirs(F: F64, xy1: F64, xy2: F64) -> None:
     parallax, noise = float(np.quantile(apart, 0.9)), float(np.quantile(distance, 0.9))
     if not parallax > PARALLAX_PER_NOISE * noise + LEAST_PARALLAX_PX:
         raise StageFailure(
-            "the two photographs show no parallax: the camera only turned, or the scene is a plane or too far "
-            "away",
+            "the two photographs show no parallax: the camera only turned, or the scene is flat or far away",
             f"one homography explains 90 % of {len(xy1)} matches to {parallax:.2g} px, the noise being "
             f"{noise:.2g} px",
             "take photographs from places farther apart",
