@@ -184,7 +184,7 @@ def test_the_kernel_is_its_numpy_twin():
     virtual = seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, -2.0]))
     places = rng.uniform(0, 600, (20, 30, 2)).astype(np.float32)
     places[3, 4] = np.nan
-    xy, nearness = np.empty((20, 30, 2), np.float32), np.empty((20, 30), np.float32)
+    xy, nearness = np.empty((20, 30, 2)), np.empty((20, 30), np.float32)
     transfer_rows(virtual.T, virtual.P2, places, 7, xy, nearness)
     x, y = np.meshgrid(np.arange(30.0), 7 + np.arange(20.0))
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)

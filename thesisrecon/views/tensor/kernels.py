@@ -9,7 +9,7 @@ from thesisrecon.types import F32, F64
 
 
 @njit(cache=True, nogil=True)
-def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F32, nearness: F32) -> None:
+def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, nearness: F32) -> None:
     """Where the third view sees the pixels (x, y), y from ``first`` on, with matches ``places`` (H, W, 2).
 
     Written are ``xy`` (H, W, 2) and ``nearness`` (H, W), as ``VirtualTensor.transfer`` has them; NaN where a

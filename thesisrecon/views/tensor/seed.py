@@ -92,6 +92,11 @@ def seed_of_two(pair: CalibratedPair) -> VirtualTensor:
     return VirtualTensor(_tensor(pair.P2, pair.P2), pair.P2, pair.K2)
 
 
+def seed_of_first(pair: CalibratedPair) -> VirtualTensor:
+    """The tensor <1, 2, 1> of two views, the first being the third: its nearness is that in view 1."""
+    return VirtualTensor(_tensor(pair.P2, np.eye(3, 4)), pair.P2, pair.K1)
+
+
 def seed_of_three(
     T: F64, xy1: F64, xy2: F64, *, K: tuple[F64, F64, F64], orientation: Orientation | None = None
 ) -> tuple[CalibratedPair, VirtualTensor]:

@@ -1,0 +1,164 @@
+"""Section 1.3: pictures of virtual cameras from two photographs and their dense correspondence.
+
+Every pixel is transferred by the tensor of the virtual camera and drawn there, nearer ones in front; the
+colours are those of both photographs. No surface is made, and no depth but the order of pixels is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.geometry.zbuffer import in_strips
+from thesisrecon.types import B8, F32, F64
+from thesisrecon.views.tensor.kernels import transfer_rows
+from thesisrecon.views.tensor.pair import CalibratedPair
+from thesisrecon.views.tensor.path import VirtualCamera
+from thesisrecon.views.tensor.seed import VirtualTensor, seed_of_first, seed_of_two
+from thesisrecon.views.warping import fill_holes, forward_map, sample
+
+U8 = NDArray[np.uint8]
+
+SURFACE_PX = 1.0
+"""Neighbours whose disparities between the photographs differ by more are not of one surface."""
+LEAST_SEEN = 0.05
+"""Share of its picture that a virtual camera must have of what the photographs show."""
+GUESS = 1e-3
+"""Weight of a colour whose place is guessed, or of the photograph that is not to be taken, beside others."""
+
+
+@dataclass(frozen=True)
+class TensorSynthesis:
+    """Two photographs ready for view synthesis; make it by :func:`prepare_synthesis`.
+
+    ``pair`` the cameras; ``seeds`` the tensors <1, 2, 2> and <2, 1, 2>; ``levels`` two (H, W, 4) float32, the
+    colours and 1 where the place of the pixel is known, 0 where it is guessed; ``places`` two (H, W, 2) px of
+    the other photograph; ``gain`` (3,) what makes the second as bright as the first.
+    """
+
+    pair: CalibratedPair
+    seeds: tuple[VirtualTensor, VirtualTensor]
+    levels: tuple[F32, F32]
+    places: tuple[F32, F32]
+    gain: F32
+
+    def render(self, camera: VirtualCamera, *, threads: int = 1) -> U8:
+        """The picture (H, W, 3) of a virtual camera.
+
+        What both photographs see is mixed by how near the camera is to either, exposures likewise; of two
+        surfaces the nearer is shown; what neither sees is filled from behind. The same bytes whatever the
+        number of threads. Raises ``StageFailure`` where the camera sees next to nothing of the scene.
+        """
+        layers = [self._layer(side, camera, threads) for side in (0, 1)]
+        seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
+        if not seen.mean() >= LEAST_SEEN:
+            raise StageFailure(
+                "the virtual camera sees nothing of the scene that the photographs show",
+                f"{100.0 * seen.mean():.1f} % of its picture, needed {100.0 * LEAST_SEEN:.0f} %",
+                "it may be beyond the scene or look away: move it less (by baselines) or turn it back",
+            )
+        rgb, nearness = self._mixed(layers, camera)
+        filled = fill_holes(rgb, nearness, step=self._step)
+        return np.asarray(np.clip(np.rint(filled), 0.0, 255.0), dtype=np.uint8)
+
+    @property
+    def _step(self) -> float:
+        """``SURFACE_PX`` in units of nearness, 1 / baseline."""
+        return SURFACE_PX / float(self.pair.K2[0, 0] * np.linalg.norm(self.pair.t))
+
+    def _layer(self, side: int, camera: VirtualCamera, threads: int) -> tuple[F32, F32]:
+        """What the camera sees of one photograph, (H, W, 4), and its nearness (H, W); NaN where nothing."""
+        virtual = self.seeds[side].moved(camera.rotation, camera.translation, K=camera.K)
+        xy, nearness = transfer_grid(virtual, self.places[side], threads=threads)
+        source, front = forward_map(xy, nearness, size=camera.size, step=self._step, threads=threads)
+        return sample(self.levels[side], source, threads=threads), front
+
+    def _mixed(self, layers: list[tuple[F32, F32]], camera: VirtualCamera) -> tuple[F32, F32]:
+        share = np.float32(camera.share_of_second(self.pair))
+        (first, near1), (second, near2) = layers
+        w1, w2 = (
+            (np.float32(GUESS) + part) * (np.float32(GUESS) + np.nan_to_num(levels[..., 3]))
+            for part, levels in ((1 - share, first), (share, second))
+        )
+        # A comparison with NaN is false: where one sees nothing the other is not hidden.
+        sure = (first[..., 3] > 0.5) == (second[..., 3] > 0.5)
+        w1[np.isnan(near1) | (sure & (near2 > near1 + self._step))] = 0.0
+        w2[np.isnan(near2) | (sure & (near1 > near2 + self._step))] = 0.0
+        total = w1 + w2
+        w1, w2 = (np.divide(w, total, out=np.zeros_like(w), where=total > 0.0) for w in (w1, w2))
+        rgb = np.where(w1[..., None] > 0.0, first[..., :3] * self.gain**-share, 0.0) * w1[..., None]
+        rgb += np.where(w2[..., None] > 0.0, second[..., :3] * self.gain ** (1 - share), 0.0) * w2[..., None]
+        nearness = np.where(w2 > w1, near2, near1)
+        rgb[total == 0.0] = np.nan
+        return rgb, np.where(total > 0.0, nearness, np.nan).astype(np.float32)
+
+
+def prepare_synthesis(
+    pair: CalibratedPair,
+    images: tuple[ArrayLike, ArrayLike],
+    places: tuple[F32, F32],
+    *,
+    gain: ArrayLike = (1.0, 1.0, 1.0),
+) -> TensorSynthesis:
+    """What does not depend on the virtual camera.
+
+    Parameters
+    ----------
+    pair : the cameras, guessed or known.
+    images : two (H, W, 3) levels 0 .. 255.
+    places : two (H, W, 2) px: where the pixels of the one photograph are in the other, NaN = unknown. Those
+        are guessed to be as far as the farthest of the nearest known ones around.
+    gain : (3,) what makes the second photograph as bright as the first.
+
+    Raises
+    ------
+    ValueError : for shapes that do not belong together.
+    StageFailure : where no place is known.
+    """
+    levels = []
+    for side, (image, known) in enumerate(zip(images, places, strict=True)):
+        rgb = np.asarray(image, dtype=np.float32)
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or known.shape != (*rgb.shape[:2], 2):
+            raise ValueError(
+                f"photograph {side + 1} is (H, W, 3) with places (H, W, 2); got {rgb.shape} and {known.shape}"
+            )
+        seen: B8 = np.asarray(np.isfinite(known).all(axis=2))
+        levels.append(np.concatenate([rgb, seen[..., None].astype(np.float32)], axis=2))
+    back = pair.swapped()
+    complete = _completed(pair, places[0]), _completed(back, places[1])
+    seeds = seed_of_two(pair), seed_of_first(back)
+    return TensorSynthesis(pair, seeds, (levels[0], levels[1]), complete, np.asarray(gain, dtype=np.float32))
+
+
+def transfer_grid(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
+    """:meth:`VirtualTensor.transfer` of all pixels with matches ``places`` (H, W, 2); (H, W, 2), (H, W)."""
+    xy, nearness = np.empty(places.shape), np.empty(places.shape[:2], dtype=np.float32)
+
+    def work(rows: tuple[int, int]) -> None:
+        part = slice(*rows)
+        transfer_rows(virtual.T, virtual.P2, places[part], rows[0], xy[part], nearness[part])
+
+    in_strips(work, len(places), threads)
+    return xy, nearness
+
+
+def _completed(pair: CalibratedPair, places: F32) -> F32:
+    """``places`` (H, W, 2) of all pixels: unknown ones are as far as what is behind them."""
+    nearness = transfer_grid(seed_of_first(pair), places)[1]
+    if not np.isfinite(nearness).any():
+        raise StageFailure(
+            "the photographs have no dense correspondence",
+            "no pixel of the one is known in the other",
+            "choose photographs that overlap more",
+        )
+    behind = fill_holes(nearness[..., None], nearness)[..., 0]
+    unknown = np.isnan(nearness)
+    y, x = np.nonzero(unknown)
+    X = np.stack([x, y, np.ones_like(x), behind[unknown]], axis=1).astype(np.float64)
+    complete = places.copy()
+    complete[unknown] = dehomogenize(X @ pair.P2.T)
+    return complete
