@@ -7,19 +7,15 @@ scripts by their hash and forbids every address but ``data:``.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
-from plotly.offline import get_plotlyjs
 
 from thesisrecon.io.run_directory import write_atomically
 from thesisrecon.report.data import ReportData
@@ -35,6 +31,7 @@ from thesisrecon.report.drawing import (
     thumbnail,
 )
 from thesisrecon.report.figures import histogram_path, pair_matrix_figure, scene_figure
+from thesisrecon.report.html import page_resource, plotly_script, script_hashes, template_environment
 from thesisrecon.report.residuals import (
     ResidualSummary,
     common_limit_px,
@@ -122,12 +119,11 @@ def render_report(data: ReportData) -> str:
     limit_px = common_limit_px(everything)
     figures, shown = _figures(data)
     model = _model(data)
-    plotly = get_plotlyjs().replace("</script", "<\\/script")
-    figure_scripts = [plotly, _resource("page.js")] if figures else []
-    model_scripts = [_resource("viewer.js")] if model is not None else []
+    figure_scripts = [plotly_script(), page_resource("page.js")] if figures else []
+    model_scripts = [page_resource("viewer.js")] if model is not None else []
     return (
         _environment()
-        .from_string(_resource("template.html.j2"))
+        .from_string(page_resource("template.html.j2"))
         .render(
             data=data,
             verdict=judge(data),
@@ -149,34 +145,20 @@ def render_report(data: ReportData) -> str:
             warnings=_warnings(data),
             self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
             summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
-            style=_resource("style.css"),
+            style=page_resource("style.css"),
             figure_scripts=figure_scripts,
             model_scripts=model_scripts,
-            script_hashes=" ".join(f"'{_hash(text)}'" for text in (*figure_scripts, *model_scripts))
-            or "'none'",
+            script_hashes=script_hashes((*figure_scripts, *model_scripts)),
             histogram_size=(HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT),
         )
     )
 
 
 def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    environment = template_environment()
     environment.filters.update(grouped=grouped, decimals=decimals, significant=significant)
     environment.globals.update(count_of=count_of)
-    # NaN is no JSON: better an error here than a page whose script cannot read its data.
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment
-
-
-def _resource(name: str) -> str:
-    return files("thesisrecon.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _hash(script: str) -> str:
-    digest = hashlib.sha256(script.encode("utf-8")).digest()
-    return "sha256-" + base64.b64encode(digest).decode("ascii")
 
 
 def _figures(data: ReportData) -> tuple[dict[str, Any], int]:

@@ -15,7 +15,7 @@ class Metric:
 
     ``values`` maps the name of a method to its number, None where it has none. ``target`` is the bound for
     the method ``judged``; ``at_most`` says on which side of it the good lies. Without a target the row is
-    only reported.
+    only reported. ``definition`` says in one line what the number is.
     """
 
     scene: str
@@ -26,6 +26,7 @@ class Metric:
     target: float | None = None
     at_most: bool = True
     note: str = ""
+    definition: str = ""
 
     @property
     def verdict(self) -> Verdict:

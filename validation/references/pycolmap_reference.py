@@ -13,6 +13,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import pycolmap
 
@@ -91,11 +92,18 @@ def reconstruct_with_pycolmap(
 
 
 def map_with_pycolmap(
-    images: Path, matched: Path, out: Path, *, start: Start | None = None, threads: int = 2
+    images: Path,
+    matched: Path,
+    out: Path,
+    *,
+    start: Start | None = None,
+    threads: int = 2,
+    mapper: Literal["incremental", "global"] = "incremental",
 ) -> ReferenceRun:
-    """Incremental mapping of what :func:`match_with_pycolmap` left in ``matched``, as ``start`` has it.
+    """Mapping of what :func:`match_with_pycolmap` left in ``matched``, as ``start`` has it.
 
-    ``out`` is another folder, emptied first. Raises :class:`StageFailure` where COLMAP makes no model.
+    ``out`` is another folder, emptied first; the global mapper (GLOMAP) refines what it refines by default.
+    Raises :class:`StageFailure` where COLMAP makes no model.
     """
     start = start or Start()
     shutil.rmtree(out, ignore_errors=True)
@@ -109,6 +117,8 @@ def map_with_pycolmap(
     if start.K is not None:
         _give_calibration(out / "database.db", start.K)
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    if mapper == "global":
+        return _map_globally(images, out, threads)
     return _map(images, out, options)
 
 
@@ -124,6 +134,17 @@ def _map(images: Path, out: Path, options: pycolmap.IncrementalPipelineOptions) 
     seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
     start = time.perf_counter()
     pycolmap.incremental_mapping(out / "database.db", images, out / "sparse", options)
+    seconds["map"] = time.perf_counter() - start
+    (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    return read_run(images, out)
+
+
+def _map_globally(images: Path, out: Path, threads: int) -> ReferenceRun:
+    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
+    start = time.perf_counter()
+    options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=0)
+    (out / "sparse").mkdir(exist_ok=True)
+    pycolmap.global_mapping(out / "database.db", images, out / "sparse", options)
     seconds["map"] = time.perf_counter() - start
     (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
     return read_run(images, out)

@@ -1,0 +1,174 @@
+"""The harness around its stages: tasks in processes, references that fail, gates, tables, pages, two runs."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.validation.harness.toy_stages import STAGES, WAYS
+from validation.__main__ import main
+from validation.harness.gates import Gate, read_gates
+from validation.harness.page import write_pages
+from validation.harness.records import Judgement, Outcome, Wishes, slug
+from validation.harness.results import Results, collect, compare, read_results, write_results
+from validation.harness.schedule import run_tasks
+
+LIMIT_S = 8.0
+GATES = {
+    "toy/yard/wheels-lost": Gate("toy/yard/wheels-lost", 1.0, True, "a toy needs wheels"),
+    "toy/yard/never-told": Gate("toy/yard/never-told", 1.0, True, "nobody tells this"),
+    "other/yard/wheels": Gate("other/yard/wheels", 1.0, True, "of a stage that did not run"),
+}
+Judged = dict[tuple[str, str], tuple[Judgement, dict[str, Outcome]]]
+
+
+def toy_wishes(out: Path, *, quick: bool) -> Wishes:
+    return Wishes(
+        out,
+        ("yard", "elsewhere"),
+        ("toy",),
+        quick=quick,
+        limit_s=LIMIT_S,
+        stages_from="tests.validation.harness.toy_stages",
+    )
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Wishes, Judged, list[str]]:
+    wishes, told = toy_wishes(tmp_path_factory.mktemp("harness"), quick=False), list[str]()
+    return wishes, run_tasks(wishes, STAGES, told.append), told
+
+
+def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran: tuple[Wishes, Judged, list[str]]) -> None:
+    _, judged, told = ran
+    assert list(judged) == [("toy", "yard")]
+    judgement, outcomes = judged["toy", "yard"]
+    assert tuple(outcomes) == ("after", *WAYS)
+    assert {name for name, o in outcomes.items() if o.ok} == {"ours", "good", "after"}
+    assert outcomes["missing"].failure == "No module named 'no_such_library'"
+    assert outcomes["failing"].failure == "the toy is broken; it has 1 wheel; buy another."
+    assert outcomes["crashing"].failure == "crashed with signal 11"
+    assert outcomes["hanging"].failure == "ended after the 8 s that a task may take"
+    assert outcomes["hanging"].wall_s < 3 * LIMIT_S
+    values = judgement.metrics[0].values
+    assert (values["ours"], values["good"], values["after"]) == (0.5, 2.0, 8.0)
+    assert values["crashing"] is None
+    assert len(told) == 8
+
+
+def test_gates_judge_numbers_and_a_number_nobody_told_breaks_its_gate(
+    ran: tuple[Wishes, Judged, list[str]],
+) -> None:
+    wishes, judged, _ = ran
+    results = collect(wishes, judged, GATES)
+    row = results.rows[0]
+    assert (row.key, row.value, row.limit, row.direction, row.verdict) == (
+        "toy/yard/wheels-lost",
+        0.5,
+        1.0,
+        "at most",
+        "reached",
+    )
+    assert row.reference["good"] == 2.0
+    assert results.missing == ["toy/yard/never-told"]
+    assert set(results.failures) == {f"toy/yard/{n}" for n in ("missing", "failing", "crashing", "hanging")}
+    strict = {row.key: dataclasses.replace(GATES[row.key], limit=0.4)}
+    assert collect(wishes, judged, strict).broken[0].key == row.key
+
+
+@pytest.mark.parametrize(
+    ("value", "held"), [(1.0, True), (1.01, False), (None, False), (float("nan"), False)]
+)
+def test_a_gate_holds_up_to_its_limit(value: float | None, held: bool) -> None:
+    assert Gate("a/b/c", 1.0, True, "").holds(value) == held
+    mirrored = None if value is None else -value
+    assert Gate("a/b/c", -1.0, False, "").holds(mirrored) == held
+
+
+def test_results_are_written_read_and_compared(ran: tuple[Wishes, Judged, list[str]], tmp_path: Path) -> None:
+    wishes, judged, _ = ran
+    results = collect(wishes, judged, GATES)
+    write_results(tmp_path, results)
+    again = read_results(tmp_path)
+    assert compare(results, again) == []
+    with (tmp_path / "tables" / "toy.csv").open(encoding="utf-8") as source:
+        first = next(csv.DictReader(source))
+    assert (first["key"], first["ours"], first["good"], first["crashing"]) == (
+        "toy/yard/wheels-lost",
+        "0.5",
+        "2.0",
+        "",
+    )
+    worse = dataclasses.replace(results.rows[0], value=3.0, verdict="missed")
+    changes = compare(results, dataclasses.replace(results, rows=[worse, results.rows[1]]))
+    assert [(c.key, c.before, c.now, c.verdicts) for c in changes] == [
+        ("toy/yard/wheels-lost", 0.5, 3.0, ("reached", "missed"))
+    ]
+
+
+def test_two_runs_tell_the_same_numbers_but_for_times(
+    ran: tuple[Wishes, Judged, list[str]], tmp_path: Path
+) -> None:
+    wishes, judged, _ = ran
+    quick = toy_wishes(tmp_path, quick=True)
+    first, second = (collect(quick, run_tasks(quick, STAGES, lambda _: None), GATES) for _ in range(2))
+    assert [c.key for c in compare(first, second) if not c.is_time] == []
+    assert first.rows[0].value == collect(wishes, judged, GATES).rows[0].value
+
+
+def test_the_pages_escape_what_they_are_told(ran: tuple[Wishes, Judged, list[str]]) -> None:
+    wishes, judged, _ = ran
+    results = collect(wishes, judged, GATES)
+    index = write_pages(wishes, STAGES, judged, results, compare(results, results))
+    whole, scene = (wishes.out / n for n in ("index.html", "scene-yard.html"))
+    assert index == whole
+    text = whole.read_text(encoding="utf-8")
+    assert "A &lt;b&gt;toy&lt;/b&gt;" in text
+    assert "1 of 2 limits are reached" in text
+    assert "crashed with signal 11" in text
+    assert "Every number but times and memory is the same." in text
+    page = scene.read_text(encoding="utf-8")
+    assert "A &lt;/script&gt; note." in page
+    assert "data:image/jpeg;base64," in page
+    assert not re.search(r'(?:src|href)="(?!data:|#|scene-|index)', text + page.split("<script>")[0])
+
+
+def test_no_gate_without_its_reason(tmp_path: Path) -> None:
+    gates = read_gates()
+    assert gates
+    for words in ("at_most = 1.0", 'at_most = 1.0\nat_least = 0.0\nreason = "r"', 'reason = "r"'):
+        (tmp_path / "gates.toml").write_text(f'["a/b/c"]\n{words}\n')
+        with pytest.raises(ValueError, match="a gate has one of"):
+            read_gates(tmp_path / "gates.toml")
+    (tmp_path / "gates.toml").write_text('["a/c"]\nat_most = 1.0\nreason = "r"\n')
+    with pytest.raises(ValueError, match="stage/scene/number"):
+        read_gates(tmp_path / "gates.toml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["report", "-o", "OUT", "--scenes", "nowhere"], "no scene is called nowhere"),
+        (["report", "-o", "OUT", "--images", "nowhere"], "there is no folder of photographs nowhere"),
+        (["report", "-o", "OUT", "--against", "nowhere"], "nowhere holds no report to compare with"),
+        (["check", "-o", "OUT", "--threads", "0"], "more than zero"),
+    ],
+)
+def test_wrong_wishes_are_named(
+    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path / "out") if a == "OUT" else a for a in arguments]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_names_for_files() -> None:
+    assert slug("COLMAP, pp refined") == "COLMAP-pp-refined"
+    assert json.loads(json.dumps(Wishes(Path("a"), (), ()).to_json()))["out"] == "a"
+    assert Wishes.from_json(Wishes(Path("a"), ("s",), ()).to_json()) == Wishes(Path("a"), ("s",), ())
+    assert Results([], [], {}, {}, {}).broken == []

@@ -1,0 +1,69 @@
+"""A stage with references that do all that a reference may do: answer, be missing, fail, crash, hang."""
+
+# ruff: noqa: ARG002 (a toy takes what a stage takes, and ignores most of it)
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Mapping
+
+import PIL.Image
+
+from thesisrecon.errors import StageFailure
+from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes
+from validation.metrics.record import Metric
+
+VALUES = {"ours": 0.5, "good": 2.0, "after": 4.0}
+WAYS = ("ours", "good", "missing", "failing", "crashing", "hanging")
+
+
+class ToyStage:
+    name = "toy"
+    title = "A <b>toy</b>"
+    definition = "Numbers that were saved."
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:
+        return scene == "yard"
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
+        return ("ours", "good") if wishes.quick else ("after", *WAYS)
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return (("toy", "good"),) if method == "after" else ()
+
+    def run(self, task: Task, wishes: Wishes) -> None:
+        place = wishes.place(task.stage, task.scene, task.method)
+        if task.method == "missing":
+            import no_such_library  # type: ignore[import-not-found]  # noqa: F401
+        if task.method == "failing":
+            raise StageFailure("the toy is broken", "it has 1 wheel", "buy another")
+        if task.method == "crashing":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if task.method == "hanging":
+            time.sleep(600)
+        value = VALUES[task.method]
+        if task.method == "after":
+            value *= json.loads((wishes.place("toy", task.scene, "good") / "value.json").read_text())
+        (place / "value.json").write_text(json.dumps(value))
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+        values: dict[str, float | None] = {
+            name: json.loads((o.place / "value.json").read_text()) if o.ok else None
+            for name, o in outcomes.items()
+        }
+        place = wishes.place(self.name, scene)
+        PIL.Image.new("RGB", (40, 30), (200, 10, 10)).save(place / "red.png")
+        metrics = [
+            Metric(scene, "wheels, lost", "px", values, "ours", definition='"less" is <better>'),
+            Metric(scene, "time", "s", {"ours": time.time()}, "ours"),
+        ]
+        figure = {"data": [{"type": "scatter", "y": [1, 2]}], "layout": {}}
+        return Judgement(
+            metrics, [Plot("Wheels", figure)], [Picture("red.png", "Red")], ["A </script> note."]
+        )
+
+
+STAGES = {"toy": ToyStage()}

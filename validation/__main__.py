@@ -1,0 +1,106 @@
+"""``python -m validation report|check``: every stage of ours beside the references, on the same inputs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from validation.harness.gates import read_gates
+from validation.harness.page import write_pages
+from validation.harness.process import own_cores
+from validation.harness.records import Wishes
+from validation.harness.results import Results, collect, compare, read_results, write_results
+from validation.harness.schedule import run_tasks
+from validation.harness.stages import STAGES, available_scenes
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """0: done, all gates hold; 1: a gate is broken (``check``); 2: a wrong wish."""
+    parser = _parser()
+    told = parser.parse_args(arguments)
+    try:
+        wishes = _wishes(told)
+        other = read_results(told.against) if getattr(told, "against", None) else None
+        gates = read_gates()
+    except ValueError as error:
+        print(f"validation: {error}", file=sys.stderr)
+        return 2
+    judged = run_tasks(wishes, STAGES, _tell)
+    results = collect(wishes, judged, gates)
+    write_results(wishes.out, results)
+    changes = None if other is None else compare(other, results)
+    page = write_pages(wishes, STAGES, judged, results, changes)
+    if told.command == "check":
+        _print_gates(results)
+    print(f"{len(results.broken) + len(results.missing)} gates broken; the page is {page}")
+    return int(told.command == "check" and bool(results.broken or results.missing))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m validation", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, words in (
+        ("report", "Run stages and references and write pages, tables and results.json."),
+        ("check", "The same, with a line for every gate; exit code 1 where one is broken."),
+    ):
+        command = commands.add_parser(name, help=words, description=words)
+        command.add_argument("-o", "--out", type=Path, required=name == "report", default=Path("out/check"))
+        command.add_argument("--scenes", nargs="+", metavar="SCENE", help="by default all that are here")
+        command.add_argument("--stages", nargs="+", choices=list(STAGES), help="by default all")
+        command.add_argument("--images", type=Path, help="a folder of photographs of your own")
+        command.add_argument("--quick", action="store_true", help="few scenes and few repetitions")
+        command.add_argument("--seed", type=int, default=0)
+        command.add_argument("--threads", type=int, default=len(own_cores()), help="tasks at a time")
+        command.add_argument("--time-limit", type=float, default=300.0, help="seconds for one task")
+        if name == "report":
+            command.add_argument("--against", type=Path, help="the folder of another report, to compare with")
+    return parser
+
+
+def _wishes(told: argparse.Namespace) -> Wishes:
+    """The wishes of the command line; ``ValueError`` names what is not there."""
+    folders = {}
+    if told.images is not None:
+        if not told.images.is_dir():
+            raise ValueError(f"there is no folder of photographs {told.images}")
+        folders[told.images.resolve().name] = str(told.images.resolve())
+    here = available_scenes(quick=told.quick)
+    scenes = told.scenes or ([*folders] if folders else here)
+    unknown = [s for s in scenes if s not in (*available_scenes(quick=False), *folders)]
+    if unknown:
+        raise ValueError(
+            f"no scene is called {unknown[0]}; here are {', '.join(available_scenes(quick=False))}"
+        )
+    if told.threads < 1 or told.time_limit <= 0:
+        raise ValueError("--threads and --time-limit are more than zero")
+    return Wishes(
+        out=told.out.resolve(),
+        scenes=tuple(dict.fromkeys([*scenes, *folders])),
+        stages=tuple(told.stages or STAGES),
+        folders=folders,
+        quick=told.quick,
+        seed=told.seed,
+        threads=min(told.threads, len(own_cores())),
+        limit_s=told.time_limit,
+    )
+
+
+def _tell(line: str) -> None:
+    """Progress, where somebody looks."""
+    if sys.stderr.isatty():
+        print(line, file=sys.stderr, flush=True)
+
+
+def _print_gates(results: Results) -> None:
+    for row in results.rows:
+        if row.limit is not None:
+            sign = "<=" if row.direction == "at most" else ">="
+            value = "nothing" if row.value is None else f"{row.value:.4g}"
+            print(f"{row.verdict:8} {row.key}: {value} {sign} {row.limit:g} {row.unit}")
+    for key in results.missing:
+        print(f"missed   {key}: nobody told this number")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

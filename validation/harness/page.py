@@ -1,0 +1,199 @@
+"""The pages of a report: ``index.html`` for the whole and one for each scene, verdict first."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import PIL.Image
+
+from thesisrecon import __version__
+from thesisrecon.report.html import page_resource, plotly_script, script_hashes, template_environment
+from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Wishes, key_of, slug
+from validation.harness.results import Change, Results, Row
+
+HERE = Path(__file__).parent
+WIDEST_PX = 1400
+JPEG_QUALITY = 88
+Judged = Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]]
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    level: str
+    word: str
+    sentence: str
+    reasons: tuple[str, ...] = ()
+
+
+def write_pages(
+    wishes: Wishes,
+    stages: Mapping[str, Stage],
+    judged: Judged,
+    results: Results,
+    changes: Sequence[Change] | None,
+) -> Path:
+    """Write all pages; the path of the first to open."""
+    scenes = [s for s in wishes.scenes if any(scene == s for _, scene in judged)]
+    links = [("All scenes", "index.html"), *((s, f"scene-{slug(s)}.html") for s in scenes)]
+    names = {
+        key_of(stage, m): m.name for (stage, _), (judgement, _) in judged.items() for m in judgement.metrics
+    }
+    for scene in scenes:
+        sections = [
+            _section(stage, results, names, scene, judgement, wishes)
+            for (name, where), (judgement, _) in judged.items()
+            if where == scene
+            for stage in [stages[name]]
+        ]
+        rows = [r for r in results.rows if r.key.split("/")[1] == scene]
+        failures = [(k, why) for k, why in results.failures.items() if k.split("/")[1] == scene]
+        missing = [k for k in results.missing if k.split("/")[1] == scene]
+        page = _page(scene, links, _verdict(rows, missing), sections, failures, None, None)
+        (wishes.out / f"scene-{slug(scene)}.html").write_text(page, encoding="utf-8")
+    whole = [_section(stages[name], results, names) for name in wishes.stages]
+    page = _page(
+        "Ours beside the references",
+        links,
+        _verdict(results.rows, results.missing),
+        [section for section in whole if section["rows"]],
+        list(results.failures.items()),
+        list(results.environment.items()),
+        changes,
+    )
+    (wishes.out / "index.html").write_text(page, encoding="utf-8")
+    return wishes.out / "index.html"
+
+
+def _page(
+    title: str,
+    links: Sequence[tuple[str, str]],
+    verdict: _Verdict,
+    sections: Sequence[Mapping[str, Any]],
+    failures: Sequence[tuple[str, str]],
+    environment: Sequence[tuple[str, Any]] | None,
+    changes: Sequence[Change] | None,
+) -> str:
+    figures = {plot["id"]: plot["figure"] for section in sections for plot in section["plots"]}
+    scripts = [plotly_script(), (HERE / "page.js").read_text(encoding="utf-8")] if figures else []
+    jinja = template_environment()
+    jinja.filters["short"] = short
+    return jinja.from_string((HERE / "page.html.j2").read_text(encoding="utf-8")).render(
+        title=title,
+        links=links,
+        verdict=verdict,
+        sections=sections,
+        failures=failures,
+        environment=environment,
+        changes=changes,
+        figures=figures,
+        scripts=scripts,
+        hashes=script_hashes(scripts),
+        style=page_resource("style.css"),
+        version=__version__,
+    )
+
+
+def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> _Verdict:
+    rows = list(rows)
+    judged = [row for row in rows if row.limit is not None]
+    broken = [row for row in judged if row.verdict != "reached"]
+    if not judged and not missing:
+        return _Verdict("open", "Nothing promised here", f"{len(rows)} numbers are told, none has a limit.")
+    told = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
+    reasons = tuple(f"{r.key}: {short(r.value)} {r.unit}, {r.direction} {short(r.limit)}" for r in broken)
+    reasons += tuple(f"{key}: nobody told this number" for key in missing)
+    if reasons:
+        return _Verdict("bad", "Broken", f"{told}.", reasons)
+    return _Verdict("good", "Reached", f"{told}; {len(rows)} numbers in all.")
+
+
+def _section(
+    stage: Stage,
+    results: Results,
+    names: Mapping[str, str],
+    scene: str | None = None,
+    judgement: Judgement | None = None,
+    wishes: Wishes | None = None,
+) -> dict[str, Any]:
+    rows = [r for r in results.rows if r.key.startswith(f"{stage.name}/")]
+    rows = [r for r in rows if scene is None or r.key.split("/")[1] == scene]
+    references = list(dict.fromkeys(name for row in rows for name in row.reference))
+    plots: tuple[Any, ...] = ()
+    pictures: tuple[Any, ...] = ()
+    notes: tuple[str, ...] = ()
+    if judgement is not None and wishes is not None and scene is not None:
+        place = wishes.place(stage.name, scene)
+        plots = tuple(_plot(stage.name, n, plot) for n, plot in enumerate(judgement.plots))
+        pictures = tuple(_picture(place, picture) for picture in judgement.pictures)
+        notes = tuple(judgement.notes)
+    return {
+        "id": stage.name,
+        "title": stage.title,
+        "definition": stage.definition,
+        "rows": [_row(row, names) for row in rows],
+        "references": references,
+        "plots": plots,
+        "pictures": pictures,
+        "notes": notes,
+    }
+
+
+def _row(row: Row, names: Mapping[str, str]) -> dict[str, Any]:
+    _, scene, last = row.key.split("/")
+    return vars(row) | {
+        "name": names.get(row.key, last),
+        "scene": scene,
+        "definition": row.source or "as its name says",
+        "ratio": _ratio(row),
+    }
+
+
+def _ratio(row: Row) -> float | None:
+    """Ours over the best reference; None without one, or where zero is divided by."""
+    others = [v for v in row.reference.values() if v is not None]
+    if row.value is None or not others:
+        return None
+    best = max(others) if row.direction == "at least" else min(others)
+    return row.value / best if best else None
+
+
+def _plot(stage: str, number: int, plot: Plot) -> dict[str, Any]:
+    solid = "scene" in plot.figure.get("layout", {})
+    return {
+        "id": f"plot-{slug(stage)}-{number}",
+        "title": plot.title,
+        "words": plot.words,
+        "figure": plot.figure,
+        "solid": solid,
+    }
+
+
+def _picture(place: Path, picture: Picture) -> dict[str, Any]:
+    """The picture as a data address, no wider than a page needs."""
+    with PIL.Image.open(place / picture.file) as opened:
+        rgb = opened.convert("RGB")
+    rgb.thumbnail((WIDEST_PX, WIDEST_PX))
+    sink = io.BytesIO()
+    rgb.save(sink, "JPEG", quality=JPEG_QUALITY)
+    address = "data:image/jpeg;base64," + base64.b64encode(sink.getvalue()).decode("ascii")
+    return {
+        "address": address,
+        "title": picture.title,
+        "words": picture.words,
+        "width": rgb.width,
+        "height": rgb.height,
+    }
+
+
+def short(value: float | None) -> str:
+    """Three significant digits, whole numbers in full."""
+    if value is None:
+        return "–"
+    if float(value).is_integer() and abs(value) < 1e9:
+        return f"{int(value)}"
+    return f"{value:.3g}"

@@ -1,0 +1,88 @@
+"""A child process with its own cores, a time limit, and an account of what it used."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from validation.scenes.real import ROOT
+
+POLL_S = 0.02
+_PIN = (
+    "import os, sys; os.sched_setaffinity(0, {int(c) for c in sys.argv[1].split(',')}); "
+    "os.execv(sys.argv[2], sys.argv[2:])"
+)
+
+
+@dataclass(frozen=True)
+class Process:
+    """How a child ended: exit ``code`` (negative: the signal that ended it), seconds and processor seconds of
+    its life, peak memory, and whether it was ended because its time was up."""
+
+    code: int
+    wall_s: float
+    peak_mb: float
+    cpu_s: float
+    timed_out: bool = False
+
+
+def own_cores() -> list[int]:
+    """The cores this process may use."""
+    return sorted(os.sched_getaffinity(0))
+
+
+def run_process(
+    command: Sequence[str],
+    *,
+    log: Path,
+    cores: Sequence[int],
+    environment: Mapping[str, str],
+    limit_s: float | None = None,
+) -> Process:
+    """Run ``command`` on these cores and wait; its output goes to the file ``log``.
+
+    Where ``limit_s`` passes, the child and all it started are killed.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    start, timed_out = time.perf_counter(), False
+    with log.open("wb") as sink:
+        child = subprocess.Popen(
+            # The child takes its cores itself, so that every thread it starts inherits them.
+            [sys.executable, "-c", _PIN, ",".join(map(str, cores)), *command],
+            stdout=sink,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, **environment},
+            cwd=ROOT,
+            start_new_session=True,
+        )
+        try:
+            while True:
+                pid, status, usage = os.wait4(child.pid, os.WNOHANG)
+                if pid:
+                    break
+                if not timed_out and limit_s is not None and time.perf_counter() - start > limit_s:
+                    timed_out = True
+                    os.killpg(child.pid, signal.SIGKILL)
+                time.sleep(POLL_S)
+        except BaseException:
+            os.killpg(child.pid, signal.SIGKILL)
+            raise
+    child.returncode = os.waitstatus_to_exitcode(status)
+    wall_s, cpu_s = time.perf_counter() - start, usage.ru_utime + usage.ru_stime
+    return Process(child.returncode, wall_s, usage.ru_maxrss / 1024.0, cpu_s, timed_out)
+
+
+def last_words(log: Path) -> str:
+    """The last line that a process wrote, for the sentence that says why it failed."""
+    try:
+        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    except OSError:
+        return ""
+    return lines[-1].strip() if lines else ""

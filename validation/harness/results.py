@@ -1,0 +1,211 @@
+"""``results.json`` and the tables as CSV: every number with its limit and references; two runs compared."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from validation.harness.gates import Gate
+from validation.harness.records import Judgement, Outcome, Wishes, key_of
+from validation.metrics.record import Metric
+
+PACKAGES = (
+    "thesisrecon",
+    "numpy",
+    "scipy",
+    "numba",
+    "pycolmap",
+    "opencv-contrib-python-headless",
+    "open3d",
+    "poselib",
+)
+TIME_UNITS = ("s", "s processor", "us", "ms", "MB")
+"""Units of numbers that are never the same twice."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A number as it is written: ours (``value``) beside those of the references."""
+
+    key: str
+    value: float | None
+    unit: str
+    direction: str
+    limit: float | None
+    reference: Mapping[str, float | None]
+    source: str
+    verdict: str
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Results:
+    """A whole run of the harness."""
+
+    rows: Sequence[Row]
+    missing: Sequence[str]
+    failures: Mapping[str, str]
+    environment: Mapping[str, Any]
+    wishes: Mapping[str, Any]
+
+    @property
+    def broken(self) -> list[Row]:
+        return [row for row in self.rows if row.verdict == "missed"]
+
+
+def row_of(stage: str, metric: Metric, gate: Gate | None) -> Row:
+    """The row of a metric that carries the limit of its gate."""
+    others = {name: _finite(v) for name, v in metric.values.items() if name != metric.judged}
+    direction = "" if gate is None else "at most" if gate.at_most else "at least"
+    value = _finite(metric.values.get(metric.judged))
+    verdict = "reported" if gate is None else "reached" if gate.holds(value) else "missed"
+    return Row(
+        key_of(stage, metric),
+        value,
+        metric.unit,
+        direction,
+        None if gate is None else gate.limit,
+        others,
+        metric.definition,
+        verdict,
+        "" if gate is None else gate.reason,
+    )
+
+
+def collect(
+    wishes: Wishes,
+    judged: Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]],
+    gates: Mapping[str, Gate],
+) -> Results:
+    """All rows of a run; the gates whose numbers nobody told are ``missing``."""
+    rows = []
+    for (stage, _), (judgement, _outcomes) in judged.items():
+        rows += [row_of(stage, m, gates.get(key_of(stage, m))) for m in judgement.metrics]
+    told = {row.key for row in rows}
+    missing = sorted(k for k in gates if tuple(k.split("/")[:2]) in set(judged) and k not in told)
+    failures = {
+        f"{stage}/{scene}/{method}": outcome.failure
+        for (stage, scene), (_, outcomes) in judged.items()
+        for method, outcome in outcomes.items()
+        if not outcome.ok
+    }
+    return Results(rows, missing, failures, environment(wishes), wishes.to_json())
+
+
+def environment(wishes: Wishes) -> dict[str, Any]:
+    """What the numbers were made with."""
+    versions = {}
+    for name in PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "missing"
+    return {
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        **versions,
+        "threads": f"{wishes.threads} tasks at a time, one thread each",
+        "seed": wishes.seed,
+    }
+
+
+def write_results(out: Path, results: Results) -> None:
+    """``results.json``, and ``tables/STAGE.csv``."""
+    told = {
+        "rows": [vars(row) | {"reference": dict(row.reference)} for row in results.rows],
+        "missing": list(results.missing),
+        "failures": dict(results.failures),
+        "environment": dict(results.environment),
+        "wishes": dict(results.wishes),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "results.json").write_text(json.dumps(told, indent=1, allow_nan=False), encoding="utf-8")
+    (out / "tables").mkdir(exist_ok=True)
+    for stage in dict.fromkeys(row.key.split("/")[0] for row in results.rows):
+        _write_csv(
+            out / "tables" / f"{stage}.csv", [r for r in results.rows if r.key.startswith(f"{stage}/")]
+        )
+
+
+def read_results(out: Path) -> Results:
+    """The run in this folder.
+
+    Raises ``ValueError`` where there is none.
+    """
+    try:
+        told = json.loads((out / "results.json").read_text(encoding="utf-8"))
+        return Results(
+            [Row(**row) for row in told["rows"]],
+            told["missing"],
+            told["failures"],
+            told["environment"],
+            told["wishes"],
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{out} holds no report to compare with (results.json): {error}") from None
+
+
+@dataclass(frozen=True)
+class Change:
+    """A number that differs between two runs; None where one has it not."""
+
+    key: str
+    unit: str
+    before: float | None
+    now: float | None
+    verdicts: tuple[str, str]
+
+    @property
+    def is_time(self) -> bool:
+        return self.unit in TIME_UNITS
+
+
+def compare(before: Results, now: Results) -> list[Change]:
+    """All numbers of ours and all verdicts that are not the same, times and memory too."""
+    old, new = ({row.key: row for row in r.rows} for r in (before, now))
+    changes = []
+    for key in dict.fromkeys([*old, *new]):
+        a, b = old.get(key), new.get(key)
+        values = (None if a is None else a.value, None if b is None else b.value)
+        verdicts = ("absent" if a is None else a.verdict, "absent" if b is None else b.verdict)
+        if values[0] != values[1] or verdicts[0] != verdicts[1]:
+            changes.append(Change(key, (b or a).unit if (b or a) else "", *values, verdicts))  # type: ignore[union-attr]
+    return changes
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    references = list(dict.fromkeys(name for row in rows for name in row.reference))
+    with path.open("w", newline="", encoding="utf-8") as sink:
+        writer = csv.writer(sink)
+        writer.writerow(
+            ["key", "unit", "ours", *references, "direction", "limit", "verdict", "definition", "reason"]
+        )
+        for row in rows:
+            others = [row.reference.get(name) for name in references]
+            told = [row.direction, row.limit, row.verdict, row.source, row.reason]
+            writer.writerow([row.key, row.unit, row.value, *others, *told])
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.processor()

@@ -1,0 +1,77 @@
+"""The scenes of a report by their names, and what kind each is."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from validation.harness.records import Wishes
+from validation.metrics.cameras import TrueCameras
+from validation.scenes.real import SUFFIXES, Scene, data_root, load_fixture_scene, load_real_scene, read_scene
+from validation.scenes.stereo import STEREO_PAIRS, load_stereo_pair
+
+PHOTOGRAPHS = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
+QUICK = ("courtyard", "cube", "boards", "Tsukuba")
+SYNTHETIC = ("cube", "boards")
+"""Made from nothing wherever they are asked for: points of the thesis' cube; photographs of chessboards."""
+
+
+def available_scenes(*, quick: bool) -> tuple[str, ...]:
+    """The scenes whose files are on this machine."""
+    root = data_root()
+    found = [name for name in PHOTOGRAPHS if name == "courtyard" or load_real_scene(name) is not None]
+    found += [name for name in STEREO_PAIRS if load_stereo_pair(name) is not None]
+    found += SYNTHETIC
+    if root is not None and (root / "kusvod2").is_dir():
+        found.append("kusvod2")
+    return tuple(name for name in found if not quick or name in QUICK)
+
+
+def is_photographs(name: str, wishes: Wishes) -> bool:
+    """Whether a scene is a set of photographs of one scene."""
+    return name in PHOTOGRAPHS or name in wishes.folders
+
+
+def load_photographs(name: str, wishes: Wishes) -> Scene:
+    """The photographs of a scene with their truth, where there is one.
+
+    A folder of the user's holds photographs, or images/ with them; its truth is ``cameras.json`` (as in
+    fixtures) or a COLMAP model in ``sparse/0``. Raises ``ValueError`` where a scene has no photographs.
+    """
+    if name in wishes.folders:
+        return _own_scene(Path(wishes.folders[name]), name)
+    scene = load_fixture_scene(name) if name == "courtyard" else load_real_scene(name)
+    if scene is None:
+        raise ValueError(f"the photographs of {name} are not on this machine")
+    return scene
+
+
+def truth_of(scene: Scene) -> TrueCameras | None:
+    """The true cameras of a scene, None where nobody knows them."""
+    if scene.K is None or scene.R is None or scene.C is None:
+        return None
+    return TrueCameras(scene.K, scene.R, scene.C)
+
+
+def _own_scene(folder: Path, name: str) -> Scene:
+    if (folder / "images").is_dir():
+        scene = read_scene(folder, name)
+    else:
+        paths = tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES))
+        if not paths:
+            raise ValueError(f"there are no photographs in {folder}")
+        scene = Scene(name, paths)
+    model = folder / "sparse" / "0"
+    if scene.has_truth or not model.is_dir():
+        return scene
+    names = [path.name for path in scene.image_paths]
+    truth = reconstruction_from_colmap(read_colmap_model(model), names=names)
+    assert truth.K is not None
+    if not truth.registered.all():
+        return scene
+    Rt = np.linalg.solve(truth.K, truth.P)
+    R = np.asarray(Rt[:, :, :3], dtype=np.float64)
+    return dataclasses.replace(scene, K=truth.K, R=R, C=-np.einsum("vji,vj->vi", R, Rt[:, :, 3]))

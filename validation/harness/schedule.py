@@ -1,0 +1,153 @@
+"""All tasks of a report, as many at a time as there are cores, each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import asdict
+from typing import Any
+
+from validation.harness.process import Process, last_words, own_cores, run_process
+from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Task, Wishes
+from validation.harness.worker import JUDGEMENT, OUTCOMES
+from validation.metrics.record import Metric
+
+Told = Callable[[str], None]
+JUDGE = ""
+"""The method of the task that judges all others of its stage and scene."""
+
+
+def tasks_of(wishes: Wishes, stages: Mapping[str, Stage]) -> list[Task]:
+    """Every method of every stage on every scene, and the judgement after them."""
+    found = []
+    for scene in wishes.scenes:
+        for name in wishes.stages:
+            stage = stages[name]
+            if stage.takes(scene, wishes):
+                found += [Task(name, scene, method) for method in stage.methods(scene, wishes)]
+                found.append(Task(name, scene, JUDGE))
+    return found
+
+
+def run_tasks(
+    wishes: Wishes, stages: Mapping[str, Stage], tell: Told
+) -> dict[tuple[str, str], tuple[Judgement, dict[str, Outcome]]]:
+    """The judgement and outcomes of each (stage, scene); nothing that fails stops the others."""
+    shutil.rmtree(wishes.out / "data", ignore_errors=True)
+    wishes.out.mkdir(parents=True, exist_ok=True)
+    (wishes.out / "wishes.json").write_text(json.dumps(wishes.to_json()), encoding="utf-8")
+    waiting, ended = tasks_of(wishes, stages), dict[Task, Outcome]()
+    place_of = {task: n for n, task in enumerate(waiting)}
+    running: dict[Future[Outcome], Task] = {}
+    cores = own_cores()[: wishes.threads]
+    free, total = _Cores(cores), len(waiting)
+    with ThreadPoolExecutor(len(cores)) as pool:
+        while waiting or running:
+            for task in [t for t in waiting if len(running) < len(cores)]:
+                if len(running) < len(cores) and _ready(task, waiting, running, stages):
+                    waiting.remove(task)
+                    running[pool.submit(_carry_out, task, wishes, dict(ended), free)] = task
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                task = running.pop(future)
+                ended[task] = future.result()
+                # In the order of the tasks, so that no table depends on who was done first.
+                ended = dict(sorted(ended.items(), key=lambda item: place_of[item[0]]))
+                tell(f"[{len(ended)}/{total}] {_words(task, ended[task])}")
+    judged = [task for task in ended if task.method == JUDGE]
+    return {(t.stage, t.scene): (_judgement(ended[t]), _outcomes(t, ended)) for t in judged}
+
+
+class _Cores:
+    """Which cores no task has: each gets one of its own."""
+
+    def __init__(self, cores: list[int]) -> None:
+        self._free, self._lock = list(cores), threading.Lock()
+
+    def take(self) -> int:
+        with self._lock:
+            return self._free.pop(0)
+
+    def give_back(self, core: int) -> None:
+        with self._lock:
+            self._free.append(core)
+
+
+def _ready(
+    task: Task, waiting: list[Task], running: Mapping[Future[Outcome], Task], stages: Mapping[str, Stage]
+) -> bool:
+    """Whether nothing that the task starts from is still to come."""
+    open_tasks = set(waiting) | set(running.values())
+    own = {t for t in open_tasks - {task} if (t.stage, t.scene) == (task.stage, task.scene)}
+    if task.method == JUDGE and own:
+        return False
+    return not any(
+        Task(stage, task.scene, method) in open_tasks
+        for stage, method in stages[task.stage].needs(task.method)
+    )
+
+
+def _carry_out(task: Task, wishes: Wishes, ended: Mapping[Task, Outcome], free: _Cores) -> Outcome:
+    place = wishes.place(task.stage, task.scene, task.method)
+    place.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "validation.harness.worker", str(wishes.out / "wishes.json")]
+    command += [task.stage, task.scene]
+    if task.method == JUDGE:
+        told = {name: asdict(o) | {"place": str(o.place)} for name, o in _outcomes(task, ended).items()}
+        (place / OUTCOMES).write_text(json.dumps(told), encoding="utf-8")
+    else:
+        command.append(task.method)
+    core, log = free.take(), place / "log.txt"
+    try:
+        process = run_process(
+            command,
+            log=log,
+            cores=[core],
+            environment={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"},
+            limit_s=wishes.limit_s,
+        )
+    finally:
+        free.give_back(core)
+    failure = _failure(process, last_words(log), wishes.limit_s)
+    return Outcome(place, failure, process.wall_s, process.cpu_s, process.peak_mb)
+
+
+def _failure(process: Process, words: str, limit_s: float) -> str:
+    """Why a task did not end well, in a clause; empty where it did."""
+    if process.timed_out:
+        return f"ended after the {limit_s:.0f} s that a task may take"
+    if process.code < 0:
+        return f"crashed with signal {-process.code}"
+    if process.code:
+        return words or f"ended with exit code {process.code}"
+    return ""
+
+
+def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:
+    """Of the methods beside this judgement, in the order of the tasks."""
+    return {
+        t.method: outcome
+        for t, outcome in ended.items()
+        if (t.stage, t.scene) == (task.stage, task.scene) and t.method != JUDGE
+    }
+
+
+def _judgement(outcome: Outcome) -> Judgement:
+    if not outcome.ok:
+        return Judgement((), notes=(f"This comparison could not be judged: {outcome.failure}.",))
+    told: dict[str, Any] = json.loads((outcome.place / JUDGEMENT).read_text(encoding="utf-8"))
+    return Judgement(
+        [Metric(**metric) for metric in told["metrics"]],
+        [Plot(**plot) for plot in told["plots"]],
+        [Picture(**picture) for picture in told["pictures"]],
+        told["notes"],
+    )
+
+
+def _words(task: Task, outcome: Outcome) -> str:
+    what = f"{task.scene}: {task.stage}, {task.method or 'judged'}"
+    return f"{what}: {outcome.failure or f'{outcome.wall_s:.1f} s'}"

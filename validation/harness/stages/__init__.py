@@ -1,0 +1,11 @@
+"""The stages of a report, by name, in the order of the pipeline."""
+
+from __future__ import annotations
+
+from validation.harness.records import Stage
+from validation.harness.scenes import available_scenes
+from validation.harness.stages.cameras import CamerasStage
+
+__all__ = ["STAGES", "available_scenes"]
+
+STAGES: dict[str, Stage] = {stage.name: stage for stage in (CamerasStage(),)}

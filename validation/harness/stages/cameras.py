@@ -1,0 +1,262 @@
+"""Chapters 4 to 7 whole: intrinsics and cameras of photographs, beside COLMAP's mappers and the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+import thesisrecon
+from thesisrecon.config import config_from_tables
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.types import Reconstruction
+from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
+from validation.harness.scenes import is_photographs, load_photographs, truth_of
+from validation.metrics.cameras import CameraErrors, Reprojection, measure_cameras, measure_reprojection
+from validation.metrics.record import Metric
+from validation.scenes.real import Scene
+
+OURS, THESIS = "ours", "ours (thesis)"
+COLMAP, COLMAP_PP, COLMAP_GLOBAL = "COLMAP", "COLMAP, pp refined", "COLMAP, global"
+MATCHES = "COLMAP, matches"
+MAPPERS = {COLMAP: "default", COLMAP_PP: "principal-point", COLMAP_GLOBAL: "global"}
+FOCAL = "median |f / f_true - 1|, f = sqrt(fx fy), over the registered cameras"
+CENTRE = "mean distance of the camera centres after the least-squares similarity"
+ROTATION = "median angle after the rotation common to all cameras is taken off"
+SHARE_HELD = "share of focal lengths and principal points whose stated 95 % interval holds the truth"
+
+
+class CamerasStage:
+    """The main job of ours beside COLMAP without priors, on the same photographs."""
+
+    name = "cameras"
+    title = "Cameras and intrinsics"
+    definition = (
+        "From photographs alone, nothing told of the camera: the default and the thesis' preset beside "
+        "COLMAP (default, with the principal point refined, and its global mapper), one thread each. "
+        "Every number is recomputed from the saved cameras and points."
+    )
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:
+        return is_photographs(scene, wishes)
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        return (OURS, MATCHES, COLMAP) if wishes.quick else (OURS, MATCHES, THESIS, *MAPPERS)
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return ((self.name, MATCHES),) if method in MAPPERS else ()
+
+    def run(self, task: Task, wishes: Wishes) -> None:
+        scene = load_photographs(task.scene, wishes)
+        place = wishes.place(task.stage, task.scene, task.method)
+        if task.method in (OURS, THESIS):
+            preset = {"preset": "thesis"} if task.method == THESIS else {}
+            thesisrecon.reconstruct(
+                list(scene.image_paths),
+                place / "run",
+                config=config_from_tables(preset),
+                seed=wishes.seed,
+                threads=1,
+                until="metric",
+            )
+            return
+        _run_colmap(task, scene, wishes, place)
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+        photographs = load_photographs(scene, wishes)
+        models = {m: read_model(photographs, m, o) for m, o in outcomes.items() if m != MATCHES}
+        shared = outcomes.get(MATCHES)
+        metrics = [*_numbers(photographs, models), *_costs(scene, outcomes, shared)]
+        metrics += _interval_metrics(photographs, outcomes)
+        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
+        return Judgement(metrics, plots=_plots(photographs, models), notes=notes)
+
+
+def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
+    """The saved model of a method in the order of the scene's photographs; None where there is none."""
+    names = [path.name for path in scene.image_paths]
+    try:
+        if method in (OURS, THESIS):
+            return reconstruction_from_colmap(
+                read_colmap_model(outcome.place / "run" / "sparse" / "0"), names=names
+            )
+        folders = sorted(path for path in (outcome.place / "sparse").glob("*") if path.is_dir())
+        if not folders:
+            return None
+        largest = max((read_colmap_model(path) for path in folders), key=lambda model: len(model.images))
+        return reconstruction_from_colmap(largest, names=names)
+    except (StageFailure, OSError):
+        return None
+
+
+def _run_colmap(task: Task, scene: Scene, wishes: Wishes, place: Path) -> None:
+    from validation.references.pycolmap_reference import Start, map_with_pycolmap, match_with_pycolmap
+
+    images = scene.image_paths[0].parent
+    if task.method == MATCHES:
+        match_with_pycolmap(images, place, threads=1)
+        return
+    matched = wishes.place(task.stage, task.scene, MATCHES)
+    start = Start(refine_principal_point=task.method == COLMAP_PP)
+    mapper: Literal["incremental", "global"] = "global" if task.method == COLMAP_GLOBAL else "incremental"
+    map_with_pycolmap(images, matched, place, start=start, threads=1, mapper=mapper)
+
+
+def _numbers(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+    truth = truth_of(scene)
+    errors = {
+        n: measure_cameras(m, truth) if m is not None and truth is not None else None
+        for n, m in models.items()
+    }
+    residuals = {n: None if m is None else measure_reprojection(m) for n, m in models.items()}
+
+    def of_errors(read: Callable[[CameraErrors], float | None]) -> dict[str, float | None]:
+        return {n: None if e is None else read(e) for n, e in errors.items()}
+
+    def of_residuals(read: Callable[[Reprojection], float]) -> dict[str, float | None]:
+        return {n: None if r is None else read(r) for n, r in residuals.items()}
+
+    registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
+    rows = [Metric(scene.name, "registered", "%", registered, OURS, definition="share of the photographs")]
+    if truth is not None:
+        rows += [
+            Metric(
+                scene.name, "focal error", "%", of_errors(lambda e: e.focal_error_pct), OURS, definition=FOCAL
+            ),
+            Metric(
+                scene.name,
+                "principal point error",
+                "px",
+                of_errors(lambda e: e.principal_point_error_px),
+                OURS,
+                definition="median distance from the true one",
+            ),
+            Metric(scene.name, "centre error", "mm", of_errors(_millimetres), OURS, definition=CENTRE),
+            Metric(
+                scene.name,
+                "rotation error",
+                "deg",
+                of_errors(lambda e: e.rotation_error_deg),
+                OURS,
+                definition=ROTATION,
+            ),
+        ]
+    points = {n: None if m is None else float(m.valid.sum()) for n, m in models.items()}
+    rows += [
+        Metric(
+            scene.name,
+            "reprojection",
+            "px",
+            of_residuals(lambda r: r.median_px),
+            OURS,
+            definition="median distance of inlier observations from their projected points",
+        ),
+        Metric(
+            scene.name,
+            "observations a point",
+            "",
+            {
+                n: r.observations / p if r and p else None
+                for (n, r), p in zip(residuals.items(), points.values(), strict=True)
+            },
+            OURS,
+            definition="inlier observations over points",
+        ),
+        Metric(scene.name, "points", "", points, OURS, definition="valid points of the model"),
+    ]
+    return rows
+
+
+def _costs(scene: str, outcomes: Mapping[str, Outcome], shared: Outcome | None) -> list[Metric]:
+    """Processor seconds and memory; COLMAP's mappers carry the matching they all started from."""
+
+    def seconds(name: str, outcome: Outcome) -> float | None:
+        if not outcome.ok:
+            return None
+        return outcome.cpu_s + (shared.cpu_s if shared is not None and name in MAPPERS else 0.0)
+
+    kept = {n: o for n, o in outcomes.items() if n != MATCHES}
+    times = {n: seconds(n, o) for n, o in kept.items()}
+    memory = {n: o.peak_mb if o.ok else None for n, o in kept.items()}
+    return [
+        Metric(scene, "time", "s", times, OURS, definition="processor seconds from photographs to cameras"),
+        Metric(scene, "peak memory", "MB", memory, OURS, definition="of the process"),
+    ]
+
+
+def _interval_metrics(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
+    """Whether what ours states of its intrinsics holds the truth."""
+    truth = truth_of(scene)
+    if truth is None:
+        return []
+    held: dict[str, float | None] = {}
+    for name in (OURS, THESIS):
+        if name in outcomes and outcomes[name].ok:
+            told = json.loads((outcomes[name].place / "run" / "summary.json").read_text(encoding="utf-8"))
+            held[name] = _share_held(told["cameras"], truth.K)
+    rows = [Metric(scene.name, "intervals that hold", "%", held, OURS, definition=SHARE_HELD)]
+    return rows if held else []
+
+
+def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float | None:
+    places = {"focal_px": None, "principal_x_px": (0, 2), "principal_y_px": (1, 2)}
+    held = []
+    for camera, true_K in zip(cameras, K, strict=True):
+        for name, place in places.items():
+            told = camera.get(name)
+            if told is None or not told["std"]:
+                continue
+            truth = np.sqrt(true_K[0, 0] * true_K[1, 1]) if place is None else true_K[place]
+            held.append(abs(told["value"] - truth) <= 1.96 * told["std"])
+    return 100.0 * float(np.mean(held)) if held else None
+
+
+def _millimetres(errors: CameraErrors) -> float | None:
+    return None if errors.centre_error is None else 1000.0 * errors.centre_error
+
+
+def _plots(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Plot]:
+    """The distribution of reprojection residuals, one curve a method."""
+    traces: list[dict[str, Any]] = []
+    for name, model in models.items():
+        if model is None:
+            continue
+        focal = _focals(model)
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": name,
+                "x": list(range(1, len(focal) + 1)),
+                "y": focal,
+            }
+        )
+    if scene.K is not None:
+        true = np.sqrt(scene.K[:, 0, 0] * scene.K[:, 1, 1]).tolist()
+        marker = {"symbol": "line-ew-open", "size": 18, "color": "#1b2733"}
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": "truth",
+                "x": list(range(1, len(true) + 1)),
+                "y": true,
+                "marker": marker,
+            }
+        )
+    layout = {
+        "xaxis": {"title": {"text": "photograph"}},
+        "yaxis": {"title": {"text": "focal length (px)"}},
+        "margin": {"l": 70, "r": 10, "t": 10, "b": 50},
+    }
+    return [Plot("Focal lengths", {"data": traces, "layout": layout})]
+
+
+def _focals(model: Reconstruction) -> list[float | None]:
+    assert model.K is not None
+    found = np.sqrt(model.K[:, 0, 0] * model.K[:, 1, 1])
+    return [float(f) if seen else None for f, seen in zip(found, model.registered, strict=True)]
