@@ -110,10 +110,24 @@ def test_the_compiled_map_is_the_plain_one(seed: int) -> None:
     np.testing.assert_allclose(front, plain_front, atol=1e-5)
     # Where two surfaces are equally near either is right.
     assert np.mean(np.nan_to_num(np.abs(source - plain_source).max(axis=-1)) > 1e-3) < 0.01
-    for threads in (2, 3):
+    for threads in (2, 3, SIZE[1]):
         again = forward_map(target, near, size=SIZE, step=0.8, threads=threads)
         np.testing.assert_array_equal(again[0], source)
         np.testing.assert_array_equal(again[1], front)
+
+
+def test_strips_hold_what_reaches_into_them_from_pixels_far_above() -> None:
+    y, x = np.mgrid[0:14, 0:14].astype(float)
+    target = np.stack([1.4 * x, 2.8 * y], axis=-1)
+    # Every third pixel is elsewhere, so that the triangle opposite to it stands alone.
+    target[::3, ::3, 1] -= 9.0
+    near = (x + 0.01 * y).astype(np.float32)
+    whole = forward_map(target, near, size=(20, 40), step=2.0)
+    for threads in (2, 7, 40):
+        for part, again in zip(
+            whole, forward_map(target, near, size=(20, 40), step=2.0, threads=threads), strict=True
+        ):
+            np.testing.assert_array_equal(again, part)
 
 
 def test_a_linear_photograph_is_moved_exactly() -> None:

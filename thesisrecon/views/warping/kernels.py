@@ -128,6 +128,19 @@ def _draw_footprint(
 
 
 @njit(cache=True, nogil=True)
+def _beside(target: F64, a: tuple[int, int], reach: float, rows: tuple[int, int]) -> bool:
+    """Whether nothing that four pixels make can be seen in the rows: all lie farther from these on one side
+    than a pixel and its neighbours of one surface reach."""
+    least, most = np.inf, -np.inf
+    for y in range(a[0], min(a[0] + 2, target.shape[0])):
+        for x in range(a[1], min(a[1] + 2, target.shape[1])):
+            # A comparison with NaN is false.
+            least = target[y, x, 1] if target[y, x, 1] < least else least
+            most = target[y, x, 1] if target[y, x, 1] > most else most
+    return bool(most < rows[0] - reach - 1.0 or least > rows[1] + reach)
+
+
+@njit(cache=True, nogil=True)
 def draw_surface(
     target: F64, nearness: F32, limits: F64, rows: tuple[int, int], source: F32, front: F32
 ) -> None:
@@ -143,11 +156,12 @@ def draw_surface(
     height, width = nearness.shape
     for y in range(height):
         for x in range(width):
-            ty = target[y, x, 1]
-            # What lies farther from the rows than neighbours of one surface can reach; false for NaN.
-            if not (ty >= rows[0] - limits[1] - 1.0 and ty <= rows[1] + limits[1]):
-                continue
             a = (y, x)
+            # What is nowhere has a NaN among these.
+            if np.isnan(nearness[a] + target[y, x, 0] + target[y, x, 1]):
+                continue
+            if _beside(target, a, limits[1], rows):
+                continue
             right = x + 1 < width and _joined(target, nearness, a, (y, x + 1), limits)
             below = y + 1 < height and _joined(target, nearness, a, (y + 1, x), limits)
             if x + 1 < width and y + 1 < height:
