@@ -12,10 +12,8 @@ import json
 import os
 import platform
 import shutil
-import subprocess
 import sys
-import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,42 +21,13 @@ from typing import Any
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
 from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS, THESIS, Outcome, check_reconstruction
+from validation.harness.process import Process, own_cores, run_process
 from validation.metrics.cameras import TrueCameras
 from validation.metrics.record import Metric, markdown_table, summary_table
 from validation.references.pycolmap_reference import read_run
-from validation.scenes.real import REAL_SCENES, ROOT, Scene, load_fixture_scene, load_real_scene
+from validation.scenes.real import REAL_SCENES, Scene, load_fixture_scene, load_real_scene
 
 METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colmap-principal-point"}
-
-
-@dataclass(frozen=True)
-class Process:
-    """How a child ended: exit ``code``, seconds and processor seconds of its life, peak memory."""
-
-    code: int
-    wall_s: float
-    peak_mb: float
-    cpu_s: float
-
-
-def run_process(command: list[str], *, log: Path, threads: int, environment: dict[str, str]) -> Process:
-    """Run ``command`` on ``threads`` cores and wait; its output goes to the file ``log``."""
-    cores = sorted(os.sched_getaffinity(0))[:threads]
-    log.parent.mkdir(parents=True, exist_ok=True)
-    start = time.perf_counter()
-    with log.open("wb") as sink:
-        child = subprocess.Popen(
-            # The child takes its cores itself, so that every thread it starts inherits them.
-            [sys.executable, "-c", _PIN, ",".join(map(str, cores)), *command],
-            stdout=sink,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, **environment},
-            cwd=ROOT,
-        )
-        _, status, usage = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    wall_s, cpu_s = time.perf_counter() - start, usage.ru_utime + usage.ru_stime
-    return Process(child.returncode, wall_s, usage.ru_maxrss / 1024.0, cpu_s)
 
 
 README_BEGIN, README_END = "<!-- measured: begin -->", "<!-- measured: end -->"
@@ -74,11 +43,6 @@ README_ROWS = (
     "peak memory",
 )
 
-_PIN = (
-    "import os, sys; os.sched_setaffinity(0, {int(c) for c in sys.argv[1].split(',')}); "
-    "os.execv(sys.argv[2], sys.argv[2:])"
-)
-
 
 def run_method(method: str, scene: Scene, out: Path, *, threads: int, environment: dict[str, str]) -> Outcome:
     """Run one method on one scene in the folder ``out``, emptied first, and read what it saved."""
@@ -87,7 +51,7 @@ def run_method(method: str, scene: Scene, out: Path, *, threads: int, environmen
     process = run_process(
         _command(method, images, out, threads),
         log=out.with_suffix(".log"),
-        threads=threads,
+        cores=own_cores()[:threads],
         environment=environment,
     )
     read = _read_colmap if method in (COLMAP, COLMAP_PP) else _read_ours

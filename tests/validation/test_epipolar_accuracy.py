@@ -15,6 +15,7 @@ import pytest
 
 from thesisrecon.epipolar import estimate_fundamental
 from validation.metrics.epipolar import precision_recall, rms_epipolar_distance
+from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import RealPair, adelaide_pairs, camera_pairs, kusvod2_pairs
 
 SEEDS = (0, 1, 2)
@@ -48,7 +49,7 @@ def test_hand_made_correspondences_lie_on_their_lines(name: str, cache: Path) ->
 
 @pytest.mark.parametrize("name", CAMERAS_PX)
 def test_correspondences_of_the_true_cameras_lie_on_their_lines(name: str, cache: Path) -> None:
-    for pair in pairs_or_skip(islice(camera_pairs(name, cache), 2)):
+    for pair in pairs_or_skip(islice(camera_pairs(load_real_scene(name), cache), 2)):
         assert len(pair.truth) > 300
         assert rms_epipolar_distance(pair.F, pair.truth) < 1e-6
         for seed in SEEDS:

@@ -14,6 +14,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import colmap_from_reconstruction, write_colmap_model
 from validation import main_job
 from validation.checks.reconstruction import COLMAP, OURS
+from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric
 from validation.references.pycolmap_reference import read_run, reconstruct_with_pycolmap
@@ -25,7 +26,7 @@ from .test_cameras import N, V, _reconstruction, _truth
 def test_a_process_is_measured_whole(tmp_path: Path) -> None:
     program = "import os, sys; b = bytearray(200_000_000); print(len(os.sched_getaffinity(0))); sys.exit(3)"
     log = tmp_path / "log" / "out.txt"
-    done = main_job.run_process([sys.executable, "-c", program], log=log, threads=1, environment={})
+    done = run_process([sys.executable, "-c", program], log=log, cores=own_cores()[:1], environment={})
     assert done.code == 3
     assert done.peak_mb > 150
     assert done.wall_s > 0

@@ -36,7 +36,7 @@ from thesisrecon.optimize.metric_bundle import (
 )
 from thesisrecon.types import B8, F64, Reconstruction
 from validation.checks.growth import exponent
-from validation.main_job import run_process
+from validation.harness.process import own_cores, run_process
 from validation.metrics.record import Metric, markdown_table
 from validation.references.ceres_bundle import LOSSES, CeresOptions, ceres_covariances, refine_with_ceres
 from validation.scenes.real import load_real_scene
@@ -298,7 +298,10 @@ def _measure_child(kind: str, n: int, method: str) -> dict[str, float]:
         answer, log = Path(place) / "answer.json", Path(place) / "log"
         command = [sys.executable, "-m", "validation.checks.bundle", "--child", kind, str(n), method]
         run = run_process(
-            [*command, "-o", str(answer)], log=log, threads=1, environment={"OPENBLAS_NUM_THREADS": "1"}
+            [*command, "-o", str(answer)],
+            log=log,
+            cores=own_cores()[:1],
+            environment={"OPENBLAS_NUM_THREADS": "1"},
         )
         if run.code != 0:
             raise RuntimeError(log.read_text(encoding="utf-8"))

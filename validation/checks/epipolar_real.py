@@ -23,6 +23,7 @@ from thesisrecon.epipolar.certainty import judge_certainty
 from validation.metrics.epipolar import precision_recall, rms_epipolar_distance, rms_sampson_distance
 from validation.metrics.record import Metric, markdown_table
 from validation.references.fundamental import OURS, SOLVERS, Estimate, estimate_with
+from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import (
     SCENES_WITH_CAMERAS,
     RealPair,
@@ -189,7 +190,9 @@ def blocks(a: argparse.Namespace) -> Iterator[list[Metric]]:
         names = tuple(a.pairs) if a.pairs else None
         yield check_kusvod2(kusvod2_pairs(a.cache, names, mutual=a.mutual), a.methods, a.seeds)
     for scene in SCENES_WITH_CAMERAS if a.only in (None, "strecha") else ():
-        yield check_cameras(camera_pairs(scene, a.cache), a.methods, a.seeds, verbose=a.verbose)
+        yield check_cameras(
+            camera_pairs(load_real_scene(scene), a.cache), a.methods, a.seeds, verbose=a.verbose
+        )
     if a.only in (None, "adelaide"):
         yield check_adelaide(a.methods, a.seeds)
 

@@ -140,7 +140,7 @@ def benches(gap: int, most: int, cache: Path) -> Iterator[tuple[str, Bench]]:
             continue
         images = read_photographs(scene.image_paths, max_size_px=MAX_SIZE_PX).images
         chosen = np.unique(np.linspace(0, len(images) - gap - 1, most).round().astype(int))
-        truths = [pair.truth for pair in camera_pairs(name, cache, (gap,))]
+        truths = [pair.truth for pair in camera_pairs(load_real_scene(name), cache, (gap,))]
         pairs = {(int(i), int(i) + gap): truth for i in chosen if (truth := truths[i]) is not None}
         yield name, Bench(images, pairs)
 

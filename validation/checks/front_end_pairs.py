@@ -120,7 +120,7 @@ def measure_pairs(
     configs = front_ends()
     by = {name: PreparedViews(configs[name], images) for name in names}
     for gap in gaps:
-        for i, pair in enumerate(islice(camera_pairs(scene_name, cache, (gap,)), most)):
+        for i, pair in enumerate(islice(camera_pairs(load_real_scene(scene_name), cache, (gap,)), most)):
             assert pair.truth is not None
             views = {name: prepared.relate(i, i + gap) for name, prepared in by.items()}
             related = {name: Related(view, _error(view, pair.truth)) for name, view in views.items()}

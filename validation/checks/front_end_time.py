@@ -24,7 +24,7 @@ from thesisrecon.io.images import list_images, read_photographs
 from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.workers import Workers
 from validation.checks.front_end_pairs import MAX_SIZE_PX
-from validation.main_job import run_process
+from validation.harness.process import own_cores, run_process
 from validation.metrics.record import Metric
 from validation.scenes.real import load_real_scene
 
@@ -99,7 +99,7 @@ def measure_time(*, threads: int = 2) -> dict[str, Timed] | None:
 def _timed(command: list[str], told: Path, threads: int) -> Timed:
     log = told.parent.with_suffix(".log") if told.name == "seconds.json" else told.with_suffix(".log")
     command = [sys.executable, *command, "--threads", str(threads)]
-    process = run_process(command, log=log, threads=threads, environment=ONE_BLAS_THREAD)
+    process = run_process(command, log=log, cores=own_cores()[:threads], environment=ONE_BLAS_THREAD)
     if process.code:
         raise RuntimeError(f"{' '.join(command)} ended with {process.code}: {log.read_text()[-2000:]}")
     seconds: dict[str, float] = json.loads(told.read_text(encoding="utf-8"))

@@ -28,7 +28,7 @@ from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate
 from thesisrecon.pipeline import reconstruct
 from thesisrecon.types import RunResult
-from validation.main_job import run_process
+from validation.harness.process import own_cores, run_process
 from validation.scenes.crops import Crop, make_crops, make_separate_crops, shared_area
 from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene
 
@@ -196,7 +196,7 @@ def measure(wishes: argparse.Namespace, method: str, count: int) -> Growth:
         command += ["--same-scenes"] if wishes.same_scenes else []
         log = Path(place) / "log"
         environment = {"OPENBLAS_NUM_THREADS": "1"}
-        process = run_process(command, log=log, threads=wishes.threads, environment=environment)
+        process = run_process(command, log=log, cores=own_cores()[: wishes.threads], environment=environment)
         if process.code != 0:
             raise RuntimeError(log.read_text(encoding="utf-8"))
         told: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))

@@ -14,9 +14,9 @@ from validation.scenes.real import SUFFIXES, Scene, data_root, load_fixture_scen
 from validation.scenes.stereo import STEREO_PAIRS, load_stereo_pair
 
 PHOTOGRAPHS = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
-QUICK = ("courtyard", "cube", "boards", "Tsukuba")
-SYNTHETIC = ("cube", "boards")
-"""Made from nothing wherever they are asked for: points of the thesis' cube; photographs of chessboards."""
+QUICK = ("courtyard", "cloud", "street", "Tsukuba")
+SYNTHETIC = ("cloud", "street")
+"""Made from nothing wherever they are asked for: points seen by a few cameras; a walk of cameras."""
 
 
 def available_scenes(*, quick: bool) -> tuple[str, ...]:

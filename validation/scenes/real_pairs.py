@@ -18,7 +18,7 @@ from thesisrecon.geometry.multiview import fundamental_from_cameras, sampson_res
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.triangulation import triangulate_linear
 from validation.references.sift import SiftKeypoints, detect_sift, match_sift
-from validation.scenes.real import data_root, load_real_scene
+from validation.scenes.real import Scene, data_root
 
 F64 = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -84,13 +84,12 @@ def kusvod2_pairs(
             yield RealPair(folder.name, xy1, xy2, truth=np.loadtxt(folder / "validation.txt", ndmin=2)[:, :4])
 
 
-def camera_pairs(scene_name: str, cache: Path, gaps: tuple[int, ...] = (1, 2)) -> Iterator[RealPair]:
+def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2)) -> Iterator[RealPair]:
     """Pairs (i, i + gap) of a scene with known cameras; ``truth`` is free of noise.
 
     Its points are the matches that agree with the cameras, moved to where they agree exactly, so they lie
     where the scene has texture. Nothing where the photographs are not on this machine.
     """
-    scene = load_real_scene(scene_name)
     if scene is None or scene.K is None or scene.R is None or scene.C is None:
         return
     cameras = [compose_camera(K, R, -R @ C) for K, R, C in zip(scene.K, scene.R, scene.C, strict=True)]
@@ -100,7 +99,7 @@ def camera_pairs(scene_name: str, cache: Path, gaps: tuple[int, ...] = (1, 2)) -
             xy1, xy2 = match_photographs(paths, cache, ratio=CAMERA_RATIO, mutual=True)
             F = fundamental_from_cameras(cameras[i], cameras[i + gap])
             truth = exact_correspondences(cameras[i], cameras[i + gap], xy1, xy2)
-            yield RealPair(f"{scene_name} {i}-{i + gap}", xy1, xy2, truth=truth, F=F)
+            yield RealPair(f"{scene.name} {i}-{i + gap}", xy1, xy2, truth=truth, F=F)
 
 
 def exact_correspondences(P1: F64, P2: F64, xy1: F64, xy2: F64) -> F64:

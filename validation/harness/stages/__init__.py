@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from validation.harness.records import Stage
 from validation.harness.scenes import available_scenes
+from validation.harness.stages.bundle import BundleStage
 from validation.harness.stages.cameras import CamerasStage
+from validation.harness.stages.disparity import DisparityStage
+from validation.harness.stages.fundamental import FundamentalStage
+from validation.harness.stages.triangulation import TriangulationStage
 
 __all__ = ["STAGES", "available_scenes"]
 
-STAGES: dict[str, Stage] = {stage.name: stage for stage in (CamerasStage(),)}
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (FundamentalStage(), TriangulationStage(), CamerasStage(), BundleStage(), DisparityStage())
+}

@@ -1,0 +1,130 @@
+"""Section 2.5: disparities of rectified pairs by ours and OpenCV, against dense truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+
+from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, PairMatcher, SemiGlobal
+from thesisrecon.types import F32
+from validation.checks.stereo import bad_pixels, picture
+from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
+from validation.metrics.record import Metric
+from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
+
+OURS, THESIS, SEMI_GLOBAL = "ours", "ours (thesis)", "ours (semi-global)"
+MATCHERS: dict[str, PairMatcher] = {
+    OURS: CohesiveScanlines(),
+    THESIS: MaximumLikelihoodScanline(),
+    SEMI_GLOBAL: SemiGlobal(),
+}
+THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
+DEFINITION = "share of the pixels that both cameras see, holes filled along the row"
+
+
+class DisparityStage:
+    """Dense matching with the same parameters for all pairs."""
+
+    name = "disparity"
+    title = "Disparities"
+    definition = (
+        "Rectified pairs with dense truth; the same parameters for all pairs, one thread each. OpenCV's "
+        "semi-global matching has block 3, P1 = 216, P2 = 864, and widened images, to see every column."
+    )
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:  # noqa: ARG002 (the same for all wishes)
+        return scene in STEREO_PAIRS
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        return (*MATCHERS, THREE_WAY, HH)
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (nothing)
+        return ()
+
+    def run(self, task: Task, wishes: Wishes) -> None:
+        pair = _pair(task.scene)
+        runs = 1 if wishes.quick else 3
+        _match(task.method, pair)  # compiles
+        seconds = []
+        for _ in range(runs):
+            start = time.process_time()
+            disparity = _match(task.method, pair)
+            seconds.append(time.process_time() - start)
+        place = wishes.place(task.stage, task.scene, task.method)
+        np.savez(place / "disparity.npz", disparity=disparity, seconds=min(seconds))
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+        pair = _pair(scene)
+        kept = {name: _read(o) if o.ok else None for name, o in outcomes.items()}
+
+        def bad(limit: float) -> dict[str, float | None]:
+            return {n: None if k is None else bad_pixels(k[0], pair, limit) for n, k in kept.items()}
+
+        known = {
+            n: None if k is None else float(100.0 * np.isfinite(k[0])[pair.judged].mean())
+            for n, k in kept.items()
+        }
+        spent = {n: None if k is None else 1e3 * k[1] for n, k in kept.items()}
+        wrong = bad(1.0)
+        better = min((v for n in (THREE_WAY, HH) if (v := wrong[n]) is not None), default=None)
+        metrics = [
+            Metric(scene, "off by more than 1 px", "%", wrong, OURS, definition=DEFINITION),
+            Metric(scene, "off by more than 2 px", "%", bad(2.0), OURS, definition=DEFINITION),
+            Metric(scene, "known", "%", known, OURS, definition="share before holes are filled"),
+            Metric(scene, "time", "ms", spent, OURS, definition="processor time, the least of all runs"),
+            Metric(
+                scene,
+                "bad pixels over the better reference",
+                "",
+                {OURS: _ratio(wrong[OURS], better)},
+                OURS,
+                definition="off by more than 1 px, over the better mode of OpenCV",
+            ),
+            Metric(
+                scene,
+                "time over SGBM HH",
+                "",
+                {OURS: _ratio(spent[OURS], spent[HH])},
+                OURS,
+                definition="processor time, a ratio of two runs on the same machine",
+            ),
+        ]
+        maps = {n: k[0] for n, k in kept.items() if k is not None}
+        place = wishes.place(self.name, scene)
+        shown = [name for name in (THESIS, OURS, THREE_WAY) if name in maps]
+        PIL.Image.fromarray(picture(pair, maps, shown)).save(place / "maps.png")
+        words = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
+        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
+        return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", words)], notes=notes)
+
+
+def _ratio(a: float | None, b: float | None) -> float | None:
+    return a / b if a is not None and b else None
+
+
+def _pair(scene: str) -> StereoPair:
+    pair = load_stereo_pair(scene)
+    if pair is None:
+        raise ValueError(f"the pair {scene} is not on this machine")
+    return pair
+
+
+def _match(method: str, pair: StereoPair) -> F32:
+    if method in MATCHERS:
+        limits = (0, pair.disparities - 1)
+        return MATCHERS[method].match(pair.left, pair.right, disparity_range=limits).disparity
+    import cv2
+
+    from validation.references.semi_global import OpenCVSemiGlobal
+
+    cv2.setNumThreads(1)
+    return OpenCVSemiGlobal(method).match(pair.left, pair.right, pair.disparities)
+
+
+def _read(outcome: Outcome) -> tuple[F32, float]:
+    with np.load(Path(outcome.place) / "disparity.npz") as kept:
+        return kept["disparity"], float(kept["seconds"])

@@ -1,0 +1,207 @@
+"""Chapter 5: F of the same matches by ours, OpenCV, COLMAP and PoseLib, against the truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.geometry.multiview import epipoles
+from thesisrecon.types import B8, F64
+from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
+from validation.harness.scenes import is_photographs, load_photographs
+from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
+from validation.metrics.record import Metric
+from validation.scenes.real_pairs import RealPair, camera_pairs, kusvod2_pairs
+
+OURS, MATCHES = "ours", "SIFT matches"
+REFERENCES = (
+    "FM_RANSAC",
+    "FM_LMEDS",
+    "USAC_ACCURATE",
+    "USAC_MAGSAC",
+    "COLMAP",
+    "PoseLib",
+)
+QUICK = ("USAC_MAGSAC", "PoseLib")
+THRESHOLD_PX = 1.0
+FAILED_PX = 5.0
+ERROR = "RMS distance of right correspondences to their epipolar lines, over both images (5.6)"
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a method said of all pairs, once a seed: ``F`` (pairs, seeds, 3, 3), NaN where it gave none,
+    ``inliers`` (pairs, seeds) how many it took, ``seconds`` (pairs, seeds) of one processor."""
+
+    F: F64
+    inliers: F64
+    seconds: F64
+
+
+class FundamentalStage:
+    """F of SIFT matches with one threshold for all methods."""
+
+    name = "fundamental"
+    title = "Fundamental matrices"
+    definition = (
+        "F of the same SIFT matches, threshold 1 px, several seeds, which draw the order of the matches too. "
+        "Errors are on correspondences of the true cameras (or hand-made ones) that no method has seen."
+    )
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:
+        return scene == "kusvod2" or (
+            is_photographs(scene, wishes) and load_photographs(scene, wishes).has_truth
+        )
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        return (MATCHES, OURS, *(QUICK if wishes.quick else REFERENCES))
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return () if method in ("", MATCHES) else ((self.name, MATCHES),)
+
+    def run(self, task: Task, wishes: Wishes) -> None:
+        pairs = list(_pairs(task.scene, wishes))
+        if task.method == MATCHES:
+            return
+        from validation.references.fundamental import estimate_with
+
+        def answer(pair: RealPair, seed: int) -> tuple[F64 | None, B8, float]:
+            start = time.process_time()
+            found = estimate_with(task.method, pair.xy1, pair.xy2, threshold_px=THRESHOLD_PX, seed=seed)
+            return found.F, found.inliers, time.process_time() - start
+
+        answer(pairs[0], 0)  # compiles
+        told = [[answer(pair, wishes.seed + seed) for seed in range(_seeds(wishes))] for pair in pairs]
+        none = np.full((3, 3), np.nan)
+        np.savez(
+            wishes.place(task.stage, task.scene, task.method) / "answers.npz",
+            F=[[none if F is None else F for F, _, _ in row] for row in told],
+            inliers=[[float(inliers.sum()) for _, inliers, _ in row] for row in told],
+            seconds=[[seconds for _, _, seconds in row] for row in told],
+        )
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+        pairs = list(_pairs(scene, wishes))
+        answers = {m: _read(o) if o.ok else None for m, o in outcomes.items() if m != MATCHES}
+        errors = {m: None if a is None else _errors(a, pairs) for m, a in answers.items()}
+        metrics = _metrics(scene, pairs, answers, errors)
+        notes = [f"{len(pairs)} pairs, {_seeds(wishes)} seeds each."]
+        notes += [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
+        return Judgement(metrics, plots=[_plot(errors)], notes=notes)
+
+
+def _seeds(wishes: Wishes) -> int:
+    return 2 if wishes.quick else 5
+
+
+def _pairs(scene: str, wishes: Wishes) -> Iterator[RealPair]:
+    """The pairs of a scene; their matches are kept where the task of the matches leaves them."""
+    cache = wishes.place("fundamental", scene, MATCHES)
+    if scene == "kusvod2":
+        return kusvod2_pairs(cache)
+    return camera_pairs(load_photographs(scene, wishes), cache, (1,) if wishes.quick else (1, 2))
+
+
+def _read(outcome: Outcome) -> Answers:
+    with np.load(Path(outcome.place) / "answers.npz") as kept:
+        return Answers(kept["F"], kept["inliers"], kept["seconds"])
+
+
+def _errors(answers: Answers, pairs: list[RealPair]) -> F64:
+    """(pairs, seeds) px."""
+    rows = []
+    for pair, row in zip(pairs, answers.F, strict=True):
+        assert pair.truth is not None
+        rows.append([rms_epipolar_distance(F if np.isfinite(F).all() else None, pair.truth) for F in row])
+    return np.array(rows)
+
+
+def _metrics(
+    scene: str,
+    pairs: list[RealPair],
+    answers: Mapping[str, Answers | None],
+    errors: Mapping[str, F64 | None],
+) -> list[Metric]:
+    def row(name: str, unit: str, values: Mapping[str, float | None], definition: str) -> Metric:
+        return Metric(scene, name, unit, values, OURS, definition=definition)
+
+    def of_errors(read: Callable[[F64], Any]) -> dict[str, float | None]:
+        return {m: None if e is None else float(read(e)) for m, e in errors.items()}
+
+    def of_answers(read: Callable[[Answers], float]) -> dict[str, float | None]:
+        return {m: None if a is None else float(read(a)) for m, a in answers.items()}
+
+    counts = np.array([len(pair.xy1) for pair in pairs])[:, None]
+    rows = [
+        row("median error", "px", of_errors(np.median), ERROR),
+        row("tenth worst error", "px", of_errors(lambda e: np.quantile(e, 0.9)), "the 90 % quantile of it"),
+        row(
+            "failed",
+            "%",
+            of_errors(lambda e: 100.0 * np.mean(e > FAILED_PX)),
+            f"runs with an error above {FAILED_PX:g} px",
+        ),
+        row(
+            "inliers",
+            "%",
+            of_answers(lambda a: 100.0 * np.mean(a.inliers / counts)),
+            "mean share of the matches a method takes for right",
+        ),
+        row(
+            "time",
+            "ms",
+            of_answers(lambda a: 1e3 * np.median(a.seconds)),
+            "median processor time of a pair",
+        ),
+    ]
+    if all(pair.F is not None for pair in pairs):
+        angle = of_answers(lambda a: float(np.median(_epipole_angles(a, pairs))))
+        rows.insert(1, row("epipole angle", "deg", angle, "median angle between found and true epipole"))
+    return rows
+
+
+def _epipole_angles(answers: Answers, pairs: list[RealPair]) -> F64:
+    """Angles in degrees between the epipoles of image 1 and the true ones, as directions from the middle of
+    the matches at the distance of their spread; 90 where a method gave no F."""
+    angles = []
+    for pair, row in zip(pairs, answers.F, strict=True):
+        assert pair.F is not None
+        middle, spread = pair.xy1.mean(axis=0), np.linalg.norm(pair.xy1.std(axis=0))
+        true = _direction(pair.F, middle, float(spread))
+        for F in row:
+            if not np.isfinite(F).all():
+                angles.append(90.0)
+                continue
+            cosine = abs(float(true @ _direction(F, middle, float(spread))))
+            angles.append(float(np.degrees(np.arccos(min(cosine, 1.0)))))
+    return np.array(angles)
+
+
+def _direction(F: F64, middle: F64, spread: float) -> F64:
+    e = epipoles(F)[0]
+    moved = np.array([e[0] - middle[0] * e[2], e[1] - middle[1] * e[2], spread * e[2]])
+    return np.asarray(moved / np.linalg.norm(moved))
+
+
+def _plot(errors: Mapping[str, F64 | None]) -> Plot:
+    """All errors of every method, sorted: a curve to the left and above is better."""
+    traces = []
+    for name, found in errors.items():
+        if found is None:
+            continue
+        x = np.sort(np.minimum(found.ravel(), NONE_PX))
+        share = 100.0 * np.arange(1, len(x) + 1) / len(x)
+        traces.append(
+            {"type": "scatter", "mode": "lines", "name": name, "x": x.tolist(), "y": share.tolist()}
+        )
+    layout = {
+        "xaxis": {"type": "log", "title": {"text": "error (px)"}},
+        "yaxis": {"title": {"text": "runs below (%)"}, "range": [0, 100]},
+        "margin": {"l": 60, "r": 10, "t": 10, "b": 50},
+    }
+    return Plot("Errors of all runs", {"data": traces, "layout": layout}, "To the left is better.")

@@ -1,0 +1,206 @@
+"""Section 6.2: points from two and more views by ours, OpenCV and COLMAP, against the truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
+from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_midpoint, triangulate_optimal
+from thesisrecon.types import F64
+from validation.checks.triangulation import SCENES, cameras_of, frame_of, squared_distances
+from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
+from validation.metrics.record import Metric
+from validation.scenes.rigs import Rig
+
+OURS = "ours (polynomial, optimal)"
+LINEAR, MIDPOINT = "ours (linear)", "ours (mid-point)"
+OPENCV, OPENCV_POLYNOMIAL, COLMAP = "OpenCV", "OpenCV, correctMatches", "COLMAP"
+NOISES_PX = (0.5, 1.0, 2.0)
+POINTS = 400
+Method = Callable[[F64, F64], F64]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Points ``xy`` (V, N, 2) of cameras ``P`` (V, 3, 4) in a frame of space that ``frame`` (4, 4) leads to
+    from the metric one."""
+
+    title: str
+    sigma_px: float
+    projective: bool
+    rig: Rig
+    seen: np.ndarray
+    P: F64
+    xy: F64
+    frame: F64
+
+
+class TriangulationStage:
+    """The thesis' comparison, beside the references."""
+
+    name = "triangulation"
+    title = "Triangulation"
+    definition = (
+        "Points of a cloud seen by two and five cameras, noise 0.5 to 2 px, in a metric and in projective "
+        "frames of space. The optimum is that of the reprojection over all views."
+    )
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:  # noqa: ARG002 (the same for all wishes)
+        return scene == "cloud"
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        return (OURS, LINEAR, MIDPOINT, OPENCV, OPENCV_POLYNOMIAL, COLMAP)
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (nothing)
+        return ()
+
+    def run(self, task: Task, wishes: Wishes) -> None:
+        answers: dict[str, Any] = {}
+        seconds = []
+        for n, problem in enumerate(_problems(wishes)):
+            method = _solver(task.method, len(problem.P))
+            if method is None:
+                continue
+            method(problem.P, problem.xy[:, :8])  # compiles
+            start = time.process_time()
+            answers[f"{n}"] = method(problem.P, problem.xy)
+            if len(problem.P) == 2:
+                seconds.append((time.process_time() - start) / problem.xy.shape[1])
+        place = wishes.place(task.stage, task.scene, task.method)
+        np.savez(place / "points.npz", seconds=np.array(seconds), **answers)
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+        problems = list(_problems(wishes))
+        kept = {name: _read(o) if o.ok else None for name, o in outcomes.items()}
+        metrics = []
+        for views in (2, 5):
+            for projective in (False, True):
+                chosen = [
+                    n for n, p in enumerate(problems) if len(p.P) == views and p.projective == projective
+                ]
+                metrics += _metrics(scene, views, projective, {n: problems[n] for n in chosen}, kept)
+        spent = {n: None if k is None else 1e6 * float(np.median(k["seconds"])) for n, k in kept.items()}
+        metrics.append(
+            Metric(scene, "time a point", "us", spent, OURS, definition="two views, one processor, median")
+        )
+        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
+        return Judgement(metrics, plots=[_plot(problems, kept)], notes=notes)
+
+
+def _solver(method: str, views: int) -> Method | None:
+    """None where a method knows two views only, and there are more."""
+    if method == OURS:
+        return triangulate_polynomial if views == 2 else triangulate_optimal
+    if method in (LINEAR, MIDPOINT):
+        return triangulate_linear if method == LINEAR else triangulate_midpoint
+    from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
+
+    if method == COLMAP:
+        return colmap_points
+    if views > 2:
+        return None
+    return opencv_linear if method == OPENCV else opencv_polynomial
+
+
+def _problems(wishes: Wishes) -> Iterator[Problem]:
+    trials = 1 if wishes.quick else 4
+    for title, (make, views) in SCENES.items():
+        for sigma in NOISES_PX:
+            for projective in (False, True):
+                for trial in range(trials):
+                    rng = np.random.default_rng([wishes.seed, trial])
+                    rig = make(rng, views, POINTS)
+                    exact = rig.pixels()
+                    seen = np.asarray(np.isfinite(exact).all(axis=(0, 2)))
+                    xy = exact[:, seen] + sigma * rng.normal(size=(views, int(seen.sum()), 2))
+                    frame = frame_of("projective" if projective else "metric", rng)
+                    P = cameras_of(rig) @ np.linalg.inv(frame)
+                    yield Problem(title, sigma, projective, rig, seen, P, xy, frame)
+
+
+def _read(outcome: Outcome) -> dict[str, F64]:
+    with np.load(Path(outcome.place) / "points.npz") as kept:
+        return {name: kept[name] for name in kept.files}
+
+
+def _metrics(
+    scene: str,
+    views: int,
+    projective: bool,
+    problems: Mapping[int, Problem],
+    kept: Mapping[str, Mapping[str, F64] | None],
+) -> list[Metric]:
+    frame = "projective frame" if projective else "metric frame"
+    where = f"{views} views, {frame}"
+    best = {n: squared_distances(p.P, triangulate_optimal(p.P, p.xy), p.xy) for n, p in problems.items()}
+    above: dict[str, float | None] = {}
+    apart: dict[str, float | None] = {}
+    for name, answers in kept.items():
+        some = {n: answers[f"{n}"] for n in problems if answers is not None and f"{n}" in answers}
+        if not some:
+            above[name] = apart[name] = None
+            continue
+        cost = np.concatenate([squared_distances(problems[n].P, X, problems[n].xy) for n, X in some.items()])
+        least = np.concatenate([best[n] for n in some])
+        above[name] = float(np.sqrt(cost.mean() / least.mean()) - 1.0)
+        apart[name] = float(
+            np.median(np.concatenate([_space_errors(problems[n], X) for n, X in some.items()]))
+        )
+    return [
+        Metric(
+            scene,
+            f"residual above the optimum, {where}",
+            "",
+            above,
+            OURS,
+            definition="RMS distance to the measured points over that of the optimum, minus 1",
+        ),
+        Metric(
+            scene,
+            f"error in space, {where}",
+            "%",
+            apart,
+            OURS,
+            definition="median distance from the true point over its distance from the first camera",
+        ),
+    ]
+
+
+def _space_errors(problem: Problem, X: F64) -> F64:
+    """Per cent of the distance from the first camera."""
+    back = dehomogenize(X @ np.linalg.inv(problem.frame).T)
+    true = problem.rig.X[problem.seen]
+    off = np.linalg.norm(back - true, axis=1) / np.linalg.norm(true - problem.rig.C[0], axis=1)
+    return np.asarray(100.0 * np.nan_to_num(off, nan=np.inf), dtype=np.float64)
+
+
+def _plot(problems: list[Problem], kept: Mapping[str, Mapping[str, F64] | None]) -> Plot:
+    """Error in space over noise: two views beside each other, metric frame."""
+    traces = []
+    for name, answers in kept.items():
+        if answers is None:
+            continue
+        y = []
+        for sigma in NOISES_PX:
+            errors = [
+                _space_errors(p, answers[f"{n}"])
+                for n, p in enumerate(problems)
+                if p.sigma_px == sigma and not p.projective and len(p.P) == 2 and f"{n}" in answers
+            ]
+            y.append(float(np.median(np.concatenate(errors))))
+        traces.append(
+            {"type": "scatter", "mode": "lines+markers", "name": name, "x": list(NOISES_PX), "y": y}
+        )
+    layout = {
+        "xaxis": {"title": {"text": "noise (px)"}},
+        "yaxis": {"title": {"text": "median error in space (%)"}, "rangemode": "tozero"},
+        "margin": {"l": 70, "r": 10, "t": 10, "b": 50},
+    }
+    return Plot("Two views, metric frame", {"data": traces, "layout": layout})
