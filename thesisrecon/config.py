@@ -182,11 +182,13 @@ class DepthEstimator(Protocol):
     """Section 2.5: depth of every pixel of every view; one view at a time, so that a run can go on.
 
     ``match_rectified`` is its matcher alone, on a rectified pair of arrays; ``match_two_views`` rectifies two
-    photographs by their F and matches them from either side."""
+    photographs by their F, by homographies where ``planar``, and matches them from either side."""
 
     def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap: ...
 
-    def match_two_views(self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64) -> RectifiedPair: ...
+    def match_two_views(
+        self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
+    ) -> RectifiedPair: ...
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene: ...
 

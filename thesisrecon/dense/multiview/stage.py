@@ -61,9 +61,11 @@ class MultiViewStereo:
         """Disparities of a rectified pair of arrays by the matcher of ``pairs``."""
         return match_rectified(left, right, max_disparity_px=max_disparity_px, config=self.pairs.matcher)
 
-    def match_two_views(self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64) -> RectifiedPair:
+    def match_two_views(
+        self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
+    ) -> RectifiedPair:
         """Dense correspondence of two photographs with F and its inliers; see :func:`match_two_views`."""
-        return match_two_views(image1.rgb, image2.rgb, F, xy1, xy2, pairs=self.pairs)
+        return match_two_views(image1.rgb, image2.rgb, F, xy1, xy2, pairs=self.pairs, planar=planar)
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
         """Undistorted views, sparse points and neighbours of V photographs with a metric reconstruction.

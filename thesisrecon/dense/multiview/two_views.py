@@ -13,7 +13,16 @@ from thesisrecon.dense.multiview.correspondence import (
     sample_disparity,
     searched,
 )
-from thesisrecon.dense.rectification import AnyRectification, disparity_range, rectify_pair
+from thesisrecon.dense.rectification import (
+    AnyRectification,
+    Hartley,
+    LeastDistorted,
+    LeastDistortion,
+    LoopZhang,
+    disparity_range,
+    pair_of_fundamental,
+    rectify,
+)
 from thesisrecon.dense.rectification.sampling import require_side
 from thesisrecon.geometry.multiview import canonical_cameras
 from thesisrecon.types import B8, F32, F64, DisparityMap, PinholeView
@@ -22,6 +31,9 @@ U8 = NDArray[np.uint8]
 
 STRIP_ROWS = 128
 """Rows whose places are held in float64 at a time."""
+
+
+PLANAR = LeastDistorted((Hartley(), LoopZhang(), LeastDistortion()))
 
 
 @dataclass(frozen=True)
@@ -61,7 +73,9 @@ class RectifiedPair:
         return places
 
 
-def match_two_views(rgb1: U8, rgb2: U8, F: F64, xy1: F64, xy2: F64, *, pairs: PairMatching) -> RectifiedPair:
+def match_two_views(
+    rgb1: U8, rgb2: U8, F: F64, xy1: F64, xy2: F64, *, pairs: PairMatching, planar: bool = False
+) -> RectifiedPair:
     """Dense correspondence of two photographs of which F and its inliers are known.
 
     Parameters
@@ -69,6 +83,7 @@ def match_two_views(rgb1: U8, rgb2: U8, F: F64, xy1: F64, xy2: F64, *, pairs: Pa
     rgb1, rgb2 : (H, W, 3) uint8.
     F, xy1, xy2 : (3, 3), x2' F x1 = 0, and (N >= 8, 2) px matches that obey it.
     pairs : whose matcher and range of disparities are taken.
+    planar : rectify by homographies alone, which need the epipoles outside of the photographs.
 
     Raises
     ------
@@ -81,7 +96,8 @@ def match_two_views(rgb1: U8, rgb2: U8, F: F64, xy1: F64, xy2: F64, *, pairs: Pa
         for k, (P, rgb) in enumerate(zip(cameras, (rgb1, rgb2), strict=True))
     ]
     sizes = [(rgb.shape[1], rgb.shape[0]) for rgb in (rgb1, rgb2)]
-    frame = rectify_pair(F, xy1, xy2, sizes[0], sizes[1])
+    pair = pair_of_fundamental(F, xy1, xy2, sizes[0], sizes[1])
+    frame = PLANAR.rectify(pair) if planar else rectify(pair)
     wanted = searched(frame, disparity_range(frame, xy1, xy2, margin=pairs.range_margin))
     gain = brightness_gain(views[0], views[1], xy1, xy2)
     left = frame.warp(rgb1.astype(np.float32), 0)

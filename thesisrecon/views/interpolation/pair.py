@@ -1,0 +1,245 @@
+"""Views between two photographs whose dense correspondence is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.zbuffer import in_strips
+from thesisrecon.types import F32, F64, DisparityMap
+from thesisrecon.views.interpolation.frame import FrameBetween
+from thesisrecon.views.interpolation.kernels import (
+    ONE_SURFACE_PX,
+    blend,
+    fill_empty_rows,
+    place_between,
+    take_back,
+    weigh,
+)
+from thesisrecon.views.warping import fill_holes, forward_map, sample
+
+U8 = NDArray[np.uint8]
+
+SPARSE = 7
+"""Every seventh pixel of every seventh row suffices for a median."""
+DARK, BRIGHT = 8.0, 247.0
+"""Levels whose ratio tells how much brighter a photograph is."""
+
+
+@dataclass(frozen=True)
+class Blending:
+    """How two warped photographs become one.
+
+    Pixels whose nearness differs by no more than ``alike_px`` show the same surface. Weights are the
+    confidence, but at least ``least``; ``guessed`` of what only the other photograph's holes can show, whose
+    disparity is that of the background beside it; ``rim`` is what is left of them beside a cut.
+    """
+
+    alike_px: float = 1.5
+    least: float = 0.2
+    guessed: float = 0.01
+    rim: float = 0.2
+
+
+@dataclass(frozen=True)
+class Warped:
+    """One photograph seen from between: ``colors`` (H, W, 3), ``near`` (H, W), ``source`` (H, W, 2)."""
+
+    colors: F32
+    near: F32
+    source: F32
+
+
+@dataclass(frozen=True)
+class _Side:
+    """What is known of a photograph's pixels: ``places`` (h, w, 2) in the rectified frame, ``disparity`` (h,
+    w) without holes, ``weight`` (h, w)."""
+
+    levels: F32
+    places: F64
+    disparity: F32
+    weight: F32
+
+
+@dataclass(frozen=True)
+class InterpolatedPair:
+    """Two photographs (h, w, 3) uint8 of one size and what lies between them (thesis, section 1.2).
+
+    ``H`` (2, 3, 3) takes either one's pixels to the rectified frame, third coordinate positive for what is
+    seen; ``left`` and ``right`` are the disparities of the first and the second one there (x_right = x_left -
+    d either way), larger for nearer points.
+
+    Every pixel of either photograph is moved along its row by its share of its disparity and out of the
+    rectified frame at once, so that colours are sampled once only and from the photographs. Nearer pixels
+    hide farther ones, which is all it takes where monotonicity fails. What one photograph alone shows is
+    taken from it, with the disparity of the background beside it; what none shows is filled from behind.
+
+    Raises ``ValueError`` for photographs of different sizes and maps of different shapes.
+    """
+
+    images: tuple[U8, U8]
+    H: F64
+    left: DisparityMap
+    right: DisparityMap
+    blending: Blending = field(default_factory=Blending)
+
+    def __post_init__(self) -> None:
+        a, b = (image.shape for image in self.images)
+        if a != b or len(a) != 3 or a[2] != 3:
+            raise ValueError(f"views lie between two images (h, w, 3) of one size; got {a} and {b}")
+        if self.left.disparity.shape != self.right.disparity.shape:
+            raise ValueError(
+                "disparities of both sides must have one shape; got "
+                f"{self.left.disparity.shape} and {self.right.disparity.shape}"
+            )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the photographs and of the views."""
+        return self.images[0].shape[1], self.images[0].shape[0]
+
+    @cached_property
+    def frame(self) -> FrameBetween:
+        """Where points lie between."""
+        return FrameBetween(self.H, self.size)
+
+    @cached_property
+    def _sides(self) -> tuple[_Side, _Side]:
+        sides = [
+            _side(image, H, found, self.blending)
+            for image, H, found in zip(self.images, self.H, (self.left, self.right), strict=True)
+        ]
+        return sides[0], sides[1]
+
+    @cached_property
+    def gain(self) -> F32:
+        """(3,) by how much the second photograph is brighter than the first, the median of known pixels."""
+        first = self._sides[0]
+        grid = np.ix_(range(0, self.size[1], SPARSE), range(0, self.size[0], SPARSE))
+        places = first.places[grid].copy()
+        places[..., 0] -= first.disparity[grid]
+        back = np.linalg.inv(self.H[1])
+        at = np.concatenate([places, np.ones((*places.shape[:2], 1))], axis=2) @ back.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            source = np.where(at[..., 2:] > 0.0, at[..., :2] / at[..., 2:], np.nan).astype(np.float32)
+        levels = first.levels[grid], sample(self._sides[1].levels, source)
+        known = first.weight[grid] > self.blending.guessed
+        with np.errstate(invalid="ignore"):
+            for level in levels:
+                known &= ((level > DARK) & (level < BRIGHT)).all(axis=2)
+        if int(known.sum()) < SPARSE:
+            return np.ones(3, dtype=np.float32)
+        return np.asarray(np.exp(np.median(np.log(levels[1][known] / levels[0][known]), axis=0)), np.float32)
+
+    def view(self, s: float, *, threads: int = 1) -> U8:
+        """The view at s in [0, 1] from the first photograph to the second, (h, w, 3) uint8.
+
+        s = 0 and s = 1 are the photographs themselves. ``threads`` draw strips of rows and change no byte.
+        Raises ``ValueError`` for s elsewhere: there is nothing beyond the photographs.
+        """
+        if not 0.0 <= s <= 1.0:
+            raise ValueError(f"s is a place from 0 (the first photograph) to 1 (the second); got {s}")
+        if s in (0.0, 1.0):
+            return self.images[int(s)].copy()
+        rgb, near = self.seen(s, threads=threads)
+        filled = fill_holes(rgb, near, step=ONE_SURFACE_PX)
+        return np.clip(np.rint(np.nan_to_num(filled)), 0.0, 255.0).astype(np.uint8)
+
+    def seen(self, s: float, *, threads: int = 1) -> tuple[F32, F32]:
+        """Colours (h, w, 3) and disparities (h, w) of the view at s before what neither photograph shows is
+        filled, NaN there."""
+        warped = [self.warped(side, s, threads=threads) for side in (0, 1)]
+        sides, blending = self._sides, self.blending
+        out = np.empty_like(warped[0].colors), np.empty_like(warped[0].near)
+
+        def work(rows: tuple[int, int]) -> None:
+            part = slice(*rows)
+            blend(
+                (warped[0].colors[part], warped[1].colors[part]),
+                (warped[0].near[part], warped[1].near[part]),
+                (warped[0].source[part], warped[1].source[part]),
+                (sides[0].weight, sides[1].weight),
+                (blending.alike_px, 1.5 * blending.guessed, s),
+                (out[0][part], out[1][part]),
+            )
+
+        in_strips(work, self.size[1], threads)
+        return out
+
+    def warped(self, side: int, s: float, *, threads: int = 1) -> Warped:
+        """One photograph alone as the view at s sees it, as bright as this is."""
+        this = self._sides[side]
+        target = np.empty_like(this.places)
+        G = self.frame.original_from_rectified(s)
+        share = s - side
+        in_strips(
+            lambda rows: place_between(this.places, this.disparity, share, G, rows, target),
+            self.size[1],
+            threads,
+        )
+        source, near = forward_map(
+            target, this.disparity, size=self.size, step=ONE_SURFACE_PX, threads=threads
+        )
+        colors = sample(this.levels, source, threads=threads)
+        colors *= self.gain ** np.float32(share)
+        return Warped(colors, near, source)
+
+
+def _side(image: U8, H: F64, found: DisparityMap, blending: Blending) -> _Side:
+    whole = np.ascontiguousarray(found.filled())
+    fill_empty_rows(whole)
+    # A pair of which nothing is known dissolves.
+    maps = np.nan_to_num(whole), np.ascontiguousarray(found.confidence)
+    shape = image.shape[:2]
+    places = np.empty((*shape, 2))
+    disparity, sure, weight = (np.empty(shape, dtype=np.float32) for _ in range(3))
+    take_back(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
+    weigh(disparity, sure, (blending.guessed, blending.least, blending.rim), weight)
+    return _Side(image.astype(np.float32), places, disparity, weight)
+
+
+def pair_of_rectified(left: U8, right: U8, maps: tuple[DisparityMap, DisparityMap]) -> InterpolatedPair:
+    """Two photographs (h, w, 3) that are rectified as they are."""
+    for found in maps:
+        if found.disparity.shape != left.shape[:2]:
+            raise ValueError(
+                f"disparities must have the shape of the photographs {left.shape[:2]}; got "
+                f"{found.disparity.shape}"
+            )
+    return InterpolatedPair((left, right), np.stack([np.eye(3)] * 2), *maps)
+
+
+def unsure(disparity: F32) -> DisparityMap:
+    """Disparities (H, W), NaN = unknown, of which no more is known: each as sure as the next."""
+    known = np.isfinite(disparity)
+    return DisparityMap(disparity, known.astype(np.float32), 0.0)
+
+
+def other_side(left: DisparityMap) -> DisparityMap:
+    """The disparities of the right photograph that those of the left one imply: the nearer of two that meet
+    there; pixels that none meets take the farther of their neighbours within two pixels on both sides."""
+    height, width = left.disparity.shape
+    disparity = np.full((height, width), -np.inf, dtype=np.float32)
+    confidence = np.zeros((height, width), dtype=np.float32)
+    y, x = np.nonzero(np.isfinite(left.disparity))
+    d = left.disparity[y, x]
+    at = np.rint(x - d).astype(np.int64)
+    inside = (at >= 0) & (at < width)
+    y, x, at, d = y[inside], x[inside], at[inside], d[inside]
+    np.maximum.at(disparity, (y, at), d)
+    seen = disparity[y, at] == d
+    confidence[y[seen], at[seen]] = left.confidence[y[seen], x[seen]]
+    disparity[np.isinf(disparity)] = np.nan
+    return replace(left, disparity=_cracks_closed(disparity), confidence=confidence)
+
+
+def _cracks_closed(disparity: F32) -> F32:
+    """Single unknown pixels between two known ones of a row, which rounding left, take the smaller."""
+    closed = disparity.copy()
+    between = np.fmin(disparity[:, :-2], disparity[:, 2:])
+    both = np.isfinite(disparity[:, :-2]) & np.isfinite(disparity[:, 2:]) & np.isnan(disparity[:, 1:-1])
+    closed[:, 1:-1] = np.where(both, between, disparity[:, 1:-1])
+    return closed
