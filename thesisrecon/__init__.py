@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from thesisrecon.geometry.pinhole import PinholeCamera
     from thesisrecon.geometry.triangulation import triangulate
     from thesisrecon.pipeline import reconstruct
+    from thesisrecon.two_photographs import synthesize_view
     from thesisrecon.views import render
 
 __version__ = "0.1.0"
@@ -33,6 +34,7 @@ _HOME_OF = {
     "reconstruct": "pipeline",
     "render": "views",
     "self_calibrate": "doors",
+    "synthesize_view": "two_photographs",
     "triangulate": "geometry.triangulation",
     "upgrade_affine": "doors",
 }
@@ -47,6 +49,7 @@ __all__ = [
     "reconstruct",
     "render",
     "self_calibrate",
+    "synthesize_view",
     "triangulate",
     "upgrade_affine",
 ]

@@ -33,6 +33,8 @@ LARGEST_RESIDUAL = 0.005
 PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
 """Displacements that no homography explains, 90 % quantile, over the distances from the epipolar lines."""
 RANK_ONE = 1e-9
+OFF_ROTATION = 1e-4
+"""Entries of R'R - I: of a rotation written with four digits."""
 IN_FRONT = 0.75
 """Share of matches in front of both cameras, the rotation being the right one."""
 
@@ -186,13 +188,19 @@ def share_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
 
 
 def require_rotation(R: F64) -> None:
-    """``ValueError`` unless R (3, 3) is a rotation: R'R = I, det R = 1, to 1e-6."""
+    """``ValueError`` unless R (3, 3) is a rotation: R'R = I, det R = 1, to ``OFF_ROTATION``."""
     R = np.asarray(R, dtype=np.float64)
     if R.shape != (3, 3) or not np.isfinite(R).all():
         raise ValueError(f"a rotation is a finite matrix (3, 3); got shape {R.shape}")
     off, det = float(np.abs(R.T @ R - np.eye(3)).max()), float(np.linalg.det(R))
-    if not (off <= 1e-6 and det > 0.0):
+    if not (off <= OFF_ROTATION and det > 0.0):
         raise ValueError(f"a rotation has R'R = I and det R = 1; this one is off by {off:.2g}, det {det:.3g}")
+
+
+def require_translation(t: F64) -> None:
+    """``ValueError`` unless t is three finite numbers."""
+    if np.shape(t) != (3,) or not np.isfinite(t).all():
+        raise ValueError(f"a translation is three finite numbers; got {t}")
 
 
 def require_intrinsics(K: F64) -> None:

@@ -8,7 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.types import F64
-from thesisrecon.views.tensor.pair import CalibratedPair, require_intrinsics
+from thesisrecon.views.tensor.pair import (
+    CalibratedPair,
+    require_intrinsics,
+    require_rotation,
+    require_translation,
+)
 
 
 @dataclass(frozen=True)
@@ -16,8 +21,7 @@ class VirtualCamera:
     """The second camera after a motion from X_2 to R X_2 + t.
 
     ``rotation`` R (3, 3); ``translation`` t (3,) in baselines; ``K`` (3, 3) and ``size`` (width, height) of
-    its picture. Raises ``ValueError`` for a size below 1 px; what is no rotation, translation or K is refused
-    where it is used.
+    its picture. Raises ``ValueError`` for what is no rotation, translation or K, and a size below 1 px.
     """
 
     rotation: F64
@@ -26,6 +30,8 @@ class VirtualCamera:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
+        require_rotation(self.rotation)
+        require_translation(self.translation)
         require_intrinsics(self.K)
         if min(self.size) < 1:
             raise ValueError(f"a picture is at least 1 x 1 px; got {self.size}")

@@ -23,6 +23,7 @@ from thesisrecon.views.tensor.pair import (
     pair_from_fundamental,
     require_intrinsics,
     require_rotation,
+    require_translation,
 )
 
 
@@ -47,10 +48,8 @@ class VirtualTensor:
         what is no rotation, translation or K.
         """
         require_rotation(rotation)
-        translation = np.asarray(translation, dtype=np.float64)
-        if translation.shape != (3,) or not np.isfinite(translation).all():
-            raise ValueError(f"a translation is three finite numbers; got {translation}")
-        K = self.K if K is None else np.asarray(K, dtype=np.float64)
+        require_translation(translation)
+        K = self.K if K is None else K
         require_intrinsics(K)
         turn, shift = K @ rotation @ np.linalg.inv(self.K), K @ translation
         T = np.einsum("kl,ijl->ijk", turn, self.T) + np.einsum("k,ji->ijk", shift, self.P2[:, :3])

@@ -17,7 +17,7 @@ from thesisrecon.geometry.zbuffer import in_strips
 from thesisrecon.types import B8, F32, F64
 from thesisrecon.views.tensor.kernels import transfer_rows
 from thesisrecon.views.tensor.pair import CalibratedPair
-from thesisrecon.views.tensor.path import VirtualCamera
+from thesisrecon.views.tensor.path import VirtualCamera, cameras_along
 from thesisrecon.views.tensor.seed import VirtualTensor, seed_of_first, seed_of_two
 from thesisrecon.views.warping import fill_holes, forward_map, sample
 
@@ -27,8 +27,6 @@ SURFACE_PX = 1.0
 """Neighbours whose disparities between the photographs differ by more are not of one surface."""
 LEAST_SEEN = 0.05
 """Share of its picture that a virtual camera must have of what the photographs show."""
-GUESS = 1e-3
-"""Weight of a colour whose place is guessed, or of the photograph that is not to be taken, beside others."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +44,22 @@ class TensorSynthesis:
     places: tuple[F32, F32]
     gain: F32
 
+    @property
+    def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """(width, height) of the photographs."""
+        (h1, w1), (h2, w2) = (levels.shape[:2] for levels in self.levels)
+        return (w1, h1), (w2, h2)
+
+    def along(self, frames: int, *, beyond: float = 0.0) -> list[VirtualCamera]:
+        """Cameras from the first photograph to the second and beyond; see :func:`cameras_along`."""
+        return cameras_along(self.pair, frames, sizes=self.sizes, beyond=beyond)
+
     def render(self, camera: VirtualCamera, *, threads: int = 1) -> U8:
         """The picture (H, W, 3) of a virtual camera.
 
-        What both photographs see is mixed by how near the camera is to either, exposures likewise; of two
-        surfaces the nearer is shown; what neither sees is filled from behind. The same bytes whatever the
-        number of threads. Raises ``StageFailure`` where the camera sees next to nothing of the scene.
+        What both photographs see is mixed by how near the camera is to either, exposures likewise; what
+        neither sees is filled from behind. The same bytes whatever the number of threads. Raises
+        ``StageFailure`` where the camera sees next to nothing of the scene.
         """
         layers = [self._layer(side, camera, threads) for side in (0, 1)]
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
@@ -78,23 +86,35 @@ class TensorSynthesis:
         return sample(self.levels[side], source, threads=threads), front
 
     def _mixed(self, layers: list[tuple[F32, F32]], camera: VirtualCamera) -> tuple[F32, F32]:
+        """Colours and nearness of both layers together; NaN where neither sees anything."""
         share = np.float32(camera.share_of_second(self.pair))
         (first, near1), (second, near2) = layers
-        w1, w2 = (
-            (np.float32(GUESS) + part) * (np.float32(GUESS) + np.nan_to_num(levels[..., 3]))
-            for part, levels in ((1 - share, first), (share, second))
-        )
-        # A comparison with NaN is false: where one sees nothing the other is not hidden.
-        sure = (first[..., 3] > 0.5) == (second[..., 3] > 0.5)
-        w1[np.isnan(near1) | (sure & (near2 > near1 + self._step))] = 0.0
-        w2[np.isnan(near2) | (sure & (near1 > near2 + self._step))] = 0.0
-        total = w1 + w2
-        w1, w2 = (np.divide(w, total, out=np.zeros_like(w), where=total > 0.0) for w in (w1, w2))
-        rgb = np.where(w1[..., None] > 0.0, first[..., :3] * self.gain**-share, 0.0) * w1[..., None]
-        rgb += np.where(w2[..., None] > 0.0, second[..., :3] * self.gain ** (1 - share), 0.0) * w2[..., None]
-        nearness = np.where(w2 > w1, near2, near1)
-        rgb[total == 0.0] = np.nan
-        return rgb, np.where(total > 0.0, nearness, np.nan).astype(np.float32)
+        of_second = self._weight_of_second(layers, share)
+        dark, bright = self.gain**-share, self.gain ** (1 - share)
+        # Weights of 0 must not meet NaN.
+        rgb = np.where((of_second < 1.0)[..., None], first[..., :3] * dark, 0.0) * (1 - of_second)[..., None]
+        rgb += np.where((of_second > 0.0)[..., None], second[..., :3] * bright, 0.0) * of_second[..., None]
+        return rgb, np.where(of_second > 0.5, near2, near1)
+
+    def _weight_of_second(self, layers: list[tuple[F32, F32]], share: np.float32) -> F32:
+        """(H, W) how much of the second photograph is in the mixture, 0 to 1; NaN where neither is.
+
+        ``share`` of it where both show the same. Where they differ the nearer surface is shown, as far as its
+        photograph is to be believed: fully from half the way on, not at all in the last quarter before the
+        other one, which would have shown it.
+        """
+        (first, near1), (second, near2) = layers
+        seen1, seen2 = np.isfinite(near1), np.isfinite(near2)
+        sure1, sure2 = np.nan_to_num(first[..., 3]) > 0.5, np.nan_to_num(second[..., 3]) > 0.5
+        weight = np.full(near1.shape, share, dtype=np.float32)
+        alike = seen1 & seen2 & (sure1 == sure2)
+        weight[alike & (near2 > near1 + self._step)] = np.clip(4.0 * share - 1.0, 0.0, 1.0)
+        weight[alike & (near1 > near2 + self._step)] = np.clip(4.0 * share - 2.0, 0.0, 1.0)
+        # What is known is right, before what is guessed or behind it.
+        weight[seen1 & ~(seen2 & (sure2 | ~sure1))] = 0.0
+        weight[seen2 & ~(seen1 & (sure1 | ~sure2))] = 1.0
+        weight[~(seen1 | seen2)] = np.nan
+        return weight
 
 
 def prepare_synthesis(

@@ -1,0 +1,88 @@
+"""Views without a model from two photographs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import PIL.Image
+import pytest
+
+import thesisrecon
+from thesisrecon.assumptions import IntrinsicsAssumption
+from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.errors import StageFailure
+from thesisrecon.two_photographs import match_photographs, tensor_views
+from thesisrecon.views.tensor import VirtualCamera
+from validation.scenes.real import load_fixture_scene
+
+SCENE = load_fixture_scene()
+SMALL = PipelineConfig(images=ImageOptions(max_size_px=512))
+
+
+@pytest.fixture(scope="module")
+def found():
+    return match_photographs(SCENE.image_paths[6], SCENE.image_paths[7], config=SMALL)
+
+
+def _photograph(k):
+    with PIL.Image.open(SCENE.image_paths[k]) as image:
+        return np.asarray(image.resize((512, 384), PIL.Image.Resampling.BOX))
+
+
+def _psnr(a, b):
+    return 10.0 * np.log10(255.0**2 / np.mean((a.astype(np.float64) - b) ** 2))
+
+
+def test_calibrated_photographs_show_a_third_one(found):
+    views = tensor_views(found, K=SCENE.K[6], config=SMALL)
+    R, C = SCENE.R, SCENE.C
+    baseline = np.linalg.norm(C[7] - C[6])
+    np.testing.assert_allclose(views.pair.t, R[7] @ (C[6] - C[7]) / baseline, atol=0.01)
+    np.testing.assert_allclose(views.pair.K2[0], [454.3, 0.0, 264.2], atol=0.06)
+    camera = VirtualCamera(R[8] @ R[7].T, R[8] @ (C[7] - C[8]) / baseline, views.pair.K2, views.sizes[1])
+    picture, truth = views.render(camera), _photograph(8)
+    gain = truth[100:300, 130:400].mean() / picture[100:300, 130:400].mean()
+    inner = (slice(60, -60), slice(80, -80))
+    assert _psnr(gain * picture[inner], truth[inner]) > _psnr(_photograph(7)[inner], truth[inner]) + 3.0
+
+
+def test_at_their_own_places_the_photographs_are_seen_again(found):
+    guessed = tensor_views(found, config=SMALL)
+    np.testing.assert_allclose(guessed.pair.K1[0], [512.0, 0.0, 255.5])
+    first, second = (guessed.render(camera) for camera in guessed.along(2))
+    assert np.mean(second != found.photographs[1].image.rgb) < 1e-3
+    # Rounding leaves a corner to its neighbours.
+    assert np.mean(first != found.photographs[0].image.rgb) < 1e-3
+
+
+def test_what_is_told_of_the_focal_length_is_taken(found):
+    told = replace(SMALL, intrinsics=IntrinsicsAssumption(focal="known", focal_px=900.0))
+    assert tensor_views(found, config=told).pair.K2[0, 0] == 450.0
+
+
+def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
+    with pytest.raises(ValueError, match="det -1"):
+        thesisrecon.synthesize_view("no.jpg", "file.jpg", -np.eye(3), np.zeros(3))
+    with pytest.raises(ValueError, match="three finite"):
+        thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), [0.0, 1.0])
+    with pytest.raises(ValueError, match="K is"):
+        thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3), K=np.eye(4))
+    with pytest.raises(StageFailure, match=r"no\.jpg"):
+        thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3))
+
+
+def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
+    motion = np.eye(3), np.array([0.1, 0.0, 0.0])
+    picture = thesisrecon.synthesize_view(SCENE.image_paths[6], SCENE.image_paths[7], *motion, config=SMALL)
+    assert picture.shape == (384, 512, 3)
+    assert picture.dtype == np.uint8
+    views = tensor_views(found, config=SMALL)
+    np.testing.assert_array_equal(
+        picture, views.render(VirtualCamera(*motion, views.pair.K2, views.sizes[1]), threads=2)
+    )
+
+
+def test_one_photograph_twice_has_no_parallax():
+    with pytest.raises(StageFailure):
+        match_photographs(SCENE.image_paths[6], SCENE.image_paths[6], config=SMALL)
