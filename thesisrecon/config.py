@@ -16,7 +16,8 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from thesisrecon.assumptions import IntrinsicsAssumption
-from thesisrecon.dense import MultiViewScene, MultiViewStereo, RectifiedPair
+from thesisrecon.dense import MultiViewScene, MultiViewStereo
+from thesisrecon.dense import RectifiedPair as RectifiedPair
 from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification, ThesisRansac
 from thesisrecon.errors import UsageError
 from thesisrecon.features import HarrisCorners, MultiScaleCorners
