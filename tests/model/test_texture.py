@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from tests.model.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.model import VolumetricFusion
 from thesisrecon.model.mesh import face_neighbours
-from thesisrecon.model.texture import TextureAtlas, color_vertices
+from thesisrecon.model.texture import BlendedViews, SingleView, TextureAtlas, color_vertices
 from thesisrecon.model.texture.atlas import pack_rectangles
 from thesisrecon.model.texture.labels import charts_of, choose_views
 from thesisrecon.model.texture.visibility import face_quality
@@ -49,9 +50,11 @@ def test_a_new_view_shows_the_painted_sphere(sphere: TexturedMesh) -> None:
     assert np.sqrt(np.mean(difference(colored) ** 2)) < 12.0
 
 
-def test_exposures_are_levelled(sphere: TexturedMesh) -> None:
+@pytest.mark.parametrize("kind", [SingleView, BlendedViews])
+def test_exposures_are_levelled(sphere: TexturedMesh, kind: type[SingleView] | type[BlendedViews]) -> None:
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
-    rough, level = (TextureAtlas(level=on).texture(sphere, views) for on in (False, True))
+    rough = TextureAtlas(painter=SingleView(level=False)).texture(sphere, views)
+    level = TextureAtlas(painter=kind(level=True)).texture(sphere, views)
     jump = [seam_jumps(mesh) for mesh in (rough, level)]
     assert np.median(jump[0]) > 8.0
     assert np.median(jump[1]) < 0.3 * np.median(jump[0])
@@ -70,7 +73,11 @@ def seam_jumps(mesh: TexturedMesh) -> F64:
     at = np.argmax(mesh.faces[other] == vertex[:, None], axis=1)
     here, there = mesh.uv[face, side], mesh.uv[other, at]
     apart = np.abs(here - there).max(axis=1) > 1e-6
-    a, b = (mesh.texture[tuple(np.rint(p[apart]).astype(int).T[::-1])].astype(float) for p in (here, there))
+    planes = [mesh.texture[..., k].astype(float) for k in range(3)]
+    a, b = (
+        np.stack([map_coordinates(plane, p[apart].T[::-1], order=1) for plane in planes], axis=1)
+        for p in (here, there)
+    )
     return np.abs(a - b).mean(axis=1)
 
 

@@ -34,6 +34,17 @@ def face_areas(vertices: F64, faces: I64) -> F64:
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
+def vertex_normals(mesh: TexturedMesh) -> F64:
+    """Unit normals (N, 3) of the vertices: the mean over their faces by area."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    total = np.zeros_like(mesh.vertices)
+    for k in range(3):
+        for d in range(3):
+            total[:, d] += np.bincount(mesh.faces[:, k], normal[:, d], len(total))
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
+
+
 def parts_of(faces: I64, vertices: int) -> I64:
     """(M,) number of the connected part that each face belongs to; faces connect by common vertices."""
     if not len(faces):

@@ -33,7 +33,23 @@ class SurfaceModel:
 
         The result does not depend on ``threads``.
         """
-        surface = self.fusion.fuse(depth_maps, threads=threads)
+        return self.color(self.fusion.fuse(depth_maps, threads=threads), views, threads=threads)
+
+    def color(
+        self,
+        surface: TexturedMesh,
+        views: Sequence[PinholeView],
+        *,
+        without: int | None = None,
+        threads: int = 1,
+    ) -> TexturedMesh:
+        """A surface with new graphics, for a model that is made already too.
+
+        ``without`` is the number of a view (:attr:`PinholeView.view`) that gives none: rendered from there,
+        the model shows how like an unseen photograph it is. Its depths are in the surface all the same.
+        Raises :class:`StageFailure` where no view sees any of it.
+        """
+        used = [view for view in views if view.view != without]
         if self.colors == "vertices":
-            return color_vertices(surface, views, threads=threads)
-        return self.atlas.texture(surface, views, threads=threads)
+            return color_vertices(surface, used, threads=threads)
+        return self.atlas.texture(surface, used, threads=threads)

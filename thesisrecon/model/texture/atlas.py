@@ -1,22 +1,25 @@
-"""The texture of a mesh: pieces of photographs, packed into one picture, without seams.
+"""The texture of a mesh: pieces in the outline of photographs, packed into one picture, without seams.
 
-Each chart (connected faces that take their texture from one photograph) is cut out of its photograph as it
-is, so that no pixel is sampled twice. What differs between photographs (exposure, white balance, vignetting)
-is taken out where charts meet by :mod:`thesisrecon.model.texture.leveling`.
+Each chart (connected faces that one photograph shows best) has the outline and the resolution that it has in
+that photograph. What is painted there is either what all photographs agree on
+(:class:`~thesisrecon.model.texture.blending.BlendedViews`) or that photograph alone
+(:class:`~thesisrecon.model.texture.leveling.SingleView`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.raster import resample, smooth
 from thesisrecon.model.mesh import face_neighbours
+from thesisrecon.model.texture.blending import BlendedViews
+from thesisrecon.model.texture.charts import Charts
 from thesisrecon.model.texture.labels import charts_of, choose_views
-from thesisrecon.model.texture.leveling import level_seams
+from thesisrecon.model.texture.leveling import SingleView
 from thesisrecon.model.texture.visibility import camera_of, color_vertices, face_quality, project
 from thesisrecon.types import F64, I64, PinholeView, TexturedMesh
 
@@ -39,16 +42,16 @@ class Pieces:
 
 @dataclass(frozen=True)
 class TextureAtlas:
-    """Texture from the view that shows each part of the surface largest.
+    """Texture at the resolution of the view that shows each part of the surface largest.
 
     ``max_texels``: photographs are reduced until the atlas has no more. ``smooth_rounds``, ``least_faces``:
-    see :func:`choose_views`. ``level``: take differences between photographs out.
+    see :func:`choose_views`. ``painter`` puts the colours on it.
     """
 
     max_texels: int = 4096 * 4096
     smooth_rounds: int = 40
     least_faces: int = 30
-    level: bool = True
+    painter: BlendedViews | SingleView = field(default_factory=BlendedViews)
 
     def texture(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
         """The mesh with ``uv``, ``texture`` and ``untextured``.
@@ -72,9 +75,8 @@ class TextureAtlas:
                 break
             scale *= 0.95 * np.sqrt(self.max_texels / (size[0] * size[1]))
         uv = pieces.xy + (offsets - rectangles[:, :2])[chart][:, None, :]
-        texture = _fill(smaller, pieces, rectangles, offsets, size)
-        if self.level:
-            texture = level_seams(mesh, smaller, pieces.label, chart, uv=uv, texture=texture)
+        cut_out = _fill(smaller, pieces, rectangles, offsets, size)
+        texture = self.painter.paint(mesh, smaller, Charts(label, chart, uv, cut_out), threads=threads)
         uv, texture = _swatches(mesh, label, uv, texture)
         return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
 

@@ -6,7 +6,11 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from thesisrecon.model.texture.kernels import spread_shares
 from thesisrecon.types import F32, I64
+
+OWN = 0.1
+"""Weight of a face's own shares against those of its neighbours."""
 
 
 def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, least_faces: int = 30) -> I64:
@@ -22,13 +26,10 @@ def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, least_faces
         return np.full(len(quality), -1, dtype=np.int64)
     visible = quality > 0.0
     share = quality / np.maximum(quality.max(axis=1, keepdims=True), np.float32(1e-20))
-    spread = share.copy()
-    padded = np.vstack([spread, np.zeros_like(spread[:1])])
-    count = (neighbours >= 0).sum(axis=1, keepdims=True).astype(np.float32)
+    spread, other = share.copy(), np.empty_like(share)
     for _ in range(rounds):
-        padded[:-1] = spread
-        around = padded[neighbours].sum(axis=1) / np.maximum(count, 1.0)
-        spread = np.where(visible, 0.1 * share + 0.9 * around, np.float32(0.0))
+        spread_shares(share, neighbours, OWN, spread, other)
+        spread, other = other, spread
     label = np.where(visible.any(axis=1), spread.argmax(axis=1), -1)
     # Where spreading left nothing of any view, the largest decides.
     lost = visible.any(axis=1) & (spread.max(axis=1) <= 0.0)

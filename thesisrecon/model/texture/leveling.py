@@ -7,14 +7,17 @@ what the photographs differ by, within a chart they change as slowly as they can
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from thesisrecon.geometry.raster import smooth
 from thesisrecon.geometry.zbuffer.kernels import interpolate_corners, rasterize_rows
+from thesisrecon.model.texture.charts import Charts
 from thesisrecon.model.texture.visibility import camera_of, project, sample_view
 from thesisrecon.types import F32, F64, I64, PinholeView, TexturedMesh
 
@@ -29,6 +32,26 @@ BLUR_PX = 2.0
 
 BEYOND = 3
 """Texels beyond a chart that share its corrections: sampling reaches there."""
+
+
+@dataclass(frozen=True)
+class SingleView:
+    """Each piece as its own photograph shows it; ``level``: differences between photographs are taken out."""
+
+    level: bool = True
+
+    def paint(
+        self,
+        mesh: TexturedMesh,
+        views: Sequence[PinholeView],
+        charts: Charts,
+        *,
+        threads: int = 1,  # noqa: ARG002 - one linear system for all
+    ) -> NDArray[np.uint8]:
+        """The texture (H, W, 3)."""
+        if not self.level:
+            return charts.cut_out
+        return level_seams(mesh, views, charts.label, charts.chart, uv=charts.uv, texture=charts.cut_out)
 
 
 def level_seams(
