@@ -37,16 +37,16 @@ class TwoPhotographs:
 
 
 def match_photographs(
-    image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0
+    image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0, planar: bool = False
 ) -> TwoPhotographs:
     """Sparse and dense correspondence of two photographs, files or uint8 arrays.
 
-    Raises :class:`StageFailure` where one of them cannot be read, they do not match, or show no parallax.
+    ``planar`` rectifies by homographies alone, which not all pairs allow. Raises :class:`StageFailure` where one of them cannot be read, they do not match, or show no parallax.
     """
     config = config or PipelineConfig()
     first, second = (_read_one(image, config) for image in (image1, image2))
     pair = match_pair(first.image, second.image, config=config, seed=seed)
-    dense = config.dense.match_two_views(first.image, second.image, pair.F, pair.xy1, pair.xy2)
+    dense = config.dense.match_two_views(first.image, second.image, pair.F, pair.xy1, pair.xy2, planar=planar)
     return TwoPhotographs((first, second), pair, dense)
 
 
