@@ -41,7 +41,8 @@ def match_photographs(
 ) -> TwoPhotographs:
     """Sparse and dense correspondence of two photographs, files or uint8 arrays.
 
-    ``planar`` rectifies by homographies alone, which not all pairs allow. Raises :class:`StageFailure` where one of them cannot be read, they do not match, or show no parallax.
+    ``planar`` rectifies by homographies alone, which not all pairs allow. Raises :class:`StageFailure` where
+    one of them cannot be read, they do not match, or show no parallax.
     """
     config = config or PipelineConfig()
     first, second = (_read_one(image, config) for image in (image1, image2))
