@@ -154,8 +154,8 @@ def _row(row: Row, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _ratio(row: Row) -> float | None:
-    """Ours over the best reference; None without one, or where zero is divided by."""
-    others = [v for v in row.reference.values() if v is not None]
+    """Ours over the best reference (variants of ours are none); None where there is nothing to divide by."""
+    others = [v for name, v in row.reference.items() if v is not None and not name.startswith("ours")]
     if row.value is None or not others:
         return None
     best = max(others) if row.direction == "at least" else min(others)

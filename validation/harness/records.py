@@ -16,9 +16,10 @@ class Wishes:
     """What a report is asked for.
 
     ``out`` : its folder. ``scenes``, ``stages`` : their names, in order. ``folders`` : scene -> folder, of
-    scenes that the user brought. ``quick`` : less of everything that can be less. ``seed`` : of all random
-    steps. ``threads`` : cores that may be used at once. ``limit_s`` : seconds a single task may take.
-    ``stages_from`` : the module whose ``STAGES`` hold the stages.
+    scenes that the user brought. ``quick`` : less of everything that can be less. ``gates_only`` : no
+    reference that takes long and that no gate needs. ``seed`` : of all random steps. ``threads`` : cores that
+    may be used at once. ``limit_s`` : seconds a single task may take. ``stages_from`` : the module whose
+    ``STAGES`` hold the stages.
     """
 
     out: Path
@@ -26,6 +27,7 @@ class Wishes:
     stages: tuple[str, ...]
     folders: Mapping[str, str] = field(default_factory=dict)
     quick: bool = False
+    gates_only: bool = False
     seed: int = 0
     threads: int = 2
     limit_s: float = 300.0

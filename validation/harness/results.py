@@ -34,7 +34,8 @@ TIME_UNITS = ("s", "s processor", "us", "ms", "MB")
 
 @dataclass(frozen=True)
 class Row:
-    """A number as it is written: ours (``value``) beside those of the references."""
+    """A number as it is written: ours (``value``) beside those of the references; the good side of the
+    ``limit`` is the ``direction``, which stands without a limit too."""
 
     key: str
     value: float | None
@@ -65,14 +66,14 @@ class Results:
 def row_of(stage: str, metric: Metric, gate: Gate | None) -> Row:
     """The row of a metric that carries the limit of its gate."""
     others = {name: _finite(v) for name, v in metric.values.items() if name != metric.judged}
-    direction = "" if gate is None else "at most" if gate.at_most else "at least"
+    at_most = metric.at_most if gate is None else gate.at_most
     value = _finite(metric.values.get(metric.judged))
     verdict = "reported" if gate is None else "reached" if gate.holds(value) else "missed"
     return Row(
         key_of(stage, metric),
         value,
         metric.unit,
-        direction,
+        "at most" if at_most else "at least",
         None if gate is None else gate.limit,
         others,
         metric.definition,

@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
             stages[stage].run(Task(stage, scene, method[0]), wishes)
         else:
             _judge(wishes, stages[stage], scene)
-    except (StageFailure, ImportError) as error:
+    except (StageFailure, ImportError, ValueError) as error:
         print(error, file=sys.stderr)
         return 3
     return 0

@@ -6,7 +6,9 @@ from validation.harness.records import Stage
 from validation.harness.scenes import available_scenes
 from validation.harness.stages.bundle import BundleStage
 from validation.harness.stages.cameras import CamerasStage
+from validation.harness.stages.clouds import CloudsStage
 from validation.harness.stages.disparity import DisparityStage
+from validation.harness.stages.features import FeaturesStage
 from validation.harness.stages.fundamental import FundamentalStage
 from validation.harness.stages.triangulation import TriangulationStage
 
@@ -14,5 +16,13 @@ __all__ = ["STAGES", "available_scenes"]
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
-    for stage in (FundamentalStage(), TriangulationStage(), CamerasStage(), BundleStage(), DisparityStage())
+    for stage in (
+        FundamentalStage(),
+        FeaturesStage(),
+        TriangulationStage(),
+        CamerasStage(),
+        CloudsStage(),
+        BundleStage(),
+        DisparityStage(),
+    )
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -17,12 +18,18 @@ from thesisrecon.types import Reconstruction
 from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs, truth_of
 from validation.metrics.cameras import CameraErrors, Reprojection, measure_cameras, measure_reprojection
+from validation.metrics.intervals import focal_errors_pct
 from validation.metrics.record import Metric
 from validation.scenes.real import Scene
 
-OURS, THESIS = "ours", "ours (thesis)"
+OURS, THESIS, PER_IMAGE = "ours", "ours (thesis)", "ours (a camera each)"
 COLMAP, COLMAP_PP, COLMAP_GLOBAL = "COLMAP", "COLMAP, pp refined", "COLMAP, global"
 MATCHES = "COLMAP, matches"
+SETTINGS: dict[str, dict[str, Any]] = {
+    OURS: {},
+    THESIS: {"preset": "thesis"},
+    PER_IMAGE: {"intrinsics": {"cameras": "per-image"}},
+}
 MAPPERS = {COLMAP: "default", COLMAP_PP: "principal-point", COLMAP_GLOBAL: "global"}
 FOCAL = "median |f / f_true - 1|, f = sqrt(fx fy), over the registered cameras"
 CENTRE = "mean distance of the camera centres after the least-squares similarity"
@@ -45,33 +52,40 @@ class CamerasStage:
         return is_photographs(scene, wishes)
 
     def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
-        return (OURS, MATCHES, COLMAP) if wishes.quick else (OURS, MATCHES, THESIS, *MAPPERS)
+        if wishes.gates_only:
+            return (OURS, PER_IMAGE)
+        return (OURS, MATCHES, COLMAP) if wishes.quick else (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        if method == PER_IMAGE:
+            return ((self.name, OURS),)
         return ((self.name, MATCHES),) if method in MAPPERS else ()
 
     def run(self, task: Task, wishes: Wishes) -> None:
         scene = load_photographs(task.scene, wishes)
         place = wishes.place(task.stage, task.scene, task.method)
-        if task.method in (OURS, THESIS):
-            preset = {"preset": "thesis"} if task.method == THESIS else {}
-            thesisrecon.reconstruct(
-                list(scene.image_paths),
-                place / "run",
-                config=config_from_tables(preset),
-                seed=wishes.seed,
-                threads=1,
-                until="metric",
-            )
+        if task.method not in SETTINGS:
+            _run_colmap(task, scene, wishes, place)
             return
-        _run_colmap(task, scene, wishes, place)
+        if task.method == PER_IMAGE:
+            # The matches are the same.
+            shutil.copytree(wishes.place(self.name, task.scene, OURS) / "run", place / "run")
+        thesisrecon.reconstruct(
+            list(scene.image_paths),
+            place / "run",
+            config=config_from_tables(SETTINGS[task.method]),
+            seed=wishes.seed,
+            threads=1,
+            until="metric",
+            overwrite=True,
+        )
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
         photographs = load_photographs(scene, wishes)
         models = {m: read_model(photographs, m, o) for m, o in outcomes.items() if m != MATCHES}
         shared = outcomes.get(MATCHES)
         metrics = [*_numbers(photographs, models), *_costs(scene, outcomes, shared)]
-        metrics += _interval_metrics(photographs, outcomes)
+        metrics += [*_per_image(photographs, models.get(PER_IMAGE)), *_stated(photographs, outcomes)]
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         return Judgement(metrics, plots=_plots(photographs, models), notes=notes)
 
@@ -80,7 +94,7 @@ def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | 
     """The saved model of a method in the order of the scene's photographs; None where there is none."""
     names = [path.name for path in scene.image_paths]
     try:
-        if method in (OURS, THESIS):
+        if method in SETTINGS:
             return reconstruction_from_colmap(
                 read_colmap_model(outcome.place / "run" / "sparse" / "0"), names=names
             )
@@ -121,7 +135,17 @@ def _numbers(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[
         return {n: None if r is None else read(r) for n, r in residuals.items()}
 
     registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
-    rows = [Metric(scene.name, "registered", "%", registered, OURS, definition="share of the photographs")]
+    rows = [
+        Metric(
+            scene.name,
+            "registered",
+            "%",
+            registered,
+            OURS,
+            at_most=False,
+            definition="share of the photographs",
+        )
+    ]
     if truth is not None:
         rows += [
             Metric(
@@ -164,9 +188,10 @@ def _numbers(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[
                 for (n, r), p in zip(residuals.items(), points.values(), strict=True)
             },
             OURS,
+            at_most=False,
             definition="inlier observations over points",
         ),
-        Metric(scene.name, "points", "", points, OURS, definition="valid points of the model"),
+        Metric(scene.name, "points", "", points, OURS, at_most=False, definition="valid points of the model"),
     ]
     return rows
 
@@ -188,18 +213,64 @@ def _costs(scene: str, outcomes: Mapping[str, Outcome], shared: Outcome | None) 
     ]
 
 
-def _interval_metrics(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
-    """Whether what ours states of its intrinsics holds the truth."""
-    truth = truth_of(scene)
-    if truth is None:
+def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
+    """Focal lengths where nothing is said of the photographs having one camera."""
+    if scene.K is None or model is None or model.K is None or not model.registered.any():
         return []
-    held: dict[str, float | None] = {}
-    for name in (OURS, THESIS):
-        if name in outcomes and outcomes[name].ok:
-            told = json.loads((outcomes[name].place / "run" / "summary.json").read_text(encoding="utf-8"))
-            held[name] = _share_held(told["cameras"], truth.K)
-    rows = [Metric(scene.name, "intervals that hold", "%", held, OURS, definition=SHARE_HELD)]
-    return rows if held else []
+    errors = focal_errors_pct(model.K[model.registered], scene.K[model.registered])
+    words = "of |f / f_true - 1| over the photographs, each with a camera of its own"
+    return [
+        Metric(
+            scene.name,
+            "focal error, a camera each",
+            "%",
+            {OURS: float(np.median(errors))},
+            OURS,
+            definition=f"median {words}",
+        ),
+        Metric(
+            scene.name,
+            "worst focal error, a camera each",
+            "%",
+            {OURS: float(errors.max())},
+            OURS,
+            definition=f"largest {words}",
+        ),
+    ]
+
+
+def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
+    """What ours says of itself: whether it trusts the result, and whether its intervals hold the truth."""
+    told: dict[str, dict[str, Any]] = {}
+    for name in (n for n in SETTINGS if n in outcomes and outcomes[n].ok):
+        text = (outcomes[name].place / "run" / "summary.json").read_text(encoding="utf-8")
+        told[name] = json.loads(text)
+    trusted: dict[str, float | None] = {n: float(bool(t["trusted"])) for n, t in told.items()}
+    rows = [
+        Metric(scene.name, "trusted", "", trusted, OURS, at_most=False, definition="1: passed its self-check")
+    ]
+    truth = truth_of(scene)
+    if truth is None or not told:
+        return rows
+    held = {name: _share_held(t["cameras"], truth.K) for name, t in told.items()}
+    widest = {name: _widest(t["cameras"]) for name, t in told.items()}
+    return [
+        *rows,
+        Metric(scene.name, "intervals that hold", "%", held, OURS, at_most=False, definition=SHARE_HELD),
+        Metric(
+            scene.name,
+            "widest focal interval",
+            "%",
+            widest,
+            OURS,
+            definition="largest stated deviation of a focal length",
+        ),
+    ]
+
+
+def _widest(cameras: list[dict[str, Any]]) -> float | None:
+    told = [c["focal_px"] for c in cameras if c.get("focal_px")]
+    return max((100.0 * f["std"] / f["value"] for f in told), default=None)
 
 
 def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float | None:

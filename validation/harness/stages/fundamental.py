@@ -59,6 +59,8 @@ class FundamentalStage:
         )
 
     def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        if wishes.gates_only:
+            return (MATCHES, OURS)
         return (MATCHES, OURS, *(QUICK if wishes.quick else REFERENCES))
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:

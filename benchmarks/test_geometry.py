@@ -1,0 +1,72 @@
+"""F, triangulation and bundle adjustment beside OpenCV, PoseLib, COLMAP and Ceres."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.conftest import Bench
+from thesisrecon.epipolar.degeneracy import Configuration
+from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
+from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_optimal
+from thesisrecon.optimize.metric_bundle import BundleOptions, refine_metric_bundle
+from validation.checks.bundle import FOCAL_K1
+from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
+from validation.references.fundamental import SOLVERS
+from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
+from validation.scenes.streets import SIZE, make_walk
+from validation.scenes.two_views import make_two_views
+
+MATCHES, SIGMA_PX, FRAME = 1000, 0.5, (1280.0, 960.0)
+POINTS = 2000
+
+
+@pytest.mark.parametrize("outliers", [0.1, 0.3, 0.5, 0.7])
+@pytest.mark.parametrize("method", ["ours", "USAC_ACCURATE", "USAC_MAGSAC", "FM_RANSAC", "COLMAP", "PoseLib"])
+def test_fundamental(bench: Bench, method: str, outliers: float) -> None:
+    rng = np.random.default_rng(1)
+    scene = make_two_views(Configuration.GENERAL, MATCHES, rng)
+    xy1, xy2 = (xy + rng.normal(0.0, SIGMA_PX, xy.shape) for xy in (scene.xy1, scene.xy2))
+    wrong = rng.random(MATCHES) < outliers
+    xy2[wrong] = rng.uniform((0.0, 0.0), FRAME, (int(wrong.sum()), 2))
+    group = f"F of 1000 matches, {100 * outliers:.0f} % wrong"
+    bench(group, method, lambda: SOLVERS[method](xy1, xy2, 1.0, 0))
+
+
+@pytest.mark.parametrize(
+    ("group", "method", "solve"),
+    [
+        ("linear triangulation, two views", "ours", triangulate_linear),
+        ("linear triangulation, two views", "OpenCV", opencv_linear),
+        ("linear triangulation, two views", "COLMAP", colmap_points),
+        ("optimal triangulation, two views", "ours", triangulate_polynomial),
+        ("optimal triangulation, two views", "ours (iterative)", triangulate_optimal),
+        ("optimal triangulation, two views", "OpenCV", opencv_polynomial),
+    ],
+)
+def test_triangulation(bench: Bench, group: str, method: str, solve: object) -> None:
+    assert callable(solve)
+    rng = np.random.default_rng(2)
+    scene = make_two_views(Configuration.GENERAL, POINTS, rng)
+    xy = np.stack([scene.xy1, scene.xy2])
+    xy += rng.normal(0.0, SIGMA_PX, xy.shape)
+    P = np.stack([scene.P1, scene.P2])
+    bench(group, method, lambda: solve(P, xy))
+
+
+@pytest.mark.parametrize("views", [10, 30])
+@pytest.mark.parametrize("method", ["ours", "Ceres"])
+def test_bundle_adjustment(bench: Bench, method: str, views: int) -> None:
+    rng = np.random.default_rng(3)
+    walk = make_walk(views, "street", rng)
+    cameras, X = walk.start(rng)
+    options = BundleOptions(loss="soft_l1", loss_px=1.0, max_iterations=100, threads=1)
+
+    def ours() -> object:
+        return refine_metric_bundle(cameras, X, walk.seen, free=FOCAL_K1, options=options)
+
+    def theirs() -> object:
+        return refine_with_ceres(cameras, X, walk.seen, SIZE, CeresOptions("soft_l1", 1.0))
+
+    group = f"bundle adjustment, a street of {views} photographs"
+    bench(group, method, ours if method == "ours" else theirs)

@@ -1,0 +1,75 @@
+"""Corners, matching, rectification, disparities and rendering beside OpenCV."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.conftest import Bench
+from thesisrecon.config import preset
+from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, PairMatcher, SemiGlobal
+from thesisrecon.dense.rectification import PlanarRectification
+from thesisrecon.features import HarrisCorners
+from thesisrecon.pipeline import detect_features, match_views
+from thesisrecon.types import Image
+from validation.references.corners import harris_corners
+from validation.references.semi_global import OpenCVSemiGlobal
+from validation.references.sift import grey_of, sift_front_end
+
+DISPARITIES = 64
+MATCHERS: dict[str, PairMatcher] = {
+    "ours": CohesiveScanlines(),
+    "ours (thesis)": MaximumLikelihoodScanline(),
+    "ours (semi-global)": SemiGlobal(),
+}
+
+
+@pytest.mark.parametrize("method", ["ours", "OpenCV", "SIFT"])
+def test_corners(bench: Bench, method: str, photographs: tuple[Image, ...]) -> None:
+    image, corners = photographs[0], HarrisCorners()
+    grey = grey_of(image)
+
+    def sift() -> object:
+        return cv2.SIFT.create().detectAndCompute(grey, None)
+
+    calls = {
+        "ours": lambda: corners.detect(image),
+        "OpenCV": lambda: harris_corners(image, 2000),
+        "SIFT": sift,
+    }
+    bench("corners of a photograph, 1024 x 768", method, calls[method])
+
+
+@pytest.mark.parametrize("method", ["ours", "SIFT"])
+def test_matches_of_a_pair(bench: Bench, method: str, photographs: tuple[Image, ...]) -> None:
+    config = preset("default") if method == "ours" else sift_front_end(preset("default"))
+    one, two = (config.matching.prepare(image, detect_features(config, image)) for image in photographs)
+    bench("matches and F of a pair, features known", method, lambda: match_views(config, one, two, (0, 1), 0))
+
+
+@pytest.mark.parametrize("method", ["ours", "OpenCV"])
+def test_rectifying_warp(bench: Bench, method: str, photographs: tuple[Image, ...]) -> None:
+    rgb = photographs[0].rgb.astype(np.float32)
+    size = (rgb.shape[1], rgb.shape[0])
+    H = np.array([[1.02, 0.03, -8.0], [-0.02, 1.01, 5.0], [1e-5, 2e-5, 1.0]])
+    rectified = PlanarRectification(H, np.eye(3), size)
+    calls = {
+        "ours": lambda: rectified.warp(rgb, 0),
+        "OpenCV": lambda: cv2.warpPerspective(rgb, H, size, flags=cv2.INTER_CUBIC),
+    }
+    bench("rectifying warp, 1024 x 768", method, calls[method])
+
+
+@pytest.mark.parametrize("method", [*MATCHERS, "SGBM HH", "SGBM 3-way"])
+def test_disparities(bench: Bench, method: str, photographs: tuple[Image, ...]) -> None:
+    left = photographs[0].rgb[::2, ::2].copy()
+    right = np.roll(left, -20, axis=1)
+
+    def ours() -> object:
+        return MATCHERS[method].match(left, right, disparity_range=(0, DISPARITIES - 1))
+
+    def theirs() -> object:
+        return OpenCVSemiGlobal(method, widened=False).match(left, right, DISPARITIES)
+
+    bench("disparities, 512 x 384, 64 levels", method, ours if method in MATCHERS else theirs)

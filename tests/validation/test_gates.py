@@ -1,0 +1,70 @@
+"""Every limit of ``validation/gates.toml``, held against what the stages find on fixtures and photographs.
+
+All numbers come from the harness, which runs each stage as a process of its own and recomputes what it says.
+Gates of scenes whose photographs are not on this machine are skipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import pytest
+
+from validation.harness.gates import Gate, read_gates
+from validation.harness.process import own_cores
+from validation.harness.records import Wishes
+from validation.harness.results import Results, collect
+from validation.harness.scenes import PHOTOGRAPHS, available_scenes
+from validation.harness.schedule import run_tasks
+from validation.harness.stages import STAGES
+
+GATES = read_gates()
+ALWAYS = ("courtyard", "cloud", "street")
+"""Scenes that this repository makes or ships."""
+LIMIT_S = 900.0
+"""A machine with much other work is no broken gate."""
+
+
+def scene_of(gate: Gate) -> str:
+    return gate.key.split("/")[1]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[[bool], Results]:
+    """The numbers of the scenes that are always there, and of the others."""
+
+    @cache
+    def run(always: bool) -> Results:
+        here = [s for s in available_scenes(quick=False) if (s in ALWAYS) == always]
+        wanted = {tuple(key.split("/")[:2]) for key in GATES}
+        scenes = tuple(s for s in here if any(scene == s for _, scene in wanted))
+        stages = tuple(name for name in STAGES if any(stage == name for stage, _ in wanted))
+        out = tmp_path_factory.mktemp("gates")
+        wishes = Wishes(
+            out, scenes, stages, quick=True, gates_only=True, threads=len(own_cores()), limit_s=LIMIT_S
+        )
+        return collect(wishes, run_tasks(wishes, STAGES, lambda _: None), GATES)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "gate",
+    [
+        pytest.param(gate, id=key, marks=() if scene_of(gate) in ALWAYS else pytest.mark.real)
+        for key, gate in GATES.items()
+    ],
+)
+def test_a_promise_is_kept(gate: Gate, results: Callable[[bool], Results]) -> None:
+    scene = scene_of(gate)
+    if scene not in available_scenes(quick=False):
+        pytest.skip(f"{scene} is not on this machine (THESISRECON_DATA)")
+    told = results(scene in ALWAYS)
+    found = [row for row in told.rows if row.key == gate.key]
+    assert found, f"nobody told this number; what did not run: {dict(told.failures)}"
+    assert gate.holds(found[0].value), f"{found[0].value} {found[0].unit}, {gate.reason}"
+
+
+def test_every_set_of_photographs_has_its_gates() -> None:
+    assert {scene_of(gate) for gate in GATES.values()} >= {*PHOTOGRAPHS, *ALWAYS}

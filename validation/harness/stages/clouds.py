@@ -1,0 +1,216 @@
+"""Points of ours and COLMAP after similarity alignment: distances both ways, ICP, pictures of differences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from thesisrecon.geometry.alignment import Similarity, estimate_similarity
+from thesisrecon.geometry.camera import camera_centre
+from thesisrecon.types import F64, Reconstruction
+from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes
+from validation.harness.scenes import is_photographs, load_photographs
+from validation.harness.stages.cameras import COLMAP, COLMAP_PP, MATCHES, OURS, read_model
+from validation.metrics.record import Metric
+from validation.scenes.real import Scene
+
+NEAR_PCT = 0.5
+"""A point has a partner where the other cloud has one within this share of its distance from the cameras."""
+PLOTTED = 6000
+
+
+class CloudsStage:
+    """Two clouds of one scene, brought together by their cameras."""
+
+    name = "clouds"
+    title = "Point clouds"
+    definition = (
+        "The points of ours and of COLMAP, brought together by the least-squares similarity of their camera "
+        "centres (both to the true ones where they are known). Distances are in per cent of the median "
+        "distance of the points from the cameras. ICP refines rotation and translation, the scale is kept."
+    )
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:
+        return is_photographs(scene, wishes)
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        return ()
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the judgement's)
+        return (("cameras", OURS), ("cameras", COLMAP), ("cameras", COLMAP_PP))
+
+    def run(self, task: Task, wishes: Wishes) -> None:  # noqa: ARG002 (never called)
+        raise ValueError("the clouds are those of the cameras: there is nothing to run")
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:  # noqa: ARG002
+        photographs = load_photographs(scene, wishes)
+        models = {}
+        for name in (OURS, COLMAP, COLMAP_PP):
+            place = wishes.place("cameras", scene, name)
+            models[name] = read_model(photographs, name, Outcome(place)) if place.is_dir() else None
+        ours = models[OURS]
+        if ours is None or (models[COLMAP] is None and models[COLMAP_PP] is None):
+            names = [name for name, model in models.items() if model is None and name != MATCHES]
+            return Judgement(
+                (), notes=[f"There is no model of {', '.join(names)}, hence nothing to compare."]
+            )
+        metrics: list[Metric] = []
+        plots, pictures, notes = list[Plot](), list[Picture](), list[str]()
+        for name in (COLMAP, COLMAP_PP):
+            theirs = models[name]
+            if theirs is None:
+                continue
+            clouds = _common_frame(photographs, ours, theirs)
+            if clouds is None:
+                notes.append(f"{name}: too few cameras in common to bring the clouds together.")
+                continue
+            mine, other, unit = clouds
+            metrics += _metrics(scene, name, mine, other, unit, notes)
+            plots.append(_plot(name, mine, other, unit))
+            pictures += _pictures(wishes.place(self.name, scene), name, mine, other, unit, notes)
+        return Judgement(metrics, plots, pictures, notes)
+
+
+def _common_frame(
+    scene: Scene, ours: Reconstruction, theirs: Reconstruction
+) -> tuple[F64, F64, float] | None:
+    """Both clouds (N, 3), (M, 3) in the frame of the truth, or of theirs where there is none, and the median
+    distance of the points from the cameras there."""
+    both = ours.registered & theirs.registered
+    if both.sum() < 3:
+        return None
+    centres = {name: _centres(model, both) for name, model in (("ours", ours), ("theirs", theirs))}
+    target = centres["theirs"] if scene.C is None else scene.C[both]
+    try:
+        moves = {name: estimate_similarity(c, target) for name, c in centres.items()}
+    except ValueError:
+        return None
+    mine, other = (_moved(m, moves[n]) for n, m in (("ours", ours), ("theirs", theirs)))
+    distance = np.linalg.norm(other[:, None] - target[None], axis=2)
+    return mine, other, float(np.median(distance))
+
+
+def _centres(model: Reconstruction, views: np.ndarray[Any, Any]) -> F64:
+    C = camera_centre(model.P[views])
+    return np.asarray(C[:, :3] / C[:, 3:], dtype=np.float64)
+
+
+def _moved(model: Reconstruction, move: Similarity) -> F64:
+    X = model.X[model.valid]
+    return np.asarray(move.apply(X[:, :3] / X[:, 3:]), dtype=np.float64)
+
+
+def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float, notes: list[str]) -> list[Metric]:
+    forth, back = (100.0 * cKDTree(b).query(a)[0] / unit for a, b in ((mine, other), (other, mine)))
+    rows = [
+        _row(scene, f"ours to {name}", np.median(forth), "median distance of a point of ours to the nearest"),
+        _row(
+            scene, f"{name} to ours", np.median(back), "median distance of one of their points to the nearest"
+        ),
+    ]
+    share = 100.0 * float(np.mean(forth <= NEAR_PCT))
+    rows.append(
+        Metric(
+            scene,
+            f"near {name}",
+            "%",
+            {OURS: share},
+            OURS,
+            at_most=False,
+            definition=f"share of our points with one of theirs within {NEAR_PCT} %",
+        )
+    )
+    try:
+        from validation.references.open3d_clouds import refine_by_icp
+
+        found = refine_by_icp(mine, other, NEAR_PCT / 100.0 * unit)
+    except ImportError as error:
+        notes.append(f"ICP: {error}.")
+        return rows
+    rows += [
+        Metric(
+            scene,
+            f"ICP to {name}: turn",
+            "deg",
+            {OURS: found.turn_deg},
+            OURS,
+            definition="rotation by which ICP still turns our cloud after the similarity",
+        ),
+        _row(
+            scene, f"ICP to {name}: shift", 100.0 * found.shift / unit, "how far it moves the cloud's middle"
+        ),
+        Metric(
+            scene,
+            f"ICP to {name}: inliers",
+            "%",
+            {OURS: 100.0 * found.fitness},
+            OURS,
+            at_most=False,
+            definition="share of our points with a partner after ICP",
+        ),
+    ]
+    return rows
+
+
+def _row(scene: str, name: str, value: float, words: str) -> Metric:
+    return Metric(scene, name, "% of distance", {OURS: float(value)}, OURS, definition=words)
+
+
+def _plot(name: str, mine: F64, other: F64, unit: float) -> Plot:
+    """Both clouds in space: ours coloured by the distance to theirs, theirs grey."""
+    distance = 100.0 * cKDTree(other).query(mine)[0] / unit
+    ours, theirs = _thinned(mine), _thinned(other)
+    low, high = np.quantile(mine, [0.02, 0.98], axis=0)
+    margin = 0.3 * (high - low).max()
+    traces = [
+        _trace("ours", mine[ours], {"size": 2, "color": np.minimum(distance[ours], 2.0).round(3).tolist()}),
+        _trace(name, other[theirs], {"size": 1.5, "color": "#9aa5ad"}),
+    ]
+    bar = {"title": {"text": "% of distance"}}
+    traces[0]["marker"] |= {
+        "colorscale": "Viridis",
+        "cmin": 0.0,
+        "cmax": 1.0,
+        "showscale": True,
+        "colorbar": bar,
+    }
+    axes = {
+        f"{axis}axis": {"range": [float(low[k] - margin), float(high[k] + margin)], "visible": False}
+        for k, axis in enumerate("xyz")
+    }
+    layout = {"scene": {"aspectmode": "data", **axes}, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}}
+    words = "Ours is coloured by the distance of each point to the nearest of theirs; drag to turn."
+    return Plot(f"Ours and {name}", {"data": traces, "layout": layout}, words)
+
+
+def _trace(name: str, X: F64, marker: dict[str, Any]) -> dict[str, Any]:
+    digits = 4
+    xyz = {axis: np.round(X[:, k], digits).tolist() for k, axis in enumerate("xyz")}
+    return {"type": "scatter3d", "mode": "markers", "name": name, "marker": marker, **xyz}
+
+
+def _thinned(X: F64) -> np.ndarray[Any, Any]:
+    """Every n-th point."""
+    return np.arange(0, len(X), max(1, len(X) // PLOTTED))
+
+
+def _pictures(place: Path, name: str, mine: F64, other: F64, unit: float, notes: list[str]) -> list[Picture]:
+    """The difference of the clouds rendered by Open3D, without a screen."""
+    try:
+        from validation.references.open3d_clouds import render_difference
+    except ImportError:
+        return []
+    file = f"difference-{len(list(place.glob('difference-*.png')))}.png"
+    try:
+        render_difference(place / file, mine, other, NEAR_PCT / 100.0 * unit)
+    except RuntimeError as error:
+        notes.append(f"Open3D could not render: {error}.")
+        return []
+    words = (
+        f"Points of ours, from blue (on theirs) to red ({NEAR_PCT} % of the distance or more); theirs grey."
+    )
+    return [Picture(file, f"Ours to {name}", words)]

@@ -1,0 +1,197 @@
+"""Chapter 4: corners and matches of ours beside SIFT and OpenCV's Harris corners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from thesisrecon.config import preset
+from thesisrecon.features import HarrisCorners
+from thesisrecon.geometry.camera import compose_camera
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.io.images import read_photographs
+from thesisrecon.types import F64, Image
+from validation.checks.front_end_pairs import RIGHT_PX, PreparedViews, front_ends
+from validation.harness.records import Judgement, Outcome, Task, Wishes
+from validation.harness.scenes import is_photographs, load_photographs
+from validation.harness.stages.fundamental import MATCHES
+from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
+from validation.metrics.record import Metric
+from validation.scenes.real import Scene, load_fixture_depth
+from validation.scenes.real_pairs import RealPair, camera_pairs
+
+OURS, THESIS, SIFT, HARRIS = "ours", "ours (thesis)", "SIFT", "cv2.cornerHarris"
+FRONT_ENDS = {OURS: "ours", THESIS: "thesis", SIFT: "SIFT"}
+CORNERS = 1000
+REPEATED_PX = 1.5
+MAX_SIZE_PX = 1600
+WITH_DEPTH = ("courtyard",)
+"""Scenes whose depth is known, so that it is known where a corner must be in the next photograph."""
+
+
+class FeaturesStage:
+    """Corners by repeatability, front ends by the matches that a right F verifies."""
+
+    name = "features"
+    title = "Corners and matches"
+    definition = (
+        "Verified matches: inliers of an F that is right (below 1 px on matches of the true cameras), "
+        "all front ends through one estimator and one verification. Repeatability: of the 1000 strongest "
+        "corners, those with a corner within 1.5 px of where the true depth takes them in the next one."
+    )
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:
+        return is_photographs(scene, wishes) and load_photographs(scene, wishes).has_truth
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
+        if wishes.gates_only:
+            return (OURS,)
+        return (*FRONT_ENDS, HARRIS) if scene in WITH_DEPTH else tuple(FRONT_ENDS)
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        # The judgement scores F on correspondences made of these matches, moved onto the true lines.
+        return () if method else (("fundamental", MATCHES),)
+
+    def run(self, task: Task, wishes: Wishes) -> None:
+        scene = load_photographs(task.scene, wishes)
+        images = read_photographs(scene.image_paths, max_size_px=MAX_SIZE_PX).images
+        place = wishes.place(task.stage, task.scene, task.method)
+        if task.scene in WITH_DEPTH:
+            corners: dict[str, Any] = {f"{i}": _corners(task.method, m) for i, m in enumerate(images)}
+            np.savez(place / "corners.npz", **corners)
+        if task.method != HARRIS:
+            np.savez(place / "matches.npz", **_matches(task.method, images, wishes))
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+        photographs = load_photographs(scene, wishes)
+        gaps = _gaps(wishes)
+        cache = wishes.place("fundamental", scene, MATCHES)
+        truths = {(p.name, g): p for g in gaps for p in camera_pairs(photographs, cache, (g,))}
+        metrics = []
+        for gap in gaps:
+            pairs = [pair for (_, g), pair in truths.items() if g == gap]
+            metrics += _match_metrics(scene, gap, pairs, outcomes)
+        if scene in WITH_DEPTH:
+            metrics.append(_repeatability(photographs, outcomes))
+        return Judgement(metrics, notes=[f"{n}: {o.failure}." for n, o in outcomes.items() if not o.ok])
+
+
+def _gaps(wishes: Wishes) -> tuple[int, ...]:
+    return (1,) if wishes.quick else (1, 2)
+
+
+def _corners(method: str, image: Image) -> F64:
+    """The strongest corners (N, 2) of a photograph."""
+    if method in (OURS, THESIS):
+        config = HarrisCorners() if method == THESIS else preset("default").features
+        found = config.detect(image)
+        strongest = np.argsort(-found.response, kind="stable")[:CORNERS]
+        return np.asarray(found.xy[strongest], dtype=np.float64)
+    from validation.references.corners import harris_corners, sift_corners
+
+    return sift_corners(image, CORNERS) if method == SIFT else harris_corners(image, CORNERS)
+
+
+def _matches(method: str, images: tuple[Image, ...], wishes: Wishes) -> dict[str, Any]:
+    """F, number of inliers and sigma of every pair."""
+    prepared = PreparedViews(front_ends()[FRONT_ENDS[method]], images)
+    told: dict[str, Any] = {}
+    for gap in _gaps(wishes):
+        views = [prepared.relate(i, i + gap, wishes.seed) for i in range(len(images) - gap)]
+        told[f"F{gap}"] = np.array([view.F for view in views])
+        told[f"inliers{gap}"] = np.array([view.inliers for view in views])
+        told[f"sigma{gap}"] = np.array([view.sigma_px for view in views])
+    return told
+
+
+def _match_metrics(
+    scene: str, gap: int, pairs: list[RealPair], outcomes: Mapping[str, Outcome]
+) -> list[Metric]:
+    verified: dict[str, float | None] = {}
+    right: dict[str, float | None] = {}
+    sigma: dict[str, float | None] = {}
+    for name in FRONT_ENDS:
+        if name not in outcomes or not outcomes[name].ok:
+            verified[name] = right[name] = sigma[name] = None
+            continue
+        with np.load(Path(outcomes[name].place) / "matches.npz") as kept:
+            F, inliers, noise = (kept[f"{what}{gap}"] for what in ("F", "inliers", "sigma"))
+        good = np.array([_error(f, pair) < RIGHT_PX for f, pair in zip(F, pairs, strict=True)])
+        verified[name] = float(inliers[good].sum() / len(pairs))
+        right[name] = float(100.0 * good.mean())
+        sigma[name] = float(np.median(noise[good])) if good.any() else None
+    where = f"(i, i+{gap})"
+
+    def row(name: str, unit: str, values: dict[str, float | None], more: bool, words: str) -> Metric:
+        return Metric(scene, f"{name} {where}", unit, values, OURS, at_most=not more, definition=words)
+
+    return [
+        row("verified matches", "", verified, True, "mean over the pairs; none where F is wrong"),
+        row("right F", "%", right, True, "share of the pairs whose F is right"),
+        row("noise", "px", sigma, False, "median over the pairs of the noise of the verified matches"),
+    ]
+
+
+def _error(F: F64, pair: RealPair) -> float:
+    assert pair.truth is not None
+    return rms_epipolar_distance(F, pair.truth) if F.any() else NONE_PX
+
+
+def _repeatability(scene: Scene, outcomes: Mapping[str, Outcome]) -> Metric:
+    values: dict[str, float | None] = {}
+    for name, outcome in outcomes.items():
+        if not outcome.ok:
+            values[name] = None
+            continue
+        with np.load(Path(outcome.place) / "corners.npz") as kept:
+            corners = [kept[f"{i}"] for i in range(len(scene.image_paths))]
+        values[name] = 100.0 * _share_repeated(scene, corners)
+    words = (
+        "of the 1000 strongest corners that the next photograph must show, those found again within 1.5 px"
+    )
+    return Metric(scene.name, "repeatability", "%", values, OURS, at_most=False, definition=words)
+
+
+def _share_repeated(scene: Scene, corners: list[F64]) -> float:
+    """Over all neighbouring photographs."""
+    again, asked = 0, 0
+    transfer = _transfer(scene)
+    for i in range(len(corners) - 1):
+        there = transfer(i, i + 1, corners[i])
+        distance, _ = cKDTree(corners[i + 1]).query(there)
+        again, asked = again + int((distance <= REPEATED_PX).sum()), asked + len(there)
+    return again / max(asked, 1)
+
+
+def _transfer(scene: Scene) -> Callable[[int, int, F64], F64]:
+    """Where points (N, 2) of view i are in view j: those with a depth whose place is seen there too."""
+    assert scene.K is not None
+    assert scene.R is not None
+    assert scene.C is not None
+    K, R, C = scene.K, scene.R, scene.C
+    P = compose_camera(K, R, -np.einsum("vab,vb->va", R, C))
+    depths = [load_fixture_depth(view, scene.name) for view in range(len(K))]
+
+    def read(view: int, xy: F64) -> F64:
+        depth, stride = depths[view]
+        at = np.rint(xy / stride).astype(int)
+        inside = (at >= 0).all(axis=1) & (at[:, 0] < depth.shape[1]) & (at[:, 1] < depth.shape[0])
+        found = np.full(len(xy), np.nan)
+        found[inside] = depth[at[inside, 1], at[inside, 0]]
+        return found
+
+    def transfer(i: int, j: int, xy: F64) -> F64:
+        rays = homogenize(xy) @ np.linalg.inv(K[i]).T
+        X = (read(i, xy)[:, None] * rays) @ R[i] + C[i]
+        X = X[np.isfinite(X).all(axis=1)]
+        x = homogenize(X) @ P[j].T
+        z = ((X - C[j]) @ R[j].T)[:, 2]
+        there = x[:, :2] / x[:, 2:]
+        seen = (z > 0) & (np.abs(read(j, there) / z - 1.0) < 0.01)
+        return np.asarray(there[seen], dtype=np.float64)
+
+    return transfer
