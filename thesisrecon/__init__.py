@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from thesisrecon.between import interpolate_view
     from thesisrecon.config import PipelineConfig
     from thesisrecon.doors import (
         estimate_fundamental,
@@ -29,6 +30,7 @@ _HOME_OF = {
     "PinholeCamera": "geometry.pinhole",
     "PipelineConfig": "config",
     "estimate_fundamental": "doors",
+    "interpolate_view": "between",
     "match_pair": "doors",
     "match_rectified": "doors",
     "reconstruct": "pipeline",
@@ -44,6 +46,7 @@ __all__ = [
     "PipelineConfig",
     "__version__",
     "estimate_fundamental",
+    "interpolate_view",
     "match_pair",
     "match_rectified",
     "reconstruct",

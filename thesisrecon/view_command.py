@@ -1,28 +1,41 @@
-"""The work of ``thesisrecon views``: pictures of the model of a finished run, on the way of a camera."""
+"""The work of ``thesisrecon views``: pictures of the model of a finished run on the way of a camera, and
+views between photographs of which no model was made."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import PIL.ImageColor
 
+from thesisrecon.between import Film, read_photograph
+from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.io.cameras import read_cameras
 from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io.meshes import read_mesh
-from thesisrecon.io.run_directory import read_json, write_json
+from thesisrecon.io.run_directory import read_json, write_atomically, write_json
+from thesisrecon.report.strip import strip_page
 from thesisrecon.settings import unknown_word
 from thesisrecon.types import F64, TexturedMesh
 from thesisrecon.views import Light, Shading, interpolate, orbit, render, surface_points, upward
 from thesisrecon.workers import Workers
 
-MODEL, CAMERAS, FRAMES = "model.glb", "cameras.json", "frames.json"
+MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
 PATHS, LIGHTS = ("orbit", "interpolate"), ("none", "camera", "sun")
+METHODS = {
+    "interpolation": ("thesisrecon.between", "interpolation_film"),
+    "tensor": ("thesisrecon.beyond", "tensor_film"),
+}
+"""Ways to views without a model, and what makes the film of each."""
+FRAMES_BETWEEN, BETWEEN_MS = 21, 100
+"""Pictures where their number is not asked for, and how long each is shown."""
 LARGEST_PX = 8192
 LONG_SIDE_PX = 1000
 """Of the pictures where no size is asked for."""
@@ -122,6 +135,86 @@ def write_views(
     return ViewFiles(folder, tuple(files), animation, path[0].size)
 
 
+@dataclass(frozen=True)
+class BetweenWishes:
+    """What pictures are wanted of 2 or 3 ``photographs``: how many, and by which ``method``."""
+
+    photographs: tuple[Path, ...]
+    method: str = "interpolation"
+    frames: int = FRAMES_BETWEEN
+    seed: int = 0
+    max_size_px: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UsageError(unknown_word("method", self.method, list(METHODS)))
+        if self.frames < 1:
+            raise UsageError(f"--frames takes a whole number of at least 1; got {self.frames}")
+        if len(self.photographs) not in (2, 3):
+            raise UsageError(f"views lie between 2 or 3 photographs; got {len(self.photographs)}")
+        for path in self.photographs:
+            if path.is_dir():
+                raise UsageError(f"{path} is a folder; views lie between photographs")
+        for first, second in combinations(self.photographs, 2):
+            if first.resolve() == second.resolve():
+                raise UsageError(f"{first} is given twice; give different photographs")
+
+
+def write_between(
+    folder: Path, wishes: BetweenWishes, *, threads: int = 1, progress: Progress | None = None
+) -> ViewFiles:
+    """Views between photographs into ``folder``.
+
+    Writes ``frame-0001.png`` and so on, an animated file and a page ``strip.html`` of all frames, and
+    ``frames.json`` with the place of each. Frames of an earlier call that this one does not replace are
+    removed; nothing is written before the photographs are known to have views between them. The files do not
+    depend on ``threads``; ``progress`` hears (stage, done, total). Raises :class:`UsageError` and
+    :class:`StageFailure` with what is wrong with the photographs, :class:`UsageError` where ``folder`` holds
+    what is not of this command or cannot be written.
+    """
+    _claim(folder)
+    config = PipelineConfig()
+    if wishes.max_size_px is not None:
+        config = replace(config, images=ImageOptions(wishes.max_size_px))
+    photographs = [
+        read_photograph(path, max_size_px=config.images.max_size_px) for path in wishes.photographs
+    ]
+    film = _film_of(wishes.method)(photographs, wishes.frames, config=config, seed=wishes.seed)
+    tell, count = progress or (lambda *_: None), wishes.frames
+    write_json(folder / FRAMES, {"method": wishes.method, **film.told, "frames": _places(film)})
+    _remove_old(folder, count)
+    frames = []
+    for k in range(count):
+        rgb = film.draw(k, threads)
+        write_frame(folder, k + 1, rgb)
+        frames.append((film.captions[k], rgb))
+        tell("views", k + 1, count + 2)
+    files = [folder / frame_name(k + 1) for k in range(count)]
+    animation = write_animation(
+        folder / f"{wishes.method}{animation_suffix()}", files, milliseconds=BETWEEN_MS
+    )
+    tell("views", count + 1, count + 2)
+    title = "Between " + " and ".join(image.name for image in photographs)
+    write_atomically(folder / STRIP, strip_page(title, frames, notes=film.notes).encode("utf-8", "replace"))
+    tell("views", count + 2, count + 2)
+    height, width = frames[0][1].shape[:2]
+    return ViewFiles(folder, tuple(files), animation, (width, height))
+
+
+def _film_of(method: str) -> Callable[..., Film]:
+    """The maker of films by that method, loaded when it is asked for."""
+    module, name = METHODS[method]
+    try:
+        maker: Callable[..., Film] = getattr(import_module(module), name)
+    except (ModuleNotFoundError, AttributeError):
+        raise UsageError(f"--method {method} is not part of this version") from None
+    return maker
+
+
+def _places(film: Film) -> list[dict[str, Any]]:
+    return [{"name": frame_name(k + 1), **place} for k, place in enumerate(film.places)]
+
+
 def _run_of(out: Path) -> tuple[TexturedMesh, dict[str, PinholeCamera]]:
     """The model and the cameras of a finished run."""
     if not out.is_dir() or not any((out / name).is_file() for name in (MODEL, CAMERAS, "run.json")):
@@ -153,7 +246,8 @@ def _claim(folder: Path) -> None:
 def _remove_old(folder: Path, frames: int) -> None:
     names = {frame_name(k + 1) for k in range(frames)}
     old = [p for p in folder.glob("frame-*.png") if p.name not in names]
-    old += [folder / f"{path}{suffix}" for path in PATHS for suffix in (".webp", ".png")]
+    old += [folder / f"{path}{suffix}" for path in (*PATHS, *METHODS) for suffix in (".webp", ".png")]
+    old += [folder / STRIP]
     try:
         for path in old:
             path.unlink(missing_ok=True)
