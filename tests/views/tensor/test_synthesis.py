@@ -15,7 +15,9 @@ from thesisrecon.views.tensor import (
     camera_at,
     cameras_along,
     prepare_synthesis,
+    seed_of_two,
 )
+from thesisrecon.views.tensor.seed import seed_of_first
 
 SIZE = (160, 120)
 K = calibration_matrix(150.0, 150.0, 81.0, 58.0)
@@ -115,7 +117,6 @@ def test_the_way_goes_from_one_photograph_to_the_other_and_beyond():
     np.testing.assert_allclose(path[1].rotation @ PAIR.R, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(path[3].rotation, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(path[3].translation, 0.0, atol=1e-12)
-    assert [c.share_of_second(PAIR) for c in path] == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
     assert len(cameras_along(PAIR, 1, sizes=(SIZE, SIZE))) == 1
 
 
@@ -153,3 +154,25 @@ def test_shapes_and_places_that_do_not_fit_are_refused():
         prepare_synthesis(PAIR, (image, image), (places + 1, places[:5]))
     with pytest.raises(ValueError, match="at least 1 x 1"):
         VirtualCamera(np.eye(3), np.zeros(3), K, (0, 5))
+
+
+def test_from_the_tensor_of_three_photographs_the_same_pictures_are_made(synthesis):
+    """A third photograph only says where the virtual camera's motion begins."""
+    third = np.column_stack([Rotation.from_rotvec([0.05, 0.1, 0.0]).as_matrix(), [0.3, 0.2, -0.5]])
+    start = seed_of_two(PAIR).moved(third[:, :3] @ PAIR.R.T, third[:, 3] - third[:, :3] @ PAIR.R.T @ PAIR.t)
+    (one, X1), (two, X2) = _scene(*STILL), _scene(PAIR.R, PAIR.t)
+    places = _places(X1, PAIR.R, PAIR.t), _places(X2, *STILL)
+    views = prepare_synthesis(PAIR, (one, two), places, seed=start)
+    for from_three, from_two in zip(views.along(4), synthesis.along(4), strict=True):
+        expected = synthesis.render(from_two).astype(float)
+        assert np.mean(np.abs(views.render(from_three) - expected) > 1.0) < 1e-3
+    moved = seed_of_two(PAIR).swapped()
+    np.testing.assert_allclose(moved.T, seed_of_first(PAIR.swapped()).T, atol=1e-9)
+    np.testing.assert_allclose(start.P3, K @ third @ _space_from_first(), atol=1e-9)
+
+
+def _space_from_first():
+    """X_1 from the frame of the tensor, whose points are (K X_1, 1)."""
+    change = np.eye(4)
+    change[:3, :3] = np.linalg.inv(K)
+    return change

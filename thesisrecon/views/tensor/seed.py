@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thesisrecon.geometry.camera import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, require_finite
 from thesisrecon.geometry.trifocal import cameras_from_tensor, fundamentals_from_tensor
 from thesisrecon.types import F64
@@ -39,6 +40,25 @@ class VirtualTensor:
     T: F64
     P2: F64
     K: F64
+
+    @property
+    def P3(self) -> F64:
+        """[b, b_4] (3, 4), the third camera with its scale: nine linear equations for each of its rows."""
+        design = np.zeros((3, 3, 4))
+        design[:, :, 3] = self.P2[:, :3].T
+        for i in range(3):
+            design[i, :, i] = -self.P2[:, 3]
+        return np.asarray(np.linalg.lstsq(design.reshape(9, 4), self.T.reshape(9, 3), rcond=None)[0].T)
+
+    @property
+    def centre(self) -> F64:
+        """The third centre (4,), homogeneous."""
+        return camera_centre(self.P3)
+
+    def swapped(self) -> VirtualTensor:
+        """The tensor <2, 1, 3> in the frame of the swapped pair."""
+        change = np.linalg.inv(np.vstack([self.P2, np.eye(4)[3]]))
+        return VirtualTensor(_tensor(change[:3], self.P3 @ change), change[:3], self.K)
 
     def moved(self, rotation: F64, translation: F64, *, K: F64 | None = None) -> VirtualTensor:
         """The tensor after a motion of the third camera from X_3 to R X_3 + t.

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize
@@ -33,9 +34,10 @@ LEAST_SEEN = 0.05
 class TensorSynthesis:
     """Two photographs ready for view synthesis; make it by :func:`prepare_synthesis`.
 
-    ``pair`` the cameras; ``seeds`` the tensors <1, 2, 2> and <2, 1, 2>; ``levels`` two (H, W, 4) float32, the
-    colours and 1 where the place of the pixel is known, 0 where it is guessed; ``places`` two (H, W, 2) px of
-    the other photograph; ``gain`` (3,) what makes the second as bright as the first.
+    ``pair`` the cameras; ``seeds`` the tensors <1, 2, 2> and <2, 1, 2>, or those with a third photograph;
+    ``levels`` two (H, W, 4) float32, the colours and 1 where the place of the pixel is known, 0 where it is
+    guessed; ``places`` two (H, W, 2) px of the other photograph; ``gain`` (3,) what makes the second as
+    bright as the first.
     """
 
     pair: CalibratedPair
@@ -52,7 +54,9 @@ class TensorSynthesis:
 
     def along(self, frames: int, *, beyond: float = 0.0) -> list[VirtualCamera]:
         """Cameras from the first photograph to the second and beyond; see :func:`cameras_along`."""
-        return cameras_along(self.pair, frames, sizes=self.sizes, beyond=beyond)
+        third = np.linalg.inv(self.seeds[0].K) @ self.seeds[0].P3
+        R3 = Rotation.from_matrix(third[:, :3] @ self.pair.K1).as_matrix()
+        return cameras_along(self.pair, frames, sizes=self.sizes, beyond=beyond, third=(R3, third[:, 3]))
 
     def render(self, camera: VirtualCamera, *, threads: int = 1) -> U8:
         """The picture (H, W, 3) of a virtual camera.
@@ -61,7 +65,8 @@ class TensorSynthesis:
         neither sees is filled from behind. The same bytes whatever the number of threads. Raises
         ``StageFailure`` where the camera sees next to nothing of the scene.
         """
-        layers = [self._layer(side, camera, threads) for side in (0, 1)]
+        moved = [seed.moved(camera.rotation, camera.translation, K=camera.K) for seed in self.seeds]
+        layers = [self._layer(side, moved[side], camera.size, threads) for side in (0, 1)]
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
         if not seen.mean() >= LEAST_SEEN:
             raise StageFailure(
@@ -69,7 +74,7 @@ class TensorSynthesis:
                 f"{100.0 * seen.mean():.1f} % of its picture, needed {100.0 * LEAST_SEEN:.0f} %",
                 "it may be beyond the scene or look away: move it less (by baselines) or turn it back",
             )
-        rgb, nearness = self._mixed(layers, camera)
+        rgb, nearness = self._mixed(layers, self._share_of_second(moved[0]))
         filled = fill_holes(rgb, nearness, step=self._step)
         return np.asarray(np.clip(np.rint(filled), 0.0, 255.0), dtype=np.uint8)
 
@@ -78,16 +83,23 @@ class TensorSynthesis:
         """``SURFACE_PX`` in units of nearness, 1 / baseline."""
         return SURFACE_PX / float(self.pair.K2[0, 0] * np.linalg.norm(self.pair.t))
 
-    def _layer(self, side: int, camera: VirtualCamera, threads: int) -> tuple[F32, F32]:
+    def _share_of_second(self, virtual: VirtualTensor) -> np.float32:
+        """How far along the baseline the camera is: 0 beside the first photograph, 1 beside the second, and
+        not beyond."""
+        centre, baseline = virtual.centre, self.pair.centre2
+        along = np.linalg.solve(self.pair.K1, centre[:3]) @ baseline / (centre[3] * baseline @ baseline)
+        return np.float32(np.clip(along, 0.0, 1.0))
+
+    def _layer(
+        self, side: int, virtual: VirtualTensor, size: tuple[int, int], threads: int
+    ) -> tuple[F32, F32]:
         """What the camera sees of one photograph, (H, W, 4), and its nearness (H, W); NaN where nothing."""
-        virtual = self.seeds[side].moved(camera.rotation, camera.translation, K=camera.K)
         xy, nearness = transfer_grid(virtual, self.places[side], threads=threads)
-        source, front = forward_map(xy, nearness, size=camera.size, step=self._step, threads=threads)
+        source, front = forward_map(xy, nearness, size=size, step=self._step, threads=threads)
         return sample(self.levels[side], source, threads=threads), front
 
-    def _mixed(self, layers: list[tuple[F32, F32]], camera: VirtualCamera) -> tuple[F32, F32]:
+    def _mixed(self, layers: list[tuple[F32, F32]], share: np.float32) -> tuple[F32, F32]:
         """Colours and nearness of both layers together; NaN where neither sees anything."""
-        share = np.float32(camera.share_of_second(self.pair))
         (first, near1), (second, near2) = layers
         of_second = self._weight_of_second(layers, share)
         dark, bright = self.gain**-share, self.gain ** (1 - share)
@@ -123,6 +135,7 @@ def prepare_synthesis(
     places: tuple[F32, F32],
     *,
     gain: ArrayLike = (1.0, 1.0, 1.0),
+    seed: VirtualTensor | None = None,
 ) -> TensorSynthesis:
     """What does not depend on the virtual camera.
 
@@ -133,6 +146,8 @@ def prepare_synthesis(
     places : two (H, W, 2) px: where the pixels of the one photograph are in the other, NaN = unknown. Those
         are guessed to be as far as the farthest of the nearest known ones around.
     gain : (3,) what makes the second photograph as bright as the first.
+    seed : the tensor that virtual cameras move from: that of three photographs (:func:`seed_of_three`), or
+        <1, 2, 2> by default.
 
     Raises
     ------
@@ -150,7 +165,8 @@ def prepare_synthesis(
         levels.append(np.concatenate([rgb, seen[..., None].astype(np.float32)], axis=2))
     back = pair.swapped()
     complete = _completed(pair, places[0]), _completed(back, places[1])
-    seeds = seed_of_two(pair), seed_of_first(back)
+    seed = seed_of_two(pair) if seed is None else seed
+    seeds = seed, seed.swapped()
     return TensorSynthesis(pair, seeds, (levels[0], levels[1]), complete, np.asarray(gain, dtype=np.float32))
 
 
