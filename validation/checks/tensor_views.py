@@ -1,0 +1,418 @@
+"""Views by the trilinear tensor beside the truth: ``python -m validation.checks.tensor_views``.
+
+The courtyard is rendered anew at places along the baseline of two of its views and off it, with guessed and
+with true intrinsics; photograph 5 of fountain-P11 is made from 4 and 6; the views in between of Cones from
+its views 2 and 6, beside the same warp with OpenCV's semi-global matching. ``-o`` takes a folder for the
+pictures and the plot. The exit code is 1 where a target is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.dense.matching import CohesiveScanlines
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.two_photographs import match_photographs
+from thesisrecon.types import DisparityMap
+from thesisrecon.views.tensor import (
+    CalibratedPair,
+    TensorSynthesis,
+    VirtualCamera,
+    camera_at,
+    guessed_intrinsics,
+    pair_from_fundamental,
+    prepare_synthesis,
+    seed_of_two,
+)
+from validation.metrics.pictures import psnr_db, ssim
+from validation.metrics.record import Metric, markdown_table
+from validation.references.semi_global import MODES, OpenCVSemiGlobal
+from validation.scenes.courtyard import build_courtyard
+from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_photograph
+from validation.scenes.raycast import Rays, World, trace
+from validation.scenes.real import data_root, load_real_scene
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+VIEWS = (6, 7)
+"""Of the courtyard: 11 degrees and 1.3 m apart, the scene 3 to 9 m away."""
+ALONG = (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
+OFF = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+DIRECTIONS = {"up": (0.0, -1.0, 0.0), "ahead": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0)}
+FRAME_SIZE, FRAME_S = (1000, 700), 1.0
+CONES = (3, 4, 5)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A virtual camera of the courtyard: ``s`` baselines along it, ``off`` baselines from it."""
+
+    s: float
+    off: float = 0.0
+    direction: str = "along"
+
+    @property
+    def distance(self) -> float:
+        """From the nearest place between the photographs, in baselines."""
+        return float(np.hypot(max(-self.s, self.s - 1.0, 0.0), self.off))
+
+    def of(self, pair: CalibratedPair) -> VirtualCamera:
+        """The camera as the pair takes it."""
+        camera = camera_at(pair, self.s, sizes=(SIZE, SIZE))
+        if self.direction == "along":
+            return camera
+        step = self.off * np.array(DIRECTIONS[self.direction])
+        return replace(camera, translation=camera.translation - step)
+
+
+def places_of_courtyard() -> Iterator[Place]:
+    """Along the baseline, and off its middle in three directions."""
+    yield from (Place(s) for s in ALONG)
+    yield from (Place(0.5, off, direction) for direction in DIRECTIONS for off in OFF)
+
+
+@dataclass(frozen=True)
+class CourtyardTruth:
+    """The ``world`` and two of its cameras, ``photographs`` of equal exposure and the true ``places``."""
+
+    world: World
+    poses: tuple[Pose, Pose]
+    photographs: tuple[U8, U8]
+    places: tuple[F32, F32]
+
+    @property
+    def pair(self) -> CalibratedPair:
+        """The true cameras, in baselines."""
+        one, two = self.poses
+        return CalibratedPair(
+            one.K, two.K, two.R @ one.R.T, two.R @ (one.C - two.C) / np.linalg.norm(two.C - one.C)
+        )
+
+    def pose(self, camera: VirtualCamera) -> Pose:
+        """Where a virtual camera of the true pair stands in the world."""
+        two = self.poses[1]
+        step = camera.rotation.T @ camera.translation * np.linalg.norm(two.C - self.poses[0].C)
+        return Pose(camera.K, camera.rotation @ two.R, two.C - two.R.T @ step)
+
+
+def photograph(world: World, pose: Pose) -> U8:
+    """As the fixtures are made, with the exposure of the pose and no white balance."""
+    with PIL.Image.open(io.BytesIO(render_photograph(world, pose, 0)[0])) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+@cache
+def courtyard() -> CourtyardTruth:
+    """Rendered, with the true correspondence from the traced depth."""
+    world = build_courtyard()
+    one, two = (replace(courtyard_poses()[k], exposure=1.0) for k in VIEWS)
+    places = []
+    for here, there in ((one, two), (two, one)):
+        depth = trace(world, Rays(here.K, here.R, here.C), SIZE, shade=False)[1]
+        y, x = np.indices(depth.shape)
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(here.K).T
+        X = rays * np.where(depth > 0.0, depth, np.nan)[..., None] @ here.R + here.C
+        places.append(dehomogenize((X - there.C) @ (there.K @ there.R).T).astype(np.float32))
+    pictures = photograph(world, one), photograph(world, two)
+    return CourtyardTruth(world, (one, two), pictures, (places[0], places[1]))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A picture at one ``place`` by one ``method``: ``psnr`` dB, ``ssim``, and how far its pixels are from
+    where they belong, median and 90 % (px)."""
+
+    place: Place
+    method: str
+    psnr: float
+    ssim: float
+    off_px: tuple[float, float]
+
+
+def measure_courtyard(out: Path | None) -> list[Measured]:
+    """All places by true cameras and correspondence, and by F and matches with true and guessed K."""
+    truth = courtyard()
+    found = match_photographs(*truth.photographs, config=PipelineConfig())
+    dense = found.dense.places(0, SIZE), found.dense.places(1, SIZE)
+    K, guess = truth.poses[0].K, guessed_intrinsics(SIZE)
+    matches = found.pair.xy1, found.pair.xy2
+    pairs = {
+        "all true": truth.pair,
+        "true K": pair_from_fundamental(found.pair.F, *matches, K1=K, K2=K),
+        "guessed K": pair_from_fundamental(found.pair.F, *matches, K1=guess, K2=guess),
+    }
+    ready = {
+        name: prepare_synthesis(
+            pair,
+            truth.photographs,
+            truth.places if name == "all true" else dense,
+            gain=found.dense.gain if name != "all true" else np.ones(3),
+        )
+        for name, pair in pairs.items()
+    }
+    rows = []
+    for place in places_of_courtyard():
+        wanted = photograph(truth.world, truth.pose(place.of(truth.pair)))
+        shown = []
+        for name, views in ready.items():
+            picture = views.render(place.of(views.pair), threads=2)
+            off = _displaced(truth, place, views.pair)
+            rows.append(Measured(place, name, psnr_db(picture, wanted), ssim(picture, wanted), off))
+            shown.append(picture)
+        if out is not None:
+            name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
+            save_beside(out / name, [wanted, *shown])
+    return rows
+
+
+def _displaced(truth: CourtyardTruth, place: Place, pair: CalibratedPair) -> tuple[float, float]:
+    """How far the exact matches of view 1 come to lie from where the true camera has them (px)."""
+    y, x = np.indices(truth.places[0].shape[:2])[:, ::8, ::8].reshape(2, -1).astype(np.float64)
+    matches = truth.places[0][::8, ::8].reshape(-1, 2).astype(np.float64)
+    both = []
+    for cameras in (truth.pair, pair):
+        camera = place.of(cameras)
+        tensor = seed_of_two(cameras).moved(camera.rotation, camera.translation, K=camera.K)
+        both.append(tensor.transfer(np.stack([x, y], axis=1), matches)[0])
+    inside = np.all((both[0] > 0.0) & (both[0] < np.array(SIZE)), axis=1)
+    apart = np.linalg.norm(both[1] - both[0], axis=1)[inside]
+    apart = apart[np.isfinite(apart)]
+    return float(np.median(apart)), float(np.quantile(apart, 0.9))
+
+
+def linear_range(rows: list[Measured], method: str) -> tuple[float, float]:
+    """Up to which distance beyond the baseline's ends the median displacement grows in proportion, within
+    10 %, and its slope, px a baseline: from the places along the baseline."""
+    ends = sorted((r.place.distance, r.off_px[0]) for r in rows if r.method == method and r.place.s > 1.0)
+    slope = ends[0][1] / ends[0][0]
+    reach = 0.0
+    for distance, off in ends:
+        if abs(off / distance - slope) > 0.1 * slope:
+            break
+        reach = distance
+    return reach, slope
+
+
+def draw(rows: list[Measured]) -> go.Figure:
+    """PSNR and displacement as functions of the distance from the baseline."""
+    figure = go.Figure()
+    for method in dict.fromkeys(row.method for row in rows):
+        for direction in ("along", *DIRECTIONS):
+            chosen = [r for r in rows if r.method == method and r.place.direction == direction]
+            figure.add_scatter(
+                x=[r.place.s - 1.0 if direction == "along" else r.place.off for r in chosen],
+                y=[r.psnr for r in chosen],
+                name=f"{method}, {direction}",
+                mode="lines+markers",
+                customdata=[r.off_px for r in chosen],
+                hovertemplate="%{x} baselines: %{y:.1f} dB, displaced by %{customdata[0]:.2f} px",
+            )
+    figure.update_layout(
+        xaxis_title="baselines beyond the second photograph, or off the middle", yaxis_title="PSNR, dB"
+    )
+    return figure
+
+
+def save_beside(path: Path, pictures: list[U8]) -> None:
+    """Pictures in a row, at half their size."""
+    PIL.Image.fromarray(np.concatenate(pictures, axis=1)[::2, ::2]).save(path)
+
+
+def courtyard_table(rows: list[Measured]) -> str:
+    """Every place, a column for each method: PSNR, SSIM, median displacement."""
+    methods = list(dict.fromkeys(row.method for row in rows))
+    lines = [f"| place | {' | '.join(methods)} |", f"| --- |{' --- |' * len(methods)}"]
+    for place in dict.fromkeys(row.place for row in rows):
+        cells = [f"{r.psnr:.1f} dB, {r.ssim:.3f}, {r.off_px[0]:.2f} px" for r in rows if r.place == place]
+        where = f"s = {place.s:g}" if place.direction == "along" else f"{place.off:g} {place.direction}"
+        lines.append(f"| {where} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def measure_fountain(out: Path | None) -> list[Metric]:
+    """Photograph 5 from 4 and 6, by its true place."""
+    scene = load_real_scene("fountain-P11")
+    if scene is None or scene.K is None or scene.R is None or scene.C is None:
+        return []
+    (K1, K, K2), (R1, R, R2), (C1, C, C2) = scene.K[4:7], scene.R[4:7], scene.C[4:7]
+    found = match_photographs(scene.image_paths[4], scene.image_paths[6])
+    images = [part.image for part in found.photographs]
+    size = images[0].size
+    dense = found.dense.places(0, size), found.dense.places(1, size)
+    with PIL.Image.open(scene.image_paths[5]) as image:
+        wanted = np.asarray(image.convert("RGB"))
+    baseline = float(np.linalg.norm(C1 - C2))
+    guess = guessed_intrinsics(size)
+    matches = found.pair.xy1, found.pair.xy2
+    pairs = {
+        "true cameras": CalibratedPair(K1, K2, R2 @ R1.T, R2 @ (C1 - C2) / baseline),
+        "F, true K": pair_from_fundamental(found.pair.F, *matches, K1=K1, K2=K2),
+        "F, guessed K": pair_from_fundamental(found.pair.F, *matches, K1=guess, K2=guess),
+    }
+    pictures: dict[str, U8] = {}
+    for name, pair in pairs.items():
+        views = prepare_synthesis(pair, (images[0].rgb, images[1].rgb), dense, gain=found.dense.gain)
+        own = guess if "guessed" in name else K
+        camera = VirtualCamera(R @ R2.T, R @ (C2 - C) / baseline, own, size)
+        pictures[name] = views.render(camera, threads=2)
+    pictures["cross-dissolve"] = _dissolved(images[0].rgb, images[1].rgb, 0.5)
+    if out is not None:
+        save_beside(out / "fountain-5.jpg", [wanted, *pictures.values()])
+    return _pictures("fountain-P11, 5 from 4 and 6", pictures, wanted)
+
+
+def _pictures(scene: str, pictures: dict[str, U8], wanted: U8) -> list[Metric]:
+    judged = next(iter(pictures))
+    return [
+        Metric(scene, "PSNR", "dB", {n: psnr_db(p, wanted) for n, p in pictures.items()}, judged),
+        Metric(scene, "SSIM", "", {n: ssim(p, wanted) for n, p in pictures.items()}, judged),
+    ]
+
+
+def _dissolved(first: U8, second: U8, share: float) -> U8:
+    mixed = (1.0 - share) * first.astype(np.float64) + share * second
+    return np.asarray(np.rint(mixed), dtype=np.uint8)
+
+
+def measure_cones(out: Path | None) -> list[Metric]:
+    """Views 3, 4 and 5 from 2 and 6, by our disparities, those of OpenCV and the true ones."""
+    root = data_root()
+    if root is None or not (root / "stereo" / "Cones9").is_dir():
+        return []
+    folder = root / "stereo" / "Cones9"
+    images = {k: _rgb(folder / f"im{k}.png") for k in (2, *CONES, 6)}
+    synthesis = {
+        "ours": _of_disparities(images[2], images[6], *_both_ways(_ours, images[2], images[6])),
+        **{
+            name: _of_disparities(images[2], images[6], *_both_ways(_of_opencv(name), images[2], images[6]))
+            for name in MODES
+        },
+        "true disparity": _of_disparities(
+            images[2], images[6], _true_disparity(folder / "disp2.png"), _true_disparity(folder / "disp6.png")
+        ),
+    }
+    sizes = next(iter(synthesis.values())).sizes
+    rows = []
+    for k in CONES:
+        share = (k - 2) / 4
+        pictures = {n: v.render(camera_at(v.pair, share, sizes=sizes)) for n, v in synthesis.items()}
+        pictures["cross-dissolve"] = _dissolved(images[2], images[6], share)
+        rows += _pictures(f"Cones, view {k}", pictures, images[k])
+        if out is not None:
+            save_beside(out / f"cones-{k}.png", [images[k], pictures["ours"]])
+    mean = {n: float(np.mean([r.values[n] for r in rows if r.name == "PSNR"])) for n in rows[0].values}
+    sgbm = max(mean[name] for name in MODES)
+    scene = "Cones, mean of views 3 to 5"
+    over = {"ours": mean["ours"] - mean["cross-dissolve"]}
+    return [
+        *rows,
+        Metric(scene, "PSNR", "dB", mean, "ours", sgbm + 0.3, at_most=False),
+        Metric(scene, "over cross-dissolve", "dB", over, "ours", 5.0, at_most=False),
+    ]
+
+
+Disparities = Callable[[U8, U8], F32]
+
+
+def _rgb(path: Path) -> U8:
+    with PIL.Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def _true_disparity(path: Path) -> F32:
+    with PIL.Image.open(path) as image:
+        quarters = np.asarray(image, dtype=np.float32)
+    return np.where(quarters > 0.0, 0.25 * quarters, np.nan).astype(np.float32)
+
+
+def _ours(left: U8, right: U8) -> F32:
+    return CohesiveScanlines().match(left, right, disparity_range=(0, 63)).disparity
+
+
+def _of_opencv(mode: str) -> Disparities:
+    return lambda left, right: OpenCVSemiGlobal(mode).match(left, right, 64)
+
+
+def _both_ways(match: Disparities, left: U8, right: U8) -> tuple[F32, F32]:
+    """Disparities of either image; the right one is a left one in a mirror."""
+    mirrored = match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))
+    return match(left, right), mirrored[:, ::-1]
+
+
+def _of_disparities(left: U8, right: U8, of_left: F32, of_right: F32) -> TensorSynthesis:
+    """A rectified pair of parallel cameras as a pair for the tensor, hidden pixels taken for background."""
+    height, width = of_left.shape
+    places = []
+    for d, sign in ((of_left, -1.0), (of_right, 1.0)):
+        y, x = np.indices(d.shape, dtype=np.float32)
+        filled = DisparityMap(d, np.zeros_like(d), 0.0).filled()
+        places.append(np.stack([x + np.float32(sign) * filled, y], axis=-1))
+    K = guessed_intrinsics((width, height))
+    pair = CalibratedPair(K, K, np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    return prepare_synthesis(pair, (left, right), (places[0], places[1]))
+
+
+def measure_time(repeats: int) -> Metric:
+    """A frame of 1000 x 700 px from photographs as large, once the correspondence is known."""
+    truth = courtyard()
+    width, height = FRAME_SIZE
+    images = tuple(picture[:height, :width] for picture in truth.photographs)
+    places = tuple(part[:height, :width] for part in truth.places)
+    views = prepare_synthesis(truth.pair, (images[0], images[1]), (places[0], places[1]))
+    camera = replace(camera_at(truth.pair, 0.4, sizes=(FRAME_SIZE, FRAME_SIZE)))
+    wall, processor = [], []
+    for _ in range(repeats + 1):  # the first compiles
+        start = time.perf_counter(), time.process_time()
+        views.render(camera, threads=2)
+        wall.append(time.perf_counter() - start[0])
+        processor.append(time.process_time() - start[1])
+    values: dict[str, float | None] = {"wall, 2 threads": min(wall[1:]), "processor": min(processor[1:])}
+    return Metric("courtyard, 1000 x 700", "time of a frame", "s", values, "processor", target=FRAME_S)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("parts", nargs="*", default=["cones", "fountain", "courtyard", "time"])
+    parser.add_argument("-o", "--out", type=Path)
+    parser.add_argument("--repeats", type=int, default=5)
+    wishes = parser.parse_args(arguments)
+    if wishes.out is not None:
+        wishes.out.mkdir(parents=True, exist_ok=True)
+    rows: list[Metric] = []
+    if "cones" in wishes.parts:
+        rows += measure_cones(wishes.out)
+    if "fountain" in wishes.parts:
+        rows += measure_fountain(wishes.out)
+    if "time" in wishes.parts:
+        rows.append(measure_time(wishes.repeats))
+    if "courtyard" in wishes.parts:
+        measured = measure_courtyard(wishes.out)
+        print(courtyard_table(measured), end="\n\n")
+        for method in ("true K", "guessed K"):
+            reach, slope = linear_range(measured, method)
+            print(f"{method}: {slope:.2f} px a baseline beyond, linear to {reach:g} baselines", end="\n\n")
+        if wishes.out is not None:
+            draw(measured).write_html(wishes.out / "tensor-views.html", include_plotlyjs=True)
+    for scene in dict.fromkeys(row.scene for row in rows):
+        print(f"### {scene}\n\n{markdown_table([r for r in rows if r.scene == scene])}", end="\n\n")
+    return int(any(row.verdict == "missed" for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
