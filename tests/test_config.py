@@ -19,6 +19,7 @@ from thesisrecon.config import (
     toml_from_config,
 )
 from thesisrecon.errors import UsageError
+from thesisrecon.model import BSplineSurface, DepthSheets
 from thesisrecon.selfcalibration import ModulusConstraint, PollefeysQuadric, Stratified
 from thesisrecon.settings import parse_word, toml_from_tables
 
@@ -181,3 +182,14 @@ def test_toml_keeps_awkward_text() -> None:
         }
     }
     assert tomllib.loads(toml_from_tables(tables)) == tables
+
+
+def test_surface_and_fusion_are_chosen_by_their_words() -> None:
+    assert apply_settings("model.surface=b-spline-surface").model.surface == BSplineSurface()
+    config = apply_settings("model.surface.kind=b-spline-surface", "model.surface.knot_px=6")
+    assert config.model.surface == BSplineSurface(knot_px=6)
+    assert apply_settings("model.fusion=depth-sheets", "model.fusion.step=3").model.fusion == DepthSheets(
+        step=3
+    )
+    with pytest.raises(UsageError, match="linear-surface"):
+        apply_settings("model.surface=linear")

@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.model.sphere import SHAPE, looking_at_origin, ring_of, sphere_map
+from tests.model.sphere import SHAPE, looking_at_origin, photograph, ring_of, sphere_map
 from thesisrecon.errors import StageFailure
-from thesisrecon.model import VolumetricFusion, keep_large_parts, surface_from_depth
+from thesisrecon.model import (
+    BSplineSurface,
+    DepthSheets,
+    LinearSurface,
+    SurfaceModel,
+    VolumetricFusion,
+    keep_large_parts,
+    surface_from_depth,
+)
 from thesisrecon.model.mesh import face_areas, parts_of
 from thesisrecon.types import F64, DepthMap, TexturedMesh
 
@@ -129,3 +137,38 @@ def test_crumbs_are_dropped() -> None:
     np.testing.assert_array_equal(mesh.colors, np.arange(12).reshape(4, 3))
     empty = TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     assert keep_large_parts(empty) is empty
+
+
+def test_sheets_show_each_place_once(ring: list[DepthMap]) -> None:
+    mesh = DepthSheets(step=1).fuse(ring)
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    assert np.abs(radius - 1.0).max() < 1e-3
+    assert (outward(mesh) > 0.0).all()
+    # The sphere but for its outline in each view, with some overlap and no more.
+    assert 0.9 * 4 * np.pi < face_areas(mesh.vertices, mesh.faces).sum() < 1.25 * 4 * np.pi
+    one, two = (DepthSheets(step=3).fuse(ring, threads=n) for n in (1, 2))
+    np.testing.assert_array_equal(one.vertices, two.vertices)
+    assert len(one.faces) == pytest.approx(len(mesh.faces) / 9, rel=0.25)
+
+
+def test_hopeless_sheets_are_refused(ring: list[DepthMap]) -> None:
+    empty = DepthMap(0, ring[0].P, np.full(SHAPE, np.nan, np.float32), ring[0].std, ring[0].views)
+    for maps in ([], [empty], [empty, empty]):
+        with pytest.raises(StageFailure, match="no surface"):
+            DepthSheets().fuse(maps)
+    for wrong in ({"step": 0}, {"same": -1.0}, {"grazing_deg": 90.0}):
+        with pytest.raises(ValueError, match="needed"):
+            DepthSheets(**wrong)  # type: ignore[arg-type]
+
+
+def test_the_model_is_made_of_fitted_surfaces_where_asked() -> None:
+    noise = 0.01
+    noisy = [sphere_map(m.view, m.P, noise=noise) for m in ring_of()[:3]]
+    views = [photograph(m) for m in ring_of()[:3]]
+    off = []
+    for surface in (LinearSurface(), BSplineSurface()):
+        model = SurfaceModel(surface=surface, fusion=DepthSheets(), colors="vertices")
+        mesh = model.build(noisy, views)
+        assert mesh.colors is not None
+        off.append(np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1.0)))
+    assert off[1] < off[0] / 2.5

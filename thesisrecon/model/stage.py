@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Literal
 
-from thesisrecon.model.fusion import VolumetricFusion
+from thesisrecon.model.fusion import DepthSheets, VolumetricFusion
+from thesisrecon.model.surfaces import BSplineSurface, LinearSurface, resampled
 from thesisrecon.model.texture import TextureAtlas, color_vertices
 from thesisrecon.types import DepthMap, PinholeView, TexturedMesh
 
@@ -15,10 +17,12 @@ from thesisrecon.types import DepthMap, PinholeView, TexturedMesh
 class SurfaceModel:
     """Depth maps fused to a surface, with a texture or with colours of its vertices.
 
-    ``fusion`` makes the surface, ``atlas`` its texture; ``colors`` "texture" or "vertices".
+    ``surface`` is what stands in front of each map, ``fusion`` makes one of all, ``atlas`` its texture;
+    ``colors`` "texture" or "vertices".
     """
 
-    fusion: VolumetricFusion = field(default_factory=VolumetricFusion)
+    surface: LinearSurface | BSplineSurface = field(default_factory=LinearSurface)
+    fusion: VolumetricFusion | DepthSheets = field(default_factory=VolumetricFusion)
     atlas: TextureAtlas = field(default_factory=TextureAtlas)
     colors: Literal["texture", "vertices"] = "texture"
 
@@ -33,7 +37,9 @@ class SurfaceModel:
 
         The result does not depend on ``threads``.
         """
-        return self.color(self.fusion.fuse(depth_maps, threads=threads), views, threads=threads)
+        with ThreadPoolExecutor(max(threads, 1)) as pool:
+            fitted = list(pool.map(lambda m: resampled(self.surface.fit(m)), depth_maps))
+        return self.color(self.fusion.fuse(fitted, threads=threads), views, threads=threads)
 
     def color(
         self,

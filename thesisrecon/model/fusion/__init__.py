@@ -1,5 +1,6 @@
-"""Several depth maps as one surface."""
+"""Several depth maps to one surface: their mean in space, or their own surfaces put together."""
 
+from thesisrecon.model.fusion.sheets import DepthSheets
 from thesisrecon.model.fusion.volume import VolumetricFusion
 
-__all__ = ["VolumetricFusion"]
+__all__ = ["DepthSheets", "VolumetricFusion"]

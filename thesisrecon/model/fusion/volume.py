@@ -78,14 +78,14 @@ class VolumetricFusion:
             list(pool.map(integrate, parts))
         mesh = extract_surface(grid, value, weight)
         if not len(mesh.faces):
-            raise _nothing()
+            raise nothing_to_fuse()
         return keep_large_parts(mesh, self.least_part)
 
     def _lay_out(self, depth_maps: Sequence[DepthMap]) -> tuple[Grid, float]:
         """The blocks that the surface may pass, and where distances are cut."""
         footprints = [_footprint(m)[np.isfinite(m.depth)] for m in depth_maps]
         if not sum(map(len, footprints)):
-            raise _nothing()
+            raise nothing_to_fuse()
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
             truncation = self.truncation_voxels * voxel
@@ -118,7 +118,8 @@ class VolumetricFusion:
         )
 
 
-def _nothing() -> StageFailure:
+def nothing_to_fuse() -> StageFailure:
+    """The refusal of depth maps without depths."""
     return StageFailure(
         "no surface could be made",
         "the depth maps have no depths that agree",
@@ -169,7 +170,7 @@ def _grid(depth_maps: Sequence[DepthMap], sure: Sequence[F32], voxel: float, rea
         if len(xyz):
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
     if not np.isfinite(low).all():
-        raise _nothing()
+        raise nothing_to_fuse()
     edge = SIDE * voxel
     origin = low - 2.0 * reach
     shape = np.ceil((high - low + 4.0 * reach) / edge).astype(int) + 1
