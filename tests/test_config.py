@@ -188,8 +188,6 @@ def test_surface_and_fusion_are_chosen_by_their_words() -> None:
     assert apply_settings("model.surface=b-spline-surface").model.surface == BSplineSurface()
     config = apply_settings("model.surface.kind=b-spline-surface", "model.surface.knot_px=6")
     assert config.model.surface == BSplineSurface(knot_px=6)
-    assert apply_settings("model.fusion=depth-sheets", "model.fusion.step=3").model.fusion == DepthSheets(
-        step=3
-    )
+    assert apply_settings("model.fusion=depth-sheets").model.fusion == DepthSheets()
     with pytest.raises(UsageError, match="linear-surface"):
         apply_settings("model.surface=linear")
