@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from thesisrecon.between import interpolate_view
+    from thesisrecon.beyond import synthesize_view
     from thesisrecon.config import PipelineConfig
     from thesisrecon.doors import (
         estimate_fundamental,
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from thesisrecon.geometry.pinhole import PinholeCamera
     from thesisrecon.geometry.triangulation import triangulate
     from thesisrecon.pipeline import reconstruct
-    from thesisrecon.two_photographs import synthesize_view
     from thesisrecon.views import render
 
 __version__ = "0.1.0"
@@ -36,7 +36,7 @@ _HOME_OF = {
     "reconstruct": "pipeline",
     "render": "views",
     "self_calibrate": "doors",
-    "synthesize_view": "two_photographs",
+    "synthesize_view": "beyond",
     "triangulate": "geometry.triangulation",
     "upgrade_affine": "doors",
 }

@@ -22,10 +22,10 @@ import PIL.Image
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
+from thesisrecon.beyond import match_photographs
 from thesisrecon.config import PipelineConfig
 from thesisrecon.dense.matching import CohesiveScanlines
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.two_photographs import match_photographs
 from thesisrecon.types import DisparityMap
 from thesisrecon.views.tensor import (
     CalibratedPair,
@@ -251,7 +251,7 @@ def measure_fountain(out: Path | None) -> list[Metric]:
         return []
     (K1, K, K2), (R1, R, R2), (C1, C, C2) = scene.K[4:7], scene.R[4:7], scene.C[4:7]
     found = match_photographs(scene.image_paths[4], scene.image_paths[6])
-    images = [part.image for part in found.photographs]
+    images = found.images
     size = images[0].size
     dense = found.dense.places(0, size), found.dense.places(1, size)
     with PIL.Image.open(scene.image_paths[5]) as image:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 
 import thesisrecon
 from thesisrecon.assumptions import IntrinsicsAssumption
+from thesisrecon.beyond import match_photographs, tensor_film, tensor_views
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import StageFailure
-from thesisrecon.two_photographs import match_photographs, tensor_views
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.view_command import BetweenWishes, write_between
 from thesisrecon.views.tensor import VirtualCamera
 from validation.scenes.real import load_fixture_scene
 
@@ -51,9 +53,9 @@ def test_at_their_own_places_the_photographs_are_seen_again(found):
     guessed = tensor_views(found, config=SMALL)
     np.testing.assert_allclose(guessed.pair.K1[0], [512.0, 0.0, 255.5])
     first, second = (guessed.render(camera) for camera in guessed.along(2))
-    assert np.mean(second != found.photographs[1].image.rgb) < 1e-3
+    assert np.mean(second != found.images[1].rgb) < 1e-3
     # Rounding leaves a corner to its neighbours.
-    assert np.mean(first != found.photographs[0].image.rgb) < 1e-3
+    assert np.mean(first != found.images[0].rgb) < 1e-3
 
 
 def test_what_is_told_of_the_focal_length_is_taken(found):
@@ -86,3 +88,31 @@ def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
 def test_one_photograph_twice_has_no_parallax():
     with pytest.raises(StageFailure):
         match_photographs(SCENE.image_paths[6], SCENE.image_paths[6], config=SMALL)
+
+
+def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
+    paths = tuple(SCENE.image_paths[6:8])
+    made = write_between(tmp_path / "film", BetweenWishes(paths, "tensor", frames=5, max_size_px=320))
+    told = json.loads((tmp_path / "film" / "frames.json").read_text(encoding="utf-8"))
+    assert [frame["baselines"] for frame in told["frames"]] == [-0.5, 0.0, 0.5, 1.0, 1.5]
+    assert told["photographs"] == ["0006.jpg", "0007.jpg"]
+    assert made.size == (320, 240)
+    pictures = []
+    for path in made.frames:
+        with PIL.Image.open(path) as image:
+            pictures.append(np.asarray(image))
+    with PIL.Image.open(SCENE.image_paths[7]) as image:
+        second = np.asarray(image.resize((320, 240), PIL.Image.Resampling.BOX))
+    likeness = [_psnr(picture, second) for picture in pictures]
+    assert np.argmax(likeness) == 3
+    page = (tmp_path / "film" / "strip.html").read_text(encoding="utf-8")
+    assert "0.50 baselines before 0006.jpg" in page
+    assert "0.50 baselines beyond 0007.jpg" in page
+
+
+def test_films_are_of_two_different_photographs(found):
+    first, second = found.images
+    with pytest.raises(UsageError, match="2 photographs; got 3"):
+        tensor_film((first, second, first), 5)
+    with pytest.raises(UsageError, match="the same photograph"):
+        tensor_film((first, first), 5)
