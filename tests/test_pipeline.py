@@ -204,6 +204,12 @@ def test_the_end_is_a_model_unless_told_otherwise(tmp_path: Path) -> None:
     summary = read(tmp_path / "summary.json")
     assert summary["until"] == "model"
     assert summary["model"]["faces"] == len(result.mesh.faces)
+    assert result.held_out is not None
+    assert summary["model"]["held_out"]["name"] == f"{result.held_out.view:02d}.png"
+    # Photographs of noise on a plane have nothing in common: only the numbers are at stake.
+    assert 0.5 < result.held_out.share <= 1.0
+    assert summary["model"]["held_out"]["psnr_db"] == pytest.approx(result.held_out.psnr_db)
+    assert 'id="held-out"' in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert [m["share_known"] for m in summary["depth_maps"]] == [
         pytest.approx(np.isfinite(m.depth).mean()) for m in result.depth_maps
     ]

@@ -205,6 +205,15 @@ class ModelBuilder(Protocol):
         self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
     ) -> TexturedMesh: ...
 
+    def color(
+        self,
+        surface: TexturedMesh,
+        views: Sequence[PinholeView],
+        *,
+        without: int | None = None,
+        threads: int = 1,
+    ) -> TexturedMesh: ...
+
 
 @dataclass(frozen=True)
 class ImageOptions:

@@ -192,6 +192,7 @@ def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: Stage
         affine=affine_of(result) if result.metric is not None else None,
         failure=failure,
         model=_model_for_page(run, result),
+        held_out=result.held_out,
         depth_pictures={m.view: _thinned(m.depth) for m in result.depth_maps},
     )
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.report.synthetic import made_up_run, projective_run
-from thesisrecon.report import HeldOut
-from thesisrecon.types import TexturedMesh
+from thesisrecon.types import HeldOut, TexturedMesh
 
 
 def test_the_metric_reconstruction_goes_before_the_projective_one() -> None:
@@ -55,6 +54,6 @@ def test_a_model_and_its_pictures_must_belong_to_the_run() -> None:
     pixels = np.zeros((4, 6, 3), dtype=np.uint8)
     compared = np.zeros((4, 6), dtype=bool)
     compared[:2] = True
-    assert HeldOut("a.jpg", pixels, pixels, compared, 30.0, 0.9).share == 0.5
+    assert HeldOut(0, pixels, pixels, compared, 30.0, 0.9).share == 0.5
     with pytest.raises(ValueError, match="of one size"):
-        HeldOut("a.jpg", pixels, pixels[:3], compared, 30.0, 0.9)
+        HeldOut(0, pixels, pixels[:3], compared, 30.0, 0.9)

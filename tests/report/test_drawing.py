@@ -9,7 +9,6 @@ import pytest
 from PIL import Image as PillowImage
 
 from tests.report.synthetic import SIZE, made_up_run
-from thesisrecon.report import HeldOut
 from thesisrecon.report.drawing import (
     DIFFERENCE_LIMIT,
     HUES,
@@ -24,6 +23,7 @@ from thesisrecon.report.drawing import (
     spread_matches,
     thumbnail,
 )
+from thesisrecon.types import HeldOut
 
 
 def opened(uri: str) -> PillowImage.Image:
@@ -153,7 +153,7 @@ def test_the_comparison_shows_what_differs() -> None:
     rendered, compared = real.copy(), np.ones((300, 400), dtype=bool)
     rendered[:, 200:] += np.uint8(DIFFERENCE_LIMIT)
     compared[200:] = False
-    pictures = draw_held_out(HeldOut("a.jpg", real, rendered, compared, 20.0, 0.9))
+    pictures = draw_held_out(HeldOut(0, real, rendered, compared, 20.0, 0.9))
     photo, model, apart = (np.asarray(opened(p.uri)).astype(float) for p in pictures)
     assert np.abs(photo - 120).max() < 4
     assert np.abs(model[:190, 210:] - 184).max() < 4
@@ -162,4 +162,4 @@ def test_the_comparison_shows_what_differs() -> None:
     assert lightness(apart[100, 100]) < 20
     assert lightness(apart[100, 300]) > 90
     large = [np.zeros((900, 1200, 3), dtype=np.uint8)] * 2
-    assert draw_held_out(HeldOut("", *large, np.ones((900, 1200), dtype=bool), 0.0, 0.0))[2].width == 640
+    assert draw_held_out(HeldOut(0, *large, np.ones((900, 1200), dtype=bool), 0.0, 0.0))[2].width == 640

@@ -9,8 +9,13 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.dense import MultiViewScene
 from thesisrecon.errors import StageFailure
+from thesisrecon.io.run_directory import code_key
+from thesisrecon.pipeline.held_out import compare_held_out
 from thesisrecon.pipeline.work import Work
-from thesisrecon.types import DepthMap, Image, Reconstruction
+from thesisrecon.types import DepthMap, Image, Reconstruction, TexturedMesh
+
+RENDERER = "thesisrecon.views.render"
+"""What a held-out picture depends on beside the model."""
 
 
 def depth_of_view(config: PipelineConfig, scene: MultiViewScene, view: int) -> DepthMap:
@@ -66,7 +71,18 @@ def build_model(work: Work) -> None:
         key,
         lambda: work.config.model.build(result.depth_maps, result.views, threads=run.workers.threads),
     )
-    work.result = replace(work.result, mesh=mesh)
+    model, threads = work.config.model, run.workers.threads
+
+    def without(view: int) -> TexturedMesh:
+        return model.color(mesh, result.views, without=view, threads=threads)
+
+    held_out = run.kept(
+        "model",
+        "held-out",
+        run.key("model", key, "held-out", code_key(RENDERER)),
+        lambda: compare_held_out(mesh, result.views, without, threads=threads),
+    )
+    work.result = replace(work.result, mesh=mesh, held_out=held_out)
     bare = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())
     counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     run.finish("model", counts=counts, metrics={"share_untextured": bare})

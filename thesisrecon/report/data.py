@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import (
-    B8,
     F32,
+    HeldOut,
     IntrinsicInterval,
     MetricResult,
     PairChoice,
@@ -47,38 +47,6 @@ class Photograph:
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """A photograph that gave the model no texture, beside the model as its camera sees it.
-
-    ``name`` of the photograph; ``real, rendered`` (H, W, 3) uint8, the photograph without its distortion and
-    the picture of the model; ``compared`` (H, W) the pixels that both have and the numbers are of;
-    ``psnr_db`` peak signal-to-noise ratio in dB; ``ssim`` structural similarity, 1 = the same.
-
-    Raises
-    ------
-    ValueError
-        where the pictures and the mask are not of one size.
-    """
-
-    name: str
-    real: U8
-    rendered: U8
-    compared: B8
-    psnr_db: float
-    ssim: float
-
-    def __post_init__(self) -> None:
-        shapes = (self.real.shape, self.rendered.shape, (*self.compared.shape, 3))
-        if len(set(shapes)) > 1:
-            raise ValueError(f"a held-out comparison needs pictures and a mask of one size; got {shapes}")
-
-    @property
-    def share(self) -> float:
-        """Part of the pixels that were compared."""
-        return float(self.compared.mean()) if self.compared.size else 0.0
-
-
-@dataclass(frozen=True)
 class ReportData:
     """Everything ``report.html`` says, for a run that ended well, ended early or failed.
 
@@ -102,7 +70,7 @@ class ReportData:
         a texture, colours of its vertices, or neither; None or without faces = the page has no model.
     depth_pictures : view -> depth (H, W) float32, NaN where unknown, in units of the scene; any size (a long
         side of 400 px is enough), of as many views as have one.
-    held_out : a photograph beside the model, or None.
+    held_out : a photograph beside the model as its camera sees it, or None.
     until : the stage the user asked to end with, None where all were asked for.
     failure : why the run could not go on, None where it did.
 

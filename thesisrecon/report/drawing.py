@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
-from thesisrecon.report.data import HeldOut, Photograph
-from thesisrecon.types import F32, F64, I64, TwoView
+from thesisrecon.report.data import Photograph
+from thesisrecon.types import F32, F64, I64, HeldOut, TwoView
 
 THUMBNAIL_BYTES = 2_000_000
 PANEL_LONG_SIDE = 640

@@ -91,7 +91,21 @@ def _model(result: RunResult) -> dict[str, Any] | None:
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "texture_px": texture,
+        "held_out": _held_out(result),
         "share_untextured": None if mesh.untextured is None else float(mesh.untextured.mean()),
+    }
+
+
+def _held_out(result: RunResult) -> dict[str, Any] | None:
+    """How like an unseen photograph the model is."""
+    held = result.held_out
+    if held is None:
+        return None
+    return {
+        "name": result.images[held.view].name,
+        "psnr_db": held.psnr_db if np.isfinite(held.psnr_db) else None,
+        "ssim": held.ssim,
+        "share_compared": held.share,
     }
 
 

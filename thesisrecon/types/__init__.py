@@ -7,7 +7,14 @@ numbered i, j, k. A view's number is its place in the sorted list of photographs
 """
 
 from thesisrecon.types.arrays import B8, F32, F64, I64, Stratum
-from thesisrecon.types.dense import DepthMap, DisparityMap, PinholeView, RenderedView, TexturedMesh
+from thesisrecon.types.dense import (
+    DepthMap,
+    DisparityMap,
+    HeldOut,
+    PinholeView,
+    RenderedView,
+    TexturedMesh,
+)
 from thesisrecon.types.front_end import (
     Certainty,
     Features,
@@ -43,6 +50,7 @@ __all__ = [
     "DisparityMap",
     "Features",
     "FundamentalFit",
+    "HeldOut",
     "Image",
     "IntrinsicInterval",
     "Matches",

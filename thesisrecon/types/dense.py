@@ -90,3 +90,35 @@ class RenderedView:
     color: NDArray[np.uint8]
     depth: F32
     valid: B8
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A photograph that gave the model no texture, beside the model as its camera sees it.
+
+    ``view`` its number; ``real, rendered`` (H, W, 3) uint8, the photograph without its distortion and the
+    picture of the model; ``compared`` (H, W) the pixels that both have and the numbers are of; ``psnr_db``
+    peak signal-to-noise ratio in dB; ``ssim`` structural similarity, 1 = the same.
+
+    Raises
+    ------
+    ValueError
+        where the pictures and the mask are not of one size.
+    """
+
+    view: int
+    real: NDArray[np.uint8]
+    rendered: NDArray[np.uint8]
+    compared: B8
+    psnr_db: float
+    ssim: float
+
+    def __post_init__(self) -> None:
+        shapes = (self.real.shape, self.rendered.shape, (*self.compared.shape, 3))
+        if len(set(shapes)) > 1:
+            raise ValueError(f"a held-out comparison needs pictures and a mask of one size; got {shapes}")
+
+    @property
+    def share(self) -> float:
+        """Part of the pixels that were compared."""
+        return float(self.compared.mean()) if self.compared.size else 0.0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.types.arrays import I64
-from thesisrecon.types.dense import DepthMap, PinholeView, TexturedMesh
+from thesisrecon.types.dense import DepthMap, HeldOut, PinholeView, TexturedMesh
 from thesisrecon.types.front_end import Features, Image, PairChoice, TwoView
 from thesisrecon.types.reconstruction import MetricResult, Reconstruction, SelfCalibration, Tracks
 
@@ -53,6 +53,7 @@ class RunResult:
     views: tuple[PinholeView, ...] = ()
     depth_maps: tuple[DepthMap, ...] = ()
     mesh: TexturedMesh | None = None
+    held_out: HeldOut | None = None
     reports: tuple[StageReport, ...] = ()
     warnings: tuple[str, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
