@@ -1,0 +1,431 @@
+"""Views by interpolation beside the truth: ``python -m validation.checks.interpolation [PART ...] [-o OUT]``.
+
+``cones``: views 3, 4 and 5 of nine from 2 and 6, beside a cross-dissolve and the same warp with OpenCV's and
+the true disparities. ``courtyard``: rendered anew along the baseline of two of its views and off it, and
+within the triangle of three. ``fountain``: photograph 5 of fountain-P11 from 4 and 6. ``time``: a frame of
+1000 x 700 px. OUT takes the pictures and the plot. The exit code is 1 where a target is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from thesisrecon.between import rectified_pair, relate
+from thesisrecon.config import PipelineConfig
+from thesisrecon.dense.matching import CohesiveScanlines
+from thesisrecon.geometry.camera import camera_centre, camera_from_centre, decompose_camera, project
+from thesisrecon.geometry.multiview import estimate_homography, homography_distances
+from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.types import DisparityMap, Image
+from thesisrecon.views.interpolation import InterpolatedPair, check_monotonicity
+from thesisrecon.views.warping import sample
+from validation.checks.tensor_views import (
+    DIRECTIONS,
+    VIEWS,
+    CourtyardTruth,
+    Measured,
+    Place,
+    courtyard,
+    courtyard_table,
+    draw,
+    linear_range,
+    photograph,
+    places_of_courtyard,
+    save_beside,
+)
+from validation.metrics.pictures import psnr_db, ssim
+from validation.metrics.record import Metric, markdown_table
+from validation.references.semi_global import MODES, OpenCVSemiGlobal
+from validation.scenes.fixtures import SIZE, Pose, courtyard_poses
+from validation.scenes.real import data_root, load_real_scene
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+CONES, ENDS, DISPARITIES = (3, 4, 5), (2, 6), 64
+OVER_SGBM_DB, OVER_DISSOLVE_DB = 0.3, 5.0
+FRAME_SIZE, FRAME_S = (1000, 700), 1.0
+THIRD = 5
+"""View of the courtyard that spans the triangle with the other two."""
+OURS, TRUE, DISSOLVE = "ours", "true disparity", "cross-dissolve"
+
+
+def cones_maps(
+    left: U8, right: U8, folder: Path
+) -> dict[str, tuple[DisparityMap, DisparityMap] | tuple[F32, F32]]:
+    """Disparities of both photographs by every method."""
+
+    def both(match: OpenCVSemiGlobal) -> tuple[F32, F32]:
+        mirrored = match.match(_mirrored(right), _mirrored(left), DISPARITIES)
+        return match.match(left, right, DISPARITIES), np.ascontiguousarray(mirrored[:, ::-1])
+
+    limits = (0, DISPARITIES - 1)
+    matcher = CohesiveScanlines()
+    back = matcher.match(_mirrored(right), _mirrored(left), disparity_range=limits)
+    turned = [np.ascontiguousarray(part[:, ::-1]) for part in (back.disparity, back.confidence)]
+    ours = matcher.match(left, right, disparity_range=limits)
+    theirs = {mode: both(OpenCVSemiGlobal(mode)) for mode in MODES}
+    truth = tuple(_true_disparity(folder / f"disp{k}.png") for k in ENDS)
+    return {
+        OURS: (ours, DisparityMap(turned[0], turned[1], back.sigma_px)),
+        **theirs,
+        TRUE: (truth[0], truth[1]),
+    }
+
+
+def measure_cones(out: Path | None) -> list[Metric]:
+    """Views 3, 4 and 5 by every method, and their means against the targets."""
+    root = data_root()
+    folder = None if root is None else root / "stereo" / "Cones9"
+    if folder is None or not folder.is_dir():
+        print("Cones: not on this machine (THESISRECON_DATA), left out", flush=True)
+        return []
+    images = {k: _rgb(folder / f"im{k}.png") for k in (ENDS[0], *CONES, ENDS[1])}
+    left, right = images[ENDS[0]], images[ENDS[1]]
+    maps = cones_maps(left, right, folder)
+    pairs = {name: rectified_pair(left, right, disparity=found) for name, found in maps.items()}
+    rows: list[Metric] = []
+    for k in CONES:
+        s = (k - ENDS[0]) / (ENDS[1] - ENDS[0])
+        pictures = {name: pair.view(s) for name, pair in pairs.items()}
+        pictures[DISSOLVE] = dissolved(left, right, s)
+        rows += picture_metrics(f"Cones, view {k}", pictures, images[k])
+        if out is not None:
+            save_whole(out / f"cones-{k}.png", [images[k], pictures[OURS]])
+    shares: dict[str, float | None] = {
+        name: 100.0 * check_monotonicity(pair.left.disparity).share for name, pair in pairs.items()
+    }
+    rows.append(Metric("Cones", "pixels that violate monotonicity", "% of known", shares, OURS))
+    return [*rows, *cones_targets(rows)]
+
+
+def cones_targets(rows: list[Metric]) -> list[Metric]:
+    """Means over the three views, and what ours must be above."""
+    scene = "Cones, mean of views 3 to 5"
+    mean = {
+        n: float(np.mean([r.values[n] for r in rows if r.name == "PSNR"]))
+        for n in (OURS, *MODES, TRUE, DISSOLVE)
+    }
+    likeness: dict[str, float | None] = {
+        n: float(np.mean([r.values[n] for r in rows if r.name == "SSIM"])) for n in mean
+    }
+    target = max(mean[mode] for mode in MODES) + OVER_SGBM_DB
+    over: dict[str, float | None] = {n: mean[n] - mean[DISSOLVE] for n in mean}
+    return [
+        Metric(scene, "PSNR", "dB", dict(mean), OURS, target, at_most=False, note="the better SGBM + 0.3"),
+        Metric(scene, "over cross-dissolve", "dB", over, OURS, OVER_DISSOLVE_DB, at_most=False),
+        Metric(scene, "SSIM", "", likeness, OURS),
+        Metric(scene, "true disparity over this", "dB", {n: mean[TRUE] - mean[n] for n in mean}, OURS),
+    ]
+
+
+def camera_between(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
+    """The camera (3, 4) that the view at s is of, given those of the photographs.
+
+    In the rectified frame both have their rows and depths in common up to a scale, so that the interpolated
+    place of every point is its image in (1 - s) P_0 + s P_1 (Seitz and Dyer).
+    """
+    first, second = (H @ camera for H, camera in zip(pair.H, P, strict=True))
+    # What is common is so but for the errors of F.
+    scale = float(np.sum(first[1:] * second[1:]) / np.sum(second[1:] ** 2))
+    return np.asarray(pair.frame.original_from_rectified(s) @ ((1.0 - s) * first + s * scale * second))
+
+
+def pose_of(P: F64) -> Pose:
+    """K, R, C of a camera."""
+    K, R, t = decompose_camera(P)
+    return Pose(K, R, -R.T @ t)
+
+
+def cameras_of(truth: CourtyardTruth) -> tuple[F64, F64]:
+    """The cameras (3, 4) of both photographs."""
+    one, two = (camera_from_centre(pose.K, pose.R, pose.C) for pose in truth.poses)
+    return one, two
+
+
+@dataclass(frozen=True)
+class Yard:
+    """The courtyard, its interpolated ``pair``, points ``X`` (N, 3) that both photographs see and their
+    pixels ``xy1``, ``xy2``."""
+
+    truth: CourtyardTruth
+    pair: InterpolatedPair
+    X: F64
+    xy1: F64
+    xy2: F64
+
+
+def prepare_yard() -> Yard:
+    """Match the courtyard's photographs; exact points from its true places."""
+    truth = courtyard()
+    images = [Image(f"{k}", rgb, SIZE) for k, rgb in zip(VIEWS, truth.photographs, strict=True)]
+    y, x = np.indices(truth.places[0].shape[:2])[:, ::8, ::8].reshape(2, -1).astype(np.float64)
+    xy1, xy2 = np.stack([x, y], axis=1), truth.places[0][::8, ::8].reshape(-1, 2).astype(np.float64)
+    inside = np.all((xy2 > 0.0) & (xy2 < np.array(SIZE)), axis=1)
+    xy1, xy2 = xy1[inside], xy2[inside]
+    Xh = triangulate_linear(np.stack(cameras_of(truth)), np.stack([xy1, xy2]))
+    return Yard(truth, relate(images[0], images[1]), Xh[:, :3] / Xh[:, 3:], xy1, xy2)
+
+
+def measure_place(yard: Yard, place: Place, out: Path | None) -> Measured:
+    """The nearest view between the photographs beside the picture taken from ``place``.
+
+    Between them it is compared as it is. Elsewhere, where interpolation cannot go, the camera keeps its
+    orientation, and the view is turned onto its picture by the best homography: what is left is parallax.
+    """
+    P = cameras_of(yard.truth)
+    s = min(max(place.s, 0.0), 1.0)
+    pose = pose_of(camera_between(yard.pair, P, s))
+    step = yard.truth.poses[1].C - yard.truth.poses[0].C
+    beyond = (place.s - s) * step
+    if place.off:
+        beyond = beyond + place.off * np.linalg.norm(step) * (
+            pose.R.T @ np.array(DIRECTIONS[place.direction])
+        )
+    moved = Pose(pose.K, pose.R, pose.C + beyond)
+    there = project(camera_from_centre(moved.K, moved.R, moved.C), yard.X)
+    here = yard.pair.frame.points(yard.xy1, yard.xy2, s)
+    picture, kept = yard.pair.view(s, threads=2), np.ones(SIZE[::-1], dtype=bool)
+    if place.distance:
+        H = best_homography(here, there)
+        here, (picture, kept) = _through(H, here), turned(picture, H)
+    off = np.linalg.norm(here - there, axis=1)
+    wanted = photograph(yard.truth.world, moved)
+    if out is not None:
+        name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
+        save_beside(out / name, [wanted, picture])
+    likeness = ssim(np.where(kept[..., None], picture, wanted), wanted)
+    errors = float(np.median(off)), float(np.quantile(off, 0.9))
+    return Measured(place, "interpolation", psnr_db(picture, wanted, where=kept), likeness, errors)
+
+
+def measure_courtyard(out: Path | None) -> tuple[list[Measured], list[Metric]]:
+    """All places, and the triangle of three photographs."""
+    yard = prepare_yard()
+    rows = [measure_place(yard, place, out) for place in (*between_places(), *places_of_courtyard())]
+    rows = list({row.place: row for row in rows}.values())
+    return rows, [measure_triangle(yard, out)]
+
+
+def between_places() -> list[Place]:
+    """More of them between the photographs."""
+    return [Place(s) for s in (0.125, 0.375, 0.625, 0.875)]
+
+
+def measure_triangle(yard: Yard, out: Path | None) -> Metric:
+    """The middle of the triangle that a third photograph spans, interpolated twice, and the two edges of
+    it."""
+    pose = courtyard_poses()[THIRD]
+    third = Image(str(THIRD), photograph(yard.truth.world, Pose(pose.K, pose.R, pose.C)), SIZE)
+    middle = Image("middle", yard.pair.view(0.5), SIZE)
+    P_third = camera_from_centre(pose.K, pose.R, pose.C)
+    P_middle = camera_between(yard.pair, cameras_of(yard.truth), 0.5)
+    second = relate(middle, third)
+    values: dict[str, float | None] = {}
+    for name, t in (("a third towards the third", 1.0 / 3.0), ("half way", 0.5)):
+        P = camera_between(second, (P_middle, P_third), t)
+        wanted, picture = photograph(yard.truth.world, pose_of(P)), second.view(t)
+        values[name] = psnr_db(picture, wanted)
+        if out is not None:
+            save_beside(out / f"courtyard-triangle-{t:.2f}.jpg", [wanted, picture])
+    return Metric("courtyard, three photographs", "PSNR", "dB", values, "half way")
+
+
+def measure_fountain(out: Path | None) -> list[Metric]:
+    """Photograph 5 from 4 and 6: the view nearest to it, as it is and turned onto it."""
+    scene = load_real_scene("fountain-P11")
+    if scene is None or scene.K is None or scene.R is None or scene.C is None:
+        print("fountain-P11: not on this machine (THESISRECON_DATA), left out", flush=True)
+        return []
+    first, wanted, second = (Image(str(k), _rgb(scene.image_paths[k]), (0, 0)) for k in (4, 5, 6))
+    pair = relate(first, second)
+    P4, P6 = (camera_from_centre(scene.K[k], scene.R[k], scene.C[k]) for k in (4, 6))
+    s = nearest_place(pair, (P4, P6), scene.C[5])
+    view, (width, height) = pair.view(s, threads=2), pair.size
+    rays = scene.R[5].T @ np.linalg.inv(scene.K[5])
+    seen = pose_of(camera_between(pair, (P4, P6), s))
+    # Of two cameras in one place every picture is the other's through this.
+    infinite = np.linalg.inv(seen.K @ seen.R @ rays)
+    matches = pair_matches(view, wanted.rgb)
+    best = best_homography(*matches)
+    pictures = {
+        "as it is": view,
+        "turned as camera 5": turned(view, infinite)[0],
+        "turned best": turned(view, best)[0],
+    }
+    pictures[DISSOLVE] = dissolved(first.rgb, second.rgb, s)
+    ends = [
+        turned(one.rgb, best_homography(*pair_matches(one.rgb, wanted.rgb)))[0] for one in (first, second)
+    ]
+    pictures["cross-dissolve, both turned best"] = dissolved(ends[0], ends[1], s)
+    if out is not None:
+        save_beside(out / "fountain-5.jpg", [wanted.rgb, pictures["turned best"], pictures[DISSOLVE]])
+        save_whole(out / "fountain-5-view.png", [pictures["turned best"]])
+    inner = np.zeros((height, width), dtype=bool)
+    inner[height // 8 : -height // 8, width // 8 : -width // 8] = True
+    metrics = picture_metrics("fountain-P11, 5 from 4 and 6", pictures, wanted.rgb)
+    values: dict[str, float | None] = {n: psnr_db(p, wanted.rgb, where=inner) for n, p in pictures.items()}
+    off = np.linalg.norm(camera_centre_of(pair, (P4, P6), s) - scene.C[5]) / np.linalg.norm(
+        scene.C[6] - scene.C[4]
+    )
+    return [
+        *metrics,
+        Metric(metrics[0].scene, "PSNR of the inner nine sixteenths", "dB", values, "turned best"),
+        Metric(
+            metrics[0].scene, "camera 5 off the baseline", "baselines", {"as it is": float(off)}, "as it is"
+        ),
+        Metric(metrics[0].scene, "s", "", {"as it is": s}, "as it is"),
+    ]
+
+
+def camera_centre_of(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
+    """(3,) where the view at s is taken from."""
+    C = camera_centre(camera_between(pair, P, s))
+    return np.asarray(C[:3] / C[3])
+
+
+def nearest_place(pair: InterpolatedPair, P: tuple[F64, F64], C: F64) -> float:
+    """The s, to a hundredth, whose camera is nearest to C (3,)."""
+    places = np.linspace(0.0, 1.0, 101)
+    return float(places[np.argmin([np.linalg.norm(camera_centre_of(pair, P, s) - C) for s in places])])
+
+
+def pair_matches(first: U8, second: U8) -> tuple[F64, F64]:
+    """Verified matches of two pictures."""
+    from thesisrecon import match_pair
+
+    pair = match_pair(first, second)
+    return pair.xy1, pair.xy2
+
+
+def best_homography(xy1: F64, xy2: F64) -> F64:
+    """Least squares over the nine tenths of the points that fit best."""
+    kept = np.ones(len(xy1), dtype=bool)
+    H = estimate_homography(xy1, xy2)
+    for _ in range(3):
+        off = homography_distances(H, xy1, xy2)
+        kept = off <= np.quantile(off, 0.9)
+        H = estimate_homography(xy1[kept], xy2[kept])
+    return H
+
+
+def turned(picture: U8, H: F64) -> tuple[U8, NDArray[np.bool_]]:
+    """The picture through H (3, 3), black outside, and where it has pixels."""
+    height, width = picture.shape[:2]
+    y, x = np.indices((height, width), dtype=np.float64)
+    back: F64 = np.asarray(np.linalg.inv(H), dtype=np.float64)
+    source = _through(back, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(height, width, 2)
+    rgb = sample(picture.astype(np.float32), source.astype(np.float32), threads=2)
+    kept = np.isfinite(rgb[..., 0])
+    return np.clip(np.rint(np.nan_to_num(rgb)), 0, 255).astype(np.uint8), kept
+
+
+def _through(H: F64, xy: F64) -> F64:
+    xh = np.column_stack([xy, np.ones(len(xy))]) @ H.T
+    return np.asarray(xh[:, :2] / xh[:, 2:])
+
+
+def picture_metrics(scene: str, pictures: Mapping[str, U8], wanted: U8) -> list[Metric]:
+    """PSNR and SSIM of every picture."""
+    judged = next(iter(pictures))
+    return [
+        Metric(scene, "PSNR", "dB", {n: psnr_db(p, wanted) for n, p in pictures.items()}, judged),
+        Metric(scene, "SSIM", "", {n: ssim(p, wanted) for n, p in pictures.items()}, judged),
+    ]
+
+
+def measure_time(repeats: int) -> Metric:
+    """A frame of 1000 x 700 px between photographs as large, once the correspondence is known."""
+    width, height = FRAME_SIZE
+    rng = np.random.default_rng(0)
+    y, x = np.indices((height, width))
+    d = (20.0 + 8.0 * np.sin(x / 90.0) + 25.0 * ((x // 160 + y // 140) % 2)).astype(np.float32)
+    left = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
+    right = np.take_along_axis(left, np.clip(x + np.rint(d).astype(int), 0, width - 1)[..., None], axis=1)
+    pair = rectified_pair(left, right, disparity=d, config=PipelineConfig())
+    wall, processor = [], []
+    for _ in range(repeats + 1):  # the first compiles and prepares
+        start = time.perf_counter(), time.process_time()
+        pair.view(0.4, threads=2)
+        wall.append(time.perf_counter() - start[0])
+        processor.append(time.process_time() - start[1])
+    values: dict[str, float | None] = {"wall, 2 threads": min(wall[1:]), "processor": min(processor[1:])}
+    return Metric("1000 x 700", "time of a frame", "s", values, "processor", target=FRAME_S)
+
+
+def dissolved(first: U8, second: U8, share: float) -> U8:
+    """Both pictures mixed where they are."""
+    mixed = (1.0 - share) * first.astype(np.float64) + share * second
+    return np.asarray(np.rint(mixed), dtype=np.uint8)
+
+
+def save_whole(path: Path, pictures: list[U8]) -> None:
+    """Pictures in a row."""
+    PIL.Image.fromarray(np.concatenate(pictures, axis=1)).save(path)
+
+
+def _mirrored(image: U8) -> U8:
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def _rgb(path: Path) -> U8:
+    with PIL.Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def _true_disparity(path: Path) -> F32:
+    with PIL.Image.open(path) as image:
+        quarters = np.asarray(image, dtype=np.float32)
+    return np.where(quarters > 0.0, 0.25 * quarters, np.nan).astype(np.float32)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print, write if asked, and say whether every target was reached."""
+    parser = argparse.ArgumentParser(prog="python -m validation.checks.interpolation", description=__doc__)
+    parser.add_argument("parts", nargs="*", default=["cones", "fountain", "courtyard", "time"])
+    parser.add_argument("-o", "--out", type=Path)
+    parser.add_argument("--repeats", type=int, default=5)
+    wishes = parser.parse_args(arguments)
+    if wishes.out is not None:
+        wishes.out.mkdir(parents=True, exist_ok=True)
+    rows: list[Metric] = []
+    if "cones" in wishes.parts:
+        rows += measure_cones(wishes.out)
+    if "fountain" in wishes.parts:
+        rows += measure_fountain(wishes.out)
+    if "time" in wishes.parts:
+        rows.append(measure_time(wishes.repeats))
+    text = [table_of(scene, rows) for scene in dict.fromkeys(row.scene for row in rows)]
+    if "courtyard" in wishes.parts:
+        measured, more = measure_courtyard(wishes.out)
+        rows += more
+        reach, slope = linear_range(measured, "interpolation")
+        text.append(f"### courtyard\n\n{courtyard_table(measured)}")
+        text.append(f"{slope:.2f} px a baseline beyond the ends, linear to {reach:g} baselines")
+        text += [table_of(scene, more) for scene in dict.fromkeys(row.scene for row in more)]
+        if wishes.out is not None:
+            draw(measured).write_html(wishes.out / "interpolation.html", include_plotlyjs=True)
+    told = "\n\n".join(text)
+    print(told)
+    if wishes.out is not None:
+        (wishes.out / "interpolation.md").write_text(told + "\n", encoding="utf-8")
+    return int(any(row.verdict == "missed" for row in rows))
+
+
+def table_of(scene: str, rows: list[Metric]) -> str:
+    """The rows of one scene under its name."""
+    return f"### {scene}\n\n{markdown_table([row for row in rows if row.scene == scene])}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
