@@ -32,7 +32,7 @@ def test_gains_are_found(sphere: TexturedMesh) -> None:
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
     found = BlendedViews().prepare(sphere, views).gains
     wanted = np.exp(np.log(GAINS).mean()) / np.array(GAINS)
-    np.testing.assert_allclose(found, np.repeat(wanted[:, None], 3, axis=1), atol=0.01)
+    np.testing.assert_allclose(found, np.repeat(wanted[:, None], 3, axis=1), atol=0.025)
     np.testing.assert_array_equal(BlendedViews(level=False).prepare(sphere, views).gains, 1.0)
 
 

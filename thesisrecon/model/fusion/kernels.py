@@ -15,24 +15,28 @@ SIDE = 8
 
 
 @njit(cache=True, nogil=True)
-def touched_blocks(depth: F32, rays: F64, centre: F64, reach: float, edge: float, marked: U8) -> None:
-    """Mark the blocks (X, Y, Z) that the surface may pass: those within ``reach`` of a point before and
-    behind along its ray.
+def touched_blocks(
+    depth: F32, lean: F32, rays: F64, centre: F64, reach: float, edge: float, marked: U8
+) -> None:
+    """Mark the blocks (X, Y, Z) that the surface may pass: those on a ray before and behind its point as
+    long as the ray is within ``reach`` of the surface.
 
-    ``rays`` (3, 3) takes (x, y, 1) to the point at depth 1 less ``centre`` (3,), which counts from the
-    grid's origin; ``edge`` is the side of a block. Points outside of the grid mark nothing.
+    ``lean`` (H, W) is how far a ray comes off the surface for a unit of depth. ``rays`` (3, 3) takes
+    (x, y, 1) to the point at depth 1 less ``centre`` (3,), which counts from the grid's origin; ``edge`` is
+    the side of a block. Points outside of the grid mark nothing.
     """
-    steps = int(np.ceil(2.0 * reach / (0.5 * edge))) + 1
     for y in range(depth.shape[0]):
         for x in range(depth.shape[1]):
             z = depth[y, x]
             if not z > 0.0:
                 continue
+            along = reach / lean[y, x]
+            steps = int(np.ceil(2.0 * along / (0.5 * edge))) + 1
             dx = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
             dy = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
             dz = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
             for s in range(steps):
-                r = z + reach * (2.0 * s / (steps - 1) - 1.0)
+                r = z + along * (2.0 * s / (steps - 1) - 1.0)
                 i = int(np.floor((centre[0] + r * dx) / edge))
                 j = int(np.floor((centre[1] + r * dy) / edge))
                 k = int(np.floor((centre[2] + r * dz) / edge))
@@ -47,6 +51,7 @@ def integrate_view(
     voxel: float,
     depth: F32,
     std: F32,
+    lean: F32,
     slope: float,
     truncation: float,
     value: F32,
@@ -55,10 +60,12 @@ def integrate_view(
     """Add one depth map to the signed distances of blocks (Curless and Levoy 1996).
 
     ``blocks`` (B, 3) grid places; ``P`` (3, 4) = K [R t] of the map, the centre of the first voxel the
-    origin; ``value`` and ``weight`` (B, 8, 8, 8) are updated: the weighted mean of the distance in depth to
-    the surface, in units of ``truncation``, cut at 1. A view weighs by 1 / (std^2 + (truncation / 8)^2).
-    What lies more than ``truncation`` behind a surface is not seen. ``slope`` is the largest relative step in
-    depth from one pixel to the next on one surface.
+    origin; ``lean`` (H, W) how far a ray comes off the surface for a unit of depth. ``value`` and ``weight``
+    (B, 8, 8, 8) are updated: the weighted mean of the distance to the surface, in units of ``truncation``,
+    cut at 1. What lies more than ``truncation`` behind a surface is not seen. A view weighs by
+    lean^4 / (s^2 + (truncation / 8)^2), s the deviation across the surface: the surface is taken to be plane
+    as far as the ray is near it, and the error of that grows with 1 / lean^2. ``slope`` is the largest
+    relative step in depth from one pixel to the next on one surface.
     """
     height, width = depth.shape
     base = (truncation / 8.0) ** 2
@@ -77,12 +84,15 @@ def integrate_view(
                     if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
                         continue
                     seen, spread = _depth_at(depth, std, slope, u, v)
-                    distance = seen - z
+                    leaning = lean[int(v + 0.5), int(u + 0.5)]
+                    distance = leaning * (seen - z)
                     if not distance > -truncation:
                         continue
-                    own = 1.0 / (spread * spread + base)
+                    own = 1.0 / (leaning * leaning * spread * spread + base)
                     if distance > truncation:
                         distance = truncation
+                    else:
+                        own *= leaning**4
                     total = weight[b, i, j, k] + own
                     mean = value[b, i, j, k]
                     value[b, i, j, k] = np.float32(mean + own / total * (distance / truncation - mean))

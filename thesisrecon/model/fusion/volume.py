@@ -1,7 +1,8 @@
 """Depth maps fused in a sparse grid of signed distances, and the surface in it.
 
-Each voxel holds the weighted mean of the distances that the views measure (Curless and Levoy 1996), views
-that look past it count as well, and the surface is where the mean is 0. Only blocks of voxels that a depth
+Each voxel holds the weighted mean of the distances that the views measure (Curless and Levoy 1996), across
+the surface and not along the rays, so that ground seen at a slant is as thick as a wall; views that look past
+it count as well, and the surface is where the mean is 0. Only blocks of voxels that a depth
 map comes near to exist. The surface is taken out as a net (Gibson 1998): one vertex a cell, which unlike
 the corners of marching cubes makes no slivers.
 """
@@ -13,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import decompose_camera
@@ -25,6 +27,9 @@ from thesisrecon.model.fusion.kernels import (
 )
 from thesisrecon.model.mesh import keep_large_parts, without_unused_vertices
 from thesisrecon.types import F32, F64, I64, DepthMap, TexturedMesh
+
+FLATTEST = 0.1
+"""Surfaces seen more flatly than this count as seen so: what they measure across themselves is little."""
 
 FINER = 1.15
 """Factor by which voxels grow until their blocks fit into the memory that is allowed."""
@@ -54,7 +59,7 @@ class VolumetricFusion:
     voxel_px: float = 1.5
     truncation_voxels: float = 4.0
     max_blocks: int = 250_000
-    grazing_deg: float = 10.0
+    grazing_deg: float = 5.0
     least_part: float = 0.002
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
@@ -62,9 +67,9 @@ class VolumetricFusion:
 
         The result does not depend on ``threads``. Raises :class:`StageFailure` where the maps have no depth.
         """
-        depth_maps = [_facing(depth_map, self._slope(depth_map)) for depth_map in depth_maps]
         with ThreadPoolExecutor(max(threads, 1)) as pool:
-            grid, truncation = self._lay_out(depth_maps)
+            measured = list(pool.map(lambda m: _measured(m, self.grazing_deg), depth_maps))
+            grid, truncation, measured = self._lay_out(measured)
             value = np.zeros((len(grid.blocks), SIDE, SIDE, SIDE), dtype=np.float32)
             weight = np.zeros_like(value)
             parts = np.array_split(np.arange(len(grid.blocks)), 4 * max(threads, 1))
@@ -72,8 +77,8 @@ class VolumetricFusion:
             def integrate(part: I64) -> None:
                 if len(part):
                     some = slice(int(part[0]), int(part[-1]) + 1)
-                    for depth_map in depth_maps:
-                        self._integrate(grid, truncation, depth_map, some, value, weight)
+                    for one in measured:
+                        _integrate(grid, truncation, one, some, value, weight)
 
             list(pool.map(integrate, parts))
         mesh = extract_surface(grid, value, weight)
@@ -81,41 +86,71 @@ class VolumetricFusion:
             raise nothing_to_fuse()
         return keep_large_parts(mesh, self.least_part)
 
-    def _lay_out(self, depth_maps: Sequence[DepthMap]) -> tuple[Grid, float]:
-        """The blocks that the surface may pass, and where distances are cut."""
-        footprints = [_footprint(m)[np.isfinite(m.depth)] for m in depth_maps]
+    def _lay_out(self, measured: list[Measured]) -> tuple[Grid, float, list[Measured]]:
+        """The blocks that the surface may pass, where distances are cut, and the depths that are sure enough
+        for that."""
+        footprints = [(m.depth / np.float32(m.focal))[np.isfinite(m.depth)] for m in measured]
         if not sum(map(len, footprints)):
             raise nothing_to_fuse()
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
             truncation = self.truncation_voxels * voxel
-            sure = [_sure(m, truncation) for m in depth_maps]
-            grid = _grid(depth_maps, sure, voxel, truncation)
+            sure = [m.sure(truncation) for m in measured]
+            grid = _grid(sure, voxel, truncation)
             if grid is not None and len(grid.blocks) <= self.max_blocks:
-                return grid, truncation
+                return grid, truncation, sure
             voxel *= FINER
 
-    def _slope(self, depth_map: DepthMap) -> float:
-        """Largest step in depth from one pixel to the next on one surface, in units of the depth."""
-        return float(1.0 / (_focal(depth_map) * np.tan(np.radians(self.grazing_deg))))
 
-    def _integrate(
-        self, grid: Grid, truncation: float, depth_map: DepthMap, some: slice, value: F32, weight: F32
-    ) -> None:
-        K, R, t = decompose_camera(depth_map.P)
-        P = K @ np.column_stack([R, t + R @ grid.origin])
-        depth, slope = _sure(depth_map, truncation), self._slope(depth_map)
-        integrate_view(
-            grid.blocks[some],
-            P,
-            grid.voxel,
-            depth,
-            depth_map.std,
-            slope,
-            truncation,
-            value[some],
-            weight[some],
-        )
+@dataclass(frozen=True)
+class Measured:
+    """A depth map as the grid takes it: ``P`` (3, 4), ``focal`` in pixels, ``depth`` and ``std`` (H, W),
+    ``lean`` (H, W) how far a ray comes off the surface for a unit of depth, ``slope`` the largest step in
+    depth from one pixel to the next on one surface, in units of the depth."""
+
+    P: F64
+    focal: float
+    depth: F32
+    std: F32
+    lean: F32
+    slope: float
+
+    def sure(self, truncation: float) -> Measured:
+        """Without depths whose deviation across the surface a grid of this resolution cannot hold."""
+        with np.errstate(invalid="ignore"):
+            held = self.std * self.lean <= truncation
+        return replace(self, depth=np.where(held, self.depth, np.float32(np.nan)))
+
+    @property
+    def rays(self) -> tuple[F64, F64]:
+        """What takes (x, y, 1) to the point at depth 1 less the centre (3, 3), and the centre (3,)."""
+        K, R, t = decompose_camera(self.P)
+        return np.ascontiguousarray(R.T @ np.linalg.inv(K)), -R.T @ t
+
+
+def _measured(depth_map: DepthMap, grazing_deg: float) -> Measured:
+    K = decompose_camera(depth_map.P)[0]
+    focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+    slope = float(1.0 / (focal * np.tan(np.radians(grazing_deg))))
+    facing = _facing(depth_map, slope)
+    return Measured(facing.P, focal, facing.depth, facing.std, leaning(facing.depth, K), slope)
+
+
+def _integrate(grid: Grid, truncation: float, one: Measured, some: slice, value: F32, weight: F32) -> None:
+    K, R, t = decompose_camera(one.P)
+    P = K @ np.column_stack([R, t + R @ grid.origin])
+    integrate_view(
+        grid.blocks[some],
+        P,
+        grid.voxel,
+        one.depth,
+        one.std,
+        one.lean,
+        one.slope,
+        truncation,
+        value[some],
+        weight[some],
+    )
 
 
 def nothing_to_fuse() -> StageFailure:
@@ -127,20 +162,32 @@ def nothing_to_fuse() -> StageFailure:
     )
 
 
-def _sure(depth_map: DepthMap, truncation: float) -> F32:
-    """Depths (H, W) without those whose deviation a grid of this resolution cannot hold."""
+def leaning(depth: F32, K: F64) -> F32:
+    """(H, W) how far a ray comes off its surface for a unit of depth: 1 seen straight on, towards 0 along it.
+
+    Inverse depth is linear in the pixel on a plane, and its gradient with the ray gives the plane. Of the
+    steps to the two neighbours the gentler counts, meaned over 3 x 3 pixels; at least ``FLATTEST``.
+    """
+    with np.errstate(divide="ignore"):
+        inverse = np.float32(1.0) / depth
+    known = np.isfinite(inverse)
+    share = np.maximum(uniform_filter(known.astype(np.float32), 3), np.float32(1e-6))
+    a, b = (uniform_filter(np.nan_to_num(_gentler(inverse, axis)), 3) / share for axis in (1, 0))
+    y, x = np.indices(inverse.shape, dtype=np.float32)
+    # Pixels (x, y, 1) of inverse depth (a, b, c) . (x, y, 1) are of the plane with the normal K' (a, b, c).
+    c = inverse - a * x - b * y
+    normal = np.einsum("ji,j...->i...", K.astype(np.float32), np.stack([a, b, c]))
+    lean = inverse / np.sqrt((normal**2).sum(axis=0))
+    return np.where(known, np.maximum(lean, np.float32(FLATTEST)), np.float32(1.0))
+
+
+def _gentler(values: F32, axis: int) -> F32:
+    """(H, W) the smaller of the steps from the neighbour before and to the one after, NaN without either."""
+    step = np.diff(values, axis=axis)
+    before = np.insert(step, 0, np.nan, axis=axis)
+    after = np.insert(step, step.shape[axis], np.nan, axis=axis)
     with np.errstate(invalid="ignore"):
-        return np.where(depth_map.std <= truncation, depth_map.depth, np.float32(np.nan))
-
-
-def _footprint(depth_map: DepthMap) -> F32:
-    """(H, W) width of a pixel at its depth."""
-    return np.asarray(depth_map.depth / np.float32(_focal(depth_map)))
-
-
-def _focal(depth_map: DepthMap) -> float:
-    K = decompose_camera(depth_map.P)[0]
-    return float(np.sqrt(K[0, 0] * K[1, 1]))
+        return np.where((np.abs(after) < np.abs(before)) | np.isnan(before), after, before)
 
 
 def _facing(depth_map: DepthMap, slope: float) -> DepthMap:
@@ -151,22 +198,19 @@ def _facing(depth_map: DepthMap, slope: float) -> DepthMap:
     depth = depth_map.depth
     steepest = np.zeros_like(depth)
     for axis in (0, 1):
-        step = np.abs(np.diff(depth, axis=axis))
-        before = np.insert(step, 0, np.nan, axis=axis)
-        after = np.insert(step, step.shape[axis], np.nan, axis=axis)
-        steepest = np.hypot(steepest, np.nan_to_num(np.fmin(before, after)))
+        steepest = np.hypot(steepest, np.nan_to_num(_gentler(depth, axis)))
     with np.errstate(invalid="ignore"):
         flat = steepest > np.maximum(slope * depth, 3.0 * depth_map.std)
     return replace(depth_map, depth=np.where(flat, np.float32(np.nan), depth))
 
 
-def _grid(depth_maps: Sequence[DepthMap], sure: Sequence[F32], voxel: float, reach: float) -> Grid | None:
+def _grid(measured: Sequence[Measured], voxel: float, reach: float) -> Grid | None:
     """The blocks within ``reach`` of any depth; None where the box about them is too large to be listed."""
-    rays = [_rays(m.P) for m in depth_maps]
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for depth, (directions, centre) in zip(sure, rays, strict=True):
-        y, x = np.nonzero(np.isfinite(depth))
-        xyz = centre + depth[y, x, None] * (np.stack([x, y, np.ones_like(x)], axis=1) @ directions.T)
+    for one in measured:
+        directions, centre = one.rays
+        y, x = np.nonzero(np.isfinite(one.depth))
+        xyz = centre + one.depth[y, x, None] * (np.stack([x, y, np.ones_like(x)], axis=1) @ directions.T)
         if len(xyz):
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
     if not np.isfinite(low).all():
@@ -177,18 +221,13 @@ def _grid(depth_maps: Sequence[DepthMap], sure: Sequence[F32], voxel: float, rea
     if np.prod(shape.astype(float)) > 2e8:
         return None
     marked = np.zeros(tuple(shape), dtype=np.uint8)
-    for depth, (directions, centre) in zip(sure, rays, strict=True):
-        touched_blocks(depth, directions, centre - origin, reach, edge, marked)
+    for one in measured:
+        directions, centre = one.rays
+        touched_blocks(one.depth, one.lean, directions, centre - origin, reach, edge, marked)
     blocks = np.argwhere(marked).astype(np.int64)
     place = np.full(marked.shape, -1, dtype=np.int64)
     place[tuple(blocks.T)] = np.arange(len(blocks))
     return Grid(origin, voxel, blocks, place)
-
-
-def _rays(P: F64) -> tuple[F64, F64]:
-    """What takes (x, y, 1) to the point at depth 1 less the centre (3, 3), and the centre (3,)."""
-    K, R, t = decompose_camera(P)
-    return np.ascontiguousarray(R.T @ np.linalg.inv(K)), -R.T @ t
 
 
 def extract_surface(grid: Grid, value: F32, weight: F32) -> TexturedMesh:

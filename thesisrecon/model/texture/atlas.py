@@ -176,8 +176,8 @@ def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> t
 def _surroundings(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> np.ndarray:
     """(M, 3) uint8: the colour of seen faces, carried from face to face to those that are not."""
     neighbours = face_neighbours(mesh.faces)
-    x, y = np.rint(uv.mean(axis=1)).astype(np.int64).T
-    color = np.where(label[:, None] >= 0, texture[np.clip(y, 0, len(texture) - 1), x], 0).astype(np.float64)
+    x, y = np.clip(np.rint(uv.mean(axis=1)).astype(np.int64), 0, np.array(texture.shape[1::-1]) - 1).T
+    color = np.where(label[:, None] >= 0, texture[y, x], 0).astype(np.float64)
     known = label >= 0
     while not known.all():
         open_ = np.flatnonzero(~known)
