@@ -67,7 +67,7 @@ def render_difference(path: Path, mine: F64, other: F64, reach: float) -> None:
         low, high = np.quantile(mine, [0.05, 0.95], axis=0)
         middle, extent = 0.5 * (low + high), float(np.linalg.norm(high - low))
         # Cameras of ours and of the truths look along z with y down.
-        eye = middle + extent * np.array([0.35, -0.35, -1.2])
+        eye = middle + extent * np.array([0.25, -0.3, -0.75])
         renderer.setup_camera(50.0, middle, eye, [0.0, -1.0, 0.0])
         o3d.io.write_image(str(path), renderer.render_to_image())
     finally:

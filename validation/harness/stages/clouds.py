@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from thesisrecon.geometry.alignment import Similarity, estimate_similarity
 from thesisrecon.geometry.camera import camera_centre
-from thesisrecon.types import F64, Reconstruction
+from thesisrecon.types import F64, I64, Reconstruction
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import COLMAP, COLMAP_PP, MATCHES, OURS, read_model
@@ -21,6 +22,8 @@ from validation.scenes.real import Scene
 NEAR_PCT = 0.5
 """A point has a partner where the other cloud has one within this share of its distance from the cameras."""
 PLOTTED = 6000
+SAME_PX = 1.0
+"""Points of two models are one where they were seen this near each other."""
 
 
 class CloudsStage:
@@ -69,6 +72,7 @@ class CloudsStage:
                 notes.append(f"{name}: too few cameras in common to bring the clouds together.")
                 continue
             mine, other, unit = clouds
+            metrics += _same_points(scene, name, ours, theirs, clouds)
             metrics += _metrics(scene, name, mine, other, unit, notes)
             plots.append(_plot(name, mine, other, unit))
             pictures += _pictures(wishes.place(self.name, scene), name, mine, other, unit, notes)
@@ -92,6 +96,65 @@ def _common_frame(
     mine, other = (_moved(m, moves[n]) for n, m in (("ours", ours), ("theirs", theirs)))
     distance = np.linalg.norm(other[:, None] - target[None], axis=2)
     return mine, other, float(np.median(distance))
+
+
+def same_points(ours: Reconstruction, theirs: Reconstruction) -> I64:
+    """Pairs (M, 2) of valid points, as places among the valid ones, that stand for one point of the scene.
+
+    They were seen within ``SAME_PX`` of each other in more photographs than any other pair of either.
+    """
+    votes: Counter[tuple[int, int]] = Counter()
+    for view in np.flatnonzero(ours.registered & theirs.registered):
+        (xy1, point1), (xy2, point2) = (_seen(model, int(view)) for model in (ours, theirs))
+        if not len(xy1) or not len(xy2):
+            continue
+        distance, nearest = cKDTree(xy2).query(xy1, distance_upper_bound=SAME_PX)
+        near = np.isfinite(distance)
+        votes.update(zip(point1[near].tolist(), point2[nearest[near]].tolist(), strict=True))
+    taken1, taken2, pairs = set[int](), set[int](), []
+    for (a, b), _ in sorted(votes.items(), key=lambda item: (-item[1], item[0])):
+        if a not in taken1 and b not in taken2:
+            taken1.add(a)
+            taken2.add(b)
+            pairs.append((a, b))
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _seen(model: Reconstruction, view: int) -> tuple[F64, I64]:
+    """Inlier observations of a view: pixels, and the places of their points among the valid ones."""
+    place = np.cumsum(model.valid) - 1
+    tracks = model.tracks
+    here = (tracks.view_index == view) & model.inlier & model.valid[tracks.point_index]
+    return tracks.xy[here], np.asarray(place[tracks.point_index[here]], dtype=np.int64)
+
+
+def _same_points(
+    scene: str, name: str, ours: Reconstruction, theirs: Reconstruction, clouds: tuple[F64, F64, float]
+) -> list[Metric]:
+    mine, other, unit = clouds
+    pairs = same_points(ours, theirs)
+    if not len(pairs):
+        return []
+    apart = 100.0 * np.linalg.norm(mine[pairs[:, 0]] - other[pairs[:, 1]], axis=1) / unit
+    words = "distance of ours to theirs, of points that both saw within a pixel of each other"
+    return [
+        Metric(
+            scene,
+            f"points shared with {name}",
+            "",
+            {OURS: float(len(pairs))},
+            OURS,
+            at_most=False,
+            definition=words,
+        ),
+        _row(scene, f"shared with {name}: median apart", np.median(apart), f"median {words}"),
+        _row(
+            scene,
+            f"shared with {name}: 90 % within",
+            np.quantile(apart, 0.9),
+            f"90 % quantile of the {words}",
+        ),
+    ]
 
 
 def _centres(model: Reconstruction, views: np.ndarray[Any, Any]) -> F64:
