@@ -121,7 +121,7 @@ class TrueDisparity:
 def test_exact_disparities_give_exact_depth(method):
     walled = make_walled(on_arc((-6.0, 6.0)))
     true = TrueDisparity(walled, (0, 1), method)
-    pair = PairMatching()._back(true.frame(), true.found(), SIZE[::-1])
+    pair = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE))
     rho, std = inverse_depth_of(walled.reconstruction.P[0], walled.reconstruction.P[1], pair)
     known = np.isfinite(rho)
     assert known.mean() > 0.6
@@ -129,6 +129,21 @@ def test_exact_disparities_give_exact_depth(method):
     assert np.nanquantile(np.abs(6.0 * rho - 1.0), 0.99) < 2e-4
     # 0.2 px of about f B / z = 54 px per unit of relative inverse depth.
     assert np.nanmedian(6.0 * std) == pytest.approx(0.2 / 54.0 / np.sqrt(2.0), rel=0.5)
+
+
+def test_pixels_of_larger_photographs_are_told_where_their_places_are():
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    true = TrueDisparity(walled, (0, 1), "metric")
+    larger = (2 * SIZE[0], 2 * SIZE[1])
+    own = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE))
+    told = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (larger, larger))
+    assert told.sigma.shape == (2 * SIZE[1], 2 * SIZE[0])
+    # The middle of four pixels is the pixel of the smaller photograph.
+    four = np.mean([told.xy[a::2, b::2] for a in (0, 1) for b in (0, 1)], axis=0)
+    apart = np.abs((four + 0.5) / 2.0 - 0.5 - own.xy)
+    assert np.nanmedian(apart) < 1e-3
+    assert np.nanquantile(apart, 0.99) < 0.02
+    assert np.nanmedian(told.sigma[::2, ::2] / own.sigma) == pytest.approx(2.0, rel=0.01)
 
 
 def test_disparities_are_interpolated_on_a_surface_and_not_across_its_edge():
@@ -157,7 +172,7 @@ def test_links_of_a_chain_lead_from_view_to_view():
     steps = []
     for i, j in ((0, 1), (1, 2)):
         true = TrueDisparity(walled, (i, j), "metric")
-        steps.append(PairMatching()._back(true.frame(), true.found(), SIZE[::-1]))
+        steps.append(PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE)))
     linked = follow(*steps)
     known = linked.known
     assert known.mean() > 0.3

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from tests.dense.multiview.scenes import RADIAL, make_walled, on_arc
 from thesisrecon.dense.multiview import MultiViewStereo, SequenceLinking
 
 STEREO = MultiViewStereo()
+SMALL = replace(STEREO, max_side=160, match_side=160)
 
 
 @pytest.fixture(scope="module")
@@ -18,9 +20,16 @@ def walled():
     return make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)), radial=RADIAL)
 
 
+def at_size(depth, shape):
+    """Depths between pixels as the inverse depths interpolate them."""
+    rows, columns = ((np.arange(n) + 0.5) * m / n - 0.5 for n, m in zip(shape, depth.shape, strict=True))
+    places = np.meshgrid(rows, columns, indexing="ij")
+    return 1.0 / map_coordinates(1.0 / depth, places, order=1, mode="nearest")
+
+
 def errors(walled, maps):
     """Relative errors of known pixels, and the share of all that is known."""
-    apart = [maps[i].depth / walled.depth[i] - 1.0 for i in maps]
+    apart = [maps[i].depth / at_size(walled.depth[i], maps[i].depth.shape) - 1.0 for i in maps]
     known = np.concatenate([a[np.isfinite(a)] for a in apart])
     return np.abs(known), len(known) / sum(a.size for a in apart)
 
@@ -43,13 +52,24 @@ def test_depth_is_that_of_the_scene_and_its_deviation_tells_the_error(walled, li
 
 def test_the_same_bytes_whatever_the_number_of_threads_and_one_by_one(walled):
     reconstruction = replace(walled.reconstruction, registered=np.array([True, True, True, False]))
-    together = STEREO.map_all(walled.images, reconstruction, threads=2)
-    scene = STEREO.prepare(walled.images, reconstruction)
-    raw = {i: STEREO.depth_map(scene, i) for i in sorted(scene.views, reverse=True)}
+    stereo = replace(STEREO, max_side=120, match_side=90)
+    together = stereo.map_all(walled.images, reconstruction, threads=2)
+    scene = stereo.prepare(walled.images, reconstruction)
+    raw = {i: stereo.depth_map(scene, i) for i in sorted(scene.views, reverse=True)}
     for i in scene.views:
-        one = STEREO.confirm(scene, raw, i)
+        one = stereo.confirm(scene, raw, i)
         for field in ("depth", "std", "views", "P"):
             assert getattr(one, field).tobytes() == getattr(together[i], field).tobytes()
+
+
+def test_pairs_are_matched_smaller_and_depths_are_as_exact(walled):
+    stereo = replace(STEREO, match_side=160)
+    scene = stereo.prepare(walled.images, walled.reconstruction)
+    assert scene.matched[1].seen.shape == (120, 160)
+    error, known = errors(walled, {1: stereo.depth_map(scene, 1)})
+    assert np.median(error) < 0.002
+    assert np.mean(error < 0.01) > 0.93
+    assert known > 0.75
 
 
 def known_share(maps):
@@ -58,7 +78,7 @@ def known_share(maps):
 
 def test_one_baseline_gives_depth_though_nothing_is_seen_by_a_third_view():
     walled = make_walled(on_arc((-5.0, 5.0)))
-    error, known = errors(walled, STEREO.map_all(walled.images, walled.reconstruction))
+    error, known = errors(walled, SMALL.map_all(walled.images, walled.reconstruction))
     assert known > 0.5
     assert np.median(error) < 0.003
 
@@ -66,20 +86,20 @@ def test_one_baseline_gives_depth_though_nothing_is_seen_by_a_third_view():
 def test_no_baseline_gives_no_depth():
     walled = make_walled(on_arc((0.0, 0.0)))
     still = replace(walled.reconstruction, P=np.stack([walled.reconstruction.P[0]] * 2))
-    maps = STEREO.map_all(walled.images, still)
+    maps = SMALL.map_all(walled.images, still)
     assert known_share(maps) == 0.0
     assert all((found.views == 0).all() for found in maps.values())
 
 
 def test_a_wall_without_texture_is_unknown():
     plain = make_walled(on_arc((-5.0, 5.0)), plain=True)
-    assert known_share(STEREO.map_all(plain.images, plain.reconstruction)) < 0.3
+    assert known_share(SMALL.map_all(plain.images, plain.reconstruction)) < 0.3
 
 
 def test_forward_motion_is_right_where_it_is_known():
     P = np.concatenate([on_arc((0.0,), distance=d) for d in (6.0, 5.3, 4.6)])
     walled = make_walled(P)
-    error, known = errors(walled, STEREO.map_all(walled.images, walled.reconstruction))
+    error, known = errors(walled, SMALL.map_all(walled.images, walled.reconstruction))
     assert known > 0.1
     assert np.median(error) < 0.01
 

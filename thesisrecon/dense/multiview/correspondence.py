@@ -12,6 +12,8 @@ from thesisrecon.dense.rectification import AnyRectification, disparity_range, r
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import B8, F32, F64, DisparityMap, PinholeView
 
+Size = tuple[int, int]
+"""Width and height, px."""
 STRIP_ROWS = 128
 """Rows of the reference whose places are held in float64 at a time."""
 ONE_SURFACE_PX = 1.0
@@ -53,30 +55,43 @@ class PairMatching:
     range_margin: float = 0.25
     least_sigma_px: float = 0.2
 
-    def correspond(self, reference: PinholeView, other: PinholeView, xy1: F64, xy2: F64) -> Correspondence:
+    def correspond(
+        self,
+        reference: PinholeView,
+        other: PinholeView,
+        xy1: F64,
+        xy2: F64,
+        *,
+        sizes: tuple[Size, Size] | None = None,
+    ) -> Correspondence:
         """Where the pixels of ``reference`` are in ``other``.
 
         ``xy1, xy2`` (N, 2) px are the projections of points of the scene into both: they give the range of
-        disparities and how much brighter one photograph is. ``StageFailure`` where the pair cannot be
-        rectified or no point is inside.
+        disparities and how much brighter one photograph is. ``sizes`` (width, height) of both: pixels of
+        these sizes are asked for and told of, though the views are matched at their own. ``StageFailure``
+        where the pair cannot be rectified or no point is inside.
         """
-        sizes = [(v.seen.shape[1], v.seen.shape[0]) for v in (reference, other)]
-        frame = rectify_cameras(reference.P, other.P, sizes[0], sizes[1], xy1=xy1, xy2=xy2)
+        own = (size_of(reference), size_of(other))
+        frame = rectify_cameras(reference.P, other.P, *own, xy1=xy1, xy2=xy2)
         wanted = searched(frame, disparity_range(frame, xy1, xy2, margin=self.range_margin))
         left = frame.warp(_levels(reference), 0)
         right = frame.warp(_levels(other) * brightness_gain(reference, other, xy1, xy2), 1)
         found = self.matcher.match(left, right, disparity_range=wanted)
-        return self._back(frame, found, (sizes[0][1], sizes[0][0]))
+        return self._back(frame, found, own, sizes or own)
 
-    def _back(self, frame: AnyRectification, found: DisparityMap, shape: tuple[int, int]) -> Correspondence:
+    def _back(
+        self, frame: AnyRectification, found: DisparityMap, own: tuple[Size, Size], told: tuple[Size, Size]
+    ) -> Correspondence:
+        shape = told[0][::-1]
+        enlarged = max(told[1]) / max(own[1])
         xy = np.full((*shape, 2), np.nan, dtype=np.float32)
         sigma = np.full(shape, np.nan, dtype=np.float32)
         confidence = np.zeros(shape, dtype=np.float32)
-        told = found.sigma_px if np.isfinite(found.sigma_px) else 0.0
-        deviation = max(told, self.least_sigma_px)
+        sigma_px = found.sigma_px if np.isfinite(found.sigma_px) else 0.0
+        deviation = max(sigma_px, self.least_sigma_px)
         for first in range(0, shape[0], STRIP_ROWS):
             rows = slice(first, min(first + STRIP_ROWS, shape[0]))
-            pixels = _pixels(shape[1], rows)
+            pixels = resized(_pixels(shape[1], rows), told[0], own[0])
             places = frame.rectified_from_original(0, pixels)
             d, sure = sample_disparity(found, places)
             inside: B8 = np.asarray(np.isfinite(d))
@@ -87,11 +102,21 @@ class PairMatching:
             )
             scale = np.linalg.norm(b - a, axis=1)
             at = (np.flatnonzero(inside) // shape[1] + first, np.flatnonzero(inside) % shape[1])
-            xy[at] = right
+            xy[at] = resized(right, own[1], told[1])
             confidence[at] = sure[inside]
             # Half the confidence is what a pixel has whose rival costs a step on every path more.
-            sigma[at] = deviation * scale * np.sqrt(0.5 / np.clip(sure[inside], 0.05, 0.5))
+            sigma[at] = enlarged * deviation * scale * np.sqrt(0.5 / np.clip(sure[inside], 0.05, 0.5))
         return Correspondence(xy, sigma, confidence)
+
+
+def size_of(view: PinholeView) -> Size:
+    """(width, height)."""
+    return view.seen.shape[1], view.seen.shape[0]
+
+
+def resized(xy: F64, size: Size, wanted: Size) -> F64:
+    """Pixels (N, 2) of a photograph of ``size`` where they are at the size that is wanted."""
+    return np.asarray((xy + 0.5) * (np.array(wanted) / np.array(size)) - 0.5)
 
 
 def searched(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from thesisrecon.dense.matching import match_rectified
 from thesisrecon.dense.multiview.consistency import Consistency
-from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching
+from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching, size_of
 from thesisrecon.dense.multiview.linking import InverseDepth, RobustFusion, SequenceLinking
 from thesisrecon.dense.multiview.neighbours import (
     NeighbourChoice,
@@ -31,10 +31,11 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class MultiViewScene:
-    """What the views share: ``views`` without distortion by number, the sparse ``points``, and the
-    ``neighbours`` of each view, the best first."""
+    """What the views share: ``views`` without distortion by number, the same ``matched`` at the size that
+    pairs are matched at, the sparse ``points``, and the ``neighbours`` of each view, the best first."""
 
     views: Mapping[int, PinholeView]
+    matched: Mapping[int, PinholeView]
     points: SparsePoints
     neighbours: Mapping[int, tuple[int, ...]]
 
@@ -45,7 +46,9 @@ class MultiViewStereo:
 
     ``pairs`` finds correspondences, ``choice`` the neighbours, ``linker`` makes one inverse depth of what
     they say, ``refinement`` (None: none) makes it agree with the photographs, ``consistency`` holds the maps
-    against each other. ``max_side`` px bounds the working size. One view's map depends on nothing but the
+    against each other. ``max_side`` px bounds the size of the depth maps, ``match_side`` px that at which
+    pairs are matched: windows that do not slant find less in larger pictures, and the refinement works out
+    what the smaller ones lack. One view's map depends on nothing but the
     photographs and cameras, so views can be done in any order, by any number of threads and in several runs:
     :meth:`prepare`, :meth:`depth_map` of each, :meth:`confirm` of each.
     """
@@ -56,6 +59,7 @@ class MultiViewStereo:
     refinement: PlaneRefinement | None = field(default_factory=PlaneRefinement)
     consistency: Consistency = field(default_factory=Consistency)
     max_side: int = 1024
+    match_side: int = 640
 
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
         """Disparities of a rectified pair of arrays by the matcher of ``pairs``."""
@@ -75,13 +79,16 @@ class MultiViewStereo:
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many photographs; got {len(images)}")
         points = sparse_points(reconstruction)
-        views = {
-            i: pinhole_view(image, reconstruction, i, max_side=self.max_side)
-            for i, image in enumerate(images)
-            if reconstruction.registered[i]
-        }
+        views, matched = (
+            {
+                i: pinhole_view(image, reconstruction, i, max_side=side)
+                for i, image in enumerate(images)
+                if reconstruction.registered[i]
+            }
+            for side in (self.max_side, min(self.match_side, self.max_side))
+        )
         chosen = {i: tuple(self.choice.choose(points, views, i)) for i in views}
-        return MultiViewScene(views, points, chosen)
+        return MultiViewScene(views, matched, points, chosen)
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
         """Depths of one view from its neighbours, before other depth maps are asked.
@@ -93,9 +100,10 @@ class MultiViewStereo:
             raise ValueError(f"view {view} has no camera; those with one are {sorted(scene.views)}")
 
         def correspond(i: int, j: int) -> Correspondence | None:
-            a, b = scene.views[i], scene.views[j]
+            a, b = scene.matched[i], scene.matched[j]
+            sizes = size_of(scene.views[i]), size_of(scene.views[j])
             try:
-                return self.pairs.correspond(a, b, *shared_projections(scene.points, a, b))
+                return self.pairs.correspond(a, b, *shared_projections(scene.points, a, b), sizes=sizes)
             except StageFailure:
                 return None
 

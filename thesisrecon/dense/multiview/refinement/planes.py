@@ -13,6 +13,7 @@ from thesisrecon.dense.multiview.refinement.kernels import (
     UNKNOWN,
     begin_planes,
     fit_planes,
+    pack_squares,
     rate_planes,
     sweep_planes,
 )
@@ -20,6 +21,7 @@ from thesisrecon.geometry.camera import camera_centre
 from thesisrecon.types import F32, F64, I64, PinholeView
 
 U8 = NDArray[np.uint8]
+U32 = NDArray[np.uint32]
 
 
 @dataclass(frozen=True)
@@ -92,35 +94,37 @@ class PlaneRefinement:
         views = np.where(both, np.maximum(support, found.views), np.where(seen, support, found.views))
         return InverseDepth(value, std, np.where(np.isfinite(value), views, 0).astype(np.uint8), found.rivals)
 
-    def _offsets(self) -> I64:
-        """(S, 2) samples of the window."""
-        one = np.arange(-self.radius, self.radius + 1, self.spacing)
-        return np.stack(np.meshgrid(one, one), axis=-1).reshape(-1, 2).astype(np.int64)
+    def _offsets(self) -> F32:
+        """(2, S) samples of the window, the centre among them."""
+        one = self.spacing * np.arange(-(self.radius // self.spacing), self.radius // self.spacing + 1)
+        return np.stack(np.meshgrid(one, one)).reshape(2, -1).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """The grey levels of a view and its neighbours, and how pixels go from one to the others."""
+    """The grey levels of a view and its neighbours (row by row), and how pixels go from one to the others."""
 
-    views: tuple[F32, F32, I64, F64, F64]
-    offsets: I64
+    views: tuple[F32, U32, I64, F64, F64]
+    offsets: F32
     likeness: F32
 
     @classmethod
     def of(
-        cls, reference: PinholeView, others: Sequence[PinholeView], offsets: I64, likeness: float
+        cls, reference: PinholeView, others: Sequence[PinholeView], offsets: F32, likeness: float
     ) -> _Setting:
         gray = [_gray(view) for view in (reference, *others)]
-        sizes = np.array([one.shape[::-1] for one in gray[1:]], dtype=np.int64)
-        stack = np.full((len(others), *sizes.max(axis=0)[::-1]), np.nan, dtype=np.float32)
-        for k, one in enumerate(gray[1:]):
-            stack[k, : one.shape[0], : one.shape[1]] = one
+        layout = np.array([(0, *one.shape[::-1]) for one in gray[1:]], dtype=np.int64)
+        layout[1:, 0] = np.cumsum([one.size for one in gray[1:]])[:-1]
+        squares = [np.empty(one.shape, dtype=np.uint32) for one in gray[1:]]
+        for one, words in zip(gray[1:], squares, strict=True):
+            pack_squares(one, words)
         M = np.linalg.inv(reference.P[:, :3])
         centre = camera_centre(reference.P)
         H = np.stack([other.P[:, :3] @ M for other in others])
         e = np.stack([other.P @ (centre / centre[3]) for other in others])
         table = np.exp(-np.arange(256.0) / likeness).astype(np.float32)
-        return cls((gray[0], stack, sizes, H, e), offsets, table)
+        packed = np.concatenate([words.ravel() for words in squares])
+        return cls((gray[0], packed, layout, H, e), offsets, table)
 
     def rate(self, planes: F32, accepted: float) -> tuple[F32, U8, F32]:
         """Least cost, support and slope (H, W) of planes (H, W, 3)."""
