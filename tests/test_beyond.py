@@ -85,9 +85,11 @@ def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
     )
 
 
-def test_one_photograph_twice_has_no_parallax():
-    with pytest.raises(StageFailure):
-        match_photographs(SCENE.image_paths[6], SCENE.image_paths[6], config=SMALL)
+def test_cameras_in_one_place_show_no_parallax():
+    """As of one camera with another principal point."""
+    picture = _photograph(6)
+    with pytest.raises(StageFailure, match="show no parallax: the camera only turned"):
+        match_photographs(picture[:, :-32].copy(), picture[:, 32:].copy(), config=SMALL)
 
 
 def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):

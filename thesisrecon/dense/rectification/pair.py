@@ -14,12 +14,10 @@ from thesisrecon.geometry.homogeneous import require_finite
 from thesisrecon.geometry.homographies import infinite_homography
 from thesisrecon.geometry.multiview import (
     canonical_cameras,
-    estimate_homography,
     fundamental_from_cameras,
-    homography_residuals,
     rotation_planes,
-    sampson_residuals,
 )
+from thesisrecon.geometry.parallax import require_parallax
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.types import F64
 
@@ -28,8 +26,6 @@ Size = tuple[int, int]
 LEAST_MATCHES = 8
 SAME_HALF = 0.8
 """Share of matches that must lie on the same half of their epipolar lines: wrong ones do by chance."""
-PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
-"""Displacements that no homography explains, 90 % quantile, over the distances from the epipolar lines."""
 SAMPLES = 16
 """Places along either side of a photograph at which distortion is measured."""
 
@@ -88,7 +84,7 @@ def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) ->
             f"its second singular value is {ratio:.1g} of the first",
             "estimate it from more matches",
         )
-    _require_parallax(F, xy1, xy2, None)
+    require_parallax(F, xy1, xy2, advice=", or rectify from cameras if the scene is a plane")
     return _complete(pencil, xy1, xy2, None)
 
 
@@ -114,7 +110,7 @@ def pair_of_cameras(
     P = P * np.sign(det)[:, None, None]
     F = _fundamental(P)
     if len(xy1) >= LEAST_MATCHES:
-        _require_parallax(F, xy1, xy2, infinite_homography(P[0], P[1]))
+        require_parallax(F, xy1, xy2, at_infinity=infinite_homography(P[0], P[1]))
     return _complete(pencil_of_fundamental(F, sizes)[0], xy1, xy2, P)
 
 
@@ -146,29 +142,6 @@ def _checked_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
         raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
     require_finite("rectification, for its matches,", xy1, xy2)
     return xy1, xy2
-
-
-def _require_parallax(F: F64, xy1: F64, xy2: F64, at_infinity: F64 | None) -> None:
-    """Refuse matches that one homography takes to each other: F is then any, and no depth is to be had."""
-    noise = float(np.quantile(np.abs(sampson_residuals(F, xy1, xy2)), 0.9))
-    H, kept = at_infinity, np.ones(len(xy1), dtype=bool)
-    residuals = np.zeros(len(xy1))
-    for _ in range(1 if at_infinity is not None else 3):
-        if at_infinity is None:
-            H = estimate_homography(xy1[kept], xy2[kept])
-        assert H is not None
-        residuals = homography_residuals(H, xy1, xy2)
-        kept = residuals <= np.quantile(residuals, 0.9)
-    parallax = float(np.quantile(residuals, 0.9))
-    if parallax > PARALLAX_PER_NOISE * noise + LEAST_PARALLAX_PX:
-        return
-    what = "a scene at infinity" if at_infinity is not None else "one homography"
-    raise StageFailure(
-        "the photographs show no parallax: the camera only turned, or the scene is a plane or too far away",
-        f"{what} explains 90 % of {len(xy1)} matches to {parallax:.2g} px, the noise being {noise:.2g} px",
-        "take photographs from places farther apart"
-        + ("" if at_infinity is not None else ", or rectify from cameras if the scene is a plane"),
-    )
 
 
 def _complete(pencil: EpipolarPencil, xy1: F64, xy2: F64, P: F64 | None) -> EpipolarPair:

@@ -19,10 +19,9 @@ from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, require_f
 from thesisrecon.geometry.multiview import (
     enforce_rank_two,
     epipoles,
-    estimate_homography,
-    homography_residuals,
     sampson_residuals,
 )
+from thesisrecon.geometry.parallax import require_parallax
 from thesisrecon.types import F64
 
 USUAL_FOCAL = 1.0
@@ -30,8 +29,6 @@ USUAL_FOCAL = 1.0
 LEAST_MATCHES = 8
 LARGEST_RESIDUAL = 0.005
 """Median distance of matches from their epipolar lines, over the long side, beyond which F is not theirs."""
-PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
-"""Displacements that no homography explains, 90 % quantile, over the distances from the epipolar lines."""
 RANK_ONE = 1e-9
 OFF_ROTATION = 1e-4
 """Entries of R'R - I: of a rotation written with four digits."""
@@ -246,22 +243,4 @@ def _require_theirs(F: F64, xy1: F64, xy2: F64) -> None:
             f"half of them are more than {np.median(distance):.3g} px off their epipolar lines",
             "estimate it from these matches",
         )
-    apart = homography_residuals(_best_homography(xy1, xy2), xy1, xy2)
-    parallax, noise = float(np.quantile(apart, 0.9)), float(np.quantile(distance, 0.9))
-    if not parallax > PARALLAX_PER_NOISE * noise + LEAST_PARALLAX_PX:
-        raise StageFailure(
-            "the two photographs show no parallax: the camera only turned, or the scene is flat or far away",
-            f"one homography explains 90 % of {len(xy1)} matches to {parallax:.2g} px, the noise being "
-            f"{noise:.2g} px",
-            "take photographs from places farther apart",
-        )
-
-
-def _best_homography(xy1: F64, xy2: F64) -> F64:
-    """The homography of most matches (N, 2): least squares, twice more without the worst tenth."""
-    H = estimate_homography(xy1, xy2)
-    for _ in range(2):
-        residuals = homography_residuals(H, xy1, xy2)
-        kept = residuals <= np.quantile(residuals, 0.9)
-        H = estimate_homography(xy1[kept], xy2[kept])
-    return H
+    require_parallax(F, xy1, xy2)
