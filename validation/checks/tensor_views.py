@@ -55,7 +55,9 @@ ALONG = (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 OFF = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 DIRECTIONS = {"up": (0.0, -1.0, 0.0), "ahead": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0)}
 FRAME_SIZE, FRAME_S = (1000, 700), 1.0
-CONES = (3, 4, 5)
+CONES, CONES_BEYOND = (3, 4, 5), (1, 7)
+BORDER_PX = 50
+"""Columns of views beyond the baseline that no photograph shows, or whose picture ends before."""
 
 
 @dataclass(frozen=True)
@@ -295,7 +297,7 @@ def measure_cones(out: Path | None) -> list[Metric]:
     if root is None or not (root / "stereo" / "Cones9").is_dir():
         return []
     folder = root / "stereo" / "Cones9"
-    images = {k: _rgb(folder / f"im{k}.png") for k in (2, *CONES, 6)}
+    images = {k: _rgb(folder / f"im{k}.png") for k in (2, *CONES, 6, *CONES_BEYOND)}
     synthesis = {
         "ours": _of_disparities(images[2], images[6], *_both_ways(_ours, images[2], images[6])),
         **{
@@ -315,7 +317,12 @@ def measure_cones(out: Path | None) -> list[Metric]:
         rows += _pictures(f"Cones, view {k}", pictures, images[k])
         if out is not None:
             save_beside(out / f"cones-{k}.png", [images[k], pictures["ours"]])
-    mean = {n: float(np.mean([r.values[n] for r in rows if r.name == "PSNR"])) for n in rows[0].values}
+    for k in CONES_BEYOND:
+        camera = camera_at(synthesis["ours"].pair, (k - 2) / 4, sizes=sizes)
+        beyond = {n: v.render(camera)[:, BORDER_PX:-BORDER_PX] for n, v in synthesis.items()}
+        rows += _pictures(f"Cones, view {k}, without its borders", beyond, images[k][:, BORDER_PX:-BORDER_PX])
+    between = rows[: 2 * len(CONES)]
+    mean = {n: float(np.mean([r.values[n] for r in between if r.name == "PSNR"])) for n in rows[0].values}
     sgbm = max(mean[name] for name in MODES)
     scene = "Cones, mean of views 3 to 5"
     over = {"ours": mean["ours"] - mean["cross-dissolve"]}
