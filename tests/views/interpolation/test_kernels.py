@@ -8,10 +8,13 @@ import pytest
 from thesisrecon.types import F32
 from thesisrecon.views.interpolation.kernels import (
     ONE_SURFACE_PX,
+    REACH,
+    SPARSE,
     blend,
     fill_empty_rows,
     mark_crossings,
     place_between,
+    settle_guesses,
     take_back,
     weigh,
 )
@@ -91,6 +94,41 @@ def test_pixels_lie_between_as_the_homography_says() -> None:
     plain = np.where(xh[..., 2:] > 0, xh[..., :2] / xh[..., 2:], np.nan)
     np.testing.assert_allclose(target, plain, rtol=1e-12)
     assert 0 < np.isnan(plain).sum() < plain.size
+
+
+def test_guesses_become_medians_of_pixels_of_their_colour() -> None:
+    rng = np.random.default_rng(6)
+    shape = (20, 31)
+    d = np.where(np.arange(31) < 15, 4.0, 12.0) + rng.uniform(0, 0.3, shape)
+    d[rng.random(shape) < 0.1] = np.nan
+    d = d.astype(np.float32)
+    sure = rng.choice([0.0, 0.7], shape).astype(np.float32)
+    levels = np.where(np.arange(31) < 18, 60.0, 200.0)[None, :, None] + rng.uniform(0, 40, (*shape, 3))
+    levels = levels.astype(np.float32)
+    out = np.empty_like(d)
+    settle_guesses(levels, d, sure, (0, 9), (30.0, 0.5), out)
+    settle_guesses(levels, d, sure, (9, 20), (30.0, 0.5), out)
+    for y, x in np.ndindex(shape):
+        if sure[y, x] > 0.0 or np.isnan(d[y, x]):
+            np.testing.assert_array_equal(out[y, x], d[y, x])
+            continue
+        rows = [v for v in range(y - REACH, y + REACH + 1, SPARSE) if 0 <= v < shape[0]]
+        columns = [u for u in range(x - REACH, x + REACH + 1, SPARSE) if 0 <= u < shape[1]]
+        part = np.ix_(rows, columns)
+        apart = np.abs(levels[part] - levels[y, x]).sum(axis=-1)
+        weight = np.exp(-apart / 30.0) * np.where(sure[part] > 0.0, 1.0, 0.5)
+        values, weight = d[part].ravel(), weight.ravel()
+        kept = np.isfinite(values)
+        values, weight = values[kept], weight[kept]
+        if np.ptp(np.append(values, d[y, x])) <= ONE_SURFACE_PX:
+            assert out[y, x] == d[y, x]
+            continue
+        order = np.argsort(values)
+        below = np.cumsum(weight[order])
+        assert out[y, x] == values[order][np.searchsorted(below, 0.5 * weight.sum() - 1e-9)]
+    # Between 15 and 18 the colours are those of the left surface.
+    guessed = sure[:, 15:18] == 0.0
+    assert np.median(out[:, 15:18][guessed & np.isfinite(d[:, 15:18])]) < 5.0
 
 
 def test_weights_are_confidences_but_at_rims() -> None:

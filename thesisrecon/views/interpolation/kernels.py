@@ -11,6 +11,11 @@ ONE_SURFACE_PX = 1.0
 """Neighbouring disparities that differ by more belong to different surfaces."""
 
 
+REACH, SPARSE = 12, 3
+"""How far about a guessed pixel its disparity is looked for, and how many pixels are skipped in between."""
+WINDOW = 2 * REACH // SPARSE + 1
+
+
 @njit(cache=True, nogil=True)
 def mark_crossings(disparity: F32, slack: float, crossing: B8) -> None:
     """Mark pixels (H, W) whose partner x - d lies on the wrong side of that of another pixel of their row, by
@@ -85,6 +90,56 @@ def take_back(
             else:
                 disparity[y, x] = field[near_y, near_x]
             sure[y, x] = confidence[near_y, near_x] if inside else 0.0
+
+
+@njit(cache=True, nogil=True)
+def settle_guesses(
+    levels: F32, disparity: F32, sure: F32, rows: tuple[int, int], limits: tuple[float, float], out: F32
+) -> None:
+    """Make the guessed disparities of a photograph follow its colours, rows [first, last).
+
+    Those whose confidence ``sure`` (h, w) is 0 become the weighted median of ``disparity`` (h, w) over every
+    ``SPARSE``-th pixel of every such row within ``REACH``. Weights fall with the difference of ``levels``
+    (h, w, 3), to 1 / e at ``limits[0]`` in sum over the channels; guesses weigh ``limits[1]`` of known ones.
+    """
+    height, width = disparity.shape
+    values, weights = np.empty(WINDOW * WINDOW, np.float32), np.empty(WINDOW * WINDOW)
+    for y in range(rows[0], rows[1]):
+        for x in range(width):
+            out[y, x] = disparity[y, x]
+            if sure[y, x] > 0.0 or np.isnan(disparity[y, x]):
+                continue
+            n, total = 0, 0.0
+            least, most = disparity[y, x], disparity[y, x]
+            for v in range(max(y - REACH, y % SPARSE), min(y + REACH + 1, height), SPARSE):
+                for u in range(max(x - REACH, x % SPARSE), min(x + REACH + 1, width), SPARSE):
+                    d = disparity[v, u]
+                    if np.isnan(d):
+                        continue
+                    apart = 0.0
+                    for c in range(levels.shape[2]):
+                        apart += abs(levels[y, x, c] - levels[v, u, c])
+                    weight = np.exp(-apart / limits[0])
+                    if sure[v, u] <= 0.0:
+                        weight *= limits[1]
+                    values[n], weights[n] = d, weight
+                    least, most = min(least, d), max(most, d)
+                    total += weight
+                    n += 1
+            # On one surface there is nothing to choose.
+            if most - least > ONE_SURFACE_PX:
+                out[y, x] = _weighted_median(values[:n], weights[:n], 0.5 * total)
+
+
+@njit(cache=True, nogil=True)
+def _weighted_median(values: F32, weights: F64, half: float) -> float:
+    """The least of ``values`` (N,) up to which the weights sum to ``half``."""
+    order, total = np.argsort(values), 0.0
+    for k in order:
+        total += weights[k]
+        if total >= half:
+            return float(values[k])
+    return float(values[order[-1]])
 
 
 @njit(cache=True, nogil=True)

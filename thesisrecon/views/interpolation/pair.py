@@ -16,6 +16,7 @@ from thesisrecon.views.interpolation.kernels import (
     blend,
     fill_empty_rows,
     place_between,
+    settle_guesses,
     take_back,
     weigh,
 )
@@ -25,6 +26,8 @@ U8 = NDArray[np.uint8]
 
 SPARSE = 7
 """Every seventh pixel of every seventh row suffices for a median."""
+PREPARING = 2
+"""Threads that prepare a photograph."""
 DARK, BRIGHT = 8.0, 247.0
 """Levels whose ratio tells how much brighter a photograph is."""
 
@@ -35,10 +38,14 @@ class Blending:
 
     Pixels whose nearness differs by no more than ``alike_px`` show the same surface. Weights are the
     confidence, but at least ``least``; ``guessed`` of what only the other photograph's holes can show, whose
-    disparity is that of the background beside it; ``rim`` is what is left of them beside a cut.
+    disparity is that of the background beside it; ``rim`` is what is left of them beside a cut. Guessed
+    disparities are the median of those around, weighted by their likeness in colour, which falls to 1 / e at
+    a difference of ``colour`` levels in sum over the channels; other guesses count ``hearsay`` of known ones.
     """
 
     alike_px: float = 1.5
+    colour: float = 30.0
+    hearsay: float = 0.5
     least: float = 0.2
     guessed: float = 0.01
     rim: float = 0.2
@@ -197,8 +204,13 @@ def _side(image: U8, H: F64, found: DisparityMap, blending: Blending) -> _Side:
     places = np.empty((*shape, 2))
     disparity, sure, weight = (np.empty(shape, dtype=np.float32) for _ in range(3))
     take_back(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
-    weigh(disparity, sure, (blending.guessed, blending.least, blending.rim), weight)
-    return _Side(image.astype(np.float32), places, disparity, weight)
+    levels, settled = image.astype(np.float32), np.empty_like(disparity)
+    likeness = (blending.colour, blending.hearsay)
+    in_strips(
+        lambda rows: settle_guesses(levels, disparity, sure, rows, likeness, settled), shape[0], PREPARING
+    )
+    weigh(settled, sure, (blending.guessed, blending.least, blending.rim), weight)
+    return _Side(levels, places, settled, weight)
 
 
 def pair_of_rectified(left: U8, right: U8, maps: tuple[DisparityMap, DisparityMap]) -> InterpolatedPair:
