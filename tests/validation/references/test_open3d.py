@@ -1,0 +1,138 @@
+"""Conventions between our records and Open3D's, at their border."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.model.sphere import SHAPE, K, paint, photograph, ring_of
+from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.io.meshes import read_mesh, write_mesh
+from thesisrecon.model import SurfaceModel, VolumetricFusion
+from thesisrecon.types import F64, DepthMap, PinholeView, TexturedMesh
+from thesisrecon.views import render
+
+try:
+    from validation.references import open3d as reference
+except (ImportError, OSError) as missing:
+    # Without libraries of the system (libgomp1, libgl1, libegl1, libx11-6) it cannot be loaded.
+    pytest.skip(f"Open3D is not here: {missing}", allow_module_level=True)
+
+NORMAL = np.array([0.3, 0.2, 1.0])
+
+
+def slanted() -> tuple[DepthMap, PinholeView]:
+    """A slanted plane NORMAL . X = 2.3 and a photograph whose colours are its pixels' coordinates."""
+    y, x = np.indices(SHAPE)
+    rays = np.stack([x, y, np.ones(SHAPE)], axis=-1) @ np.linalg.inv(K).T
+    depth = (2.3 / (rays @ NORMAL)).astype(np.float32)
+    P = np.column_stack([K, np.zeros(3)])
+    rgb = np.stack([x, y, 0 * x], axis=-1).astype(np.uint8)
+    everywhere = np.ones(SHAPE, dtype=bool)
+    return DepthMap(0, P, depth, np.full(SHAPE, 1e-4, np.float32), everywhere.astype(np.uint8)), PinholeView(
+        0, P, rgb, everywhere
+    )
+
+
+def test_a_pixel_is_the_same_pixel_in_its_grid() -> None:
+    depth_map, view = slanted()
+    mesh = reference.OpenTsdf(voxel_px=0.5).fuse([depth_map], [view])
+    assert mesh.colors is not None
+    off = mesh.vertices @ NORMAL - 2.3
+    # Half a pixel would be 4e-3.
+    assert abs(np.median(off)) < 3e-4
+    xy = mesh.vertices @ K.T
+    shift = mesh.colors[:, :2] - xy[:, :2] / xy[:, 2:]
+    np.testing.assert_allclose(np.median(shift, axis=0), 0.0, atol=0.05)
+
+
+def test_meshes_lie_on_the_sphere_and_distances_are_right() -> None:
+    maps = ring_of()
+    views = [photograph(m) for m in maps]
+    fused = reference.OpenTsdf().fuse(maps, views)
+    for mesh in (fused, reference.poisson_mesh(maps, depth=7)):
+        assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1.0)) < 0.006
+    away = np.array([[0.0, 0.0, -3.0], [2.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    np.testing.assert_allclose(reference.distances(away, fused), [2.0, 1.0, 0.0], atol=0.01)
+    assert fused.colors is not None
+    assert np.median(np.abs(fused.colors - paint(fused.vertices))) < 12.0
+
+
+def test_skew_is_refused() -> None:
+    skew = K.copy()
+    skew[0, 1] = 1.0
+    with pytest.raises(ValueError, match="skew"):
+        reference.camera_of(np.column_stack([skew, np.zeros(3)]))
+
+
+@pytest.fixture(scope="module")
+def model() -> TexturedMesh:
+    surface = VolumetricFusion().fuse(ring_of())
+    return SurfaceModel().color(surface, [photograph(m) for m in ring_of()])
+
+
+def colors_at(points: F64, vertices: F64, faces: F64, uv: F64, texture: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) in the middle of the face whose middle is nearest to each point; v runs up."""
+    middle = vertices[faces].mean(axis=1)
+    nearest = np.argmin(((points[:, None] - middle[None]) ** 2).sum(axis=-1), axis=1)
+    height, width = texture.shape[:2]
+    u, v = uv[nearest].mean(axis=1).T
+    x, y = np.rint(u * width - 0.5).astype(int), np.rint((1.0 - v) * height - 0.5).astype(int)
+    return texture[y, x].astype(float)
+
+
+def places() -> F64:
+    """Points of the sphere that photographs see well."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    return np.stack([np.sin(angle), 0.3 * np.cos(5 * angle), -np.cos(angle)], axis=1)
+
+
+def test_a_glb_opens_in_open3d_with_its_texture(model: TexturedMesh, tmp_path: Path) -> None:
+    write_mesh(tmp_path / "model.glb", model)
+    vertices, faces, uv, texture = reference.read_glb(tmp_path / "model.glb")
+    assert len(faces) == len(model.faces)
+    assert model.texture is not None
+    assert texture.shape == model.texture.shape
+    points = places()
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    found = colors_at(points, vertices * [1.0, -1.0, -1.0], faces, uv, texture)
+    assert np.median(np.abs(found - paint(points))) < 6.0
+    assert np.quantile(np.abs(found - paint(points)), 0.9) < 20.0
+
+
+def test_a_glb_opens_in_trimesh_with_its_texture(model: TexturedMesh, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    write_mesh(tmp_path / "model.glb", model)
+    loaded = trimesh.load(tmp_path / "model.glb", process=False, force="mesh")
+    texture = np.asarray(loaded.visual.material.baseColorTexture.convert("RGB"))
+    points = places()
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    corners = np.asarray(loaded.visual.uv)[loaded.faces]
+    vertices = np.asarray(loaded.vertices) * [1.0, -1.0, -1.0]
+    found = colors_at(points, vertices, np.asarray(loaded.faces), corners, texture)
+    assert np.median(np.abs(found - paint(points))) < 6.0
+    again = read_mesh(tmp_path / "model.glb")
+    camera = PinholeCamera.from_matrix(ring_of()[0].P, (SHAPE[1], SHAPE[0]))
+    apart = render(again, camera).color.astype(float) - render(model, camera).color
+    assert np.sqrt(np.mean(apart**2)) < 4.0
+
+
+def test_its_own_pictures_agree_with_ours() -> None:
+    maps = ring_of()
+    mesh = reference.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
+    camera = PinholeCamera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).resized(2)
+    try:
+        theirs = reference.render_open3d(mesh, camera)
+    except RuntimeError as error:
+        pytest.skip(f"Open3D cannot draw here: {error}")
+    ours = render(mesh, camera)
+    inner = ours.valid & (ours.depth < 3.0)
+    best = {}
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            moved = np.roll(theirs, (dy, dx), axis=(0, 1)).astype(float)
+            best[dx, dy] = float(np.mean(np.abs(moved - ours.color)[inner]))
+    assert min(best, key=lambda shift: best[shift]) == (0, 0)
+    assert best[0, 0] < 8.0

@@ -1,0 +1,167 @@
+"""Open3D as our stages are called: meshes from depth maps, distances, pictures and files.
+
+Its voxel grids take the pixel that the truncated coordinates name, so the centre of the top-left pixel is
+(0.5, 0.5) there; its pictures have it at (0, 0) as ours. (``ScalableTSDFVolume`` of 0.20.0 gives empty
+meshes; the grid of blocks is its successor.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.camera import decompose_camera
+from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.types import F64, I64, DepthMap, PinholeView, TexturedMesh
+
+U8 = NDArray[np.uint8]
+
+# The types that it brings do not describe it.
+o3d: Any = open3d
+CPU = o3d.core.Device("CPU:0")
+
+
+@dataclass(frozen=True)
+class OpenTsdf:
+    """Truncated signed distances in a grid of blocks (``VoxelBlockGrid``), surface by marching cubes.
+
+    ``voxel_px``: side of a voxel in pixels at the median depth, as :class:`VolumetricFusion` has it.
+    ``truncation_voxels``. ``least_views``: how many maps must have seen a voxel.
+    """
+
+    voxel_px: float = 1.5
+    truncation_voxels: float = 4.0
+    least_views: int = 1
+
+    def fuse(self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView]) -> TexturedMesh:
+        """The surface with colours of its vertices, means over the photographs ``views`` of the maps."""
+        kinds = (o3d.core.float32,) * 3
+        grid = o3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight", "color"),
+            kinds,
+            ((1,), (1,), (3,)),
+            median_footprint(depth_maps) * self.voxel_px,
+            8,
+            50_000,
+            CPU,
+        )
+        for depth_map, view in zip(depth_maps, views, strict=True):
+            self._integrate(grid, depth_map, view)
+        found = grid.extract_triangle_mesh(self.least_views - 0.5)
+        colors = np.clip(np.rint(found.vertex.colors.numpy()), 0, 255).astype(np.uint8)
+        faces = found.triangle.indices.numpy().astype(np.int64)
+        return TexturedMesh(found.vertex.positions.numpy().astype(np.float64), faces, colors=colors)
+
+    def _integrate(self, grid: Any, depth_map: DepthMap, view: PinholeView) -> None:
+        if depth_map.depth.shape != view.rgb.shape[:2]:
+            raise ValueError("each depth map needs its photograph at its own size")
+        K, world = camera_of(depth_map.P, shift=0.5)
+        depth = o3d.t.geometry.Image(o3d.core.Tensor(np.nan_to_num(depth_map.depth).astype(np.float32)))
+        color = o3d.t.geometry.Image(o3d.core.Tensor(view.rgb.astype(np.float32)))
+        intrinsic, extrinsic = o3d.core.Tensor(K), o3d.core.Tensor(world)
+        far = 1.01 * float(np.nanmax(depth_map.depth, initial=0.0)) + 1e-9
+        cut = (1.0, far, self.truncation_voxels)
+        blocks = grid.compute_unique_block_coordinates(depth, intrinsic, extrinsic, *cut)
+        grid.integrate(blocks, depth, color, intrinsic, intrinsic, extrinsic, *cut)
+
+
+def poisson_mesh(
+    depth_maps: Sequence[DepthMap], *, depth: int = 9, least_density: float = 0.05
+) -> TexturedMesh:
+    """Screened Poisson surface of the points of all maps, with normals of each map's own neighbourhoods.
+
+    ``depth`` of the octree; ``least_density``: the share of vertices with the fewest points that is cut off,
+    since the surface is closed where there is nothing.
+    """
+    cloud = o3d.geometry.PointCloud()
+    for one in depth_maps:
+        K, world = camera_of(one.P)
+        height, width = one.depth.shape
+        pinhole = o3d.camera.PinholeCameraIntrinsic(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        image = o3d.geometry.Image(np.nan_to_num(one.depth).astype(np.float32))
+        part = o3d.geometry.PointCloud.create_from_depth_image(
+            image, pinhole, world, depth_scale=1.0, depth_trunc=1e9, stride=2
+        )
+        part.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(16))
+        part.orient_normals_towards_camera_location(-world[:3, :3].T @ world[:3, 3])
+        cloud += part
+    mesh, density = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    values = np.asarray(density)
+    mesh.remove_vertices_by_mask(values < np.quantile(values, least_density))
+    return TexturedMesh(
+        np.asarray(mesh.vertices).copy(),
+        # What was solved faces the cameras as the normals do: outwards is anticlockwise there as here.
+        np.asarray(mesh.triangles).astype(np.int64),
+    )
+
+
+def distances(points: F64, mesh: TexturedMesh) -> F64:
+    """(N,) distances of points (N, 3) to the nearest place of a surface."""
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
+    )
+    found = scene.compute_distance(o3d.core.Tensor(points.astype(np.float32)), nthreads=1)
+    return np.asarray(found.numpy(), dtype=np.float64)
+
+
+def render_open3d(mesh: TexturedMesh, camera: PinholeCamera) -> U8:
+    """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit.
+
+    Raises ``RuntimeError`` where the machine has no graphics that it can use.
+    """
+    width, height = camera.size
+    renderer = o3d.visualization.rendering.OffscreenRenderer(width, height)
+    material = o3d.visualization.rendering.MaterialRecord()
+    material.shader = "defaultUnlit"
+    drawn = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    )
+    if mesh.colors is not None:
+        drawn.vertex_colors = o3d.utility.Vector3dVector(mesh.colors / 255.0)
+    renderer.scene.set_background([0.0, 0.0, 0.0, 1.0])
+    renderer.scene.view.set_post_processing(False)
+    renderer.scene.add_geometry("model", drawn, material)
+    K, world = camera_of(camera.P, shift=0.5)
+    renderer.setup_camera(K, world, width, height)
+    return np.asarray(renderer.render_to_image()).copy()
+
+
+def read_glb(path: Path) -> tuple[F64, I64, F64, U8]:
+    """Vertices (N, 3) in glTF's axes, faces (M, 3), texture coordinates (M, 3, 2), v up, and the texture of a
+    GLB as Open3D reads it."""
+    model = o3d.io.read_triangle_model(str(path))
+    mesh = model.meshes[0].mesh
+    albedo = np.asarray(model.materials[model.meshes[0].material_idx].albedo_img)
+    uv = np.asarray(mesh.triangle_uvs).reshape(-1, 3, 2)
+    faces = np.asarray(mesh.triangles).astype(np.int64)
+    return np.asarray(mesh.vertices).copy(), faces, uv.copy(), albedo[..., :3].copy()
+
+
+def camera_of(P: F64, *, shift: float = 0.0) -> tuple[F64, F64]:
+    """K (3, 3) with its principal point moved by ``shift`` px, and the world-to-camera matrix (4, 4).
+
+    Raises ``ValueError`` where pixels are skew, which Open3D does not know.
+    """
+    K, R, t = decompose_camera(P)
+    if abs(K[0, 1]) > 1e-6 * K[0, 0]:
+        raise ValueError(f"Open3D knows no skew; got {K[0, 1]:.3g} px")
+    K = np.array([[K[0, 0], 0.0, K[0, 2] + shift], [0.0, K[1, 1], K[1, 2] + shift], [0.0, 0.0, 1.0]])
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = R, t
+    return K, world
+
+
+def median_footprint(depth_maps: Sequence[DepthMap]) -> float:
+    """Width of a pixel at its depth, the median over all pixels of all maps."""
+    widths = []
+    for one in depth_maps:
+        K = decompose_camera(one.P)[0]
+        widths.append(one.depth[np.isfinite(one.depth)] / np.sqrt(K[0, 0] * K[1, 1]))
+    return float(np.median(np.concatenate(widths)))
