@@ -23,7 +23,7 @@ from thesisrecon.between import rectified_pair, relate
 from thesisrecon.config import PipelineConfig
 from thesisrecon.dense.matching import CohesiveScanlines
 from thesisrecon.geometry.camera import camera_centre, camera_from_centre, decompose_camera, project
-from thesisrecon.geometry.multiview import estimate_homography, homography_distances
+from thesisrecon.geometry.multiview import estimate_homography, homography_residuals
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.types import DisparityMap, Image
 from thesisrecon.views.interpolation import InterpolatedPair, check_monotonicity
@@ -313,7 +313,7 @@ def best_homography(xy1: F64, xy2: F64) -> F64:
     kept = np.ones(len(xy1), dtype=bool)
     H = estimate_homography(xy1, xy2)
     for _ in range(3):
-        off = homography_distances(H, xy1, xy2)
+        off = homography_residuals(H, xy1, xy2)
         kept = off <= np.quantile(off, 0.9)
         H = estimate_homography(xy1[kept], xy2[kept])
     return H

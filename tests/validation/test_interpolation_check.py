@@ -1,0 +1,82 @@
+"""The check of interpolated views: its cameras are right, and on real photographs its targets are reached."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.textures import texture
+from thesisrecon.dense.rectification import rectify_cameras
+from thesisrecon.geometry.camera import camera_from_centre, project
+from thesisrecon.views.interpolation import InterpolatedPair, unsure
+from validation.checks.interpolation import (
+    best_homography,
+    camera_between,
+    camera_centre_of,
+    measure_cones,
+    nearest_place,
+    turned,
+)
+from validation.scenes.real import data_root
+
+SIZE = (160, 120)
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[InterpolatedPair, tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Two turned cameras, rectified; their photographs do not matter."""
+    rng = np.random.default_rng(0)
+    K = np.array([[150.0, 0.0, 82.0], [0.0, 150.0, 57.0], [0.0, 0.0, 1.0]])
+    centres = np.array([[-0.5, 0.1, 0.0], [0.5, 0.0, 0.1]])
+    turns = [Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix() for _ in range(2)]
+    first, second = (camera_from_centre(K, R, C) for R, C in zip(turns, centres, strict=True))
+    frame = rectify_cameras(first, second, SIZE, SIZE, method="least-distortion")
+    image, nothing = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), unsure(np.zeros((9, 9), np.float32))
+    H = np.stack([frame.H1, frame.H2])
+    return InterpolatedPair((image, image), H, nothing, nothing), (first, second), centres
+
+
+def test_points_are_seen_where_the_camera_between_sees_them(
+    pair: tuple[InterpolatedPair, tuple[np.ndarray, np.ndarray], np.ndarray],
+) -> None:
+    X = np.random.default_rng(1).uniform([-2, -2, 4], [2, 2, 9], (100, 3))
+    found, P, centres = pair
+    for s in (0.0, 0.2, 0.5, 1.0):
+        expected = found.frame.points(project(P[0], X), project(P[1], X), s)
+        np.testing.assert_allclose(project(camera_between(found, P, s), X), expected, atol=1e-7)
+        C = camera_centre_of(found, P, s)
+        along = (C - centres[0]) @ (centres[1] - centres[0]) / np.sum((centres[1] - centres[0]) ** 2)
+        assert 0.0 <= along <= 1.0 or abs(along - round(along)) < 1e-9
+        np.testing.assert_allclose(C, centres[0] + along * (centres[1] - centres[0]), atol=1e-9)
+    assert nearest_place(found, P, centres[1]) == 1.0
+    assert nearest_place(found, P, camera_centre_of(found, P, 0.37)) == pytest.approx(0.37)
+
+
+def test_pictures_are_turned_as_their_points_are() -> None:
+    rng = np.random.default_rng(2)
+    H = np.array([[1.02, 0.01, 3.0], [-0.02, 0.99, -2.0], [1e-5, 2e-5, 1.0]])
+    xy = rng.uniform(0, 100, (80, 2))
+    xh = np.column_stack([xy, np.ones(80)]) @ H.T
+    there = xh[:, :2] / xh[:, 2:]
+    there[:5] += 30.0
+    found = best_homography(xy, there)
+    np.testing.assert_allclose(found / found[2, 2], H, atol=1e-6)
+    picture = np.repeat(texture(120, 160)[:, :, None], 3, axis=2).astype(np.uint8)
+    back, kept = turned(turned(picture, H)[0], np.linalg.inv(H))
+    inner = kept.copy()
+    inner[:10], inner[-10:], inner[:, :10], inner[:, -10:] = False, False, False, False
+    assert inner.mean() > 0.5
+    assert np.abs(back.astype(float) - picture)[inner].mean() < 4.0
+
+
+@pytest.mark.real
+def test_views_between_real_photographs_are_as_near_as_wanted() -> None:
+    root = data_root()
+    if root is None or not (root / "stereo" / "Cones9").is_dir():
+        pytest.skip("the photographs of Cones are not on this machine (THESISRECON_DATA)")
+    rows = measure_cones(None)
+    judged = [row for row in rows if row.target is not None]
+    assert len(judged) == 2
+    for row in judged:
+        assert row.verdict == "reached", (row.name, row.values)
