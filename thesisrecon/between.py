@@ -244,10 +244,10 @@ def interpolation_film(
     told = {
         "photographs": names,
         "violating_monotonicity": [found.share for found in monotonic],
-        "known": [found.known for found in monotonic],
+        "known": [leg.known for leg in legs],
     }
     captions = tuple(", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in shares)
-    notes = tuple(_sentence(found.share, found.known) for found in monotonic)
+    notes = tuple(_sentence(found.share, leg.known) for found, leg in zip(monotonic, legs, strict=True))
     return Film(captions, draw, notes, told, tuple({"shares": list(w)} for w in shares))
 
 

@@ -122,6 +122,11 @@ class InterpolatedPair:
         return sides[0], sides[1]
 
     @cached_property
+    def known(self) -> float:
+        """Share of the pixels of both photographs whose partner is known."""
+        return float(np.mean([side.weight > 1.5 * self.blending.guessed for side in self._sides]))
+
+    @cached_property
     def gain(self) -> F32:
         """(3,) by how much the second photograph is brighter than the first, the median of known pixels."""
         first = self._sides[0]
