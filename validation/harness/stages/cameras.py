@@ -246,26 +246,34 @@ def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
         text = (outcomes[name].place / "run" / "summary.json").read_text(encoding="utf-8")
         told[name] = json.loads(text)
     trusted: dict[str, float | None] = {n: float(bool(t["trusted"])) for n, t in told.items()}
+    silent = {n: float(sum(not r["reason"] for r in t["refused"])) for n, t in told.items()}
     rows = [
-        Metric(scene.name, "trusted", "", trusted, OURS, at_most=False, definition="1: passed its self-check")
+        Metric(
+            scene.name, "trusted", "", trusted, OURS, at_most=False, definition="1: passed its self-check"
+        ),
+        Metric(scene.name, "refused without a reason", "", {**silent}, OURS, definition="photographs"),
     ]
     truth = truth_of(scene)
     if truth is None or not told:
         return rows
-    held = {name: _share_held(t["cameras"], truth.K) for name, t in told.items()}
-    widest = {name: _widest(t["cameras"]) for name, t in told.items()}
-    return [
-        *rows,
-        Metric(scene.name, "intervals that hold", "%", held, OURS, at_most=False, definition=SHARE_HELD),
-        Metric(
-            scene.name,
-            "widest focal interval",
-            "%",
-            widest,
-            OURS,
-            definition="largest stated deviation of a focal length",
-        ),
-    ]
+    for name, where in ((OURS, ""), (PER_IMAGE, ", a camera each")):
+        cameras = told.get(name, {}).get("cameras", [])
+        held: dict[str, float | None] = {OURS: _share_held(cameras, truth.K) if cameras else None}
+        widest = {OURS: _widest(cameras)}
+        words = "largest stated deviation of a focal length"
+        rows += [
+            Metric(
+                scene.name,
+                f"intervals that hold{where}",
+                "%",
+                held,
+                OURS,
+                at_most=False,
+                definition=SHARE_HELD,
+            ),
+            Metric(scene.name, f"widest focal interval{where}", "%", widest, OURS, definition=words),
+        ]
+    return rows
 
 
 def _widest(cameras: list[dict[str, Any]]) -> float | None:
