@@ -18,6 +18,8 @@ import numpy as np
 from thesisrecon.assumptions import IntrinsicsAssumption
 from thesisrecon.dense import MultiViewScene, MultiViewStereo
 from thesisrecon.dense import RectifiedPair as RectifiedPair
+from thesisrecon.dense.matching import MaximumLikelihoodScanline
+from thesisrecon.dense.multiview import PairMatching, SequenceLinking
 from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification, ThesisRansac
 from thesisrecon.errors import UsageError
 from thesisrecon.features import HarrisCorners, MultiScaleCorners
@@ -30,7 +32,7 @@ from thesisrecon.matching.pair_selection import (
     SequenceWindow,
 )
 from thesisrecon.metric import UpgradeAndBundle
-from thesisrecon.model import SurfaceModel
+from thesisrecon.model import BSplineSurface, DepthSheets, SurfaceModel
 from thesisrecon.projective import Factorization, GatedIncremental, SequentialProjective
 from thesisrecon.selfcalibration import (
     FocalScan,
@@ -292,6 +294,14 @@ PRESETS: Mapping[str, PipelineConfig] = {
         tracks=PlainTracks(),
         projective=SequentialProjective(),
         selfcalibration=Stratified(),
+        dense=MultiViewStereo(
+            # It has an opinion of blank walls too, and says how little that is worth.
+            pairs=PairMatching(matcher=MaximumLikelihoodScanline(), least_confidence=0.25),
+            linker=SequenceLinking(),
+            refinement=None,
+        ),
+        # "By fitting parametric surfaces through the points ... sampled in a fine scale triangular pattern".
+        model=SurfaceModel(surface=BSplineSurface(), fusion=DepthSheets()),
         # The thesis knows no distortion, and its self-calibration keeps the principal point in the centre.
         intrinsics=IntrinsicsAssumption(principal_point="known", k1="known"),
     ),

@@ -46,7 +46,7 @@ class PairMatching:
 
     ``matcher`` finds the disparities, in the range of the sparse points widened by ``range_margin`` of itself
     at either end. Their deviation is what the matcher tells but at least ``least_sigma_px``, in pixels of the
-    rectified frame, and larger where its confidence is low.
+    rectified frame, and larger where its confidence is low; below ``least_confidence`` there are none.
     """
 
     matcher: CohesiveScanlines | SemiGlobal | MaximumLikelihoodScanline = field(
@@ -54,6 +54,7 @@ class PairMatching:
     )
     range_margin: float = 0.25
     least_sigma_px: float = 0.2
+    least_confidence: float = 0.0
 
     def correspond(
         self,
@@ -94,7 +95,7 @@ class PairMatching:
             pixels = resized(_pixels(shape[1], rows), told[0], own[0])
             places = frame.rectified_from_original(0, pixels)
             d, sure = sample_disparity(found, places)
-            inside: B8 = np.asarray(np.isfinite(d))
+            inside: B8 = np.asarray(np.isfinite(d) & (sure >= self.least_confidence))
             where = places[inside]
             right, a, b = (
                 frame.original_from_rectified(1, where - np.outer(d[inside] + step, (1.0, 0.0)), within=False)

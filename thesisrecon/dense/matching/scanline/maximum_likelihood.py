@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.dense.matching.costs.kernels import LEVELS
+from thesisrecon.dense.matching.finish.checks import texture_of
+from thesisrecon.dense.matching.finish.kernels import rate
 from thesisrecon.dense.matching.pair import estimate_noise, prepare_pair
 from thesisrecon.dense.matching.ranges import checked_range
 from thesisrecon.dense.matching.scanline.kernels import NOTHING, solve_rows
@@ -74,8 +76,9 @@ class MaximumLikelihoodScanline:
         """Whole disparities of the left image; the arguments and the result are those of the default variant.
 
         ``confidence`` is the probability of the disparity (or one beside it) against all others of the range,
-        given the two measurements alone: 3 / D where nothing tells them apart. Ordered rows are all the
-        memory it takes: a few rows of D costs.
+        given the two measurements alone: 3 / D where nothing tells them apart; and less where there is no
+        texture, for the errors of neighbouring pixels are not as independent as that takes them to be.
+        Ordered rows are all the memory it takes: a few rows of D costs.
         """
         first, last = checked_range(disparity_range)
         sides = prepare_pair(left, right)
@@ -107,6 +110,7 @@ class MaximumLikelihoodScanline:
             confidence[start:stop] = probable[own]
 
         run_strips(work, self._strips(height), self.threads)
+        rate(confidence, disparity, disparity, texture_of(sides[0], noise))
         return DisparityMap(disparity, confidence, ROUNDING_PX)
 
     def hidden_cost(self, components: int, variance: float) -> float:
