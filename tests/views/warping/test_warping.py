@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thesisrecon.types import F32, F64
-from thesisrecon.views.warping import EIGHT, STRETCH, fill_holes, forward_map, forward_warp, sample
+from thesisrecon.views.warping import DIRECTIONS, STRETCH, fill_holes, forward_map, forward_warp, sample
 
 SIZE = (31, 23)
 
@@ -177,7 +177,7 @@ def test_nearer_wins_whatever_the_order(order: int) -> None:
 
 def test_holes_take_the_mean_of_what_is_behind() -> None:
     rng = np.random.default_rng(3)
-    near = rng.choice([1.0, 1.2, 5.0, np.nan], (14, 17)).astype(np.float32)
+    near = rng.choice([1.0, 1.2, 2.4, 3.0, 5.0, np.nan, np.nan], (14, 17)).astype(np.float32)
     rgb = rng.uniform(0, 255, (14, 17, 3)).astype(np.float32)
     rgb[np.isnan(near)] = np.nan
     for reach in (np.inf, 2.0):
@@ -185,7 +185,7 @@ def test_holes_take_the_mean_of_what_is_behind() -> None:
         np.testing.assert_array_equal(filled[~np.isnan(near)], rgb[~np.isnan(near)])
         for y, x in np.argwhere(np.isnan(near)):
             seen = []
-            for dy, dx in EIGHT:
+            for dy, dx in DIRECTIONS:
                 n = 1
                 while 0 <= y + n * dy < 14 and 0 <= x + n * dx < 17:
                     if not np.isnan(near[y + n * dy, x + n * dx]):
@@ -197,8 +197,9 @@ def test_holes_take_the_mean_of_what_is_behind() -> None:
             if not seen:
                 assert np.isnan(filled[y, x]).all()
                 continue
-            least = min(one[0] for one in seen)
-            kept = [(1.0 / r**2, color) for z, r, color in seen if z <= least + 0.5]
+            least, most = min(one[0] for one in seen), max(one[0] for one in seen)
+            behind = least + max(0.5, 0.4 * (most - least))
+            kept = [(1.0 / r**2, color) for z, r, color in seen if z <= behind]
             mean = sum(w * color for w, color in kept) / sum(w for w, _ in kept)
             np.testing.assert_allclose(filled[y, x], mean, rtol=1e-5)
 

@@ -24,7 +24,10 @@ __all__ = ["fill_holes", "forward_map", "forward_warp", "sample"]
 STRETCH = 3.0
 """Pixels that neighbours of one surface come apart at most: what is stretched more is no surface."""
 
-EIGHT = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)], dtype=np.int32)
+DIRECTIONS = np.array(
+    [(a, b) for a in range(-2, 3) for b in range(-2, 3) if np.gcd(a, b) == 1], dtype=np.int32
+)
+"""Sixteen (down, right) in which holes look for what is around them."""
 
 
 def forward_warp(
@@ -112,8 +115,8 @@ def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
 def fill_holes(rgb: F32, nearness: F32, *, step: float = 0.0, reach_px: float = np.inf) -> F32:
     """The picture with its holes filled from what is behind them: what was hidden is background.
 
-    Of the nearest known pixels in eight directions those count whose nearness is at most ``step`` above the
-    least; their colours are averaged, weighted by 1 / distance^2.
+    Of the nearest known pixels in sixteen directions those count that are behind: their nearness is at most
+    ``step``, or 0.4 of its range, above the least. Their colours are averaged, weighted by 1 / distance^2.
 
     Parameters
     ----------
@@ -130,8 +133,8 @@ def fill_holes(rgb: F32, nearness: F32, *, step: float = 0.0, reach_px: float = 
     """
     if rgb.ndim != 3 or rgb.shape[:2] != nearness.shape:
         raise ValueError(f"rgb must be (H, W, C) and nearness (H, W); got {rgb.shape} and {nearness.shape}")
-    distance = np.empty((len(EIGHT), *nearness.shape), dtype=np.int32)
-    distances_to_known(nearness, EIGHT, distance)
+    distance = np.empty((len(DIRECTIONS), *nearness.shape), dtype=np.int16)
+    distances_to_known(nearness, DIRECTIONS, distance)
     filled = rgb.copy()
-    fill_from_behind(rgb, nearness, EIGHT, distance, (step, reach_px), filled)
+    fill_from_behind(rgb, nearness, DIRECTIONS, distance, (step, reach_px), filled)
     return filled

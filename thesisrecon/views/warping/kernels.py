@@ -8,10 +8,15 @@ from numpy.typing import NDArray
 
 from thesisrecon.types import F32, F64
 
+I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
 
 SLACK = 1e-7
 """Barycentric distance by which a triangle reaches beyond its edges, so that no rounding opens a crack."""
+
+BEHIND = 0.4
+"""Around a hole what is in this farther part of the range of nearness is behind it: a single far pixel is not
+all there is."""
 
 LEAST_AREA = 1e-9
 """Twice the area (px^2) of the least triangle that is drawn."""
@@ -241,7 +246,7 @@ def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.floa
 
 
 @njit(cache=True, nogil=True)
-def distances_to_known(nearness: F32, steps: I32, distance: I32) -> None:
+def distances_to_known(nearness: F32, steps: I32, distance: I16) -> None:
     """Into ``distance`` (K, H, W): how many of each of the ``steps`` (K, 2) (down, right) lead from a pixel
     to the next whose nearness (H, W) is not NaN; 0 there, -1 where none does."""
     height, width = nearness.shape
@@ -263,13 +268,13 @@ def distances_to_known(nearness: F32, steps: I32, distance: I32) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_from_behind(
-    rgb: F32, nearness: F32, steps: I32, distance: I32, limits: tuple[float, float], out: F32
+    rgb: F32, nearness: F32, steps: I32, distance: I16, limits: tuple[float, float], out: F32
 ) -> None:
     """Give the holes of ``rgb`` (H, W, C) in ``out`` (H, W, C) the colours of what is behind them.
 
     Of the known pixels that the ``steps`` lead to within ``limits[1]`` px those count whose ``nearness``
-    (H, W) is at most ``limits[0]`` above the least: the mean of their colours weighted by 1 / distance^2. NaN
-    where no step leads anywhere; what is no hole is left alone.
+    (H, W) is at most ``limits[0]``, or ``BEHIND`` of its range, above the least: the mean of their colours
+    weighted by 1 / distance^2. NaN where no step leads anywhere; what is no hole is left alone.
     """
     reach = np.empty(steps.shape[0])
     colors = np.empty(rgb.shape[2])
@@ -277,19 +282,21 @@ def fill_from_behind(
         for x in range(rgb.shape[1]):
             if not np.isnan(nearness[y, x]):
                 continue
-            least, total = np.inf, 0.0
+            least, most, total = np.inf, -np.inf, 0.0
             colors[:] = 0.0
             for k in range(steps.shape[0]):
                 n = distance[k, y, x]
                 reach[k] = n * np.hypot(steps[k, 0], steps[k, 1]) if n > 0 else np.nan
                 if reach[k] <= limits[1]:
                     least = min(least, nearness[y + n * steps[k, 0], x + n * steps[k, 1]])
+                    most = max(most, nearness[y + n * steps[k, 0], x + n * steps[k, 1]])
+            behind = least + max(limits[0], BEHIND * (most - least))
             for k in range(steps.shape[0]):
                 if not reach[k] <= limits[1]:
                     continue
                 n = distance[k, y, x]
                 v, u = y + n * steps[k, 0], x + n * steps[k, 1]
-                if nearness[v, u] > least + limits[0]:
+                if nearness[v, u] > behind:
                     continue
                 weight = 1.0 / (reach[k] * reach[k])
                 total += weight
