@@ -152,6 +152,18 @@ def test_matches_beside_their_epipolar_lines_go_where_their_nearest_place_on_it_
     )
 
 
+def test_disparities_of_nearness_are_their_differences():
+    pair, X = _pair((0.05, -0.2, 0.1), (0.5, 0.2, 0.6, False)), _scene(8)
+    virtual = seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, -1.0]))
+    xy1, xy2 = _images(pair, X)
+    nearness = virtual.transfer(xy1, xy2)[1]
+    xy1_again, farther = _images(pair, 1.0001 * X)
+    np.testing.assert_allclose(xy1_again, xy1, atol=1e-9)
+    change = np.abs(virtual.transfer(xy1, farther)[1] - nearness)
+    expected = np.linalg.norm(farther - xy2, axis=1) / change
+    np.testing.assert_allclose(virtual.disparity_per_nearness(xy1, xy2), expected, rtol=1e-3)
+
+
 def test_points_behind_the_virtual_camera_have_no_place():
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
     X = _scene(4)

@@ -105,6 +105,20 @@ class VirtualTensor:
             nearness = np.where(seen, np.sum(lines * (x @ self.P2[:, :3].T), axis=1) / places[:, 2], np.nan)
         return np.where(seen[:, None], dehomogenize(places), np.nan), nearness
 
+    def disparity_per_nearness(self, xy1: F64, xy2: F64) -> F64:
+        """How many pixels of view 2 matches (N, 2), (N, 2) are displaced by where their nearness in the third
+        view changes by one (first order); (N,). NaN at the epipole.
+        """
+        x = homogenize(xy1)
+        a, a4 = x @ self.P2[:, :3].T, self.P2[:, 3]
+        lines, third = self.lines_across(xy1, xy2), self.P3[2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rho = -np.sum(lines * a, axis=1) / (lines @ a4)
+            # x_2 = (a + rho a_4) / w_2, and the nearness is rho / w_3.
+            w2, w3 = a[:, 2] + rho * a4[2], x @ third[:3] + rho * third[3]
+            along = np.linalg.norm(a4[:2] * a[:, 2:] - a[:, :2] * a4[2], axis=1) / w2**2
+            return np.asarray(along * w3**2 / np.abs(x @ third[:3]))
+
 
 def seed_of_two(pair: CalibratedPair) -> VirtualTensor:
     """The tensor <1, 2, 2> of two views, the second being its own third: all that F knows, as a tensor."""

@@ -26,6 +26,8 @@ U8 = NDArray[np.uint8]
 
 SURFACE_PX = 1.0
 """Neighbours whose disparities between the photographs differ by more are not of one surface."""
+SPARSE = 16
+"""Every sixteenth pixel of every sixteenth row suffices for a median."""
 LEAST_SEEN = 0.05
 """Share of its picture that a virtual camera must have of what the photographs show."""
 
@@ -66,7 +68,8 @@ class TensorSynthesis:
         ``StageFailure`` where the camera sees next to nothing of the scene.
         """
         moved = [seed.moved(camera.rotation, camera.translation, K=camera.K) for seed in self.seeds]
-        layers = [self._layer(side, moved[side], camera.size, threads) for side in (0, 1)]
+        step = self._step(moved[0])
+        layers = [self._layer(side, moved[side], camera.size, step, threads) for side in (0, 1)]
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
         if not seen.mean() >= LEAST_SEEN:
             raise StageFailure(
@@ -74,14 +77,16 @@ class TensorSynthesis:
                 f"{100.0 * seen.mean():.1f} % of its picture, needed {100.0 * LEAST_SEEN:.0f} %",
                 "it may be beyond the scene or look away: move it less (by baselines) or turn it back",
             )
-        rgb, nearness = self._mixed(layers, self._share_of_second(moved[0]))
-        filled = fill_holes(rgb, nearness, step=self._step)
+        rgb, nearness = self._mixed(layers, self._share_of_second(moved[0]), step)
+        filled = fill_holes(rgb, nearness, step=step)
         return np.asarray(np.clip(np.rint(filled), 0.0, 255.0), dtype=np.uint8)
 
-    @property
-    def _step(self) -> float:
-        """``SURFACE_PX`` in units of nearness, 1 / baseline."""
-        return SURFACE_PX / float(self.pair.K2[0, 0] * np.linalg.norm(self.pair.t))
+    def _step(self, virtual: VirtualTensor) -> float:
+        """``SURFACE_PX`` in units of the virtual camera's nearness, for the middle one of the pixels."""
+        y, x = np.indices(self.places[0].shape[:2])[:, ::SPARSE, ::SPARSE].reshape(2, -1)
+        places = self.places[0][y, x].astype(np.float64)
+        pixels = np.stack([x, y], axis=1).astype(np.float64)
+        return SURFACE_PX / float(np.nanmedian(virtual.disparity_per_nearness(pixels, places)))
 
     def _share_of_second(self, virtual: VirtualTensor) -> np.float32:
         """How far along the baseline the camera is: 0 beside the first photograph, 1 beside the second, and
@@ -91,42 +96,43 @@ class TensorSynthesis:
         return np.float32(np.clip(along, 0.0, 1.0))
 
     def _layer(
-        self, side: int, virtual: VirtualTensor, size: tuple[int, int], threads: int
+        self, side: int, virtual: VirtualTensor, size: tuple[int, int], step: float, threads: int
     ) -> tuple[F32, F32]:
         """What the camera sees of one photograph, (H, W, 4), and its nearness (H, W); NaN where nothing."""
         xy, nearness = transfer_grid(virtual, self.places[side], threads=threads)
-        source, front = forward_map(xy, nearness, size=size, step=self._step, threads=threads)
+        source, front = forward_map(xy, nearness, size=size, step=step, threads=threads)
         return sample(self.levels[side], source, threads=threads), front
 
-    def _mixed(self, layers: list[tuple[F32, F32]], share: np.float32) -> tuple[F32, F32]:
+    def _mixed(self, layers: list[tuple[F32, F32]], share: np.float32, step: float) -> tuple[F32, F32]:
         """Colours and nearness of both layers together; NaN where neither sees anything."""
         (first, near1), (second, near2) = layers
-        of_second = self._weight_of_second(layers, share)
+        of_second = _weight_of_second(layers, share, step)
         dark, bright = self.gain**-share, self.gain ** (1 - share)
         # Weights of 0 must not meet NaN.
         rgb = np.where((of_second < 1.0)[..., None], first[..., :3] * dark, 0.0) * (1 - of_second)[..., None]
         rgb += np.where((of_second > 0.0)[..., None], second[..., :3] * bright, 0.0) * of_second[..., None]
         return rgb, np.where(of_second > 0.5, near2, near1)
 
-    def _weight_of_second(self, layers: list[tuple[F32, F32]], share: np.float32) -> F32:
-        """(H, W) how much of the second photograph is in the mixture, 0 to 1; NaN where neither is.
 
-        ``share`` of it where both show the same. Where they differ the nearer surface is shown, as far as its
-        photograph is to be believed: fully from half the way on, not at all in the last quarter before the
-        other one, which would have shown it.
-        """
-        (first, near1), (second, near2) = layers
-        seen1, seen2 = np.isfinite(near1), np.isfinite(near2)
-        sure1, sure2 = np.nan_to_num(first[..., 3]) > 0.5, np.nan_to_num(second[..., 3]) > 0.5
-        weight = np.full(near1.shape, share, dtype=np.float32)
-        alike = seen1 & seen2 & (sure1 == sure2)
-        weight[alike & (near2 > near1 + self._step)] = np.clip(4.0 * share - 1.0, 0.0, 1.0)
-        weight[alike & (near1 > near2 + self._step)] = np.clip(4.0 * share - 2.0, 0.0, 1.0)
-        # What is known is right, before what is guessed or behind it.
-        weight[seen1 & ~(seen2 & (sure2 | ~sure1))] = 0.0
-        weight[seen2 & ~(seen1 & (sure1 | ~sure2))] = 1.0
-        weight[~(seen1 | seen2)] = np.nan
-        return weight
+def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: float) -> F32:
+    """(H, W) how much of the second photograph is in the mixture, 0 to 1; NaN where neither is.
+
+    ``share`` of it where both show the same. Where they differ the nearer surface is shown, as far as its
+    photograph is to be believed: fully from half the way on, not at all in the last quarter before the
+    other one, which would have shown it.
+    """
+    (first, near1), (second, near2) = layers
+    seen1, seen2 = np.isfinite(near1), np.isfinite(near2)
+    sure1, sure2 = np.nan_to_num(first[..., 3]) > 0.5, np.nan_to_num(second[..., 3]) > 0.5
+    weight = np.full(near1.shape, share, dtype=np.float32)
+    alike = seen1 & seen2 & (sure1 == sure2)
+    weight[alike & (near2 > near1 + step)] = np.clip(4.0 * share - 1.0, 0.0, 1.0)
+    weight[alike & (near1 > near2 + step)] = np.clip(4.0 * share - 2.0, 0.0, 1.0)
+    # What is known is right, before what is guessed or behind it.
+    weight[seen1 & ~(seen2 & (sure2 | ~sure1))] = 0.0
+    weight[seen2 & ~(seen1 & (sure1 | ~sure2))] = 1.0
+    weight[~(seen1 | seen2)] = np.nan
+    return weight
 
 
 def prepare_synthesis(
