@@ -37,9 +37,7 @@ from validation.checks.tensor_views import (
     courtyard,
     courtyard_table,
     draw,
-    linear_range,
     photograph,
-    places_of_courtyard,
     save_beside,
 )
 from validation.metrics.pictures import psnr_db, ssim
@@ -55,6 +53,12 @@ U8 = NDArray[np.uint8]
 CONES, ENDS, DISPARITIES = (3, 4, 5), (2, 6), 64
 OVER_SGBM_DB, OVER_DISSOLVE_DB = 0.3, 5.0
 FRAME_SIZE, FRAME_S = (1000, 700), 1.0
+PLACES = (
+    *(Place(s) for s in (-0.5, -0.25, 0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0, 1.25, 1.5, 2.0)),
+    *(Place(0.5, off, direction) for direction in ("up", "ahead") for off in (0.1, 0.25, 0.5, 1.0)),
+)
+"""Of cameras, in baselines; at 0 and 1 stand the photographs."""
+DISTANCES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 THIRD = 5
 """View of the courtyard that spans the triangle with the other two."""
 OURS, TRUE, DISSOLVE = "ours", "true disparity", "cross-dissolve"
@@ -177,29 +181,38 @@ def prepare_yard() -> Yard:
     return Yard(truth, relate(images[0], images[1]), Xh[:, :3] / Xh[:, 3:], xy1, xy2)
 
 
-def measure_place(yard: Yard, place: Place, out: Path | None) -> Measured:
-    """The nearest view between the photographs beside the picture taken from ``place``.
-
-    Between them it is compared as it is. Elsewhere, where interpolation cannot go, the camera keeps its
-    orientation, and the view is turned onto its picture by the best homography: what is left is parallax.
-    """
-    P = cameras_of(yard.truth)
+def camera_of(yard: Yard, place: Place) -> tuple[float, Pose]:
+    """The nearest s between the photographs, and the true camera at ``place``: turned as that of the view."""
     s = min(max(place.s, 0.0), 1.0)
-    pose = pose_of(camera_between(yard.pair, P, s))
+    pose = pose_of(camera_between(yard.pair, cameras_of(yard.truth), s))
     step = yard.truth.poses[1].C - yard.truth.poses[0].C
-    beyond = (place.s - s) * step
+    away = (place.s - s) * step
     if place.off:
-        beyond = beyond + place.off * np.linalg.norm(step) * (
-            pose.R.T @ np.array(DIRECTIONS[place.direction])
-        )
-    moved = Pose(pose.K, pose.R, pose.C + beyond)
+        away = away + place.off * np.linalg.norm(step) * (pose.R.T @ np.array(DIRECTIONS[place.direction]))
+    return s, Pose(pose.K, pose.R, pose.C + away)
+
+
+def displaced(yard: Yard, place: Place) -> tuple[F64, F64 | None]:
+    """How far points of the view are from where ``place`` sees them (N,) px, and what it is turned by.
+
+    Between the photographs it is compared as it is. Elsewhere, where interpolation cannot go, the view is
+    turned onto the picture by the best homography (3, 3): what is left is parallax.
+    """
+    s, moved = camera_of(yard, place)
     there = project(camera_from_centre(moved.K, moved.R, moved.C), yard.X)
     here = yard.pair.frame.points(yard.xy1, yard.xy2, s)
+    H = best_homography(here, there) if place.distance else None
+    here = here if H is None else _through(H, here)
+    return np.linalg.norm(here - there, axis=1), H
+
+
+def measure_place(yard: Yard, place: Place, out: Path | None) -> Measured:
+    """The nearest view between the photographs beside the picture taken from ``place``."""
+    off, H = displaced(yard, place)
+    s, moved = camera_of(yard, place)
     picture, kept = yard.pair.view(s, threads=2), np.ones(SIZE[::-1], dtype=bool)
-    if place.distance:
-        H = best_homography(here, there)
-        here, (picture, kept) = _through(H, here), turned(picture, H)
-    off = np.linalg.norm(here - there, axis=1)
+    if H is not None:
+        picture, kept = turned(picture, H)
     wanted = photograph(yard.truth.world, moved)
     if out is not None:
         name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
@@ -209,17 +222,36 @@ def measure_place(yard: Yard, place: Place, out: Path | None) -> Measured:
     return Measured(place, "interpolation", psnr_db(picture, wanted, where=kept), likeness, errors)
 
 
-def measure_courtyard(out: Path | None) -> tuple[list[Measured], list[Metric]]:
-    """All places, and the triangle of three photographs."""
+def linear_reach(yard: Yard, direction: str) -> tuple[float, float]:
+    """Up to which distance from the baseline (in baselines, at most 3) the median displacement grows in
+    proportion, within 10 %, and its slope, px a baseline."""
+    first, reach, slope = DISTANCES[0], 0.0, 0.0
+    for distance in DISTANCES:
+        place = Place(1.0 + distance) if direction == "along" else Place(0.5, distance, direction)
+        off = float(np.median(displaced(yard, place)[0]))
+        slope = off / distance if distance == first else slope
+        if abs(off / distance - slope) > 0.1 * slope:
+            break
+        reach = distance
+    return reach, slope
+
+
+def measure_courtyard(out: Path | None) -> tuple[list[Measured], list[str], list[Metric]]:
+    """All places; what is told of the linear range; the triangle of three photographs."""
     yard = prepare_yard()
-    rows = [measure_place(yard, place, out) for place in (*between_places(), *places_of_courtyard())]
-    rows = list({row.place: row for row in rows}.values())
-    return rows, [measure_triangle(yard, out)]
-
-
-def between_places() -> list[Place]:
-    """More of them between the photographs."""
-    return [Place(s) for s in (0.125, 0.375, 0.625, 0.875)]
+    told = []
+    for direction in ("along", *DIRECTIONS):
+        reach, slope = linear_reach(yard, direction)
+        where = "beyond the ends" if direction == "along" else f"off the middle, {direction}"
+        told.append(
+            f"{where}: displaced by {slope:.1f} px a baseline, in proportion up to {reach:g} baselines"
+        )
+    print("\n".join(told), flush=True)
+    rows = []
+    for place in PLACES:
+        rows.append(measure_place(yard, place, out))
+        print(rows[-1], flush=True)
+    return rows, told, [measure_triangle(yard, out)]
 
 
 def measure_triangle(yard: Yard, out: Path | None) -> Metric:
@@ -407,11 +439,10 @@ def main(arguments: list[str] | None = None) -> int:
         rows.append(measure_time(wishes.repeats))
     text = [table_of(scene, rows) for scene in dict.fromkeys(row.scene for row in rows)]
     if "courtyard" in wishes.parts:
-        measured, more = measure_courtyard(wishes.out)
+        measured, told_of_range, more = measure_courtyard(wishes.out)
         rows += more
-        reach, slope = linear_range(measured, "interpolation")
         text.append(f"### courtyard\n\n{courtyard_table(measured)}")
-        text.append(f"{slope:.2f} px a baseline beyond the ends, linear to {reach:g} baselines")
+        text.append("\n".join(told_of_range))
         text += [table_of(scene, more) for scene in dict.fromkeys(row.scene for row in more)]
         if wishes.out is not None:
             draw(measured).write_html(wishes.out / "interpolation.html", include_plotlyjs=True)

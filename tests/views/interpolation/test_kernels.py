@@ -7,6 +7,7 @@ import pytest
 
 from thesisrecon.types import F32
 from thesisrecon.views.interpolation.kernels import (
+    NEAR,
     ONE_SURFACE_PX,
     REACH,
     SPARSE,
@@ -15,6 +16,7 @@ from thesisrecon.views.interpolation.kernels import (
     mark_crossings,
     place_between,
     settle_guesses,
+    smooth_guesses,
     take_back,
     weigh,
 )
@@ -129,6 +131,24 @@ def test_guesses_become_medians_of_pixels_of_their_colour() -> None:
     # Between 15 and 18 the colours are those of the left surface.
     guessed = sure[:, 15:18] == 0.0
     assert np.median(out[:, 15:18][guessed & np.isfinite(d[:, 15:18])]) < 5.0
+
+
+def test_a_guess_alone_goes_with_those_around() -> None:
+    d = field(7)
+    rng = np.random.default_rng(7)
+    d[rng.random(d.shape) < 0.15] += 9.0
+    sure = rng.choice([0.0, 0.0, 1.0], d.shape).astype(np.float32)
+    out = np.empty_like(d)
+    for rows in ((0, 5), (5, 14)):
+        smooth_guesses(d, sure, rows, out)
+    for y, x in np.ndindex(d.shape):
+        around = d[max(y - NEAR, 0) : y + NEAR + 1, max(x - NEAR, 0) : x + NEAR + 1].ravel()
+        around = np.sort(around[np.isfinite(around)])
+        expected = d[y, x]
+        if sure[y, x] == 0.0 and np.isfinite(expected) and np.ptp(around) > ONE_SURFACE_PX:
+            expected = around[len(around) // 2]
+        np.testing.assert_array_equal(out[y, x], expected)
+    assert (out != d).sum() > 20
 
 
 def test_weights_are_confidences_but_at_rims() -> None:

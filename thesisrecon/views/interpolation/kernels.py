@@ -14,6 +14,8 @@ ONE_SURFACE_PX = 1.0
 REACH, SPARSE = 12, 3
 """How far about a guessed pixel its disparity is looked for, and how many pixels are skipped in between."""
 WINDOW = 2 * REACH // SPARSE + 1
+NEAR = 2
+"""How far about a guessed pixel others must agree with it."""
 
 
 @njit(cache=True, nogil=True)
@@ -129,6 +131,27 @@ def settle_guesses(
             # On one surface there is nothing to choose.
             if most - least > ONE_SURFACE_PX:
                 out[y, x] = _weighted_median(values[:n], weights[:n], 0.5 * total)
+
+
+@njit(cache=True, nogil=True)
+def smooth_guesses(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
+    """Guessed disparities (h, w), whose confidence ``sure`` is 0, become the median of those within ``NEAR``
+    pixels, rows [first, last): a pixel alone is a speck in every view between."""
+    height, width = disparity.shape
+    values = np.empty((2 * NEAR + 1) ** 2, np.float32)
+    for y in range(rows[0], rows[1]):
+        for x in range(width):
+            out[y, x] = disparity[y, x]
+            if sure[y, x] > 0.0 or np.isnan(disparity[y, x]):
+                continue
+            n = 0
+            for v in range(max(y - NEAR, 0), min(y + NEAR + 1, height)):
+                for u in range(max(x - NEAR, 0), min(x + NEAR + 1, width)):
+                    if not np.isnan(disparity[v, u]):
+                        values[n] = disparity[v, u]
+                        n += 1
+            if values[:n].max() - values[:n].min() > ONE_SURFACE_PX:
+                out[y, x] = np.sort(values[:n])[n // 2]
 
 
 @njit(cache=True, nogil=True)

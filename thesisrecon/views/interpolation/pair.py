@@ -17,6 +17,7 @@ from thesisrecon.views.interpolation.kernels import (
     fill_empty_rows,
     place_between,
     settle_guesses,
+    smooth_guesses,
     take_back,
     weigh,
 )
@@ -214,8 +215,9 @@ def _side(image: U8, H: F64, found: DisparityMap, blending: Blending) -> _Side:
     in_strips(
         lambda rows: settle_guesses(levels, disparity, sure, rows, likeness, settled), shape[0], PREPARING
     )
-    weigh(settled, sure, (blending.guessed, blending.least, blending.rim), weight)
-    return _Side(levels, places, settled, weight)
+    in_strips(lambda rows: smooth_guesses(settled, sure, rows, disparity), shape[0], PREPARING)
+    weigh(disparity, sure, (blending.guessed, blending.least, blending.rim), weight)
+    return _Side(levels, places, disparity, weight)
 
 
 def pair_of_rectified(left: U8, right: U8, maps: tuple[DisparityMap, DisparityMap]) -> InterpolatedPair:
