@@ -1,0 +1,44 @@
+"""Views by the trilinear tensor beside real photographs and rendered truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thesisrecon.views.tensor import CalibratedPair
+from validation.checks.tensor_views import Measured, Place, draw, linear_range, measure_cones
+from validation.scenes.real import data_root
+
+
+@pytest.mark.real
+def test_cones_are_shown_better_than_by_the_reference_and_than_by_dissolving():
+    root = data_root()
+    if root is None or not (root / "stereo" / "Cones9").is_dir():
+        pytest.skip("needs stereo/Cones9 of the real photographs")
+    rows = measure_cones(None)
+    assert {row.verdict for row in rows} == {"reported", "reached"}
+    assert [row.verdict for row in rows].count("reached") == 2
+
+
+def test_places_are_as_far_from_the_baseline_as_they_say():
+    K = np.array([[900.0, 0.0, 511.5], [0.0, 900.0, 383.5], [0.0, 0.0, 1.0]])
+    pair = CalibratedPair(K, K, np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    for place, centre, distance in (
+        (Place(1.5), (1.5, 0.0, 0.0), 0.5),
+        (Place(-0.25), (-0.25, 0.0, 0.0), 0.25),
+        (Place(0.5), (0.5, 0.0, 0.0), 0.0),
+        (Place(0.5, 0.3, "up"), (0.5, -0.3, 0.0), 0.3),
+        (Place(0.5, 0.3, "back"), (0.5, 0.0, -0.3), 0.3),
+    ):
+        camera = place.of(pair)
+        # From the second camera, which is one baseline on.
+        found = np.array([1.0, 0.0, 0.0]) - camera.rotation.T @ camera.translation
+        np.testing.assert_allclose(found, centre, atol=1e-12)
+        assert place.distance == pytest.approx(distance)
+
+
+def test_the_linear_range_ends_where_proportion_does():
+    offs = {1.25: 1.0, 1.5: 2.05, 2.0: 6.0}
+    rows = [Measured(Place(s), "guessed K", 25.0, 0.8, (off, 2 * off)) for s, off in offs.items()]
+    assert linear_range(rows, "guessed K") == (0.5, 4.0)
+    assert len(draw(rows).data) == 4
