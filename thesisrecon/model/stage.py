@@ -37,9 +37,13 @@ class SurfaceModel:
 
         The result does not depend on ``threads``.
         """
+        return self.color(self.surface_of(depth_maps, threads=threads), views, threads=threads)
+
+    def surface_of(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
+        """The surface alone; :class:`StageFailure` where the maps have no depths."""
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             fitted = list(pool.map(lambda m: resampled(self.surface.fit(m)), depth_maps))
-        return self.color(self.fusion.fuse(fitted, threads=threads), views, threads=threads)
+        return self.fusion.fuse(fitted, threads=threads)
 
     def color(
         self,

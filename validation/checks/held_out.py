@@ -17,20 +17,20 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-import thesisrecon
-from thesisrecon.config import preset
+from thesisrecon.dense.multiview import MultiViewStereo
 from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.model import SurfaceModel
 from thesisrecon.model.texture import SingleView, TextureAtlas
 from thesisrecon.types import DepthMap, PinholeView, RenderedView, TexturedMesh
 from thesisrecon.views import render
 from thesisrecon.views.likeness import exposed_alike, psnr_db, ssim, whole_pixels
+from validation.checks.dense_scene import depth_maps_of
 from validation.metrics.record import Metric, markdown_table
 from validation.references.open3d import OpenTsdf, render_open3d
 from validation.scenes.real import load_fixture_scene, load_real_scene
@@ -57,7 +57,7 @@ def models(
     maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int
 ) -> dict[str, TexturedMesh]:
     """The same depth maps and photographs as models of ours and of Open3D."""
-    surface = SurfaceModel().fusion.fuse(maps, threads=threads)
+    surface = SurfaceModel().surface_of(maps, threads=threads)
     single = TextureAtlas(painter=SingleView())
     found = {
         OURS: SurfaceModel().color(surface, views, threads=threads),
@@ -154,7 +154,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if scene is None:
                 print(f"{name}: not on this machine")
                 continue
-            maps, views = dense_scene(scene.image_paths, out / name, max_side=options.max_side)
+            stereo = MultiViewStereo(max_side=options.max_side)
+            maps, views = depth_maps_of(scene.image_paths, out / name, stereo, threads=options.threads)
             found = []
             for left_out in spread_out(sorted(maps), options.views):
                 where = out / f"{name}-held-out"
@@ -164,18 +165,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"\n## {name}\n\n{markdown_table(metrics)}", flush=True)
             missed |= any(metric.verdict == "missed" for metric in metrics)
     return int(missed)
-
-
-def dense_scene(
-    photographs: Sequence[Path], out: Path, *, max_side: int
-) -> tuple[dict[int, DepthMap], dict[int, PinholeView]]:
-    """Depth maps and undistorted photographs by view, from photographs alone; kept in ``out``."""
-    config = preset("default")
-    config = replace(config, dense=replace(config.dense, max_side=max_side))  # type: ignore[type-var]
-    run = thesisrecon.reconstruct(list(photographs), out, config=config, until="dense")
-    if not run.depth_maps:
-        raise RuntimeError(f"{out}: {run.failure}")
-    return {m.view: m for m in run.depth_maps}, {v.view: v for v in run.views}
 
 
 def _in_short(found: Mapping[str, Likeness]) -> str:

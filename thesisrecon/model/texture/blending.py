@@ -65,7 +65,7 @@ class BlendedViews:
     made equally bright first.
     """
 
-    power: float = 1.0
+    power: float = 2.0
     scatter: float = 20.0
     feather_px: float = 8.0
     level: bool = True
