@@ -8,6 +8,7 @@ from thesisrecon.dense.multiview.kernels import (
     count_agreement,
     fuse_inverse_depths,
     inverse_depths,
+    splat_depths,
     update_kalman,
 )
 from thesisrecon.dense.multiview.refinement.kernels import fit_planes
@@ -116,6 +117,25 @@ def test_agreement_counts_what_comes_back_and_what_is_seen_through():
     assert (agree == (np.abs(found - depth) <= bound)).all()
     assert contradict.sum() > 8
     assert agree.sum() > 300
+
+
+def test_depths_land_on_the_nearest_pixels_of_another_view_the_nearer_before_the_farther():
+    rng = np.random.default_rng(5)
+    to = np.column_stack([np.diag([1.0, 1.0, 1.1]), [3.0, -1.0, 0.2]])
+    depth = holes(rng, rng.choice([0.5, 1.0], SHAPE))
+    out = np.full((19, 25), np.nan, np.float32)
+    out[4, 5], out[6, 7] = 0.1, 9.0
+    wanted = out.copy()
+    splat_depths(depth, to, out)
+    z = depth.astype(float)
+    w = 1.1 * z + 0.2
+    p, q = (
+        np.floor((z * c + d) / w + 0.5) for c, d in zip(pixels().transpose(2, 0, 1), (3.0, -1.0), strict=True)
+    )
+    good = (w > 0) & (p >= 0) & (q >= 0) & (p < 25) & (q < 19)
+    np.fmin.at(wanted, (q[good].astype(int), p[good].astype(int)), w[good].astype(np.float32))
+    np.testing.assert_allclose(out, wanted, rtol=1e-6)
+    assert np.isnan(out).any()
 
 
 def test_planes_are_fitted_to_what_is_alike():

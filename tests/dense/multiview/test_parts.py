@@ -9,9 +9,11 @@ import pytest
 
 from tests.dense.multiview.scenes import RADIAL, SIZE, make_walled, on_arc
 from thesisrecon.dense.multiview import (
+    Completion,
     Consistency,
     NeighbourChoice,
     PairMatching,
+    PlaneRefinement,
     pinhole_view,
     sparse_points,
 )
@@ -185,13 +187,42 @@ def test_links_of_a_chain_lead_from_view_to_view():
     assert (linked.sigma[known] >= steps[0].sigma[known]).all()
 
 
-def test_what_other_views_see_through_and_small_pieces_go():
-    walled = make_walled(on_arc((-6.0, 6.0)))
-    maps = [
+def true_maps(walled):
+    return [
         DepthMap(i, walled.reconstruction.P[i], d.astype(np.float32), np.full(d.shape, 5e-3, np.float32),
                  np.ones(d.shape, np.uint8))
         for i, d in enumerate(walled.depth)
     ]  # fmt: skip
+
+
+def test_what_a_view_lacks_is_taken_from_others_where_the_photographs_agree():
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    maps, views = true_maps(walled), views_of(walled)
+    depth, other = maps[0].depth.copy(), maps[1].depth.copy()
+    lacks, wrong = np.s_[60:100, 60:110], np.s_[130:160, 100:150]
+    depth[lacks], depth[wrong] = np.nan, np.nan
+    # The other view is wrong there: what the photographs say counts, with the planes around the gap.
+    other[120:] *= 0.8
+    own, offering = replace(maps[0], depth=depth), replace(maps[1], depth=other)
+    found = Completion().complete(own, [offering], views, refinement=PlaneRefinement())
+    kept = np.isfinite(depth)
+    assert (found.depth[kept] == depth[kept]).all()
+    error = np.abs(found.depth[lacks] / maps[0].depth[lacks] - 1.0)
+    assert np.isfinite(error).mean() > 0.7
+    error = error[np.isfinite(error)]
+    assert np.median(error) < 0.004
+    assert np.mean(error < 0.02) > 0.95
+    error = found.depth[wrong] / maps[0].depth[wrong] - 1.0
+    assert np.mean(np.abs(error[np.isfinite(error)]) < 0.02) > 0.95
+    assert np.isfinite(found.std[np.isfinite(found.depth)]).all()
+    assert (found.views[lacks][np.isfinite(found.depth[lacks])] == 1).all()
+    nothing = replace(offering, depth=np.full_like(other, np.nan))
+    assert Completion().complete(own, [nothing], views, refinement=PlaneRefinement()) is own
+
+
+def test_what_other_views_see_through_and_small_pieces_go():
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    maps = true_maps(walled)
     depth = maps[0].depth.copy()
     depth[80:100, 20:40] *= 0.6
     depth[100, 200:203] = np.nan

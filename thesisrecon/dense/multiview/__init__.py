@@ -4,6 +4,7 @@ Undistorted views, the choice of neighbours, pairwise correspondence through rec
 the sequence or robust fusion, and consistency between the maps.
 """
 
+from thesisrecon.dense.multiview.completion import Completion
 from thesisrecon.dense.multiview.consistency import Consistency
 from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching
 from thesisrecon.dense.multiview.linking import InverseDepth, Linker, RobustFusion, SequenceLinking
@@ -14,6 +15,7 @@ from thesisrecon.dense.multiview.two_views import RectifiedPair, match_two_views
 from thesisrecon.dense.multiview.undistort import pinhole_view
 
 __all__ = [
+    "Completion",
     "Consistency",
     "Correspondence",
     "InverseDepth",

@@ -162,3 +162,23 @@ def count_agreement(
                 dy = (found * (back[1, 0] * x + back[1, 1] * y + back[1, 2]) + back[1, 3]) / b - v
                 if b > 0.0 and dx * dx + dy * dy <= limits[0] * limits[0]:
                     agree[v, u] += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def splat_depths(depth: F32, to: F64, out: F32) -> None:
+    """Depths (H, W) of one view at the nearest pixels of another, the nearer of several there; ``out``
+    (H', W') is updated, NaN where nothing is known. ``to`` (3, 4) see :func:`count_agreement`."""
+    rows, columns = out.shape
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = np.float64(depth[v, u])
+            if not np.isfinite(z):
+                continue
+            w = z * (to[2, 0] * u + to[2, 1] * v + to[2, 2]) + to[2, 3]
+            x = (z * (to[0, 0] * u + to[0, 1] * v + to[0, 2]) + to[0, 3]) / w
+            y = (z * (to[1, 0] * u + to[1, 1] * v + to[1, 2]) + to[1, 3]) / w
+            if w > 0.0 and -0.5 < x < columns - 0.5 and -0.5 < y < rows - 0.5:
+                q, p = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+                # A comparison with NaN is false.
+                if not out[q, p] <= w:
+                    out[q, p] = w

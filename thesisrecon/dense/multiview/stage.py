@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.dense.matching import match_rectified
+from thesisrecon.dense.multiview.completion import Completion
 from thesisrecon.dense.multiview.consistency import Consistency
 from thesisrecon.dense.multiview.correspondence import Correspondence, PairMatching, size_of
 from thesisrecon.dense.multiview.linking import InverseDepth, RobustFusion, SequenceLinking
@@ -46,11 +47,12 @@ class MultiViewStereo:
 
     ``pairs`` finds correspondences, ``choice`` the neighbours, ``linker`` makes one inverse depth of what
     they say, ``refinement`` (None: none) makes it agree with the photographs, ``consistency`` holds the maps
-    against each other. ``max_side`` px bounds the size of the depth maps, ``match_side`` px that at which
-    pairs are matched: windows that do not slant find less in larger pictures, and the refinement works out
-    what the smaller ones lack. One view's map depends on nothing but the
-    photographs and cameras, so views can be done in any order, by any number of threads and in several runs:
-    :meth:`prepare`, :meth:`depth_map` of each, :meth:`confirm` of each.
+    of at least ``least_partners`` views, as far as there are, against each other once ``completion`` (None:
+    none) has taken from them what a view lacks. ``max_side`` px bounds the size of the depth maps,
+    ``match_side`` px that at which pairs are matched: windows that do not slant find less in larger
+    pictures, and the refinement works out what the smaller ones lack. One view's map depends on
+    nothing but the photographs and cameras, so views can be done in any order, by any number of threads and
+    in several runs: :meth:`prepare`, :meth:`depth_map` of each, :meth:`confirm` of each.
     """
 
     pairs: PairMatching = field(default_factory=PairMatching)
@@ -58,6 +60,8 @@ class MultiViewStereo:
     linker: RobustFusion | SequenceLinking = field(default_factory=RobustFusion)
     refinement: PlaneRefinement | None = field(default_factory=PlaneRefinement)
     consistency: Consistency = field(default_factory=Consistency)
+    completion: Completion | None = field(default_factory=Completion)
+    least_partners: int = 12
     max_side: int = 1024
     match_side: int = 640
 
@@ -118,12 +122,20 @@ class MultiViewStereo:
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
         """The map of ``view`` with what the maps of other views confirm; see :class:`Consistency`."""
         others = [depth_maps[j] for j in self.partners(scene, view) if j in depth_maps]
-        return self.consistency.confirm(depth_maps[view], others)
+        own = depth_maps[view]
+        if self.completion is not None and self.refinement is not None:
+            own = self.completion.complete(own, others, scene.views, refinement=self.refinement)
+        return self.consistency.confirm(own, others)
 
     def partners(self, scene: MultiViewScene, view: int) -> tuple[int, ...]:
-        """Views whose maps are held against that of ``view``: its neighbours and those it is one of."""
+        """Views whose maps are held against that of ``view``: its neighbours, those it is one of, and as
+        many more as make ``least_partners``, those with most points in common."""
         mutual = {j for j, chosen in scene.neighbours.items() if view in chosen}
-        return tuple(sorted(mutual | set(scene.neighbours[view])))
+        partners = (mutual | set(scene.neighbours[view])) - {view}
+        seen = scene.points.seen
+        common = {j: int(np.sum(seen[view] & seen[j])) for j in scene.views if j not in partners | {view}}
+        order = sorted((j for j in common if common[j]), key=lambda j: (-common[j], j))
+        return tuple(sorted(partners | set(order[: max(self.least_partners - len(partners), 0)])))
 
     def map_all(
         self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1

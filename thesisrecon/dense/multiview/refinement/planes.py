@@ -18,7 +18,7 @@ from thesisrecon.dense.multiview.refinement.kernels import (
     sweep_planes,
 )
 from thesisrecon.geometry.camera import camera_centre
-from thesisrecon.types import F32, F64, I64, PinholeView
+from thesisrecon.types import B8, F32, F64, I64, PinholeView
 
 U8 = NDArray[np.uint8]
 U32 = NDArray[np.uint32]
@@ -59,32 +59,58 @@ class PlaneRefinement:
         if not others or not np.isfinite(found.value).any():
             return found
         setting = _Setting.of(reference, others, self._offsets(), self.likeness)
-        planes = np.empty((*found.value.shape, 3), dtype=np.float32)
-        gradients = np.empty((2, *found.value.shape), dtype=np.float32)
-        fit_planes(found.value, self.radius, 0.03, gradients[0], gradients[1])
-        planes[..., 0], planes[..., 1], planes[..., 2] = found.value, gradients[0], gradients[1]
-        cost = np.empty(found.value.shape, dtype=np.float32)
-        begin_planes(*setting.views, setting.offsets, setting.likeness, planes, cost)
-        for k in range(self.sweeps):
-            step = self.first_step_px * 0.5**k
-            sweep_planes(
-                *setting.views,
-                setting.offsets,
-                setting.likeness,
-                step,
-                self.settled,
-                k % 2 == 1,
-                planes,
-                cost,
-            )
+        planes = self._planes(found.value)
+        cost = setting.begin(planes)
+        self._sweep(setting, planes, cost, self.sweeps)
         return self._kept(found, planes[..., 0], setting.rate(planes, self.accepted))
+
+    def search(
+        self,
+        reference: PinholeView,
+        others: Sequence[PinholeView],
+        rho: F32,
+        *,
+        wanted: B8,
+        sweeps: int,
+    ) -> tuple[F32, F32, U8]:
+        """Inverse depth, deviation and support (H, W) of the pixels that are ``wanted``, begun with ``rho``
+        (H, W); NaN where no plane is accepted. Planes of other pixels stay as they are."""
+        setting = _Setting.of(reference, others, self._offsets(), self.likeness)
+        planes = self._planes(rho)
+        begun = np.where(wanted[..., None], planes, np.float32(np.nan))
+        # Nothing is tried where a plane costs nothing.
+        cost = np.where(wanted, setting.begin(begun), np.float32(0.0))
+        self._sweep(setting, planes, cost, sweeps)
+        planes[~wanted] = np.nan
+        least, support, slope = setting.rate(planes, self.accepted)
+        seen = self._seen(least, support)
+        with np.errstate(divide="ignore"):
+            std = (self.sigma_px / slope).astype(np.float32)
+        unknown = np.float32(np.nan)
+        return np.where(seen, planes[..., 0], unknown), np.where(seen, std, unknown), support * seen
+
+    def _planes(self, rho: F32) -> F32:
+        """(H, W, 3) inverse depths and their gradients."""
+        gradients = np.empty((2, *rho.shape), dtype=np.float32)
+        fit_planes(rho, self.radius, 0.03, gradients[0], gradients[1])
+        return np.stack([rho, gradients[0], gradients[1]], axis=-1)
+
+    def _sweep(self, setting: _Setting, planes: F32, cost: F32, sweeps: int) -> None:
+        for k in range(sweeps):
+            step = self.first_step_px * 0.5**k
+            views, window = setting.views, (setting.offsets, setting.likeness)
+            sweep_planes(*views, *window, step, self.settled, k % 2 == 1, planes, cost)
+
+    def _seen(self, least: F32, support: U8) -> B8:
+        """(H, W) planes that two neighbours accept, or one without doubt."""
+        return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * self.accepted)))
 
     def _kept(self, found: InverseDepth, rho: F32, rating: tuple[F32, U8, F32]) -> InverseDepth:
         least, support, slope = rating
         with np.errstate(divide="ignore", invalid="ignore"):
             std = (self.sigma_px / slope).astype(np.float32)
             near = np.abs(rho - found.value) <= self.gate * np.hypot(found.std, std)
-        seen = (support >= 2) | ((support == 1) & (least <= 0.5 * self.accepted))
+        seen = self._seen(least, support)
         matched = ~seen & (found.views >= 2)
         # Where windows say nothing (no texture) the matching has the word.
         with np.errstate(invalid="ignore"):
@@ -125,6 +151,12 @@ class _Setting:
         table = np.exp(-np.arange(256.0) / likeness).astype(np.float32)
         packed = np.concatenate([words.ravel() for words in squares])
         return cls((gray[0], packed, layout, H, e), offsets, table)
+
+    def begin(self, planes: F32) -> F32:
+        """Cost (H, W) of planes (H, W, 3)."""
+        cost = np.empty(planes.shape[:2], dtype=np.float32)
+        begin_planes(*self.views, self.offsets, self.likeness, planes, cost)
+        return cost
 
     def rate(self, planes: F32, accepted: float) -> tuple[F32, U8, F32]:
         """Least cost, support and slope (H, W) of planes (H, W, 3)."""
