@@ -41,7 +41,7 @@ def test_calibrated_photographs_show_a_third_one(found):
     R, C = SCENE.R, SCENE.C
     baseline = np.linalg.norm(C[7] - C[6])
     np.testing.assert_allclose(views.pair.t, R[7] @ (C[6] - C[7]) / baseline, atol=0.01)
-    np.testing.assert_allclose(views.pair.K2[0], [454.3, 0.0, 264.2], atol=0.06)
+    np.testing.assert_allclose(views.pair.K1[0], [454.3, 0.0, 264.2], atol=0.06)
     camera = VirtualCamera(R[8] @ R[7].T, R[8] @ (C[7] - C[8]) / baseline, views.pair.K2, views.sizes[1])
     picture, truth = views.render(camera), _photograph(8)
     gain = truth[100:300, 130:400].mean() / picture[100:300, 130:400].mean()
@@ -60,7 +60,7 @@ def test_at_their_own_places_the_photographs_are_seen_again(found):
 
 def test_what_is_told_of_the_focal_length_is_taken(found):
     told = replace(SMALL, intrinsics=IntrinsicsAssumption(focal="known", focal_px=900.0))
-    assert tensor_views(found, config=told).pair.K2[0, 0] == 450.0
+    assert tensor_views(found, config=told).pair.K1[0, 0] == 450.0
 
 
 def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():

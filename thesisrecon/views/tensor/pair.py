@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import calibration_matrix
+from thesisrecon.geometry.camera import calibration_matrix, rq
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, require_finite
 from thesisrecon.geometry.multiview import (
     enforce_rank_two,
@@ -145,7 +145,10 @@ def pair_from_fundamental(
 
     Returns
     -------
-    Cameras with a baseline of length 1. With wrong intrinsics R and t are those that come nearest.
+    Cameras with a baseline of length 1 whose fundamental matrix is F exactly, so that both photographs agree
+    on every point. They have K1 and, of all second cameras that F allows, the one whose left part is nearest
+    to K2 R K1^-1 (least squares, in coordinates of K2 and K1) with R of the essential matrix: its K2 differs
+    from the given one as far as F contradicts the intrinsics.
 
     Raises
     ------
@@ -170,9 +173,38 @@ def pair_from_fundamental(
             f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, for the best of {len(shares)} cameras",
             "the fundamental matrix or the intrinsics are wrong; estimate them anew",
         )
-    return CalibratedPair(
-        np.asarray(K1, dtype=np.float64), np.asarray(K2, dtype=np.float64), *candidates[best]
-    )
+    return _pair_with(F, K1, K2, *candidates[best])
+
+
+def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
+    """The pair that has F and is nearest to K1, K2, R, t."""
+    F = enforce_rank_two(F)
+    e2 = epipoles(F)[1]
+    H = -cross_matrix(e2) @ F
+    m, v = nearest_plane(H, e2, K2 @ R @ np.linalg.inv(K1), K1=K1, K2=K2)
+    left = m * (H + np.outer(e2, v)) @ K1
+    if not np.linalg.det(left) > 0.0:
+        raise StageFailure(
+            "the fundamental matrix contradicts the intrinsics",
+            "no second camera that it allows is near to one with these",
+            "give the focal length of the photographs, or none",
+        )
+    own, turn = rq(left)
+    baseline: F64 = np.asarray(np.linalg.solve(own, e2), dtype=np.float64)
+    baseline *= np.sign(baseline @ t) / np.linalg.norm(baseline)
+    return CalibratedPair(np.asarray(K1, dtype=np.float64), own / own[2, 2], turn, baseline)
+
+
+def nearest_plane(a: F64, a4: F64, wanted: F64, *, K1: F64, K2: F64) -> tuple[float, F64]:
+    """m and v (3,) for which m (a + a_4 v') is nearest to ``wanted`` (3, 3): least squares of K2^-1 (.) K1.
+
+    Of all planes that may play infinity it is the one that is where it would be in a metric frame.
+    """
+    back = np.linalg.inv(K2)
+    members = [a, *(np.outer(a4, axis) for axis in np.eye(3))]
+    design = np.stack([(back @ member @ K1).ravel() for member in members], axis=1)
+    m, *mv = np.linalg.lstsq(design, (back @ wanted @ K1).ravel(), rcond=None)[0]
+    return float(m), np.asarray(mv) / m
 
 
 def share_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:

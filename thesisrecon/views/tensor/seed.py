@@ -21,6 +21,7 @@ from thesisrecon.types import F64
 from thesisrecon.views.tensor.pair import (
     CalibratedPair,
     Orientation,
+    nearest_plane,
     pair_from_fundamental,
     require_intrinsics,
     require_rotation,
@@ -146,12 +147,11 @@ def seed_of_three(
     pair = pair_from_fundamental(
         fundamentals_from_tensor(T)[0], xy1, xy2, K1=K[0], K2=K[1], orientation=orientation
     )
-    # P2 of the pair is m (a + a_4 v', s a_4): linear in m and m v; then s from the last column.
+    # P2 of the pair is m (a + a_4 v', s a_4).
     a, a4 = P2[:, :3], P2[:, 3]
-    free = [a.ravel(), *(np.outer(a4, axis).ravel() for axis in np.eye(3))]
-    m, *mv = np.linalg.lstsq(np.stack(free, axis=1), pair.P2[:, :3].ravel(), rcond=None)[0]
+    m, v = nearest_plane(a, a4, pair.P2[:, :3], K1=pair.K1, K2=pair.K2)
     change = np.eye(4)
-    change[3, :3] = np.asarray(mv) / m
+    change[3, :3] = v
     change[3, 3] = a4 @ pair.P2[:, 3] / (m * (a4 @ a4))
     third = np.linalg.inv(K[2]) @ P3 @ change
     left = third[:, :3] @ K[0]
