@@ -32,13 +32,13 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class MultiViewScene:
-    """What the views share: ``views`` without distortion by number, the same ``matched`` at the size that
-    pairs are matched at, the sparse ``points``, and the ``neighbours`` of each view, the best first."""
+    """What the views share: ``views`` without distortion by number, the sparse ``points``, the ``neighbours``
+    of each view, the best first, and views ``matched`` at another size than that of their depth maps."""
 
     views: Mapping[int, PinholeView]
-    matched: Mapping[int, PinholeView]
     points: SparsePoints
     neighbours: Mapping[int, tuple[int, ...]]
+    matched: Mapping[int, PinholeView] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class MultiViewStereo:
             for side in (self.max_side, min(self.match_side, self.max_side))
         )
         chosen = {i: tuple(self.choice.choose(points, views, i)) for i in views}
-        return MultiViewScene(views, matched, points, chosen)
+        return MultiViewScene(views, points, chosen, matched)
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
         """Depths of one view from its neighbours, before other depth maps are asked.
@@ -104,7 +104,7 @@ class MultiViewStereo:
             raise ValueError(f"view {view} has no camera; those with one are {sorted(scene.views)}")
 
         def correspond(i: int, j: int) -> Correspondence | None:
-            a, b = scene.matched[i], scene.matched[j]
+            a, b = (scene.matched.get(k, scene.views[k]) for k in (i, j))
             sizes = size_of(scene.views[i]), size_of(scene.views[j])
             try:
                 return self.pairs.correspond(a, b, *shared_projections(scene.points, a, b), sizes=sizes)
