@@ -210,16 +210,33 @@ def measure_place(yard: Yard, place: Place, out: Path | None) -> Measured:
     """The nearest view between the photographs beside the picture taken from ``place``."""
     off, H = displaced(yard, place)
     s, moved = camera_of(yard, place)
-    picture, kept = yard.pair.view(s, threads=2), np.ones(SIZE[::-1], dtype=bool)
-    if H is not None:
-        picture, kept = turned(picture, H)
-    wanted = photograph(yard.truth.world, moved)
+    plain, square = square_camera(moved)
+    turn = square if H is None else square @ H
+    at_end = H is None and s in (0.0, 1.0)
+    picture = yard.pair.view(s, turn=None if at_end else turn, threads=2)
+    kept, wanted = within(np.eye(3) if at_end else turn), photograph(yard.truth.world, plain)
     if out is not None:
         name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
         save_beside(out / name, [wanted, picture])
     likeness = ssim(np.where(kept[..., None], picture, wanted), wanted)
     errors = float(np.median(off)), float(np.quantile(off, 0.9))
     return Measured(place, "interpolation", psnr_db(picture, wanted, where=kept), likeness, errors)
+
+
+def square_camera(pose: Pose) -> tuple[Pose, F64]:
+    """A camera of square pixels in the same place, which can be rendered, and what turns the one's pixels
+    into the other's (3, 3): an interpolated camera has some skew."""
+    focal = float(np.sqrt(pose.K[0, 0] * pose.K[1, 1]))
+    K = np.array([[focal, 0.0, pose.K[0, 2]], [0.0, focal, pose.K[1, 2]], [0.0, 0.0, 1.0]])
+    return Pose(K, pose.R, pose.C), np.asarray(K @ np.linalg.inv(pose.K))
+
+
+def within(turn: F64) -> NDArray[np.bool_]:
+    """(H, W) pixels that a view turned so has of its own frame."""
+    y, x = np.indices(SIZE[::-1], dtype=np.float64)
+    back = _through(np.asarray(np.linalg.inv(turn)), np.stack([x.ravel(), y.ravel()], axis=1))
+    inside = ((back >= 0.0) & (back <= np.array(SIZE) - 1.0)).all(axis=1)
+    return np.asarray(inside.reshape(SIZE[::-1]))
 
 
 def linear_reach(yard: Yard, direction: str) -> tuple[float, float]:
@@ -266,8 +283,9 @@ def measure_triangle(yard: Yard, out: Path | None) -> Metric:
     values: dict[str, float | None] = {}
     for name, t in (("a third towards the third", 1.0 / 3.0), ("half way", 0.5)):
         P = camera_between(second, (P_middle, P_third), t)
-        wanted, picture = photograph(yard.truth.world, pose_of(P)), second.view(t)
-        values[name] = psnr_db(picture, wanted)
+        plain, turn = square_camera(pose_of(P))
+        wanted, picture = photograph(yard.truth.world, plain), second.view(t, turn=turn)
+        values[name] = psnr_db(picture, wanted, where=within(turn))
         if out is not None:
             save_beside(out / f"courtyard-triangle-{t:.2f}.jpg", [wanted, picture])
     return Metric("courtyard, three photographs", "PSNR", "dB", values, "half way")
@@ -292,8 +310,8 @@ def measure_fountain(out: Path | None) -> list[Metric]:
     best = best_homography(*matches)
     pictures = {
         "as it is": view,
-        "turned as camera 5": turned(view, infinite)[0],
-        "turned best": turned(view, best)[0],
+        "turned as camera 5": pair.view(s, turn=infinite, threads=2),
+        "turned best": pair.view(s, turn=best, threads=2),
     }
     pictures[DISSOLVE] = dissolved(first.rgb, second.rgb, s)
     ends = [

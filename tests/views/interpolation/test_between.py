@@ -202,6 +202,15 @@ def test_rectified_and_turned_photographs_give_the_view_of_a_turned_camera(stage
     np.testing.assert_array_equal(pair.view(1.0), turned)
 
 
+def test_a_turned_view_is_the_view_through_a_homography(stage: Stage) -> None:
+    left, right = photographs(stage)
+    pair = pair_of_rectified(left, right, disparities(stage))
+    shift = np.array([[1.0, 0.0, 7.0], [0.0, 1.0, -3.0], [0.0, 0.0, 1.0]])
+    for s in (0.0, 0.5):
+        off = np.abs(pair.view(s, turn=shift)[2:-8, 12:-2] - pair.view(s)[5:-5, 5:-9].astype(float))
+        assert np.quantile(off, 0.9) < 1.0
+
+
 def test_exposures_are_interpolated_too(stage: Stage) -> None:
     left, right = photographs(stage)
     factor = np.array([0.8, 0.7, 0.75])

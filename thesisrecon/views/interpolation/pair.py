@@ -147,24 +147,25 @@ class InterpolatedPair:
             return np.ones(3, dtype=np.float32)
         return np.asarray(np.exp(np.median(np.log(levels[1][known] / levels[0][known]), axis=0)), np.float32)
 
-    def view(self, s: float, *, threads: int = 1) -> U8:
+    def view(self, s: float, *, turn: F64 | None = None, threads: int = 1) -> U8:
         """The view at s in [0, 1] from the first photograph to the second, (h, w, 3) uint8.
 
-        s = 0 and s = 1 are the photographs themselves. ``threads`` draw strips of rows and change no byte.
-        Raises ``ValueError`` for s elsewhere: there is nothing beyond the photographs.
+        s = 0 and s = 1 are the photographs themselves. ``turn`` (3, 3), of pixels, is what the camera there
+        is turned or zoomed by. ``threads`` draw strips of rows and change no byte. Raises ``ValueError`` for
+        s elsewhere: there is nothing beyond the photographs.
         """
         if not 0.0 <= s <= 1.0:
             raise ValueError(f"s is a place from 0 (the first photograph) to 1 (the second); got {s}")
-        if s in (0.0, 1.0):
+        if turn is None and s in (0.0, 1.0):
             return self.images[int(s)].copy()
-        rgb, near = self.seen(s, threads=threads)
+        rgb, near = self.seen(s, turn=turn, threads=threads)
         filled = fill_holes(rgb, near, step=ONE_SURFACE_PX)
         return np.clip(np.rint(np.nan_to_num(filled)), 0.0, 255.0).astype(np.uint8)
 
-    def seen(self, s: float, *, threads: int = 1) -> tuple[F32, F32]:
+    def seen(self, s: float, *, turn: F64 | None = None, threads: int = 1) -> tuple[F32, F32]:
         """Colours (h, w, 3) and disparities (h, w) of the view at s before what neither photograph shows is
         filled, NaN there."""
-        warped = [self.warped(side, s, threads=threads) for side in (0, 1)]
+        warped = [self.warped(side, s, turn=turn, threads=threads) for side in (0, 1)]
         sides, blending = self._sides, self.blending
         out = np.empty_like(warped[0].colors), np.empty_like(warped[0].near)
 
@@ -182,11 +183,12 @@ class InterpolatedPair:
         in_strips(work, self.size[1], threads)
         return out
 
-    def warped(self, side: int, s: float, *, threads: int = 1) -> Warped:
+    def warped(self, side: int, s: float, *, turn: F64 | None = None, threads: int = 1) -> Warped:
         """One photograph alone as the view at s sees it, as bright as this is."""
         this = self._sides[side]
         target = np.empty_like(this.places)
         G = self.frame.original_from_rectified(s)
+        G = G if turn is None else np.ascontiguousarray(turn @ G)
         share = s - side
         in_strips(
             lambda rows: place_between(this.places, this.disparity, share, G, rows, target),
