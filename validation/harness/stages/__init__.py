@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from validation.harness.records import Stage
 from validation.harness.scenes import available_scenes
+from validation.harness.stages.between import BetweenStage
 from validation.harness.stages.bundle import BundleStage
 from validation.harness.stages.cameras import CamerasStage
 from validation.harness.stages.clouds import CloudsStage
@@ -24,5 +25,6 @@ STAGES: dict[str, Stage] = {
         CloudsStage(),
         BundleStage(),
         DisparityStage(),
+        BetweenStage(),
     )
 }

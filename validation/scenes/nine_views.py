@@ -1,0 +1,75 @@
+"""Nine equally spaced rectified photographs: views between two of them are there to compare with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from validation.scenes.real import data_root
+
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+
+ENDS = (2, 6)
+BETWEEN = (3, 4, 5)
+BEYOND = (1, 7)
+DISPARITIES = 64
+"""Between the ends; their disparities are less than this."""
+
+
+@dataclass(frozen=True)
+class NineViews:
+    """``images`` (H, W, 3) by their number, and the true disparities (H, W) of both ends, NaN = unknown."""
+
+    images: dict[int, U8]
+    disparities: tuple[F32, F32]
+
+    def share(self, view: int) -> float:
+        """Where a view is on the way from the first end, 0, to the second, 1."""
+        return (view - ENDS[0]) / (ENDS[1] - ENDS[0])
+
+
+def load_cones() -> NineViews | None:
+    """The Cones of Scharstein and Szeliski (CVPR 2003); None where they are not on this machine."""
+    root = data_root()
+    folder = None if root is None else root / "stereo" / "Cones9"
+    if folder is None or not folder.is_dir():
+        return None
+    numbers = sorted({*ENDS, *BETWEEN, *BEYOND})
+    images = {k: read_rgb(folder / f"im{k}.png") for k in numbers}
+    first, second = (_quarters(folder / f"disp{k}.png") for k in ENDS)
+    return NineViews(images, (first, second))
+
+
+def read_rgb(path: Path) -> U8:
+    """(H, W, 3)."""
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def mirrored(image: U8) -> U8:
+    """The picture from right to left: the right one of a pair becomes a left one."""
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def both_ways(match: Callable[[U8, U8], F32], left: U8, right: U8) -> tuple[F32, F32]:
+    """Disparities of either photograph by a method that knows those of the left one only."""
+    back = match(mirrored(right), mirrored(left))
+    return match(left, right), np.ascontiguousarray(back[:, ::-1])
+
+
+def dissolved(first: U8, second: U8, share: float) -> U8:
+    """Both photographs mixed where they are: what a view between must be better than."""
+    mixed = (1.0 - share) * first.astype(np.float64) + share * second
+    return np.asarray(np.rint(mixed), dtype=np.uint8)
+
+
+def _quarters(path: Path) -> F32:
+    with Image.open(path) as image:
+        told = np.asarray(image, dtype=np.float32)
+    return np.where(told > 0.0, 0.25 * told, np.nan).astype(np.float32)
