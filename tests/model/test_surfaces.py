@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
@@ -211,3 +213,16 @@ def test_ground_seen_at_a_slant_has_no_holes() -> None:
     assert inner.sum() > 3000
     assert np.isfinite(seen[inner]).mean() > 0.99
     assert np.median(np.abs(seen / ground.depth - 1.0)[inner]) < 0.004
+
+
+def test_holes_of_a_sheet_are_closed_by_another() -> None:
+    first, second = (sphere_map(k, looking_at_origin(0.2 * k, 0.3, 3.5)) for k in (0, 1))
+    depth = first.depth.copy()
+    depth[60, 80] = np.nan  # four squares of the sheet, one pixel of the map
+    depth[40:43, 70:73] = np.nan
+    mesh = DepthSheets(step=2).fuse([replace(first, depth=depth), replace(second, depth=second.depth)])
+    seen = mesh.vertices[mesh.faces].mean(axis=1) @ first.P[:, :3].T + first.P[:, 3]
+    x, y = (seen[:, :2] / seen[:, 2:]).T
+    near = seen[:, 2] < 3.5  # not the far side of the sphere
+    for row, column in ((60, 80), (41, 71)):
+        assert ((np.abs(x - column) < 1.0) & (np.abs(y - row) < 1.0) & near).any()
