@@ -220,7 +220,8 @@ def test_holes_of_a_sheet_are_closed_by_another() -> None:
     depth = first.depth.copy()
     depth[60, 80] = np.nan  # four squares of the sheet, one pixel of the map
     depth[40:43, 70:73] = np.nan
-    mesh = DepthSheets(step=2).fuse([replace(first, depth=depth), replace(second, depth=second.depth)])
+    part = np.where(np.arange(SHAPE[1]) < 50, np.float32(np.nan), second.depth)  # fewer: it comes later
+    mesh = DepthSheets(step=2).fuse([replace(first, depth=depth), replace(second, depth=part)])
     seen = mesh.vertices[mesh.faces].mean(axis=1) @ first.P[:, :3].T + first.P[:, 3]
     x, y = (seen[:, :2] / seen[:, 2:]).T
     near = seen[:, 2] < 3.5  # not the far side of the sphere
