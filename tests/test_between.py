@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +19,7 @@ from thesisrecon.cli import run_command
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.types import Image
-from thesisrecon.view_command import BetweenWishes, write_between
+from thesisrecon.view_command import METHODS, BetweenWishes, write_between
 from thesisrecon.views.interpolation import pair_of_rectified, unsure
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
@@ -265,3 +266,9 @@ def test_wishes_name_what_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(UsageError, match="not of this command"):
         write_between(tmp_path, BetweenWishes(photographs))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_its_film(method: str) -> None:
+    module, name = METHODS[method]
+    assert callable(getattr(import_module(module), name))

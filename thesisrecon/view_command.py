@@ -204,10 +204,7 @@ def write_between(
 def _film_of(method: str) -> Callable[..., Film]:
     """The maker of films by that method, loaded when it is asked for."""
     module, name = METHODS[method]
-    try:
-        maker: Callable[..., Film] = getattr(import_module(module), name)
-    except (ModuleNotFoundError, AttributeError):
-        raise UsageError(f"--method {method} is not part of this version") from None
+    maker: Callable[..., Film] = getattr(import_module(module), name)
     return maker
 
 
