@@ -10,14 +10,8 @@ from tests.textures import texture
 from thesisrecon.dense.rectification import rectify_cameras
 from thesisrecon.geometry.camera import camera_from_centre, project
 from thesisrecon.views.interpolation import InterpolatedPair, unsure
-from validation.checks.interpolation import (
-    best_homography,
-    camera_between,
-    camera_centre_of,
-    measure_cones,
-    nearest_place,
-    turned,
-)
+from validation.checks.interpolation import measure_cones
+from validation.scenes.between import best_homography, camera_between, camera_centre_of, nearest_place, turned
 from validation.scenes.real import data_root
 
 SIZE = (160, 120)

@@ -22,12 +22,10 @@ from numpy.typing import NDArray
 from thesisrecon.between import rectified_pair, relate
 from thesisrecon.config import PipelineConfig
 from thesisrecon.dense.matching import CohesiveScanlines
-from thesisrecon.geometry.camera import camera_centre, camera_from_centre, decompose_camera, project
-from thesisrecon.geometry.multiview import estimate_homography, homography_residuals
+from thesisrecon.geometry.camera import camera_from_centre, project
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.types import DisparityMap, Image
 from thesisrecon.views.interpolation import InterpolatedPair, check_monotonicity
-from thesisrecon.views.warping import sample
 from validation.checks.tensor_views import (
     DIRECTIONS,
     VIEWS,
@@ -43,6 +41,16 @@ from validation.checks.tensor_views import (
 from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric, markdown_table
 from validation.references.semi_global import MODES, OpenCVSemiGlobal
+from validation.scenes.between import (
+    best_homography,
+    camera_between,
+    camera_centre_of,
+    nearest_place,
+    pose_of,
+    square_camera,
+    through,
+    turned,
+)
 from validation.scenes.fixtures import SIZE, Pose, courtyard_poses
 from validation.scenes.real import data_root, load_real_scene
 
@@ -133,24 +141,6 @@ def cones_targets(rows: list[Metric]) -> list[Metric]:
     ]
 
 
-def camera_between(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
-    """The camera (3, 4) that the view at s is of, given those of the photographs.
-
-    In the rectified frame both have their rows and depths in common up to a scale, so that the interpolated
-    place of every point is its image in (1 - s) P_0 + s P_1 (Seitz and Dyer).
-    """
-    first, second = (H @ camera for H, camera in zip(pair.H, P, strict=True))
-    # What is common is so but for the errors of F.
-    scale = float(np.sum(first[1:] * second[1:]) / np.sum(second[1:] ** 2))
-    return np.asarray(pair.frame.original_from_rectified(s) @ ((1.0 - s) * first + s * scale * second))
-
-
-def pose_of(P: F64) -> Pose:
-    """K, R, C of a camera."""
-    K, R, t = decompose_camera(P)
-    return Pose(K, R, -R.T @ t)
-
-
 def cameras_of(truth: CourtyardTruth) -> tuple[F64, F64]:
     """The cameras (3, 4) of both photographs."""
     one, two = (camera_from_centre(pose.K, pose.R, pose.C) for pose in truth.poses)
@@ -202,7 +192,7 @@ def displaced(yard: Yard, place: Place) -> tuple[F64, F64 | None]:
     there = project(camera_from_centre(moved.K, moved.R, moved.C), yard.X)
     here = yard.pair.frame.points(yard.xy1, yard.xy2, s)
     H = best_homography(here, there) if place.distance else None
-    here = here if H is None else _through(H, here)
+    here = here if H is None else through(H, here)
     return np.linalg.norm(here - there, axis=1), H
 
 
@@ -223,18 +213,10 @@ def measure_place(yard: Yard, place: Place, out: Path | None) -> Measured:
     return Measured(place, "interpolation", psnr_db(picture, wanted, where=kept), likeness, errors)
 
 
-def square_camera(pose: Pose) -> tuple[Pose, F64]:
-    """A camera of square pixels in the same place, which can be rendered, and what turns the one's pixels
-    into the other's (3, 3): an interpolated camera has some skew."""
-    focal = float(np.sqrt(pose.K[0, 0] * pose.K[1, 1]))
-    K = np.array([[focal, 0.0, pose.K[0, 2]], [0.0, focal, pose.K[1, 2]], [0.0, 0.0, 1.0]])
-    return Pose(K, pose.R, pose.C), np.asarray(K @ np.linalg.inv(pose.K))
-
-
 def within(turn: F64) -> NDArray[np.bool_]:
     """(H, W) pixels that a view turned so has of its own frame."""
     y, x = np.indices(SIZE[::-1], dtype=np.float64)
-    back = _through(np.asarray(np.linalg.inv(turn)), np.stack([x.ravel(), y.ravel()], axis=1))
+    back = through(np.asarray(np.linalg.inv(turn)), np.stack([x.ravel(), y.ravel()], axis=1))
     inside = ((back >= 0.0) & (back <= np.array(SIZE) - 1.0)).all(axis=1)
     return np.asarray(inside.reshape(SIZE[::-1]))
 
@@ -338,51 +320,12 @@ def measure_fountain(out: Path | None) -> list[Metric]:
     ]
 
 
-def camera_centre_of(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
-    """(3,) where the view at s is taken from."""
-    C = camera_centre(camera_between(pair, P, s))
-    return np.asarray(C[:3] / C[3])
-
-
-def nearest_place(pair: InterpolatedPair, P: tuple[F64, F64], C: F64) -> float:
-    """The s, to a hundredth, whose camera is nearest to C (3,)."""
-    places = np.linspace(0.0, 1.0, 101)
-    return float(places[np.argmin([np.linalg.norm(camera_centre_of(pair, P, s) - C) for s in places])])
-
-
 def pair_matches(first: U8, second: U8) -> tuple[F64, F64]:
     """Verified matches of two pictures."""
     from thesisrecon import match_pair
 
     pair = match_pair(first, second)
     return pair.xy1, pair.xy2
-
-
-def best_homography(xy1: F64, xy2: F64) -> F64:
-    """Least squares over the nine tenths of the points that fit best."""
-    kept = np.ones(len(xy1), dtype=bool)
-    H = estimate_homography(xy1, xy2)
-    for _ in range(3):
-        off = homography_residuals(H, xy1, xy2)
-        kept = off <= np.quantile(off, 0.9)
-        H = estimate_homography(xy1[kept], xy2[kept])
-    return H
-
-
-def turned(picture: U8, H: F64) -> tuple[U8, NDArray[np.bool_]]:
-    """The picture through H (3, 3), black outside, and where it has pixels."""
-    height, width = picture.shape[:2]
-    y, x = np.indices((height, width), dtype=np.float64)
-    back: F64 = np.asarray(np.linalg.inv(H), dtype=np.float64)
-    source = _through(back, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(height, width, 2)
-    rgb = sample(picture.astype(np.float32), source.astype(np.float32), threads=2)
-    kept = np.isfinite(rgb[..., 0])
-    return np.clip(np.rint(np.nan_to_num(rgb)), 0, 255).astype(np.uint8), kept
-
-
-def _through(H: F64, xy: F64) -> F64:
-    xh = np.column_stack([xy, np.ones(len(xy))]) @ H.T
-    return np.asarray(xh[:, :2] / xh[:, 2:])
 
 
 def picture_metrics(scene: str, pictures: Mapping[str, U8], wanted: U8) -> list[Metric]:

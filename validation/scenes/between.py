@@ -1,0 +1,82 @@
+"""True cameras of interpolated views, and pictures turned onto each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.camera import camera_centre, decompose_camera
+from thesisrecon.geometry.multiview import estimate_homography, homography_residuals
+from thesisrecon.views.interpolation import InterpolatedPair
+from thesisrecon.views.warping import sample
+from validation.scenes.fixtures import Pose
+
+B8 = NDArray[np.bool_]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+
+def camera_between(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
+    """The camera (3, 4) that the view at s is of, given those of the photographs.
+
+    In the rectified frame both have their rows and depths in common up to a scale, so that the interpolated
+    place of every point is its image in (1 - s) P_0 + s P_1 (Seitz and Dyer).
+    """
+    first, second = (H @ camera for H, camera in zip(pair.H, P, strict=True))
+    # What is common is so but for the errors of F.
+    scale = float(np.sum(first[1:] * second[1:]) / np.sum(second[1:] ** 2))
+    return np.asarray(pair.frame.original_from_rectified(s) @ ((1.0 - s) * first + s * scale * second))
+
+
+def pose_of(P: F64) -> Pose:
+    """K, R, C of a camera."""
+    K, R, t = decompose_camera(P)
+    return Pose(K, R, -R.T @ t)
+
+
+def square_camera(pose: Pose) -> tuple[Pose, F64]:
+    """A camera of square pixels in the same place, which can be rendered, and what turns the one's pixels
+    into the other's (3, 3): an interpolated camera has some skew."""
+    focal = float(np.sqrt(pose.K[0, 0] * pose.K[1, 1]))
+    K = np.array([[focal, 0.0, pose.K[0, 2]], [0.0, focal, pose.K[1, 2]], [0.0, 0.0, 1.0]])
+    return Pose(K, pose.R, pose.C), np.asarray(K @ np.linalg.inv(pose.K))
+
+
+def camera_centre_of(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
+    """(3,) where the view at s is taken from."""
+    C = camera_centre(camera_between(pair, P, s))
+    return np.asarray(C[:3] / C[3])
+
+
+def nearest_place(pair: InterpolatedPair, P: tuple[F64, F64], C: F64) -> float:
+    """The s, to a hundredth, whose camera is nearest to C (3,)."""
+    places = np.linspace(0.0, 1.0, 101)
+    return float(places[np.argmin([np.linalg.norm(camera_centre_of(pair, P, s) - C) for s in places])])
+
+
+def best_homography(xy1: F64, xy2: F64) -> F64:
+    """Least squares over the nine tenths of the points that fit best."""
+    kept = np.ones(len(xy1), dtype=bool)
+    H = estimate_homography(xy1, xy2)
+    for _ in range(3):
+        off = homography_residuals(H, xy1, xy2)
+        kept = off <= np.quantile(off, 0.9)
+        H = estimate_homography(xy1[kept], xy2[kept])
+    return H
+
+
+def turned(picture: U8, H: F64) -> tuple[U8, B8]:
+    """The picture through H (3, 3), black outside, and where it has pixels."""
+    height, width = picture.shape[:2]
+    y, x = np.indices((height, width), dtype=np.float64)
+    back: F64 = np.asarray(np.linalg.inv(H), dtype=np.float64)
+    source = through(back, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(height, width, 2)
+    rgb = sample(picture.astype(np.float32), source.astype(np.float32), threads=2)
+    kept = np.isfinite(rgb[..., 0])
+    return np.clip(np.rint(np.nan_to_num(rgb)), 0, 255).astype(np.uint8), kept
+
+
+def through(H: F64, xy: F64) -> F64:
+    """Points (N, 2) moved by H (3, 3)."""
+    xh = np.column_stack([xy, np.ones(len(xy))]) @ H.T
+    return np.asarray(xh[:, :2] / xh[:, 2:])
