@@ -1,6 +1,6 @@
 """A photograph that the model has not seen beside the model, and beside Open3D's.
 
-``python -m validation.checks.held_out [-o OUT] [--scenes ...] [--views K]``
+``python -m validation.checks.held_out [-o OUT] [--scenes ...] [--views K] [--levelled]``
 
 Every view in turn of a few is left out: its depth map and its photograph go into neither model. (The other
 depth maps were matched with it, for both alike.) Ours is fused and textured; Open3D's is a grid of truncated
@@ -8,8 +8,9 @@ signed distances with the colours of its vertices from the same depth maps and p
 the same size as ours and finer ones. All meshes are drawn by our renderer at the camera that was left out
 and compared over the pixels that all of them cover whole. Photographs are exposed differently, and how an
 unseen one was exposed nobody knows: numbers are of pictures made as bright as the photograph by one factor a
-channel, each method its own, and of pictures as they are. The exit code is 1 where Open3D is better in the
-former. Pictures are kept in OUT.
+channel, each method its own, and of pictures as they are. With ``--levelled`` all photographs are made
+equally bright before any model is made of them. The exit code is 1 where Open3D is better in the former
+numbers. Pictures are kept in OUT.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from PIL import Image
 from thesisrecon.dense.multiview import MultiViewStereo
 from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.model import SurfaceModel
-from thesisrecon.model.texture import SingleView, TextureAtlas
+from thesisrecon.model.texture import BlendedViews, SingleView, TextureAtlas
 from thesisrecon.types import DepthMap, PinholeView, RenderedView, TexturedMesh
 from thesisrecon.views import render
 from thesisrecon.views.likeness import exposed_alike, psnr_db, ssim, whole_pixels
@@ -130,11 +131,23 @@ def table(scene: str, found: Sequence[Mapping[str, Likeness]]) -> list[Metric]:
     ]
 
 
+def equally_bright(
+    maps: Mapping[int, DepthMap], views: Mapping[int, PinholeView], *, threads: int = 1
+) -> dict[int, PinholeView]:
+    """All photographs with one exposure, by the gains that the texture of ours finds."""
+    order = sorted(maps)
+    surface = SurfaceModel().surface_of([maps[i] for i in order], threads=threads)
+    gains = BlendedViews().prepare(surface, [views[i] for i in order], threads=threads).gains
+    return {
+        i: replace(views[i], rgb=np.clip(np.rint(views[i].rgb * gain), 0, 255).astype(np.uint8))
+        for i, gain in zip(order, gains, strict=True)
+    }
+
+
 def spread_out(views: Sequence[int], count: int) -> list[int]:
-    """``count`` of the views, not the first or last where there are others."""
-    inner = list(views[1:-1]) if len(views) > 2 else list(views)
-    places = np.linspace(0, len(inner) - 1, min(count, len(inner)) + 2)[1:-1]
-    return [inner[round(float(place))] for place in places]
+    """``count`` of the views, evenly, without the first and the last where there are others."""
+    places = np.linspace(0, len(views) - 1, count + 2)[1:-1]
+    return sorted({views[round(float(place))] for place in places})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -143,7 +156,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-o", "--out", type=Path, help="where reconstructions and pictures are kept")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=[*SCENES, "courtyard"])
     parser.add_argument("--views", type=int, default=3, help="how many photographs are left out, one by one")
+    parser.add_argument("--left-out", type=int, nargs="*", help="these instead")
     parser.add_argument("--max-side", type=int, default=1024, help="px of the depth maps")
+    parser.add_argument(
+        "--levelled", action="store_true", help="make all photographs equally bright first, for every model"
+    )
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args(arguments)
     missed = False
@@ -156,8 +173,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 continue
             stereo = MultiViewStereo(max_side=options.max_side)
             maps, views = depth_maps_of(scene.image_paths, out / name, stereo, threads=options.threads)
+            if options.levelled:
+                views = equally_bright(maps, views, threads=options.threads)
             found = []
-            for left_out in spread_out(sorted(maps), options.views):
+            for left_out in options.left_out or spread_out(sorted(maps), options.views):
                 where = out / f"{name}-held-out"
                 found.append(hold_out(left_out, maps, views, pictures=where, threads=options.threads))
                 print(f"{name}, without {left_out}: {_in_short(found[-1])}", flush=True)

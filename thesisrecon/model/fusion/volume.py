@@ -60,7 +60,7 @@ class VolumetricFusion:
     truncation_voxels: float = 4.0
     max_blocks: int = 250_000
     grazing_deg: float = 5.0
-    least_part: float = 0.002
+    least_part: float = 0.0005
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
         """The surface, without colours; faces anticlockwise seen from where the views look at it.
