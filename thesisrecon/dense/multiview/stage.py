@@ -28,6 +28,8 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.types import F64, DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 
 Result = TypeVar("Result")
+SURE = 3.0
+"""Deviations by which an inverse depth is above that of infinity."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +150,9 @@ class MultiViewStereo:
 
 
 def _depth_map(view: PinholeView, found: InverseDepth) -> DepthMap:
-    known = np.isfinite(found.value) & view.seen
+    """Depths of inverse depths; those that cannot be told from infinity are none."""
     with np.errstate(divide="ignore", invalid="ignore"):
+        known = (found.value > SURE * found.std) & view.seen
         depth = np.where(known, 1.0 / found.value, np.nan).astype(np.float32)
         std = np.where(known, found.std * depth * depth, np.nan).astype(np.float32)
     return DepthMap(view.view, view.P, depth, std, np.where(known, found.views, 0).astype(np.uint8))
