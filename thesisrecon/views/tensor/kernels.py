@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from thesisrecon.types import F32, F64
+
+I16 = NDArray[np.int16]
+I32 = NDArray[np.int32]
 
 
 @njit(cache=True, nogil=True)
@@ -43,3 +47,47 @@ def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, nearness: F
             xy[row, column, 0] = u / w
             xy[row, column, 1] = v / w
             nearness[row, column] = (l0 * a0 + l1 * a1 + l2 * a2) / w
+
+
+@njit(cache=True, nogil=True)
+def guess_rows(nearness: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32) -> None:
+    """Nearness of all pixels of a photograph, into ``out`` (H, W): the known one, or that of a pixel around.
+
+    ``nearness`` of this photograph (H, W) and of the other (h, w), each in its own view, NaN = unknown;
+    ``P2`` (3, 4) the other camera; ``distance`` (K, H, W) how many of the ``steps`` (K, 2) (down, right) lead
+    to the next known pixel. Of these pixels the nearest is taken, unless its surface would stand in front of
+    what the other photograph sees by more than ``step``: such a one only where all do. NaN where there is
+    none.
+    """
+    own, other = nearness
+    for y in range(own.shape[0]):
+        for x in range(own.shape[1]):
+            out[y, x] = own[y, x]
+            if not np.isnan(own[y, x]):
+                continue
+            least, before = np.inf, True
+            for k in range(steps.shape[0]):
+                n = distance[k, y, x]
+                if n < 1:
+                    continue
+                reach = n * n * (steps[k, 0] ** 2 + steps[k, 1] ** 2)
+                rho = own[y + n * steps[k, 0], x + n * steps[k, 1]]
+                stands = _stands_before(other, P2, x, y, rho, step)
+                if (before and not stands) or (before == stands and reach < least):
+                    least, before = reach, stands
+                    out[y, x] = rho
+
+
+@njit(cache=True, nogil=True)
+def _stands_before(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> bool:
+    """Whether the point of a pixel at a nearness is in front of what the other photograph sees there."""
+    u = P2[0, 0] * x + P2[0, 1] * y + P2[0, 2] + rho * P2[0, 3]
+    v = P2[1, 0] * x + P2[1, 1] * y + P2[1, 2] + rho * P2[1, 3]
+    w = P2[2, 0] * x + P2[2, 1] * y + P2[2, 2] + rho * P2[2, 3]
+    if not w > 0.0:
+        return True
+    column, row = np.rint(u / w), np.rint(v / w)
+    if not (0 <= row < other.shape[0] and 0 <= column < other.shape[1]):
+        return False
+    # A comparison with NaN is false.
+    return bool(rho / w > other[int(row), int(column)] + step)

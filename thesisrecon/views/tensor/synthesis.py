@@ -13,21 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.geometry.zbuffer import in_strips
-from thesisrecon.types import B8, F32, F64
-from thesisrecon.views.tensor.kernels import transfer_rows
+from thesisrecon.types import B8, F32
+from thesisrecon.views.tensor.completion import complete_places, surface_step, transfer_grid
 from thesisrecon.views.tensor.pair import CalibratedPair
 from thesisrecon.views.tensor.path import VirtualCamera, cameras_along
-from thesisrecon.views.tensor.seed import VirtualTensor, seed_of_first, seed_of_two
+from thesisrecon.views.tensor.seed import VirtualTensor, seed_of_two
 from thesisrecon.views.warping import fill_holes, forward_map, sample
 
 U8 = NDArray[np.uint8]
 
-SURFACE_PX = 1.0
-"""Neighbours whose disparities between the photographs differ by more are not of one surface."""
-SPARSE = 16
-"""Every sixteenth pixel of every sixteenth row suffices for a median."""
+AGREE_PX = 1.5
+"""Half a pixel of rounding, and a pixel of noise."""
 LEAST_SEEN = 0.05
 """Share of its picture that a virtual camera must have of what the photographs show."""
 
@@ -68,7 +64,7 @@ class TensorSynthesis:
         ``StageFailure`` where the camera sees next to nothing of the scene.
         """
         moved = [seed.moved(camera.rotation, camera.translation, K=camera.K) for seed in self.seeds]
-        step = self._step(moved[0])
+        step = surface_step(moved[0], self.places[0])
         layers = [self._layer(side, moved[side], camera.size, step, threads) for side in (0, 1)]
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
         if not seen.mean() >= LEAST_SEEN:
@@ -80,13 +76,6 @@ class TensorSynthesis:
         rgb, nearness = self._mixed(layers, self._share_of_second(moved[0]), step)
         filled = fill_holes(rgb, nearness, step=step)
         return np.asarray(np.clip(np.rint(filled), 0.0, 255.0), dtype=np.uint8)
-
-    def _step(self, virtual: VirtualTensor) -> float:
-        """``SURFACE_PX`` in units of the virtual camera's nearness, for the middle one of the pixels."""
-        y, x = np.indices(self.places[0].shape[:2])[:, ::SPARSE, ::SPARSE].reshape(2, -1)
-        places = self.places[0][y, x].astype(np.float64)
-        pixels = np.stack([x, y], axis=1).astype(np.float64)
-        return SURFACE_PX / float(np.nanmedian(virtual.disparity_per_nearness(pixels, places)))
 
     def _share_of_second(self, virtual: VirtualTensor) -> np.float32:
         """How far along the baseline the camera is: 0 beside the first photograph, 1 beside the second, and
@@ -142,6 +131,7 @@ def prepare_synthesis(
     *,
     gain: ArrayLike = (1.0, 1.0, 1.0),
     seed: VirtualTensor | None = None,
+    agree_px: float = AGREE_PX,
 ) -> TensorSynthesis:
     """What does not depend on the virtual camera.
 
@@ -149,58 +139,30 @@ def prepare_synthesis(
     ----------
     pair : the cameras, guessed or known.
     images : two (H, W, 3) levels 0 .. 255.
-    places : two (H, W, 2) px: where the pixels of the one photograph are in the other, NaN = unknown. Those
-        are guessed to be as far as the farthest of the nearest known ones around.
+    places : two (H, W, 2) px: where the pixels of the one photograph are in the other, NaN = unknown.
     gain : (3,) what makes the second photograph as bright as the first.
     seed : the tensor that virtual cameras move from: that of three photographs (:func:`seed_of_three`), or
         <1, 2, 2> by default.
+    agree_px : places whose way there and back ends farther off are guessed anew, for what only one photograph
+        shows has no partner (:func:`complete_places`); inf where also these are right.
 
     Raises
     ------
     ValueError : for shapes that do not belong together.
     StageFailure : where no place is known.
     """
-    levels = []
-    for side, (image, known) in enumerate(zip(images, places, strict=True)):
-        rgb = np.asarray(image, dtype=np.float32)
-        if rgb.ndim != 3 or rgb.shape[2] != 3 or known.shape != (*rgb.shape[:2], 2):
+    rgb = [np.asarray(image, dtype=np.float32) for image in images]
+    for side, (image, there) in enumerate(zip(rgb, places, strict=True)):
+        if image.ndim != 3 or image.shape[2] != 3 or there.shape != (*image.shape[:2], 2):
             raise ValueError(
-                f"photograph {side + 1} is (H, W, 3) with places (H, W, 2); got {rgb.shape} and {known.shape}"
+                f"photograph {side + 1} is (H, W, 3) with places (H, W, 2); got {image.shape} and "
+                f"{there.shape}"
             )
-        seen: B8 = np.asarray(np.isfinite(known).all(axis=2))
-        levels.append(np.concatenate([rgb, seen[..., None].astype(np.float32)], axis=2))
-    back = pair.swapped()
-    complete = _completed(pair, places[0]), _completed(back, places[1])
+    complete, known = complete_places(pair, places, agree_px=agree_px)
+    levels = [
+        np.concatenate([image, sure[..., None].astype(np.float32)], axis=2)
+        for image, sure in zip(rgb, known, strict=True)
+    ]
     seed = seed_of_two(pair) if seed is None else seed
     seeds = seed, seed.swapped()
     return TensorSynthesis(pair, seeds, (levels[0], levels[1]), complete, np.asarray(gain, dtype=np.float32))
-
-
-def transfer_grid(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
-    """:meth:`VirtualTensor.transfer` of all pixels with matches ``places`` (H, W, 2); (H, W, 2), (H, W)."""
-    xy, nearness = np.empty(places.shape), np.empty(places.shape[:2], dtype=np.float32)
-
-    def work(rows: tuple[int, int]) -> None:
-        part = slice(*rows)
-        transfer_rows(virtual.T, virtual.P2, places[part], rows[0], xy[part], nearness[part])
-
-    in_strips(work, len(places), threads)
-    return xy, nearness
-
-
-def _completed(pair: CalibratedPair, places: F32) -> F32:
-    """``places`` (H, W, 2) of all pixels: unknown ones are as far as what is behind them."""
-    nearness = transfer_grid(seed_of_first(pair), places)[1]
-    if not np.isfinite(nearness).any():
-        raise StageFailure(
-            "the photographs have no dense correspondence",
-            "no pixel of the one is known in the other",
-            "choose photographs that overlap more",
-        )
-    behind = fill_holes(nearness[..., None], nearness)[..., 0]
-    unknown = np.isnan(nearness)
-    y, x = np.nonzero(unknown)
-    X = np.stack([x, y, np.ones_like(x), behind[unknown]], axis=1).astype(np.float64)
-    complete = places.copy()
-    complete[unknown] = dehomogenize(X @ pair.P2.T)
-    return complete
