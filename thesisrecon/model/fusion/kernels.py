@@ -13,6 +13,9 @@ U8 = NDArray[np.uint8]
 SIDE = 8
 """Voxels a side of a block."""
 
+BEYOND = 0.1
+"""Weight of a depth half a pixel and more beyond the last that is known."""
+
 
 @njit(cache=True, nogil=True)
 def touched_blocks(
@@ -83,12 +86,12 @@ def integrate_view(
                     v = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) / z
                     if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
                         continue
-                    seen, spread = _depth_at(depth, std, slope, u, v)
-                    leaning = lean[int(v + 0.5), int(u + 0.5)]
+                    seen, place, trust = _depth_at(depth, std, slope, u, v)
+                    spread, leaning = std[place], lean[place]
                     distance = leaning * (seen - z)
                     if not distance > -truncation:
                         continue
-                    own = 1.0 / (leaning * leaning * spread * spread + base)
+                    own = trust / (leaning * leaning * spread * spread + base)
                     if distance > truncation:
                         distance = truncation
                     else:
@@ -100,23 +103,36 @@ def integrate_view(
 
 
 @njit(cache=True, nogil=True)
-def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[float, float]:
-    """Depth and deviation at (u, v): bilinear in 1 / z where the four pixels are one surface, else that of
-    the nearest pixel; NaN where there is none."""
+def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[float, tuple[int, int], float]:
+    """Depth at (u, v), the row and column that it is of, and how far that can be trusted.
+
+    Bilinear in 1 / z where the four pixels are one surface, else that of the nearest pixel. Where that has
+    none, the next of the four is taken to go on: a net ends half a voxel before what is known does. NaN where
+    all four have none.
+    """
     x, y = min(int(u), depth.shape[1] - 2), min(int(v), depth.shape[0] - 2)
     x, y = max(x, 0), max(y, 0)
     x1, y1 = min(x + 1, depth.shape[1] - 1), min(y + 1, depth.shape[0] - 1)
     a, b, c, d = depth[y, x], depth[y, x1], depth[y1, x], depth[y1, x1]
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
     s, t = u - x, v - y
-    near_x, near_y = (x1 if s > 0.5 else x), (y1 if t > 0.5 else y)
-    nearest, spread = depth[near_y, near_x], std[near_y, near_x]
+    row, column = (y1 if t > 0.5 else y), (x1 if s > 0.5 else x)
     # Comparisons with NaN are false, so that any unknown pixel ends here too.
-    if not (a == a and b == b and c == c and d == d) or not high - low <= max(3.0 * spread, slope * low):
-        return nearest, spread
-    upper = (1.0 - s) / a + s / b
-    lower = (1.0 - s) / c + s / d
-    return 1.0 / ((1.0 - t) * upper + t * lower), spread
+    whole = a == a and b == b and c == c and d == d
+    if whole and high - low <= max(3.0 * std[row, column], slope * low):
+        upper = (1.0 - s) / a + s / b
+        lower = (1.0 - s) / c + s / d
+        return 1.0 / ((1.0 - t) * upper + t * lower), (row, column), 1.0
+    if depth[row, column] == depth[row, column]:
+        return depth[row, column], (row, column), 1.0
+    other_row, other_column = y + y1 - row, x + x1 - column
+    if depth[row, other_column] == depth[row, other_column]:
+        column = other_column
+    elif depth[other_row, column] == depth[other_row, column]:
+        row = other_row
+    else:
+        row, column = other_row, other_column
+    return depth[row, column], (row, column), BEYOND
 
 
 @njit(cache=True, nogil=True)

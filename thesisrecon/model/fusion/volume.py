@@ -57,7 +57,7 @@ class VolumetricFusion:
     """
 
     voxel_px: float = 1.5
-    truncation_voxels: float = 4.0
+    truncation_voxels: float = 3.0
     max_blocks: int = 250_000
     grazing_deg: float = 5.0
     least_part: float = 0.0005
