@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.dense.multiview.kernels import (
+    continue_surface,
     count_agreement,
     fuse_inverse_depths,
     inverse_depths,
@@ -150,3 +151,32 @@ def test_planes_are_fitted_to_what_is_alike():
     assert (np.isfinite(gx) == known).all()
     np.testing.assert_allclose(gx[known], 1e-3, atol=2e-6)
     np.testing.assert_allclose(gy[known], -2e-3, atol=2e-6)
+
+
+def test_what_continues_a_surface_lies_on_the_plane_of_what_is_sure_about_it():
+    rng = np.random.default_rng(6)
+    y, x = np.indices(SHAPE)
+    rho = (1.0 + 2e-3 * x - 1e-3 * y + 1e-4 * rng.normal(size=SHAPE)).astype(np.float32)
+    rho[:, 22:] += 0.4
+    sure = (rng.random(SHAPE) < 0.6).astype(np.uint8)
+    sure[:, 26:] = 0
+    doubtful = (sure == 0) & (rng.random(SHAPE) < 0.5)
+    rho[doubtful] += rng.choice([0.0, 2e-3], int(doubtful.sum())).astype(np.float32)
+    rho = holes(rng, rho)
+    sure[np.isnan(rho)] = 0
+    std = np.full(SHAPE, 4e-4, np.float32)
+    joins = np.empty(SHAPE, np.uint8)
+    continue_surface(rho, std, sure, 3, 0.05, 2.0, joins)
+    wanted = np.zeros(SHAPE, bool)
+    for v, u in np.argwhere((sure == 0) & np.isfinite(rho)):
+        near = (np.abs(x - u) <= 3) & (np.abs(y - v) <= 3) & (sure > 0)
+        near &= np.abs(rho - rho[v, u]) <= 0.05 * rho[v, u]
+        dx, dy = x[near] - u, y[near] - v
+        if near.sum() < 49 // 4 or dx.mean() ** 2 + dy.mean() ** 2 > 0.5 * (dx.var() + dy.var()):
+            continue
+        A = np.stack([np.ones(len(dx)), dx, dy], axis=1)
+        plane = np.linalg.lstsq(A, rho[near].astype(float), rcond=None)[0]
+        wanted[v, u] = abs(plane[0] - rho[v, u]) <= 2.0 * std[v, u]
+    assert (joins.astype(bool) == wanted).all()
+    assert wanted.sum() > 20
+    assert ((sure == 0) & np.isfinite(rho) & ~wanted).sum() > 20

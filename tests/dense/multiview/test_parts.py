@@ -241,6 +241,22 @@ def test_what_other_views_see_through_and_small_pieces_go():
     assert sizes[25, 5] == 0
 
 
+def test_what_nobody_confirms_stays_if_it_continues_what_is_confirmed():
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    maps = true_maps(walled)
+    other = maps[1].depth.copy()
+    other[20:26, 60:200] = np.nan
+    depth = maps[0].depth.copy()
+    depth[22:25, 100:103] *= 0.98
+    found = Consistency().confirm(replace(maps[0], depth=depth), [replace(maps[1], depth=other)])
+    assert np.isnan(found.depth[22:25, 100:103]).all()
+    strip = np.isfinite(found.depth[20:26, 110:180])
+    assert strip.mean() > 0.95
+    other[20:60, 60:200] = np.nan
+    found = Consistency().confirm(maps[0], [replace(maps[1], depth=other)])
+    assert np.isnan(found.depth[35:45, 110:180]).all()
+
+
 def test_a_pixel_goes_to_another_view_and_back():
     P = on_arc((-6.0, 6.0))
     to, back = transfer(P[0], P[1]), transfer(P[1], P[0])

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from thesisrecon.dense.multiview.kernels import count_agreement
+from thesisrecon.dense.multiview.kernels import continue_surface, count_agreement
+from thesisrecon.dense.multiview.refinement.planes import ALIKE
 from thesisrecon.geometry.camera import camera_centre
 from thesisrecon.types import B8, F32, F64, DepthMap
 
@@ -21,7 +22,9 @@ class Consistency:
     A pixel is taken to another view by its depth, and that view's depth brings it back. It is confirmed
     where it returns within ``reprojection_px`` and both depths differ by at most ``relative`` plus
     ``deviations`` of their deviations; it is contradicted where the other view sees through it. A pixel
-    stays if at least ``least_views`` confirm it and more than contradict it. Connected pieces of fewer than
+    stays if at least ``least_views`` confirm it and more than contradict it, or if none contradicts it and it
+    continues the surface of those about it: within ``gate`` deviations of the plane through the pixels within
+    ``radius``. Connected pieces of fewer than
     ``smallest_piece`` of the pixels, across which depth changes by less than ``step`` from pixel to pixel,
     go.
     """
@@ -32,6 +35,8 @@ class Consistency:
     least_views: int = 1
     smallest_piece: float = 1e-4
     step: float = 0.02
+    radius: int = 5
+    gate: float = 2.0
 
     def confirm(self, depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
         """``depth_map`` where ``others`` confirm it, with their number in ``views``."""
@@ -51,7 +56,17 @@ class Consistency:
                 contradict,
             )
         keep = (agree >= self.least_views) & (agree > contradict)
-        return self.clean(_kept(replace(depth_map, views=agree), keep))
+        keep |= (contradict == 0) & self.continues(depth_map, keep)
+        return self.clean(_kept(replace(depth_map, views=np.maximum(agree, 1)), keep))
+
+    def continues(self, depth_map: DepthMap, sure: B8) -> B8:
+        """(H, W) pixels that continue the surface of those that are ``sure``."""
+        with np.errstate(divide="ignore"):
+            rho = (1.0 / depth_map.depth).astype(np.float32)
+        joins = np.zeros(sure.shape, dtype=np.uint8)
+        std = depth_map.std * rho * rho
+        continue_surface(rho, std, sure.astype(np.uint8), self.radius, ALIKE, self.gate, joins)
+        return joins > 0
 
     def clean(self, depth_map: DepthMap) -> DepthMap:
         """Without small pieces."""

@@ -182,3 +182,42 @@ def splat_depths(depth: F32, to: F64, out: F32) -> None:
                 # A comparison with NaN is false.
                 if not out[q, p] <= w:
                     out[q, p] = w
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def continue_surface(rho: F32, std: F32, sure: U8, radius: int, alike: float, gate: float, joins: U8) -> None:
+    """``joins`` (H, W): whether the inverse depth of a pixel that is not sure continues the surface about it.
+
+    The surface is the plane that fits the sure pixels within ``radius``, those that differ by at most the
+    share ``alike``; they must be a quarter of the window and not all to one side, and the plane must pass
+    within ``gate`` deviations.
+    """
+    height, width = rho.shape
+    least = (2 * radius + 1) ** 2 // 4
+    for v in range(height):
+        for u in range(width):
+            joins[v, u] = 0
+            here = np.float64(rho[v, u])
+            if sure[v, u] or not np.isfinite(here):
+                continue
+            sxx, sxy, syy, sxd, syd, sx, sy, sd, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
+            for b in range(max(v - radius, 0), min(v + radius + 1, height)):
+                for a in range(max(u - radius, 0), min(u + radius + 1, width)):
+                    d = np.float64(rho[b, a]) - here
+                    if sure[b, a] and abs(d) <= alike * here:
+                        x, y = a - u, b - v
+                        sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
+                        sxd, syd = sxd + x * d, syd + y * d
+                        sx, sy, sd, n = sx + x, sy + y, sd + d, n + 1
+            if n < least:
+                continue
+            mx, my = sx / n, sy / n
+            sxx, sxy, syy = sxx - sx * mx, sxy - sx * my, syy - sy * my
+            sxd, syd = sxd - sx * sd / n, syd - sy * sd / n
+            det = sxx * syy - sxy * sxy
+            # Farther from their middle than they spread, the plane would be extrapolated.
+            if det <= 1e-3 * sxx * syy or mx * mx + my * my > 0.5 * (sxx + syy) / n:
+                continue
+            gx, gy = (syy * sxd - sxy * syd) / det, (sxx * syd - sxy * sxd) / det
+            if abs(sd / n - gx * mx - gy * my) <= gate * std[v, u]:
+                joins[v, u] = 1

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.dense.multiview.kernels import continue_surface
 from thesisrecon.dense.multiview.linking import InverseDepth
 from thesisrecon.dense.multiview.refinement.kernels import (
     UNKNOWN,
@@ -21,6 +22,9 @@ from thesisrecon.geometry.camera import camera_centre
 from thesisrecon.types import B8, F32, F64, I64, PinholeView
 
 U8 = NDArray[np.uint8]
+
+ALIKE = 0.03
+"""Share of the inverse depth up to which pixels near each other may be one surface."""
 U32 = NDArray[np.uint32]
 
 
@@ -48,9 +52,10 @@ class PlaneRefinement:
     spacing: int = 2
     likeness: float = 15.0
     accepted: float = 0.4
+    doubtful: float = 0.6
     settled: float = 0.1
     gate: float = 3.0
-    sigma_px: float = 0.3
+    sigma_px: float = 0.4
 
     def refine(
         self, reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth
@@ -62,7 +67,7 @@ class PlaneRefinement:
         planes = self._planes(found.value)
         cost = setting.begin(planes)
         self._sweep(setting, planes, cost, self.sweeps)
-        return self._kept(found, planes[..., 0], setting.rate(planes, self.accepted))
+        return self._kept(found, setting, planes)
 
     def search(
         self,
@@ -92,7 +97,7 @@ class PlaneRefinement:
     def _planes(self, rho: F32) -> F32:
         """(H, W, 3) inverse depths and their gradients."""
         gradients = np.empty((2, *rho.shape), dtype=np.float32)
-        fit_planes(rho, self.radius, 0.03, gradients[0], gradients[1])
+        fit_planes(rho, self.radius, ALIKE, gradients[0], gradients[1])
         return np.stack([rho, gradients[0], gradients[1]], axis=-1)
 
     def _sweep(self, setting: _Setting, planes: F32, cost: F32, sweeps: int) -> None:
@@ -105,12 +110,15 @@ class PlaneRefinement:
         """(H, W) planes that two neighbours accept, or one without doubt."""
         return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * self.accepted)))
 
-    def _kept(self, found: InverseDepth, rho: F32, rating: tuple[F32, U8, F32]) -> InverseDepth:
-        least, support, slope = rating
-        with np.errstate(divide="ignore", invalid="ignore"):
-            std = (self.sigma_px / slope).astype(np.float32)
-            near = np.abs(rho - found.value) <= self.gate * np.hypot(found.std, std)
+    def _kept(self, found: InverseDepth, setting: _Setting, planes: F32) -> InverseDepth:
+        rho = planes[..., 0]
+        least, support, slope = setting.rate(planes, self.accepted)
         seen = self._seen(least, support)
+        joining, std = self._joining(setting, planes, seen, least)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            std = np.where(joining, std, self.sigma_px / slope).astype(np.float32)
+            near = np.abs(rho - found.value) <= self.gate * np.hypot(found.std, std)
+        seen |= joining
         matched = ~seen & (found.views >= 2)
         # Where windows say nothing (no texture) the matching has the word.
         with np.errstate(invalid="ignore"):
@@ -118,7 +126,20 @@ class PlaneRefinement:
         value = np.where(seen, rho, np.where(matched, found.value, np.nan)).astype(np.float32)
         std = np.where(seen, std, np.where(matched, found.std, np.nan)).astype(np.float32)
         views = np.where(both, np.maximum(support, found.views), np.where(seen, support, found.views))
+        views = np.where(joining, np.maximum(views, 1), views)
         return InverseDepth(value, std, np.where(np.isfinite(value), views, 0).astype(np.uint8), found.rivals)
+
+    def _joining(self, setting: _Setting, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
+        """(H, W) pixels of doubtful planes that continue the surface of those that are seen, and the
+        deviation of their inverse depths."""
+        doubtful = ~seen & (least <= self.doubtful)
+        slope = setting.rate(np.where(doubtful[..., None], planes, np.float32(np.nan)), self.doubtful)[2]
+        with np.errstate(divide="ignore"):
+            std = (self.sigma_px / slope).astype(np.float32)
+        joins = np.zeros(seen.shape, dtype=np.uint8)
+        rho = np.where(seen | doubtful, planes[..., 0], np.float32(np.nan))
+        continue_surface(rho, std, seen.astype(np.uint8), self.radius + 1, ALIKE, self.gate, joins)
+        return joins > 0, std
 
     def _offsets(self) -> F32:
         """(2, S) samples of the window, the centre among them."""
