@@ -209,6 +209,7 @@ def test_a_turned_view_is_the_view_through_a_homography(stage: Stage) -> None:
     for s in (0.0, 0.5):
         off = np.abs(pair.view(s, turn=shift)[2:-8, 12:-2] - pair.view(s)[5:-5, 5:-9].astype(float))
         assert np.quantile(off, 0.9) < 1.0
+        np.testing.assert_array_equal(pair.view(s, turn=-2.0 * shift), pair.view(s, turn=shift))
 
 
 def test_exposures_are_interpolated_too(stage: Stage) -> None:

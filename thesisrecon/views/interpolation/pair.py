@@ -188,7 +188,10 @@ class InterpolatedPair:
         this = self._sides[side]
         target = np.empty_like(this.places)
         G = self.frame.original_from_rectified(s)
-        G = G if turn is None else np.ascontiguousarray(turn @ G)
+        if turn is not None:
+            # Of any sign and scale: what is in the middle of the view stays in front.
+            middle = np.array([0.5 * (self.size[0] - 1.0), 0.5 * (self.size[1] - 1.0), 1.0])
+            G = np.ascontiguousarray(np.sign(turn[2] @ middle) * (turn @ G))
         share = s - side
         in_strips(
             lambda rows: place_between(this.places, this.disparity, share, G, rows, target),
