@@ -135,6 +135,11 @@ class BSplineFit:
     cell: int
     coefficients: F64
 
+    @property
+    def passes_through(self) -> bool:
+        """False: it passes near them."""
+        return False
+
     def evaluate(self, xy: F64) -> SurfaceSample:
         """The spline of the piece that the nearest pixel is of; nothing where that pixel is of none."""
         height, width = self.given.depth.shape

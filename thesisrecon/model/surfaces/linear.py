@@ -44,6 +44,11 @@ class LinearFit:
     inverse_depth: F64
     squares: Squares
 
+    @property
+    def passes_through(self) -> bool:
+        """True."""
+        return True
+
     def evaluate(self, xy: F64) -> SurfaceSample:
         """Linear within each whole triangle; at pixels their own inverse depth, whole triangles or not."""
         height, width = self.given.depth.shape

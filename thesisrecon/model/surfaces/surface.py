@@ -27,6 +27,10 @@ class FittedSurface(Protocol):
     @property
     def given(self) -> DepthMap: ...
 
+    @property
+    def passes_through(self) -> bool:
+        """Whether the depths of ``given`` are on the surface as they are."""
+
     def evaluate(self, xy: F64) -> SurfaceSample:
         """The surface at places ``xy`` (N, 2) px, between pixels too."""
 
@@ -59,6 +63,8 @@ def resampled(surface: FittedSurface, scale: float = 1.0) -> DepthMap:
     if not scale > 0.0:
         raise ValueError(f"scale must be positive; got {scale}")
     given = surface.given
+    if scale == 1.0 and surface.passes_through:
+        return given
     shape = tuple(max(round(n * scale), 1) for n in given.depth.shape)
     places = [(np.arange(n) + 0.5) / scale - 0.5 for n in shape]
     xy = np.stack(np.meshgrid(places[1], places[0]), axis=-1).reshape(-1, 2)
