@@ -117,9 +117,11 @@ def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: fl
     alike = seen1 & seen2 & (sure1 == sure2)
     weight[alike & (near2 > near1 + step)] = np.clip(4.0 * share - 1.0, 0.0, 1.0)
     weight[alike & (near1 > near2 + step)] = np.clip(4.0 * share - 2.0, 0.0, 1.0)
-    # What is known is right, before what is guessed or behind it.
-    weight[seen1 & ~(seen2 & (sure2 | ~sure1))] = 0.0
-    weight[seen2 & ~(seen1 & (sure1 | ~sure2))] = 1.0
+    # What is known is right, before what is guessed or behind it, but where a guess moves next to nothing.
+    weight[seen1 & seen2 & sure1 & ~sure2] = np.clip(4.0 * share - 3.0, 0.0, 1.0)
+    weight[seen1 & seen2 & sure2 & ~sure1] = np.clip(4.0 * share, 0.0, 1.0)
+    weight[seen1 & ~seen2] = 0.0
+    weight[seen2 & ~seen1] = 1.0
     weight[~(seen1 | seen2)] = np.nan
     return weight
 
