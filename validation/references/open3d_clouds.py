@@ -69,6 +69,6 @@ def render_difference(path: Path, mine: F64, other: F64, reach: float) -> None:
         # Cameras of ours and of the truths look along z with y down.
         eye = middle + extent * np.array([0.25, -0.3, -0.75])
         renderer.setup_camera(50.0, middle, eye, [0.0, -1.0, 0.0])
-        o3d.io.write_image(str(path), renderer.render_to_image())
+        o3d.io.write_image(path, renderer.render_to_image())
     finally:
         del renderer
