@@ -10,9 +10,7 @@ from tests.textures import texture
 from thesisrecon.dense.rectification import rectify_cameras
 from thesisrecon.geometry.camera import camera_from_centre, project
 from thesisrecon.views.interpolation import InterpolatedPair, unsure
-from validation.checks.interpolation import measure_cones
 from validation.scenes.between import best_homography, camera_between, camera_centre_of, nearest_place, turned
-from validation.scenes.real import data_root
 
 SIZE = (160, 120)
 
@@ -62,15 +60,3 @@ def test_pictures_are_turned_as_their_points_are() -> None:
     inner[:10], inner[-10:], inner[:, :10], inner[:, -10:] = False, False, False, False
     assert inner.mean() > 0.5
     assert np.abs(back.astype(float) - picture)[inner].mean() < 4.0
-
-
-@pytest.mark.real
-def test_views_between_real_photographs_are_as_near_as_wanted() -> None:
-    root = data_root()
-    if root is None or not (root / "stereo" / "Cones9").is_dir():
-        pytest.skip("the photographs of Cones are not on this machine (THESISRECON_DATA)")
-    rows = measure_cones(None)
-    judged = [row for row in rows if row.target is not None]
-    assert len(judged) == 2
-    for row in judged:
-        assert row.verdict == "reached", (row.name, row.values)

@@ -52,13 +52,23 @@ from validation.scenes.between import (
     turned,
 )
 from validation.scenes.fixtures import SIZE, Pose, courtyard_poses
-from validation.scenes.real import data_root, load_real_scene
+from validation.scenes.nine_views import (
+    BETWEEN,
+    DISPARITIES,
+    ENDS,
+    NineViews,
+    both_ways,
+    dissolved,
+    load_cones,
+    mirrored,
+    read_rgb,
+)
+from validation.scenes.real import load_real_scene
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
-CONES, ENDS, DISPARITIES = (3, 4, 5), (2, 6), 64
 OVER_SGBM_DB, OVER_DISSOLVE_DB = 0.3, 5.0
 FRAME_SIZE, FRAME_S = (1000, 700), 1.0
 PLACES = (
@@ -72,43 +82,39 @@ THIRD = 5
 OURS, TRUE, DISSOLVE = "ours", "true disparity", "cross-dissolve"
 
 
-def cones_maps(
-    left: U8, right: U8, folder: Path
-) -> dict[str, tuple[DisparityMap, DisparityMap] | tuple[F32, F32]]:
+def cones_maps(cones: NineViews) -> dict[str, tuple[DisparityMap, DisparityMap] | tuple[F32, F32]]:
     """Disparities of both photographs by every method."""
+    left, right = (cones.images[k] for k in ENDS)
 
     def both(match: OpenCVSemiGlobal) -> tuple[F32, F32]:
-        mirrored = match.match(_mirrored(right), _mirrored(left), DISPARITIES)
-        return match.match(left, right, DISPARITIES), np.ascontiguousarray(mirrored[:, ::-1])
+        return both_ways(lambda a, b: match.match(a, b, DISPARITIES), left, right)
 
     limits = (0, DISPARITIES - 1)
     matcher = CohesiveScanlines()
-    back = matcher.match(_mirrored(right), _mirrored(left), disparity_range=limits)
+    back = matcher.match(mirrored(right), mirrored(left), disparity_range=limits)
     turned = [np.ascontiguousarray(part[:, ::-1]) for part in (back.disparity, back.confidence)]
     ours = matcher.match(left, right, disparity_range=limits)
     theirs = {mode: both(OpenCVSemiGlobal(mode)) for mode in MODES}
-    truth = tuple(_true_disparity(folder / f"disp{k}.png") for k in ENDS)
     return {
         OURS: (ours, DisparityMap(turned[0], turned[1], back.sigma_px)),
         **theirs,
-        TRUE: (truth[0], truth[1]),
+        TRUE: cones.disparities,
     }
 
 
 def measure_cones(out: Path | None) -> list[Metric]:
     """Views 3, 4 and 5 by every method, and their means against the targets."""
-    root = data_root()
-    folder = None if root is None else root / "stereo" / "Cones9"
-    if folder is None or not folder.is_dir():
+    cones = load_cones()
+    if cones is None:
         print("Cones: not on this machine (THESISRECON_DATA), left out", flush=True)
         return []
-    images = {k: _rgb(folder / f"im{k}.png") for k in (ENDS[0], *CONES, ENDS[1])}
+    images = cones.images
     left, right = images[ENDS[0]], images[ENDS[1]]
-    maps = cones_maps(left, right, folder)
+    maps = cones_maps(cones)
     pairs = {name: rectified_pair(left, right, disparity=found) for name, found in maps.items()}
     rows: list[Metric] = []
-    for k in CONES:
-        s = (k - ENDS[0]) / (ENDS[1] - ENDS[0])
+    for k in BETWEEN:
+        s = cones.share(k)
         pictures = {name: pair.view(s) for name, pair in pairs.items()}
         pictures[DISSOLVE] = dissolved(left, right, s)
         rows += picture_metrics(f"Cones, view {k}", pictures, images[k])
@@ -279,7 +285,7 @@ def measure_fountain(out: Path | None) -> list[Metric]:
     if scene is None or scene.K is None or scene.R is None or scene.C is None:
         print("fountain-P11: not on this machine (THESISRECON_DATA), left out", flush=True)
         return []
-    first, wanted, second = (Image(str(k), _rgb(scene.image_paths[k]), (0, 0)) for k in (4, 5, 6))
+    first, wanted, second = (Image(str(k), read_rgb(scene.image_paths[k]), (0, 0)) for k in (4, 5, 6))
     pair = relate(first, second)
     P4, P6 = (camera_from_centre(scene.K[k], scene.R[k], scene.C[k]) for k in (4, 6))
     s = nearest_place(pair, (P4, P6), scene.C[5])
@@ -356,30 +362,9 @@ def measure_time(repeats: int) -> Metric:
     return Metric("1000 x 700", "time of a frame", "s", values, "processor", target=FRAME_S)
 
 
-def dissolved(first: U8, second: U8, share: float) -> U8:
-    """Both pictures mixed where they are."""
-    mixed = (1.0 - share) * first.astype(np.float64) + share * second
-    return np.asarray(np.rint(mixed), dtype=np.uint8)
-
-
 def save_whole(path: Path, pictures: list[U8]) -> None:
     """Pictures in a row."""
     PIL.Image.fromarray(np.concatenate(pictures, axis=1)).save(path)
-
-
-def _mirrored(image: U8) -> U8:
-    return np.ascontiguousarray(image[:, ::-1])
-
-
-def _rgb(path: Path) -> U8:
-    with PIL.Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
-
-
-def _true_disparity(path: Path) -> F32:
-    with PIL.Image.open(path) as image:
-        quarters = np.asarray(image, dtype=np.float32)
-    return np.where(quarters > 0.0, 0.25 * quarters, np.nan).astype(np.float32)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -43,8 +43,9 @@ from validation.metrics.record import Metric, markdown_table
 from validation.references.semi_global import MODES, OpenCVSemiGlobal
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_photograph
+from validation.scenes.nine_views import BETWEEN, BEYOND, both_ways, dissolved, load_cones
 from validation.scenes.raycast import Rays, World, trace
-from validation.scenes.real import data_root, load_real_scene
+from validation.scenes.real import load_real_scene
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -56,7 +57,6 @@ ALONG = (-1.0, -0.5, -0.25, 0.25, 0.5, 0.75, 1.25, 1.5, 2.0)
 OFF = (0.1, 0.25, 0.5, 1.0)
 DIRECTIONS = {"up": (0.0, -1.0, 0.0), "ahead": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0)}
 FRAME_SIZE, FRAME_S = (1000, 700), 1.0
-CONES, CONES_BEYOND = (3, 4, 5), (1, 7)
 BORDER_PX = 50
 """Columns of views beyond the baseline that no photograph shows, or whose picture ends before."""
 
@@ -274,7 +274,7 @@ def measure_fountain(out: Path | None) -> list[Metric]:
         own = guess if "guessed" in name else K
         camera = VirtualCamera(R @ R2.T, R @ (C2 - C) / baseline, own, size)
         pictures[name] = views.render(camera, threads=2)
-    pictures["cross-dissolve"] = _dissolved(images[0].rgb, images[1].rgb, 0.5)
+    pictures["cross-dissolve"] = dissolved(images[0].rgb, images[1].rgb, 0.5)
     if out is not None:
         save_beside(out / "fountain-5.jpg", [wanted, *pictures.values()])
     return _pictures("fountain-P11, 5 from 4 and 6", pictures, wanted)
@@ -288,47 +288,40 @@ def _pictures(scene: str, pictures: dict[str, U8], wanted: U8) -> list[Metric]:
     ]
 
 
-def _dissolved(first: U8, second: U8, share: float) -> U8:
-    mixed = (1.0 - share) * first.astype(np.float64) + share * second
-    return np.asarray(np.rint(mixed), dtype=np.uint8)
-
-
 def measure_cones(out: Path | None) -> list[Metric]:
     """Views 3, 4 and 5 from 2 and 6, by our disparities, those of OpenCV and the true ones."""
-    root = data_root()
-    if root is None or not (root / "stereo" / "Cones9").is_dir():
+    cones = load_cones()
+    if cones is None:
         return []
-    folder = root / "stereo" / "Cones9"
-    images = {k: _rgb(folder / f"im{k}.png") for k in (2, *CONES, 6, *CONES_BEYOND)}
+    images = cones.images
     synthesis = {
-        "ours": _of_disparities(images[2], images[6], *_both_ways(_ours, images[2], images[6])),
+        "ours": _of_disparities(images[2], images[6], *both_ways(_ours, images[2], images[6])),
         **{
-            name: _of_disparities(images[2], images[6], *_both_ways(_of_opencv(name), images[2], images[6]))
+            name: _of_disparities(images[2], images[6], *both_ways(_of_opencv(name), images[2], images[6]))
             for name in MODES
         },
         # Known of hidden pixels, too.
         "true disparity": _of_disparities(
             images[2],
             images[6],
-            _true_disparity(folder / "disp2.png"),
-            _true_disparity(folder / "disp6.png"),
+            *cones.disparities,
             agree_px=np.inf,
         ),
     }
     sizes = next(iter(synthesis.values())).sizes
     rows = []
-    for k in CONES:
+    for k in BETWEEN:
         share = (k - 2) / 4
         pictures = {n: v.render(camera_at(v.pair, share, sizes=sizes)) for n, v in synthesis.items()}
-        pictures["cross-dissolve"] = _dissolved(images[2], images[6], share)
+        pictures["cross-dissolve"] = dissolved(images[2], images[6], share)
         rows += _pictures(f"Cones, view {k}", pictures, images[k])
         if out is not None:
             save_beside(out / f"cones-{k}.png", [images[k], pictures["ours"]])
-    for k in CONES_BEYOND:
+    for k in BEYOND:
         camera = camera_at(synthesis["ours"].pair, (k - 2) / 4, sizes=sizes)
         beyond = {n: v.render(camera)[:, BORDER_PX:-BORDER_PX] for n, v in synthesis.items()}
         rows += _pictures(f"Cones, view {k}, without its borders", beyond, images[k][:, BORDER_PX:-BORDER_PX])
-    between = rows[: 2 * len(CONES)]
+    between = rows[: 2 * len(BETWEEN)]
     mean = {n: float(np.mean([r.values[n] for r in between if r.name == "PSNR"])) for n in rows[0].values}
     sgbm = max(mean[name] for name in MODES)
     scene = "Cones, mean of views 3 to 5"
@@ -343,29 +336,12 @@ def measure_cones(out: Path | None) -> list[Metric]:
 Disparities = Callable[[U8, U8], F32]
 
 
-def _rgb(path: Path) -> U8:
-    with PIL.Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
-
-
-def _true_disparity(path: Path) -> F32:
-    with PIL.Image.open(path) as image:
-        quarters = np.asarray(image, dtype=np.float32)
-    return np.where(quarters > 0.0, 0.25 * quarters, np.nan).astype(np.float32)
-
-
 def _ours(left: U8, right: U8) -> F32:
     return CohesiveScanlines().match(left, right, disparity_range=(0, 63)).disparity
 
 
 def _of_opencv(mode: str) -> Disparities:
     return lambda left, right: OpenCVSemiGlobal(mode).match(left, right, 64)
-
-
-def _both_ways(match: Disparities, left: U8, right: U8) -> tuple[F32, F32]:
-    """Disparities of either image; the right one is a left one in a mirror."""
-    mirrored = match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))
-    return match(left, right), mirrored[:, ::-1]
 
 
 def _of_disparities(

@@ -72,8 +72,11 @@ class BetweenStage:
         metrics = [
             Metric(scene, "PSNR", "dB", peak, OURS, at_most=False, definition=words),
             Metric(scene, "SSIM", "", alike, OURS, at_most=False, definition=words),
-            _over(scene, "PSNR over the better SGBM", peak, sgbm),
-            _over(scene, "PSNR over cross-dissolve", peak, peak[DISSOLVE]),
+            *(
+                _over(scene, f"{what}PSNR over {name}", peak[method], other)
+                for what, method in (("", OURS), ("tensor: ", TENSOR))
+                for name, other in (("the better SGBM", sgbm), ("cross-dissolve", peak[DISSOLVE]))
+            ),
         ]
         place = wishes.place(self.name, scene)
         shown = []
@@ -88,11 +91,9 @@ class BetweenStage:
         )
 
 
-def _over(scene: str, name: str, peak: Mapping[str, float | None], other: float | None) -> Metric:
-    values = {
-        n: None if v is None or other is None else v - other for n, v in peak.items() if n in (OURS, TENSOR)
-    }
-    return Metric(scene, name, "dB", values, OURS, at_most=False, definition="difference of the means")
+def _over(scene: str, name: str, peak: float | None, other: float | None) -> Metric:
+    over = None if peak is None or other is None else peak - other
+    return Metric(scene, name, "dB", {OURS: over}, OURS, at_most=False, definition="difference of the means")
 
 
 def _cones() -> NineViews:
