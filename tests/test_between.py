@@ -68,6 +68,11 @@ def test_wrong_calls_of_the_front_door_are_refused(wall: tuple[np.ndarray, np.nd
         thesisrecon.interpolate_view(left.astype(float), right, 0.5)
     with pytest.raises(ValueError, match="shape of the photographs"):
         thesisrecon.interpolate_view(left, right, 0.5, disparity=np.zeros((3, 4), np.float32))
+    d = np.zeros(left.shape[:2], np.float32)
+    odd: Any
+    for odd in ([d, d], d[..., None]):
+        with pytest.raises(ValueError, match=r"\(H, W\), or a tuple"):
+            thesisrecon.interpolate_view(left, right, 0.5, disparity=odd)
     with pytest.raises(UsageError, match="no photograph"):
         thesisrecon.interpolate_view(Path("nowhere.png"), right, 0.5)
 
@@ -82,15 +87,21 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(
         between.relate(a, photograph(2, (40, 20)))
     with pytest.raises(UsageError, match="same photograph"):
         between.interpolation_film([a, b, a], 3)
+    with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
+        between.interpolation_film([a, b, photograph(2, (40, 20))], 3)
     # Forward motion: both epipoles at (21, 14).
-    F = cross_matrix(np.array([21.0, 14.0, 1.0]))
-    nothing = np.zeros((0, 2))
-    monkeypatch.setattr(
-        between, "match_pair", lambda *_, **__: SimpleNamespace(F=F, xy1=nothing, xy2=nothing)
-    )
+    e, rng = np.array([21.0, 14.0]), np.random.default_rng(0)
+    xy = rng.uniform((0.0, 0.0), (40.0, 30.0), (100, 2))
+    ahead = e + rng.uniform(1.05, 1.3, (100, 1)) * (xy - e)
+    pair = SimpleNamespace(F=cross_matrix(np.append(e, 1.0)), xy1=xy, xy2=ahead)
+    monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
     with pytest.raises(
         StageFailure, match=r"moved towards what they show, or away; .*\(21, 14\) px of the first"
     ):
+        between.relate(a, b)
+    # A photograph and a copy of it, saved anew: this F is as good as any.
+    pair.xy2 = xy + rng.normal(0.0, 0.01, xy.shape)
+    with pytest.raises(StageFailure, match="no parallax"):
         between.relate(a, b)
 
 
@@ -176,6 +187,7 @@ def test_a_place_in_the_triangle_is_reached_by_interpolating_twice(still: list[t
         ((0.4, 0.6, 0.0), [("a", "b")]),
         ((0.5, 0.0, 0.5), [("the view between", "c")]),
         ((0.0, 0.0, 1.0), []),
+        ((0.0, 0.0, 1.0 - 1e-7), []),
     ):
         still.clear()
         np.testing.assert_array_equal(between.interpolate_three(three, weights), 100)

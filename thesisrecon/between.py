@@ -15,8 +15,9 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.doors import match_pair
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.multiview import epipoles
+from thesisrecon.geometry.parallax import require_parallax
 from thesisrecon.io.images import read_photographs
-from thesisrecon.types import F32, F64, DisparityMap, Image
+from thesisrecon.types import F32, DisparityMap, Image, TwoView
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
     check_monotonicity,
@@ -114,7 +115,12 @@ def _levels(side: Any) -> U8:
 
 
 def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
-    return disparity if isinstance(disparity, DisparityMap) else unsure(np.asarray(disparity, np.float32))
+    if isinstance(disparity, DisparityMap):
+        return disparity
+    disparity = np.asarray(disparity, dtype=np.float32)
+    if disparity.ndim != 2:
+        raise ValueError(f"disparities are (H, W), or a tuple of two such maps; got {disparity.shape}")
+    return unsure(disparity)
 
 
 def _matched_both_ways(left: U8, right: U8, config: PipelineConfig) -> tuple[DisparityMap, DisparityMap]:
@@ -172,12 +178,9 @@ def relate(
     lines, and no view lies between but one of the two, scaled.
     """
     config = config or PipelineConfig()
-    if first.size != second.size:
-        sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
-        raise UsageError(f"views lie between photographs of one size; {sizes} px")
-    _require_different((first, second))
+    _require_alike_in_size_only((first, second))
     pair = match_pair(first.rgb, second.rgb, config=config, seed=seed)
-    _require_sideways(pair.F, first.size)
+    _require_sideways(pair, first.size)
     try:
         dense = config.dense.match_two_views(first, second, pair.F, pair.xy1, pair.xy2, planar=True)
     except StageFailure as failure:
@@ -191,18 +194,23 @@ def relate(
     return InterpolatedPair((first.rgb, second.rgb), np.stack([H1, H2]), dense.left, dense.right)
 
 
-def _require_different(photographs: Sequence[Image]) -> None:
+def _require_alike_in_size_only(photographs: Sequence[Image]) -> None:
     for first, second in combinations(photographs, 2):
+        if first.size != second.size:
+            sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
+            raise UsageError(f"views lie between photographs of one size; {sizes} px")
         if np.array_equal(first.rgb, second.rgb):
             raise UsageError(f"{first.name} and {second.name} are the same photograph; give different ones")
 
 
-def _require_sideways(F: F64, size: tuple[int, int]) -> None:
-    for name, e in zip(("first", "second"), epipoles(F), strict=True):
+def _require_sideways(pair: TwoView, size: tuple[int, int]) -> None:
+    for name, e in zip(("first", "second"), epipoles(pair.F), strict=True):
         if abs(e[2]) * max(size) <= 1e-9 * np.hypot(e[0], e[1]):
             continue
         x, y = e[:2] / e[2]
         if -0.5 <= x <= size[0] - 0.5 and -0.5 <= y <= size[1] - 0.5:
+            # Without parallax F is any, and its epipoles are anywhere.
+            require_parallax(pair.F, pair.xy1, pair.xy2)
             raise StageFailure(
                 "there is no view between the photographs: the camera moved towards what they show, or away",
                 f"one camera stands at ({x:.0f}, {y:.0f}) px of the {name} photograph",
@@ -220,7 +228,7 @@ def interpolation_film(
     """
     if len(photographs) not in (2, 3) or frames < 1:
         raise ValueError(f"a film needs 2 or 3 photographs and a frame; got {len(photographs)} and {frames}")
-    _require_different(photographs)
+    _require_alike_in_size_only(photographs)
     ways = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([MIDWAY])
     pair = relate(photographs[0], photographs[1], config=config, seed=seed)
     shares: list[tuple[float, ...]]
@@ -283,7 +291,8 @@ def interpolate_three(
     if len(photographs) != 3 or w.shape != (3,) or not (w >= 0.0).all() or abs(w.sum() - 1.0) > 1e-6:
         raise ValueError(f"weights of three photographs are not negative and sum to 1; got {weights}")
     first, second, third = photographs
-    if w[2] >= 1.0:
+    # What is left of the first two may be lost in rounding.
+    if w[0] + w[1] <= 1e-6:
         return third.rgb.copy()
     s = float(w[1] / (w[0] + w[1]))
     rgb = {0.0: first.rgb, 1.0: second.rgb}.get(s)
