@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,6 +80,20 @@ def test_memory_is_kept_by_larger_voxels(ring: list[DepthMap]) -> None:
     fine = VolumetricFusion().fuse(ring[:2])
     coarse = VolumetricFusion(max_blocks=150).fuse(ring[:2])
     assert 0 < len(coarse.faces) < 0.5 * len(fine.faces)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [{"voxel_px": 0.0}, {"truncation_voxels": np.nan}, {"max_blocks": 7}, {"grazing_deg": 90.0}],
+)
+def test_settings_under_which_voxels_would_grow_for_ever_are_refused(setting: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="needed"):
+        VolumetricFusion(**setting)
+
+
+def test_voxels_stop_growing_with_as_few_blocks_as_there_may_be(ring: list[DepthMap]) -> None:
+    with pytest.raises(StageFailure, match="no surface"):
+        VolumetricFusion(max_blocks=8).fuse(ring[:1])
 
 
 def test_what_views_look_through_is_removed(ring: list[DepthMap]) -> None:

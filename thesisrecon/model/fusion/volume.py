@@ -62,6 +62,19 @@ class VolumetricFusion:
     grazing_deg: float = 5.0
     least_part: float = 0.0005
 
+    def __post_init__(self) -> None:
+        if not (0.0 < self.voxel_px < np.inf and 0.0 < self.truncation_voxels < np.inf):
+            raise ValueError(
+                "voxel_px > 0 and truncation_voxels > 0 are needed; got "
+                f"{self.voxel_px} and {self.truncation_voxels}"
+            )
+        # However large voxels are, so many blocks may be about a single depth.
+        least = int(np.ceil(2.0 * self.truncation_voxels / SIDE) + 1) ** 3
+        if self.max_blocks < least:
+            raise ValueError(f"max_blocks >= {least} is needed; got {self.max_blocks}")
+        if not 0.0 < self.grazing_deg < 90.0:
+            raise ValueError(f"0 < grazing_deg < 90 is needed; got {self.grazing_deg}")
+
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
         """The surface, without colours; faces anticlockwise seen from where the views look at it.
 
