@@ -166,7 +166,7 @@ def test_the_written_config_runs_again(
 ) -> None:
     out, _ = killed_and_resumed
     arguments = ["reconstruct", str(photographs), "-o", str(out), "--config", str(out / "config.toml")]
-    assert run_command([*arguments, "--threads", "2"]) == 0
+    assert run_command([*arguments, "--threads", "2", "--until", "metric"]) == 0
     assert "registered" in capsys.readouterr().out
     assert set(read(out / "summary.json")["resumed"]) >= {"features", "matches", "tracks", "metric"}
 

@@ -65,7 +65,7 @@ def interpolate_view(
     left, right : files, or (H, W, 3) uint8 arrays of parallel cameras whose rows correspond.
     s : from 0, the left photograph, to 1, the right one.
     disparity : what is known of the left photograph's disparities (H, W), x_right = x_left - d, NaN =
-    unknown; or of both sides', which knows better what only one of them sees. Matched where None, by
+        unknown; or of both sides', which knows better what only one of them sees. Matched where None, by
         ``config.dense``.
 
     Returns
