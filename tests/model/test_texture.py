@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -130,6 +131,20 @@ def test_the_atlas_is_no_larger_than_allowed_and_the_same_for_any_threads(sphere
     assert one.texture.shape[0] * one.texture.shape[1] < 40_000  # with the patches of unseen faces
     np.testing.assert_array_equal(one.texture, two.texture)
     assert np.sqrt(np.mean(difference(one) ** 2)) < 20.0
+
+
+def test_an_atlas_that_cannot_be_as_small_as_asked_is_refused(sphere: TexturedMesh) -> None:
+    views = [photograph(m) for m in ring_of()]
+    with pytest.raises(StageFailure, match=r"too large; \d+ pieces take \d+ texels, allowed are 40"):
+        TextureAtlas(max_texels=40).texture(sphere, views)
+    with pytest.raises(ValueError, match="max_texels >= 1"):
+        TextureAtlas(max_texels=0)
+
+
+@pytest.mark.parametrize("setting", [{"power": -1.0}, {"scatter": 0.0}, {"feather_px": 0.0}])
+def test_blending_settings_without_a_meaning_are_refused(setting: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="needed"):
+        BlendedViews(**setting)
 
 
 def test_unseen_faces_take_the_colour_of_their_surroundings(sphere: TexturedMesh) -> None:

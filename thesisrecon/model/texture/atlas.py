@@ -40,6 +40,10 @@ class Pieces:
     chart: I64
 
 
+LEAST_SCALE = 0.05
+"""Photographs reduced to less show nothing; the pieces' margins remain."""
+
+
 @dataclass(frozen=True)
 class TextureAtlas:
     """Texture at the resolution of the view that shows each part of the surface largest.
@@ -53,11 +57,15 @@ class TextureAtlas:
     least_faces: int = 30
     painter: BlendedViews | SingleView = field(default_factory=BlendedViews)
 
+    def __post_init__(self) -> None:
+        if self.max_texels < 1:
+            raise ValueError(f"max_texels >= 1 is needed; got {self.max_texels}")
+
     def texture(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
         """The mesh with ``uv``, ``texture`` and ``untextured``.
 
         Faces that no view sees whole get the colour of their surroundings. Raises :class:`StageFailure` where
-        no face is seen at all.
+        no face is seen at all, and where the atlas is too large with photographs of ``LEAST_SCALE``.
         """
         neighbours = face_neighbours(mesh.faces)
         quality = face_quality(mesh, views, threads=threads)
@@ -73,7 +81,14 @@ class TextureAtlas:
             offsets, size = pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
             if size[0] * size[1] <= self.max_texels:
                 break
-            scale *= 0.95 * np.sqrt(self.max_texels / (size[0] * size[1]))
+            if scale <= LEAST_SCALE:
+                texels = size[0] * size[1]
+                raise StageFailure(
+                    "the texture is too large",
+                    f"{len(rectangles)} pieces take {texels} texels, allowed are {self.max_texels}",
+                    "allow more texels, or fewer pieces (least_faces)",
+                )
+            scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), LEAST_SCALE)
         uv = pieces.xy + (offsets - rectangles[:, :2])[chart][:, None, :]
         cut_out = _fill(smaller, pieces, rectangles, offsets, size)
         texture = self.painter.paint(mesh, smaller, Charts(label, chart, uv, cut_out), threads=threads)

@@ -70,6 +70,13 @@ class BlendedViews:
     feather_px: float = 8.0
     level: bool = True
 
+    def __post_init__(self) -> None:
+        if not (self.power >= 0.0 and self.scatter > 0.0 and self.feather_px > 0.0):
+            raise ValueError(
+                "power >= 0, scatter > 0 and feather_px > 0 are needed; got "
+                f"{self.power}, {self.scatter} and {self.feather_px}"
+            )
+
     def paint(
         self, mesh: TexturedMesh, views: Sequence[PinholeView], charts: Charts, *, threads: int = 1
     ) -> U8:
