@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import PIL.Image
@@ -70,7 +71,7 @@ def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), [0.0, 1.0])
     with pytest.raises(ValueError, match="K is"):
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3), K=np.eye(4))
-    with pytest.raises(StageFailure, match=r"no\.jpg"):
+    with pytest.raises(UsageError, match=r"there is no photograph no\.jpg"):
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3))
 
 
@@ -118,3 +119,8 @@ def test_films_are_of_two_different_photographs(found):
         tensor_film((first, second, first), 5)
     with pytest.raises(UsageError, match="the same photograph"):
         tensor_film((first, first), 5)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="there is no photograph"):
+        match_photographs(tmp_path / "none.png", tmp_path / "none.png")

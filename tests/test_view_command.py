@@ -189,7 +189,10 @@ def test_what_is_missing_is_named(run: Path, tmp_path: Path, capsys: pytest.Capt
     assert "model.glb cannot be read" in told(run)
     (run / "model.glb").unlink()
     assert "has no model yet (model.glb)" in (said := told(run))
-    assert "--until model" in said
+    assert "without --until" in said
+    reason = "there is no model: no depths were found; none of 4 views agrees with another."
+    (run / "summary.json").write_text(json.dumps({"warnings": ["something else", reason]}))
+    assert f"found its cameras and no surface: {reason}" in told(run)
 
 
 def test_a_folder_of_photographs_is_not_written_over(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,11 +48,14 @@ def match_photographs(
 ) -> MatchedPhotographs:
     """Sparse and dense correspondence of two photographs: files, uint8 arrays or :class:`Image` records.
 
-    Raises :class:`StageFailure` where one of them cannot be read, they do not match, or show no parallax.
+    Raises :class:`UsageError` where there is no such file, :class:`StageFailure` where one of them cannot be
+    read, they do not match, or show no parallax.
     """
     config = config or PipelineConfig()
     images, focals = [], []
     for source in (image1, image2):
+        if isinstance(source, str | Path) and not Path(source).is_file():
+            raise UsageError(f"there is no photograph {source}")
         found = read_photographs([source], max_size_px=config.images.max_size_px)
         for name, reason in found.refused.items():
             raise StageFailure(f"{name} {reason}")

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 DONE, INTERNAL, USAGE, IMPOSSIBLE, INTERRUPTED = 0, 1, 2, 3, 130
 DEBUG_VARIABLE = "THESISRECON_DEBUG"
 DEMO_SCENE = Path("fixtures") / "courtyard"
+DEMO_SETTINGS: dict[str, Any] = {"dense": {"max_side": 512, "match_side": 512}}
+"""Whoever tries it wants to see a model soon."""
 STAGE_WORDS = {
     "features": "corners",
     "pairs": "choice of pairs",
@@ -36,12 +38,15 @@ STAGE_WORDS = {
     "projective": "projective cameras",
     "selfcalibration": "self-calibration",
     "metric": "metric refinement",
+    "dense": "depth maps",
+    "model": "surface and texture",
+    "correspondence": "which pixels correspond",
     "views": "views",
 }
 
 app = typer.Typer(
     name="thesisrecon",
-    help="From uncalibrated photographs to metric cameras and points.",
+    help="From uncalibrated photographs to metric cameras, points and a textured model.",
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -174,7 +179,7 @@ def demo(
         )
     # The folder of an older demo may hold other settings: the demo is always that of today.
     options = {"threads": threads or None, "overwrite": True}
-    _run(scene, out, _config(None, None, {}, []), 0, options)
+    _run(scene, out, _config(None, None, DEMO_SETTINGS, []), 0, options)
 
 
 @app.command()

@@ -179,8 +179,10 @@ def write_between(
     photographs = [
         read_photograph(path, max_size_px=config.images.max_size_px) for path in wishes.photographs
     ]
-    film = _film_of(wishes.method)(photographs, wishes.frames, config=config, seed=wishes.seed)
     tell, count = progress or (lambda *_: None), wishes.frames
+    tell("correspondence", 0, 1)
+    film = _film_of(wishes.method)(photographs, wishes.frames, config=config, seed=wishes.seed)
+    tell("correspondence", 1, 1)
     write_json(folder / FRAMES, {"method": wishes.method, **film.told, "frames": _places(film)})
     _remove_old(folder, count)
     frames = []
@@ -217,11 +219,21 @@ def _run_of(out: Path) -> tuple[TexturedMesh, dict[str, PinholeCamera]]:
     if not out.is_dir() or not any((out / name).is_file() for name in (MODEL, CAMERAS, "run.json")):
         raise UsageError(f"{out} holds no run; make one with thesisrecon reconstruct PHOTOGRAPHS -o {out}")
     if not (out / MODEL).is_file():
-        raise UsageError(
-            f"the run in {out} has no model yet ({MODEL}); run thesisrecon reconstruct PHOTOGRAPHS -o {out} "
-            "--until model"
-        )
+        raise UsageError(_why_no_model(out))
     return read_mesh(out / MODEL), read_cameras(out / CAMERAS)
+
+
+def _why_no_model(out: Path) -> str:
+    """A run that went as far as it could says itself why it has no model; others have not come so far."""
+    told = read_json(out / "summary.json")
+    warnings = told.get("warnings", []) if isinstance(told, dict) else []
+    reason = next((str(w) for w in warnings if str(w).startswith("there is no model")), None)
+    if reason is not None:
+        return f"the run in {out} found its cameras and no surface: {reason}"
+    return (
+        f"the run in {out} has no model yet ({MODEL}); thesisrecon reconstruct PHOTOGRAPHS -o {out}, "
+        "without --until, goes on to it"
+    )
 
 
 def _claim(folder: Path) -> None:
