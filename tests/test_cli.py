@@ -18,6 +18,7 @@ import pytest
 
 import thesisrecon.cli as cli
 from thesisrecon.cli import run_command
+from thesisrecon.console import intrinsic_lines, time_taken
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
 
 ROOT = Path(__file__).parent.parent
@@ -232,9 +233,9 @@ def test_the_focal_length_is_given_as_the_readme_says(
 
 def test_the_last_line_tells_the_time_of_this_run() -> None:
     whole = {"seconds": {"total": 40.0}, "elapsed_seconds": 41.5, "resumed": []}
-    assert cli._time_taken(whole) == "41.5 s"
+    assert time_taken(whole) == "41.5 s"
     again = {**whole, "elapsed_seconds": 1.5, "resumed": ["features"]}
-    assert cli._time_taken(again) == "1.5 s (40.0 s with what was kept of an earlier run)"
+    assert time_taken(again) == "1.5 s (40.0 s with what was kept of an earlier run)"
 
 
 def test_every_camera_has_a_line_with_what_was_estimated_of_it() -> None:
@@ -246,7 +247,7 @@ def test_every_camera_has_a_line_with_what_was_estimated_of_it() -> None:
         }
 
     square, other = view(0, 900.0, aspect=1.0), view(1, 800.0, aspect=1.2, skew_px=2.0)
-    lines = cli._intrinsic_lines([square, square, other, {"camera": 0, "registered": False}])
+    lines = intrinsic_lines([square, square, other, {"camera": 0, "registered": False}])
     assert len(lines) == 2
     assert lines[0].startswith("camera 0: focal 900.0 +- 0.5 px")
     assert "aspect" not in lines[0]

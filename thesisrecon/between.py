@@ -16,7 +16,7 @@ from thesisrecon.doors import match_pair
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.multiview import epipoles
 from thesisrecon.geometry.parallax import require_parallax
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import PhotographSet, read_photograph
 from thesisrecon.types import F32, DisparityMap, Image, TwoView
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
@@ -108,7 +108,7 @@ def rectified_pair(
 
 def _levels(side: Any) -> U8:
     if not isinstance(side, np.ndarray):
-        return read_photograph(side, max_size_px=int(np.iinfo(np.int32).max)).rgb
+        return named_photograph(side, max_size_px=int(np.iinfo(np.int32).max)).images[0].rgb
     if side.dtype != np.uint8 or side.ndim not in (2, 3) or (side.ndim == 3 and side.shape[2] != 3):
         raise ValueError(f"a photograph is a uint8 array (H, W, 3); got {side.dtype} {side.shape}")
     return side if side.ndim == 3 else np.repeat(side[:, :, None], 3, axis=2)
@@ -156,15 +156,12 @@ def _reduced(image: U8) -> F32:
     return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float32)
 
 
-def read_photograph(source: Any, *, max_size_px: int) -> Image:
-    """One file or array at working size; :class:`UsageError` where there is no such file,
-    :class:`StageFailure` where it cannot be read."""
-    if not isinstance(source, np.ndarray) and not Path(source).is_file():
+def named_photograph(source: Any, *, max_size_px: int) -> PhotographSet:
+    """One file, array or record at working size, as a set of one; :class:`UsageError` where there is no such
+    file, :class:`StageFailure` where it cannot be read."""
+    if isinstance(source, str | Path) and not Path(source).is_file():
         raise UsageError(f"there is no photograph {source}")
-    found = read_photographs([source], max_size_px=max_size_px)
-    for name, reason in found.refused.items():
-        raise StageFailure(f"{name} {reason}")
-    return found.images[0]
+    return read_photograph(source, max_size_px=max_size_px)
 
 
 def relate(

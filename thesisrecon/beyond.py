@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.assumptions import assumptions_of_views
-from thesisrecon.between import Film
+from thesisrecon.between import Film, named_photograph
 from thesisrecon.config import PipelineConfig, RectifiedPair
 from thesisrecon.doors import match_pair
-from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera import calibration_matrix
-from thesisrecon.io.images import read_photographs
 from thesisrecon.types import F64, Image, TwoView
 from thesisrecon.views.tensor import (
     TensorSynthesis,
@@ -54,11 +52,7 @@ def match_photographs(
     config = config or PipelineConfig()
     images, focals = [], []
     for source in (image1, image2):
-        if isinstance(source, str | Path) and not Path(source).is_file():
-            raise UsageError(f"there is no photograph {source}")
-        found = read_photographs([source], max_size_px=config.images.max_size_px)
-        for name, reason in found.refused.items():
-            raise StageFailure(f"{name} {reason}")
+        found = named_photograph(source, max_size_px=config.images.max_size_px)
         images.append(found.images[0])
         focals.append(float(found.exif_focal_px[0]))
     first, second = images

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thesisrecon import __version__
+from thesisrecon.console import summary_text
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.workers import available_threads
 
@@ -193,7 +194,7 @@ def inspect(
     if not isinstance(summary, dict):
         raise UsageError(f"{out} holds no summary of a run (summary.json); has a run ended there?")
     try:
-        _print_summary(summary, out)
+        typer.echo(summary_text(summary, out))
     except (KeyError, TypeError, AttributeError):
         raise UsageError(f"{out / 'summary.json'} is not a summary of this program") from None
 
@@ -406,7 +407,7 @@ def _run(images: Path, out: Path, config: PipelineConfig, seed: int, options: Ma
         raise _Interrupted(
             f"interrupted; the same command goes on where it stopped (kept in {out})"
         ) from None
-    _print_summary(result.summary, out)
+    typer.echo(summary_text(result.summary, out))
 
 
 @contextmanager
@@ -428,78 +429,6 @@ def _progress_bars() -> Iterator[Any]:
             bars.update(tasks[stage], completed=done, total=total)
 
         yield hear
-
-
-def _print_summary(summary: Mapping[str, Any], out: Path) -> None:
-    lines = [_found(summary)]
-    if summary["reprojection_rms_px"] is not None:
-        lines.append(
-            f"reprojection residual {summary['reprojection_rms_px']:.3f} px RMS, "
-            f"{summary['reprojection_median_px']:.3f} px median"
-        )
-    lines += _intrinsic_lines(summary["cameras"])
-    if summary.get("model"):
-        lines.append(f"model of {summary['model']['faces']} triangles: {out / 'model.glb'}")
-    lines += [f"refused: {refused['name']}: {refused['reason']}" for refused in summary["refused"]]
-    lines += [f"warning: {warning}" for warning in summary["warnings"]]
-    if summary["failure"]:
-        lines.append(f"failed: {summary['failure']}")
-    lines.append(f"{_time_taken(summary)}; the page is {out / 'report.html'}")
-    typer.echo("\n".join(lines))
-
-
-def _time_taken(summary: Mapping[str, Any]) -> str:
-    """What this run took; where stages were kept, also what all of them took when they were computed."""
-    total = summary["seconds"]["total"]
-    took = f"{summary.get('elapsed_seconds', total):.1f} s"
-    return f"{took} ({total:.1f} s with what was kept of an earlier run)" if summary["resumed"] else took
-
-
-def _found(summary: Mapping[str, Any]) -> str:
-    """What the last stage that found something found."""
-    images, pairs = summary["images"], summary["pairs"]
-    if summary["stratum"] is not None:
-        kind = " in projective cameras" if summary["stratum"] == "projective" else ""
-        return f"{summary['registered']} of {images} photographs registered{kind}, {summary['points']} points"
-    if pairs["matched"]:
-        possible = pairs.get("possible", pairs["matched"])
-        chosen = f" ({possible} are possible)" if possible > pairs["matched"] else ""
-        return (
-            f"{pairs['accepted']} of {pairs['matched']} pairs of photographs accepted{chosen}, "
-            f"{pairs['verified_matches']} verified matches"
-        )
-    corners = [view["corners"] for view in summary["cameras"] if view["corners"] is not None]
-    if corners:
-        return f"{sum(corners)} corners in {len(corners)} photographs"
-    return f"{len(summary['cameras'])} of {images} photographs read"
-
-
-def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
-    """One line per camera: focal length, principal point and what else of K was estimated, with their
-    standard deviations."""
-    lines: dict[tuple[int, float], str] = {}
-    for view in views:
-        if "focal_px" not in view:
-            continue
-        focal, x, y = (view[name] for name in ("focal_px", "principal_x_px", "principal_y_px"))
-        lines.setdefault(
-            (view["camera"], focal["value"]),
-            f"camera {view['camera']}: "
-            f"focal {focal['value']:.1f} +- {focal['std']:.1f} px ({focal['source']}), "
-            f"principal point ({x['value']:.1f} +- {x['std']:.1f}, {y['value']:.1f} +- {y['std']:.1f}) px"
-            + _shape_of_pixels(view),
-        )
-    return list(lines.values())
-
-
-def _shape_of_pixels(view: Mapping[str, Any]) -> str:
-    """Aspect and skew, where they were estimated."""
-    words = ""
-    for name, text, digits, unit in (("aspect", "aspect", 5, ""), ("skew_px", "skew", 2, " px")):
-        interval = view.get(name)
-        if interval is not None and interval["std"] != 0.0:
-            words += f", {text} {interval['value']:.{digits}f} +- {interval['std']:.{digits}f}{unit}"
-    return words
 
 
 def run_command(arguments: list[str]) -> int:

@@ -12,7 +12,7 @@ from thesisrecon.assumptions import assume
 from thesisrecon.config import PipelineConfig, seeing
 from thesisrecon.epipolar import estimate_fundamental
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import read_photograph
 from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.run import stream
 from thesisrecon.types import DisparityMap, Image, Reconstruction, SelfCalibration, TwoView
@@ -26,19 +26,14 @@ def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None
     Raises :class:`StageFailure` where one of them cannot be read or they do not match.
     """
     config = config or PipelineConfig()
-    photographs = [_read_one(image, config) for image in (image1, image2)]
+    photographs = [
+        read_photograph(image, max_size_px=config.images.max_size_px).images[0] for image in (image1, image2)
+    ]
     views = [config.matching.prepare(image, detect_features(config, image)) for image in photographs]
     pair = match_views(config, views[0], views[1], (0, 1), seed)
     if not pair.accepted:
         raise StageFailure("the two photographs do not match", pair.reason)
     return pair
-
-
-def _read_one(image: Any, config: PipelineConfig) -> Image:
-    photographs = read_photographs([image], max_size_px=config.images.max_size_px)
-    for name, reason in photographs.refused.items():
-        raise StageFailure(f"{name} {reason}")
-    return photographs.images[0]
 
 
 def match_rectified(
@@ -57,10 +52,7 @@ def match_rectified(
 
 
 def _full_size(path: Any) -> Any:
-    photographs = read_photographs([path], max_size_px=np.iinfo(np.int32).max)
-    for name, reason in photographs.refused.items():
-        raise StageFailure(f"{name} {reason}")
-    return photographs.images[0].rgb
+    return read_photograph(path, max_size_px=np.iinfo(np.int32).max).images[0].rgb
 
 
 def self_calibrate(

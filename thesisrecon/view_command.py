@@ -13,7 +13,7 @@ from typing import Any
 
 import PIL.ImageColor
 
-from thesisrecon.between import Film, read_photograph
+from thesisrecon.between import Film, named_photograph
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.pinhole import PinholeCamera
@@ -177,7 +177,7 @@ def write_between(
     if wishes.max_size_px is not None:
         config = replace(config, images=ImageOptions(wishes.max_size_px))
     photographs = [
-        read_photograph(path, max_size_px=config.images.max_size_px) for path in wishes.photographs
+        named_photograph(path, max_size_px=config.images.max_size_px).images[0] for path in wishes.photographs
     ]
     tell, count = progress or (lambda *_: None), wishes.frames
     tell("correspondence", 0, 1)

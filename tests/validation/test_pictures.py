@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from validation.metrics.pictures import LUMINANCE, psnr_db, ssim
+from thesisrecon.views.likeness import GREY
+from validation.metrics.pictures import psnr_db, ssim
 
 
 def test_psnr_is_that_of_the_mean_square():
@@ -24,7 +25,7 @@ def test_similarity_of_structure_is_the_formula_of_windows():
     rng = np.random.default_rng(0)
     truth = rng.uniform(0.0, 255.0, (24, 30, 3))
     other = truth + rng.normal(0.0, 30.0, truth.shape)
-    x, y = truth @ LUMINANCE, other @ LUMINANCE
+    x, y = truth @ GREY, other @ GREY
     at = np.arange(-5, 6)
     w = np.exp(-0.5 * (at / 1.5) ** 2)
     w = np.outer(w, w) / w.sum() ** 2

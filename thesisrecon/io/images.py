@@ -18,7 +18,7 @@ import PIL.Image
 import PIL.ImageOps
 from numpy.typing import NDArray
 
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.types import F64, Image
 
 U8 = NDArray[np.uint8]
@@ -95,6 +95,17 @@ def scene_name(folder: Path) -> str:
     """
     folder = folder.resolve()
     return printable(folder.parent.name if folder.name.lower() in COMMON_NAMES else folder.name)
+
+
+def read_photograph(source: Any, *, max_size_px: int) -> PhotographSet:
+    """One file, array or record as a set of one; arguments as in :func:`read_photographs`.
+
+    Raises :class:`StageFailure` where it cannot be read.
+    """
+    found = read_photographs([source], max_size_px=max_size_px)
+    for name, reason in found.refused.items():
+        raise StageFailure(f"{name} {reason}")
+    return found
 
 
 def read_photographs(

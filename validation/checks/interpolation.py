@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +20,10 @@ from numpy.typing import NDArray
 
 from thesisrecon.between import rectified_pair, relate
 from thesisrecon.config import PipelineConfig
-from thesisrecon.dense.matching import CohesiveScanlines
 from thesisrecon.geometry.camera import camera_from_centre, project
 from thesisrecon.geometry.triangulation import triangulate_linear
-from thesisrecon.types import DisparityMap, Image
-from thesisrecon.views.interpolation import InterpolatedPair, check_monotonicity
+from thesisrecon.types import Image
+from thesisrecon.views.interpolation import InterpolatedPair
 from validation.checks.tensor_views import (
     DIRECTIONS,
     VIEWS,
@@ -38,9 +36,9 @@ from validation.checks.tensor_views import (
     photograph,
     save_beside,
 )
-from validation.metrics.pictures import psnr_db, ssim
+from validation.metrics.pictures import picture_metrics, psnr_db, ssim
 from validation.metrics.record import Metric, markdown_table
-from validation.references.semi_global import MODES, OpenCVSemiGlobal
+from validation.metrics.timing import time_of_a_frame
 from validation.scenes.between import (
     best_homography,
     camera_between,
@@ -53,14 +51,7 @@ from validation.scenes.between import (
 )
 from validation.scenes.fixtures import SIZE, Pose, courtyard_poses
 from validation.scenes.nine_views import (
-    BETWEEN,
-    DISPARITIES,
-    ENDS,
-    NineViews,
-    both_ways,
     dissolved,
-    load_cones,
-    mirrored,
     read_rgb,
 )
 from validation.scenes.real import load_real_scene
@@ -80,71 +71,6 @@ DISTANCES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 THIRD = 5
 """View of the courtyard that spans the triangle with the other two."""
 OURS, TRUE, DISSOLVE = "ours", "true disparity", "cross-dissolve"
-
-
-def cones_maps(cones: NineViews) -> dict[str, tuple[DisparityMap, DisparityMap] | tuple[F32, F32]]:
-    """Disparities of both photographs by every method."""
-    left, right = (cones.images[k] for k in ENDS)
-
-    def both(match: OpenCVSemiGlobal) -> tuple[F32, F32]:
-        return both_ways(lambda a, b: match.match(a, b, DISPARITIES), left, right)
-
-    limits = (0, DISPARITIES - 1)
-    matcher = CohesiveScanlines()
-    back = matcher.match(mirrored(right), mirrored(left), disparity_range=limits)
-    turned = [np.ascontiguousarray(part[:, ::-1]) for part in (back.disparity, back.confidence)]
-    ours = matcher.match(left, right, disparity_range=limits)
-    theirs = {mode: both(OpenCVSemiGlobal(mode)) for mode in MODES}
-    return {
-        OURS: (ours, DisparityMap(turned[0], turned[1], back.sigma_px)),
-        **theirs,
-        TRUE: cones.disparities,
-    }
-
-
-def measure_cones(out: Path | None) -> list[Metric]:
-    """Views 3, 4 and 5 by every method, and their means against the targets."""
-    cones = load_cones()
-    if cones is None:
-        print("Cones: not on this machine (THESISRECON_DATA), left out", flush=True)
-        return []
-    images = cones.images
-    left, right = images[ENDS[0]], images[ENDS[1]]
-    maps = cones_maps(cones)
-    pairs = {name: rectified_pair(left, right, disparity=found) for name, found in maps.items()}
-    rows: list[Metric] = []
-    for k in BETWEEN:
-        s = cones.share(k)
-        pictures = {name: pair.view(s) for name, pair in pairs.items()}
-        pictures[DISSOLVE] = dissolved(left, right, s)
-        rows += picture_metrics(f"Cones, view {k}", pictures, images[k])
-        if out is not None:
-            save_whole(out / f"cones-{k}.png", [images[k], pictures[OURS]])
-    shares: dict[str, float | None] = {
-        name: 100.0 * check_monotonicity(pair.left.disparity).share for name, pair in pairs.items()
-    }
-    rows.append(Metric("Cones", "pixels that violate monotonicity", "% of known", shares, OURS))
-    return [*rows, *cones_targets(rows)]
-
-
-def cones_targets(rows: list[Metric]) -> list[Metric]:
-    """Means over the three views, and what ours must be above."""
-    scene = "Cones, mean of views 3 to 5"
-    mean = {
-        n: float(np.mean([r.values[n] for r in rows if r.name == "PSNR"]))
-        for n in (OURS, *MODES, TRUE, DISSOLVE)
-    }
-    likeness: dict[str, float | None] = {
-        n: float(np.mean([r.values[n] for r in rows if r.name == "SSIM"])) for n in mean
-    }
-    target = max(mean[mode] for mode in MODES) + OVER_SGBM_DB
-    over: dict[str, float | None] = {n: mean[n] - mean[DISSOLVE] for n in mean}
-    return [
-        Metric(scene, "PSNR", "dB", dict(mean), OURS, target, at_most=False, note="the better SGBM + 0.3"),
-        Metric(scene, "over cross-dissolve", "dB", over, OURS, OVER_DISSOLVE_DB, at_most=False),
-        Metric(scene, "SSIM", "", likeness, OURS),
-        Metric(scene, "true disparity over this", "dB", {n: mean[TRUE] - mean[n] for n in mean}, OURS),
-    ]
 
 
 def cameras_of(truth: CourtyardTruth) -> tuple[F64, F64]:
@@ -334,15 +260,6 @@ def pair_matches(first: U8, second: U8) -> tuple[F64, F64]:
     return pair.xy1, pair.xy2
 
 
-def picture_metrics(scene: str, pictures: Mapping[str, U8], wanted: U8) -> list[Metric]:
-    """PSNR and SSIM of every picture."""
-    judged = next(iter(pictures))
-    return [
-        Metric(scene, "PSNR", "dB", {n: psnr_db(p, wanted) for n, p in pictures.items()}, judged),
-        Metric(scene, "SSIM", "", {n: ssim(p, wanted) for n, p in pictures.items()}, judged),
-    ]
-
-
 def measure_time(repeats: int) -> Metric:
     """A frame of 1000 x 700 px between photographs as large, once the correspondence is known."""
     width, height = FRAME_SIZE
@@ -352,14 +269,8 @@ def measure_time(repeats: int) -> Metric:
     left = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
     right = np.take_along_axis(left, np.clip(x + np.rint(d).astype(int), 0, width - 1)[..., None], axis=1)
     pair = rectified_pair(left, right, disparity=d, config=PipelineConfig())
-    wall, processor = [], []
-    for _ in range(repeats + 1):  # the first compiles and prepares
-        start = time.perf_counter(), time.process_time()
-        pair.view(0.4, threads=2)
-        wall.append(time.perf_counter() - start[0])
-        processor.append(time.process_time() - start[1])
-    values: dict[str, float | None] = {"wall, 2 threads": min(wall[1:]), "processor": min(processor[1:])}
-    return Metric("1000 x 700", "time of a frame", "s", values, "processor", target=FRAME_S)
+    draw_frame = partial(pair.view, 0.4, threads=2)
+    return time_of_a_frame("1000 x 700", draw_frame, repeats=repeats, target_s=FRAME_S)
 
 
 def save_whole(path: Path, pictures: list[U8]) -> None:
@@ -370,15 +281,13 @@ def save_whole(path: Path, pictures: list[U8]) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print, write if asked, and say whether every target was reached."""
     parser = argparse.ArgumentParser(prog="python -m validation.checks.interpolation", description=__doc__)
-    parser.add_argument("parts", nargs="*", default=["cones", "fountain", "courtyard", "time"])
+    parser.add_argument("parts", nargs="*", default=["fountain", "courtyard", "time"])
     parser.add_argument("-o", "--out", type=Path)
     parser.add_argument("--repeats", type=int, default=5)
     wishes = parser.parse_args(arguments)
     if wishes.out is not None:
         wishes.out.mkdir(parents=True, exist_ok=True)
     rows: list[Metric] = []
-    if "cones" in wishes.parts:
-        rows += measure_cones(wishes.out)
     if "fountain" in wishes.parts:
         rows += measure_fountain(wishes.out)
     if "time" in wishes.parts:

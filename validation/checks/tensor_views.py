@@ -11,10 +11,9 @@ from __future__ import annotations
 import argparse
 import io
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +23,9 @@ from numpy.typing import NDArray
 
 from thesisrecon.beyond import match_photographs
 from thesisrecon.config import PipelineConfig
-from thesisrecon.dense.matching import CohesiveScanlines
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.types import DisparityMap
 from thesisrecon.views.tensor import (
     CalibratedPair,
-    TensorSynthesis,
     VirtualCamera,
     camera_at,
     guessed_intrinsics,
@@ -38,12 +34,12 @@ from thesisrecon.views.tensor import (
     seed_of_two,
 )
 from thesisrecon.views.tensor.synthesis import AGREE_PX
-from validation.metrics.pictures import psnr_db, ssim
+from validation.metrics.pictures import picture_metrics, psnr_db, ssim
 from validation.metrics.record import Metric, markdown_table
-from validation.references.semi_global import MODES, OpenCVSemiGlobal
+from validation.metrics.timing import time_of_a_frame
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_photograph
-from validation.scenes.nine_views import BETWEEN, BEYOND, both_ways, dissolved, load_cones
+from validation.scenes.nine_views import dissolved
 from validation.scenes.raycast import Rays, World, trace
 from validation.scenes.real import load_real_scene
 
@@ -277,86 +273,7 @@ def measure_fountain(out: Path | None) -> list[Metric]:
     pictures["cross-dissolve"] = dissolved(images[0].rgb, images[1].rgb, 0.5)
     if out is not None:
         save_beside(out / "fountain-5.jpg", [wanted, *pictures.values()])
-    return _pictures("fountain-P11, 5 from 4 and 6", pictures, wanted)
-
-
-def _pictures(scene: str, pictures: dict[str, U8], wanted: U8) -> list[Metric]:
-    judged = next(iter(pictures))
-    return [
-        Metric(scene, "PSNR", "dB", {n: psnr_db(p, wanted) for n, p in pictures.items()}, judged),
-        Metric(scene, "SSIM", "", {n: ssim(p, wanted) for n, p in pictures.items()}, judged),
-    ]
-
-
-def measure_cones(out: Path | None) -> list[Metric]:
-    """Views 3, 4 and 5 from 2 and 6, by our disparities, those of OpenCV and the true ones."""
-    cones = load_cones()
-    if cones is None:
-        return []
-    images = cones.images
-    synthesis = {
-        "ours": _of_disparities(images[2], images[6], *both_ways(_ours, images[2], images[6])),
-        **{
-            name: _of_disparities(images[2], images[6], *both_ways(_of_opencv(name), images[2], images[6]))
-            for name in MODES
-        },
-        # Known of hidden pixels, too.
-        "true disparity": _of_disparities(
-            images[2],
-            images[6],
-            *cones.disparities,
-            agree_px=np.inf,
-        ),
-    }
-    sizes = next(iter(synthesis.values())).sizes
-    rows = []
-    for k in BETWEEN:
-        share = (k - 2) / 4
-        pictures = {n: v.render(camera_at(v.pair, share, sizes=sizes)) for n, v in synthesis.items()}
-        pictures["cross-dissolve"] = dissolved(images[2], images[6], share)
-        rows += _pictures(f"Cones, view {k}", pictures, images[k])
-        if out is not None:
-            save_beside(out / f"cones-{k}.png", [images[k], pictures["ours"]])
-    for k in BEYOND:
-        camera = camera_at(synthesis["ours"].pair, (k - 2) / 4, sizes=sizes)
-        beyond = {n: v.render(camera)[:, BORDER_PX:-BORDER_PX] for n, v in synthesis.items()}
-        rows += _pictures(f"Cones, view {k}, without its borders", beyond, images[k][:, BORDER_PX:-BORDER_PX])
-    between = rows[: 2 * len(BETWEEN)]
-    mean = {n: float(np.mean([r.values[n] for r in between if r.name == "PSNR"])) for n in rows[0].values}
-    sgbm = max(mean[name] for name in MODES)
-    scene = "Cones, mean of views 3 to 5"
-    over = {"ours": mean["ours"] - mean["cross-dissolve"]}
-    return [
-        *rows,
-        Metric(scene, "PSNR", "dB", mean, "ours", sgbm + 0.3, at_most=False),
-        Metric(scene, "over cross-dissolve", "dB", over, "ours", 5.0, at_most=False),
-    ]
-
-
-Disparities = Callable[[U8, U8], F32]
-
-
-def _ours(left: U8, right: U8) -> F32:
-    return CohesiveScanlines().match(left, right, disparity_range=(0, 63)).disparity
-
-
-def _of_opencv(mode: str) -> Disparities:
-    return lambda left, right: OpenCVSemiGlobal(mode).match(left, right, 64)
-
-
-def _of_disparities(
-    left: U8, right: U8, of_left: F32, of_right: F32, *, agree_px: float = AGREE_PX
-) -> TensorSynthesis:
-    """A rectified pair of parallel cameras as a pair for the tensor, unknown pixels taken for background."""
-    height, width = of_left.shape
-    places = []
-    for d, sign in ((of_left, -1.0), (of_right, 1.0)):
-        y, x = np.indices(d.shape, dtype=np.float32)
-        filled = DisparityMap(d, np.zeros_like(d), 0.0).filled()
-        places.append(np.stack([x + np.float32(sign) * filled, y], axis=-1))
-    K = guessed_intrinsics((width, height))
-    pair = CalibratedPair(K, K, np.eye(3), np.array([-1.0, 0.0, 0.0]))
-    return prepare_synthesis(pair, (left, right), (places[0], places[1]), agree_px=agree_px)
+    return picture_metrics("fountain-P11, 5 from 4 and 6", pictures, wanted)
 
 
 def measure_time(repeats: int) -> Metric:
@@ -367,28 +284,20 @@ def measure_time(repeats: int) -> Metric:
     places = tuple(part[:height, :width] for part in truth.places)
     views = prepare_synthesis(truth.pair, (images[0], images[1]), (places[0], places[1]))
     camera = replace(camera_at(truth.pair, 0.4, sizes=(FRAME_SIZE, FRAME_SIZE)))
-    wall, processor = [], []
-    for _ in range(repeats + 1):  # the first compiles
-        start = time.perf_counter(), time.process_time()
-        views.render(camera, threads=2)
-        wall.append(time.perf_counter() - start[0])
-        processor.append(time.process_time() - start[1])
-    values: dict[str, float | None] = {"wall, 2 threads": min(wall[1:]), "processor": min(processor[1:])}
-    return Metric("courtyard, 1000 x 700", "time of a frame", "s", values, "processor", target=FRAME_S)
+    draw_frame = partial(views.render, camera, threads=2)
+    return time_of_a_frame("courtyard, 1000 x 700", draw_frame, repeats=repeats, target_s=FRAME_S)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("parts", nargs="*", default=["cones", "fountain", "courtyard", "time"])
+    parser.add_argument("parts", nargs="*", default=["fountain", "courtyard", "time"])
     parser.add_argument("-o", "--out", type=Path)
     parser.add_argument("--repeats", type=int, default=5)
     wishes = parser.parse_args(arguments)
     if wishes.out is not None:
         wishes.out.mkdir(parents=True, exist_ok=True)
     rows: list[Metric] = []
-    if "cones" in wishes.parts:
-        rows += measure_cones(wishes.out)
     if "fountain" in wishes.parts:
         rows += measure_fountain(wishes.out)
     if "time" in wishes.parts:

@@ -1,38 +1,39 @@
-"""How near a picture is to the one that it should be."""
+"""How near pictures are to the one that they should be, as rows of a table."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter
+from numpy.typing import NDArray
 
-B8 = NDArray[np.bool_]
-F64 = NDArray[np.float64]
+from thesisrecon.views import likeness
+from validation.metrics.record import Metric
 
-LUMINANCE = np.array([0.299, 0.587, 0.114])
+U8 = NDArray[np.uint8]
 
-
-def psnr_db(picture: ArrayLike, truth: ArrayLike, *, where: B8 | None = None) -> float:
-    """10 log10 of 255^2 over the mean squared difference of levels (H, W, 3), of the pixels ``where`` (H, W);
-    inf for equal pictures."""
-    apart = np.asarray(picture, dtype=np.float64) - np.asarray(truth, dtype=np.float64)
-    squared = float(np.mean((apart if where is None else apart[where]) ** 2))
-    return float("inf") if squared == 0.0 else float(10.0 * np.log10(255.0**2 / squared))
+BORDER_PX = 5
+"""How far the windows of the structural similarity reach."""
 
 
-def ssim(picture: ArrayLike, truth: ArrayLike) -> float:
-    """Mean structural similarity of the luminances of (H, W, 3) levels, 1 for equal ones.
+def psnr_db(picture: NDArray[Any], truth: NDArray[Any], *, where: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio of pictures (H, W, 3) over the pixels ``where`` (H, W), or all."""
+    compared = np.ones(truth.shape[:2], dtype=bool) if where is None else where
+    return likeness.psnr_db(truth, picture, compared)
 
-    Gaussian windows of 1.5 px, C1 = (0.01 255)^2, C2 = (0.03 255)^2 (Wang et al. 2004); the outermost five
-    pixels, whose windows leave the picture, are left out.
-    """
-    x, y = (np.asarray(image, dtype=np.float64) @ LUMINANCE for image in (picture, truth))
 
-    def mean(a: F64) -> F64:
-        return np.asarray(gaussian_filter(a, 1.5, truncate=3.5))
+def ssim(picture: NDArray[Any], truth: NDArray[Any]) -> float:
+    """Mean structural similarity of pictures (H, W, 3), 1 for equal ones, where whole windows fit."""
+    found = likeness.ssim_map(truth, picture, np.ones(truth.shape[:2], dtype=bool))
+    return float(found[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX].mean())
 
-    mx, my = mean(x), mean(y)
-    vx, vy, vxy = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
-    c1, c2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
-    found = (2.0 * mx * my + c1) * (2.0 * vxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
-    return float(found[5:-5, 5:-5].mean())
+
+def picture_metrics(scene: str, pictures: Mapping[str, U8], wanted: U8) -> list[Metric]:
+    """PSNR and SSIM of every picture; the first is judged."""
+
+    def row(name: str, unit: str, measure: Callable[[U8, U8], float]) -> Metric:
+        values: dict[str, float | None] = {n: measure(p, wanted) for n, p in pictures.items()}
+        return Metric(scene, name, unit, values, next(iter(pictures)))
+
+    return [row("PSNR", "dB", psnr_db), row("SSIM", "", ssim)]

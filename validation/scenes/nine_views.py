@@ -10,6 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from thesisrecon.dense.matching import CohesiveScanlines
+from thesisrecon.types import DisparityMap
+from thesisrecon.views.tensor import CalibratedPair, TensorSynthesis, guessed_intrinsics, prepare_synthesis
+from thesisrecon.views.tensor.synthesis import AGREE_PX
 from validation.scenes.real import data_root
 
 F32 = NDArray[np.float32]
@@ -61,6 +65,29 @@ def both_ways(match: Callable[[U8, U8], F32], left: U8, right: U8) -> tuple[F32,
     """Disparities of either photograph by a method that knows those of the left one only."""
     back = match(mirrored(right), mirrored(left))
     return match(left, right), np.ascontiguousarray(back[:, ::-1])
+
+
+def our_disparities(left: U8, right: U8) -> tuple[DisparityMap, DisparityMap]:
+    """The maps of both photographs by the library's default matcher, with its confidences."""
+    matcher, limits = CohesiveScanlines(), (0, DISPARITIES - 1)
+    back = matcher.match(mirrored(right), mirrored(left), disparity_range=limits)
+    turned, sure = (np.ascontiguousarray(part[:, ::-1]) for part in (back.disparity, back.confidence))
+    return matcher.match(left, right, disparity_range=limits), DisparityMap(turned, sure, back.sigma_px)
+
+
+def synthesis_of_disparities(
+    left: U8, right: U8, of_left: F32, of_right: F32, *, agree_px: float = AGREE_PX
+) -> TensorSynthesis:
+    """A rectified pair of parallel cameras as a pair for the tensor, unknown pixels taken for background."""
+    height, width = of_left.shape
+    places = []
+    for d, sign in ((of_left, -1.0), (of_right, 1.0)):
+        y, x = np.indices(d.shape, dtype=np.float32)
+        filled = DisparityMap(d, np.zeros_like(d), 0.0).filled()
+        places.append(np.stack([x + np.float32(sign) * filled, y], axis=-1))
+    K = guessed_intrinsics((width, height))
+    pair = CalibratedPair(K, K, np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    return prepare_synthesis(pair, (left, right), (places[0], places[1]), agree_px=agree_px)
 
 
 def dissolved(first: U8, second: U8, share: float) -> U8:

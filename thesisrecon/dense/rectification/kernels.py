@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from thesisrecon.geometry.sampling import cubic_weights
 from thesisrecon.types import F32, F64
 
 MOST_TAPS = 24
@@ -52,15 +53,6 @@ def _spread(xy: F64, i: int, j: int, axis: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _four_taps(share: float, weights: F64) -> None:
-    """The weights of an unwidened kernel at ``share`` in [0, 1] between the second and the third pixel."""
-    weights[0] = ((-0.5 * share + 1.0) * share - 0.5) * share
-    weights[1] = (1.5 * share - 2.5) * share * share + 1.0
-    weights[2] = ((-1.5 * share + 2.0) * share + 0.5) * share
-    weights[3] = (0.5 * share - 0.5) * share * share
-
-
-@njit(cache=True, nogil=True)
 def sample_image(image: F32, xy: F64, out: F32) -> None:
     """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C); NaN outside.
 
@@ -86,8 +78,8 @@ def sample_image(image: F32, xy: F64, out: F32) -> None:
             spread_x, spread_y = _spread(xy, i, j, 0), _spread(xy, i, j, 1)
             inner = x0 >= 1 and x0 + 2 < width and y0 >= 1 and y0 + 2 < height
             if inner and spread_x == 1.0 and spread_y == 1.0:
-                _four_taps(x - x0, wx)
-                _four_taps(y - y0, wy)
+                cubic_weights(x - x0, wx)
+                cubic_weights(y - y0, wy)
                 for c in range(channels):
                     value = 0.0
                     for k in range(4):

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from thesisrecon.geometry.sampling import cubic_weights
 from thesisrecon.types import F32, F64
 
 I16 = NDArray[np.int16]
@@ -192,15 +193,6 @@ def draw_surface(
 
 
 @njit(cache=True, nogil=True)
-def _cubic(share: float, weights: F32) -> None:
-    """Weights of four pixels at ``share`` in [0, 1] between the second and third: Keys 1981, a = -1/2."""
-    weights[0] = ((-0.5 * share + 1.0) * share - 0.5) * share
-    weights[1] = (1.5 * share - 2.5) * share * share + 1.0
-    weights[2] = ((-1.5 * share + 2.0) * share + 0.5) * share
-    weights[3] = (0.5 * share - 0.5) * share * share
-
-
-@njit(cache=True, nogil=True)
 def sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None:
     """Cubic samples of ``image`` (h, w, C) at ``source`` (H, W, 2) px into rows of ``out`` (H, W, C); beyond
     the border linear ones, NaN where the place or one of the pixels around it is NaN."""
@@ -217,8 +209,8 @@ def sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None:
             inner = x0 >= 1 and y0 >= 1 and x0 + 2 < width and y0 + 2 < height
             value = np.float32(np.nan)
             if inner:
-                _cubic(u - x0, wx)
-                _cubic(v - y0, wy)
+                cubic_weights(u - x0, wx)
+                cubic_weights(v - y0, wy)
             for c in range(channels):
                 if inner:
                     value = np.float32(0.0)

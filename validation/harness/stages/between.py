@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,85 +10,129 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from thesisrecon.between import rectified_pair
-from thesisrecon.dense.matching import CohesiveScanlines
 from thesisrecon.types import F32, DisparityMap
-from thesisrecon.views.likeness import psnr_db, ssim
-from thesisrecon.views.tensor import CalibratedPair, camera_at, guessed_intrinsics, prepare_synthesis
+from thesisrecon.views.tensor import camera_at
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
+from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.scenes.nine_views import (
     BETWEEN,
+    BEYOND,
     DISPARITIES,
     ENDS,
     NineViews,
     both_ways,
     dissolved,
     load_cones,
-    mirrored,
+    our_disparities,
     read_rgb,
+    synthesis_of_disparities,
 )
 
 U8 = NDArray[np.uint8]
-OURS, TENSOR, TRUE, DISSOLVE = "ours", "ours (tensor)", "true disparities", "cross-dissolve"
+Measure = Callable[[U8, U8], float]
+OURS, TRUE, DISSOLVE = "ours", "true disparities", "cross-dissolve"
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
+BY_TENSOR = " (tensor)"
+TENSOR = OURS + BY_TENSOR
+BORDER_PX = 50
+"""Columns of views beyond the ends that no photograph shows, or whose picture ends before."""
 
 
 class BetweenStage:
-    """The same warp with our disparities, OpenCV's and the true ones, and the tensor with ours."""
+    """The same warp with our disparities, OpenCV's and the true ones, and the tensor with each of them."""
 
     name = "between"
     title = "Views between photographs"
     definition = (
         "Photographs 3, 4 and 5 of nine, made from 2 and 6, beside the real ones: interpolation with our "
-        "disparities, with OpenCV's and with the true ones, the tensor with ours, and a mere mixture."
+        "disparities, with OpenCV's and with the true ones, the tensor with the same, and a mere mixture. "
+        "The tensor also makes 1 and 7, a quarter of the baseline beyond the ends."
     )
 
     def takes(self, scene: str, wishes: Wishes) -> bool:  # noqa: ARG002 (the same for all wishes)
         return scene == "Cones" and load_cones() is not None
 
     def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
-        return (OURS, TENSOR, THREE_WAY, HH, TRUE, DISSOLVE)
+        sources = (OURS, THREE_WAY, HH, TRUE)
+        tensors = (OURS,) if wishes.gates_only else sources
+        return (*sources, DISSOLVE, *(source + BY_TENSOR for source in tensors))
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (nothing)
         return ()
 
     def run(self, task: Task, wishes: Wishes) -> None:
-        cones = _cones()
         place = wishes.place(task.stage, task.scene, task.method)
-        for view, picture in _pictures(task.method, cones).items():
-            PIL.Image.fromarray(picture).save(place / f"{view}.png")
+        for view, picture in _pictures(task.method, _cones()).items():
+            PIL.Image.fromarray(picture).save(_file(place, view))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
         cones = _cones()
-        made = {n: _read(o) if o.ok else None for n, o in outcomes.items()}
-        everywhere = np.ones(cones.images[ENDS[0]].shape[:2], dtype=bool)
-        peak, alike = dict[str, float | None](), dict[str, float | None]()
-        for name, pictures in made.items():
-            told = [] if pictures is None else [(cones.images[k], p) for k, p in pictures.items()]
-            peak[name] = float(np.mean([psnr_db(a, b, everywhere) for a, b in told])) if told else None
-            alike[name] = float(np.mean([ssim(a, b, everywhere) for a, b in told])) if told else None
+        made = {name: _read(outcome) for name, outcome in outcomes.items()}
+        judged = Judged(cones, made)
+        peak = judged.mean(psnr_db)
         sgbm = max((v for n in (THREE_WAY, HH) if (v := peak[n]) is not None), default=None)
         words = "mean over photographs 3, 4 and 5"
         metrics = [
             Metric(scene, "PSNR", "dB", peak, OURS, at_most=False, definition=words),
-            Metric(scene, "SSIM", "", alike, OURS, at_most=False, definition=words),
+            Metric(scene, "SSIM", "", judged.mean(ssim), OURS, at_most=False, definition=words),
             *(
                 _over(scene, f"{what}PSNR over {name}", peak[method], other)
                 for what, method in (("", OURS), ("tensor: ", TENSOR))
                 for name, other in (("the better SGBM", sgbm), ("cross-dissolve", peak[DISSOLVE]))
             ),
+            *(judged.view(scene, k) for k in (*BETWEEN, *BEYOND)),
         ]
-        place = wishes.place(self.name, scene)
-        shown = []
-        ours = made[OURS]
-        if ours is not None:
-            for k in BETWEEN:
-                row = np.concatenate([cones.images[k], ours[k]], axis=1)
-                PIL.Image.fromarray(row).save(place / f"{k}.png")
-                shown.append(Picture(f"{k}.png", f"View {k}", "The photograph, and ours."))
         return Judgement(
-            metrics, pictures=shown, notes=[f"{n}: {o.failure}." for n, o in outcomes.items() if not o.ok]
+            metrics,
+            pictures=_beside(wishes.place(self.name, scene), cones, made),
+            notes=[f"{n}: {o.failure}." for n, o in outcomes.items() if not o.ok],
         )
+
+
+class Judged:
+    """Pictures of methods, by the number of the view, beside the photographs."""
+
+    def __init__(self, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> None:
+        self.cones, self.made = cones, made
+
+    def mean(self, measure: Measure) -> dict[str, float | None]:
+        """Of all views between, by method; None where one is missing."""
+        return {
+            name: float(np.mean([measure(pictures[k], self.cones.images[k]) for k in BETWEEN]))
+            if pictures
+            else None
+            for name, pictures in self.made.items()
+        }
+
+    def view(self, scene: str, k: int) -> Metric:
+        """The row of one view."""
+        beyond = k in BEYOND
+        shown = slice(BORDER_PX, -BORDER_PX) if beyond else slice(None)
+        wanted = self.cones.images[k][:, shown]
+        values: dict[str, float | None] = {
+            name: psnr_db(pictures[k][:, shown], wanted) if k in pictures else None
+            for name, pictures in self.made.items()
+            if not beyond or BY_TENSOR in name
+        }
+        words = f"without {BORDER_PX} columns at the borders" if beyond else "of this view alone"
+        judged = TENSOR if beyond else OURS
+        return Metric(scene, f"PSNR, view {k}", "dB", values, judged, at_most=False, definition=words)
+
+
+def _beside(place: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> list[Picture]:
+    shown = []
+    for k, picture in made[OURS].items():
+        row = np.concatenate([cones.images[k], picture, _difference(picture, cones.images[k])], axis=1)
+        PIL.Image.fromarray(row).save(_file(place, k))
+        words = "The photograph, ours, and four times the difference from middle grey."
+        shown.append(Picture(_file(place, k).name, f"View {k}", words))
+    return shown
+
+
+def _difference(picture: U8, wanted: U8) -> U8:
+    apart = 4.0 * (picture.astype(np.float32) - wanted)
+    return np.asarray(np.clip(128.0 + apart, 0.0, 255.0), dtype=np.uint8)
 
 
 def _over(scene: str, name: str, peak: float | None, other: float | None) -> Metric:
@@ -107,46 +151,41 @@ def _pictures(method: str, cones: NineViews) -> dict[int, U8]:
     left, right = (cones.images[k] for k in ENDS)
     if method == DISSOLVE:
         return {k: dissolved(left, right, cones.share(k)) for k in BETWEEN}
-    if method == TENSOR:
-        return _by_tensor(cones, left, right)
-    pair = rectified_pair(left, right, disparity=_disparities(method, cones, left, right))
-    return {k: pair.view(cones.share(k)) for k in BETWEEN}
+    maps = _disparities(method.removesuffix(BY_TENSOR), cones, left, right)
+    if not method.endswith(BY_TENSOR):
+        pair = rectified_pair(left, right, disparity=maps)
+        return {k: pair.view(cones.share(k)) for k in BETWEEN}
+    of_left, of_right = (m.disparity if isinstance(m, DisparityMap) else m for m in maps)
+    # The true disparities are known of hidden pixels, too, which need not agree.
+    agree = {"agree_px": np.inf} if method.startswith(TRUE) else {}
+    made = synthesis_of_disparities(left, right, of_left, of_right, **agree)
+    return {
+        k: made.render(camera_at(made.pair, cones.share(k), sizes=made.sizes)) for k in (*BETWEEN, *BEYOND)
+    }
 
 
 def _disparities(
-    method: str, cones: NineViews, left: U8, right: U8
+    source: str, cones: NineViews, left: U8, right: U8
 ) -> tuple[DisparityMap, DisparityMap] | tuple[F32, F32]:
-    if method == TRUE:
+    if source == TRUE:
         return cones.disparities
-    if method == OURS:
-        matcher, limits = CohesiveScanlines(), (0, DISPARITIES - 1)
-        back = matcher.match(mirrored(right), mirrored(left), disparity_range=limits)
-        turned, sure = (np.ascontiguousarray(part[:, ::-1]) for part in (back.disparity, back.confidence))
-        return matcher.match(left, right, disparity_range=limits), DisparityMap(turned, sure, back.sigma_px)
+    if source == OURS:
+        return our_disparities(left, right)
     import cv2
 
     from validation.references.semi_global import OpenCVSemiGlobal
 
     cv2.setNumThreads(1)
-    reference = OpenCVSemiGlobal(method)
+    reference = OpenCVSemiGlobal(source)
     return both_ways(lambda a, b: reference.match(a, b, DISPARITIES), left, right)
 
 
-def _by_tensor(cones: NineViews, left: U8, right: U8) -> dict[int, U8]:
-    """A rectified pair is one of parallel cameras; what only one sees is taken for background."""
-    matcher, limits = CohesiveScanlines(), (0, DISPARITIES - 1)
-    maps = both_ways(lambda a, b: matcher.match(a, b, disparity_range=limits).disparity, left, right)
-    places = []
-    for d, sign in zip(maps, (-1.0, 1.0), strict=True):
-        y, x = np.indices(d.shape, dtype=np.float32)
-        filled = DisparityMap(d, np.zeros_like(d), 0.0).filled()
-        places.append(np.stack([x + np.float32(sign) * filled, y], axis=-1))
-    height, width = maps[0].shape
-    K = guessed_intrinsics((width, height))
-    pair = CalibratedPair(K, K, np.eye(3), np.array([-1.0, 0.0, 0.0]))
-    synthesis = prepare_synthesis(pair, (left, right), (places[0], places[1]))
-    return {k: synthesis.render(camera_at(pair, cones.share(k), sizes=synthesis.sizes)) for k in BETWEEN}
+def _file(place: Path, view: int) -> Path:
+    return place / f"{view}.png"
 
 
 def _read(outcome: Outcome) -> dict[int, U8]:
-    return {k: read_rgb(Path(outcome.place) / f"{k}.png") for k in BETWEEN}
+    place = Path(outcome.place)
+    return {
+        k: read_rgb(_file(place, k)) for k in (*BETWEEN, *BEYOND) if outcome.ok and _file(place, k).exists()
+    }
