@@ -25,7 +25,14 @@ DOUBT = np.log(1e3)
 LARGEST = 1 << 40
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(
+    cache=True,
+    nogil=True,
+    inline="always",
+    error_model="numpy",
+    fastmath={"reassoc", "contract"},
+    forceinline=True,
+)
 def reflect(v: F64, start: int, scale: float, x: F64) -> None:
     """x <- (I - scale v v') x, v zero before ``start``."""
     dot = 0.0
@@ -36,7 +43,7 @@ def reflect(v: F64, start: int, scale: float, x: F64) -> None:
         x[r] -= dot * v[r]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
     """Two orthonormal vectors (``pencil`` (2, 9)) that span the null space of the seven equations (5.1).
 
@@ -222,7 +229,7 @@ def sampson_distances(f: F64, points: F64) -> F64:
     return r
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
     """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and how many have r < gate.
 
@@ -243,7 +250,7 @@ def block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tupl
     return total, inside
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def truncated_score(
     f: F64, columns: F64, gate: float, give_up: float, evidence: tuple[float, float]
 ) -> tuple[float, int, int]:
@@ -292,7 +299,7 @@ def draw_batch(points: F64, uniforms: F64, X: F64) -> None:
                 X[4 * m + c, lane] = points[sample[m], c]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def improve(points: F64, columns: F64, gate: float, state: F64, F: F64) -> None:
     """Refine the best matrix a little (on at most 300 points, with a gate twice as wide) and keep the better.
 

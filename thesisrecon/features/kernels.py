@@ -58,7 +58,7 @@ def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: flo
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _slopes(image: F32, derivative: F32, y: int, out: F32) -> None:
     """Row y of the derivatives of ``image`` along x and y, from column ``len(derivative) // 2`` on."""
     reach, width = derivative.size // 2, image.shape[1]
@@ -74,7 +74,7 @@ def _slopes(image: F32, derivative: F32, y: int, out: F32) -> None:
             across[x] += weight * below[x]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _add_products(slope: F32, reach: int, out: F32) -> None:
     gx, gy = slope[0, reach:], slope[1, reach:]
     xx, xy, yy = out[0, reach:], out[1, reach:], out[2, reach:]
@@ -84,7 +84,7 @@ def _add_products(slope: F32, reach: int, out: F32) -> None:
         yy[x] += gy[x] * gy[x]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _measure(moment: F32, count: int, trace_weight: float, out: F32) -> None:
     a, b, c = moment[0], moment[1], moment[2]
     if trace_weight == 0.0:

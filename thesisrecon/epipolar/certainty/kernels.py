@@ -189,7 +189,7 @@ def geometry_of_plane(h: F64, e2: F64, f: F64) -> None:
     f /= np.sqrt(np.sum(f * f)) + 1e-300
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def agreements(f: F64, columns: F64, gate: float, agree: F64) -> None:
     """``agree`` (N,): 1 for the columns of (4, N) with a Sampson distance below the gate, else 0."""
     wide = gate * gate

@@ -70,7 +70,7 @@ def triple(a: Three, b: Three, c: Three) -> float:
     return value
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def solve_batch(X: F64, Y: F64) -> None:
     """Pencils and cubics of LANES samples: ``X`` (28, LANES) holds x1, y1, x2, y2 of seven matches.
 
@@ -112,7 +112,7 @@ def solve_batch(X: F64, Y: F64) -> None:
         Y[51, k], Y[52, k], Y[53, k] = m2 * inverse, m1 * inverse, m0 * inverse
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     """Real roots of x^3 + a x^2 + b x + c: one by Newton from outside, the others of the quadratic left.
 
@@ -144,7 +144,7 @@ def newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     return 3
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
     """Whether all seven matches of a lane can be in front of both cameras of the member ``g`` (6,).
 
@@ -172,7 +172,7 @@ def oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
     """F = T2' G T1 as a unit vector ``f`` (9,), G of the entries ``g`` (6,); False where it is not finite."""
     norm = 0.0
@@ -190,7 +190,7 @@ def leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def lane_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
     """Fundamental matrices (``F`` (3, 9), unit norm) of one sample that keep its orientation; how many.
 

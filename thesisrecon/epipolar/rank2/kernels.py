@@ -18,7 +18,7 @@ CORRECTIONS = 8
 BLOCK = 128
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta: float, D: F64) -> float:
     """Derivatives of the residuals of at most BLOCK points by the entries of F: columns of ``D`` (11, BLOCK).
 
@@ -70,7 +70,7 @@ def weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: F64) -> float:
     """As :func:`weighted_derivatives`, of the distances r of (x1, y1, x2, y2) to the nearest exact match.
 
@@ -107,7 +107,7 @@ def reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: 
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64) -> float:
     """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by the entries of F.
 
@@ -248,7 +248,7 @@ def split(f: F64, U: F64, V: F64) -> float:
     return float(np.arctan2(s[1], s[0]))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def refine(
     f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int
 ) -> tuple[float, int]:

@@ -201,7 +201,7 @@ def _corners_in_band(
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _warp_windows(
     view1: tuple[F32, I64, float],
     corner: tuple[F64, float],

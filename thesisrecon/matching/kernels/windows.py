@@ -24,7 +24,7 @@ def level_of(scale: float, base: float, count: int) -> int:
     return min(max(k, 0), count - 1)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, side: int, out: F32) -> bool:
     """Bilinear samples of a ``side`` x ``side`` window around ``xy`` px into ``out`` (side^2,), False where
     it leaves.
@@ -58,7 +58,7 @@ def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, 
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def normalize_window(window: F32) -> float:
     """Subtract the mean and divide by the norm, in place; returns the norm before (0: no structure, left
     zero)."""
@@ -81,7 +81,7 @@ def normalize_window(window: F32) -> float:
     return float(norm)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def dot(a: F32, b: F32) -> float:
     """Inner product of two float32 vectors."""
     total = np.float32(0.0)

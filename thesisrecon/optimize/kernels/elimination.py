@@ -146,7 +146,7 @@ def inverse_root(v00: float, v01: float, v02: float, v11: float, v12: float, v22
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def add_views(first: int, last: int, J: Jacobians, places: Places, sums: Sums, left: _Left) -> None:
     """The blocks of all pairs of views that see a point, and the views' part of the right-hand side."""
     C = J.A.shape[2]
@@ -179,7 +179,7 @@ def add_views(first: int, last: int, J: Jacobians, places: Places, sums: Sums, l
                     add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
 
 
-@njit(cache=True, nogil=True, inline="always", fastmath={"contract"})
+@njit(cache=True, nogil=True, inline="always", fastmath={"contract"}, forceinline=True)
 def add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float, q11: float) -> None:
     """S (C, C) += left' Q right for left, right (2, C)."""
     C = S.shape[0]

@@ -122,7 +122,7 @@ def _carry(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, way: F64) ->
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS, inline="always", forceinline=True)
 def _cost_inside(
     squares: U32, start: int, width: int, way: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
@@ -195,7 +195,7 @@ def _cost_at_border(
     return _cost_of(saa / held - sa * sa, sbb / held - sb * sb, sab / held - sa * sb)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
 def view_cost(
     squares: U32, layout: I64, k: int, way: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
@@ -218,7 +218,7 @@ def view_cost(
     return _cost_at_border(squares, start, (width, height), way, offsets, samples)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
 def plane_cost(
     squares: U32,
     layout: I64,
