@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from thesisrecon.io.images import read_photographs
 from thesisrecon.types import Image
+from validation.references.libraries import one_thread
 from validation.scenes.real import load_fixture_scene
 
 Bench = Callable[[str, str, Callable[[], Any]], None]
@@ -18,7 +18,7 @@ Bench = Callable[[str, str, Callable[[], Any]], None]
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> None:
-    cv2.setNumThreads(1)
+    one_thread()
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
@@ -14,8 +13,9 @@ from thesisrecon.features import HarrisCorners
 from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.types import Image
 from validation.references.corners import harris_corners
+from validation.references.pictures import warp_perspective
 from validation.references.semi_global import OpenCVSemiGlobal
-from validation.references.sift import grey_of, sift_front_end
+from validation.references.sift import compute_sift, grey_of, sift_front_end
 
 DISPARITIES = 64
 MATCHERS: dict[str, PairMatcher] = {
@@ -30,13 +30,10 @@ def test_corners(bench: Bench, method: str, photographs: tuple[Image, ...]) -> N
     image, corners = photographs[0], HarrisCorners()
     grey = grey_of(image)
 
-    def sift() -> object:
-        return cv2.SIFT.create().detectAndCompute(grey, None)
-
     calls = {
         "ours": lambda: corners.detect(image),
         "OpenCV": lambda: harris_corners(image, 2000),
-        "SIFT": sift,
+        "SIFT": lambda: compute_sift(grey),
     }
     bench("corners of a photograph, 1024 x 768", method, calls[method])
 
@@ -56,7 +53,7 @@ def test_rectifying_warp(bench: Bench, method: str, photographs: tuple[Image, ..
     rectified = PlanarRectification(H, np.eye(3), size)
     calls = {
         "ours": lambda: rectified.warp(rgb, 0),
-        "OpenCV": lambda: cv2.warpPerspective(rgb, H, size, flags=cv2.INTER_CUBIC),
+        "OpenCV": lambda: warp_perspective(rgb, H, size),
     }
     bench("rectifying warp, 1024 x 768", method, calls[method])
 

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
 from validation.harness.process import own_cores
@@ -26,6 +27,8 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2
+    for words in ask_canaries(wishes).values():
+        print(f"validation: {words}", file=sys.stderr)
     judged = run_tasks(wishes, STAGES, _tell)
     results = collect(wishes, judged, gates)
     write_results(wishes.out, results)
@@ -100,7 +103,8 @@ def _print_gates(results: Results) -> None:
             value = "nothing" if row.value is None else f"{row.value:.4g}"
             print(f"{row.verdict:8} {row.key}: {value} {sign} {row.limit:g} {row.unit}")
     for key in results.missing:
-        print(f"missed   {key}: nobody told this number")
+        why = [words for task, words in results.failures.items() if task.split("/")[:2] == key.split("/")[:2]]
+        print(f"missed   {key}: nobody told this number{''.join(f' ({words})' for words in why[:1])}")
 
 
 if __name__ == "__main__":

@@ -9,14 +9,14 @@ import pytest
 
 from tests.model.sphere import photograph, ring_of
 from thesisrecon.types import DepthMap, TexturedMesh
+from validation.checks import held_out, surface
+from validation.references.libraries import NoReference, load
+from validation.scenes.real import load_fixture_scene
 
 try:
-    import validation.references.open3d  # noqa: F401
-except (ImportError, OSError) as missing:
-    pytest.skip(f"Open3D is not here: {missing}", allow_module_level=True)
-
-from validation.checks import held_out, surface
-from validation.scenes.real import load_fixture_scene
+    load("open3d")
+except NoReference as missing:
+    pytest.skip(str(missing), allow_module_level=True)
 
 
 def test_points_are_spread_evenly() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +26,7 @@ from thesisrecon.epipolar.row_parameterization import (
 from thesisrecon.epipolar.thesis_ransac import SevenPointProblem
 from thesisrecon.errors import StageFailure
 from thesisrecon.robust.ransac import SampleConsensus
-from validation.references.fundamental import SOLVERS
+from validation.references.fundamental import SOLVERS, opencv_eight_point
 
 F64 = NDArray[np.float64]
 Estimate = Callable[[F64, F64, float, int], F64 | None]
@@ -96,8 +95,7 @@ def _gold_from_default(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F6
 
 
 def _opencv_eight_point(xy1: F64, xy2: F64, _: float, __: int) -> F64 | None:
-    F = cv2.findFundamentalMat(xy1, xy2, cv2.FM_8POINT)[0]
-    return None if F is None else np.asarray(F, dtype=np.float64)
+    return opencv_eight_point(xy1, xy2)
 
 
 def _library(name: str) -> Estimate:

@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +24,7 @@ from thesisrecon.epipolar.degeneracy import Configuration
 from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.geometry.multiview import symmetric_residuals
 from validation.checks.epipolar_catalogue import DEFAULT, GOLD, METHODS, THRESHOLD_PX, TOLD_SIGMAS, Method
+from validation.references.libraries import PACKAGES, one_thread
 from validation.scenes.two_views import make_two_views
 
 F64 = NDArray[np.float64]
@@ -121,7 +121,7 @@ def run_study(settings: Sequence[Setting], methods: Sequence[Method], trials: in
 
     Where there are wrong matches only the robust methods take part.
     """
-    cv2.setNumThreads(1)
+    one_thread()
     results: list[Result] = []
     for setting in settings:
         data = [make_trial(setting, seed) for seed in range(trials)]
@@ -189,7 +189,7 @@ def write_results(path: Path, results: Sequence[Result]) -> None:
     made = {
         "machine": platform.machine(),
         "python": platform.python_version(),
-        "opencv": cv2.__version__,
+        "opencv": version(PACKAGES["cv2"]),
         "poselib": version("poselib"),
     }
     path.parent.mkdir(parents=True, exist_ok=True)

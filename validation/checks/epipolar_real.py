@@ -15,7 +15,6 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +22,7 @@ from thesisrecon.epipolar.certainty import judge_certainty
 from validation.metrics.epipolar import precision_recall, rms_epipolar_distance, rms_sampson_distance
 from validation.metrics.record import Metric, markdown_table
 from validation.references.fundamental import OURS, SOLVERS, Estimate, estimate_with
+from validation.references.libraries import one_thread
 from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import (
     SCENES_WITH_CAMERAS,
@@ -209,7 +209,7 @@ def main() -> int:
     default = Path(tempfile.gettempdir()) / "thesisrecon-matches"
     parser.add_argument("--cache", type=Path, default=default, help="folder that keeps the SIFT matches")
     arguments = parser.parse_args()
-    cv2.setNumThreads(1)
+    one_thread()
     rows: list[Metric] = []
     for found in blocks(arguments):
         rows += found

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import time
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +17,7 @@ from thesisrecon.epipolar.degeneracy import Configuration
 from validation.metrics.epipolar import rms_epipolar_distance
 from validation.metrics.record import Metric, markdown_table
 from validation.references.fundamental import OURS, SOLVERS
+from validation.references.libraries import one_thread
 from validation.scenes.two_views import make_two_views
 
 F64 = NDArray[np.float64]
@@ -29,7 +29,7 @@ METHODS = (OURS, ACCURATE, POSELIB, "USAC_ACCURATE default", "USAC_MAGSAC", "FM_
 
 def check_speed(outliers: float, n: int, trials: int) -> list[Metric]:
     """Medians over the trials of milliseconds and of RMS distances of exact matches, px; warm, one thread."""
-    cv2.setNumThreads(1)
+    one_thread()
     milliseconds: dict[str, list[float]] = {name: [] for name in METHODS}
     errors: dict[str, list[float]] = {name: [] for name in METHODS}
     for seed in range(-1, trials):

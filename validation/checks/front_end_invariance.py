@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -22,6 +21,7 @@ from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.types import F64, Features, Image
 from validation.checks.front_end_pairs import MAX_SIZE_PX, OURS, SIFT, front_ends
 from validation.metrics.record import Metric
+from validation.references.pictures import shrink, warp_affine
 from validation.scenes.real import load_real_scene
 
 U8 = NDArray[np.uint8]
@@ -60,19 +60,18 @@ def _turned(rgb: U8, degrees: float) -> Copy:
     height, width = rgb.shape[:2]
     side = int(min(height, width) / np.sqrt(2.0))
     middle = ((width - 1) / 2.0, (height - 1) / 2.0)
-    A = np.asarray(cv2.getRotationMatrix2D(middle, degrees, 1.0), dtype=np.float64)
-    A[:, 2] += (side - 1) / 2.0 - np.array([width - 1, height - 1]) / 2.0
-    copy = cv2.warpAffine(rgb, A, (side, side), flags=cv2.INTER_LANCZOS4)
-    return Copy(f"turned by {degrees:g} degrees", np.asarray(copy, np.uint8), A)
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[cos, sin], [-sin, cos]])
+    A = np.column_stack([turn, (side - 1) / 2.0 - turn @ middle])
+    return Copy(f"turned by {degrees:g} degrees", warp_affine(rgb, A, (side, side)), A)
 
 
 def _scaled(rgb: U8, scale: float) -> Copy:
     """Smaller, by the mean over the area of each pixel."""
     height, width = (round(scale * n) for n in rgb.shape[:2])
-    copy = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
     sx, sy = width / rgb.shape[1], height / rgb.shape[0]
     A = np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5]])
-    return Copy(f"scaled by {scale:g}", np.asarray(copy, np.uint8), A)
+    return Copy(f"scaled by {scale:g}", shrink(rgb, (width, height)), A)
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ def repeatability(first: Features, second: Features, size: tuple[int, int], copy
     angles at one place are one.
     """
     A = copy.copy_from_photograph
-    inverse = np.asarray(cv2.invertAffineTransform(A), dtype=np.float64)
+    inverse = np.linalg.inv(np.vstack([A, [0.0, 0.0, 1.0]]))[:2]
     there, found = _mapped(A, _places(first)), _places(second)
     there = there[_inside(there, (copy.rgb.shape[1], copy.rgb.shape[0]))]
     found = found[_inside(_mapped(inverse, found), size)]

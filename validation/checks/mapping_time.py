@@ -27,6 +27,7 @@ from thesisrecon.pipeline import reconstruct
 from thesisrecon.run import stream
 from thesisrecon.types import MetricResult, RunResult
 from validation.metrics.record import Metric, markdown_table
+from validation.references.libraries import pycolmap
 from validation.references.pycolmap_reference import match_with_pycolmap
 from validation.scenes.real import REAL_SCENES, load_real_scene
 
@@ -81,8 +82,6 @@ def _stages(matched: RunResult) -> tuple[dict[str, float], MetricResult]:
 
 def time_colmap(images: Path, work: Path, threads: int) -> dict[str, float]:
     """Seconds of incremental mapping on the database kept in ``work``."""
-    import pycolmap
-
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(0)
     options = pycolmap.IncrementalPipelineOptions(num_threads=threads)

@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -25,6 +24,7 @@ from PIL import Image
 from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, PairMatcher, SemiGlobal
 from thesisrecon.types import DisparityMap
 from validation.metrics.record import Metric, markdown_table, summary_table
+from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
@@ -105,7 +105,7 @@ def check_pair(pair: StereoPair, runs: int) -> tuple[list[Metric], dict[str, F32
 
 def processor_time(calls: Mapping[str, Callable[[], F32]], runs: int) -> dict[str, float]:
     """Least processor time in ms of each; they take turns, so that all meet the same machine."""
-    cv2.setNumThreads(1)
+    one_thread()
     least = dict.fromkeys(calls, float("inf"))
     for _ in range(runs):
         for name, call in calls.items():

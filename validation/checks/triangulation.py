@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +26,7 @@ from thesisrecon.geometry.triangulation import (
     triangulate_optimal,
 )
 from validation.metrics.record import Metric, markdown_table
+from validation.references.libraries import one_thread
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.cloud import make_cloud
 from validation.scenes.rigs import Rig
@@ -218,7 +218,7 @@ def check_optimum(kind: str, *, trials: int, points: int) -> Metric:
 
 def check_speed(*, points: int = 2000, repeats: int = 15) -> list[Metric]:
     """Microseconds a point on one thread, the least of ``repeats`` runs that take turns."""
-    cv2.setNumThreads(1)
+    one_thread()
     rng = np.random.default_rng(0)
     timed: dict[str, dict[str, Method]] = {
         "polynomial, 2 views": {"ours": triangulate_polynomial, "OpenCV": opencv_polynomial},

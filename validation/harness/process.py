@@ -86,3 +86,14 @@ def last_words(log: Path) -> str:
     except OSError:
         return ""
     return lines[-1].strip() if lines else ""
+
+
+def failure_of(process: Process, words: str, limit_s: float) -> str:
+    """Why a process did not end well, in a clause; empty where it did. ``words`` are its last."""
+    if process.timed_out:
+        return f"ended after the {limit_s:.0f} s that a task may take"
+    if process.code < 0:
+        return f"crashed with signal {-process.code}"
+    if process.code:
+        return words or f"ended with exit code {process.code}"
+    return ""

@@ -14,20 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from validation.harness.canaries import read_refused
 from validation.harness.gates import Gate
 from validation.harness.records import Judgement, Outcome, Wishes, key_of
 from validation.metrics.record import Metric
+from validation.references.libraries import PACKAGES
 
-PACKAGES = (
-    "thesisrecon",
-    "numpy",
-    "scipy",
-    "numba",
-    "pycolmap",
-    "opencv-contrib-python-headless",
-    "open3d",
-    "poselib",
-)
+OWN_PACKAGES = ("thesisrecon", "numpy", "scipy", "numba")
 TIME_UNITS = ("s", "s processor", "us", "ms", "MB")
 """Units of numbers that are never the same twice."""
 
@@ -104,12 +97,9 @@ def collect(
 
 def environment(wishes: Wishes) -> dict[str, Any]:
     """What the numbers were made with."""
-    versions = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "missing"
+    versions = {name: _version(name) for name in (*OWN_PACKAGES, *PACKAGES.values())}
+    for library, words in read_refused(wishes.out).items():
+        versions[PACKAGES[library]] += f". Not asked: {words}"
     return {
         "machine": platform.machine(),
         "processor": _processor(),
@@ -120,6 +110,13 @@ def environment(wishes: Wishes) -> dict[str, Any]:
         "threads": f"{wishes.threads} tasks at a time, one thread each",
         "seed": wishes.seed,
     }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "missing"
 
 
 def write_results(out: Path, results: Results) -> None:

@@ -11,7 +11,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict
 from typing import Any
 
-from validation.harness.process import Process, last_words, own_cores, run_process
+from validation.harness.process import failure_of, last_words, own_cores, run_process
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Task, Wishes
 from validation.harness.worker import JUDGEMENT, OUTCOMES
 from validation.metrics.record import Metric
@@ -101,7 +101,8 @@ def _carry_out(task: Task, wishes: Wishes, ended: Mapping[Task, Outcome], free: 
         (place / OUTCOMES).write_text(json.dumps(told), encoding="utf-8")
     else:
         command.append(task.method)
-    core, log = free.take(), place / "log.txt"
+    # Beside the place of the task, which may empty it.
+    core, log = free.take(), place.with_name(f"{place.name}.log")
     try:
         process = run_process(
             command,
@@ -112,19 +113,8 @@ def _carry_out(task: Task, wishes: Wishes, ended: Mapping[Task, Outcome], free: 
         )
     finally:
         free.give_back(core)
-    failure = _failure(process, last_words(log), wishes.limit_s)
+    failure = failure_of(process, last_words(log), wishes.limit_s)
     return Outcome(place, failure, process.wall_s, process.cpu_s, process.peak_mb)
-
-
-def _failure(process: Process, words: str, limit_s: float) -> str:
-    """Why a task did not end well, in a clause; empty where it did."""
-    if process.timed_out:
-        return f"ended after the {limit_s:.0f} s that a task may take"
-    if process.code < 0:
-        return f"crashed with signal {-process.code}"
-    if process.code:
-        return words or f"ended with exit code {process.code}"
-    return ""
 
 
 def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:

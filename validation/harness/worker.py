@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import StageFailure
+from validation.harness.canaries import read_refused
 from validation.harness.records import Judgement, Outcome, Stage, Task, Wishes
+from validation.references.libraries import refuse
 
 JUDGEMENT, OUTCOMES = "judgement.json", "outcomes.json"
 
@@ -21,6 +23,7 @@ JUDGEMENT, OUTCOMES = "judgement.json", "outcomes.json"
 def main(arguments: list[str] | None = None) -> int:
     wishes_file, stage, scene, *method = sys.argv[1:] if arguments is None else arguments
     wishes = Wishes.from_json(json.loads(Path(wishes_file).read_text(encoding="utf-8")))
+    refuse(read_refused(wishes.out))
     stages: dict[str, Stage] = importlib.import_module(wishes.stages_from).STAGES
     try:
         if method:

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.losses import LossName
 from thesisrecon.optimize.metric_bundle import MetricCameras, Observations
 from thesisrecon.types import F64
+from validation.references.libraries import pycolmap
 
-LOSSES: dict[LossName, pycolmap.LossFunctionType] = {
-    "squared": pycolmap.LossFunctionType.TRIVIAL,
-    "soft_l1": pycolmap.LossFunctionType.SOFT_L1,
-    "cauchy": pycolmap.LossFunctionType.CAUCHY,
-    "huber": pycolmap.LossFunctionType.HUBER,
+LOSSES: dict[LossName, str] = {
+    "squared": "TRIVIAL",
+    "soft_l1": "SOFT_L1",
+    "cauchy": "CAUCHY",
+    "huber": "HUBER",
 }
 SOLVERS = {
     "dense": "DENSE_SCHUR",
@@ -108,7 +108,8 @@ def bundle_adjuster(
     wishes.refine_principal_point = options.principal_point
     wishes.print_summary = False
     ceres = wishes.ceres
-    ceres.loss_function_type, ceres.loss_function_scale = LOSSES[options.loss], options.loss_px
+    ceres.loss_function_type = getattr(pycolmap.LossFunctionType, LOSSES[options.loss])
+    ceres.loss_function_scale = options.loss_px
     ceres.min_num_residuals_for_cpu_multi_threading = 0
     solver = ceres.solver_options
     solver.num_threads, solver.max_num_iterations = options.threads, options.max_iterations

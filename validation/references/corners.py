@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.types import Image
+from validation.references.libraries import cv2
 from validation.references.sift import detect_sift, grey_of
 
 F64 = NDArray[np.float64]

@@ -10,15 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
-import poselib
-import pycolmap
 from numpy.typing import NDArray
 
 from thesisrecon.epipolar import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import FundamentalFit
+from validation.references.libraries import cv2, poselib, pycolmap
 
 F64 = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -52,12 +50,19 @@ def _ours(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     return fit.F, fit.inliers, fit
 
 
-def _opencv(method: int, confidence: float = 0.99, iterations: int = 1000) -> Solver:
+def _opencv(method: str, confidence: float = 0.99, iterations: int = 1000) -> Solver:
     def solve(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
-        F, told = cv2.findFundamentalMat(xy1, xy2, method, threshold_px, confidence, iterations)
+        kind = getattr(cv2, method)
+        F, told = cv2.findFundamentalMat(xy1, xy2, kind, threshold_px, confidence, iterations)
         return F, told, None
 
     return solve
+
+
+def opencv_eight_point(xy1: F64, xy2: F64) -> F64 | None:
+    """``cv2.findFundamentalMat`` by its normalised eight-point method, of all matches (N, 2) px."""
+    F = cv2.findFundamentalMat(xy1, xy2, cv2.FM_8POINT)[0]
+    return None if F is None else np.asarray(F, dtype=np.float64)
 
 
 def _colmap(**options: int) -> Solver:
@@ -81,13 +86,13 @@ def _poselib(**options: int) -> Solver:
 _LONG: tuple[float, int] = (CONFIDENCE, ITERATIONS)
 SOLVERS: dict[str, Solver] = {
     OURS: _ours,
-    "USAC_ACCURATE": _opencv(cv2.USAC_ACCURATE, *_LONG),
-    "USAC_ACCURATE default": _opencv(cv2.USAC_ACCURATE),
-    "USAC_MAGSAC": _opencv(cv2.USAC_MAGSAC, *_LONG),
-    "USAC_MAGSAC default": _opencv(cv2.USAC_MAGSAC),
-    "FM_RANSAC": _opencv(cv2.FM_RANSAC, *_LONG),
-    "FM_RANSAC default": _opencv(cv2.FM_RANSAC),
-    "FM_LMEDS": _opencv(cv2.FM_LMEDS, *_LONG),
+    "USAC_ACCURATE": _opencv("USAC_ACCURATE", *_LONG),
+    "USAC_ACCURATE default": _opencv("USAC_ACCURATE"),
+    "USAC_MAGSAC": _opencv("USAC_MAGSAC", *_LONG),
+    "USAC_MAGSAC default": _opencv("USAC_MAGSAC"),
+    "FM_RANSAC": _opencv("FM_RANSAC", *_LONG),
+    "FM_RANSAC default": _opencv("FM_RANSAC"),
+    "FM_LMEDS": _opencv("FM_LMEDS", *_LONG),
     "COLMAP": _colmap(),
     "COLMAP long": _colmap(min_num_trials=MIN_ITERATIONS),
     "PoseLib": _poselib(),

@@ -13,18 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import open3d
 from numpy.typing import NDArray
 
 from thesisrecon.geometry.camera import decompose_camera
 from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.types import F64, I64, DepthMap, PinholeView, TexturedMesh
+from validation.references.libraries import open3d as o3d
 
 U8 = NDArray[np.uint8]
-
-# The types that it brings do not describe it.
-o3d: Any = open3d
-CPU = o3d.core.Device("CPU:0")
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ class OpenTsdf:
             median_footprint(depth_maps) * self.voxel_px,
             8,
             50_000,
-            CPU,
+            o3d.core.Device("CPU:0"),
         )
         for depth_map, view in zip(depth_maps, views, strict=True):
             self._integrate(grid, depth_map, view)

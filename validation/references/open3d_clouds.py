@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
+
+from validation.references.libraries import open3d as o3d
 
 F64 = NDArray[np.float64]
 
@@ -17,19 +17,7 @@ SIZE = (900, 640)
 ITERATIONS = 60
 
 
-@dataclass(frozen=True)
-class IcpResult:
-    """How ICP moves a cloud: ``transform`` (4, 4), ``turn_deg``, ``shift`` of its middle, and the share of
-    its points with a partner (``fitness``) at an RMS distance of ``rms``."""
-
-    transform: F64
-    turn_deg: float
-    shift: float
-    fitness: float
-    rms: float
-
-
-def cloud(X: F64, colors: F64 | None = None) -> o3d.geometry.PointCloud:
+def cloud(X: F64, colors: F64 | None = None) -> Any:
     """Points (N, 3) and their colours (N, 3), 0 .. 1."""
     made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(X, dtype=np.float64)))
     if colors is not None:
@@ -37,18 +25,15 @@ def cloud(X: F64, colors: F64 | None = None) -> o3d.geometry.PointCloud:
     return made
 
 
-def refine_by_icp(moving: F64, fixed: F64, reach: float) -> IcpResult:
-    """Point-to-point ICP without scale: pairs are no farther apart than ``reach``."""
+def refine_by_icp(moving: F64, fixed: F64, reach: float) -> F64:
+    """The motion (4, 4) by which point-to-point ICP, without scale, brings (N, 3) onto (M, 3); pairs are no
+    farther apart than ``reach``."""
     criteria = o3d.pipelines.registration.ICPConvergenceCriteria(1e-9, 1e-9, ITERATIONS)
     method = o3d.pipelines.registration.TransformationEstimationPointToPoint(False)
     found = o3d.pipelines.registration.registration_icp(
         cloud(moving), cloud(fixed), reach, np.eye(4), method, criteria
     )
-    T = np.asarray(found.transformation)
-    middle = np.median(moving, axis=0)
-    turn = np.degrees(np.linalg.norm(Rotation.from_matrix(T[:3, :3]).as_rotvec()))
-    shift = np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle)
-    return IcpResult(T, float(turn), float(shift), float(found.fitness), float(found.inlier_rmse))
+    return np.array(found.transformation, dtype=np.float64)
 
 
 def render_difference(path: Path, mine: F64, other: F64, reach: float) -> None:

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import pycolmap
-
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
 from thesisrecon.types import F64, Reconstruction
+from validation.references.libraries import pycolmap
 
 _DEFAULT_FOCAL_REL = 1.2
 
@@ -106,11 +105,13 @@ def map_with_pycolmap(
     Raises :class:`StageFailure` where COLMAP makes no model.
     """
     start = start or Start()
+    pycolmap.set_random_seed(0)
+    if not (matched / "seconds.json").is_file():
+        raise StageFailure("COLMAP left no matches to start from")
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     for name in ("database.db", "seconds.json"):
         shutil.copy(matched / name, out / name)
-    pycolmap.set_random_seed(0)
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     options = _options(threads, start.refine_principal_point)
     _forget_focal_priors(out / "database.db", start.focal_rel)

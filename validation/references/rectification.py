@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from thesisrecon.dense.rectification import PlanarRectification
 from thesisrecon.geometry.camera import decompose_camera
 from thesisrecon.types import F64
+from validation.references.libraries import cv2
 
 Size = tuple[int, int]
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from validation.references.libraries import cv2
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 
-MODES = {"SGBM 3-way": cv2.STEREO_SGBM_MODE_SGBM_3WAY, "SGBM HH": cv2.STEREO_SGBM_MODE_HH}
+MODES = {"SGBM 3-way": "STEREO_SGBM_MODE_SGBM_3WAY", "SGBM HH": "STEREO_SGBM_MODE_HH"}
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,8 @@ class OpenCVSemiGlobal:
 
     def match(self, left: U8, right: U8, disparities: int) -> F32:
         """(H, W) disparities 0 .. disparities - 1 (a multiple of 16) of RGB images, NaN = unknown."""
-        matcher = cv2.StereoSGBM.create(0, disparities, 3, 216, 864, 1, 0, 10, 100, 2, MODES[self.mode])
+        mode = getattr(cv2, MODES[self.mode])
+        matcher = cv2.StereoSGBM.create(0, disparities, 3, 216, 864, 1, 0, 10, 100, 2, mode)
         extra = disparities if self.widened else 0
         images = [
             cv2.copyMakeBorder(image[..., ::-1], 0, 0, extra, 0, cv2.BORDER_REPLICATE)

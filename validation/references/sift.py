@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from thesisrecon.config import EstimateFundamental, PipelineConfig
 from thesisrecon.types import F32, F64, I64, Features, Image, Matches
+from validation.references.libraries import cv2
 
 U8 = NDArray[np.uint8]
 
@@ -31,13 +31,17 @@ class SiftKeypoints:
 
 
 def detect_sift(grey: U8) -> SiftKeypoints:
-    """SIFT of a grey photograph (H, W) with OpenCV's defaults; those of the last photographs are kept."""
+    """What :func:`compute_sift` finds; the keypoints of the last photographs are kept."""
     return _detect(grey.tobytes(), grey.shape)
 
 
 @lru_cache(maxsize=32)
 def _detect(pixels: bytes, shape: tuple[int, ...]) -> SiftKeypoints:
-    grey = np.frombuffer(pixels, dtype=np.uint8).reshape(shape)
+    return compute_sift(np.frombuffer(pixels, dtype=np.uint8).reshape(shape))
+
+
+def compute_sift(grey: U8) -> SiftKeypoints:
+    """SIFT of a grey photograph (H, W) with OpenCV's defaults."""
     keypoints, descriptors = cv2.SIFT.create().detectAndCompute(grey, None)
     return SiftKeypoints(
         np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2),

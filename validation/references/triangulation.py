@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from thesisrecon.geometry.multiview import fundamental_from_cameras
+from validation.references.libraries import cv2, pycolmap
 
 F64 = NDArray[np.float64]
 
@@ -39,11 +38,12 @@ def colmap_points(P: F64, xy: F64) -> F64:
     rays = np.concatenate([moved, np.ones((*moved.shape[:2], 1))], axis=2)
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     X = np.zeros((xy.shape[1], 4))
+    of_two, of_many = pycolmap.triangulate_point, pycolmap.triangulate_multi_view_point
     for n in range(xy.shape[1]):
         if len(P) == 2:
-            found = pycolmap.triangulate_point(cameras[0], cameras[1], moved[0, n], moved[1, n])
+            found = of_two(cameras[0], cameras[1], moved[0, n], moved[1, n])
         else:
-            found = pycolmap.triangulate_multi_view_point(list(cameras), rays[:, n])
+            found = of_many(list(cameras), rays[:, n])
         if found is not None:
             X[n] = [*np.asarray(found), 1.0]
     return X

@@ -13,12 +13,14 @@ from thesisrecon.io.meshes import read_mesh, write_mesh
 from thesisrecon.model import SurfaceModel, VolumetricFusion
 from thesisrecon.types import F64, DepthMap, PinholeView, TexturedMesh
 from thesisrecon.views import render
+from validation.references import open3d as reference
+from validation.references.libraries import NoReference, load
 
 try:
-    from validation.references import open3d as reference
-except (ImportError, OSError) as missing:
+    load("open3d")
+except NoReference as missing:
     # Without libraries of the system (libgomp1, libgl1, libegl1, libx11-6) it cannot be loaded.
-    pytest.skip(f"Open3D is not here: {missing}", allow_module_level=True)
+    pytest.skip(str(missing), allow_module_level=True)
 
 NORMAL = np.array([0.3, 0.2, 1.0])
 

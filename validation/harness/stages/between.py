@@ -15,6 +15,8 @@ from thesisrecon.views.tensor import camera_at
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric
+from validation.references.libraries import one_thread
+from validation.references.semi_global import OpenCVSemiGlobal
 from validation.scenes.nine_views import (
     BETWEEN,
     BEYOND,
@@ -171,11 +173,7 @@ def _disparities(
         return cones.disparities
     if source == OURS:
         return our_disparities(left, right)
-    import cv2
-
-    from validation.references.semi_global import OpenCVSemiGlobal
-
-    cv2.setNumThreads(1)
+    one_thread()
     reference = OpenCVSemiGlobal(source)
     return both_ways(lambda a, b: reference.match(a, b, DISPARITIES), left, right)
 

@@ -21,6 +21,7 @@ from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import OURS as OUR_CAMERAS
 from validation.harness.stages.cameras import read_model
 from validation.metrics.record import Metric
+from validation.references.ceres_bundle import CeresOptions, ceres_covariances, refine_with_ceres
 from validation.scenes.streets import SIZE, make_walk
 
 OURS, CERES = "ours", "Ceres"
@@ -114,8 +115,6 @@ def _adjust(
 ) -> tuple[MetricCameras, F64, float]:
     """The second of two runs counts: the first compiles."""
     if method == CERES:
-        from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
-
         told = refine_with_ceres(cameras, X, seen, size, CeresOptions("soft_l1", LOSS_PX))
         return told.cameras, told.X, told.cpu_s
     options = BundleOptions(loss="soft_l1", loss_px=LOSS_PX, max_iterations=200, threads=1)
@@ -148,8 +147,6 @@ def _covariances(method: str) -> tuple[F64, F64]:
     """Of poses (V, 6, 6) and of (f, cx, cy, k1) at one optimum, for noise of 1 px, two views fixed."""
     walk = make_walk(12, "street", np.random.default_rng(4))
     if method == CERES:
-        from validation.references.ceres_bundle import ceres_covariances
-
         return ceres_covariances(walk.cameras, walk.X, walk.seen, SIZE, (0, 1))
     fixed = np.arange(12) < 2
     options = BundleOptions(loss="squared", max_iterations=100, covariance=True, fixed_views=fixed)

@@ -20,6 +20,7 @@ from validation.harness.scenes import is_photographs, load_photographs, truth_of
 from validation.metrics.cameras import CameraErrors, Reprojection, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
 from validation.metrics.record import Metric
+from validation.references.pycolmap_reference import Start, map_with_pycolmap, match_with_pycolmap
 from validation.scenes.real import Scene
 
 OURS, THESIS, PER_IMAGE = "ours", "ours (thesis)", "ours (a camera each)"
@@ -108,8 +109,6 @@ def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | 
 
 
 def _run_colmap(task: Task, scene: Scene, wishes: Wishes, place: Path) -> None:
-    from validation.references.pycolmap_reference import Start, map_with_pycolmap, match_with_pycolmap
-
     images = scene.image_paths[0].parent
     if task.method == MATCHES:
         match_with_pycolmap(images, place, threads=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,16 +10,19 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.geometry.alignment import Similarity, estimate_similarity
 from thesisrecon.geometry.camera import camera_centre
 from thesisrecon.types import F64, I64, Reconstruction
-from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes, slug
 from validation.harness.scenes import is_photographs, load_photographs
-from validation.harness.stages.cameras import COLMAP, COLMAP_PP, MATCHES, OURS, read_model
+from validation.harness.stages.cameras import COLMAP, COLMAP_PP, OURS, read_model
 from validation.metrics.record import Metric
+from validation.references.open3d_clouds import refine_by_icp, render_difference
 from validation.scenes.real import Scene
 
+ICP, PICTURES = "Open3D, ICP", "Open3D, pictures"
 NEAR_PCT = 0.5
 """A point has a partner where the other cloud has one within this share of its distance from the cameras."""
 PLOTTED = 6000
@@ -41,42 +45,65 @@ class CloudsStage:
         return is_photographs(scene, wishes)
 
     def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
-        return ()
+        return () if wishes.gates_only else (ICP, PICTURES)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the judgement's)
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the same for all)
         return (("cameras", OURS), ("cameras", COLMAP), ("cameras", COLMAP_PP))
 
-    def run(self, task: Task, wishes: Wishes) -> None:  # noqa: ARG002 (never called)
-        raise ValueError("the clouds are those of the cameras: there is nothing to run")
+    def run(self, task: Task, wishes: Wishes) -> None:
+        place = wishes.place(task.stage, task.scene, task.method)
+        photographs = load_photographs(task.scene, wishes)
+        for name, (mine, other, unit) in _pairs_of_clouds(photographs, _models(photographs, wishes)).items():
+            if task.method == PICTURES:
+                render_difference(place / f"{slug(name)}.png", mine, other, NEAR_PCT / 100.0 * unit)
+                continue
+            transform = refine_by_icp(mine, other, NEAR_PCT / 100.0 * unit)
+            np.savez(place / f"{slug(name)}.npz", transform=transform)
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:  # noqa: ARG002
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
         photographs = load_photographs(scene, wishes)
-        models = {}
-        for name in (OURS, COLMAP, COLMAP_PP):
-            place = wishes.place("cameras", scene, name)
-            models[name] = read_model(photographs, name, Outcome(place)) if place.is_dir() else None
+        models = _models(photographs, wishes)
+        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         ours = models[OURS]
         if ours is None or (models[COLMAP] is None and models[COLMAP_PP] is None):
-            names = [name for name, model in models.items() if model is None and name != MATCHES]
-            return Judgement(
-                (), notes=[f"There is no model of {', '.join(names)}, hence nothing to compare."]
-            )
+            names = ", ".join(name for name, model in models.items() if model is None)
+            return Judgement((), notes=[f"There is no model of {names}, hence nothing to compare.", *notes])
         metrics: list[Metric] = []
-        plots, pictures, notes = list[Plot](), list[Picture](), list[str]()
-        for name in (COLMAP, COLMAP_PP):
+        plots, pictures = list[Plot](), list[Picture]()
+        clouds = _pairs_of_clouds(photographs, models)
+        for name, (mine, other, unit) in clouds.items():
             theirs = models[name]
-            if theirs is None:
-                continue
-            clouds = _common_frame(photographs, ours, theirs)
-            if clouds is None:
-                notes.append(f"{name}: too few cameras in common to bring the clouds together.")
-                continue
-            mine, other, unit = clouds
-            metrics += _same_points(scene, name, ours, theirs, clouds)
-            metrics += _metrics(scene, name, mine, other, unit, notes)
+            assert theirs is not None
+            metrics += _same_points(scene, name, ours, theirs, (mine, other, unit))
+            metrics += _metrics(scene, name, mine, other, unit)
+            metrics += _icp_metrics(scene, name, mine, other, unit, outcomes.get(ICP))
             plots.append(_plot(name, mine, other, unit))
-            pictures += _pictures(wishes.place(self.name, scene), name, mine, other, unit, notes)
+            pictures += _pictures(wishes.place(self.name, scene), name, outcomes.get(PICTURES))
+        few = [name for name in (COLMAP, COLMAP_PP) if models[name] is not None and name not in clouds]
+        notes += [f"{name}: too few cameras in common to bring the clouds together." for name in few]
         return Judgement(metrics, plots, pictures, notes)
+
+
+def _models(scene: Scene, wishes: Wishes) -> dict[str, Reconstruction | None]:
+    """The models that the cameras were judged by, None where a run left none."""
+    models = {}
+    for name in (OURS, COLMAP, COLMAP_PP):
+        place = wishes.place("cameras", scene.name, name)
+        models[name] = read_model(scene, name, Outcome(place)) if place.is_dir() else None
+    return models
+
+
+def _pairs_of_clouds(
+    scene: Scene, models: Mapping[str, Reconstruction | None]
+) -> dict[str, tuple[F64, F64, float]]:
+    """What :func:`_common_frame` makes of ours and each of theirs that there is."""
+    ours, found = models[OURS], {}
+    for name in (COLMAP, COLMAP_PP):
+        theirs = models[name]
+        clouds = None if ours is None or theirs is None else _common_frame(scene, ours, theirs)
+        if clouds is not None:
+            found[name] = clouds
+    return found
 
 
 def _common_frame(
@@ -167,16 +194,14 @@ def _moved(model: Reconstruction, move: Similarity) -> F64:
     return np.asarray(move.apply(X[:, :3] / X[:, 3:]), dtype=np.float64)
 
 
-def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float, notes: list[str]) -> list[Metric]:
+def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float) -> list[Metric]:
     forth, back = (100.0 * cKDTree(b).query(a)[0] / unit for a, b in ((mine, other), (other, mine)))
-    rows = [
+    share = 100.0 * float(np.mean(forth <= NEAR_PCT))
+    return [
         _row(scene, f"ours to {name}", np.median(forth), "median distance of a point of ours to the nearest"),
         _row(
             scene, f"{name} to ours", np.median(back), "median distance of one of their points to the nearest"
         ),
-    ]
-    share = 100.0 * float(np.mean(forth <= NEAR_PCT))
-    rows.append(
         Metric(
             scene,
             f"near {name}",
@@ -185,38 +210,29 @@ def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float, notes: l
             OURS,
             at_most=False,
             definition=f"share of our points with one of theirs within {NEAR_PCT} %",
-        )
-    )
-    try:
-        from validation.references.open3d_clouds import refine_by_icp
-
-        found = refine_by_icp(mine, other, NEAR_PCT / 100.0 * unit)
-    except ImportError as error:
-        notes.append(f"ICP: {error}.")
-        return rows
-    rows += [
-        Metric(
-            scene,
-            f"ICP to {name}: turn",
-            "deg",
-            {OURS: found.turn_deg},
-            OURS,
-            definition="rotation by which ICP still turns our cloud after the similarity",
-        ),
-        _row(
-            scene, f"ICP to {name}: shift", 100.0 * found.shift / unit, "how far it moves the cloud's middle"
-        ),
-        Metric(
-            scene,
-            f"ICP to {name}: inliers",
-            "%",
-            {OURS: 100.0 * found.fitness},
-            OURS,
-            at_most=False,
-            definition="share of our points with a partner after ICP",
         ),
     ]
-    return rows
+
+
+def _icp_metrics(
+    scene: str, name: str, mine: F64, other: F64, unit: float, outcome: Outcome | None
+) -> list[Metric]:
+    """How far Open3D's ICP moves our cloud, and how many of its points have a partner then."""
+    if outcome is None or not outcome.ok:
+        return []
+    with np.load(outcome.place / f"{slug(name)}.npz") as kept:
+        R, t = kept["transform"][:3, :3], kept["transform"][:3, 3]
+    turn = float(np.degrees(np.linalg.norm(Rotation.from_matrix(R).as_rotvec())))
+    middle = np.median(mine, axis=0)
+    shift = float(np.linalg.norm(R @ middle + t - middle))
+    share = 100.0 * float(np.mean(cKDTree(other).query(mine @ R.T + t)[0] <= NEAR_PCT / 100.0 * unit))
+    turned = "rotation by which ICP still turns our cloud after the similarity"
+    near = "share of our points with a partner after ICP"
+    return [
+        Metric(scene, f"ICP to {name}: turn", "deg", {OURS: turn}, OURS, definition=turned),
+        _row(scene, f"ICP to {name}: shift", 100.0 * shift / unit, "how far it moves the cloud's middle"),
+        Metric(scene, f"ICP to {name}: inliers", "%", {OURS: share}, OURS, at_most=False, definition=near),
+    ]
 
 
 def _row(scene: str, name: str, value: float, words: str) -> Metric:
@@ -261,18 +277,12 @@ def _thinned(X: F64) -> np.ndarray[Any, Any]:
     return np.arange(0, len(X), max(1, len(X) // PLOTTED))
 
 
-def _pictures(place: Path, name: str, mine: F64, other: F64, unit: float, notes: list[str]) -> list[Picture]:
-    """The difference of the clouds rendered by Open3D, without a screen."""
-    try:
-        from validation.references.open3d_clouds import render_difference
-    except ImportError:
+def _pictures(place: Path, name: str, outcome: Outcome | None) -> list[Picture]:
+    """The difference of the clouds as Open3D rendered it, copied beside the judgement."""
+    if outcome is None or not outcome.ok:
         return []
-    file = f"difference-{len(list(place.glob('difference-*.png')))}.png"
-    try:
-        render_difference(place / file, mine, other, NEAR_PCT / 100.0 * unit)
-    except RuntimeError as error:
-        notes.append(f"Open3D could not render: {error}.")
-        return []
+    file = f"{slug(name)}.png"
+    shutil.copy(outcome.place / file, place / file)
     words = (
         f"Points of ours, from blue (on theirs) to red ({NEAR_PCT} % of the distance or more); theirs grey."
     )

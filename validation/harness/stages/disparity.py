@@ -14,6 +14,8 @@ from thesisrecon.types import F32
 from validation.checks.stereo import bad_pixels, picture
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.metrics.record import Metric
+from validation.references.libraries import one_thread
+from validation.references.semi_global import OpenCVSemiGlobal
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 OURS, THESIS, SEMI_GLOBAL = "ours", "ours (thesis)", "ours (semi-global)"
@@ -119,11 +121,7 @@ def _match(method: str, pair: StereoPair) -> F32:
     if method in MATCHERS:
         limits = (0, pair.disparities - 1)
         return MATCHERS[method].match(pair.left, pair.right, disparity_range=limits).disparity
-    import cv2
-
-    from validation.references.semi_global import OpenCVSemiGlobal
-
-    cv2.setNumThreads(1)
+    one_thread()
     return OpenCVSemiGlobal(method).match(pair.left, pair.right, pair.disparities)
 
 

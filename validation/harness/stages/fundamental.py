@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
+from validation.references.fundamental import estimate_with
+from validation.references.libraries import NoReference
 from validation.scenes.real_pairs import RealPair, camera_pairs, kusvod2_pairs
 
 OURS, MATCHES = "ours", "SIFT matches"
@@ -67,10 +69,9 @@ class FundamentalStage:
         return () if method in ("", MATCHES) else ((self.name, MATCHES),)
 
     def run(self, task: Task, wishes: Wishes) -> None:
-        pairs = list(_pairs(task.scene, wishes))
+        pairs = _pairs(task.scene, wishes)
         if task.method == MATCHES:
             return
-        from validation.references.fundamental import estimate_with
 
         def answer(pair: RealPair, seed: int) -> tuple[F64 | None, B8, float]:
             start = time.process_time()
@@ -88,7 +89,7 @@ class FundamentalStage:
         )
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        pairs = list(_pairs(scene, wishes))
+        pairs = _pairs(scene, wishes)
         answers = {m: _read(o) if o.ok else None for m, o in outcomes.items() if m != MATCHES}
         errors = {m: None if a is None else _errors(a, pairs) for m, a in answers.items()}
         metrics = _metrics(scene, pairs, answers, errors)
@@ -101,12 +102,19 @@ def _seeds(wishes: Wishes) -> int:
     return 2 if wishes.quick else 5
 
 
-def _pairs(scene: str, wishes: Wishes) -> Iterator[RealPair]:
-    """The pairs of a scene; their matches are kept where the task of the matches leaves them."""
+def _pairs(scene: str, wishes: Wishes) -> list[RealPair]:
+    """The pairs of a scene; their matches are kept where the task of the matches leaves them.
+
+    Raises :class:`NoReference` where nobody can make them.
+    """
     cache = wishes.place("fundamental", scene, MATCHES)
-    if scene == "kusvod2":
-        return kusvod2_pairs(cache)
-    return camera_pairs(load_photographs(scene, wishes), cache, (1,) if wishes.quick else (1, 2))
+    try:
+        if scene == "kusvod2":
+            return list(kusvod2_pairs(cache))
+        gaps = (1,) if wishes.quick else (1, 2)
+        return list(camera_pairs(load_photographs(scene, wishes), cache, gaps))
+    except NoReference as error:
+        raise NoReference(f"there are no SIFT matches: {error}") from error
 
 
 def _read(outcome: Outcome) -> Answers:

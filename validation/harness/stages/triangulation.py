@@ -17,6 +17,7 @@ from thesisrecon.types import F64
 from validation.checks.triangulation import SCENES, cameras_of, frame_of, squared_distances
 from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
 from validation.metrics.record import Metric
+from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.rigs import Rig
 
 OURS = "ours (polynomial, optimal)"
@@ -100,8 +101,6 @@ def _solver(method: str, views: int) -> Method | None:
         return triangulate_polynomial if views == 2 else triangulate_optimal
     if method in (LINEAR, MIDPOINT):
         return triangulate_linear if method == LINEAR else triangulate_midpoint
-    from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
-
     if method == COLMAP:
         return colmap_points
     if views > 2:

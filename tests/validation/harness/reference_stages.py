@@ -1,0 +1,57 @@
+"""A stage with one method for each reference library, through its adapter, on a few points."""
+
+# ruff: noqa: ARG002 (the stage takes what a stage takes, and ignores most of it)
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from thesisrecon.types import TexturedMesh
+from validation.harness.records import Judgement, Outcome, Task, Wishes
+from validation.metrics.record import Metric
+from validation.references.fundamental import estimate_with
+from validation.references.open3d import distances
+from validation.references.triangulation import colmap_points, opencv_linear
+
+METHODS = ("cv2", "pycolmap", "poselib", "open3d")
+
+
+class ReferenceStage:
+    """Scenes are called after the methods that run on them."""
+
+    name = "references"
+    title = "References"
+    definition = "Whether each answers."
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:
+        return True
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
+        return tuple(scene.split("-"))
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return ()
+
+    def run(self, task: Task, wishes: Wishes) -> None:
+        rng = np.random.default_rng(0)
+        P = np.stack([np.eye(3, 4), np.eye(3, 4)])
+        P[1, 0, 3] = -1.0
+        X = rng.uniform(1.0, 4.0, (40, 3))
+        xy = np.stack([X[:, :2], X[:, :2] - [1.0, 0.0]]) / X[:, 2:]
+        if task.method == "cv2":
+            opencv_linear(P, xy)
+        if task.method == "pycolmap":
+            colmap_points(P, xy)
+        if task.method == "poselib":
+            estimate_with("PoseLib", 100.0 * xy[0], 100.0 * xy[1], threshold_px=1.0, seed=0)
+        if task.method == "open3d":
+            distances(X, TexturedMesh(np.eye(3), np.array([[0, 1, 2]])))
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+        values: dict[str, float | None] = {name: 1.0 if o.ok else None for name, o in outcomes.items()}
+        return Judgement([Metric(scene, "answers", "", values, next(iter(values)))])
+
+
+STAGES = {"references": ReferenceStage()}

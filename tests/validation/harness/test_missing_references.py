@@ -1,0 +1,150 @@
+"""A reference that is missing, changed, crashes or hangs leaves rows that say so; the report stands."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.validation.harness.reference_stages import METHODS, STAGES
+from validation.__main__ import main
+from validation.harness.canaries import ask_canaries
+from validation.harness.gates import read_gates
+from validation.harness.page import write_pages
+from validation.harness.process import own_cores
+from validation.harness.records import Wishes
+from validation.harness.results import collect
+from validation.harness.schedule import run_tasks
+from validation.references.libraries import NAMES, PACKAGES, NoReference, load, refuse
+
+ROOT = Path(__file__).parents[3]
+MISSING = "raise ModuleNotFoundError(\"No module named '{0}'\", name='{0}')"
+CRASHING = "import os; os.abort()"
+HANGING = "import time; time.sleep(600)"
+TRANSPOSED = """
+import numpy as np
+def estimate_fundamental(xy1, xy2, settings, options):
+    return np.array([[0.0, 0, 0], [0, 0, 2], [0, -1, 0]]), {"inliers": [True] * len(xy1)}
+"""
+
+
+def not_installed(library: str) -> str:
+    return f"{NAMES[library]} is not installed: pip install {PACKAGES[library]}"
+
+
+@pytest.fixture
+def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder whose modules come before those that are installed, in every process started from here."""
+    folder = tmp_path / "stubs"
+    folder.mkdir()
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), str(ROOT)]))
+    return folder
+
+
+def wishes_for(out: Path, scene: str, limit_s: float = 60.0) -> Wishes:
+    return Wishes(
+        out,
+        (scene,),
+        ("references",),
+        threads=len(own_cores()),
+        limit_s=limit_s,
+        stages_from="tests.validation.harness.reference_stages",
+    )
+
+
+@pytest.mark.parametrize("library", METHODS)
+def test_one_that_is_missing_leaves_the_others(library: str, stub: Path, tmp_path: Path) -> None:
+    (stub / f"{library}.py").write_text(MISSING.format(library))
+    other = "cv2" if library == "poselib" else "poselib"
+    wishes = wishes_for(tmp_path / "out", f"{library}-{other}")
+    (judged,) = run_tasks(wishes, STAGES, lambda _: None).values()
+    assert judged[1][library].failure == not_installed(library)
+    assert judged[0].metrics[0].values == {library: None, other: 1.0}
+
+
+def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(
+    stub: Path, tmp_path: Path
+) -> None:
+    stubs = {"poselib": TRANSPOSED, "cv2": CRASHING, "pycolmap": HANGING, "open3d": MISSING.format("open3d")}
+    for library, text in stubs.items():
+        (stub / f"{library}.py").write_text(text)
+    limit_s = 8.0
+    refused = ask_canaries(wishes_for(tmp_path, "-".join(METHODS), limit_s))
+    version = refused["poselib"].split()[1]
+    assert refused == {
+        "cv2": "OpenCV crashed with signal 6 when asked a small question",
+        "pycolmap": "pycolmap gives no answer to a small question within 8 s",
+        "poselib": f"PoseLib {version} gives F of matches with y2 = 2 y1 as [[ 0. 0. 0.] [ 0. 0. 2.] "
+        "[ 0. -1. 0.]]; this harness expects [[ 0. 0. 0.] [ 0. 0. -1.] [ 0. 2. 0.]]",
+        "open3d": not_installed("open3d"),
+    }
+    wishes = wishes_for(tmp_path, "-".join(METHODS))
+    judged = run_tasks(wishes, STAGES, lambda _: None)
+    ((_, outcomes),) = judged.values()
+    # Nobody waits for one that is known to hang.
+    assert {name: o.failure for name, o in outcomes.items()} == refused
+    results = collect(wishes, judged, {})
+    page = write_pages(wishes, STAGES, judged, results, None).read_text(encoding="utf-8")
+    assert page.count("pycolmap gives no answer to a small question within 8 s") == 2
+    assert "Not asked: OpenCV crashed" in results.environment[PACKAGES["cv2"]]
+
+
+def test_report_and_check_run_without_any(stub: Path, tmp_path: Path) -> None:
+    for library in METHODS:
+        (stub / f"{library}.py").write_text(MISSING.format(library))
+    command = [sys.executable, "-m", "validation", "check", "--quick", "--scenes", "street"]
+    done = subprocess.run(
+        [*command, "--stages", "bundle", "-o", str(tmp_path / "out")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stderr.splitlines() == [f"validation: {not_installed(library)}" for library in NAMES]
+    told = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))
+    assert told["failures"] == {"bundle/street/Ceres": not_installed("pycolmap")}
+    promised = [key for key in read_gates() if key.startswith("bundle/street/")]
+    assert done.returncode == int(bool(promised))
+    for key in promised:
+        assert f"missed   {key}: nobody told this number ({not_installed('pycolmap')})" in done.stdout
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "bundle/street/Ceres" in page
+    assert not_installed("pycolmap") in page
+
+
+def test_only_the_libraries_module_imports_them() -> None:
+    """Else one that is missing would stop what does not need it."""
+    for path in [*(ROOT / "validation").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]:
+        if path.name == "libraries.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [str(node.module)] if isinstance(node, ast.ImportFrom) else []
+            assert not {name.split(".")[0] for name in names} & set(NAMES), path
+
+
+def test_one_that_does_not_load_says_why(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (stub / "open3d.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(str(stub))
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    with pytest.raises(NoReference, match=r"^Open3D does not load: libGL\.so\.1: cannot open"):
+        load("open3d")
+
+
+def test_refused_ones_are_not_asked() -> None:
+    try:
+        refuse({"poselib": "PoseLib is odd today"})
+        with pytest.raises(NoReference, match="odd today"):
+            load("poselib")
+    finally:
+        refuse({})
+
+
+def test_wrong_wishes_ask_nobody(tmp_path: Path) -> None:
+    assert main(["check", "-o", str(tmp_path / "out"), "--scenes", "nowhere"]) == 2
+    assert not (tmp_path / "out").exists()
