@@ -15,7 +15,8 @@ from thesisrecon.types import Image
 from validation.references.corners import harris_corners
 from validation.references.pictures import warp_perspective
 from validation.references.semi_global import OpenCVSemiGlobal
-from validation.references.sift import compute_sift, grey_of, sift_front_end
+from validation.references.sift import compute_sift, grey_of
+from validation.references.sift_front_end import sift_front_end
 
 DISPARITIES = 64
 MATCHERS: dict[str, PairMatcher] = {

@@ -24,7 +24,7 @@ from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS, THESIS, Ou
 from validation.harness.process import Process, own_cores, run_process
 from validation.metrics.cameras import TrueCameras
 from validation.metrics.record import Metric, markdown_table, summary_table
-from validation.references.pycolmap_reference import read_run
+from validation.references.colmap_mapping import read_run
 from validation.scenes.real import REAL_SCENES, Scene, load_fixture_scene, load_real_scene
 
 METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colmap-principal-point"}
@@ -67,7 +67,7 @@ def _command(method: str, images: Path, out: Path, threads: int) -> list[str]:
         ours = [sys.executable, "-m", "thesisrecon", "reconstruct", str(images), "-o", str(out)]
         ours += ["--until", "metric"]  # as far as the mappings of the references go
         return [*ours, "--preset", METHODS[method], "--cameras", "shared", "--threads", str(threads)]
-    theirs = [sys.executable, "-m", "validation.references.pycolmap_reference", str(images), str(out)]
+    theirs = [sys.executable, "-m", "validation.references.colmap_run", str(images), str(out)]
     extra = ["--refine-principal-point"] if method == COLMAP_PP else []
     return [*theirs, "--threads", str(threads), *extra]
 

@@ -17,7 +17,8 @@ from validation.checks.reconstruction import COLMAP, OURS
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric
-from validation.references.pycolmap_reference import read_run, reconstruct_with_pycolmap
+from validation.references.colmap_mapping import read_run
+from validation.references.colmap_run import reconstruct_with_pycolmap
 from validation.scenes.real import Scene, load_fixture_scene
 
 from .test_cameras import N, V, _reconstruction, _truth

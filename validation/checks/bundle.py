@@ -38,7 +38,8 @@ from thesisrecon.types import B8, F64, Reconstruction
 from validation.checks.growth import exponent
 from validation.harness.process import own_cores, run_process
 from validation.metrics.record import Metric, markdown_table
-from validation.references.ceres_bundle import LOSSES, CeresOptions, ceres_covariances, refine_with_ceres
+from validation.references.ceres_bundle import LOSSES, CeresOptions, refine_with_ceres
+from validation.references.ceres_covariance import ceres_covariances
 from validation.scenes.real import load_real_scene
 from validation.scenes.streets import SIZE, Walk, make_walk, project
 

@@ -18,7 +18,8 @@ from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS
 from validation.metrics.cameras import CameraErrors, TrueCameras, measure_cameras
 from validation.metrics.intervals import focal_errors_pct, interval_scores
 from validation.metrics.record import Metric
-from validation.references.pycolmap_reference import Start, map_with_pycolmap, match_with_pycolmap, read_run
+from validation.references.colmap_mapping import Start, map_with_pycolmap, read_run
+from validation.references.colmap_matching import match_with_pycolmap
 from validation.scenes.real import Scene
 
 Config = Callable[[PipelineConfig], PipelineConfig]

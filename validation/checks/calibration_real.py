@@ -28,7 +28,7 @@ from validation.checks.calibration_wide import check_against_shared, check_wide
 from validation.checks.reconstruction import COLMAP, OURS
 from validation.metrics.intervals import interval_scores, join_scores
 from validation.metrics.record import Metric, markdown_table
-from validation.references.pycolmap_reference import Start
+from validation.references.colmap_mapping import Start
 from validation.scenes.real import REAL_SCENES, load_real_scene
 from validation.scenes.zoomed import central_scene, rezoom_scene
 

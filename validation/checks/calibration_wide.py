@@ -13,7 +13,7 @@ from validation.checks.calibration_parts import LEAST_HOLDING, MODES, SUCCESS_PC
 from validation.checks.reconstruction import COLMAP, OURS
 from validation.metrics.intervals import LEVEL
 from validation.metrics.record import Metric
-from validation.references.pycolmap_reference import Start
+from validation.references.colmap_mapping import Start
 from validation.scenes.zoomed import windowed_scene
 
 WINDOW = 0.3, 0.45

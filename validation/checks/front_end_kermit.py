@@ -25,7 +25,7 @@ from thesisrecon.geometry.multiview import fundamental_from_cameras, sampson_res
 from thesisrecon.types import F64, Reconstruction, RunResult, TwoView
 from validation.checks.front_end_pairs import OURS, SIFT, THESIS, PreparedViews, front_ends
 from validation.metrics.record import Metric
-from validation.references.pycolmap_reference import reconstruct_with_pycolmap
+from validation.references.colmap_run import reconstruct_with_pycolmap
 from validation.scenes.real import load_real_scene
 
 OUR_MODEL, COLMAP = "our model", "COLMAP's"

@@ -89,7 +89,7 @@ def measure_time(*, threads: int = 2) -> dict[str, Timed] | None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         ours = ["-m", "validation.checks.front_end_time", str(images), str(folder / "ours.json")]
-        theirs = ["-m", "validation.references.pycolmap_reference", str(images), str(folder / "colmap")]
+        theirs = ["-m", "validation.references.colmap_run", str(images), str(folder / "colmap")]
         return {
             OURS: _timed(ours, folder / "ours.json", threads),
             COLMAP: _timed([*theirs, "--only-matches"], folder / "colmap" / "seconds.json", threads),

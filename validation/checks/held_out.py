@@ -33,7 +33,8 @@ from thesisrecon.views import render
 from thesisrecon.views.likeness import exposed_alike, psnr_db, ssim, whole_pixels
 from validation.checks.dense_scene import depth_maps_of
 from validation.metrics.record import Metric, markdown_table
-from validation.references.open3d import OpenTsdf, render_open3d
+from validation.references.open3d_meshes import render_open3d
+from validation.references.open3d_surfaces import OpenTsdf
 from validation.scenes.real import load_fixture_scene, load_real_scene
 
 SCENES = ("fountain-P11", "Herz-Jesus-P8")

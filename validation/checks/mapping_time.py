@@ -27,8 +27,8 @@ from thesisrecon.pipeline import reconstruct
 from thesisrecon.run import stream
 from thesisrecon.types import MetricResult, RunResult
 from validation.metrics.record import Metric, markdown_table
-from validation.references.libraries import pycolmap
-from validation.references.pycolmap_reference import match_with_pycolmap
+from validation.references.colmap_mapping import map_database, mapper_options
+from validation.references.colmap_matching import match_with_pycolmap
 from validation.scenes.real import REAL_SCENES, load_real_scene
 
 OURS, COLMAP = "thesisrecon", "COLMAP"
@@ -82,15 +82,11 @@ def _stages(matched: RunResult) -> tuple[dict[str, float], MetricResult]:
 
 def time_colmap(images: Path, work: Path, threads: int) -> dict[str, float]:
     """Seconds of incremental mapping on the database kept in ``work``."""
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    pycolmap.set_random_seed(0)
-    options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
-    options.mapper.num_threads = threads
+    options = mapper_options(threads)
     with tempfile.TemporaryDirectory() as place:
         start, cpu = time.perf_counter(), time.process_time()
-        models = pycolmap.incremental_mapping(work / "database.db", images, place, options)
+        registered = map_database(work / "database.db", images, Path(place), options)
         wall, cpu = time.perf_counter() - start, time.process_time() - cpu
-    registered = max((model.num_reg_images() for model in models.values()), default=0)
     return {"wall": wall, "cpu": cpu, "registered": float(registered)}
 
 

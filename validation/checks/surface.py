@@ -32,7 +32,8 @@ from thesisrecon.types import F64, I64, DepthMap, PinholeView, TexturedMesh
 from validation.checks.dense_scene import depth_maps_of
 from validation.checks.depth import true_depth
 from validation.metrics.record import Metric, markdown_table
-from validation.references.open3d import OpenTsdf, distances, poisson_mesh
+from validation.references.open3d_meshes import distances
+from validation.references.open3d_surfaces import OpenTsdf, poisson_mesh
 from validation.scenes.real import Scene, load_fixture_depth, load_fixture_scene
 
 SAMPLES = 200_000

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.losses import LossName
 from thesisrecon.optimize.metric_bundle import MetricCameras, Observations
 from thesisrecon.types import F64
+from validation.references.colmap_model import cameras_from_colmap, colmap_model
 from validation.references.libraries import pycolmap
 
 LOSSES: dict[LossName, str] = {
@@ -21,6 +21,8 @@ LOSSES: dict[LossName, str] = {
     "cauchy": "CAUCHY",
     "huber": "HUBER",
 }
+
+
 SOLVERS = {
     "dense": "DENSE_SCHUR",
     "sparse": "SPARSE_SCHUR",
@@ -56,41 +58,21 @@ class CeresResult:
     cpu_s: float
 
 
-def colmap_model(
-    cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int]
-) -> pycolmap.Reconstruction:
-    """A COLMAP model with SIMPLE_RADIAL cameras; views, rows of intrinsics and points count from 1 in it."""
-    model = pycolmap.Reconstruction()
-    for g, (f, _, _, cx, cy, k1) in enumerate(cameras.intrinsics):
-        camera = pycolmap.Camera(
-            model="SIMPLE_RADIAL",
-            width=size[0],
-            height=size[1],
-            params=[f, cx + 0.5, cy + 0.5, k1],
-            camera_id=g + 1,
-        )
-        model.add_camera_with_trivial_rig(camera)
-    order = np.lexsort((seen.point_index, seen.view_index))
-    view, point, xy = seen.view_index[order], seen.point_index[order], seen.xy[order] + 0.5
-    first = np.searchsorted(view, np.arange(len(cameras.R) + 1))
-    for v in range(len(cameras.R)):
-        image = pycolmap.Image(
-            name=f"{v}.png",
-            keypoints=xy[first[v] : first[v + 1]],
-            camera_id=int(cameras.group[v]) + 1,
-            image_id=v + 1,
-        )
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(cameras.R[v]), cameras.t[v])
-        model.add_image_with_trivial_frame(image, pose)
-    place = np.arange(len(view)) - first[view]
-    by_point = np.argsort(point, kind="stable")
-    bounds = np.searchsorted(point[by_point], np.arange(len(X) + 1))
-    for j in range(len(X)):
-        k = by_point[bounds[j] : bounds[j + 1]]
-        if len(k):
-            track = pycolmap.Track([pycolmap.TrackElement(int(view[i]) + 1, int(place[i])) for i in k])
-            model.add_point3D(X[j], track, np.zeros(3, dtype=np.uint8))
-    return model
+def refine_with_ceres(
+    cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int], options: CeresOptions
+) -> CeresResult:
+    """Adjust all poses, points, focals and k1 (and principal points) by Ceres."""
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    model = colmap_model(cameras, X, seen, size)
+    wall, cpu = time.perf_counter(), time.process_time()
+    summary: Any = bundle_adjuster(model, options).solve()
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    told = summary.ceres_summary
+    refined, points = cameras_from_colmap(model, cameras)
+    moved = X.copy()
+    moved[np.bincount(seen.point_index, minlength=len(X)) > 0] = points
+    steps = told.num_successful_steps + told.num_unsuccessful_steps
+    return CeresResult(refined, moved, told.final_cost, told.initial_cost, steps, wall, cpu)
 
 
 def bundle_adjuster(
@@ -120,56 +102,3 @@ def bundle_adjuster(
             {"linear_solver_type": SOLVERS[options.solver], "preconditioner_type": "SCHUR_JACOBI"}
         )
     return pycolmap.create_default_ceres_bundle_adjuster(wishes, config, model)
-
-
-def ceres_covariances(
-    cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int], fixed: Sequence[int]
-) -> tuple[F64, F64]:
-    """Covariances (V, 6, 6) of poses and (4, 4) of (f, cx, cy, k1) for noise of 1 px, by COLMAP.
-
-    One camera; the views ``fixed`` hold the frame. Poses as ours: (w, d) of x -> exp(w) x + d. COLMAP's own
-    coordinates are half the angle (Ceres' quaternions) and a translation that the rotation leaves alone.
-    """
-    model = colmap_model(cameras, X, seen, size)
-    adjuster = bundle_adjuster(model, CeresOptions(principal_point=True, function_tolerance=0.0), fixed)
-    adjuster.solve()
-    found = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
-    if found is None:
-        raise RuntimeError("COLMAP has no covariances for this problem")
-    poses = np.zeros((len(cameras.R), 6, 6))
-    for v in np.setdiff1d(np.arange(len(poses)), fixed):
-        ours_from_theirs = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
-        t = model.images[v + 1].cam_from_world().translation
-        ours_from_theirs[3:, :3] = 2.0 * cross_matrix(t)
-        poses[v] = ours_from_theirs @ found.get_cam_cov_from_world(v + 1) @ ours_from_theirs.T
-    return poses, np.asarray(found.get_other_params_cov(model.cameras[1].params))
-
-
-def refine_with_ceres(
-    cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int], options: CeresOptions
-) -> CeresResult:
-    """Adjust all poses, points, focals and k1 (and principal points) by Ceres."""
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    model = colmap_model(cameras, X, seen, size)
-    wall, cpu = time.perf_counter(), time.process_time()
-    summary: Any = bundle_adjuster(model, options).solve()
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    told = summary.ceres_summary
-    refined, points = cameras_from_colmap(model, cameras)
-    moved = X.copy()
-    moved[np.bincount(seen.point_index, minlength=len(X)) > 0] = points
-    steps = told.num_successful_steps + told.num_unsuccessful_steps
-    return CeresResult(refined, moved, told.final_cost, told.initial_cost, steps, wall, cpu)
-
-
-def cameras_from_colmap(model: pycolmap.Reconstruction, like: MetricCameras) -> tuple[MetricCameras, F64]:
-    """The cameras of :func:`colmap_model` and its points in their order."""
-    poses = [model.images[v + 1].cam_from_world() for v in range(len(like.R))]
-    rows = []
-    for g in range(len(like.intrinsics)):
-        f, cx, cy, k = model.cameras[g + 1].params
-        rows.append([f, 1.0, 0.0, cx - 0.5, cy - 0.5, k])
-    R = np.array([pose.rotation.matrix() for pose in poses])
-    t = np.array([pose.translation for pose in poses])
-    X = np.array([model.points3D[j].xyz for j in sorted(model.points3D)])
-    return MetricCameras(R, t, np.array(rows), like.group, like.shared), X

@@ -1,19 +1,15 @@
-"""OpenCV's SIFT with Lowe's ratio test, alone and as a front end that the pipeline can run in place of ours.
-
-As a front end its matches go through the same estimator of F and the same verification as ours.
-"""
+"""OpenCV's SIFT with Lowe's ratio test."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from thesisrecon.config import EstimateFundamental, PipelineConfig
-from thesisrecon.types import F32, F64, I64, Features, Image, Matches
+from thesisrecon.types import F32, F64, I64, Image
 from validation.references.libraries import cv2
 
 U8 = NDArray[np.uint8]
@@ -67,48 +63,6 @@ def match_sift(first: SiftKeypoints, second: SiftKeypoints, *, ratio: float, mut
         back = {m.queryIdx: m.trainIdx for m in matcher.match(second.descriptors, first.descriptors)}
         pairs = [(a, b) for a, b in pairs if back[b] == a]
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
-
-
-@dataclass(frozen=True)
-class SiftCorners:
-    """SIFT keypoints, all of them, in the place of corners."""
-
-    def detect(self, image: Image) -> Features:
-        """The keypoints, strongest first."""
-        found = detect_sift(grey_of(image))
-        order = np.argsort(-found.response, kind="stable")
-        return Features(found.xy[order], found.size[order], found.response[order])
-
-
-@dataclass(frozen=True)
-class SiftRatioTest:
-    """Matches of SIFT descriptors, each the other's nearest, that pass the ratio test."""
-
-    ratio: float = 0.8
-
-    def prepare(self, image: Image, features: Features) -> SiftKeypoints:  # noqa: ARG002
-        """The keypoints with their descriptors."""
-        return detect_sift(grey_of(image))
-
-    def match(
-        self,
-        view1: SiftKeypoints,
-        view2: SiftKeypoints,
-        *,
-        pair: tuple[int, int],
-        estimate_fundamental: EstimateFundamental,  # noqa: ARG002
-        rng: np.random.Generator,  # noqa: ARG002
-    ) -> Matches:
-        """Matches by descriptors alone."""
-        one, two = match_sift(view1, view2, ratio=self.ratio, mutual=True).T
-        affine = np.broadcast_to(np.eye(2), (len(one), 2, 2)).copy()
-        score = np.ones(len(one), np.float32)
-        return Matches(*pair, one, two, view1.xy[one], view2.xy[two], score, affine)
-
-
-def sift_front_end(config: PipelineConfig) -> PipelineConfig:
-    """The same pipeline with SIFT in the place of corners and correlation."""
-    return replace(config, features=SiftCorners(), matching=SiftRatioTest())
 
 
 def grey_of(image: Image) -> U8:

@@ -12,7 +12,7 @@ from thesisrecon.types import TexturedMesh
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.metrics.record import Metric
 from validation.references.fundamental import estimate_with
-from validation.references.open3d import distances
+from validation.references.open3d_meshes import distances
 from validation.references.triangulation import colmap_points, opencv_linear
 
 METHODS = ("cv2", "pycolmap", "poselib", "open3d")

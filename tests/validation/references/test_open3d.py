@@ -13,7 +13,7 @@ from thesisrecon.io.meshes import read_mesh, write_mesh
 from thesisrecon.model import SurfaceModel, VolumetricFusion
 from thesisrecon.types import F64, DepthMap, PinholeView, TexturedMesh
 from thesisrecon.views import render
-from validation.references import open3d as reference
+from validation.references import open3d_cameras, open3d_meshes, open3d_surfaces
 from validation.references.libraries import NoReference, load
 
 try:
@@ -40,7 +40,7 @@ def slanted() -> tuple[DepthMap, PinholeView]:
 
 def test_a_pixel_is_the_same_pixel_in_its_grid() -> None:
     depth_map, view = slanted()
-    mesh = reference.OpenTsdf(voxel_px=0.5).fuse([depth_map], [view])
+    mesh = open3d_surfaces.OpenTsdf(voxel_px=0.5).fuse([depth_map], [view])
     assert mesh.colors is not None
     off = mesh.vertices @ NORMAL - 2.3
     # Half a pixel would be 4e-3.
@@ -53,11 +53,11 @@ def test_a_pixel_is_the_same_pixel_in_its_grid() -> None:
 def test_meshes_lie_on_the_sphere_and_distances_are_right() -> None:
     maps = ring_of()
     views = [photograph(m) for m in maps]
-    fused = reference.OpenTsdf().fuse(maps, views)
-    for mesh in (fused, reference.poisson_mesh(maps, depth=7)):
+    fused = open3d_surfaces.OpenTsdf().fuse(maps, views)
+    for mesh in (fused, open3d_surfaces.poisson_mesh(maps, depth=7)):
         assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1.0)) < 0.006
     away = np.array([[0.0, 0.0, -3.0], [2.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    np.testing.assert_allclose(reference.distances(away, fused), [2.0, 1.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(open3d_meshes.distances(away, fused), [2.0, 1.0, 0.0], atol=0.01)
     assert fused.colors is not None
     assert np.median(np.abs(fused.colors - paint(fused.vertices))) < 12.0
 
@@ -66,7 +66,7 @@ def test_skew_is_refused() -> None:
     skew = K.copy()
     skew[0, 1] = 1.0
     with pytest.raises(ValueError, match="skew"):
-        reference.camera_of(np.column_stack([skew, np.zeros(3)]))
+        open3d_cameras.camera_of(np.column_stack([skew, np.zeros(3)]))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def places() -> F64:
 
 def test_a_glb_opens_in_open3d_with_its_texture(model: TexturedMesh, tmp_path: Path) -> None:
     write_mesh(tmp_path / "model.glb", model)
-    vertices, faces, uv, texture = reference.read_glb(tmp_path / "model.glb")
+    vertices, faces, uv, texture = open3d_meshes.read_glb(tmp_path / "model.glb")
     assert len(faces) == len(model.faces)
     assert model.texture is not None
     assert texture.shape == model.texture.shape
@@ -123,10 +123,10 @@ def test_a_glb_opens_in_trimesh_with_its_texture(model: TexturedMesh, tmp_path: 
 
 def test_its_own_pictures_agree_with_ours() -> None:
     maps = ring_of()
-    mesh = reference.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
+    mesh = open3d_surfaces.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
     camera = PinholeCamera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).resized(2)
     try:
-        theirs = reference.render_open3d(mesh, camera)
+        theirs = open3d_meshes.render_open3d(mesh, camera)
     except RuntimeError as error:
         pytest.skip(f"Open3D cannot draw here: {error}")
     ours = render(mesh, camera)

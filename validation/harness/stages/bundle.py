@@ -21,7 +21,8 @@ from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import OURS as OUR_CAMERAS
 from validation.harness.stages.cameras import read_model
 from validation.metrics.record import Metric
-from validation.references.ceres_bundle import CeresOptions, ceres_covariances, refine_with_ceres
+from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
+from validation.references.ceres_covariance import ceres_covariances
 from validation.scenes.streets import SIZE, make_walk
 
 OURS, CERES = "ours", "Ceres"

@@ -20,7 +20,8 @@ from validation.harness.scenes import is_photographs, load_photographs, truth_of
 from validation.metrics.cameras import CameraErrors, Reprojection, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
 from validation.metrics.record import Metric
-from validation.references.pycolmap_reference import Start, map_with_pycolmap, match_with_pycolmap
+from validation.references.colmap_mapping import Start, map_with_pycolmap
+from validation.references.colmap_matching import match_with_pycolmap
 from validation.scenes.real import Scene
 
 OURS, THESIS, PER_IMAGE = "ours", "ours (thesis)", "ours (a camera each)"

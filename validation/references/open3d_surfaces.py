@@ -1,26 +1,21 @@
-"""Open3D as our stages are called: meshes from depth maps, distances, pictures and files.
+"""Open3D's surfaces of depth maps as our stage is called: truncated distances and Poisson.
 
 Its voxel grids take the pixel that the truncated coordinates name, so the centre of the top-left pixel is
-(0.5, 0.5) there; its pictures have it at (0, 0) as ours. (``ScalableTSDFVolume`` of 0.20.0 gives empty
-meshes; the grid of blocks is its successor.)
+(0.5, 0.5) there; its points of a depth image have it at (0, 0) as ours. (``ScalableTSDFVolume`` of 0.20.0
+gives empty meshes; the grid of blocks is its successor.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.camera import decompose_camera
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.types import F64, I64, DepthMap, PinholeView, TexturedMesh
+from thesisrecon.types import DepthMap, PinholeView, TexturedMesh
 from validation.references.libraries import open3d as o3d
-
-U8 = NDArray[np.uint8]
+from validation.references.open3d_cameras import camera_of, median_footprint
 
 
 @dataclass(frozen=True)
@@ -95,69 +90,3 @@ def poisson_mesh(
         # What was solved faces the cameras as the normals do: outwards is anticlockwise there as here.
         np.asarray(mesh.triangles).astype(np.int64),
     )
-
-
-def distances(points: F64, mesh: TexturedMesh) -> F64:
-    """(N,) distances of points (N, 3) to the nearest place of a surface."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
-    )
-    found = scene.compute_distance(o3d.core.Tensor(points.astype(np.float32)), nthreads=1)
-    return np.asarray(found.numpy(), dtype=np.float64)
-
-
-def render_open3d(mesh: TexturedMesh, camera: PinholeCamera) -> U8:
-    """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit.
-
-    Raises ``RuntimeError`` where the machine has no graphics that it can use.
-    """
-    width, height = camera.size
-    renderer = o3d.visualization.rendering.OffscreenRenderer(width, height)
-    material = o3d.visualization.rendering.MaterialRecord()
-    material.shader = "defaultUnlit"
-    drawn = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
-    )
-    if mesh.colors is not None:
-        drawn.vertex_colors = o3d.utility.Vector3dVector(mesh.colors / 255.0)
-    renderer.scene.set_background([0.0, 0.0, 0.0, 1.0])
-    renderer.scene.view.set_post_processing(False)
-    renderer.scene.add_geometry("model", drawn, material)
-    K, world = camera_of(camera.P, shift=0.5)
-    renderer.setup_camera(K, world, width, height)
-    return np.asarray(renderer.render_to_image()).copy()
-
-
-def read_glb(path: Path) -> tuple[F64, I64, F64, U8]:
-    """Vertices (N, 3) in glTF's axes, faces (M, 3), texture coordinates (M, 3, 2), v up, and the texture of a
-    GLB as Open3D reads it."""
-    model = o3d.io.read_triangle_model(str(path))
-    mesh = model.meshes[0].mesh
-    albedo = np.asarray(model.materials[model.meshes[0].material_idx].albedo_img)
-    uv = np.asarray(mesh.triangle_uvs).reshape(-1, 3, 2)
-    faces = np.asarray(mesh.triangles).astype(np.int64)
-    return np.asarray(mesh.vertices).copy(), faces, uv.copy(), albedo[..., :3].copy()
-
-
-def camera_of(P: F64, *, shift: float = 0.0) -> tuple[F64, F64]:
-    """K (3, 3) with its principal point moved by ``shift`` px, and the world-to-camera matrix (4, 4).
-
-    Raises ``ValueError`` where pixels are skew, which Open3D does not know.
-    """
-    K, R, t = decompose_camera(P)
-    if abs(K[0, 1]) > 1e-6 * K[0, 0]:
-        raise ValueError(f"Open3D knows no skew; got {K[0, 1]:.3g} px")
-    K = np.array([[K[0, 0], 0.0, K[0, 2] + shift], [0.0, K[1, 1], K[1, 2] + shift], [0.0, 0.0, 1.0]])
-    world = np.eye(4)
-    world[:3, :3], world[:3, 3] = R, t
-    return K, world
-
-
-def median_footprint(depth_maps: Sequence[DepthMap]) -> float:
-    """Width of a pixel at its depth, the median over all pixels of all maps."""
-    widths = []
-    for one in depth_maps:
-        K = decompose_camera(one.P)[0]
-        widths.append(one.depth[np.isfinite(one.depth)] / np.sqrt(K[0, 0] * K[1, 1]))
-    return float(np.median(np.concatenate(widths)))

@@ -1,0 +1,138 @@
+"""COLMAP's reconstruction of what it has matched (Schönberger and Frahm, CVPR 2016; Pan et al., ECCV 2024).
+
+Models come back in our types and pixels.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.types import F64, Reconstruction
+from validation.references.colmap_matching import DEFAULT_FOCAL_REL, forget_focal_priors
+from validation.references.libraries import pycolmap
+
+
+@dataclass(frozen=True)
+class ReferenceRun:
+    """What COLMAP made of a folder of photographs: ``names[i]`` is view i of ``reconstruction`` (its largest
+    model, in our pixel convention), ``seconds`` of "extract", "match" and "map"."""
+
+    names: tuple[str, ...]
+    reconstruction: Reconstruction
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Start:
+    """What COLMAP starts from and refines: a focal length of ``focal_rel`` long sides, and the principal
+    point only where that is wished; or ``K`` (3, 3) by the name of the photograph, pixels as ours, taken for
+    exact (the cameras of the photographs must be their own then)."""
+
+    refine_principal_point: bool = False
+    focal_rel: float = DEFAULT_FOCAL_REL
+    K: Mapping[str, F64] | None = None
+
+
+def map_with_pycolmap(
+    images: Path,
+    matched: Path,
+    out: Path,
+    *,
+    start: Start | None = None,
+    threads: int = 2,
+    mapper: Literal["incremental", "global"] = "incremental",
+) -> ReferenceRun:
+    """Mapping of what :func:`match_with_pycolmap` left in ``matched``, as ``start`` has it.
+
+    ``out`` is another folder, emptied first; the global mapper (GLOMAP) refines what it refines by default.
+    Raises :class:`StageFailure` where COLMAP makes no model.
+    """
+    start = start or Start()
+    pycolmap.set_random_seed(0)
+    if not (matched / "seconds.json").is_file():
+        raise StageFailure("COLMAP left no matches to start from")
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    for name in ("database.db", "seconds.json"):
+        shutil.copy(matched / name, out / name)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    options = mapper_options(threads, start.refine_principal_point)
+    forget_focal_priors(out / "database.db", start.focal_rel)
+    if start.K is not None:
+        _give_calibration(out / "database.db", start.K)
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    if mapper == "global":
+        return _map_globally(images, out, threads)
+    return map_incrementally(images, out, options)
+
+
+def read_run(images: Path, out: Path) -> ReferenceRun:
+    """What a mapping left in ``out``; :class:`StageFailure` without a model."""
+    folders = sorted(path for path in (out / "sparse").glob("*") if path.is_dir())
+    if not folders:
+        raise StageFailure("COLMAP made no model of these photographs")
+    largest = max((read_colmap_model(path) for path in folders), key=lambda model: len(model.images))
+    names = tuple(sorted(path.name for path in images.iterdir() if path.is_file()))
+    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
+    return ReferenceRun(names, reconstruction_from_colmap(largest, names=names), seconds)
+
+
+def mapper_options(threads: int, refine_principal_point: bool = False) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's defaults for so many threads, the principal point refined where that is wished."""
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=threads, ba_refine_principal_point=refine_principal_point
+    )
+    options.mapper.num_threads = threads
+    return options
+
+
+def map_database(
+    database: Path, images: Path, out: Path, options: pycolmap.IncrementalPipelineOptions
+) -> int:
+    """Incremental mapping of a database into folders of models in ``out``; photographs in the largest."""
+    pycolmap.set_random_seed(0)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    models = pycolmap.incremental_mapping(database, images, out, options)
+    return max((model.num_reg_images() for model in models.values()), default=0)
+
+
+def map_incrementally(images: Path, out: Path, options: pycolmap.IncrementalPipelineOptions) -> ReferenceRun:
+    """Incremental mapping of the database in ``out``, whose folder "sparse" the models go to."""
+    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
+    start = time.perf_counter()
+    map_database(out / "database.db", images, out / "sparse", options)
+    seconds["map"] = time.perf_counter() - start
+    (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    return read_run(images, out)
+
+
+def _map_globally(images: Path, out: Path, threads: int) -> ReferenceRun:
+    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
+    start = time.perf_counter()
+    options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=0)
+    (out / "sparse").mkdir(exist_ok=True)
+    pycolmap.global_mapping(out / "database.db", images, out / "sparse", options)
+    seconds["map"] = time.perf_counter() - start
+    (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    return read_run(images, out)
+
+
+def _give_calibration(database: Path, K: Mapping[str, F64]) -> None:
+    """Put the true calibration in the place of every camera."""
+    store = pycolmap.Database.open(database)
+    for image in store.read_all_images():
+        camera, known = store.read_camera(image.camera_id), K[image.name]
+        camera.model = pycolmap.CameraModelId.PINHOLE
+        # COLMAP's pixels have their origin at the corner of the first one.
+        camera.params = [known[0, 0], known[1, 1], known[0, 2] + 0.5, known[1, 2] + 0.5]
+        camera.has_prior_focal_length = True
+        store.update_camera(camera)
+    store.close()
