@@ -55,6 +55,9 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--quick", action="store_true", help="few scenes and few repetitions")
         command.add_argument("--seed", type=int, default=0)
         command.add_argument("--threads", type=int, default=len(own_cores()), help="tasks at a time")
+        command.add_argument(
+            "--resume", type=Path, help="the folder of a like run, whose references are taken as they are"
+        )
         command.add_argument("--time-limit", type=float, default=300.0, help="seconds for one task")
         if name == "report":
             command.add_argument("--against", type=Path, help="the folder of another report, to compare with")
@@ -87,6 +90,7 @@ def _wishes(told: argparse.Namespace) -> Wishes:
         seed=told.seed,
         threads=min(told.threads, len(own_cores())),
         limit_s=told.time_limit,
+        resume="" if told.resume is None else str(told.resume.resolve()),
     )
 
 

@@ -44,8 +44,9 @@ def run_process(
     cores: Sequence[int],
     environment: Mapping[str, str],
     limit_s: float | None = None,
+    cwd: Path = ROOT,
 ) -> Process:
-    """Run ``command`` on these cores and wait; its output goes to the file ``log``.
+    """Run ``command`` in the folder ``cwd`` on these cores and wait; its output goes to the file ``log``.
 
     Where ``limit_s`` passes, the child and all it started are killed.
     """
@@ -59,7 +60,7 @@ def run_process(
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             env={**os.environ, **environment},
-            cwd=ROOT,
+            cwd=cwd,
             start_new_session=True,
         )
         try:

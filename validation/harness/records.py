@@ -18,8 +18,9 @@ class Wishes:
     ``out`` : its folder. ``scenes``, ``stages`` : their names, in order. ``folders`` : scene -> folder, of
     scenes that the user brought. ``quick`` : less of everything that can be less. ``gates_only`` : no
     reference that takes long and that no gate needs. ``seed`` : of all random steps. ``threads`` : cores that
-    may be used at once. ``limit_s`` : seconds a single task may take. ``stages_from`` : the module whose
-    ``STAGES`` hold the stages.
+    may be used at once. ``limit_s`` : seconds a single task may take. ``resume`` : the folder of another run,
+    whose references are taken as they are; empty for none. ``stages_from`` : the module whose ``STAGES`` hold
+    the stages.
     """
 
     out: Path
@@ -31,6 +32,7 @@ class Wishes:
     seed: int = 0
     threads: int = 2
     limit_s: float = 300.0
+    resume: str = ""
     stages_from: str = "validation.harness.stages"
 
     def place(self, stage: str, scene: str, method: str = "") -> Path:

@@ -175,11 +175,12 @@ def compare(before: Results, now: Results) -> list[Change]:
     old, new = ({row.key: row for row in r.rows} for r in (before, now))
     changes = []
     for key in dict.fromkeys([*old, *new]):
-        a, b = old.get(key), new.get(key)
-        values = (None if a is None else a.value, None if b is None else b.value)
-        verdicts = ("absent" if a is None else a.verdict, "absent" if b is None else b.verdict)
+        rows = [row for row in (old.get(key), new.get(key)) if row is not None]
+        values = [None if (row := found.get(key)) is None else row.value for found in (old, new)]
+        verdicts = ["absent" if (row := found.get(key)) is None else row.verdict for found in (old, new)]
         if values[0] != values[1] or verdicts[0] != verdicts[1]:
-            changes.append(Change(key, (b or a).unit if (b or a) else "", *values, verdicts))  # type: ignore[union-attr]
+            told = (verdicts[0], verdicts[1])
+            changes.append(Change(key, rows[-1].unit, values[0], values[1], told))
     return changes
 
 

@@ -10,8 +10,16 @@ import numpy as np
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
 from validation.harness.records import Wishes
 from validation.metrics.cameras import TrueCameras
-from validation.scenes.real import SUFFIXES, Scene, data_root, load_fixture_scene, load_real_scene, read_scene
-from validation.scenes.stereo import STEREO_PAIRS, load_stereo_pair
+from validation.scenes.real import (
+    SUFFIXES,
+    Scene,
+    data_root,
+    load_fixture_scene,
+    load_real_scene,
+    read_scene,
+    real_folder,
+)
+from validation.scenes.stereo import STEREO_PAIRS, stereo_folder
 
 PHOTOGRAPHS = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
 QUICK = ("courtyard", "cloud", "street", "Tsukuba")
@@ -22,8 +30,8 @@ SYNTHETIC = ("cloud", "street")
 def available_scenes(*, quick: bool) -> tuple[str, ...]:
     """The scenes whose files are on this machine."""
     root = data_root()
-    found = [name for name in PHOTOGRAPHS if name == "courtyard" or load_real_scene(name) is not None]
-    found += [name for name in STEREO_PAIRS if load_stereo_pair(name) is not None]
+    found = [name for name in PHOTOGRAPHS if name == "courtyard" or real_folder(name) is not None]
+    found += [name for name in STEREO_PAIRS if stereo_folder(name) is not None]
     found += SYNTHETIC
     if root is not None and (root / "kusvod2").is_dir():
         found.append("kusvod2")

@@ -13,6 +13,7 @@ from typing import Any
 
 from validation.harness.process import failure_of, last_words, own_cores, run_process
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Task, Wishes
+from validation.harness.resume import take_over
 from validation.harness.worker import JUDGEMENT, OUTCOMES
 from validation.metrics.record import Metric
 
@@ -40,11 +41,13 @@ def run_tasks(
     shutil.rmtree(wishes.out / "data", ignore_errors=True)
     wishes.out.mkdir(parents=True, exist_ok=True)
     (wishes.out / "wishes.json").write_text(json.dumps(wishes.to_json()), encoding="utf-8")
-    waiting, ended = tasks_of(wishes, stages), dict[Task, Outcome]()
-    place_of = {task: n for n, task in enumerate(waiting)}
+    tasks = tasks_of(wishes, stages)
+    place_of = {task: n for n, task in enumerate(tasks)}
+    ended = take_over(wishes, tasks, stages)
+    waiting = [task for task in tasks if task not in ended]
     running: dict[Future[Outcome], Task] = {}
     cores = own_cores()[: wishes.threads]
-    free, total = _Cores(cores), len(waiting)
+    free, total = _Cores(cores), len(tasks)
     with ThreadPoolExecutor(len(cores)) as pool:
         while waiting or running:
             for task in [t for t in waiting if len(running) < len(cores)]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar import estimate_fundamental
+from thesisrecon.epipolar import ThesisRansac, estimate_eight_point, estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import FundamentalFit
 from validation.references.libraries import cv2, poselib, pycolmap
@@ -22,7 +22,7 @@ F64 = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Answer = tuple[Any, Any, FundamentalFit | None]
 
-OURS = "ours"
+OURS, THESIS, LINEAR = "ours", "ours (thesis)", "ours (eight points)"
 CONFIDENCE, ITERATIONS = 0.9999, 20000
 """What OpenCV is given beyond its defaults (0.99 and 1000)."""
 MIN_ITERATIONS = 10000
@@ -48,6 +48,20 @@ def _ours(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     except StageFailure:
         return None, None, None
     return fit.F, fit.inliers, fit
+
+
+def _thesis(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+    try:
+        fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, np.random.default_rng(seed))
+    except StageFailure:
+        return None, None, None
+    return fit.F, fit.inliers, fit
+
+
+def _eight_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+    """Of the matches that the front door takes for right: it knows no wrong ones."""
+    _, right, fit = _ours(xy1, xy2, threshold_px, seed)
+    return (None, None, None) if fit is None else (estimate_eight_point(xy1[right], xy2[right]), right, None)
 
 
 def _opencv(method: str, confidence: float = 0.99, iterations: int = 1000) -> Solver:
@@ -86,6 +100,8 @@ def _poselib(**options: int) -> Solver:
 _LONG: tuple[float, int] = (CONFIDENCE, ITERATIONS)
 SOLVERS: dict[str, Solver] = {
     OURS: _ours,
+    THESIS: _thesis,
+    LINEAR: _eight_points,
     "USAC_ACCURATE": _opencv("USAC_ACCURATE", *_LONG),
     "USAC_ACCURATE default": _opencv("USAC_ACCURATE"),
     "USAC_MAGSAC": _opencv("USAC_MAGSAC", *_LONG),

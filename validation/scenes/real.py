@@ -70,17 +70,22 @@ def read_scene(folder: Path, name: str) -> Scene:
     return Scene(name, paths, K, R, C)
 
 
-def load_real_scene(name: str) -> Scene | None:
-    """One of ``REAL_SCENES``, or None where the photographs are not on this machine.
+def real_folder(name: str) -> Path | None:
+    """Where one of ``REAL_SCENES`` is, None where its photographs are not on this machine.
 
     Raises ``ValueError`` for a name that is none of them.
     """
     if name not in REAL_SCENES:
         raise ValueError(f"a real scene is one of {sorted(REAL_SCENES)}; got {name!r}")
     root = data_root()
-    if root is None or not (root / REAL_SCENES[name]).is_dir():
-        return None
-    return read_scene(root / REAL_SCENES[name], name)
+    folder = None if root is None else root / REAL_SCENES[name]
+    return folder if folder is not None and folder.is_dir() else None
+
+
+def load_real_scene(name: str) -> Scene | None:
+    """One of ``REAL_SCENES``, or None; as :func:`real_folder`."""
+    folder = real_folder(name)
+    return None if folder is None else read_scene(folder, name)
 
 
 def load_fixture_scene(name: str = "courtyard") -> Scene:

@@ -33,17 +33,27 @@ class StereoPair:
     disparities: int
 
 
-def load_stereo_pair(name: str) -> StereoPair | None:
-    """One of ``STEREO_PAIRS``, None where its files are not on this machine.
+def stereo_folder(name: str) -> Path | None:
+    """Where one of ``STEREO_PAIRS`` is, None where its files are not on this machine.
 
     The motorcycle comes with scikit-image, whose files are read without importing it.
     """
     if name == "Motorcycle":
-        return _motorcycle()
+        found = importlib.util.find_spec("skimage")
+        place = None if found is None or found.origin is None else Path(found.origin).parent / "data"
+        return place if place is not None and (place / "motorcycle_disp.npz").is_file() else None
     root = data_root()
     folder = None if root is None else root / "stereo" / ("Cones9" if name == "Cones" else name)
-    if folder is None or not folder.is_dir():
+    return folder if folder is not None and folder.is_dir() else None
+
+
+def load_stereo_pair(name: str) -> StereoPair | None:
+    """One of ``STEREO_PAIRS``, None where its files are not on this machine."""
+    folder = stereo_folder(name)
+    if folder is None:
         return None
+    if name == "Motorcycle":
+        return _motorcycle(folder)
     if name == "Cones":
         truth, other = (_truth(folder / f"disp{k}.png", 4.0) for k in (2, 6))
         judged = seen_by_both(truth, other)
@@ -73,13 +83,7 @@ def seen_by_both(truth: F32, other: F32 | None) -> B8:
     return judged
 
 
-def _motorcycle() -> StereoPair | None:
-    found = importlib.util.find_spec("skimage")
-    if found is None or found.origin is None:
-        return None
-    folder = Path(found.origin).parent / "data"
-    if not (folder / "motorcycle_disp.npz").is_file():
-        return None
+def _motorcycle(folder: Path) -> StereoPair:
     stored = np.load(folder / "motorcycle_disp.npz")["arr_0"].astype(np.float32)
     truth = np.where(np.isfinite(stored), stored, np.float32(np.nan)).astype(np.float32)
     left, right = (_rgb(folder / f"motorcycle_{side}.png") for side in ("left", "right"))

@@ -172,3 +172,27 @@ def test_names_for_files() -> None:
     assert json.loads(json.dumps(Wishes(Path("a"), (), ()).to_json()))["out"] == "a"
     assert Wishes.from_json(Wishes(Path("a"), ("s",), ()).to_json()) == Wishes(Path("a"), ("s",), ())
     assert Results([], [], {}, {}, {}).broken == []
+
+
+def test_a_run_starts_from_the_references_of_a_like_one(tmp_path: Path) -> None:
+    first = toy_wishes(tmp_path / "first", quick=True)
+    run_tasks(first, STAGES, lambda _: None)
+    # Of ours nothing is taken but the folders of a run; a reference stands as it is.
+    (first.place("toy", "yard", "good") / "value.json").write_text("7.0", encoding="utf-8")
+    told: list[str] = []
+    second = dataclasses.replace(toy_wishes(tmp_path / "second", quick=True), resume=str(first.out))
+    judgement, outcomes = run_tasks(second, STAGES, told.append)["toy", "yard"]
+    assert judgement.metrics[0].values == {"ours": 0.5, "good": 7.0}
+    assert [line for line in told if "good" in line] == []
+    assert outcomes["good"].place == second.place("toy", "yard", "good")
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"quick": True}, None])
+def test_a_run_starts_from_no_unlike_one(change: dict[str, object] | None, tmp_path: Path) -> None:
+    wishes = dataclasses.replace(toy_wishes(tmp_path / "now", quick=False), resume=str(tmp_path / "before"))
+    if change is not None:
+        before = dataclasses.replace(wishes, **change)  # type: ignore[arg-type]
+        (tmp_path / "before").mkdir()
+        (tmp_path / "before" / "wishes.json").write_text(json.dumps(before.to_json()), encoding="utf-8")
+    with pytest.raises(ValueError, match="start from a like one" if change else "holds no run"):
+        run_tasks(wishes, STAGES, lambda _: None)

@@ -14,10 +14,12 @@ import thesisrecon
 from thesisrecon.config import config_from_tables
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.io.run_directory import MANIFEST_FILE, RunDirectory, read_json
+from thesisrecon.run import FOLDERS
 from thesisrecon.types import Reconstruction
 from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs, truth_of
-from validation.metrics.cameras import CameraErrors, Reprojection, measure_cameras, measure_reprojection
+from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
 from validation.metrics.record import Metric
 from validation.references.colmap_mapping import Start, map_with_pycolmap
@@ -27,6 +29,8 @@ from validation.scenes.real import Scene
 OURS, THESIS, PER_IMAGE = "ours", "ours (thesis)", "ours (a camera each)"
 COLMAP, COLMAP_PP, COLMAP_GLOBAL = "COLMAP", "COLMAP, pp refined", "COLMAP, global"
 MATCHES = "COLMAP, matches"
+FIXTURE = "courtyard"
+"""The scene that is always there: the gates of the thesis' preset are set on it."""
 SETTINGS: dict[str, dict[str, Any]] = {
     OURS: {},
     THESIS: {"preset": "thesis"},
@@ -35,6 +39,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
 MAPPERS = {COLMAP: "default", COLMAP_PP: "principal-point", COLMAP_GLOBAL: "global"}
 FOCAL = "median |f / f_true - 1|, f = sqrt(fx fy), over the registered cameras"
 CENTRE = "mean distance of the camera centres after the least-squares similarity"
+PRINCIPAL_POINT = "median distance from the true one"
+REPROJECTION = "median distance of inlier observations from their projected points"
 ROTATION = "median angle after the rotation common to all cameras is taken off"
 SHARE_HELD = "share of focal lengths and principal points whose stated 95 % interval holds the truth"
 
@@ -53,9 +59,9 @@ class CamerasStage:
     def takes(self, scene: str, wishes: Wishes) -> bool:
         return is_photographs(scene, wishes)
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
         if wishes.gates_only:
-            return (OURS, PER_IMAGE)
+            return (OURS, PER_IMAGE, THESIS) if scene == FIXTURE else (OURS, PER_IMAGE)
         return (OURS, MATCHES, COLMAP) if wishes.quick else (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
@@ -71,7 +77,8 @@ class CamerasStage:
             return
         if task.method == PER_IMAGE:
             # The matches are the same.
-            shutil.copytree(wishes.place(self.name, task.scene, OURS) / "run", place / "run")
+            matched = wishes.place(self.name, task.scene, OURS) / "run"
+            shutil.copytree(matched, place / "run", dirs_exist_ok=True)
         thesisrecon.reconstruct(
             list(scene.image_paths),
             place / "run",
@@ -87,6 +94,7 @@ class CamerasStage:
         models = {m: read_model(photographs, m, o) for m, o in outcomes.items() if m != MATCHES}
         shared = outcomes.get(MATCHES)
         metrics = [*_numbers(photographs, models), *_costs(scene, outcomes, shared)]
+        metrics += _before_adjustment(photographs, outcomes.get(OURS))
         metrics += [*_per_image(photographs, models.get(PER_IMAGE)), *_stated(photographs, outcomes)]
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         return Judgement(metrics, plots=_plots(photographs, models), notes=notes)
@@ -121,79 +129,80 @@ def _run_colmap(task: Task, scene: Scene, wishes: Wishes, place: Path) -> None:
 
 
 def _numbers(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
-    truth = truth_of(scene)
-    errors = {
-        n: measure_cameras(m, truth) if m is not None and truth is not None else None
-        for n, m in models.items()
-    }
-    residuals = {n: None if m is None else measure_reprojection(m) for n, m in models.items()}
-
-    def of_errors(read: Callable[[CameraErrors], float | None]) -> dict[str, float | None]:
-        return {n: None if e is None else read(e) for n, e in errors.items()}
-
-    def of_residuals(read: Callable[[Reprojection], float]) -> dict[str, float | None]:
-        return {n: None if r is None else read(r) for n, r in residuals.items()}
-
     registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
-    rows = [
-        Metric(
-            scene.name,
-            "registered",
-            "%",
-            registered,
-            OURS,
-            at_most=False,
-            definition="share of the photographs",
-        )
+    words = "share of the photographs"
+    rows = [Metric(scene.name, "registered", "%", registered, OURS, at_most=False, definition=words)]
+    return [*rows, *_errors(scene, models), *_fit(scene, models)]
+
+
+def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+    """How far the cameras are from the true ones; nothing where nobody knows them."""
+    truth = truth_of(scene)
+    if truth is None:
+        return []
+    errors = {n: None if m is None else measure_cameras(m, truth) for n, m in models.items()}
+
+    def row(name: str, unit: str, read: Callable[[CameraErrors], float | None], words: str) -> list[Metric]:
+        values = {n: None if e is None else read(e) for n, e in errors.items()}
+        found = [Metric(scene.name, name, unit, values, OURS, definition=words)]
+        if THESIS in values:
+            of_thesis = {OURS: values[THESIS]}
+            found.append(Metric(scene.name, f"{THESIS}: {name}", unit, of_thesis, OURS, definition=words))
+        return found
+
+    return [
+        *row("focal error", "%", lambda e: e.focal_error_pct, FOCAL),
+        *row("principal point error", "px", lambda e: e.principal_point_error_px, PRINCIPAL_POINT),
+        *row("centre error", "mm", _millimetres, CENTRE),
+        *row("rotation error", "deg", lambda e: e.rotation_error_deg, ROTATION),
     ]
-    if truth is not None:
-        rows += [
-            Metric(
-                scene.name, "focal error", "%", of_errors(lambda e: e.focal_error_pct), OURS, definition=FOCAL
-            ),
-            Metric(
-                scene.name,
-                "principal point error",
-                "px",
-                of_errors(lambda e: e.principal_point_error_px),
-                OURS,
-                definition="median distance from the true one",
-            ),
-            Metric(scene.name, "centre error", "mm", of_errors(_millimetres), OURS, definition=CENTRE),
-            Metric(
-                scene.name,
-                "rotation error",
-                "deg",
-                of_errors(lambda e: e.rotation_error_deg),
-                OURS,
-                definition=ROTATION,
-            ),
-        ]
+
+
+def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+    """How well the cameras and points of a model fit what was seen, and how many there are."""
+    residuals = {n: None if m is None else measure_reprojection(m) for n, m in models.items()}
     points = {n: None if m is None else float(m.valid.sum()) for n, m in models.items()}
-    rows += [
-        Metric(
-            scene.name,
-            "reprojection",
-            "px",
-            of_residuals(lambda r: r.median_px),
-            OURS,
-            definition="median distance of inlier observations from their projected points",
-        ),
-        Metric(
-            scene.name,
-            "observations a point",
-            "",
-            {
-                n: r.observations / p if r and p else None
-                for (n, r), p in zip(residuals.items(), points.values(), strict=True)
-            },
-            OURS,
-            at_most=False,
-            definition="inlier observations over points",
-        ),
-        Metric(scene.name, "points", "", points, OURS, at_most=False, definition="valid points of the model"),
+    median = {n: None if r is None else r.median_px for n, r in residuals.items()}
+    seen = {n: r.observations / p if r and (p := points[n]) else None for n, r in residuals.items()}
+
+    def row(name: str, unit: str, values: dict[str, float | None], more: bool, words: str) -> Metric:
+        return Metric(scene.name, name, unit, values, OURS, at_most=not more, definition=words)
+
+    return [
+        row("reprojection", "px", median, False, REPROJECTION),
+        row("observations a point", "", seen, True, "inlier observations over points"),
+        row("points", "", points, True, "valid points of the model"),
     ]
-    return rows
+
+
+def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
+    """Chapters 6 and 7 by themselves, from the files of their stages: the metric stage makes much good."""
+    if outcome is None or not outcome.ok:
+        return []
+    projective = _kept(outcome, "projective")
+    t, P, X = projective.tracks, projective.P, projective.X
+    seen = projective.inlier & projective.registered[t.view_index] & projective.valid[t.point_index]
+    x = np.einsum("kab,kb->ka", P[t.view_index[seen]], X[t.point_index[seen]])
+    residual = float(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - t.xy[seen], axis=1)))
+    words = f"{REPROJECTION}, by the projective model"
+    rows = [Metric(scene.name, "projective reprojection", "px", {OURS: residual}, OURS, definition=words)]
+    if scene.K is None:
+        return rows
+    K = _kept(outcome, "selfcalibration").K
+    known = np.isfinite(K).all(axis=(1, 2)) & (K[:, 0, 0] > 0.0)
+    error = float(np.median(focal_errors_pct(K[known], scene.K[known])))
+    words = f"{FOCAL}, as self-calibration leaves it"
+    return [
+        *rows,
+        Metric(scene.name, "self-calibrated focal error", "%", {OURS: error}, OURS, definition=words),
+    ]
+
+
+def _kept(outcome: Outcome, stage: str) -> Any:
+    """The last record that a stage of the run kept."""
+    folder = RunDirectory(outcome.place / "run").stage(FOLDERS[stage])
+    *_, (item, key) = read_json(folder.path / MANIFEST_FILE)["keys"].items()
+    return folder.load(item, key)
 
 
 def _costs(scene: str, outcomes: Mapping[str, Outcome], shared: Outcome | None) -> list[Metric]:
@@ -299,7 +308,7 @@ def _millimetres(errors: CameraErrors) -> float | None:
 
 
 def _plots(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Plot]:
-    """The distribution of reprojection residuals, one curve a method."""
+    """The focal length of every photograph, as each method has it, and the true one."""
     traces: list[dict[str, Any]] = []
     for name, model in models.items():
         if model is None:

@@ -21,6 +21,7 @@ from validation.references.libraries import NoReference
 from validation.scenes.real_pairs import RealPair, camera_pairs, kusvod2_pairs
 
 OURS, MATCHES = "ours", "SIFT matches"
+VARIANTS = ("ours (thesis)", "ours (eight points)")
 REFERENCES = (
     "FM_RANSAC",
     "FM_LMEDS",
@@ -62,8 +63,8 @@ class FundamentalStage:
 
     def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         if wishes.gates_only:
-            return (MATCHES, OURS)
-        return (MATCHES, OURS, *(QUICK if wishes.quick else REFERENCES))
+            return (MATCHES, OURS, *VARIANTS)
+        return (MATCHES, OURS, *VARIANTS, *(QUICK if wishes.quick else REFERENCES))
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return () if method in ("", MATCHES) else ((self.name, MATCHES),)
@@ -169,6 +170,8 @@ def _metrics(
             "median processor time of a pair",
         ),
     ]
+    found = of_errors(np.median)
+    rows += [row(f"{name}: median error", "px", {OURS: found.get(name)}, ERROR) for name in VARIANTS]
     if all(pair.F is not None for pair in pairs):
         angle = of_answers(lambda a: float(np.median(_epipole_angles(a, pairs))))
         rows.insert(1, row("epipole angle", "deg", angle, "median angle between found and true epipole"))

@@ -153,6 +153,17 @@ def _metrics(
             np.median(np.concatenate([_space_errors(problems[n], X) for n, X in some.items()]))
         )
     return [
+        *(
+            Metric(
+                scene,
+                f"{name}: error in space, {where}",
+                "%",
+                {OURS: apart.get(name)},
+                OURS,
+                definition="of this variant",
+            )
+            for name in (LINEAR, MIDPOINT)
+        ),
         Metric(
             scene,
             f"residual above the optimum, {where}",

@@ -1,0 +1,152 @@
+"""The list of planted faults, and the bench that plants them; the faults themselves take their time."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from validation.harness.gates import Gate
+from validation.harness.results import Results, Row
+from validation.harness.stages import STAGES
+from validation.mutations import (
+    Bench,
+    Checked,
+    Fate,
+    Mutation,
+    importers,
+    main,
+    read_mutations,
+    table,
+    write_fates,
+)
+from validation.scenes.real import ROOT
+
+MUTATIONS = read_mutations()
+LEAST = 25
+FOLDERS = {
+    "dense",
+    "epipolar",
+    "features",
+    "geometry",
+    "io",
+    "matching",
+    "metric",
+    "optimize",
+    "projective",
+    "selfcalibration",
+    "views",
+}
+"""Parts of the library that have faults of their own."""
+
+
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.name)
+def test_a_fault_can_be_planted_and_is_python(mutation: Mutation) -> None:
+    compile(mutation.apply(ROOT), mutation.file, "exec")
+    assert set(mutation.stages) <= set(STAGES)
+
+
+def test_the_faults_are_many_and_everywhere() -> None:
+    assert len(MUTATIONS) >= LEAST
+    assert {m.file.split("/")[1] for m in MUTATIONS} >= FOLDERS
+    assert {stage for m in MUTATIONS for stage in m.stages} >= {
+        "features", "fundamental", "triangulation", "cameras", "bundle", "disparity", "between",
+    }  # fmt: skip
+
+
+WRONG = {
+    'file = "a.py"\nold = "a"\nnew = "b"\ncheck = ["bundle/street"]': "a mutation has",
+    'name = "n"\nfile = "a.py"\nold = "a"\nnew = "a"\ncheck = ["bundle/street"]': "old unlike new",
+    'name = "n"\nfile = "a.py"\nold = "a"\nnew = "b"\ncheck = ["a/moon"]': "no gate is called a/moon",
+}
+
+
+@pytest.mark.parametrize("entry", WRONG)
+def test_a_wrong_entry_is_refused_in_a_sentence(entry: str, tmp_path: Path) -> None:
+    listed = tmp_path / "list.toml"
+    listed.write_text(f"[[mutation]]\n{entry}\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=re.escape(WRONG[entry])):
+        read_mutations(listed)
+
+
+def test_a_name_twice_is_refused(tmp_path: Path) -> None:
+    entry = '[[mutation]]\nname = "n"\nfile = "a.py"\nold = "a"\nnew = "b"\ncheck = ["bundle/street"]\n'
+    (tmp_path / "list.toml").write_text(2 * entry, encoding="utf-8")
+    with pytest.raises(ValueError, match="two mutations are called"):
+        read_mutations(tmp_path / "list.toml")
+
+
+@pytest.mark.parametrize("text", ["", "a = 1\n", "x = 1\nx = 1\n"])
+def test_an_old_text_that_does_not_stand_there_once_is_refused(text: str, tmp_path: Path) -> None:
+    if text:
+        (tmp_path / "a.py").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=r"must stand in a\.py once, it stands there [02] times"):
+        Mutation("n", "a.py", "x = 1", "x = 2", ("bundle/street",)).apply(tmp_path)
+
+
+def small_tree(root: Path) -> Path:
+    """inner.py, which middle.py imports, which outer.py does; and one that has nothing to do with them."""
+    package = root / "package"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("", encoding="utf-8")
+    (package / "inner.py").write_text("VALUE = 1\n", encoding="utf-8")
+    (package / "middle.py").write_text("from package import inner\n", encoding="utf-8")
+    (package / "outer.py").write_text("import package.middle\n", encoding="utf-8")
+    (package / "alone.py").write_text("import math\n", encoding="utf-8")
+    return package
+
+
+def test_all_that_imports_a_fault_counts_as_newer_while_it_is_planted(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    package = small_tree(bench.tree)
+    bench.kernels.mkdir()
+    (bench.kernels / "compiled").write_text("of the sound tree", encoding="utf-8")
+    before = {path: (path.read_text(encoding="utf-8"), path.stat().st_mtime) for path in package.iterdir()}
+    fault = Mutation("n", "package/inner.py", "VALUE = 1", "VALUE = 2", ("bundle/street",))
+    with bench.planted(fault, 3) as kernels:
+        assert (package / "inner.py").read_text(encoding="utf-8") == "VALUE = 2\n"
+        newer = {path.name for path in package.iterdir() if path.stat().st_mtime > 3_999_999_999}
+        assert newer == {"inner.py", "middle.py", "outer.py"}
+        (kernels / "compiled").unlink()
+        (kernels / "other").write_text("of the fault", encoding="utf-8")
+    assert before == {p: (p.read_text(encoding="utf-8"), p.stat().st_mtime) for p in package.iterdir()}
+    assert [path.name for path in bench.kernels.iterdir()] == ["compiled"]
+
+
+def test_importers_of_the_library_go_through_packages() -> None:
+    found = {path.relative_to(ROOT).as_posix() for path in importers(ROOT, "thesisrecon/robust/kernels.py")}
+    assert {"thesisrecon/robust/kernels.py", "thesisrecon/epipolar/kernels.py"} <= found
+    assert "thesisrecon/errors.py" not in found
+
+
+def test_gates_are_broken_by_numbers_beyond_them_and_by_none() -> None:
+    gates = {
+        key: Gate(key, 1.0, True, "a reason") for key in ("a/s/far", "a/s/near", "a/s/untold", "b/s/other")
+    }
+    rows = [
+        Row(f"a/s/{name}", value, "px", "at most", None, {}, "", "reported")
+        for name, value in {"far": 2.0, "near": 0.5}.items()
+    ]
+    found = Checked(Results(rows, [], {}, {}, {}), ("a/s",), 1.0)
+    assert found.broken(gates) == ("a/s/far", "a/s/untold")
+
+
+def test_the_table_says_what_caught_a_fault_and_what_survived(tmp_path: Path) -> None:
+    fates = [
+        Fate("one", "a.py", ("a/s/far", "a/s/untold"), 1.2),
+        Fate("two", "b.py", (), 3.0),
+        Fate("three", "c.py", (), 0.0, "Mars is not on this machine"),
+    ]
+    assert [fate.survived for fate in fates] == [False, True, False]
+    lines = table(fates).splitlines()
+    assert lines[2] == "| one | a.py | a/s/far, a/s/untold | 1 |"
+    assert "**nothing**" in lines[3]
+    assert "not planted: Mars" in lines[4]
+    write_fates(tmp_path, fates)
+    assert (tmp_path / "mutations.md").read_text(encoding="utf-8") == "\n".join(lines) + "\n"
+
+
+def test_an_unknown_name_ends_the_command_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--only", "no such fault"]) == 2
+    assert 'no mutation is called "no such fault"' in capsys.readouterr().err
