@@ -58,6 +58,9 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--resume", type=Path, help="the folder of a like run, whose references are taken as they are"
         )
+        command.add_argument(
+            "--methods", nargs="+", metavar="METHOD", help="of ours, those that run again with --resume"
+        )
         command.add_argument("--time-limit", type=float, default=300.0, help="seconds for one task")
         if name == "report":
             command.add_argument("--against", type=Path, help="the folder of another report, to compare with")
@@ -78,6 +81,8 @@ def _wishes(told: argparse.Namespace) -> Wishes:
         raise ValueError(
             f"no scene is called {unknown[0]}; here are {', '.join(available_scenes(quick=False))}"
         )
+    if told.methods and told.resume is None:
+        raise ValueError("--methods says what runs again with --resume: name the folder of the run before")
     if told.threads < 1 or told.time_limit <= 0:
         raise ValueError("--threads and --time-limit are more than zero")
     return Wishes(
@@ -90,6 +95,7 @@ def _wishes(told: argparse.Namespace) -> Wishes:
         seed=told.seed,
         threads=min(told.threads, len(own_cores())),
         limit_s=told.time_limit,
+        methods=tuple(told.methods or ()),
         resume="" if told.resume is None else str(told.resume.resolve()),
     )
 

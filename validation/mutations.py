@@ -38,13 +38,14 @@ FAULTY_S = 4_000_000_000
 @dataclass(frozen=True)
 class Mutation:
     """A planted fault: in ``file``, ``old`` (which stands there once) becomes ``new``; the gates of one of
-    ``check`` ("stage/scene") must notice."""
+    ``check`` ("stage/scene") must notice, of ``methods`` of ours (all where it is empty)."""
 
     name: str
     file: str
     old: str
     new: str
     check: tuple[str, ...]
+    methods: tuple[str, ...] = ()
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -98,13 +99,14 @@ def read_mutations(path: Path = MUTATIONS_FILE) -> list[Mutation]:
     judged = {key.rsplit("/", 1)[0] for key in read_gates()}
     found: list[Mutation] = []
     for told in tomllib.loads(path.read_text(encoding="utf-8"))["mutation"]:
-        whole = set(told) == set(FIELDS) and all(told[name] for name in FIELDS if name != "new")
+        told.setdefault("methods", [])
+        whole = set(told) == {*FIELDS, "methods"} and all(told[name] for name in FIELDS if name != "new")
         if not whole or told["old"] == told["new"]:
             raise ValueError(f"a mutation has {', '.join(FIELDS)}, old unlike new; one has {told}")
         wrong = [where for where in told["check"] if where not in judged]
         if wrong:
             raise ValueError(f'"{told["name"]}": no gate is called {wrong[0]}/...')
-        found.append(Mutation(**{**told, "check": tuple(told["check"])}))
+        found.append(Mutation(**{**told, **{name: tuple(told[name]) for name in ("check", "methods")}}))
     twice = [m.name for n, m in enumerate(found) if m.name in {other.name for other in found[:n]}]
     if twice:
         raise ValueError(f'two mutations are called "{twice[0]}"')
@@ -174,6 +176,8 @@ class Bench:
         command += ["--time-limit", str(TASK_LIMIT_S), "--stages", *stages]
         command += ["--scenes", *_all(m.scenes for m in wanted)]
         command += ["--resume", str(self.out / resume)] if resume else []
+        methods = _all(m.methods for m in wanted)
+        command += ["--methods", *methods] if resume and methods else []
         environment = {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(kernels)}
         root = data_root()
         if root is not None:

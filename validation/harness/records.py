@@ -19,8 +19,8 @@ class Wishes:
     scenes that the user brought. ``quick`` : less of everything that can be less. ``gates_only`` : no
     reference that takes long and that no gate needs. ``seed`` : of all random steps. ``threads`` : cores that
     may be used at once. ``limit_s`` : seconds a single task may take. ``resume`` : the folder of another run,
-    whose references are taken as they are; empty for none. ``stages_from`` : the module whose ``STAGES`` hold
-    the stages.
+    whose references are taken as they are; empty for none. ``methods`` : those of ours that run again where
+    a run is resumed; empty for all. ``stages_from`` : the module whose ``STAGES`` hold the stages.
     """
 
     out: Path
@@ -33,6 +33,7 @@ class Wishes:
     threads: int = 2
     limit_s: float = 300.0
     resume: str = ""
+    methods: tuple[str, ...] = ()
     stages_from: str = "validation.harness.stages"
 
     def place(self, stage: str, scene: str, method: str = "") -> Path:
@@ -45,7 +46,7 @@ class Wishes:
 
     @classmethod
     def from_json(cls, told: Mapping[str, Any]) -> Wishes:
-        tuples = {name: tuple(told[name]) for name in ("scenes", "stages")}
+        tuples = {name: tuple(told[name]) for name in ("scenes", "stages", "methods")}
         return cls(**{**told, **tuples, "out": Path(told["out"])})
 
 

@@ -36,14 +36,20 @@ def take_over(wishes: Wishes, tasks: Sequence[Task], stages: Mapping[str, Stage]
         raise ValueError(f"{wishes.resume} is a run with another {', '.join(unlike)}: start from a like one")
     known = {}
     for task in tasks:
-        if task.method.startswith(OURS):
+        if _runs_again(task, wishes):
             _take_folders(other.place(task.stage, task.scene, task.method) / "run", wishes, task)
-        elif task.method and task.stage not in OVER_OURS:
+        elif task.method:
             outcome = _outcome(other, task)
             if outcome is not None and outcome.ok:
                 known[task] = _taken(other, wishes, task, outcome)
         _take_needed(other, wishes, task, stages)
     return known
+
+
+def _runs_again(task: Task, wishes: Wishes) -> bool:
+    if task.method.startswith(OURS):
+        return not wishes.methods or task.method in wishes.methods
+    return bool(task.method) and task.stage in OVER_OURS
 
 
 def _wishes_of(folder: Path) -> Wishes:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 import thesisrecon
-from thesisrecon.config import config_from_tables
+from thesisrecon.config import PipelineConfig, config_from_tables, preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
 from thesisrecon.io.run_directory import MANIFEST_FILE, RunDirectory, read_json
@@ -31,10 +31,10 @@ COLMAP, COLMAP_PP, COLMAP_GLOBAL = "COLMAP", "COLMAP, pp refined", "COLMAP, glob
 MATCHES = "COLMAP, matches"
 FIXTURE = "courtyard"
 """The scene that is always there: the gates of the thesis' preset are set on it."""
-SETTINGS: dict[str, dict[str, Any]] = {
-    OURS: {},
-    THESIS: {"preset": "thesis"},
-    PER_IMAGE: {"intrinsics": {"cameras": "per-image"}},
+SETTINGS: dict[str, PipelineConfig] = {
+    OURS: preset("default"),
+    THESIS: preset("thesis"),
+    PER_IMAGE: config_from_tables({"intrinsics": {"cameras": "per-image"}}),
 }
 MAPPERS = {COLMAP: "default", COLMAP_PP: "principal-point", COLMAP_GLOBAL: "global"}
 FOCAL = "median |f / f_true - 1|, f = sqrt(fx fy), over the registered cameras"
@@ -82,7 +82,7 @@ class CamerasStage:
         thesisrecon.reconstruct(
             list(scene.image_paths),
             place / "run",
-            config=config_from_tables(SETTINGS[task.method]),
+            config=SETTINGS[task.method],
             seed=wishes.seed,
             threads=1,
             until="metric",
