@@ -29,7 +29,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     for words in ask_canaries(wishes).values():
         print(f"validation: {words}", file=sys.stderr)
-    judged = run_tasks(wishes, STAGES, _tell)
+    try:
+        judged = run_tasks(wishes, STAGES, _tell)
+    except ValueError as error:
+        print(f"validation: {error}", file=sys.stderr)
+        return 2
     results = collect(wishes, judged, gates)
     write_results(wishes.out, results)
     changes = None if other is None else compare(other, results)

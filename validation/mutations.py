@@ -75,13 +75,15 @@ class Mutation:
 
 @dataclass(frozen=True)
 class Fate:
-    """What became of a fault: the gates that ``caught`` it, and the seconds (wall) of the check; ``skipped``
-    says why it was not planted."""
+    """What became of a fault: the gates that ``caught`` it, and the seconds (wall) of the check; ``ended``
+    says why methods of ours did not end well, which leaves their numbers untold; ``skipped`` why it was not
+    planted."""
 
     name: str
     file: str
     caught: tuple[str, ...]
     seconds: float
+    ended: tuple[str, ...] = ()
     skipped: str = ""
 
     @property
@@ -149,7 +151,7 @@ class Bench:
         compiled of the code without it; what is compiled with it goes with it.
         """
         path = self.tree / mutation.file
-        sound, kernels = path.read_text(encoding="utf-8"), self.out / "kernels-with-fault"
+        sound, kernels = path.read_text(encoding="utf-8"), self.out / f"kernels-{number:02d}"
         shutil.rmtree(kernels, ignore_errors=True)
         shutil.copytree(self.kernels, kernels, copy_function=os.link)
         newer = {file: file.stat().st_mtime for file in importers(self.tree, mutation.file)}
@@ -162,6 +164,7 @@ class Bench:
             path.write_text(sound, encoding="utf-8")
             for file, before in newer.items():
                 os.utime(file, (before, before))
+            shutil.rmtree(kernels)
 
     def check(self, name: str, wanted: Sequence[Mutation], kernels: Path, resume: str = "") -> Checked:
         """``python -m validation check`` in the tree, on what these faults ask for.
@@ -197,6 +200,12 @@ class Checked:
     results: Results
     asked: tuple[str, ...]
     seconds: float
+
+    @property
+    def ended(self) -> tuple[str, ...]:
+        """Why methods of ours did not end well."""
+        found = self.results.failures.items()
+        return tuple(dict.fromkeys(words for key, words in found if key.split("/")[2].startswith("ours")))
 
     def broken(self, gates: Mapping[str, Gate]) -> tuple[str, ...]:
         """The gates whose number is on the wrong side, or was told by nobody."""
@@ -256,11 +265,12 @@ def plant_all(bench: Bench, mutations: Sequence[Mutation], *, sound: bool = Fals
             raise ValueError(f"the tree breaks gates without any fault: {', '.join(broken)}")
     for number, mutation in enumerate(mutations):
         if mutation not in possible:
-            yield Fate(mutation.name, mutation.file, (), 0.0, f"{mutation.scenes[0]} is not on this machine")
+            absent = f"{mutation.scenes[0]} is not on this machine"
+            yield Fate(mutation.name, mutation.file, (), 0.0, skipped=absent)
             continue
         with bench.planted(mutation, number) as kernels:
             found = bench.check(slug(mutation.name), [mutation], kernels, resume="sound")
-        yield Fate(mutation.name, mutation.file, found.broken(gates), found.seconds)
+        yield Fate(mutation.name, mutation.file, found.broken(gates), found.seconds, found.ended)
 
 
 def table(fates: Sequence[Fate]) -> str:
@@ -268,6 +278,7 @@ def table(fates: Sequence[Fate]) -> str:
     lines = ["| fault | file | caught by | s |", "| --- | --- | --- | --- |"]
     for fate in fates:
         caught = ", ".join(fate.caught) or (f"not planted: {fate.skipped}" if fate.skipped else "**nothing**")
+        caught += f" (ended: {'; '.join(fate.ended)})" if fate.ended else ""
         lines.append(f"| {fate.name} | {fate.file} | {caught} | {fate.seconds:.0f} |")
     return "\n".join(lines)
 

@@ -136,13 +136,15 @@ def test_the_table_says_what_caught_a_fault_and_what_survived(tmp_path: Path) ->
     fates = [
         Fate("one", "a.py", ("a/s/far", "a/s/untold"), 1.2),
         Fate("two", "b.py", (), 3.0),
-        Fate("three", "c.py", (), 0.0, "Mars is not on this machine"),
+        Fate("three", "c.py", (), 0.0, skipped="Mars is not on this machine"),
+        Fate("four", "d.py", ("a/s/untold",), 1.0, ("no photograph fits",)),
     ]
-    assert [fate.survived for fate in fates] == [False, True, False]
+    assert [fate.survived for fate in fates] == [False, True, False, False]
     lines = table(fates).splitlines()
     assert lines[2] == "| one | a.py | a/s/far, a/s/untold | 1 |"
     assert "**nothing**" in lines[3]
     assert "not planted: Mars" in lines[4]
+    assert "a/s/untold (ended: no photograph fits)" in lines[5]
     write_fates(tmp_path, fates)
     assert (tmp_path / "mutations.md").read_text(encoding="utf-8") == "\n".join(lines) + "\n"
 

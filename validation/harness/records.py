@@ -46,7 +46,7 @@ class Wishes:
 
     @classmethod
     def from_json(cls, told: Mapping[str, Any]) -> Wishes:
-        tuples = {name: tuple(told[name]) for name in ("scenes", "stages", "methods")}
+        tuples = {name: tuple(told.get(name, ())) for name in ("scenes", "stages", "methods")}
         return cls(**{**told, **tuples, "out": Path(told["out"])})
 
 

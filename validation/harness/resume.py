@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from thesisrecon.io.run_directory import RUN_FILE
 from thesisrecon.run import FOLDERS
 from validation.harness.records import Outcome, Stage, Task, Wishes
 from validation.harness.worker import OUTCOMES
@@ -75,10 +76,14 @@ def _taken(other: Wishes, wishes: Wishes, task: Task, outcome: Outcome) -> Outco
 
 
 def _take_folders(run: Path, wishes: Wishes, task: Task) -> None:
+    place = wishes.place(task.stage, task.scene, task.method) / "run"
+    if (run / RUN_FILE).is_file():
+        # Without it the library takes the folder for none of its own.
+        place.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(run / RUN_FILE, place / RUN_FILE)
     for name in sorted(set(FOLDERS.values())):
         if (run / name).is_dir():
-            place = wishes.place(task.stage, task.scene, task.method) / "run" / name
-            shutil.copytree(run / name, place, dirs_exist_ok=True)
+            shutil.copytree(run / name, place / name, dirs_exist_ok=True)
 
 
 def _take_needed(other: Wishes, wishes: Wishes, task: Task, stages: Mapping[str, Stage]) -> None:

@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar import ThesisRansac, estimate_eight_point, estimate_fundamental
+from thesisrecon.epipolar import (
+    ThesisRansac,
+    estimate_eight_point,
+    estimate_fundamental,
+    estimate_seven_point,
+)
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import FundamentalFit
 from validation.references.libraries import cv2, poselib, pycolmap
@@ -22,7 +27,8 @@ F64 = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Answer = tuple[Any, Any, FundamentalFit | None]
 
-OURS, THESIS, LINEAR = "ours", "ours (thesis)", "ours (eight points)"
+OURS, THESIS = "ours", "ours (thesis)"
+LINEAR, MINIMAL = "ours (eight points)", "ours (seven points)"
 CONFIDENCE, ITERATIONS = 0.9999, 20000
 """What OpenCV is given beyond its defaults (0.99 and 1000)."""
 MIN_ITERATIONS = 10000
@@ -64,6 +70,16 @@ def _eight_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     return (None, None, None) if fit is None else (estimate_eight_point(xy1[right], xy2[right]), right, None)
 
 
+def _seven_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+    """The first of up to three matrices through seven of the matches that the front door takes for right."""
+    _, right, fit = _ours(xy1, xy2, threshold_px, seed)
+    if fit is None:
+        return None, None, None
+    some = np.random.default_rng(seed).choice(np.flatnonzero(right), 7, replace=False)
+    found = estimate_seven_point(xy1[some], xy2[some])
+    return (found[0], right, None) if len(found) else (None, None, None)
+
+
 def _opencv(method: str, confidence: float = 0.99, iterations: int = 1000) -> Solver:
     def solve(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
         kind = getattr(cv2, method)
@@ -102,6 +118,7 @@ SOLVERS: dict[str, Solver] = {
     OURS: _ours,
     THESIS: _thesis,
     LINEAR: _eight_points,
+    MINIMAL: _seven_points,
     "USAC_ACCURATE": _opencv("USAC_ACCURATE", *_LONG),
     "USAC_ACCURATE default": _opencv("USAC_ACCURATE"),
     "USAC_MAGSAC": _opencv("USAC_MAGSAC", *_LONG),

@@ -21,7 +21,7 @@ from validation.references.libraries import NoReference
 from validation.scenes.real_pairs import RealPair, camera_pairs, kusvod2_pairs
 
 OURS, MATCHES = "ours", "SIFT matches"
-VARIANTS = ("ours (thesis)", "ours (eight points)")
+VARIANTS, MINIMAL = ("ours (thesis)", "ours (eight points)"), "ours (seven points)"
 REFERENCES = (
     "FM_RANSAC",
     "FM_LMEDS",
@@ -63,8 +63,8 @@ class FundamentalStage:
 
     def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         if wishes.gates_only:
-            return (MATCHES, OURS, *VARIANTS)
-        return (MATCHES, OURS, *VARIANTS, *(QUICK if wishes.quick else REFERENCES))
+            return (MATCHES, OURS, *VARIANTS, MINIMAL)
+        return (MATCHES, OURS, *VARIANTS, MINIMAL, *(QUICK if wishes.quick else REFERENCES))
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return () if method in ("", MATCHES) else ((self.name, MATCHES),)
@@ -172,10 +172,18 @@ def _metrics(
     ]
     found = of_errors(np.median)
     rows += [row(f"{name}: median error", "px", {OURS: found.get(name)}, ERROR) for name in VARIANTS]
+    singular = of_answers(_third_singular_value).get(MINIMAL)
+    words = "largest third singular value of F over the second: F has rank 2"
+    rows.append(row(f"{MINIMAL}: rank", "", {OURS: singular}, words))
     if all(pair.F is not None for pair in pairs):
         angle = of_answers(lambda a: float(np.median(_epipole_angles(a, pairs))))
         rows.insert(1, row("epipole angle", "deg", angle, "median angle between found and true epipole"))
     return rows
+
+
+def _third_singular_value(answers: Answers) -> float:
+    s = np.linalg.svd(answers.F[np.isfinite(answers.F).all(axis=(2, 3))], compute_uv=False)
+    return float((s[:, 2] / s[:, 1]).max())
 
 
 def _epipole_angles(answers: Answers, pairs: list[RealPair]) -> F64:
