@@ -45,13 +45,15 @@ class RunOptions(TypedDict, total=False):
 
     ``until`` : the last stage. None = "model", and a run that finds cameras and points but no surface ends
     well, with a warning. ``threads`` : workers (all processors). ``executor`` : "local" threads or
-    "processes". ``overwrite`` : take over a folder that holds another run (False).
+    "processes". ``overwrite`` : take over a folder that holds another run (False). ``shared`` : a folder
+    where results of stages are kept for other runs, and taken from where another run has found the same.
     """
 
     until: Until | None
     threads: int | None
     executor: str
     overwrite: bool
+    shared: str | Path | None
 
 
 def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
@@ -205,6 +207,8 @@ def start_run(
     workers = Workers(threads, options.get("executor", "local"))
     if not str(out).strip():
         raise UsageError("the output folder has no name; write . for the current one")
-    directory, hear = RunDirectory(Path(out)), progress or (lambda *_: None)
+    shared = options.get("shared")
+    directory = RunDirectory(Path(out), None if shared is None else Path(shared))
+    hear = progress or (lambda *_: None)
     run = Run(config, seed, workers, directory, hear, directory.path.resolve().name)
     return until, run, bool(options.get("overwrite", False))

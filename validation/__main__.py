@@ -1,4 +1,5 @@
-"""``python -m validation report|check``: every stage of ours beside the references, on the same inputs."""
+"""``python -m validation report|check``: every stage of ours beside the references, on the same inputs;
+``ablate``: variants and parameters of ours beside each other."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from validation.ablation import command as ablation
 from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
@@ -20,6 +22,8 @@ def main(arguments: list[str] | None = None) -> int:
     """0: done, all gates hold; 1: a gate is broken (``check``); 2: a wrong wish."""
     parser = _parser()
     told = parser.parse_args(arguments)
+    if told.command == "ablate":
+        return ablation.run_command(told)
     try:
         wishes = _wishes(told)
         other = read_results(told.against) if getattr(told, "against", None) else None
@@ -68,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--time-limit", type=float, default=300.0, help="seconds for one task")
         if name == "report":
             command.add_argument("--against", type=Path, help="the folder of another report, to compare with")
+    ablation.add_parser(commands)
     return parser
 
 

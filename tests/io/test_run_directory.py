@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -217,3 +219,34 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
         {"a": float("nan"), "b": [np.float64(1.5), np.int64(2)], "c": np.array([np.inf, 1])},
     )
     assert read_json(tmp_path / "a.json") == {"a": None, "b": [1.5, 2], "c": [None, 1.0]}
+
+
+def test_what_one_run_kept_another_takes_by_its_key(tmp_path: Path) -> None:
+    one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01-features") for name in "ab")
+    one.save("00000", "key", some_features(2.0))
+    assert two.load("00007", "other") is None
+    found = two.load("00007", "key")
+    assert bytes_from_record(found, "") == bytes_from_record(some_features(2.0), "")
+    # Taken once, it is there whatever becomes of the others.
+    (tmp_path / "shared" / "01-features" / "key.npz").unlink()
+    one.path.joinpath("00000.npz").unlink()
+    assert two.load("00007", "key") is not None
+    assert not list(tmp_path.rglob("*.partial"))
+    # What is replaced in one run stays as it was in the others.
+    two.save("00007", "new", some_features(3.0))
+    one.save("00000", "key", some_features(2.0))
+    assert two.load("00007", "new") is not None
+
+
+def test_code_of_the_caller_counts_by_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = []
+    for name, text in (("callers_one", "x = 1"), ("callers_two", "x = 1"), ("callers_one", "x = 2")):
+        (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        importlib.import_module(name)
+        code_key.cache_clear()
+        keys.append(code_key(name))
+    assert len(set(keys)) == 3
+    assert code_key("typed_into_a_prompt") == code_key("typed_into_a_prompt")

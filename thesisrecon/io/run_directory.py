@@ -12,6 +12,8 @@ import hashlib
 import io
 import json
 import os
+import shutil
+import sys
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -60,12 +62,18 @@ def code_key(module: str) -> str:
     """
     package = Path(__file__).parent.parent
     parts = module.split(".")
-    own = [package / parts[1]] if parts[0] == package.name and len(parts) > 1 else []
+    own = [package / parts[1]] if parts[0] == package.name and len(parts) > 1 else _file_of(module)
     content = hashlib.sha256(f"{module} {FORMAT}".encode())
     for root in [*own, *(package / part for part in _CODE_OF_ALL_STAGES)]:
         for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
             content.update(path.read_bytes())
     return content.hexdigest()[:32]
+
+
+def _file_of(module: str) -> list[Path]:
+    """The file of a loaded module of the caller; none where it was typed into a prompt."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return [Path(file)] if file is not None and Path(file).is_file() else []
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -178,17 +186,30 @@ def read_record(path: Path, key: str) -> Any:
 
 @dataclass(frozen=True)
 class StageFolder:
-    """The folder of one stage: a file per item, and a manifest that people can read."""
+    """The folder of one stage: a file per item, and a manifest that people can read.
+
+    ``shared`` is a folder of results of several runs, each named by its key; None where a run stands alone.
+    """
 
     path: Path
+    shared: Path | None = None
 
     def load(self, item: str, key: str) -> Any:
-        """The kept record of this item, None where it must be computed."""
-        return read_record(self.path / f"{item}.npz", key)
+        """The kept record of this item, from this run or another; None where it must be computed."""
+        own = self.path / f"{item}.npz"
+        record = read_record(own, key)
+        if record is None and self.shared is not None:
+            record = read_record(self.shared / f"{key}.npz", key)
+            if record is not None:
+                _link(self.shared / f"{key}.npz", own)
+        return record
 
     def save(self, item: str, key: str, record: Any) -> None:
         """Keep the record of this item."""
-        write_atomically(self.path / f"{item}.npz", bytes_from_record(record, key))
+        own = self.path / f"{item}.npz"
+        write_atomically(own, bytes_from_record(record, key))
+        if self.shared is not None:
+            _link(own, self.shared / f"{key}.npz")
 
     def finish(self, report: StageReport, settings: Mapping[str, Any], keys: Mapping[str, str]) -> None:
         """Write the manifest of a stage that is done; files of items that are no longer part of it are
@@ -212,15 +233,37 @@ class StageFolder:
             return None
 
 
+def _link(source: Path, target: Path) -> None:
+    """The file under a second name, whole or not at all: files are only ever replaced, never changed.
+
+    Raises :class:`UsageError` where the place cannot be written.
+    """
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(source, partial)
+        except OSError:
+            shutil.copyfile(source, partial)
+        partial.replace(target)
+    except OSError as error:
+        raise UsageError(f"{target} cannot be written: {error.strerror or error}") from None
+    finally:
+        # Renaming one name of a file to another name of it does nothing at all.
+        partial.unlink(missing_ok=True)
+
+
 @dataclass(frozen=True)
 class RunDirectory:
-    """The output folder of one run."""
+    """The output folder of one run, and the folder of results it ``shared`` with others (None: it shares
+    none)."""
 
     path: Path
+    shared: Path | None = None
 
     def stage(self, folder: str) -> StageFolder:
         """The folder of one stage, as ``01-features``."""
-        return StageFolder(self.path / folder)
+        return StageFolder(self.path / folder, None if self.shared is None else self.shared / folder)
 
     @contextmanager
     def claimed(self, wishes: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:

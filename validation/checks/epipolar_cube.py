@@ -123,7 +123,12 @@ def _measure(method: Method, pair: CubePair, sigma: float, rng: np.random.Genera
     """Distance and residual, px, and the larger epipole error, degrees; NaN without F."""
     xy1, xy2 = (xy + rng.normal(0.0, 1.0, xy.shape) * sigma for xy in (pair.xy1, pair.xy2))
     threshold = max(THRESHOLD_PX, TOLD_SIGMAS * sigma)
-    F = method.fundamental(xy1, xy2, threshold_px=threshold, seed=0)
+    return measure_pair(method.fundamental(xy1, xy2, threshold_px=threshold, seed=0), pair, xy1, xy2)
+
+
+def measure_pair(F: F64 | None, pair: CubePair, xy1: F64, xy2: F64) -> tuple[float, ...]:
+    """RMS distances, px, of the exact points and of those F was estimated from to their lines, and the larger
+    epipole error, degrees; NaN without F."""
     if F is None:
         return float("nan"), float("nan"), float("nan")
     distances = (

@@ -130,23 +130,28 @@ def run_cell(cell: Cell, methods: Sequence[str], seeds: Iterable[int]) -> list[T
     """All methods on all draws of a cell; every method sees the same draws."""
     trials = []
     for seed in seeds:
-        place = (
-            seed,
-            SCENES.index(cell.scene),
-            MODES.index(cell.mode),
-            cell.views,
-            round(100 * cell.sigma_px),
-        )
-        rng = np.random.default_rng(place)
-        rig = make_rig(cell, rng)
-        tracks = noisy_tracks(rig, cell.sigma_px, rng)
-        projective, assumed = projective_from_truth(rig, tracks, rng), assumptions(rig, cell.mode)
+        rig, projective = draw_cell(cell, seed)
+        assumed = assumptions(rig, cell.mode)
         for method in methods:
             if method == BOUND:
                 trials.append(_bound(cell, seed, rig))
             else:
                 trials.append(_run(cell, seed, method, rig, projective, assumed))
     return trials
+
+
+def draw_cell(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
+    """One draw of a cell: the true cameras, and the projective reconstruction of noisy observations."""
+    place = (
+        seed,
+        SCENES.index(cell.scene),
+        MODES.index(cell.mode),
+        cell.views,
+        round(100 * cell.sigma_px),
+    )
+    rng = np.random.default_rng(place)
+    rig = make_rig(cell, rng)
+    return rig, projective_from_truth(rig, noisy_tracks(rig, cell.sigma_px, rng), rng)
 
 
 def _run(

@@ -115,30 +115,53 @@ def squared_distances(P: F64, X: F64, xy: F64) -> F64:
     return np.asarray(np.minimum(np.nan_to_num(squared, nan=np.inf), CAP_PX**2).sum(axis=0))
 
 
+@dataclass(frozen=True)
+class DrawnRig:
+    """One draw: the transform ``G`` (4, 4) of space, the cameras ``P`` (V, 3, 4) in its frame, noisy pixels
+    ``xy`` (V, N, 2), the true points ``X`` (N, 3) before the transform and the first camera's ``centre``."""
+
+    G: F64
+    P: F64
+    xy: F64
+    X: F64
+    centre: F64
+
+
+def draw_rig(scene: str, sigma_px: float, frame: Group, rng: np.random.Generator, points: int) -> DrawnRig:
+    """A rig of the scene, its noise and its frame; the same pixels in every frame."""
+    make, views = SCENES[scene]
+    rig = make(rng, views, points)
+    exact = rig.pixels()
+    seen = np.isfinite(exact).all(axis=(0, 2))
+    xy = exact[:, seen] + sigma_px * rng.normal(size=(views, int(seen.sum()), 2))
+    G = frame_of(frame, rng)
+    return DrawnRig(G, cameras_of(rig) @ np.linalg.inv(G), xy, rig.X[seen], rig.C[0])
+
+
+def compare_on_rig(drawn: DrawnRig, methods: Mapping[str, Method]) -> dict[str, Errors]:
+    """Errors of the methods on one draw."""
+    return {name: _errors(*_squared_and_apart(drawn, method)) for name, method in methods.items()}
+
+
+def _squared_and_apart(drawn: DrawnRig, method: Method) -> tuple[F64, F64]:
+    """Squared distances in the image, means over the views, and relative distances in space; (N,) each."""
+    X = method(drawn.P, drawn.xy)
+    back = dehomogenize(X @ np.linalg.inv(drawn.G).T)
+    off = np.linalg.norm(back - drawn.X, axis=1) / np.linalg.norm(drawn.X - drawn.centre, axis=1)
+    return squared_distances(drawn.P, X, drawn.xy) / len(drawn.P), np.nan_to_num(off, nan=np.inf)
+
+
 def compare_methods(
     scene: str, sigma_px: float, frame: Group, *, trials: int, points: int
 ) -> dict[str, Errors]:
     """Errors of every method over ``trials`` rigs of ``points`` points; the same pixels in every frame."""
-    make, views = SCENES[scene]
-    methods = TWO_VIEWS if views == 2 else ANY_VIEWS
-    squared: dict[str, list[F64]] = {name: [] for name in methods}
-    apart: dict[str, list[F64]] = {name: [] for name in methods}
-    for seed in range(trials):
-        rng = np.random.default_rng(seed)
-        rig = make(rng, views, points)
-        exact = rig.pixels()
-        seen = np.isfinite(exact).all(axis=(0, 2))
-        xy = exact[:, seen] + sigma_px * rng.normal(size=(views, int(seen.sum()), 2))
-        G, P = frame_of(frame, rng), cameras_of(rig)
-        moved = P @ np.linalg.inv(G)
-        distance = np.linalg.norm(rig.X[seen] - rig.C[0], axis=1)
-        for name, method in methods.items():
-            X = method(moved, xy)
-            squared[name].append(squared_distances(moved, X, xy) / views)
-            back = dehomogenize(X @ np.linalg.inv(G).T)
-            off = np.linalg.norm(back - rig.X[seen], axis=1) / distance
-            apart[name].append(np.nan_to_num(off, nan=np.inf))
-    return {name: _errors(np.concatenate(squared[name]), np.concatenate(apart[name])) for name in methods}
+    methods = TWO_VIEWS if SCENES[scene][1] == 2 else ANY_VIEWS
+    rigs = [draw_rig(scene, sigma_px, frame, np.random.default_rng(n), points) for n in range(trials)]
+    found = {name: [_squared_and_apart(rig, method) for rig in rigs] for name, method in methods.items()}
+    return {
+        name: _errors(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        for name, parts in found.items()
+    }
 
 
 def _errors(squared: F64, apart: F64) -> Errors:

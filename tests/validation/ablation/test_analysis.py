@@ -1,0 +1,142 @@
+"""What is said of rows: planted effects are found, others are not, failures are counted."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.validation.ablation.toy import Darts
+from validation.ablation import Measure, Study, analyse
+from validation.ablation.analysis import Comparison, as_told
+from validation.ablation.plan import Plan, PlannedRow, plan_study
+from validation.ablation.run import Row, Rows
+from validation.ablation.tables import markdown, write_tables
+
+
+def rows_of(study: Study | Plan, value: Any) -> Rows:
+    """Rows without running: ``value(planned row)`` is a number, or the reason why there is none."""
+    plan, rows = study if isinstance(study, Plan) else plan_study(study), []
+    for p in plan.rows:
+        found = value(p)
+        failed = isinstance(found, str)
+        metrics = {} if failed else {"miss": found, "score": -found}
+        reason = found if failed else ""
+        cost = 2.0 + len(p.variant)
+        rows.append(Row(p.key, p.variant, p.condition, p.scene, p.seed, metrics, reason, 1.0, cost))
+    return Rows(plan, tuple(rows))
+
+
+def darts(**more: Any) -> Study:
+    told: dict[str, Any] = {"scenes": ["a"], "seeds": 20, "task": Darts()}
+    return Study({"task.aim": [1.0, 2.0]}, **{**told, **more})
+
+
+def compared(rows: Rows, variant: str, measure: str = "miss") -> Comparison:
+    found = analyse(rows).comparisons
+    return next(c for c in found if (c.variant, c.measure.name) == (variant, measure))
+
+
+def test_a_planted_effect_of_one_deviation_is_found_and_nothing_else() -> None:
+    found, false, trials = 0, 0, 100
+    plan = plan_study(darts(metrics=["miss"]))
+    for trial in range(trials):
+        rng = np.random.default_rng(trial)
+        level = 10.0 * rng.normal(size=20)
+        noise = {(p.variant, p.seed): rng.normal() for p in plan.rows}
+
+        def value(p: PlannedRow, level: Any = level, noise: Any = noise) -> float:
+            # The deviation of a difference of two draws is sqrt 2.
+            planted = np.sqrt(2.0) * (p.variant == "aim = 2")
+            return float(level[p.seed] + noise[p.variant, p.seed] + planted)
+
+        rows = rows_of(plan, value)
+        found += compared(rows, "aim = 2").verdict == "worse"
+        false += compared(rows, "aim = 1").verdict != "no difference shown"
+    assert found >= 0.95 * trials
+    assert false <= 0.05 * trials + 2
+
+
+def test_among_many_variants_none_of_which_does_anything_none_is_reported() -> None:
+    reported, trials = 0, 60
+    axes = {"task.aim": [float(n) for n in range(1, 11)]}
+    plan = plan_study(replace(darts(metrics=["miss"], seeds=10), axes=axes))
+    for trial in range(trials):
+        rng = np.random.default_rng(trial)
+        found = analyse(rows_of(plan, lambda _, rng=rng: float(rng.normal()))).comparisons
+        reported += any(c.verdict != "no difference shown" for c in found)
+    assert reported <= 0.05 * trials + 2
+
+
+def test_better_is_on_the_side_that_the_measure_says() -> None:
+    rows = rows_of(
+        darts(), lambda p: p.seed % 5 + 3.0 * (p.variant == "aim = 1") - 0.01 * p.seed * len(p.variant)
+    )
+    assert compared(rows, "aim = 1").verdict == "worse"
+    assert compared(rows, "aim = 1", "score").verdict == "worse"
+    assert compared(rows, "aim = 1").interval.mean == -compared(rows, "aim = 1", "score").interval.mean
+
+
+def test_quotients_where_all_values_allow_them() -> None:
+    ratio = darts(metrics=[Measure("miss", ratio=True)])
+    rows = rows_of(ratio, lambda p: (1.0 + p.seed) * (2.0 if p.variant == "aim = 1" else 1.0))
+    found = compared(rows, "aim = 1")
+    assert found.ratio
+    assert as_told(found) == pytest.approx((2.0, 2.0, 2.0))
+    with_zero = rows_of(ratio, lambda p: float(p.seed) + (p.variant == "aim = 1"))
+    assert not compared(with_zero, "aim = 1").ratio
+    assert compared(with_zero, "aim = 1").interval.mean == 1.0
+
+
+def test_only_pairs_count_and_failures_are_told() -> None:
+    rows = rows_of(darts(), lambda p: "no luck" if p.variant == "aim = 1" and p.seed < 15 else float(p.seed))
+    analysis = analyse(rows)
+    cell = next(c for c in analysis.cells if (c.variant, c.measure.name) == ("aim = 1", "miss"))
+    assert (cell.rows, cell.failed) == (5, 15)
+    assert not cell.on_front
+    assert compared(rows, "aim = 1").interval.pairs == 5
+    # On easier rows its mean would be another one; its rank counts what it failed at.
+    ranks = {c.variant: c.rank for c in analysis.cells if c.measure.name == "miss"}
+    assert ranks["aim = 1"] == pytest.approx((15 * 3.0 + 5 * 2.0) / 20)
+    assert "17 (15 of 20 failed)" in markdown(analysis, analysis.plan.measures[0])
+
+
+def test_each_step_of_a_ladder_is_also_compared_with_the_one_before() -> None:
+    ladder = darts(mode="ladder", start="bottom")
+    height = {"bottom": 5.0, "aim = 1": 3.0, "aim = 2": 2.5}
+    analysis = analyse(rows_of(ladder, lambda p: height[p.variant] + 0.1 * np.sin(p.seed * len(p.variant))))
+    steps = {c.variant: c for c in analysis.steps if c.measure.name == "miss"}
+    assert (steps["aim = 2"].against, steps["aim = 1"].against) == ("aim = 1", "bottom")
+    assert steps["aim = 2"].interval.mean == pytest.approx(-0.5, abs=0.1)
+    against = {c.variant: c for c in analysis.comparisons if c.measure.name == "miss"}
+    assert against["aim = 2"].interval.mean == pytest.approx(-2.5, abs=0.1)
+
+
+def test_a_study_that_was_stopped_is_told_to_be_so() -> None:
+    rows = rows_of(darts(), lambda p: float(p.seed))
+    some = Rows(rows.plan, rows.rows[:-5])
+    assert analyse(some).warnings == ("5 of 60 rows have not been computed",)
+    assert str(analyse(Rows(rows.plan, ()))).startswith("warning: 60 of 60 rows")
+
+
+def test_tables_hold_every_row_and_comparison(tmp_path: Path) -> None:
+    rows = rows_of(
+        darts(conditions={"task.spread": [1.0, 2.0]}), lambda p: "gone" if p.seed == 3 else float(p.seed)
+    )
+    written = {path.name: path for path in write_tables(analyse(rows), tmp_path)}
+    with written["rows.csv"].open(encoding="utf-8") as file:
+        told = list(csv.DictReader(file))
+    assert len(told) == 3 * 2 * 20
+    assert told[0]["axis:task.spread"] == "spread = 1"
+    assert {r["failure"] for r in told} == {"", "gone"}
+    assert {r["miss"] for r in told if r["failure"]} == {""}
+    with written["comparisons.csv"].open(encoding="utf-8") as file:
+        assert len(list(csv.DictReader(file))) == 2 * 2 * 2
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra tables is not installed")
+    table = parquet.read_table(written["rows.parquet"])
+    assert table.num_rows == len(told)
+    assert table.column("miss").null_count == 3 * 2

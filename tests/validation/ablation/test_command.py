@@ -1,0 +1,124 @@
+"""The command, and the page it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.report.opened import Witness
+from tests.validation.ablation.toy import Darts
+from validation.__main__ import main
+from validation.ablation import Measure, Study, ablate, analyse, write_analysis
+from validation.ablation.progress import duration, words_of
+from validation.ablation.run import State
+
+EVIL = "<img src=x onerror=alert(1)>"
+STUDY = """
+title = "Throws"
+task = {{ kind = "{toy}:Darts" }}
+scenes = ["a", "{scene}"]
+seeds = 3
+
+[axes]
+"task.aim" = [1.0, 4.0]
+"""
+
+
+def write_study(folder: Path, scene: str = "bb") -> Path:
+    path = folder / "study.toml"
+    toy = Path(__file__).with_name("toy.py")
+    path.write_text(STUDY.format(toy=toy, scene=scene), encoding="utf-8")
+    return path
+
+
+def test_a_study_of_a_file_leaves_a_page_and_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wish = ["ablate", str(write_study(tmp_path)), "-o", str(tmp_path / "out"), "--executor", "local"]
+    assert main([*wish, "--plan"]) == 0
+    assert "3 variants: unchanged; aim = 1; aim = 4" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+    assert main([*wish, "--threads", "1"]) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("18 rows; the page is ")
+    assert told.err == "", "nobody looks at a terminal"
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "Throws" in page
+    assert "aim = 4" in page
+    assert (tmp_path / "out" / "rows.csv").is_file()
+    assert main([*wish, "--read"]) == 0
+
+
+def test_rows_that_all_fail_and_wrong_wishes_end_otherwise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["-o", str(tmp_path / "out"), "--executor", "local", "--threads", "1"]
+    some = write_study(tmp_path, "refuses")
+    assert main(["ablate", str(some), *out]) == 0
+    assert "18 rows, 9 of them failed" in capsys.readouterr().out
+    some.write_text(some.read_text().replace('["a", ', "["), encoding="utf-8")
+    assert main(["ablate", str(some), "-o", str(tmp_path / "two"), *out[2:]]) == 3
+    assert main(["ablate", str(tmp_path / "none.toml"), *out]) == 2
+    assert "none.toml cannot be read" in capsys.readouterr().err
+    assert main(["ablate", str(write_study(tmp_path, "nowhere")), *out]) == 2
+    assert "there is no scene 'nowhere'" in capsys.readouterr().err
+
+
+def test_the_view_says_what_the_bar_does_not() -> None:
+    state = State(10, kept=2, width=1, steps=3)
+    assert words_of(state) == "0 of 3 shared steps"
+    state.steps_done, state.done, state.failed = 3, 4, 1
+    state.spent["a"] = [30.0]
+    state.waiting["a"] = 4
+    assert words_of(state) == "1 failed, about 2 min left"
+    assert [duration(s) for s in (5.0, 600.0, 9000.0)] == ["5 s", "10 min", "2.5 h"]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("page")
+    study = Study(
+        {"task.aim": [1.0, 4.0], EVIL: {EVIL: {"task.spread": 3.0}}},
+        ["a", "refuses"],
+        seeds=8,
+        task=Darts(),
+        conditions={"epipolar.threshold_px": [0.5, 2.0]},
+        metrics=["miss", Measure("score", better="more", definition=EVIL)],
+        title=EVIL,
+        words=EVIL,
+    )
+    write_analysis(analyse(ablate(study, out / "two", executor="local", threads=1)), out / "two")
+    single = replace(study, conditions={}, scenes=["a"])
+    write_analysis(analyse(ablate(single, out / "one", executor="local", threads=1)), out / "one")
+    return out
+
+
+@pytest.fixture(scope="module", params=[("two", 1300), ("one", 420)], ids=["desktop", "narrow"])
+def opened(request: pytest.FixtureRequest, browser: Any, page: Path) -> Iterator[Witness]:
+    folder, width = request.param
+    drawn = ("plot-miss-forest", "plot-miss-over" if folder == "two" else "plot-miss-cost")
+    witness = Witness(browser, page / folder / "index.html", width, drawn=drawn)
+    yield witness
+    witness.context.close()
+
+
+@pytest.mark.browser
+def test_the_page_draws_complains_of_nothing_and_reaches_out_nowhere(opened: Witness) -> None:
+    assert opened.errors == []
+    assert all(r.startswith(("file:", "data:", "blob:")) for r in opened.requests)
+    assert opened.page.locator("img[onerror]").count() == 0
+    assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+@pytest.mark.browser
+def test_the_page_tells_differences_and_failures(opened: Witness) -> None:
+    assert opened.page.locator("td.bad").count() >= 2
+    text = opened.page.locator("main").inner_text()
+    assert "aim = 4" in text
+    if "two" in opened.page.url:
+        assert "no board; nothing hangs there" in text
+        assert "every row of refuses" in text

@@ -1,0 +1,208 @@
+"""Rows: kept as they end, computed once, whatever fails or is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.validation.ablation.toy import Darts, Steps, area, marks
+from thesisrecon.errors import UsageError
+from validation.ablation import Study, ablate, analyse, read_rows
+from validation.ablation.run import State
+from validation.ablation.workers import crew_of
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def study(log: Path, **more: Any) -> Study:
+    told: dict[str, Any] = {"scenes": ["a", "bb"], "seeds": 2, "task": Darts(log=str(log))}
+    return Study({"task.aim": [1.0, 2.0]}, **{**told, **more})
+
+
+def test_every_row_is_computed_once_and_told_in_the_order_of_the_plan(tmp_path: Path) -> None:
+    log, out = tmp_path / "log", tmp_path / "out"
+    rows = ablate(study(log), out, executor="local", threads=1)
+    assert len(rows) == 3 * 2 * 2 == len(marks(log))
+    assert [(r.seed, r.scene, r.variant) for r in rows[:4]] == [
+        (0, "a", "unchanged"),
+        (0, "a", "aim = 1"),
+        (0, "a", "aim = 2"),
+        (0, "bb", "unchanged"),
+    ]
+    by = {(r.variant, r.scene, r.seed): r.metrics["miss"] for r in rows}
+    assert by["aim = 2", "bb", 1] - by["unchanged", "bb", 1] == pytest.approx(2.0)
+    again = ablate(study(log), out, executor="local")
+    assert len(marks(log)) == 12
+    assert [vars(r) for r in again] == [vars(r) for r in rows]
+    grown = ablate(study(log, seeds=3), out, executor="local")
+    assert len(grown) == 18
+    assert len(marks(log)) == 18
+
+
+def test_a_row_on_disk_stands_on_its_own(tmp_path: Path) -> None:
+    rows = ablate(study(tmp_path / "log", seeds=1), tmp_path / "out", executor="local")
+    told = json.loads((tmp_path / "out" / "rows" / f"{rows[1].key}.json").read_text())
+    assert told["variant"] == "aim = 1"
+    assert told["task"]["aim"] == 1.0
+    assert told["config"]["epipolar"]["kind"] == "locally-optimised-ransac"
+    assert told["versions"]["numpy"] == np.__version__
+    assert told["metrics"] == dict(rows[1].metrics)
+    assert told["seconds"] > 0.0
+
+
+def test_a_damaged_row_is_computed_again(tmp_path: Path) -> None:
+    log, out = tmp_path / "log", tmp_path / "out"
+    rows = ablate(study(log, seeds=1), out, executor="local")
+    (out / "rows" / f"{rows[0].key}.json").write_text("{", encoding="utf-8")
+    assert len(read_rows(study(log, seeds=1), out)) == 5
+    assert len(ablate(study(log, seeds=1), out, executor="local")) == 6
+    assert len(marks(log)) == 7
+
+
+def test_what_fails_is_kept_with_its_reason_and_not_tried_again(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    failing = study(log, scenes=["a", "refuses", "breaks", "empty"], seeds=1)
+    rows = ablate(failing, tmp_path / "out", executor="local")
+    told = {r.scene: r.failure for r in rows}
+    assert told["a"] == ""
+    assert told["refuses"] == "no board; nothing hangs there; hang one up."
+    assert told["breaks"].startswith("KeyError: 'board' (toy.py, line")
+    assert told["empty"] == "miss is nan"
+    assert list(next(r for r in rows if r.scene == "empty").metrics) == ["score"]
+    count = len(marks(log))
+    ablate(failing, tmp_path / "out", executor="local")
+    assert len(marks(log)) == count
+    warnings = analyse(rows).warnings
+    assert any("every row of refuses failed, so that it says nothing: no board" in w for w in warnings)
+
+
+def test_a_metric_that_nobody_tells_is_named(tmp_path: Path) -> None:
+    wish = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
+    rows = ablate(wish, tmp_path, executor="local")
+    assert {r.failure for r in rows} == {"the task tells no wieght"}
+    assert rows[1].metrics["size"] == 800.0
+    assert "no row tells wieght" in analyse(rows).warnings
+
+
+def test_what_rows_begin_with_is_computed_once(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    axes = {"epipolar.threshold_px": [2.0], "dense.max_side": [512], "images.max_size_px": [800]}
+    shared = Study(axes, ["a", "b"], seeds=2, task=Steps(log=str(log)))
+    with ThreadPoolExecutor(3) as pool:
+        rows = ablate(shared, tmp_path / "out", executor=pool)
+    assert len(rows) == 4 * 2 * 2
+    assert not any(r.failure for r in rows)
+    # Corners of two sizes on two scenes; second steps of three kinds, two scenes, two seeds.
+    assert marks(log).count("first") == 2 * 2
+    assert marks(log).count("second") == 3 * 2 * 2
+    own = {r.key: json.loads((tmp_path / "out" / "rows" / f"{r.key}.json").read_text()) for r in rows}
+    for row in rows:
+        assert row.cost_s >= own[row.key]["cpu_s"]
+    assert sum(bool(told["steps"]) for told in own.values()) == len(rows)
+
+
+def test_the_same_rows_whoever_carries_them_out(tmp_path: Path) -> None:
+    wish = study(tmp_path / "log", scenes=["a"], seeds=1)
+    kinds: dict[str, Any] = {"one": ("local", 1), "threads": ("local", 2), "processes": ("processes", 2)}
+    found = {
+        name: [(r.key, r.metrics) for r in ablate(wish, tmp_path / name, executor=kind, threads=threads)]
+        for name, (kind, threads) in kinds.items()
+    }
+    assert found["one"] == found["threads"] == found["processes"]
+
+
+def test_a_wrong_executor_or_folder_is_told(tmp_path: Path) -> None:
+    wish = study(tmp_path / "log", seeds=1)
+    with pytest.raises(UsageError, match="unknown executor 'prozesses'; did you mean processes"):
+        ablate(wish, tmp_path / "out", executor="prozesses")
+    with pytest.raises(UsageError, match="threads must be at least 1"):
+        ablate(wish, tmp_path / "out", threads=0)
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(UsageError, match="cannot be written"):
+        ablate(wish, tmp_path / "file" / "out", executor="local")
+
+
+@dataclass(frozen=True)
+class Deadly(Darts):
+    """Kills its process where the aim is 2."""
+
+    def run(self, *wish: Any) -> Any:
+        if self.aim == 2.0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().run(*wish)
+
+
+def test_a_row_that_kills_its_process_is_lost_alone_and_tried_again_next_time(tmp_path: Path) -> None:
+    wish = study(tmp_path / "log", scenes=["a"], seeds=1, task=Deadly(log=str(tmp_path / "log")))
+    rows = ablate(wish, tmp_path / "out", executor="processes", threads=2)
+    assert [bool(r.failure) for r in rows] == [False, False, True]
+    assert "ended before it did" in rows[2].failure
+    assert len(read_rows(wish, tmp_path / "out")) == 2
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from tests.validation.ablation.test_run import slow
+from validation.ablation import ablate
+if __name__ == "__main__":
+    ablate(slow(Path(sys.argv[1])), Path(sys.argv[1]) / "out", executor="local", threads=2)
+"""
+
+
+def slow(folder: Path) -> Study:
+    return study(folder / "log", seeds=8, task=Darts(pause_s=0.05, log=str(folder / "log")))
+
+
+def test_a_killed_study_loses_no_more_than_the_rows_in_flight(tmp_path: Path) -> None:
+    script = tmp_path / "killed.py"
+    script.write_text(KILLED, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, str(script), str(tmp_path)], env=environment)
+    patience = time.monotonic() + 60.0
+    while len(marks(tmp_path / "log")) < 12 and process.poll() is None and time.monotonic() < patience:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    begun = len(marks(tmp_path / "log"))
+    kept = len(read_rows(slow(tmp_path), tmp_path / "out"))
+    assert 12 <= begun < 48, "it was killed in the middle"
+    assert begun - 2 <= kept <= begun
+    rows = ablate(slow(tmp_path), tmp_path / "out", executor="local", threads=4)
+    assert len(rows) == 48
+    assert not any(r.failure for r in rows)
+    assert len(marks(tmp_path / "log")) == 48 + begun - kept
+
+
+def test_the_time_left_is_that_of_rows_of_the_same_variant() -> None:
+    state = State(10, width=2)
+    assert state.left_s is None
+    state.spent = {"quick": [1.0, 3.0], "slow": [10.0]}
+    state.waiting.update({"quick": 3, "slow": 2, "new": 1})
+    # Three of 2 s, two of 10 s, one of the mean of all, 14 / 3 s; two at a time.
+    assert state.left_s == pytest.approx((6.0 + 20.0 + 14.0 / 3.0) / 2.0)
+
+
+def test_an_executor_of_the_caller_stays_open() -> None:
+    with ThreadPoolExecutor(3) as pool:
+        with crew_of(pool, None) as crew:
+            assert crew.width == 3
+        assert pool.submit(len, "abc").result() == 3
+
+
+def test_progress_hears_of_every_row(tmp_path: Path) -> None:
+    heard: list[int] = []
+    ablate(study(tmp_path / "log"), tmp_path / "out", executor="local", heard=lambda s: heard.append(s.done))
+    assert heard[0] == 0
+    assert heard[-1] == 12

@@ -1,0 +1,150 @@
+"""Intervals, p-values and effect sizes against a hand, SciPy and simulations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from validation.ablation.statistics import (
+    STUDENTISED_FROM,
+    holm,
+    mean_ranks,
+    on_front,
+    paired_interval,
+    resampled_t,
+)
+
+
+def test_five_differences_by_hand() -> None:
+    # 1 2 3 4 5: mean 3, variance 2.5, standard error sqrt(2.5 / 5), t = 4.2426 with 4 degrees of freedom,
+    # whose 97.5 % quantile is 2.7764; Hedges' factor 1 - 3 / 15.
+    found = paired_interval([np.arange(1.0, 6.0)])
+    assert found.mean == 3.0
+    assert found.low == pytest.approx(3.0 - 2.7764 * 0.70711, abs=1e-4)
+    assert found.high == pytest.approx(3.0 + 2.7764 * 0.70711, abs=1e-4)
+    assert found.p == pytest.approx(0.0132, abs=1e-4)
+    assert found.effect == pytest.approx(3.0 / 1.58114 * 0.8, abs=1e-4)
+    assert (found.pairs, found.unit) == (5, "seeds")
+
+
+def test_few_differences_are_a_paired_t_test() -> None:
+    rng = np.random.default_rng(1)
+    one, two = rng.normal(size=(2, STUDENTISED_FROM - 1))
+    found, known = paired_interval([one - two]), stats.ttest_rel(one, two)
+    low, high = known.confidence_interval(0.95)
+    assert found.p == pytest.approx(known.pvalue)
+    assert (found.low, found.high) == pytest.approx((low, high))
+
+
+def test_two_scenes_are_welch() -> None:
+    # The mean of two means has the standard error and the freedom of Welch's test of their difference.
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(1.0, 1.0, 5), rng.normal(2.0, 3.0, 7)
+    found, known = paired_interval([a, b]), stats.ttest_ind(a, -b, equal_var=False)
+    assert found.mean == pytest.approx((a.mean() + b.mean()) / 2.0)
+    assert found.p == pytest.approx(known.pvalue)
+    low, high = known.confidence_interval(0.95)
+    assert (2.0 * found.low, 2.0 * found.high) == pytest.approx((low, high))
+
+
+def test_the_studentised_bootstrap_is_that_of_scipy() -> None:
+    d = np.random.default_rng(3).exponential(size=12)
+    t = resampled_t([d], resamples=20000)
+
+    def statistic(x: np.ndarray, axis: int = -1) -> np.ndarray:
+        return (x.mean(axis=axis) - d.mean()) / (x.std(axis=axis, ddof=1) / np.sqrt(x.shape[axis]))
+
+    known = stats.bootstrap(
+        (d,), statistic, n_resamples=20000, rng=np.random.default_rng(4), method="percentile"
+    )
+    for q in (0.5, 0.9, 0.95):
+        assert np.quantile(t, q) == pytest.approx(
+            np.quantile(np.abs(known.bootstrap_distribution), q), rel=0.04
+        )
+
+
+def test_many_scenes_are_the_sample_and_few_are_not() -> None:
+    rng = np.random.default_rng(5)
+    groups = [rng.normal(mean, 0.1, 5) for mean in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
+    many, few = paired_interval(groups), paired_interval(groups[:2])
+    assert (many.unit, few.unit) == ("scenes", "seeds")
+    means = np.array([g.mean() for g in groups])
+    assert many.p == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue)
+    assert many.high - many.low > 5.0 * (few.high - few.low)
+    assert many.pairs == 30
+
+
+def test_what_no_seed_changes_is_judged_by_scenes_or_told_exactly() -> None:
+    same = [np.full(3, v) for v in (1.0, 2.0, 4.0)]
+    assert paired_interval(same).unit == "scenes"
+    assert paired_interval(same).p == pytest.approx(stats.ttest_1samp([1.0, 2.0, 4.0], 0.0).pvalue)
+    exact = paired_interval(same[:2])
+    assert (exact.low, exact.mean, exact.high, exact.p) == (1.5, 1.5, 1.5, 0.0)
+    nothing = paired_interval([np.zeros(4)])
+    assert (nothing.mean, nothing.low, nothing.high, nothing.p, nothing.effect) == (0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def test_one_difference_says_nothing_of_its_uncertainty() -> None:
+    alone = paired_interval([np.array([2.0])])
+    assert alone.mean == 2.0
+    assert np.isnan([alone.low, alone.high, alone.p]).all()
+    assert np.isnan(paired_interval([]).mean)
+    with pytest.raises(ValueError, match="finite"):
+        paired_interval([np.array([1.0, np.nan])])
+
+
+DRAWS = {
+    "normal": (lambda rng, n: rng.normal(size=n), 0.0),
+    "heavy tails": (lambda rng, n: rng.standard_t(3, size=n), 0.0),
+    "even": (lambda rng, n: rng.uniform(-1.0, 1.0, n), 0.0),
+}
+
+
+@pytest.mark.parametrize("count", [5, 10, 20])
+@pytest.mark.parametrize("kind", DRAWS)
+def test_no_effect_is_told_as_one_in_at_most_five_of_a_hundred(kind: str, count: int) -> None:
+    draw, mean = DRAWS[kind]
+    rng = np.random.default_rng(7)
+    trials = 400
+    found = [paired_interval([draw(rng, count)]) for _ in range(trials)]
+    held = sum(f.low <= mean <= f.high for f in found)
+    # Two standard deviations of a count of trials that each hold in 95 of 100.
+    assert held >= 0.95 * trials - 2.0 * np.sqrt(trials * 0.05 * 0.95)
+    assert sum(f.p > 0.05 for f in found) == pytest.approx(held, abs=2)
+
+
+def test_skewed_differences_are_held_more_often_than_by_student() -> None:
+    rng = np.random.default_rng(8)
+    ours = theirs = 0
+    for _ in range(400):
+        d = rng.exponential(size=10)
+        found, known = paired_interval([d]), stats.ttest_1samp(d, 1.0).pvalue
+        ours += found.low <= 1.0 <= found.high
+        theirs += known > 0.05
+    assert ours >= theirs + 5
+    assert ours >= 0.9 * 400
+
+
+def test_an_effect_of_one_deviation_is_found() -> None:
+    rng = np.random.default_rng(9)
+    found = [paired_interval([rng.normal(1.0, 1.0, 20)]) for _ in range(200)]
+    assert np.mean([f.p <= 0.05 and f.low > 0.0 for f in found]) >= 0.95
+    assert np.mean([f.effect for f in found]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_holm_by_hand() -> None:
+    assert holm([0.01, 0.04, 0.03, float("nan")])[:3] == pytest.approx([0.03, 0.06, 0.06])
+    assert np.isnan(holm([0.01, float("nan")])[1])
+    assert holm([0.6, 0.7]) == pytest.approx([1.0, 1.0])
+    assert holm([]) == []
+
+
+def test_ranks_share_places_and_put_failures_last() -> None:
+    blocks = np.array([[1.0, 2.0, 2.0], [3.0, np.nan, 1.0]])
+    assert mean_ranks(blocks) == pytest.approx([1.5, 2.75, 1.75])
+
+
+def test_the_front_is_what_nothing_beats_in_both() -> None:
+    cost, loss = np.array([1.0, 2.0, 3.0, 2.0, np.nan]), np.array([5.0, 3.0, 4.0, 3.0, 0.0])
+    assert on_front(cost, loss).tolist() == [True, True, False, True, False]

@@ -1,0 +1,112 @@
+"""Tasks and variants that take no time, for the tests of studies."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure, UsageError
+from validation.ablation.study import Measure, Place
+
+
+@dataclass(frozen=True)
+class Darts:
+    """A draw about ``aim``, and a mark in ``log`` whenever one is made.
+
+    ``refuses`` and ``empty`` are scenes where nothing, or no number, is found.
+    """
+
+    aim: float = 0.0
+    spread: float = 1.0
+    pause_s: float = 0.0
+    log: str = ""
+
+    measures: ClassVar[Sequence[Measure]] = (
+        Measure("miss", "cm", "less", False, "where the dart went"),
+        Measure("score", "", "more", False, "its points"),
+    )
+
+    def check(self, scene: str) -> None:
+        if scene == "nowhere":
+            raise UsageError("there is no scene 'nowhere'")
+
+    def scene_key(self, scene: str) -> str:
+        return scene
+
+    def run(
+        self,
+        config: PipelineConfig,
+        scene: str,
+        seed: int,
+        place: Place,  # noqa: ARG002 (a dart needs no folder)
+    ) -> Mapping[str, float]:
+        mark(self.log, f"row {scene} {seed} {self.aim:g}")
+        time.sleep(self.pause_s)
+        if scene == "refuses":
+            raise StageFailure("no board", "nothing hangs there", "hang one up")
+        if scene == "breaks":
+            raise KeyError("board")
+        rng = np.random.default_rng((seed, len(scene)))
+        threshold = getattr(config.epipolar, "threshold_px", 1.0)
+        miss = self.aim + self.spread * float(rng.normal()) + threshold
+        return {"miss": float("nan") if scene == "empty" else miss, "score": -miss}
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Two steps that several rows may share, ``miss`` the length of what they left behind."""
+
+    log: str = ""
+
+    measures: ClassVar[Sequence[Measure]] = (Measure("miss"),)
+
+    def check(self, scene: str) -> None:
+        pass
+
+    def scene_key(self, scene: str) -> str:
+        return scene
+
+    def steps(self, config: PipelineConfig, scene: str, seed: int) -> list[tuple[str, str]]:
+        first = f"first-{scene}-{config.images.max_size_px}"
+        return [("first", first), ("second", f"second-{first}-{seed}-{config.epipolar}".replace(" ", ""))]
+
+    def prepare(self, config: PipelineConfig, scene: str, seed: int, place: Place, *, step: str) -> None:
+        for name, key in self.steps(config, scene, seed):
+            kept = place.shared / f"{hash_of(key)}.txt"
+            if not kept.is_file():
+                mark(self.log, name)
+                kept.write_text(name, encoding="utf-8")
+            if name == step:
+                return
+
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
+        self.prepare(config, scene, seed, place, step="second")
+        return {"miss": float(seed)}
+
+
+def hash_of(key: str) -> str:
+    import hashlib
+
+    return hashlib.sha256(key.encode()).hexdigest()[:16]
+
+
+def mark(log: str, word: str) -> None:
+    """Add a line to the log; short lines are written whole, whoever writes beside."""
+    if log:
+        with Path(log).open("a", encoding="utf-8") as file:
+            file.write(f"{word}\n")
+
+
+def marks(log: Path) -> list[str]:
+    return log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
+
+
+def area(config: PipelineConfig, scene: str, seed: int) -> dict[str, float]:
+    """A task as a plain function."""
+    return {"size": float(config.images.max_size_px + seed), "scene_length": float(len(scene))}

@@ -1,0 +1,211 @@
+"""What the rows of a study say: differences against the baseline with their uncertainty, ranks, and what
+accuracy costs."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from validation.ablation.plan import Plan
+from validation.ablation.run import Row, Rows
+from validation.ablation.statistics import F64, Interval, holm, mean_ranks, on_front, paired_interval
+from validation.ablation.study import Measure
+
+Verdict = Literal["better", "worse", "no difference shown", "too few pairs", "the baseline"]
+ALPHA = 0.05
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A variant against another under a condition, by one measure.
+
+    ``interval`` is of the differences variant - other, with ``ratio`` of those of the logarithms, which
+    :func:`as_told` makes quotients. ``p`` is adjusted for all comparisons of the measure (Holm), and rules
+    the verdict.
+    """
+
+    measure: Measure
+    variant: str
+    against: str
+    condition: str
+    interval: Interval
+    ratio: bool
+    p: float
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A variant under a condition: ``mean`` and ``median`` of a measure over its rows that tell it, how many
+    there are, how many rows failed, mean cost (s), mean rank among the variants (1 is best) and whether no
+    other variant is both better and cheaper."""
+
+    measure: Measure
+    variant: str
+    condition: str
+    mean: float
+    median: float
+    rows: int
+    failed: int
+    cost_s: float
+    rank: float
+    on_front: bool
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """All that is told of a study. ``steps`` are comparisons of each step of a ladder with the one before."""
+
+    plan: Plan
+    rows: Rows
+    cells: tuple[Cell, ...]
+    comparisons: tuple[Comparison, ...]
+    steps: tuple[Comparison, ...]
+    warnings: tuple[str, ...]
+
+    def __str__(self) -> str:
+        from validation.ablation.tables import text_of
+
+        return text_of(self)
+
+
+def analyse(rows: Rows) -> Analysis:
+    """Compare all variants with the baseline on the same scene, seed and condition, and rank them.
+
+    Only pairs count of which both rows tell the measure; the failures of a variant are counted beside.
+    """
+    plan = rows.plan
+    names = [v.name for v in plan.variants]
+    others = [(name, plan.baseline) for name in names if name != plan.baseline]
+    steps = list(zip(names[1:], names, strict=False)) if plan.study.mode == "ladder" else []
+    table = _Table(rows)
+    return Analysis(
+        plan,
+        rows,
+        tuple(cell for m in plan.measures for cell in _cells(table, m)),
+        tuple(c for m in plan.measures for c in _comparisons(table, m, others)),
+        tuple(c for m in plan.measures for c in _comparisons(table, m, steps)),
+        tuple(_warnings(rows)),
+    )
+
+
+class _Table:
+    """Rows by their place."""
+
+    def __init__(self, rows: Rows) -> None:
+        self.plan = rows.plan
+        self.scenes = tuple(dict.fromkeys(r.scene for r in rows.plan.rows))
+        self.by_place = {(r.variant, r.condition, r.scene, r.seed): r for r in rows}
+
+    def value(self, measure: Measure, variant: str, condition: str, scene: str, seed: int) -> float:
+        row = self.by_place.get((variant, condition, scene, seed))
+        return float("nan") if row is None else row.metrics.get(measure.name, float("nan"))
+
+    def values(self, measure: Measure, variant: str, condition: str) -> F64:
+        """(scenes, seeds), NaN where there is none."""
+        return np.array(
+            [
+                [self.value(measure, variant, condition, scene, seed) for seed in self.plan.seeds]
+                for scene in self.scenes
+            ]
+        )
+
+    def rows(self, variant: str, condition: str) -> list[Row]:
+        return [r for (v, c, _, _), r in self.by_place.items() if (v, c) == (variant, condition)]
+
+
+def _comparisons(table: _Table, measure: Measure, pairs: Sequence[tuple[str, str]]) -> list[Comparison]:
+    found = [
+        _compared(table, measure, variant, other, condition.name)
+        for condition in table.plan.conditions
+        for variant, other in pairs
+    ]
+    adjusted = holm([c.interval.p for c in found])
+    return [replace(c, p=p, verdict=_verdict(c, p)) for c, p in zip(found, adjusted, strict=True)]
+
+
+def _compared(table: _Table, measure: Measure, variant: str, other: str, condition: str) -> Comparison:
+    one, two = (table.values(measure, name, condition) for name in (variant, other))
+    both = np.isfinite(one) & np.isfinite(two)
+    ratio = bool(measure.ratio and both.any() and np.all(one[both] > 0.0) and np.all(two[both] > 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        difference = np.log(one) - np.log(two) if ratio else one - two
+    interval = paired_interval([d[b] for d, b in zip(difference, both, strict=True)])
+    return Comparison(measure, variant, other, condition, interval, ratio, float("nan"), "too few pairs")
+
+
+def _verdict(found: Comparison, p: float) -> Verdict:
+    if not np.isfinite(p):
+        return "too few pairs"
+    if p > ALPHA:
+        return "no difference shown"
+    return "better" if (found.interval.mean < 0.0) == (found.measure.better == "less") else "worse"
+
+
+def as_told(found: Comparison) -> tuple[float, float, float]:
+    """Mean, low and high as they are told: quotients where the comparison is one of quotients."""
+    told = (found.interval.mean, found.interval.low, found.interval.high)
+    if not found.ratio:
+        return told
+    return tuple(float(np.exp(v)) for v in told)  # type: ignore[return-value]
+
+
+def _cells(table: _Table, measure: Measure) -> list[Cell]:
+    found = []
+    names = [v.name for v in table.plan.variants]
+    for condition in table.plan.conditions:
+        values = [table.values(measure, name, condition.name) for name in names]
+        blocks = np.array([v.ravel() for v in values]).T
+        sign = 1.0 if measure.better == "less" else -1.0
+        some = blocks[np.isfinite(blocks).any(axis=1)]
+        ranks = mean_ranks(sign * some) if len(some) else np.full(len(names), np.nan)
+        rows = [table.rows(name, condition.name) for name in names]
+        cost = np.array([_mean([r.cost_s for r in own]) for own in rows])
+        # A variant that fails where others do not is judged on easier rows than they are.
+        whole = np.isfinite(some).all(axis=0)
+        loss = np.array([sign * _mean(b[np.isfinite(b)]) for b in blocks.T])
+        front = on_front(cost, np.where(whole, loss, np.nan))
+        for k, name in enumerate(names):
+            known = blocks[:, k][np.isfinite(blocks[:, k])]
+            middle = float(np.median(known)) if len(known) else float("nan")
+            failed = len(rows[k]) - len(known)
+            found.append(
+                Cell(
+                    measure,
+                    name,
+                    condition.name,
+                    _mean(known),
+                    middle,
+                    len(known),
+                    failed,
+                    float(cost[k]),
+                    float(ranks[k]),
+                    bool(front[k]),
+                )
+            )
+    return found
+
+
+def _mean(values: Sequence[float] | F64) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _warnings(rows: Rows) -> list[str]:
+    """What a reader must know before believing the tables."""
+    plan, found = rows.plan, []
+    missing = len(plan.rows) - len(rows)
+    if missing:
+        found.append(f"{missing} of {len(plan.rows)} rows have not been computed")
+    for scene, condition in itertools.product(dict.fromkeys(r.scene for r in plan.rows), plan.conditions):
+        here = [r for r in rows if (r.scene, r.condition) == (scene, condition.name)]
+        if here and all(r.failure for r in here):
+            where = f"{scene} ({condition.name})" if condition.name else scene
+            found.append(f"every row of {where} failed, so that it says nothing: {here[0].failure}")
+    for measure in plan.measures:
+        if len(rows) and not any(measure.name in r.metrics for r in rows):
+            found.append(f"no row tells {measure.name}")
+    return found

@@ -1,0 +1,159 @@
+"""Dotted paths and values laid on a configuration and a task, with a sentence for whatever does not fit."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from thesisrecon.config import KINDS, PipelineConfig, config_from_tables, preset
+from thesisrecon.errors import UsageError
+from thesisrecon.settings import dataclass_from_table, unknown_word
+from validation.ablation.own import is_own, load_own
+from validation.ablation.tasks.function import FunctionTask
+
+TASK = "task"
+STAGES = tuple(f.name for f in dataclasses.fields(PipelineConfig))
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What one row runs by."""
+
+    config: PipelineConfig
+    task: Any
+
+
+def apply_changes(setting: Setting, changes: Mapping[str, Any], folder: Path) -> Setting:
+    """``setting`` with every change made, in order.
+
+    Raises :class:`UsageError` for a path that does not exist (naming the nearest), a value of another type, a
+    variant without the method of its stage, and whatever a variant refuses.
+    """
+    for path, value in changes.items():
+        setting = _changed(setting, path, value, folder)
+    return setting
+
+
+def _changed(setting: Setting, path: str, value: Any, folder: Path) -> Setting:
+    head, *rest = path.split(".")
+    if head not in (TASK, *STAGES):
+        raise UsageError(f"{path}: {unknown_word('stage', head, [*STAGES, TASK])}")
+    if head == TASK:
+        return dataclasses.replace(setting, task=_changed_task(setting.task, path, rest, value))
+    if not rest:
+        return dataclasses.replace(setting, config=_whole_stage(setting.config, head, value, folder))
+    if _is_object(value):
+        return dataclasses.replace(setting, config=_put(setting.config, path, path.split("."), value))
+    table = value
+    for key in reversed(rest):
+        table = {key: table}
+    return dataclasses.replace(setting, config=config_from_tables({head: table}, setting.config))
+
+
+def _changed_task(task: Any, path: str, rest: list[str], value: Any) -> Any:
+    if isinstance(task, FunctionTask) or not _is_object(task):
+        raise UsageError(f"{path}: the task of this study is a function and has no parameters")
+    if not rest:
+        raise UsageError(f"{path}: a change of the task names a parameter, as task.noise_px")
+    if _is_object(value):
+        return _put(task, path, rest, value)
+    table = value
+    for key in reversed(rest[1:]):
+        table = {key: table}
+    return dataclass_from_table(type(task), {rest[0]: table}, TASK, task)
+
+
+def _whole_stage(config: PipelineConfig, stage: str, value: Any, folder: Path) -> PipelineConfig:
+    if isinstance(value, str):
+        value = _own_variant(value, {}, stage, folder) if is_own(value) else {"kind": value}
+    elif isinstance(value, Mapping) and is_own(str(value.get("kind", ""))):
+        fields = {k: v for k, v in value.items() if k != "kind"}
+        value = _own_variant(value["kind"], fields, stage, folder)
+    elif isinstance(value, Mapping) and set(value) == {"preset"}:
+        value = getattr(preset(str(value["preset"])), stage)
+    if isinstance(value, Mapping):
+        return config_from_tables({stage: value}, config)
+    _check_variant(stage, value)
+    return dataclasses.replace(config, **{stage: value})
+
+
+def _own_variant(word: str, fields: Mapping[str, Any], stage: str, folder: Path) -> Any:
+    kind = load_own(word, stage, folder)
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise UsageError(f"{stage}: a variant is a frozen dataclass, which {word} is not")
+    return dataclass_from_table(kind, fields, stage)
+
+
+def _check_variant(stage: str, value: Any) -> None:
+    """Whether an object can stand at a stage: a dataclass with the methods that the stage is asked for."""
+    if not _is_object(value):
+        raise UsageError(f"{stage} takes a variant: a kind, a table or a frozen dataclass; got {value!r}")
+    wanted = typing.get_type_hints(PipelineConfig)[stage]
+    if stage not in KINDS:
+        if not isinstance(value, wanted):
+            raise UsageError(f"{stage} takes {wanted.__name__}; got {type(value).__name__}")
+        return
+    missing = [n for n in methods_of(wanted) if not callable(getattr(value, n, None))]
+    if missing:
+        raise UsageError(
+            f"{stage}: a {wanted.__name__} has the method {missing[0]}, which {type(value).__name__} has not"
+        )
+
+
+def methods_of(protocol: type[Any]) -> list[str]:
+    """The methods that a protocol asks for, by name."""
+    return [n for n, v in vars(protocol).items() if not n.startswith("_") and callable(v)]
+
+
+def _is_object(value: Any) -> bool:
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
+
+
+def _put(whole: Any, path: str, keys: list[str], value: Any) -> Any:
+    """``whole`` with an object in the place of a field however deep."""
+    key, *rest = keys
+    names = [f.name for f in dataclasses.fields(whole)] if _is_object(whole) else []
+    if key not in names:
+        raise UsageError(f"{path}: {unknown_word('setting', key, names)}")
+    inner = _put(getattr(whole, key), path, rest, value) if rest else value
+    try:
+        return dataclasses.replace(whole, **{key: inner})
+    except (ValueError, TypeError) as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def level_name(path: str, value: Any) -> str:
+    """What a value of an axis is called in tables: a variant by its kind, a number with its field."""
+    field = path.rpartition(".")[2]
+    if isinstance(value, Mapping):
+        fields = [f"{k} = {_words(v)}" for k, v in value.items() if k not in ("kind", "preset")]
+        head = value.get("kind", value.get("preset", ""))
+        head = str(head).rpartition(":")[2]
+        return ", ".join([head, *fields] if head else fields) or field
+    if _is_object(value):
+        fields = [f"{k} = {_words(v)}" for k, v in _told(value).items()]
+        return ", ".join([type(value).__name__, *fields])
+    if isinstance(value, str):
+        return value.rpartition(":")[2] if is_own(value) else value
+    return f"{field} = {_words(value)}"
+
+
+def _told(value: Any) -> dict[str, Any]:
+    """The fields of an object that differ from what it has by default."""
+    try:
+        usual = type(value)()
+    except TypeError:
+        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    names = [f.name for f in dataclasses.fields(value)]
+    return {n: getattr(value, n) for n in names if getattr(value, n) != getattr(usual, n)}
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    return type(value).__name__ if _is_object(value) else str(value)

@@ -1,0 +1,82 @@
+"""``python -m validation ablate STUDY.toml -o OUT``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+
+from thesisrecon.errors import UsageError
+from validation.ablation.analysis import analyse
+from validation.ablation.page import write_analysis
+from validation.ablation.plan import Plan, plan_study
+from validation.ablation.progress import progress_view
+from validation.ablation.run import Rows, ablate, parts_of, read_rows
+from validation.ablation.toml import read_study
+
+STUDIES = Path(__file__).parent / "studies"
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The command ``ablate`` among the others."""
+    words = "Compare variants and parameters over scenes and seeds, with intervals."
+    command = commands.add_parser("ablate", help=words, description=words)
+    shipped = ", ".join(sorted(p.stem for p in STUDIES.glob("*.toml")))
+    command.add_argument("study", metavar="STUDY", help=f"a file of TOML, or one of ours: {shipped}")
+    command.add_argument("-o", "--out", type=Path, required=True, help="kept and gone on with when run again")
+    command.add_argument(
+        "--executor", default="processes", help="local, processes (default) or dask://HOST:PORT"
+    )
+    command.add_argument("--threads", type=int, help="rows at a time; by default one a processor")
+    command.add_argument("--plan", action="store_true", help="say what would run, and run nothing")
+    command.add_argument("--read", action="store_true", help="only analyse the rows that are in OUT")
+
+
+def run_command(told: argparse.Namespace) -> int:
+    """0: done; 2: a wrong wish; 3: every row failed; 130: stopped."""
+    try:
+        study = read_study(_path(told.study))
+        if told.plan:
+            print(plan_words(plan_study(study)))
+            return 0
+        if told.read:
+            rows = read_rows(study, told.out)
+        else:
+            with progress_view() as heard:
+                rows = ablate(study, told.out, executor=told.executor, threads=told.threads, heard=heard)
+        page = write_analysis(analyse(rows), told.out)
+    except UsageError as error:
+        print(f"ablate: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"stopped; the rows that ended are in {told.out}, the same command goes on", file=sys.stderr)
+        return 130
+    print(_last_words(rows, page))
+    return 3 if rows and all(r.failure for r in rows) else 0
+
+
+def _path(wish: str) -> Path:
+    shipped = STUDIES / f"{wish}.toml"
+    return shipped if not Path(wish).exists() and shipped.is_file() else Path(wish)
+
+
+def plan_words(plan: Plan) -> str:
+    """How much a study is: rows, and the steps that rows share."""
+    unique = list({row.key: row for row in plan.rows}.values())
+    shared = Counter(part.step for part in parts_of(unique) if part.step)
+    steps = ", ".join(f"{step} ({count})" for step, count in shared.items())
+    parts = [
+        f"{len(plan.variants)} variants: {'; '.join(v.name for v in plan.variants)}",
+        f"baseline: {plan.baseline}",
+        f"{len(plan.conditions)} conditions" if len(plan.conditions) > 1 else "",
+        f"{len({r.scene for r in unique})} scenes, {len(plan.seeds)} seeds: {len(unique)} rows",
+        f"computed once for several rows: {steps}" if steps else "",
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def _last_words(rows: Rows, page: Path) -> str:
+    failed = sum(bool(r.failure) for r in rows)
+    told = f"{len(rows)} rows" + f", {failed} of them failed" * bool(failed)
+    return f"{told}; the page is {page}"

@@ -1,0 +1,323 @@
+"""The page of a study: what was asked, what the rows say, every number with its uncertainty."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from thesisrecon import __version__
+from thesisrecon.errors import UsageError
+from thesisrecon.report.html import page_resource, plotly_script, script_hashes, template_environment
+from validation.ablation.analysis import Analysis, Cell, Comparison, as_told
+from validation.ablation.plan import Plan
+from validation.ablation.study import Measure
+from validation.ablation.tables import comparison_text, mean_text, number, write_tables
+from validation.harness.page import HERE as HARNESS
+
+HERE = Path(__file__).parent
+PAGE = "index.html"
+COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7a7a3a", "#b05c8a")
+GOOD, BAD, NONE = "#2e7d4f", "#b3372b", "#7b8794"
+_MARGIN = {"l": 70, "r": 20, "t": 10, "b": 50}
+MOST_LEVELS = 40
+"""More rows than this in a picture of intervals and nobody can read it."""
+
+
+def write_analysis(analysis: Analysis, out: str | Path) -> Path:
+    """Write ``index.html`` and the tables into ``out``; the path of the page.
+
+    Raises :class:`UsageError` where the folder cannot be written.
+    """
+    out = Path(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        tables = write_tables(analysis, out)
+        (out / PAGE).write_text(_page(analysis, [t.name for t in tables]), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"the output folder {out} cannot be written: {error.strerror}") from None
+    return out / PAGE
+
+
+def _page(analysis: Analysis, tables: Sequence[str]) -> str:
+    plan = analysis.plan
+    sections = [_section(analysis, measure) for measure in plan.measures]
+    figures = {p["id"]: p["figure"] for section in sections for p in section["plots"]}
+    scripts = [plotly_script(), (HARNESS / "page.js").read_text(encoding="utf-8")] if figures else []
+    failures = [r for r in analysis.rows if r.failure]
+    return (
+        template_environment()
+        .from_string((HERE / "page.html.j2").read_text(encoding="utf-8"))
+        .render(
+            title=plan.study.title,
+            words=plan.study.words,
+            facts=_facts(analysis),
+            findings=_findings(analysis),
+            warnings=analysis.warnings,
+            sections=sections,
+            failures=_failures(failures),
+            versions=list(plan.versions.items()),
+            tables=tables,
+            figures=figures,
+            scripts=scripts,
+            hashes=script_hashes(scripts),
+            style=page_resource("style.css"),
+            version=__version__,
+        )
+    )
+
+
+def _facts(analysis: Analysis) -> list[tuple[str, str]]:
+    plan = analysis.plan
+    scenes = list(dict.fromkeys(r.scene for r in plan.rows))
+    cost = sum(r.cost_s for r in analysis.rows)
+    return [
+        ("Variants", str(len(plan.variants))),
+        ("Conditions", str(len(plan.conditions)) if plan.conditions[0].name else "1"),
+        ("Scenes", ", ".join(scenes) if len(scenes) <= 4 else str(len(scenes))),
+        ("Seeds", str(len(plan.seeds))),
+        ("Rows", f"{len(analysis.rows)} of {len(plan.rows)}"),
+        ("Failed", str(sum(bool(r.failure) for r in analysis.rows))),
+        ("Processor time", f"{cost:.0f} s"),
+    ]
+
+
+def _findings(analysis: Analysis) -> list[str]:
+    """One sentence for each measure: what is better and worse than the baseline."""
+    found = []
+    for measure in analysis.plan.measures:
+        here = [c for c in analysis.comparisons if c.measure == measure]
+        better = [_who(c) for c in here if c.verdict == "better"]
+        worse = [_who(c) for c in here if c.verdict == "worse"]
+        told = [f"{_listed(better)} better" if better else "", f"{_listed(worse)} worse" if worse else ""]
+        said = "; ".join(t for t in told if t) or "no difference from the baseline is shown"
+        found.append(f"{measure.name}: {said}.")
+    return found
+
+
+def _who(found: Comparison) -> str:
+    return f"{found.variant} ({found.condition})" if found.condition else found.variant
+
+
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    """A few names; of many their number."""
+    if len(names) > most:
+        return f"{len(names)} comparisons"
+    return ", ".join(names)
+
+
+def _failures(failed: Sequence[Any]) -> list[dict[str, Any]]:
+    """Failed rows, those of one reason together."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for row in failed:
+        who = f"{row.variant} ({row.condition})" if row.condition else row.variant
+        groups.setdefault((who, row.failure), []).append(f"{row.scene}, seed {row.seed}")
+    return [
+        {"who": who, "why": why, "where": _listed(where, 4).replace("comparisons", "rows")}
+        for (who, why), where in groups.items()
+    ]
+
+
+# ---------------------------------------------------------------- a measure
+
+
+def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
+    plan = analysis.plan
+    cells = [c for c in analysis.cells if c.measure == measure]
+    comparisons = [c for c in analysis.comparisons if c.measure == measure]
+    steps = [c for c in analysis.steps if c.measure == measure]
+    slug = re.sub(r"[^a-z0-9]+", "-", measure.name.lower()).strip("-")
+    plots = [
+        _over_conditions(plan, measure, cells, slug),
+        _forest(measure, comparisons, plan.baseline, slug),
+        _cost(measure, cells, slug),
+    ]
+    drawn = {c.interval.unit for c in comparisons if c.interval.pairs}
+    return {
+        "id": slug,
+        "measure": measure,
+        "table": _table(plan, cells, comparisons, steps),
+        "conditions": [c.name for c in plan.conditions],
+        "baseline": plan.baseline,
+        "steps": bool(steps),
+        "about": _about(drawn),
+        "plots": [p for p in plots if p is not None],
+    }
+
+
+def _about(drawn: Collection[str]) -> str:
+    """What the intervals speak of."""
+    if drawn == {"scenes"}:
+        return "The intervals speak of scenes like these: the scenes are the sample."
+    if drawn == {"seeds"}:
+        return "The intervals speak of these scenes alone: what is drawn at random are the seeds."
+    return ""
+
+
+def _table(
+    plan: Plan, cells: Sequence[Cell], comparisons: Sequence[Comparison], steps: Sequence[Comparison]
+) -> list[dict[str, Any]]:
+    at = {(c.variant, c.condition): c for c in cells}
+    against = {(c.variant, c.condition): c for c in comparisons}
+    step = {(c.variant, c.condition): c for c in steps}
+    found = []
+    for variant in plan.variants:
+        columns = []
+        for condition in plan.conditions:
+            place = (variant.name, condition.name)
+            columns.append(
+                {
+                    "mean": mean_text(at[place]),
+                    "rank": number(at[place].rank),
+                    "against": _told(against.get(place)),
+                    "step": _told(step.get(place)),
+                    "on_front": at[place].on_front,
+                    "cost": number(at[place].cost_s),
+                }
+            )
+        found.append({"name": variant.name, "columns": columns, "base": variant.name == plan.baseline})
+    return found
+
+
+def _told(found: Comparison | None) -> dict[str, str]:
+    if found is None:
+        return {"text": "", "verdict": "", "more": ""}
+    effect, p = found.interval.effect, found.p
+    more = f"{found.interval.pairs} pairs; effect size {number(effect)}; p {number(p)} after Holm"
+    state = {"better": "good", "worse": "bad"}.get(found.verdict, "")
+    return {"text": comparison_text(found).strip("*"), "verdict": state, "more": f"{found.verdict}; {more}"}
+
+
+# ---------------------------------------------------------------- plots
+
+
+def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] | None:
+    """The means over a condition that is a number, a line for each variant, where there is but one such."""
+    axes = list(dict.fromkeys(a for c in plan.conditions for a in c.levels))
+    if len(axes) != 1:
+        return None
+    values = [next(iter(c.changes.values()), None) for c in plan.conditions]
+    numeric = len(values) > 1 and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    if not numeric:
+        return None
+    at = {(c.variant, c.condition): c for c in cells}
+    traces = []
+    for k, variant in enumerate(plan.variants):
+        y = [_finite(at[variant.name, c.name].mean) for c in plan.conditions]
+        traces.append(_line(variant.name, values, y, k))
+    positive = all(v is None or v > 0 for t in traces for v in t["y"])
+    layout = {
+        "xaxis": {"title": {"text": axes[0].rpartition(".")[2]}},
+        "yaxis": _axis(measure) | ({"type": "log"} if measure.ratio and positive else {}),
+        "margin": _MARGIN,
+        "legend": {"orientation": "h", "y": -0.25},
+    }
+    return _plot(f"plot-{slug}-over", f"{measure.name} over {axes[0]}", {"data": traces, "layout": layout})
+
+
+def _line(name: str, x: Sequence[Any], y: Sequence[float | None], k: int) -> dict[str, Any]:
+    colour = COLOURS[k % len(COLOURS)]
+    return {
+        "type": "scatter",
+        "mode": "lines+markers",
+        "name": name,
+        "x": list(x),
+        "y": list(y),
+        "line": {"color": colour, "dash": ("solid", "dash", "dot")[k // len(COLOURS) % 3]},
+    }
+
+
+def _forest(
+    measure: Measure, comparisons: Sequence[Comparison], baseline: str, slug: str
+) -> dict[str, Any] | None:
+    """The differences from the baseline with their intervals, a row each."""
+    shown = [c for c in comparisons if math.isfinite(c.interval.mean)]
+    if not shown or len(shown) > MOST_LEVELS:
+        return None
+    ratio = all(c.ratio for c in shown)
+    shown = [c for c in shown if c.ratio == ratio]
+    told = [as_told(c) for c in shown]
+    colours = [{"better": GOOD, "worse": BAD}.get(c.verdict, NONE) for c in shown]
+    trace = {
+        "type": "scatter",
+        "mode": "markers",
+        "x": [_finite(mean) for mean, _, _ in told],
+        "y": [_who(c) for c in shown],
+        "error_x": {
+            "type": "data",
+            "symmetric": False,
+            "array": [_finite(high - mean) for mean, _, high in told],
+            "arrayminus": [_finite(mean - low) for mean, low, _ in told],
+            "color": "#55636f",
+        },
+        "marker": {"color": colours, "size": 9},
+        "showlegend": False,
+    }
+    stroke = {"color": "#1b2733", "width": 1}
+    line = {"type": "line", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "line": stroke}
+    what = f"times {baseline}" if ratio else f"difference from {baseline}"
+    unit = f" ({measure.unit})" if measure.unit and not ratio else ""
+    layout = {
+        "xaxis": {"title": {"text": f"{what}{unit}"}} | ({"type": "log"} if ratio else {"zeroline": False}),
+        "yaxis": {"autorange": "reversed", "automargin": True},
+        "shapes": [line | {"x0": int(ratio), "x1": int(ratio)}],
+        "margin": _MARGIN,
+        "height": 140 + 28 * len(shown),
+    }
+    title = f"{measure.name} against {baseline}"
+    return _plot(f"plot-{slug}-forest", title, {"data": [trace], "layout": layout})
+
+
+def _cost(measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] | None:
+    """Accuracy over processor time; what nothing beats in both is joined."""
+    names = list(dict.fromkeys(c.variant for c in cells))
+    conditions = list(dict.fromkeys(c.condition for c in cells))
+    if len(names) < 2 or len(conditions) > 1:
+        return None
+    known = [c for c in cells if math.isfinite(c.mean) and math.isfinite(c.cost_s)]
+    front = sorted((c for c in known if c.on_front), key=lambda c: c.cost_s)
+    line = {
+        "type": "scatter",
+        "mode": "lines",
+        "x": [c.cost_s for c in front],
+        "y": [c.mean for c in front],
+        "line": {"color": "#9fabb5", "dash": "dot"},
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
+    points = {
+        "type": "scatter",
+        "mode": "markers+text",
+        "x": [c.cost_s for c in known],
+        "y": [c.mean for c in known],
+        "text": [c.variant for c in known],
+        "textposition": "top center",
+        "textfont": {"size": 10},
+        "cliponaxis": False,
+        "marker": {"size": 10, "color": [GOOD if c.on_front else NONE for c in known]},
+        "showlegend": False,
+    }
+    log = measure.ratio and all(c.mean > 0 for c in known)
+    layout = {
+        "xaxis": {"title": {"text": "processor time of a row (s)"}, "rangemode": "tozero"},
+        "yaxis": _axis(measure) | ({"type": "log"} if log else {}),
+        "margin": _MARGIN,
+    }
+    words = "Green: nothing is both better and cheaper."
+    figure = {"data": [line, points], "layout": layout}
+    return _plot(f"plot-{slug}-cost", f"{measure.name} against what it costs", figure, words)
+
+
+def _axis(measure: Measure) -> dict[str, Any]:
+    unit = f" ({measure.unit})" if measure.unit else ""
+    return {"title": {"text": f"{measure.name}{unit}"}}
+
+
+def _plot(place: str, title: str, figure: Mapping[str, Any], words: str = "") -> dict[str, Any]:
+    return {"id": place, "title": title, "figure": figure, "words": words}
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,297 @@
+"""A study worked out before anything runs: variants, conditions and rows, or a sentence of what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import platform
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import thesisrecon
+from thesisrecon.config import KINDS, PipelineConfig, tables_from_config
+from thesisrecon.errors import UsageError
+from thesisrecon.io.run_directory import code_key, key_of
+from thesisrecon.settings import table_from_dataclass, unknown_word
+from validation.ablation.changes import STAGES, TASK, Setting, apply_changes, level_name
+from validation.ablation.own import PREFIX
+from validation.ablation.study import Axis, Changes, Measure, Mode, Study
+from validation.ablation.tasks import FunctionTask, Reconstruction
+
+ROOT = Path(__file__).resolve().parents[1]
+_RUN_BY_ROWS = ("scenes", "metrics", "references", "checks", "ablation/tasks")
+_VERSIONS = ("numpy", "scipy", "numba")
+Levels = Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One thing that is compared, or one condition under which things are: the level of every axis, and what
+    it changes."""
+
+    name: str
+    levels: Levels
+    changes: Changes
+
+
+@dataclass(frozen=True)
+class PlannedRow:
+    """One row to be: ``key`` names the setting, scene, seed and versions."""
+
+    key: str
+    variant: str
+    condition: str
+    scene: str
+    seed: int
+    setting: Setting
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All of a study: its rows in the order in which they run, seed by seed."""
+
+    study: Study
+    measures: tuple[Measure, ...]
+    variants: tuple[Variant, ...]
+    conditions: tuple[Variant, ...]
+    seeds: tuple[int, ...]
+    baseline: str
+    rows: tuple[PlannedRow, ...]
+    versions: Mapping[str, str]
+
+
+def plan_study(study: Study) -> Plan:
+    """The plan of a study.
+
+    Raises :class:`UsageError` for an unknown path, scene, metric or baseline, a value of another type, an
+    axis without values, and seeds that are no whole numbers.
+    """
+    task = _task_of(study)
+    start = Setting(study.config, task)
+    variants = _variants(study)
+    conditions = tuple(_combined(_axes(study.conditions, "condition"))) or (Variant("", {}, {}),)
+    settings = {
+        (v.name, c.name): _applied(start, v, c, study.folder)
+        for v, c in itertools.product(variants, conditions)
+    }
+    variants = _different(variants, conditions, settings)
+    scenes, seeds = _scenes(study, task), _seeds(study)
+    baseline = study.baseline or variants[0].name
+    if baseline not in [v.name for v in variants]:
+        raise UsageError(unknown_word("baseline", baseline, [v.name for v in variants]))
+    told = versions()
+    scene_keys = {scene: task.scene_key(scene) for scene in scenes}
+    identities = {at: identity(setting) for at, setting in settings.items()}
+    rows = tuple(
+        PlannedRow(
+            key_of("row", identities[v.name, c.name], scene_keys[scene], seed, told),
+            v.name,
+            c.name,
+            scene,
+            seed,
+            settings[v.name, c.name],
+        )
+        for seed, scene, c, v in itertools.product(seeds, scenes, conditions, variants)
+    )
+    return Plan(study, _measures(study, task), variants, conditions, seeds, baseline, rows, told)
+
+
+def _applied(start: Setting, variant: Variant, condition: Variant, folder: Path) -> Setting:
+    """The setting of a variant under a condition; what is wrong is told with their names."""
+    for part in (variant, condition):
+        try:
+            start = apply_changes(start, part.changes, folder)
+        except UsageError as error:
+            raise UsageError(f"{part.name}: {error}") from None
+    return start
+
+
+def _task_of(study: Study) -> Any:
+    task = Reconstruction() if study.task is None else study.task
+    if hasattr(task, "run") and hasattr(task, "measures"):
+        return task
+    if not callable(task):
+        raise UsageError(f"a task is a Task or a function (config, scene, seed); got {task!r}")
+    return FunctionTask(task)
+
+
+def _measures(study: Study, task: Any) -> tuple[Measure, ...]:
+    known = {m.name: m for m in task.measures}
+    asked: Sequence[str | Measure] = study.metrics or tuple(known.values())
+    if isinstance(asked, str):
+        raise UsageError(f"metrics are a list of names; got {asked!r}")
+    for metric in asked:
+        if isinstance(metric, str) and known and metric not in known:
+            raise UsageError(unknown_word("metric", metric, known))
+    if not asked:
+        raise UsageError("a function as a task needs metrics: the names of the numbers that it tells")
+    return tuple(m if isinstance(m, Measure) else known.get(m, Measure(m)) for m in asked)
+
+
+def _seeds(study: Study) -> tuple[int, ...]:
+    count = study.seeds
+    if isinstance(count, int) and not isinstance(count, bool):
+        seeds: list[Any] = list(range(count))
+    else:
+        seeds = list(count) if isinstance(count, list | tuple | range) else []
+    if not seeds or any(type(s) is not int or s < 0 for s in seeds) or len(set(seeds)) < len(seeds):
+        raise UsageError(
+            f"seeds are different whole numbers of at least 0, or how many (at least 1); got {count!r}"
+        )
+    return tuple(seeds)
+
+
+def _scenes(study: Study, task: Any) -> tuple[str, ...]:
+    scenes = study.scenes
+    if isinstance(scenes, str) or not scenes or not all(isinstance(s, str) for s in scenes):
+        raise UsageError(f"scenes are a list of at least one name; got {scenes!r}")
+    for scene in scenes:
+        task.check(scene)
+    return tuple(dict.fromkeys(scenes))
+
+
+# ---------------------------------------------------------------- axes
+
+
+def _axes(axes: Mapping[str, Axis], what: str) -> list[list[Variant]]:
+    """The levels of each axis."""
+    if not isinstance(axes, Mapping):
+        raise UsageError(f"the {what}es are a table: path or name -> levels; got {axes!r}")
+    return [_levels(name, axis, what) for name, axis in axes.items()]
+
+
+def _levels(name: str, axis: Axis, what: str) -> list[Variant]:
+    if isinstance(axis, str) or not isinstance(axis, Mapping | Sequence):
+        raise UsageError(f"the {what} {name} takes a list of values or a table of levels; got {axis!r}")
+    if not axis:
+        raise UsageError(f"the {what} {name} has no values; give it at least one")
+    if not isinstance(axis, Mapping):
+        _check_path(name, what)
+        levels = [(level_name(name, value), {name: value}) for value in axis]
+    else:
+        levels = []
+        for level, changes in axis.items():
+            if not isinstance(changes, Mapping):
+                raise UsageError(
+                    f"the level {level!r} of the {what} {name} takes a table of changes, path -> value; "
+                    f"got {changes!r} (to vary one path, give the {what} that path and a list of values)"
+                )
+            levels.append((level, dict(changes)))
+    doubled = [level for n, (level, _) in enumerate(levels) if level in [x for x, _ in levels[:n]]]
+    if doubled:
+        raise UsageError(f"the {what} {name} has the level {doubled[0]!r} twice")
+    return [Variant(level, {name: level}, changes) for level, changes in levels]
+
+
+def _check_path(path: str, what: str) -> None:
+    head = path.partition(".")[0]
+    if head not in (TASK, *STAGES):
+        known = unknown_word("stage", head, [*STAGES, TASK])
+        raise UsageError(f"the {what} {path} names no path of the configuration: {known}")
+
+
+def _combined(axes: Sequence[Sequence[Variant]]) -> Iterator[Variant]:
+    """Every combination of levels."""
+    for levels in itertools.product(*axes) if axes else ():
+        yield _joined(levels, ", ".join(v.name for v in levels))
+
+
+def _joined(parts: Sequence[Variant], name: str) -> Variant:
+    levels = {axis: level for part in parts for axis, level in part.levels.items()}
+    changes = {path: value for part in parts for path, value in part.changes.items()}
+    return Variant(name, levels, changes)
+
+
+def _variants(study: Study) -> tuple[Variant, ...]:
+    axes = _axes(study.axes, "axis")
+    if study.mode not in typing.get_args(Mode):
+        raise UsageError(unknown_word("mode", str(study.mode), typing.get_args(Mode)))
+    if study.mode == "grid":
+        if not axes:
+            raise UsageError("a study has at least one axis")
+        return tuple(_combined(axes))
+    start = Variant(study.start, {}, {})
+    levels = [level for axis in axes for level in axis]
+    if study.mode == "one-at-a-time":
+        return (start, *levels)
+    steps = [_laid(levels[: n + 1], level.name) for n, level in enumerate(levels)]
+    return (start, *steps)
+
+
+def _laid(parts: Sequence[Variant], name: str) -> Variant:
+    """The changes of a ladder, in the order of its steps: a later one of a path counts last."""
+    changes: dict[str, Any] = {}
+    for part in parts:
+        for path, value in part.changes.items():
+            changes.pop(path, None)
+            # What was set inside a stage is gone once the whole stage is.
+            changes = {k: v for k, v in changes.items() if not k.startswith(f"{path}.")}
+            changes[path] = value
+    return Variant(name, {"step": name}, changes)
+
+
+def _different(
+    variants: Sequence[Variant], conditions: Sequence[Variant], settings: Mapping[tuple[str, str], Setting]
+) -> tuple[Variant, ...]:
+    """The variants without those that equal an earlier one; one name for two settings is refused."""
+    kept: dict[str, Variant] = {}
+    seen: list[list[Any]] = []
+    for variant in variants:
+        found = [identity(settings[variant.name, c.name]) for c in conditions]
+        if variant.name in kept:
+            raise UsageError(f"two variants are called {variant.name!r}; name the levels in a table")
+        if found not in seen:
+            kept[variant.name] = variant
+            seen.append(found)
+    return tuple(kept.values())
+
+
+# ---------------------------------------------------------------- what makes two rows the same
+
+
+def identity(setting: Setting) -> list[Any]:
+    """Plain values that name a setting: equal ones find the same."""
+    return [_config_identity(setting.config), _task_identity(setting.task)]
+
+
+def _config_identity(config: PipelineConfig) -> dict[str, Any]:
+    tables: dict[str, Any] = tables_from_config(config)
+    for stage in KINDS:
+        kind = type(getattr(config, stage))
+        tables[stage] = [kind.__module__, kind.__qualname__, _own_code(kind.__module__), tables[stage]]
+    return tables
+
+
+def _task_identity(task: Any) -> list[Any]:
+    subject = task.function if isinstance(task, FunctionTask) else type(task)
+    table = table_from_dataclass(task) if dataclasses.is_dataclass(task) and subject is type(task) else {}
+    name = getattr(subject, "__qualname__", type(subject).__qualname__)
+    return [subject.__module__, name, _own_code(subject.__module__), table]
+
+
+def _own_code(module: str) -> str:
+    """A key for the code of a module of the user's; that of ours is among the versions."""
+    ours = module.split(".")[0] in ("thesisrecon", "validation")
+    return "" if ours or module.startswith(PREFIX) else code_key(module)
+
+
+@cache
+def versions() -> dict[str, str]:
+    """What a row was computed with: versions of what is installed, and a key for our code that rows run."""
+    content = hashlib.sha256()
+    package = Path(thesisrecon.__file__).parent
+    for root in (package, *(ROOT / part for part in _RUN_BY_ROWS)):
+        for path in sorted(root.rglob("*.py")):
+            content.update(f"{path.relative_to(root)}".encode() + path.read_bytes())
+    return {
+        "thesisrecon": thesisrecon.__version__,
+        "code": content.hexdigest()[:16],
+        "python": platform.python_version(),
+        **{name: version(name) for name in _VERSIONS},
+    }

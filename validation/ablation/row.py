@@ -1,0 +1,107 @@
+"""One row in the process that carries it out, whatever kind of worker that is."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from thesisrecon.errors import StageFailure, UsageError
+from validation.ablation.changes import Setting
+from validation.ablation.own import Source, sources_of
+from validation.ablation.store import SHARED, WORK, Outcome
+from validation.ablation.study import Place
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a worker is given: ``setting`` as bytes, for a class of the user's is known only once its source
+    is installed. ``step`` is the shared step to be prepared, empty for the row itself. ``by_thread`` says
+    that the worker shares its process with others."""
+
+    key: str
+    setting: bytes
+    sources: tuple[Source, ...]
+    scene: str
+    seed: int
+    out: Path
+    step: str = ""
+    by_thread: bool = False
+
+
+def pack(setting: Setting) -> tuple[bytes, tuple[Source, ...]]:
+    """A setting as it travels; :class:`UsageError` for what cannot."""
+    try:
+        content: bytes = _pickler().dumps(setting)
+    except Exception as error:
+        raise UsageError(f"this variant cannot be sent to a worker: {error}") from None
+    return content, sources_of(_modules(setting))
+
+
+def _pickler() -> Any:
+    """Where cloudpickle is installed (Dask brings it) classes of a script travel to any worker."""
+    try:
+        import cloudpickle
+    except ImportError:
+        return pickle
+    return cloudpickle
+
+
+def _modules(value: Any) -> set[str]:
+    """The modules of every object of a setting."""
+    found, waiting = set(), [value]
+    while waiting:
+        item = waiting.pop()
+        found.add(getattr(item, "__module__", type(item).__module__))
+        if hasattr(item, "__dataclass_fields__"):
+            waiting += [getattr(item, name) for name in item.__dataclass_fields__]
+        elif isinstance(item, tuple):
+            waiting += item
+    return found
+
+
+def carry_out(job: Job) -> Outcome:
+    """The row, or the step it is asked for. What goes wrong is told, and never raised."""
+    for source in job.sources:
+        source.install()
+    setting: Setting = pickle.loads(job.setting)
+    own = job.out / WORK / job.key
+    shutil.rmtree(own, ignore_errors=True)
+    place = Place(own, job.out / SHARED)
+    clock = time.thread_time if job.by_thread else time.process_time
+    start, cpu = time.perf_counter(), clock()
+    metrics: Mapping[str, float] = {}
+    failure = ""
+    try:
+        own.mkdir(parents=True, exist_ok=True)
+        if job.step:
+            setting.task.prepare(setting.config, job.scene, job.seed, place, step=job.step)
+        else:
+            metrics = _plain(setting.task.run(setting.config, job.scene, job.seed, place))
+    except (StageFailure, UsageError) as error:
+        failure = str(error)
+    except Exception as error:
+        failure = f"{type(error).__name__}: {error}{_where(error)}"
+    seconds, cpu_s = time.perf_counter() - start, clock() - cpu
+    shutil.rmtree(own, ignore_errors=True)
+    return Outcome(metrics, failure, seconds, cpu_s)
+
+
+def _plain(metrics: Any) -> dict[str, float]:
+    if not isinstance(metrics, Mapping):
+        raise TypeError(f"a task tells a table of numbers; got {type(metrics).__name__}")
+    return {str(name): float(value) for name, value in metrics.items()}
+
+
+def _where(error: BaseException) -> str:
+    """File and line of an error, for whoever wrote the variant."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if trace is None:
+        return ""
+    return f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})"

@@ -1,0 +1,346 @@
+"""Rows computed as workers become free and kept as they end; what several begin with is computed once."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, overload
+
+from thesisrecon.config import tables_from_config
+from thesisrecon.io.run_directory import write_json
+from thesisrecon.settings import table_from_dataclass
+from validation.ablation.plan import Plan, PlannedRow, plan_study
+from validation.ablation.row import Job, carry_out, pack
+from validation.ablation.store import STEPS, WORK, Outcome, Store, finite
+from validation.ablation.study import Study
+from validation.ablation.tasks import FunctionTask
+from validation.ablation.workers import Crew, crew_of
+
+Heard = Callable[["State"], None]
+"""Hears how far a study is, whenever a row or a step has ended."""
+LOST = "the process that carried this row out ended before it did: killed, or out of memory"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row that has ended: where it stands in the study, and what came of it.
+
+    ``cost_s`` is the processor time (s) of the row with all that it took over from others.
+    """
+
+    key: str
+    variant: str
+    condition: str
+    scene: str
+    seed: int
+    metrics: Mapping[str, float]
+    failure: str
+    seconds: float
+    cost_s: float
+
+
+@dataclass(frozen=True)
+class Rows(Sequence[Row]):
+    """The rows of a study that have ended, in the order of its plan."""
+
+    plan: Plan
+    rows: tuple[Row, ...]
+
+    @overload
+    def __getitem__(self, index: int) -> Row: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Row]: ...
+    def __getitem__(self, index: int | slice) -> Row | Sequence[Row]:
+        return self.rows[index]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+@dataclass
+class State:
+    """How far a study is: rows in all, ended before this run, ended now and failed of these; wall seconds of
+    those of this run by variant; seconds since the start; how many run at a time."""
+
+    total: int
+    kept: int = 0
+    done: int = 0
+    failed: int = 0
+    steps: int = 0
+    steps_done: int = 0
+    width: int = 1
+    started: float = field(default_factory=time.perf_counter)
+    spent: dict[str, list[float]] = field(default_factory=dict)
+    waiting: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds that the rest should take: for each variant the mean of its rows so far, else of all; None
+        before the first row."""
+        every = [s for spent in self.spent.values() for s in spent]
+        if not every:
+            return None
+        usual = sum(every) / len(every)
+        mean = {v: sum(s) / len(s) for v, s in self.spent.items()}
+        return sum(n * mean.get(v, usual) for v, n in self.waiting.items()) / self.width
+
+
+def ablate(
+    study: Study,
+    out: str | Path,
+    *,
+    executor: str | Executor = "processes",
+    threads: int | None = None,
+    heard: Heard | None = None,
+) -> Rows:
+    """Compute the rows of a study that are not in ``out`` yet, and return all of them.
+
+    Parameters
+    ----------
+    study : what is asked.
+    out : the folder of the study. It may be used again, after a kill or for a study that has grown: rows that
+        are there under the same setting, scene, seed and versions are not computed again.
+    executor : "local" (this process), "processes", "dask://HOST:PORT", or any
+        :class:`concurrent.futures.Executor`.
+    threads : rows at a time; all processors where None.
+    heard : hears of the progress.
+
+    Raises
+    ------
+    UsageError : a study that cannot be (see :func:`plan_study`), a folder that cannot be written, a scheduler
+        that does not answer. What goes wrong in a row is kept in the row.
+    """
+    plan, store = plan_study(study), Store(Path(out).resolve())
+    store.prepare()
+    write_json(store.path / "study.json", _told(plan))
+    todo = {row.key: row for row in plan.rows if store.load(row.key) is None}
+    state = State(len({row.key for row in plan.rows}), waiting=Counter(r.variant for r in todo.values()))
+    state.kept = state.total - len(todo)
+    lost: dict[str, Outcome] = {}
+    if todo:
+        with crew_of(executor, threads) as crew:
+            state.width = min(crew.width, len(todo))
+            lost = _Session(plan, store, crew, state, heard or (lambda _: None)).run(list(todo.values()))
+    shutil.rmtree(store.path / WORK, ignore_errors=True)
+    return _rows(plan, store, lost)
+
+
+def read_rows(study: Study, out: str | Path) -> Rows:
+    """The rows of a study that are in ``out``; nothing is computed."""
+    return _rows(plan_study(study), Store(Path(out)), {})
+
+
+def _rows(plan: Plan, store: Store, lost: Mapping[str, Outcome]) -> Rows:
+    rows = []
+    wanted = {m.name: m for m in plan.measures}
+    for planned in plan.rows:
+        outcome = store.load(planned.key) or lost.get(planned.key)
+        if outcome is None:
+            continue
+        shared = [s for s in (store.load(key, STEPS) for key in outcome.steps) if s is not None]
+        cost = outcome.cpu_s + sum(s.cpu_s for s in shared)
+        metrics, failure = dict(outcome.metrics), outcome.failure
+        if not failure:
+            metrics, failure = finite(metrics, wanted)
+        rows.append(
+            Row(
+                planned.key,
+                planned.variant,
+                planned.condition,
+                planned.scene,
+                planned.seed,
+                metrics,
+                failure,
+                outcome.seconds,
+                cost,
+            )
+        )
+    return Rows(plan, tuple(rows))
+
+
+# ---------------------------------------------------------------- what rows share
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A row or a shared step to be carried out, once the steps ``after`` have ended."""
+
+    row: PlannedRow
+    after: tuple[str, ...]
+    step: str = ""
+    key: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.key or self.row.key
+
+
+def parts_of(rows: Sequence[PlannedRow]) -> list[_Part]:
+    """The rows, and before them those steps that several of them begin with.
+
+    A step is a part of its own where its rows part after it: where all go on alike, the next step does for
+    both.
+    """
+    chains = {row.key: _chain(row) for row in rows}
+    users = Counter(key for chain in chains.values() for _, key in chain)
+    parts: dict[str, _Part] = {}
+    for row in rows:
+        before: tuple[str, ...] = ()
+        chain = chains[row.key]
+        for (step, key), following in zip(chain, [*chain, None][1:], strict=True):
+            goes_on = 0 if following is None else users[following[1]]
+            if users[key] > max(1, goes_on):
+                parts.setdefault(key, _Part(row, before, step, key))
+                before = (*before, key)
+        parts[row.key] = _Part(row, before)
+    return list(parts.values())
+
+
+def _chain(row: PlannedRow) -> Sequence[tuple[str, str]]:
+    """The steps of a row with their keys; nothing for a task that has none. The last one is the row itself
+    where its measures are all that is left."""
+    steps = getattr(row.setting.task, "steps", None)
+    return [] if steps is None else list(steps(row.setting.config, row.scene, row.seed))
+
+
+# ---------------------------------------------------------------- one call
+
+
+@dataclass
+class _Session:
+    """The state of one call of :func:`ablate`."""
+
+    plan: Plan
+    store: Store
+    crew: Crew
+    state: State
+    heard: Heard
+    tries: Counter[str] = field(default_factory=Counter)
+    lost: dict[str, Outcome] = field(default_factory=dict)
+
+    def run(self, rows: Sequence[PlannedRow]) -> dict[str, Outcome]:
+        """Carry out all rows; the outcomes of those that were lost, which are not kept."""
+        parts = parts_of(rows)
+        ended = {p.key for p in parts if p.step and self.store.load(p.key, STEPS) is not None}
+        waiting = [p for p in parts if p.name not in ended]
+        self.state.steps = sum(bool(p.step) for p in waiting)
+        packed = {p.row.key: pack(p.row.setting) for p in waiting}
+        running: dict[Future[Outcome], _Part] = {}
+        self.heard(self.state)
+        while waiting or running:
+            for part in self._ready(waiting, ended, len(running)):
+                waiting.remove(part)
+                running[self._submit(part, packed[part.row.key])] = part
+                if len(running) >= self.crew.width:
+                    break
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            outcomes = [(running.pop(future), self._outcome(future)) for future in done]
+            if self.crew.renew is not None and any(outcome.lost for _, outcome in outcomes):
+                # Of a pool that broke no row ends any more.
+                outcomes += [(part, Outcome(failure=LOST, lost=True)) for part in running.values()]
+                running.clear()
+                self.crew.executor = self.crew.renew()
+            for part, outcome in outcomes:
+                if outcome.lost and self._again(part):
+                    waiting.insert(0, part)
+                else:
+                    ended.add(part.name)
+                    self._keep(part, outcome)
+        return self.lost
+
+    def _ready(self, waiting: Sequence[_Part], ended: set[str], running: int) -> Iterator[_Part]:
+        """The parts that can begin, in order. One that was in a process that died runs alone, so that it is
+        known which of them kills processes."""
+        ready = [p for p in waiting if set(p.after) <= ended]
+        suspects = [p for p in ready if self.tries[p.name]]
+        if suspects:
+            return iter(suspects[:1] if not running else [])
+        return iter(ready[: max(0, self.crew.width - running)])
+
+    def _submit(self, part: _Part, packed: tuple[bytes, Any]) -> Future[Outcome]:
+        row = part.row
+        job = Job(
+            part.name,
+            *packed,
+            row.scene,
+            row.seed,
+            self.store.path,
+            part.step,
+            self.crew.by_thread,
+        )
+        try:
+            return self.crew.executor.submit(carry_out, job)
+        except BrokenProcessPool as error:
+            future: Future[Outcome] = Future()
+            future.set_exception(error)
+            return future
+
+    def _outcome(self, future: Future[Outcome]) -> Outcome:
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            return Outcome(failure=LOST, lost=True)
+        except Exception as error:
+            # An executor of the caller's tells in its own way that a worker is gone.
+            if type(error).__name__ == "KilledWorker":
+                return Outcome(failure=LOST, lost=True)
+            raise
+
+    def _again(self, part: _Part) -> bool:
+        """Whether a part whose process died is tried once more."""
+        self.tries[part.name] += 1
+        return self.crew.renew is not None and self.tries[part.name] < 2
+
+    def _keep(self, part: _Part, outcome: Outcome) -> None:
+        row, state = part.row, self.state
+        if part.step:
+            state.steps_done += 1
+            told = {"step": part.step, "scene": row.scene, "seed": row.seed}
+            self.store.save(part.key, outcome, told, STEPS)
+        else:
+            outcome = replace(outcome, steps=part.after)
+            if outcome.lost:
+                self.lost[row.key] = outcome
+            else:
+                self.store.save(row.key, outcome, _told_of_row(self.plan, row))
+            state.done += 1
+            failed = outcome.failure or finite(outcome.metrics, {m.name: m for m in self.plan.measures})[1]
+            state.failed += bool(failed)
+            state.waiting[row.variant] -= 1
+            state.spent.setdefault(row.variant, []).append(outcome.seconds)
+        self.heard(state)
+
+
+def _told_of_row(plan: Plan, row: PlannedRow) -> dict[str, Any]:
+    task = row.setting.task
+    return {
+        "variant": row.variant,
+        "condition": row.condition,
+        "scene": row.scene,
+        "seed": row.seed,
+        "config": tables_from_config(row.setting.config),
+        "task": {} if isinstance(task, FunctionTask) else table_from_dataclass(task),
+        "versions": dict(plan.versions),
+    }
+
+
+def _told(plan: Plan) -> dict[str, Any]:
+    """The study in plain words, beside its rows."""
+    study = plan.study
+    return {
+        "title": study.title,
+        "mode": study.mode,
+        "baseline": plan.baseline,
+        "variants": {v.name: dict(v.levels) for v in plan.variants},
+        "conditions": {c.name: dict(c.levels) for c in plan.conditions},
+        "scenes": list(dict.fromkeys(r.scene for r in plan.rows)),
+        "seeds": list(plan.seeds),
+        "metrics": [vars(m) for m in plan.measures],
+        "versions": dict(plan.versions),
+    }

@@ -1,0 +1,33 @@
+"""A plain function as a task."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from thesisrecon.config import PipelineConfig
+from validation.ablation.study import Measure, Place, TaskFunction
+
+
+@dataclass(frozen=True)
+class FunctionTask:
+    """``function(config, scene, seed)`` tells its numbers by name; every scene is its own affair."""
+
+    function: TaskFunction
+    measures: ClassVar[Sequence[Measure]] = ()
+
+    def check(self, scene: str) -> None:
+        """A function knows itself what its scenes are."""
+
+    def scene_key(self, scene: str) -> str:
+        return scene
+
+    def run(
+        self,
+        config: PipelineConfig,
+        scene: str,
+        seed: int,
+        place: Place,  # noqa: ARG002 (a function writes nothing)
+    ) -> Mapping[str, float]:
+        return self.function(config, scene, seed)

@@ -1,0 +1,95 @@
+"""Pairs of photographs with known cameras as a task: what a front end verifies, and how good its F is."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io.images import read_photographs
+from thesisrecon.pipeline import detect_features, match_views
+from thesisrecon.settings import unknown_word
+from thesisrecon.types import F64, Image
+from validation.ablation.study import Measure, Place
+from validation.checks.front_end_pairs import MAX_SIZE_PX, Related
+from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
+from validation.scenes.real import load_real_scene
+from validation.scenes.real_pairs import SCENES_WITH_CAMERAS, camera_pairs
+
+CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
+
+
+@dataclass(frozen=True)
+class PairsOfPhotographs:
+    """Photographs ``i`` and ``i + gap`` of the scene "NAME/i" (fountain-P11/3), long side 1536: corners,
+    matches, F and verification of the configuration, judged by correspondences of the true cameras."""
+
+    gap: int = 2
+
+    measures: ClassVar[Sequence[Measure]] = (
+        Measure("verified", "", "more", False, "inliers of an F whose error is below 1 px, else 0"),
+        Measure("right_pct", "%", "more", False, "100 where the error of F is below 1 px, else 0"),
+        Measure("error_px", "px", "less", True, "RMS distance of true correspondences to their lines"),
+        Measure("sigma_px", "px", "less", True, "noise of the inliers"),
+    )
+
+    def check(self, scene: str) -> None:
+        name, _, first = scene.rpartition("/")
+        if name not in SCENES_WITH_CAMERAS or not first.isdecimal():
+            known = [f"{s}/0" for s in SCENES_WITH_CAMERAS]
+            raise UsageError(unknown_word("pair", scene, known))
+        found = load_real_scene(name)
+        if found is None:
+            raise UsageError(f"the photographs of {name} are not on this machine (THESISRECON_DATA)")
+        if int(first) + self.gap >= len(found.image_paths):
+            raise UsageError(f"{name} has {len(found.image_paths)} photographs: there is no pair {scene}")
+
+    def scene_key(self, scene: str) -> str:
+        return scene
+
+    def run(
+        self,
+        config: PipelineConfig,
+        scene: str,
+        seed: int,
+        place: Place,  # noqa: ARG002 (nothing is written)
+    ) -> Mapping[str, float]:
+        name, _, first = scene.rpartition("/")
+        i = int(first)
+        images, truth = _photographs(name, i, self.gap)
+        views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
+        return numbers_of_pair(config, views, (i, i + self.gap), seed, truth)
+
+
+def numbers_of_pair(
+    config: PipelineConfig, views: Sequence[Any], pair: tuple[int, int], seed: int, truth: F64
+) -> dict[str, float]:
+    """What is told of two prepared views, against true correspondences (M, 4) px."""
+    view = match_views(config, views[0], views[1], pair, seed)
+    if not view.F.any():
+        raise StageFailure("the pair has no F", view.reason)
+    found = Related(view, rms_epipolar_distance(view.F, truth) if view.F.any() else NONE_PX)
+    return {
+        "verified": float(found.verified),
+        "right_pct": 100.0 * found.right,
+        "error_px": found.error_px,
+        "sigma_px": float(view.sigma_px),
+    }
+
+
+@lru_cache(maxsize=16)
+def _photographs(name: str, i: int, gap: int) -> tuple[tuple[Image, ...], F64]:
+    scene = load_real_scene(name)
+    assert scene is not None
+    images = read_photographs([scene.image_paths[i], scene.image_paths[i + gap]], max_size_px=MAX_SIZE_PX)
+    truths = [pair.truth for pair in camera_pairs(scene, CACHE, (gap,))]
+    truth = truths[i]
+    assert truth is not None
+    return images.images, np.asarray(truth)

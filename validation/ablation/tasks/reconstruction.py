@@ -1,0 +1,155 @@
+"""Photographs to cameras, or as far as asked, judged by the true cameras."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, get_args
+
+import numpy as np
+
+import thesisrecon
+from thesisrecon.config import KINDS, PipelineConfig, tables_from_config
+from thesisrecon.errors import UsageError
+from thesisrecon.io.run_directory import code_key, key_of
+from thesisrecon.run import Until
+from thesisrecon.settings import unknown_word
+from thesisrecon.types import RunResult
+from validation.ablation.study import Measure, Place
+from validation.harness.records import Wishes
+from validation.harness.scenes import PHOTOGRAPHS, load_photographs, truth_of
+from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
+from validation.scenes.real import Scene
+
+SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
+    "features": ("images", "features"),
+    "matches": ("pairs", "matching", "epipolar", "verification"),
+    "projective": ("tracks", "projective"),
+    "metric": ("intrinsics", "selfcalibration", "metric"),
+    "dense": ("dense",),
+    "model": ("model",),
+}
+"""The settings that each step adds to those before it."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread.
+
+    A scene is one with a name, or a folder of photographs, with ``cameras.json`` or ``sparse/0`` as its truth
+    if there is one; without truth the errors of cameras are missing.
+    """
+
+    until: str = "metric"
+
+    measures: ClassVar[Sequence[Measure]] = (
+        Measure("focal_error_pct", "%", "less", True, "median |f / f_true - 1| of the registered cameras"),
+        Measure("centre_error_mm", "mm", "less", True, "mean distance of the centres after a similarity"),
+        Measure("rotation_error_deg", "deg", "less", True, "median angle after the common rotation"),
+        Measure("registered_pct", "%", "more", False, "share of the photographs that have a camera"),
+        Measure("points", "", "more", True, "points of the model"),
+        Measure("reprojection_px", "px", "less", True, "median distance of observations from their points"),
+        Measure("verified", "", "more", True, "verified matches of all accepted pairs"),
+        Measure("sigma_px", "px", "less", True, "median noise of the accepted pairs"),
+        Measure("trusted", "", "more", False, "1: the result passed its own check"),
+    )
+
+    def __post_init__(self) -> None:
+        if self.until not in get_args(Until):
+            raise ValueError(unknown_word("stage", self.until, get_args(Until)))
+
+    def check(self, scene: str) -> None:
+        _load(scene)
+
+    def scene_key(self, scene: str) -> str:
+        content = hashlib.sha256()
+        for path in _load(scene).image_paths:
+            content.update(path.name.encode() + path.read_bytes())
+        return content.hexdigest()[:32]
+
+    def steps(self, config: PipelineConfig, scene: str, seed: int) -> list[tuple[str, str]]:
+        """A step is named by all settings up to it; corners alone do not depend on the seed."""
+        tables, settings, found = tables_from_config(config), dict[str, Any](), []
+        for step, stages in SETTINGS_OF.items():
+            for stage in stages:
+                module = type(getattr(config, stage)).__module__
+                settings[stage] = [module, code_key(module) if stage in KINDS else "", tables[stage]]
+            drawn = [] if step == "features" else [seed]
+            found.append((step, key_of("step", step, scene, settings, drawn)))
+            if step == self.until:
+                break
+        return found
+
+    def prepare(self, config: PipelineConfig, scene: str, seed: int, place: Place, *, step: str) -> None:
+        self._reconstruct(config, scene, seed, place, step)
+
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
+        return _measured(self._reconstruct(config, scene, seed, place, self.until), _load(scene))
+
+    def _reconstruct(
+        self, config: PipelineConfig, scene: str, seed: int, place: Place, until: str
+    ) -> RunResult:
+        return thesisrecon.reconstruct(
+            _load(scene).image_paths,
+            place.own,
+            config=config,
+            seed=seed,
+            until=until,  # type: ignore[arg-type]
+            threads=1,
+            shared=place.shared,
+        )
+
+
+def _load(scene: str) -> Scene:
+    """The photographs of a scene by its name or its folder; :class:`UsageError` where there are none."""
+    folder = Path(scene)
+    named = {} if scene in PHOTOGRAPHS or not folder.is_dir() else {scene: str(folder)}
+    if scene not in PHOTOGRAPHS and not named:
+        raise UsageError(f"{unknown_word('scene', scene, PHOTOGRAPHS)}; a folder of photographs is one too")
+    try:
+        return load_photographs(scene, Wishes(Path(), (), (), named))
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
+def _measured(result: RunResult, scene: Scene) -> dict[str, float]:
+    """The numbers that this result has."""
+    accepted = [pair for pair in result.pairs if pair.accepted]
+    found = {"verified": float(sum(pair.inliers for pair in accepted))} if result.pairs else {}
+    if accepted:
+        found["sigma_px"] = float(np.median([pair.sigma_px for pair in accepted]))
+    if result.metric is None:
+        if result.projective is not None:
+            found["registered_pct"] = 100.0 * float(result.projective.registered.mean())
+            found["points"] = float(result.projective.valid.sum())
+        return found
+    model, truth = result.metric.reconstruction, _truth_at_working_size(result, scene)
+    found["registered_pct"] = 100.0 * float(model.registered.sum()) / len(scene.image_paths)
+    found["points"] = float(model.valid.sum())
+    found["trusted"] = float(result.metric.trusted)
+    found["reprojection_px"] = measure_reprojection(model).median_px
+    if truth is None:
+        return found
+    errors = measure_cameras(model, truth)
+    found["focal_error_pct"] = errors.focal_error_pct
+    found["rotation_error_deg"] = errors.rotation_error_deg
+    found["centre_error_mm"] = np.nan if errors.centre_error is None else 1000.0 * errors.centre_error
+    return found
+
+
+def _truth_at_working_size(result: RunResult, scene: Scene) -> TrueCameras | None:
+    """The true cameras of the photographs that were read, in their pixels."""
+    truth = truth_of(scene)
+    if truth is None:
+        return None
+    number = {path.name: n for n, path in enumerate(scene.image_paths)}
+    chosen = [number[image.name] for image in result.images]
+    K = truth.K[chosen]
+    scale = np.array([image.scale for image in result.images])[:, None, None]
+    # Pixel centres are whole numbers: (x + 0.5) s - 0.5.
+    K[:, :2, 2] += 0.5
+    K[:, :2] *= scale
+    K[:, :2, 2] -= 0.5
+    return TrueCameras(K, truth.R[chosen], truth.C[chosen])

@@ -1,0 +1,68 @@
+"""The thesis' comparison of triangulation methods as a task: points of noisy images against the true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, get_args
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import UsageError
+from thesisrecon.geometry.strata import Group
+from thesisrecon.settings import unknown_word
+from validation.ablation.study import Measure, Place
+from validation.checks.triangulation import POLYNOMIAL, SCENES, TWO_VIEWS, compare_on_rig, draw_rig
+
+
+@dataclass(frozen=True)
+class TriangulationOverNoise:
+    """``points`` points of a rig drawn by the seed, seen with Gaussian noise of ``noise_px``, triangulated by
+    ``method`` in a ``frame`` of space that is "metric", "affine" or "projective".
+
+    Every method meets the same rig, noise and frame.
+    """
+
+    method: str = POLYNOMIAL
+    noise_px: float = 1.0
+    frame: str = "metric"
+    points: int = 200
+
+    measures: ClassVar[Sequence[Measure]] = (
+        Measure("image_px", "px", "less", True, "RMS distance of projected from measured points"),
+        Measure("space_pct", "%", "less", True, "median distance from the true point over its depth"),
+        Measure("worst_pct", "%", "less", True, "95 % quantile of the same"),
+    )
+
+    def __post_init__(self) -> None:
+        for what, word, known in (("method", self.method, TWO_VIEWS), ("frame", self.frame, get_args(Group))):
+            if word not in known:
+                raise ValueError(unknown_word(what, word, known))
+        if self.noise_px < 0.0 or self.points < 1:
+            raise ValueError("noise_px is at least 0, points at least 1")
+
+    def check(self, scene: str) -> None:
+        if scene not in SCENES:
+            raise UsageError(unknown_word("scene", scene, SCENES))
+
+    def scene_key(self, scene: str) -> str:
+        return scene
+
+    def run(
+        self,
+        config: PipelineConfig,  # noqa: ARG002 (the methods are pure functions)
+        scene: str,
+        seed: int,
+        place: Place,  # noqa: ARG002 (nothing is written)
+    ) -> Mapping[str, float]:
+        if SCENES[scene][1] > 2 and self.method == POLYNOMIAL:
+            raise ValueError("the polynomial method is one of two views")
+        rng = np.random.default_rng(seed)
+        drawn = draw_rig(scene, self.noise_px, self.frame, rng, self.points)  # type: ignore[arg-type]
+        errors = compare_on_rig(drawn, {self.method: TWO_VIEWS[self.method]})[self.method]
+        return {
+            "image_px": errors.image_px,
+            "space_pct": errors.space_pct,
+            "worst_pct": errors.worst_pct,
+        }

@@ -1,0 +1,103 @@
+"""A study as a file of TOML: read with a sentence for whatever does not fit, before anything runs."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from thesisrecon.config import PipelineConfig, config_from_tables, preset
+from thesisrecon.errors import UsageError
+from thesisrecon.settings import dataclass_from_table, unknown_word
+from validation.ablation.own import is_own, load_own
+from validation.ablation.study import Measure, Study
+from validation.ablation.tasks import TASKS
+
+_TEXTS = ("title", "words", "mode", "baseline", "start")
+_TABLES = ("axes", "conditions")
+_KEYS = (*_TEXTS, *_TABLES, "task", "preset", "config", "scenes", "seeds", "metrics")
+
+
+def read_study(path: str | Path) -> Study:
+    """The study of a file.
+
+    Raises :class:`UsageError` that names the file for one that is not there or is no TOML, an unknown key
+    (naming the nearest), and values of another type. Paths, scenes and metrics are checked when the study is
+    planned.
+    """
+    path = Path(path)
+    try:
+        told = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"the study {path} cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"the study {path} is not TOML: {error}") from None
+    try:
+        return study_from_table(told, path.parent)
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def study_from_table(told: Mapping[str, Any], folder: Path = Path()) -> Study:
+    """The study that a table tells; files in it are sought from ``folder``."""
+    for key in told:
+        if key not in _KEYS:
+            raise UsageError(unknown_word("key of a study", key, _KEYS))
+    for key in _TEXTS:
+        if key in told and not isinstance(told[key], str):
+            raise UsageError(f"{key} takes a text; got {told[key]!r}")
+    for key in _TABLES:
+        if not isinstance(told.get(key, {}), Mapping):
+            raise UsageError(f"{key} takes a table, path or name -> levels; got {told[key]!r}")
+    for key in ("scenes", "axes"):
+        if key not in told:
+            raise UsageError(f"a study needs {key}")
+    plain = {key: told[key] for key in (*_TEXTS, *_TABLES, "scenes", "seeds") if key in told}
+    return Study(
+        **plain,
+        metrics=_metrics(told.get("metrics", [])),
+        task=_task(told.get("task", "reconstruction"), folder),
+        config=_config(told),
+        folder=folder,
+    )
+
+
+def _config(told: Mapping[str, Any]) -> PipelineConfig:
+    base, changes = preset(str(told.get("preset", "default"))), told.get("config", {})
+    if not isinstance(changes, Mapping):
+        raise UsageError(f"config takes a table of stages; got {changes!r}")
+    return config_from_tables(changes, base)
+
+
+def _task(wish: Any, folder: Path) -> Any:
+    """A task by its kind, or of a file of the user's; a table holds its parameters too."""
+    table = {"kind": wish} if isinstance(wish, str) else wish
+    if not isinstance(table, Mapping) or not isinstance(table.get("kind"), str):
+        raise UsageError(f"task takes a kind, or a table with its kind and parameters; got {wish!r}")
+    kind, fields = table["kind"], {k: v for k, v in table.items() if k != "kind"}
+    if not is_own(kind):
+        if kind not in TASKS:
+            raise UsageError(unknown_word("task", kind, TASKS))
+        return dataclass_from_table(TASKS[kind], fields, "task")
+    found = load_own(kind, "task", folder)
+    if isinstance(found, type):
+        return dataclass_from_table(found, fields, "task")
+    if fields:
+        raise UsageError(f"the task {kind} is a function and has no parameters; got {', '.join(fields)}")
+    return found
+
+
+def _metrics(told: Any) -> list[str | Measure]:
+    """Names of the task's measures, or tables that describe one."""
+    if not isinstance(told, list):
+        raise UsageError(f"metrics take a list; got {told!r}")
+    return [_metric(item) for item in told]
+
+
+def _metric(item: Any) -> str | Measure:
+    if isinstance(item, str):
+        return item
+    if not isinstance(item, Mapping) or "name" not in item:
+        raise UsageError(f"a metric is a name or a table with one; got {item!r}")
+    return dataclass_from_table(Measure, item, "metrics")
