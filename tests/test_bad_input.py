@@ -72,7 +72,7 @@ def test_one_image(folder: Path, reconstruct: Callable[..., Answer]) -> None:
     shutil.copy(courtyard(1)[0], folder)
     answer = reconstruct()
     assert answer.code == 3
-    assert "1 usable photograph; at least 2 different ones are needed" in answer.sentence
+    assert "1 usable photograph; at least two different ones are needed" in answer.sentence
     assert answer.summary["images"] == 1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -168,6 +169,29 @@ def test_what_cannot_be_read_gets_its_reason_and_the_others_go_on(tmp_path: Path
     assert set(photographs.refused) == set(expected)
     for name, words in expected.items():
         assert words in photographs.refused[name]
+
+
+def test_what_is_no_regular_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.jpg")
+    (tmp_path / "endless.png").symlink_to("/dev/zero")
+    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
+    (tmp_path / "round.jpg").symlink_to(tmp_path / "round.jpg")
+    (tmp_path / "real").mkdir()
+    (tmp_path / "linked.png").symlink_to(save(tmp_path / "real" / "a.png", picture()))
+    photographs = read_photographs(tmp_path, max_size_px=1600)
+    assert [image.name for image in photographs.images] == ["linked.png"]
+    assert photographs.refused == {
+        "endless.png": "is a pipe, a device or a socket, not a file",
+        "gone.jpg": "cannot be read: No such file or directory",
+        "pipe.jpg": "is a pipe, a device or a socket, not a file",
+        "round.jpg": "cannot be read: Too many levels of symbolic links",
+    }
+
+
+def test_names_stay_in_one_line(tmp_path: Path) -> None:
+    save(tmp_path / "two\nlines\x1b[31m.png", picture())
+    (image,) = read_photographs(tmp_path, max_size_px=1600).images
+    assert image.name == "two\\x0alines\\x1b[31m.png"
 
 
 def test_a_decompression_bomb_is_refused(tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import math
+import stat
+import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +35,8 @@ SUFFIXES = (
 COMMON_NAMES = ("images", "photographs", "photos", "pictures", "dcim")
 MIN_SIDE = 64
 BLANK_RANGE = 8
+_CONTROLS = ("Cc", "Zl", "Zp")
+"""Unicode's categories of control characters and of what ends lines and paragraphs."""
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _WIDTH_35MM = 36.0
 
@@ -170,10 +174,11 @@ def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
 
 
 def printable(name: str) -> str:
-    """A file name as text that can be written anywhere: bytes that are no UTF-8 become the replacement
-    mark.
+    """A file name as text that can be written anywhere, in one line: bytes that are no UTF-8 become the
+    replacement mark, line ends and other control characters their codes.
     """
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    text = name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    return "".join(f"\\x{ord(c):02x}" if unicodedata.category(c) in _CONTROLS else c for c in text)
 
 
 def _read(name: str, item: Any, max_size_px: int) -> Photograph:
@@ -211,6 +216,7 @@ def _rgb_from_array(array: Any) -> U8:
 
 def _decode(name: str, path: Path, max_size_px: int) -> tuple[U8, Photograph]:
     """Pixels at working size, and the record that waits for them."""
+    _require_file(path)
     try:
         with PIL.Image.open(path) as file:
             note = "only its first frame is used" if getattr(file, "n_frames", 1) > 1 else ""
@@ -233,6 +239,16 @@ def _decode(name: str, path: Path, max_size_px: int) -> tuple[U8, Photograph]:
     focal = focal_35mm / _WIDTH_35MM * max(picture.size) if focal_35mm > 0 else math.nan
     record = Photograph(Image(name, np.zeros((0, 0, 3), np.uint8), picture.size), "", focal, note)
     return _reduced(picture, max_size_px), record
+
+
+def _require_file(path: Path) -> None:
+    """Refuse what is no regular file: reading a pipe waits for ever, a device never ends."""
+    try:
+        regular = stat.S_ISREG(path.stat().st_mode)
+    except OSError as error:
+        raise _Refused(f"cannot be read: {error.strerror}") from None
+    if not regular:
+        raise _Refused("is a pipe, a device or a socket, not a file")
 
 
 def _exif(file: PIL.Image.Image) -> tuple[float, Callable[[PIL.Image.Image], PIL.Image.Image]]:

@@ -73,7 +73,7 @@ def reconstruct(
     until, run, overwrite = start_run(out, config or PipelineConfig(), seed, progress, options)
     if isinstance(images, str | Path):
         if not list_images(Path(images)):
-            raise UsageError(f"there are no photographs in {images}")
+            raise UsageError(f"there are no photographs in {images} (folders in it are not searched)")
         run.title = scene_name(Path(images)) or run.title
     # Reading photographs takes long: whether the folder is free for this run is asked before.
     with run.directory.claimed(wishes(run), overwrite=overwrite):

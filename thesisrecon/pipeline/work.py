@@ -40,9 +40,12 @@ class Work:
         """Refuse what is too little before anything is computed."""
         found, needed = len(self.result.images), 1 if self.until == "features" else 2
         if found < needed:
-            why = "; ".join(f"{name} {reason}" for name, reason in list(self.result.refused.items())[:3])
+            refused = list(self.result.refused.items())
+            told = [f"{name} {reason}" for name, reason in refused[:3]]
+            why = "; ".join([*told, f"and {len(refused) - 3} more"] if len(refused) > 3 else told)
+            wanted = "two different ones are" if needed == 2 else "one is"
             raise StageFailure(
                 f"{found or 'no'} usable photograph{'s' if found != 1 else ''}",
-                f"at least {needed} different ones are needed{'; ' + why if why else ''}",
+                f"at least {wanted} needed{'; ' + why if why else ''}",
                 "take more photographs of the scene from other places",
             )
