@@ -210,5 +210,5 @@ def start_run(
     shared = options.get("shared")
     directory = RunDirectory(Path(out), None if shared is None else Path(shared))
     hear = progress or (lambda *_: None)
-    run = Run(config, seed, workers, directory, hear, directory.path.resolve().name)
+    run = Run(config, seed, workers, directory, hear, directory.path.absolute().name)
     return until, run, bool(options.get("overwrite", False))
