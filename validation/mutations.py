@@ -147,13 +147,17 @@ class Bench:
     def planted(self, mutation: Mutation, number: int) -> Iterator[Path]:
         """The tree with the fault, and the folder of compiled kernels for it.
 
-        The fault and all that import it count as newer, so that neither Python nor numba takes what was
-        compiled of the code without it; what is compiled with it goes with it.
+        Of the fault and all that import it nothing is taken that was compiled without it, by Python (their
+        files count as newer) or by numba; what is compiled with it goes with it.
         """
         path = self.tree / mutation.file
         sound, kernels = path.read_text(encoding="utf-8"), self.out / f"kernels-{number:02d}"
         shutil.rmtree(kernels, ignore_errors=True)
         shutil.copytree(self.kernels, kernels, copy_function=os.link)
+        for file in importers(self.tree, mutation.file):
+            # numba knows a change of a kernel's own file, and of no other that it is made of.
+            for stale in kernels.glob(f"{file.parent.name}_*/{file.stem}.*"):
+                stale.unlink()
         newer = {file: file.stat().st_mtime for file in importers(self.tree, mutation.file)}
         path.write_text(mutation.apply(self.tree), encoding="utf-8")
         try:

@@ -100,18 +100,22 @@ def small_tree(root: Path) -> Path:
 def test_all_that_imports_a_fault_counts_as_newer_while_it_is_planted(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     package = small_tree(bench.tree)
-    bench.kernels.mkdir()
-    (bench.kernels / "compiled").write_text("of the sound tree", encoding="utf-8")
+    compiled = bench.kernels / "package_0a1b"
+    compiled.mkdir(parents=True)
+    for name in ("alone", "outer"):
+        (compiled / f"{name}.function-1.py311.nbi").write_text("of the sound tree", encoding="utf-8")
     before = {path: (path.read_text(encoding="utf-8"), path.stat().st_mtime) for path in package.iterdir()}
     fault = Mutation("n", "package/inner.py", "VALUE = 1", "VALUE = 2", ("bundle/street",))
     with bench.planted(fault, 3) as kernels:
         assert (package / "inner.py").read_text(encoding="utf-8") == "VALUE = 2\n"
         newer = {path.name for path in package.iterdir() if path.stat().st_mtime > 3_999_999_999}
         assert newer == {"inner.py", "middle.py", "outer.py"}
-        (kernels / "compiled").unlink()
+        assert [path.name for path in (kernels / compiled.name).iterdir()] == ["alone.function-1.py311.nbi"]
         (kernels / "other").write_text("of the fault", encoding="utf-8")
     assert before == {p: (p.read_text(encoding="utf-8"), p.stat().st_mtime) for p in package.iterdir()}
-    assert [path.name for path in bench.kernels.iterdir()] == ["compiled"]
+    assert len(list(compiled.iterdir())) == 2
+    assert not kernels.exists()
+    assert list(bench.kernels.iterdir()) == [compiled]
 
 
 def test_importers_of_the_library_go_through_packages() -> None:
