@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
 from thesisrecon.config import preset
 from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, PairMatcher, SemiGlobal
-from thesisrecon.dense.rectification import PlanarRectification
+from thesisrecon.dense.rectification import PlanarRectification, pair_of_fundamental
+from thesisrecon.epipolar.degeneracy import Configuration
 from thesisrecon.features import HarrisCorners
+from thesisrecon.geometry.multiview import fundamental_from_cameras
+from thesisrecon.matching.kernels.correlation import scan_correlations
 from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.types import Image
 from validation.references.corners import harris_corners
 from validation.references.pictures import warp_perspective
+from validation.references.rectification import opencv_uncalibrated
 from validation.references.semi_global import OpenCVSemiGlobal
-from validation.references.sift import compute_sift, grey_of
+from validation.references.sift import compute_sift, grey_of, nearest_two
 from validation.references.sift_front_end import sift_front_end
+from validation.scenes.two_views import make_two_views
 
 DISPARITIES = 64
 MATCHERS: dict[str, PairMatcher] = {
@@ -44,6 +51,29 @@ def test_matches_of_a_pair(bench: Bench, method: str, photographs: tuple[Image, 
     config = preset("default") if method == "ours" else sift_front_end(preset("default"))
     one, two = (config.matching.prepare(image, detect_features(config, image)) for image in photographs)
     bench("matches and F of a pair, features known", method, lambda: match_views(config, one, two, (0, 1), 0))
+
+
+@pytest.mark.parametrize("method", ["ours", "OpenCV"])
+def test_correlation(bench: Bench, method: str, rng: np.random.Generator) -> None:
+    one, two = rng.normal(size=(2, 2000, 121)).astype(np.float32)
+    one, two = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (one, two))
+    places, apart = np.zeros((2000, 2), np.float32), np.full(2000, -1.0, np.float32)
+    calls: dict[str, Callable[[], object]] = {
+        "ours": lambda: scan_correlations(one @ two.T, places, apart),
+        "OpenCV": lambda: nearest_two(one, two),
+    }
+    bench("best two of 2000 patches for each of 2000", method, calls[method])
+
+
+@pytest.mark.parametrize("method", ["ours", "OpenCV"])
+def test_rectification(bench: Bench, method: str) -> None:
+    scene = make_two_views(Configuration.GENERAL, 500, np.random.default_rng(1))
+    F, size = fundamental_from_cameras(scene.P1, scene.P2), (1280, 960)
+    calls: dict[str, Callable[[], object]] = {
+        "ours": lambda: pair_of_fundamental(F, scene.xy1, scene.xy2, size, size),
+        "OpenCV": lambda: opencv_uncalibrated(F, scene.xy1, scene.xy2, size),
+    }
+    bench("rectifying homographies of F, 500 matches", method, calls[method])
 
 
 @pytest.mark.parametrize("method", ["ours", "OpenCV"])

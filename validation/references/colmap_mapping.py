@@ -67,7 +67,7 @@ def map_with_pycolmap(
     options = mapper_options(threads, start.refine_principal_point)
     forget_focal_priors(out / "database.db", start.focal_rel)
     if start.K is not None:
-        _give_calibration(out / "database.db", start.K)
+        give_calibration(out / "database.db", start.K)
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
     if mapper == "global":
         return _map_globally(images, out, threads)
@@ -125,7 +125,7 @@ def _map_globally(images: Path, out: Path, threads: int) -> ReferenceRun:
     return read_run(images, out)
 
 
-def _give_calibration(database: Path, K: Mapping[str, F64]) -> None:
+def give_calibration(database: Path, K: Mapping[str, F64]) -> None:
     """Put the true calibration in the place of every camera."""
     store = pycolmap.Database.open(database)
     for image in store.read_all_images():

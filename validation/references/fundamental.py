@@ -95,6 +95,12 @@ def opencv_eight_point(xy1: F64, xy2: F64) -> F64 | None:
     return None if F is None else np.asarray(F, dtype=np.float64)
 
 
+def opencv_seven_point(xy1: F64, xy2: F64) -> F64:
+    """``cv2.findFundamentalMat`` of seven matches (7, 2) px: all its answers (M, 3, 3)."""
+    F = cv2.findFundamentalMat(xy1, xy2, cv2.FM_7POINT)[0]
+    return np.zeros((0, 3, 3)) if F is None else np.asarray(F, dtype=np.float64).reshape(-1, 3, 3)
+
+
 def _colmap(**options: int) -> Solver:
     def solve(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
         settings = pycolmap.RANSACOptions(max_error=threshold_px, random_seed=seed, **options)

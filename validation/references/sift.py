@@ -38,13 +38,22 @@ def _detect(pixels: bytes, shape: tuple[int, ...]) -> SiftKeypoints:
 
 def compute_sift(grey: U8) -> SiftKeypoints:
     """SIFT of a grey photograph (H, W) with OpenCV's defaults."""
-    keypoints, descriptors = cv2.SIFT.create().detectAndCompute(grey, None)
+    # Without this its places are a quarter of a pixel right of and below those of the photograph.
+    sift = cv2.SIFT.create(enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(grey, None)
     return SiftKeypoints(
         np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2),
         np.array([k.size for k in keypoints], dtype=np.float32),
         np.array([k.response for k in keypoints], dtype=np.float32),
         np.zeros((0, 128), np.float32) if descriptors is None else np.asarray(descriptors, np.float32),
     )
+
+
+def nearest_two(first: F32, second: F32) -> tuple[I64, F32]:
+    """Of each descriptor (N, D) the nearest two of (M, D) by brute force, and their distances; (N, 2)."""
+    found = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)
+    index = np.array([[m.trainIdx for m in pair] for pair in found], dtype=np.int64)
+    return index, np.array([[m.distance for m in pair] for pair in found], dtype=np.float32)
 
 
 def match_sift(first: SiftKeypoints, second: SiftKeypoints, *, ratio: float, mutual: bool) -> I64:

@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 
 from tests.model.sphere import SHAPE, K, paint, photograph, ring_of
+from tests.validation.references.conftest import Looked, skip_without
 from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.io.meshes import read_mesh, write_mesh
 from thesisrecon.model import SurfaceModel, VolumetricFusion
 from thesisrecon.types import F64, DepthMap, PinholeView, TexturedMesh
 from thesisrecon.views import render
 from validation.references import open3d_cameras, open3d_meshes, open3d_surfaces
-from validation.references.libraries import NoReference, load
+from validation.references.open3d_clouds import refine_by_icp
 
-try:
-    load("open3d")
-except NoReference as missing:
-    # Without libraries of the system (libgomp1, libgl1, libegl1, libx11-6) it cannot be loaded.
-    pytest.skip(str(missing), allow_module_level=True)
+# Without libraries of the system (libgomp1, libgl1, libegl1, libx11-6) it cannot be loaded.
+skip_without("open3d")
 
 NORMAL = np.array([0.3, 0.2, 1.0])
 
@@ -138,3 +136,18 @@ def test_its_own_pictures_agree_with_ours() -> None:
             best[dx, dy] = float(np.mean(np.abs(moved - ours.color)[inner]))
     assert min(best, key=lambda shift: best[shift]) == (0, 0)
     assert best[0, 0] < 8.0
+
+
+def test_the_matrix_of_a_camera_takes_the_world_to_it(looked: Looked) -> None:
+    for P, true_K, Rt in zip(looked.P, looked.K, looked.P_normalised, strict=True):
+        found, world = open3d_cameras.camera_of(P, shift=0.5)
+        np.testing.assert_allclose(world[:3], Rt, atol=1e-9)
+        np.testing.assert_allclose(found[:2, 2] - 0.5, true_K[:2, 2], atol=1e-6)
+        np.testing.assert_allclose(found[0, 0], true_K[0, 0], atol=1e-6)
+
+
+def test_icp_moves_the_first_cloud_onto_the_second(looked: Looked) -> None:
+    shift = np.array([0.02, -0.01, 0.03])
+    found = refine_by_icp(looked.X, looked.X + shift, 0.2)
+    np.testing.assert_allclose(found[:3, 3], shift, atol=1e-6)
+    np.testing.assert_allclose(found[:3, :3], np.eye(3), atol=1e-6)

@@ -1,0 +1,62 @@
+"""The questions to the reference libraries: answered as expected by those that are here, and by no others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from validation.references import canary
+from validation.references.canary import QUESTIONS, ask_canary, main
+from validation.references.libraries import NAMES, NoReference, load
+
+
+@pytest.fixture(params=list(NAMES))
+def library(request: pytest.FixtureRequest) -> str:
+    try:
+        load(request.param)
+    except NoReference as missing:
+        pytest.skip(str(missing))
+    return str(request.param)
+
+
+def test_the_library_keeps_its_ways(library: str) -> None:
+    ask_canary(library)
+
+
+def test_every_other_answer_is_told(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for question in QUESTIONS[library]:
+        other = replace(question, answer=np.asarray(question.answer) + max(2.0 * question.tolerance, 1e-3))
+        monkeypatch.setitem(canary.QUESTIONS, library, (other,))
+        with pytest.raises(NoReference) as told:
+            ask_canary(library)
+        assert str(told.value).startswith(f"{NAMES[library]} ")
+        assert f" gives {question.words} as " in str(told.value)
+        assert "; this harness expects " in str(told.value)
+
+
+def test_a_function_that_is_gone_is_told(
+    library: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = replace(QUESTIONS[library][0], ask=lambda: getattr(load(library), "no_such_function"))  # noqa: B009
+    monkeypatch.setitem(canary.QUESTIONS, library, (gone,))
+    assert main([library]) == 3
+    assert f"does not tell {gone.words}, which this harness needs" in capsys.readouterr().err
+
+
+def test_quaternions_in_another_order_would_be_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    turned = pycolmap.Rotation3d
+    monkeypatch.setattr(pycolmap, "Rotation3d", lambda wxyz: turned(np.roll(wxyz, -1)))
+    with pytest.raises(NoReference, match=r"^pycolmap \S+ gives the quaternion \(0, 0, 1, 0\) as"):
+        ask_canary("pycolmap")
+
+
+def test_a_disparity_in_pixels_would_be_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("cv2")
+    monkeypatch.setattr(canary, "_opencv_disparity", lambda: 4.0)
+    asked = [q for q in QUESTIONS["cv2"] if "disparity" in q.words]
+    monkeypatch.setitem(canary.QUESTIONS, "cv2", (replace(asked[0], ask=canary._opencv_disparity),))
+    with pytest.raises(NoReference, match=r"a disparity of 4 px as 4\.; this harness expects 64"):
+        ask_canary("cv2")

@@ -1,0 +1,133 @@
+"""Conventions between our records and COLMAP's, at their border: half pixels, quaternions, poses, indices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from tests.validation.references.conftest import Looked, skip_without
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.optimize.metric_bundle import MetricCameras, Observations
+from thesisrecon.types import F64
+from validation.references.colmap_mapping import give_calibration
+from validation.references.colmap_matching import match_with_pycolmap
+from validation.references.colmap_model import cameras_from_colmap, colmap_model
+from validation.references.libraries import pycolmap
+from validation.references.triangulation import colmap_points
+
+skip_without("pycolmap")
+
+SIZE = (640, 480)
+K1 = (-0.12, 0.07)
+
+
+def problem(looked: Looked) -> tuple[MetricCameras, Observations]:
+    """Both cameras with radial distortion; each point seen by both, in an order of nobody's."""
+    rows = [[K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], k1] for K, k1 in zip(looked.K, K1, strict=True)]
+    cameras = MetricCameras(looked.R, looked.t, np.array(rows), np.arange(2))
+    order = np.random.default_rng(0).permutation(2 * len(looked.X))
+    view, point = np.divmod(order, len(looked.X))
+    return cameras, Observations(view, point, distorted(looked)[view, point])
+
+
+def distorted(looked: Looked) -> F64:
+    """Pixels (2, N, 2) by the formula: x (1 + k1 r^2) with r in the plane at distance 1."""
+    x = np.einsum("vab,nb->vna", looked.R, looked.X) + looked.t[:, None]
+    u = x[..., :2] / x[..., 2:]
+    u = u * (1.0 + np.array(K1)[:, None, None] * (u**2).sum(axis=-1, keepdims=True))
+    return np.asarray(u * looked.K[:, None, 0, :1] + looked.K[:, None, :2, 2])
+
+
+def test_colmap_sees_our_points_half_a_pixel_farther(looked: Looked) -> None:
+    cameras, seen = problem(looked)
+    model = colmap_model(cameras, looked.X, seen, SIZE)
+    for v, xy in enumerate(distorted(looked)):
+        image = model.images[v + 1]
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world()
+        theirs = camera.img_from_cam(np.array([pose * X for X in looked.X]))
+        np.testing.assert_allclose(theirs, xy + 0.5, atol=1e-9)
+        for point in image.points2D:
+            expected = theirs[point.point3D_id - 1]
+            np.testing.assert_allclose(point.xy, expected, atol=1e-9)
+    for j in (0, 17, len(looked.X) - 1):
+        np.testing.assert_array_equal(model.points3D[j + 1].xyz, looked.X[j])
+
+
+def test_what_goes_in_comes_out(looked: Looked) -> None:
+    cameras, seen = problem(looked)
+    back, X = cameras_from_colmap(colmap_model(cameras, looked.X, seen, SIZE), cameras)
+    np.testing.assert_allclose(back.R, cameras.R, atol=1e-12)
+    np.testing.assert_array_equal(back.t, cameras.t)
+    np.testing.assert_array_equal(back.intrinsics, cameras.intrinsics)
+    np.testing.assert_array_equal(X, looked.X)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_files_that_colmap_writes_mean_the_same_to_us(looked: Looked, tmp_path: Path, text: bool) -> None:
+    cameras, seen = problem(looked)
+    model = colmap_model(cameras, looked.X, seen, SIZE)
+    (model.write_text if text else model.write_binary)(tmp_path)
+    read = reconstruction_from_colmap(read_colmap_model(tmp_path), names=["0.png", "1.png"])
+    assert read.K is not None
+    assert read.radial is not None
+    np.testing.assert_allclose(read.K, looked.K, atol=1e-9)
+    np.testing.assert_allclose(read.radial[:, 0], K1, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.inv(read.K) @ read.P, looked.P_normalised, atol=1e-9)
+    xy = distorted(looked)
+    for v in range(2):
+        here = read.tracks.view_index == v
+        np.testing.assert_allclose(
+            read.tracks.xy[here], xy[v, read.tracks.point_index[here]], atol=1e-9 if not text else 1e-3
+        )
+    np.testing.assert_allclose(dehomogenize(read.X), looked.X, atol=1e-9)
+
+
+def test_quaternions_are_xyzw_in_memory_and_wxyz_in_text(looked: Looked, tmp_path: Path) -> None:
+    cameras, seen = problem(looked)
+    model = colmap_model(cameras, looked.X, seen, SIZE)
+    model.write_text(tmp_path)
+    rows = [r.split() for r in (tmp_path / "images.txt").read_text().splitlines() if r.endswith("1.png")]
+    wxyz = np.array(rows[0][1:5], dtype=float)
+    xyzw = model.images[2].cam_from_world().rotation.quat
+    np.testing.assert_allclose(wxyz, np.roll(xyzw, 1), atol=1e-12)
+    # The turn of the fixture by 0.59 rad: its cosine of half the angle comes first in the text.
+    angle = np.linalg.norm([0.1, -0.3, 0.5])
+    np.testing.assert_allclose(np.abs(wxyz[0]), np.cos(angle / 2.0), atol=1e-12)
+    np.testing.assert_allclose(wxyz[1:] / np.sin(angle / 2.0), np.array([0.1, -0.3, 0.5]) / angle, atol=1e-9)
+
+
+def test_what_it_finds_in_a_photograph_is_half_a_pixel_farther(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    y, x = np.indices((96, 128))
+    grey = 255.0 * np.exp(-((x - 70.0) ** 2 + (y - 40.0) ** 2) / 32.0)
+    for name in ("a.png", "b.png"):
+        PIL.Image.fromarray(grey.astype(np.uint8)).save(images / name)
+    match_with_pycolmap(images, tmp_path / "out", shared_camera=False, threads=1)
+    store = pycolmap.Database.open(tmp_path / "out" / "database.db")
+    image = store.read_all_images()[0]
+    np.testing.assert_allclose(store.read_keypoints(image.image_id)[0, :2], [70.5, 40.5], atol=0.02)
+    camera = store.read_camera(image.camera_id)
+    assert camera.params[0] == pytest.approx(1.2 * 128)
+    assert not camera.has_prior_focal_length
+    store.close()
+    K = np.array([[700.0, 0, 60], [0, 710, 50], [0, 0, 1]])
+    give_calibration(tmp_path / "out" / "database.db", {"a.png": K, "b.png": K})
+    store = pycolmap.Database.open(tmp_path / "out" / "database.db")
+    np.testing.assert_array_equal(store.read_camera(image.camera_id).params, [700.0, 710.0, 60.5, 50.5])
+    store.close()
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_points_of_world_to_camera_matrices_are_where_they_were(views: int, looked: Looked) -> None:
+    P, xy = looked.P, looked.xy
+    if views == 3:
+        third = looked.P[1].copy()
+        third[:, 3] += looked.K[1] @ [0.5, -0.8, 0.1]
+        x = np.column_stack([looked.X, np.ones(len(looked.X))]) @ third.T
+        P, xy = np.concatenate([P, third[None]]), np.concatenate([xy, (x[:, :2] / x[:, 2:])[None]])
+    np.testing.assert_allclose(dehomogenize(colmap_points(P, xy)), looked.X, atol=1e-6)

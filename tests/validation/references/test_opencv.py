@@ -1,0 +1,85 @@
+"""Conventions between our arrays and OpenCV's, at their border."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.validation.references.conftest import Looked, skip_without
+from thesisrecon.dense.rectification import PlanarRectification
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.types import Image
+from validation.references.corners import harris_corners, sift_corners
+from validation.references.pictures import shrink, warp_affine, warp_perspective
+from validation.references.rectification import opencv_calibrated
+from validation.references.semi_global import MODES, OpenCVSemiGlobal
+from validation.references.triangulation import opencv_linear, opencv_polynomial
+
+skip_without("cv2")
+
+AT = np.array([33.0, 28.0])
+
+
+def spot(sigma: float) -> np.ndarray:
+    """A picture (64, 72, 3) of a round spot in the centre of the pixel ``AT``."""
+    y, x = np.indices((64, 72))
+    grey = 255.0 * np.exp(-((x - AT[0]) ** 2 + (y - AT[1]) ** 2) / (2.0 * sigma**2))
+    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("solve", [opencv_linear, opencv_polynomial])
+def test_points_of_world_to_camera_matrices_are_where_they_were(solve: object, looked: Looked) -> None:
+    assert callable(solve)
+    np.testing.assert_allclose(dehomogenize(solve(looked.P, looked.xy)), looked.X, atol=1e-6)
+
+
+def test_the_middle_of_a_pixel_is_a_whole_number() -> None:
+    image = Image("spot", spot(4.0), (72, 64))
+    np.testing.assert_allclose(sift_corners(image, 1)[0], AT, atol=0.01)
+    # A corner of four fields: the edges lie between pixels 31 and 32, 27 and 28.
+    fields = np.zeros((64, 72, 3), np.uint8)
+    fields[:28, :32], fields[28:, 32:] = 200, 200
+    found = harris_corners(Image("fields", fields, (72, 64)), 50)
+    np.testing.assert_allclose(found[np.argmin(np.abs(found - 30).sum(axis=1))], [31.5, 27.5], atol=0.1)
+
+
+def test_pictures_move_the_way_their_maps_say() -> None:
+    picture = spot(2.0)
+    A = np.array([[1.0, 0.0, 5.0], [0.0, 1.0, -3.0]])
+    moved = warp_affine(picture, A, (72, 64))
+    assert np.unravel_index(moved[..., 0].argmax(), (64, 72)) == (AT[1] - 3, AT[0] + 5)
+    H = np.vstack([A, [0.0, 0.0, 1.0]])
+    ours = PlanarRectification(H, np.eye(3), (72, 64)).warp(picture.astype(np.float32), 0)
+    theirs = warp_perspective(picture.astype(np.float32), H, (72, 64))
+    inner = np.s_[6:-6, 8:-8]
+    np.testing.assert_allclose(ours[inner], theirs[inner], atol=1e-2)
+
+
+def test_a_smaller_picture_is_aligned_at_its_outer_edges() -> None:
+    small = shrink(spot(6.0), (36, 32))[..., 0].astype(np.float64)
+    y, x = np.indices(small.shape)
+    middle = np.array([(small * x).sum(), (small * y).sum()]) / small.sum()
+    np.testing.assert_allclose(middle, (AT + 0.5) * 0.5 - 0.5, atol=0.02)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("widened", [False, True])
+def test_a_disparity_is_how_far_left_the_right_photograph_has_it_in_pixels(mode: str, widened: bool) -> None:
+    left = np.random.default_rng(0).integers(0, 256, (48, 160, 3)).astype(np.uint8)
+    right = np.roll(left, -7, axis=1)
+    found = OpenCVSemiGlobal(mode, widened=widened).match(left, right, 32)
+    inner = found[8:-8, 48:-40]
+    assert np.isfinite(inner).mean() > 0.9
+    assert np.nanmedian(inner) == 7.0
+    # The columns that a disparity of 31 would take out of the photograph.
+    assert np.isfinite(found[8:-8, 10:31]).any() == widened
+    assert not (found < 0.0).any()
+
+
+def test_rows_of_rectified_cameras_agree(looked: Looked) -> None:
+    same = looked.K[:1].repeat(2, axis=0)
+    pair = Looked(same, looked.R, looked.t, looked.X)
+    found = opencv_calibrated(*pair.P, (640, 480))
+    one, two = (found.rectified_from_original(i, pair.xy[i], within=False) for i in range(2))
+    assert np.abs(one - two)[:, 1].max() < 1e-6
+    assert np.ptp(one[:, 1]) > 50.0
