@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.validation.test_cameras import N, _reconstruction, _truth
-from validation.harness.stages.clouds import _common_frame, _same_points, same_points
+from validation.harness.records import Outcome
+from validation.harness.stages.clouds import _common_frame, _icp_metrics, _same_points, same_points
 from validation.scenes.real import Scene
 
 
@@ -33,3 +36,21 @@ def test_a_shift_of_the_points_is_told_in_per_cent_of_their_distance() -> None:
     rows = _same_points("made up", "COLMAP", ours, ours, (mine + shift, other, unit))
     np.testing.assert_allclose([row.values["ours"] for row in rows[1:]], 1.0)
     assert rows[0].values["ours"] == N
+
+
+def test_what_icp_moves_is_told_of_its_matrix_alone(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    mine = rng.normal(size=(200, 3))
+    c, s = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))
+    transform = np.eye(4)
+    transform[:2, :2], transform[:3, 3] = [[c, -s], [s, c]], [0.1, 0.0, 0.0]
+    other = mine @ transform[:3, :3].T + transform[:3, 3]
+    other[:50] += 0.5
+    np.savez(tmp_path / "COLMAP.npz", transform=transform)
+    turn, shift, share = _icp_metrics("made up", "COLMAP", mine, other, 10.0, Outcome(tmp_path))
+    assert turn.values["ours"] == pytest.approx(2.0)
+    middle = np.median(mine, axis=0)
+    moved = transform[:3, :3] @ middle + transform[:3, 3] - middle
+    assert shift.values["ours"] == pytest.approx(100.0 * np.linalg.norm(moved) / 10.0)
+    assert share.values["ours"] == pytest.approx(75.0, abs=1.0)
+    assert _icp_metrics("made up", "COLMAP", mine, other, 10.0, Outcome(tmp_path, "Open3D is missing")) == []

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import time
 from collections.abc import Mapping
@@ -39,6 +40,7 @@ class ToyStage:
         if task.method == "missing":
             import no_such_library  # type: ignore[import-not-found]  # noqa: F401
         if task.method == "failing":
+            shutil.rmtree(place)  # as one that starts with an empty folder does
             raise StageFailure("the toy is broken", "it has 1 wheel", "buy another")
         if task.method == "crashing":
             os.kill(os.getpid(), signal.SIGSEGV)
