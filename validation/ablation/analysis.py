@@ -41,7 +41,7 @@ class Comparison:
 @dataclass(frozen=True)
 class Cell:
     """A variant under a condition: ``mean`` and ``median`` of a measure over its rows that tell it, how many
-    there are, how many rows failed, mean cost (s), mean rank among the variants (1 is best) and whether no
+    there are, how many rows failed, median cost (s), mean rank among the variants (1 is best) and whether no
     other variant is both better and cheaper."""
 
     measure: Measure
@@ -164,7 +164,8 @@ def _cells(table: _Table, measure: Measure) -> list[Cell]:
         some = blocks[np.isfinite(blocks).any(axis=1)]
         ranks = mean_ranks(sign * some) if len(some) else np.full(len(names), np.nan)
         rows = [table.rows(name, condition.name) for name in names]
-        cost = np.array([_mean([r.cost_s for r in own]) for own in rows])
+        # The first rows of a process compile kernels, or read them: no part of what a variant costs.
+        cost = np.array([float(np.median([r.cost_s for r in own])) if own else np.nan for own in rows])
         # A variant that fails where others do not is judged on easier rows than they are.
         whole = np.isfinite(some).all(axis=0)
         loss = np.array([sign * _mean(b[np.isfinite(b)]) for b in blocks.T])

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon.errors import UsageError
@@ -86,26 +89,23 @@ def _facts(analysis: Analysis) -> list[tuple[str, str]]:
 
 def _findings(analysis: Analysis) -> list[str]:
     """One sentence for each measure: what is better and worse than the baseline."""
+    count = len(analysis.plan.conditions)
     found = []
     for measure in analysis.plan.measures:
-        here = [c for c in analysis.comparisons if c.measure == measure]
-        better = [_who(c) for c in here if c.verdict == "better"]
-        worse = [_who(c) for c in here if c.verdict == "worse"]
-        told = [f"{_listed(better)} better" if better else "", f"{_listed(worse)} worse" if worse else ""]
-        said = "; ".join(t for t in told if t) or "no difference from the baseline is shown"
-        found.append(f"{measure.name}: {said}.")
+        told = []
+        for verdict in ("better", "worse"):
+            where = Counter(
+                c.variant for c in analysis.comparisons if (c.measure, c.verdict) == (measure, verdict)
+            )
+            names = [v if count == 1 else f"{v} (under {n} of {count} conditions)" for v, n in where.items()]
+            told += [f"{verdict}: {'; '.join(names)}"] if names else []
+        said = ". ".join(told) or "no difference from the baseline is shown"
+        found.append(f"{measure.name} {said}.")
     return found
 
 
 def _who(found: Comparison) -> str:
     return f"{found.variant} ({found.condition})" if found.condition else found.variant
-
-
-def _listed(names: Sequence[str], most: int = 6) -> str:
-    """A few names; of many their number."""
-    if len(names) > most:
-        return f"{len(names)} comparisons"
-    return ", ".join(names)
 
 
 def _failures(failed: Sequence[Any]) -> list[dict[str, Any]]:
@@ -115,7 +115,7 @@ def _failures(failed: Sequence[Any]) -> list[dict[str, Any]]:
         who = f"{row.variant} ({row.condition})" if row.condition else row.variant
         groups.setdefault((who, row.failure), []).append(f"{row.scene}, seed {row.seed}")
     return [
-        {"who": who, "why": why, "where": _listed(where, 4).replace("comparisons", "rows")}
+        {"who": who, "why": why, "where": "; ".join(where) if len(where) <= 4 else f"{len(where)} rows"}
         for (who, why), where in groups.items()
     ]
 
@@ -174,10 +174,17 @@ def _table(
                     "against": _told(against.get(place)),
                     "step": _told(step.get(place)),
                     "on_front": at[place].on_front,
-                    "cost": number(at[place].cost_s),
                 }
             )
-        found.append({"name": variant.name, "columns": columns, "base": variant.name == plan.baseline})
+        cost = float(np.mean([at[variant.name, c.name].cost_s for c in plan.conditions]))
+        found.append(
+            {
+                "name": variant.name,
+                "columns": columns,
+                "cost": number(cost),
+                "base": variant.name == plan.baseline,
+            }
+        )
     return found
 
 
@@ -213,6 +220,7 @@ def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell], slug: 
         "yaxis": _axis(measure) | ({"type": "log"} if measure.ratio and positive else {}),
         "margin": _MARGIN,
         "legend": {"orientation": "h", "y": -0.25},
+        "height": 420,
     }
     return _plot(f"plot-{slug}-over", f"{measure.name} over {axes[0]}", {"data": traces, "layout": layout})
 
@@ -304,6 +312,7 @@ def _cost(measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] 
         "xaxis": {"title": {"text": "processor time of a row (s)"}, "rangemode": "tozero"},
         "yaxis": _axis(measure) | ({"type": "log"} if log else {}),
         "margin": _MARGIN,
+        "height": 420,
     }
     words = "Green: nothing is both better and cheaper."
     figure = {"data": [line, points], "layout": layout}

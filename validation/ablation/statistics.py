@@ -18,8 +18,8 @@ from scipy import stats
 F64 = NDArray[np.float64]
 Unit = Literal["seeds", "scenes"]
 
-STUDENTISED_FROM = 8
-"""Fewer differences make resamples of the same value again and again, and intervals without end."""
+STUDENTISED_FROM = 12
+"""Of fewer differences, too many resamples hold next to no spread, and intervals have no end."""
 SCENES_FROM = 6
 """So many scenes are a sample of scenes; fewer are just these."""
 RESAMPLES = 4999

@@ -181,4 +181,4 @@ def number(value: float | None) -> str:
         return "-"
     if math.isfinite(value) and float(value).is_integer() and abs(value) < 1e6:
         return f"{int(value)}"
-    return f"{value:.3g}"
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"

@@ -49,7 +49,7 @@ def test_two_scenes_are_welch() -> None:
 
 
 def test_the_studentised_bootstrap_is_that_of_scipy() -> None:
-    d = np.random.default_rng(3).exponential(size=12)
+    d = np.random.default_rng(3).exponential(size=STUDENTISED_FROM)
     t = resampled_t([d], resamples=20000)
 
     def statistic(x: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -118,7 +118,7 @@ def test_skewed_differences_are_held_more_often_than_by_student() -> None:
     rng = np.random.default_rng(8)
     ours = theirs = 0
     for _ in range(400):
-        d = rng.exponential(size=10)
+        d = rng.exponential(size=14)
         found, known = paired_interval([d]), stats.ttest_1samp(d, 1.0).pvalue
         ours += found.low <= 1.0 <= found.high
         theirs += known > 0.05
