@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pytest
@@ -14,7 +14,12 @@ from thesisrecon.types import Image
 from validation.references.libraries import NoReference, one_thread
 from validation.scenes.real import load_fixture_scene
 
-Bench = Callable[[str, str, Callable[[], Any]], None]
+Call = Callable[..., Any]
+ROUNDS = 5
+
+
+class Bench(Protocol):
+    def __call__(self, group: str, method: str, call: Call, setup: Call | None = None) -> None: ...
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -32,15 +37,22 @@ def photographs() -> tuple[Image, ...]:
 @pytest.fixture
 def bench(benchmark: Any) -> Bench:
     """``bench(group, method, call)``: measured after one call that compiles and fills the caches; skipped
-    where the reference library is missing."""
+    where the reference library is missing. ``call`` takes what ``setup`` makes anew each time, unmeasured."""
 
-    def run(group: str, method: str, call: Callable[[], Any]) -> None:
+    def run(group: str, method: str, call: Call, setup: Call | None = None) -> None:
         benchmark.group, benchmark.extra_info["method"] = group, method
+
+        def arguments() -> tuple[Any, ...]:
+            return () if setup is None else (setup(),)
+
         try:
-            call()
+            call(*arguments())
         except NoReference as error:
             pytest.skip(f"{group}, {method}: {error}")
-        benchmark(call)
+        if setup is None:
+            benchmark(call)
+        else:
+            benchmark.pedantic(call, setup=lambda: (arguments(), {}), rounds=ROUNDS)
 
     return run
 

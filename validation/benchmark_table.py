@@ -1,7 +1,7 @@
 """The ratios of a benchmark: ``python -m validation.benchmark_table BENCHMARK.json [-o RATIOS.json]``.
 
 BENCHMARK.json is what pytest-benchmark writes for ``benchmarks/``. Both methods of a group ran in the same
-process on the same machine; their least times are compared, which other work disturbs least.
+process on the same machine; their least processor times are compared, which other work disturbs least.
 """
 
 from __future__ import annotations

@@ -73,12 +73,12 @@ def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(
     stubs = {"poselib": TRANSPOSED, "cv2": CRASHING, "pycolmap": HANGING, "open3d": MISSING.format("open3d")}
     for library, text in stubs.items():
         (stub / f"{library}.py").write_text(text)
-    limit_s = 8.0
+    limit_s = 12.0  # others are to answer within it, on a machine with other work too
     refused = ask_canaries(wishes_for(tmp_path, "-".join(METHODS), limit_s))
     version = refused["poselib"].split()[1]
     assert refused == {
         "cv2": "OpenCV crashed with signal 6 when asked a small question",
-        "pycolmap": "pycolmap gives no answer to a small question within 8 s",
+        "pycolmap": "pycolmap gives no answer to a small question within 12 s",
         "poselib": f"PoseLib {version} gives F of matches with y2 = 2 y1 as [[ 0. 0. 0.] [ 0. 0. 2.] "
         "[ 0. -1. 0.]]; this harness expects [[ 0. 0. 0.] [ 0. 0. -1.] [ 0. 2. 0.]]",
         "open3d": not_installed("open3d"),
@@ -90,7 +90,7 @@ def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(
     assert {name: o.failure for name, o in outcomes.items()} == refused
     results = collect(wishes, judged, {})
     page = write_pages(wishes, STAGES, judged, results, None).read_text(encoding="utf-8")
-    assert page.count("pycolmap gives no answer to a small question within 8 s") == 2
+    assert page.count("pycolmap gives no answer to a small question within 12 s") == 2
     assert "Not asked: OpenCV crashed" in results.environment[PACKAGES["cv2"]]
 
 
