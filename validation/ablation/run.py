@@ -237,7 +237,7 @@ class _Session:
             for part in self._ready(waiting, ended, len(running)):
                 waiting.remove(part)
                 running[self._submit(part, packed[part.row.key])] = part
-                if len(running) >= self.crew.width:
+                if len(running) >= self.crew.most:
                     break
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             outcomes = [(running.pop(future), self._outcome(future)) for future in done]
@@ -261,7 +261,7 @@ class _Session:
         suspects = [p for p in ready if self.tries[p.name]]
         if suspects:
             return iter(suspects[:1] if not running else [])
-        return iter(ready[: max(0, self.crew.width - running)])
+        return iter(ready[: max(0, self.crew.most - running)])
 
     def _submit(self, part: _Part, packed: tuple[bytes, Any]) -> Future[Outcome]:
         row = part.row

@@ -80,8 +80,10 @@ def cell_records(cells: Iterable[Cell]) -> list[Record]:
 
 
 def write_tables(analysis: Analysis, out: Path) -> list[Path]:
-    """``rows``, ``comparisons`` and ``means`` as CSV, and as Parquet where pyarrow is installed."""
-    written = []
+    """``rows``, ``comparisons`` and ``means`` as CSV, and as Parquet where pyarrow is installed; the tables
+    for people as ``tables.md``."""
+    (out / "tables.md").write_text(text_of(analysis) + "\n", encoding="utf-8")
+    written = [out / "tables.md"]
     for name, records in (
         ("rows", row_records(analysis)),
         ("comparisons", comparison_records((*analysis.comparisons, *analysis.steps))),
@@ -122,39 +124,54 @@ def _no_nan(value: Any) -> Any:
 
 
 def text_of(analysis: Analysis) -> str:
-    """Markdown: a table for each measure, variants by conditions."""
+    """Markdown: a table for each measure."""
     blocks = [f"warning: {w}" for w in analysis.warnings]
-    blocks += [markdown(analysis, measure) for measure in analysis.plan.measures]
+    several = len(analysis.plan.conditions) > 1
+    table = over_conditions if several else one_condition
+    blocks += [table(analysis, measure) for measure in analysis.plan.measures]
     return "\n\n".join(blocks)
 
 
-def markdown(analysis: Analysis, measure: Measure) -> str:
-    """A row for each variant: its mean, and under every condition the difference from the baseline."""
+def one_condition(analysis: Analysis, measure: Measure) -> str:
+    """A row for each variant: its mean, how it differs from the baseline, in a ladder from the step before,
+    and what it costs."""
+    plan = analysis.plan
+    cells = {c.variant: c for c in analysis.cells if c.measure == measure}
+    found = {c.variant: c for c in analysis.comparisons if c.measure == measure}
+    steps = {c.variant: c for c in analysis.steps if c.measure == measure}
+    head = [_title(measure), "mean", f"against {plan.baseline}"]
+    head += ["this step alone", "cost, s"] if steps else ["cost, s"]
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    for name in (v.name for v in plan.variants):
+        told = [name, mean_text(cells[name]), comparison_text(found.get(name))]
+        told += [comparison_text(steps.get(name))] if steps else []
+        lines.append(f"| {' | '.join([*told, number(cells[name].cost_s)])} |")
+    return "\n".join(lines)
+
+
+def over_conditions(analysis: Analysis, measure: Measure) -> str:
+    """Means, a row for each variant and a column for each condition: bold where shown to be better than the
+    baseline, italic where shown to be worse."""
     plan = analysis.plan
     cells = {(c.variant, c.condition): c for c in analysis.cells if c.measure == measure}
-    found = {(c.variant, c.condition): c for c in analysis.comparisons if c.measure == measure}
-    steps = {(c.variant, c.condition): c for c in analysis.steps if c.measure == measure}
-    unit = f", {measure.unit}" if measure.unit else ""
-    head = [f"{measure.name}{unit}"]
-    for condition in plan.conditions:
-        of = f" ({condition.name})" if condition.name else ""
-        head += [f"mean{of}", f"against {plan.baseline}{of}"]
-        if steps:
-            head.append(f"this step alone{of}")
-    head.append("cost, s")
+    found = {(c.variant, c.condition): c.verdict for c in analysis.comparisons if c.measure == measure}
+    marks = {"better": "**", "worse": "*"}
+    head = [_title(measure), *(c.name for c in plan.conditions), "cost, s"]
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
-    for variant in plan.variants:
-        told = [variant.name]
-        costs = []
+    for name in (v.name for v in plan.variants):
+        told, cost = [], 0.0
         for condition in plan.conditions:
-            at = (variant.name, condition.name)
-            told += [mean_text(cells[at]), comparison_text(found.get(at))]
-            if steps:
-                told.append(comparison_text(steps.get(at)))
-            costs.append(cells[at].cost_s)
-        told.append(number(sum(costs) / len(costs)))
-        lines.append(f"| {' | '.join(told)} |")
+            at = (name, condition.name)
+            mark = marks.get(found.get(at, ""), "")
+            told.append(f"{mark}{mean_text(cells[at])}{mark}")
+            cost += cells[at].cost_s / len(plan.conditions)
+        base = " (the baseline)" if name == plan.baseline else ""
+        lines.append(f"| {' | '.join([f'{name}{base}', *told, number(cost)])} |")
     return "\n".join(lines)
+
+
+def _title(measure: Measure) -> str:
+    return f"{measure.name}, {measure.unit}" if measure.unit else measure.name
 
 
 def mean_text(cell: Cell) -> str:

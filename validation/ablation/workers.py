@@ -22,13 +22,18 @@ MANY = 64
 
 @dataclass
 class Crew:
-    """An executor and how many rows it is given at a time; ``renew`` makes another where its processes died,
-    None where that is the caller's affair. ``by_thread``: several rows share a process."""
+    """An executor and how many rows it carries out at a time; ``renew`` makes another where its processes
+    died, None where that is the caller's affair. ``by_thread``: several rows share a process."""
 
     executor: Executor
     width: int
     by_thread: bool
     renew: Callable[[], Executor] | None = None
+
+    @property
+    def most(self) -> int:
+        """How many rows it is given at a time: one more for each worker, so that none waits for its next."""
+        return 1 if isinstance(self.executor, _Here) else 2 * self.width
 
 
 class _Here(Executor):

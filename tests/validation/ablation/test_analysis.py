@@ -15,7 +15,7 @@ from validation.ablation import Measure, Study, analyse
 from validation.ablation.analysis import Comparison, as_told
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.run import Row, Rows
-from validation.ablation.tables import markdown, write_tables
+from validation.ablation.tables import write_tables
 
 
 def rows_of(study: Study | Plan, value: Any) -> Rows:
@@ -102,7 +102,7 @@ def test_only_pairs_count_and_failures_are_told() -> None:
     # On easier rows its mean would be another one; its rank counts what it failed at.
     ranks = {c.variant: c.rank for c in analysis.cells if c.measure.name == "miss"}
     assert ranks["aim = 1"] == pytest.approx((15 * 3.0 + 5 * 2.0) / 20)
-    assert "17 (15 of 20 failed)" in markdown(analysis, analysis.plan.measures[0])
+    assert "17 (15 of 20 failed)" in str(analysis)
 
 
 def test_each_step_of_a_ladder_is_also_compared_with_the_one_before() -> None:
@@ -134,6 +134,7 @@ def test_tables_hold_every_row_and_comparison(tmp_path: Path) -> None:
     assert told[0]["axis:task.spread"] == "spread = 1"
     assert {r["failure"] for r in told} == {"", "gone"}
     assert {r["miss"] for r in told if r["failure"]} == {""}
+    assert "| miss, cm | spread = 1 | spread = 2 | cost, s |" in written["tables.md"].read_text()
     with written["comparisons.csv"].open(encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == 2 * 2 * 2
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra tables is not installed")
