@@ -151,7 +151,9 @@ def as_told(found: Comparison) -> tuple[float, float, float]:
     told = (found.interval.mean, found.interval.low, found.interval.high)
     if not found.ratio:
         return told
-    return tuple(float(np.exp(v)) for v in told)  # type: ignore[return-value]
+    # The interval of two differences may have no end that a number could hold.
+    mean, low, high = (float(np.exp(np.clip(v, -700.0, 700.0))) for v in told)
+    return mean, low, high
 
 
 def _cells(table: _Table, measure: Measure) -> list[Cell]:

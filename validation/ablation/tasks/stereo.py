@@ -23,8 +23,8 @@ class RectifiedPairs:
     """``dense.pairs.matcher`` on a pair with dense truth, judged where both cameras see."""
 
     measures: ClassVar[Sequence[Measure]] = (
-        Measure("bad1_pct", "%", "less", False, "pixels off by more than 1 px, holes filled along the row"),
-        Measure("bad2_pct", "%", "less", False, "pixels off by more than 2 px, holes filled along the row"),
+        Measure("bad1_pct", "%", "less", True, "pixels off by more than 1 px, holes filled along the row"),
+        Measure("bad2_pct", "%", "less", True, "pixels off by more than 2 px, holes filled along the row"),
         Measure("known_pct", "%", "more", False, "share of the pixels that are known before the filling"),
     )
 
