@@ -17,6 +17,9 @@ from validation.harness.results import Results, collect, compare, read_results, 
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
 
+LEAST_SIDE_PX = 64
+"""Of depth maps: in smaller ones there is no window to match."""
+
 
 def main(arguments: list[str] | None = None) -> int:
     """0: done, all gates hold; 1: a gate is broken (``check``); 2: a wrong wish."""
@@ -70,6 +73,9 @@ def _parser() -> argparse.ArgumentParser:
             "--methods", nargs="+", metavar="METHOD", help="of ours, those that run again with --resume"
         )
         command.add_argument("--time-limit", type=float, default=300.0, help="seconds for one task")
+        command.add_argument(
+            "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps, by default small"
+        )
         if name == "report":
             command.add_argument("--against", type=Path, help="the folder of another report, to compare with")
     ablation.add_parser(commands)
@@ -94,6 +100,8 @@ def _wishes(told: argparse.Namespace) -> Wishes:
         raise ValueError("--methods says what runs again with --resume: name the folder of the run before")
     if told.threads < 1 or told.time_limit <= 0:
         raise ValueError("--threads and --time-limit are more than zero")
+    if told.max_side and told.max_side < LEAST_SIDE_PX:
+        raise ValueError(f"--max-side is at least {LEAST_SIDE_PX} px")
     return Wishes(
         out=told.out.resolve(),
         scenes=tuple(dict.fromkeys([*scenes, *folders])),
@@ -106,6 +114,7 @@ def _wishes(told: argparse.Namespace) -> Wishes:
         limit_s=told.time_limit,
         methods=tuple(told.methods or ()),
         resume="" if told.resume is None else str(told.resume.resolve()),
+        side_px=told.max_side,
     )
 
 

@@ -20,7 +20,7 @@ from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES
 
 GATES = read_gates()
-ALWAYS = ("courtyard", "cloud", "street")
+ALWAYS = ("courtyard", "boards", "cloud", "street")
 """Scenes that this repository makes or ships."""
 HERE = available_scenes(quick=False)
 LIMIT_S = 900.0

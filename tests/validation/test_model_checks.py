@@ -1,15 +1,18 @@
-"""The checks of surface and texture on scenes whose answer is known."""
+"""What measures depth maps, surfaces and views of the model, on scenes whose answer is known."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.model.sphere import photograph, ring_of
-from thesisrecon.types import DepthMap, TexturedMesh
-from validation.checks import held_out, surface
+from thesisrecon.types import DepthMap, Reconstruction, TexturedMesh, Tracks
+from validation.harness.stages import surface as surface_stage
+from validation.harness.stages import views as views_stage
+from validation.metrics import depth, surfaces
 from validation.references.libraries import NoReference, load
 from validation.scenes.real import load_fixture_scene
 
@@ -19,15 +22,64 @@ except NoReference as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
 
+def courtyard_map(view: int, factor: float, std: float) -> DepthMap:
+    """The true depth of a view, ``factor`` times too far, in a world of half the size."""
+    scene = load_fixture_scene("courtyard")
+    assert scene.K is not None
+    assert scene.R is not None
+    assert scene.C is not None
+    true, stride, _ = depth.true_depth(scene, view)
+    K = np.diag([1.0 / stride, 1.0 / stride, 1.0]) @ scene.K[view]
+    P = K @ scene.R[view] @ np.column_stack([np.eye(3), -0.5 * scene.C[view]])
+    wrong = (0.5 * factor * true).astype(np.float32)
+    return DepthMap(view, P, wrong, np.full_like(wrong, std), np.ones(wrong.shape, np.uint8))
+
+
+def test_a_depth_that_is_too_far_is_measured() -> None:
+    scene = load_fixture_scene("courtyard")
+    maps = {view: courtyard_map(view, 1.002, 0.01) for view in (0, 5, 9)}
+    align = depth.true_from_maps(maps, scene)
+    assert align.scale == pytest.approx(2.0)
+    truth = depth.true_depth(scene, 5)
+    one = depth.judge_against_truth(maps[5], truth, align.scale)
+    told = depth.together([one])
+    assert told.median == pytest.approx(0.002, rel=0.05)
+    assert told.right == pytest.approx(told.known)
+    assert told.known > 0.99
+    assert told.deviations == pytest.approx(0.002 * np.nanmedian(truth[0]) / 0.02 / 0.6745, rel=0.2)
+    far = depth.judge_against_truth(replace(maps[5], depth=maps[5].depth * 1.02), truth, align.scale)
+    assert far.right == pytest.approx(0.0, abs=0.01)
+    with pytest.raises(ValueError, match="no depth map"):
+        depth.together([])
+
+
+def test_depth_is_read_where_sparse_points_are_seen() -> None:
+    z = np.full((20, 30), 4.0, np.float32)
+    z[:, 15:] = np.nan
+    P = np.array([[10.0, 0.0, 15.0, 0.0], [0.0, 10.0, 10.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    found = DepthMap(0, P, z, np.full_like(z, 0.1), np.ones(z.shape, np.uint8))
+    X = np.array([[-2.0, 0.0, 4.0, 1.0], [-2.0, 1.0, 4.2, 1.0], [2.0, 0.0, 4.0, 1.0], [0.0, 0.0, 9.0, 1.0]])
+    # The last is another view's.
+    tracks = Tracks(np.array([0, 0, 0, 1]), np.arange(4), np.zeros((4, 2)), 2, 4)
+    seen = np.ones(4, dtype=bool)
+    cameras, sizes = np.stack([P, P]), np.full((2, 2), 20)
+    model = Reconstruction("metric", cameras, X, seen[:2], seen, seen, tracks, sizes, 1.0, ("", ""))
+    one = depth.judge_against_points(found, model)
+    np.testing.assert_allclose(one.error, [0.0, 1.0 - 4.0 / 4.2], atol=1e-6)
+    np.testing.assert_allclose(one.deviations, [0.0, 2.0], atol=1e-4)
+    assert one.known == pytest.approx(2 / 3)
+    assert one.right == pytest.approx(1 / 3)
+
+
 def test_points_are_spread_evenly() -> None:
     vertices = np.array([[0.0, 0, 0], [4, 0, 0], [4, 1, 0], [0, 1, 0], [0, 0, 5], [1, 0, 5], [1, 1, 5]])
     mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]]))
-    points = surface.points_on(mesh, 9000)
+    points = surfaces.points_on(mesh, 9000)
     low = points[:, 2] < 1.0
     assert low.sum() == pytest.approx(8000, abs=20)
     np.testing.assert_allclose(points[low].mean(axis=0), [2.0, 0.5, 0.0], atol=0.05)
     assert points[low].min() >= 0.0
-    np.testing.assert_array_equal(points, surface.points_on(mesh, 9000))
+    np.testing.assert_array_equal(points, surfaces.points_on(mesh, 9000))
 
 
 def test_what_two_photographs_could_show_is_asked_for() -> None:
@@ -36,55 +88,46 @@ def test_what_two_photographs_could_show_is_asked_for() -> None:
     assert scene.R is not None
     assert scene.C is not None
     pixel = np.linalg.inv(scene.K[6]) @ [512.0, 384.0, 1.0]
-    depth = surface.load_fixture_depth(6)[0][192, 256]
-    along = np.array([0.5, 1.0, 1.02, 1.5])[:, None] * depth * (scene.R[6].T @ pixel) + scene.C[6]
-    count = surface.asked_for(along, scene)
+    true = surfaces.load_fixture_depth(6)[0][192, 256]
+    along = np.array([0.5, 1.0, 1.02, 1.5])[:, None] * true * (scene.R[6].T @ pixel) + scene.C[6]
+    count = surfaces.asked_for(along, scene)
     assert count[0] >= 2  # in the air
     assert count[1] >= 2
     assert count[3] == 0  # behind the wall
 
 
-def test_distances_of_the_truth_from_itself_are_none() -> None:
-    scene = load_fixture_scene("courtyard")
-    assert scene.C is not None
-    views = [
-        DepthMap(i, np.eye(3, 4), *(np.ones((1, 1), np.float32),) * 2, np.ones((1, 1), np.uint8))
-        for i in (0, 5, 9)
-    ]
-    moved = {}
-    for one in views:
-        P = np.column_stack([np.eye(3), -(2.0 * scene.C[one.view] + [1.0, 2.0, 3.0])])
-        moved[one.view] = DepthMap(one.view, P, one.depth, one.std, one.views)
-    found = surface.true_from_ours(moved, scene)
-    assert found.scale == pytest.approx(0.5)
-    np.testing.assert_allclose(found.t, [-0.5, -1.0, -1.5], atol=1e-9)
-
-
-def test_tables_hold_ours_against_theirs() -> None:
+def test_ours_is_held_against_the_grid_of_open3d() -> None:
     near, far = np.full(10, 0.1), np.full(10, 0.7)
-    rows = surface.table({"default": (near, far), "Open3D TSDF": (far, near)})
-    verdicts = {row.name: row.verdict for row in rows}
-    assert verdicts["accuracy, mean"] == "reached"
-    assert verdicts["completeness, mean"] == "missed"
+    judged = {surface_stage.OURS: (near, far), surface_stage.TSDF: (far, near), "missing": None}
+    rows = {row.name: row for row in surface_stage._metrics("courtyard", judged)}
+    assert rows["accuracy over Open3D TSDF"].values == {"ours": pytest.approx(1 / 7)}
+    assert rows["completeness over Open3D TSDF"].values == {"ours": pytest.approx(7.0)}
+    assert rows["accuracy, within 0.2 %"].values["ours"] == 100.0
+    assert rows["accuracy, mean"].values["missing"] is None
 
 
 def test_a_photograph_is_left_out(tmp_path: Path) -> None:
     maps = {m.view: m for m in ring_of(12)}
     views = {i: photograph(m, 0.9 if i % 2 else 1.1) for i, m in maps.items()}
-    found = held_out.hold_out(3, maps, views, pictures=tmp_path)
-    assert found[held_out.OURS].psnr_db > 30.0
+    others = [i for i in maps if i != 3]
+    given = [maps[i] for i in others], [views[i] for i in others]
+    camera = views_stage.PinholeCamera.from_matrix(views[3].P, (160, 120))
+    drawn = {}
+    for method in (views_stage.OURS, views_stage.FINE, views_stage.LEVELLED):
+        mesh = views_stage._model(method, *given, tmp_path / "surface.npz")
+        drawn[method] = views_stage.render(mesh, camera)
+    found, compared = views_stage.compare(views[3], drawn)
+    assert compared.any()
+    assert found[views_stage.OURS].psnr_db > 30.0
     for name, one in found.items():
         assert one.psnr_db > 22.0, name
         assert one.psnr_as_is_db < one.psnr_db + 1e-9
-        assert 0.1 < one.covered < 0.5
-    assert len(list(tmp_path.iterdir())) == len(found) + 1
-    row = held_out.table("sphere", [found])[0]
-    assert row.target == max(v.psnr_db for n, v in found.items() if n.startswith("Open3D"))
-    level = held_out.equally_bright(maps, views)
-    seen = views[3].rgb > 40
-    assert np.median(level[3].rgb[seen] / views[3].rgb[seen]) == pytest.approx(np.sqrt(1.1 / 0.9), abs=0.03)
-
-
-def test_photographs_to_leave_out_are_spread() -> None:
-    assert held_out.spread_out(list(range(11)), 3) == [2, 5, 8]
-    assert held_out.spread_out([4, 9], 3) == [4, 9]
+        assert 10.0 < one.covered < 50.0
+    rows = {row.name: row for row in views_stage._metrics("sphere", found)}
+    best = max(found[n].psnr_db for n in (views_stage.FINE, views_stage.LEVELLED))
+    over = found[views_stage.OURS].psnr_db - best
+    assert rows["PSNR over Open3D"].values == {"ours": pytest.approx(over)}
+    level = views_stage._equally_bright(views_stage._read_surface(tmp_path / "surface.npz"), given[1])
+    bright = level[2].rgb, views[2].rgb
+    seen = bright[1] > 40
+    assert np.median(bright[0][seen] / bright[1][seen]) == pytest.approx(np.sqrt(0.9 / 1.1), abs=0.03)

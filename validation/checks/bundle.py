@@ -71,27 +71,38 @@ class Case:
         return f"{2 * observations} residuals, {self.loss}, {cameras}, {what}, {threads}"
 
 
+def model_as_bundle(model: Reconstruction) -> tuple[MetricCameras, F64, Observations]:
+    """A saved model: all cameras with the first's intrinsics, as far as SIMPLE_RADIAL has them; its points
+    and its observations."""
+    assert model.K is not None
+    assert model.radial is not None
+    R, t = _poses(model)
+    K = model.K[0]
+    row = [K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], float(model.radial[0, 0])]
+    seen = Observations(model.tracks.view_index, model.tracks.point_index, model.tracks.xy)
+    X = model.X[:, :3] / model.X[:, 3:]
+    return MetricCameras(R, t, np.array([row]), np.zeros(len(R), dtype=np.int64)), X, seen
+
+
 def perturbed_model(
     model: Reconstruction, rng: np.random.Generator, *, copies: int = 1, shared: bool = True
 ) -> tuple[MetricCameras, F64, Observations]:
     """One camera, ``shared`` or for each photograph, 2 % off in its focal, poses and points off by 0.3 % of
     the scene; each point ``copies`` times, with fresh noise."""
-    tracks, R, t, X = model.tracks, *_poses(model), model.X[:, :3] / model.X[:, 3:]
+    exact, X, seen = model_as_bundle(model)
+    R, t = exact.R, exact.t
     scale = float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1)))
     turn = Rotation.from_rotvec(0.003 * rng.normal(size=t.shape)).as_matrix()
-    assert model.K is not None
-    assert model.radial is not None
-    K, k1 = model.K[0], float(model.radial[0, 0])
-    row = np.array([[1.02 * K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], k1]])
+    row = exact.intrinsics * [1.02, 1.0, 1.0, 1.0, 1.0, 1.0]
     moved = t + 0.003 * scale * rng.normal(size=t.shape)
     group = np.zeros(len(R), int) if shared else np.arange(len(R))
     cameras = MetricCameras(turn @ R, moved, np.repeat(row, group.max() + 1, axis=0), group)
     many = np.tile(X, (copies, 1))
-    xy = np.tile(tracks.xy, (copies, 1))
-    xy[len(tracks.xy) :] += model.sigma_px * rng.normal(size=xy[len(tracks.xy) :].shape)
-    point = np.concatenate([tracks.point_index + n * len(X) for n in range(copies)])
-    seen = Observations(np.tile(tracks.view_index, copies), point, xy)
-    return cameras, many + 0.003 * scale * rng.normal(size=many.shape), seen
+    xy = np.tile(seen.xy, (copies, 1))
+    xy[len(seen.xy) :] += model.sigma_px * rng.normal(size=xy[len(seen.xy) :].shape)
+    point = np.concatenate([seen.point_index + n * len(X) for n in range(copies)])
+    again = Observations(np.tile(seen.view_index, copies), point, xy)
+    return cameras, many + 0.003 * scale * rng.normal(size=many.shape), again
 
 
 def _poses(model: Reconstruction) -> tuple[F64, F64]:

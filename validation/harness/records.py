@@ -18,9 +18,10 @@ class Wishes:
     ``out`` : its folder. ``scenes``, ``stages`` : their names, in order. ``folders`` : scene -> folder, of
     scenes that the user brought. ``quick`` : less of everything that can be less. ``gates_only`` : no
     reference that takes long and that no gate needs. ``seed`` : of all random steps. ``threads`` : cores that
-    may be used at once. ``limit_s`` : seconds a single task may take. ``resume`` : the folder of another run,
-    whose references are taken as they are; empty for none. ``methods`` : those of ours that run again where
-    a run is resumed; empty for all. ``stages_from`` : the module whose ``STAGES`` hold the stages.
+    may be used at once. ``limit_s`` : seconds a single task may take. ``side_px`` : long side of depth maps,
+    0 for what a report has time for. ``resume`` : the folder of another run, whose references are taken as
+    they are; empty for none. ``methods`` : those of ours that run again where a run is resumed; empty for
+    all. ``stages_from`` : the module whose ``STAGES`` hold the stages.
     """
 
     out: Path
@@ -34,6 +35,7 @@ class Wishes:
     limit_s: float = 300.0
     resume: str = ""
     methods: tuple[str, ...] = ()
+    side_px: int = 0
     stages_from: str = "validation.harness.stages"
 
     def place(self, stage: str, scene: str, method: str = "") -> Path:

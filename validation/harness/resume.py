@@ -18,9 +18,9 @@ from validation.harness.records import Outcome, Stage, Task, Wishes
 from validation.harness.worker import OUTCOMES
 
 OURS = "ours"
-OVER_OURS = ("between",)
+OVER_OURS = ("between", "boards", "surface", "views")
 """Stages whose references, too, go through code of ours: they run again."""
-ALIKE = ("quick", "gates_only", "seed")
+ALIKE = ("quick", "gates_only", "seed", "side_px")
 """Wishes that the results of a task depend on."""
 
 

@@ -22,9 +22,10 @@ from validation.scenes.real import (
 from validation.scenes.stereo import STEREO_PAIRS, stereo_folder
 
 PHOTOGRAPHS = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
-QUICK = ("courtyard", "cloud", "street", "Tsukuba")
-SYNTHETIC = ("cloud", "street")
-"""Made from nothing wherever they are asked for: points seen by a few cameras; a walk of cameras."""
+QUICK = ("courtyard", "boards", "cloud", "street", "Tsukuba")
+SYNTHETIC = ("boards", "cloud", "street")
+"""Made from nothing wherever they are asked for: photographs of a chequered board; points seen by a few
+cameras; a walk of cameras."""
 
 
 def available_scenes(*, quick: bool) -> tuple[str, ...]:

@@ -15,14 +15,19 @@ from validation.references.open3d_cameras import camera_of
 U8 = NDArray[np.uint8]
 
 
-def distances(points: F64, mesh: TexturedMesh) -> F64:
-    """(N,) distances of points (N, 3) to the nearest place of a surface."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
-    )
-    found = scene.compute_distance(o3d.core.Tensor(points.astype(np.float32)), nthreads=1)
-    return np.asarray(found.numpy(), dtype=np.float64)
+class Nearest:
+    """A surface, ready to be asked how far points are from it."""
+
+    def __init__(self, mesh: TexturedMesh) -> None:
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(
+            o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
+        )
+
+    def distances(self, points: F64) -> F64:
+        """(N,) distances of points (N, 3) to its nearest place."""
+        found = self._scene.compute_distance(o3d.core.Tensor(points.astype(np.float32)), nthreads=1)
+        return np.asarray(found.numpy(), dtype=np.float64)
 
 
 def render_open3d(mesh: TexturedMesh, camera: PinholeCamera) -> U8:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,7 @@ def load_fixture_scene(name: str = "courtyard") -> Scene:
     return read_scene(ROOT / "fixtures" / name, name)
 
 
+@cache
 def load_fixture_depth(view: int, name: str = "courtyard") -> tuple[F64, int]:
     """True depth (H / stride, W / stride) of one view in metres, NaN where nothing was hit, and the stride.
 
@@ -104,4 +106,7 @@ def load_fixture_depth(view: int, name: str = "courtyard") -> tuple[F64, int]:
     told = json.loads((folder / "cameras.json").read_text(encoding="utf-8"))["depth"]
     with PillowImage.open(folder / "depth" / f"{view:04d}.png") as image:
         steps = np.asarray(image, dtype=np.float64)
-    return np.where(steps == told["none"], np.nan, steps * told["unit_m"]), int(told["stride"])
+    depth = np.where(steps == told["none"], np.nan, steps * told["unit_m"])
+    # Every caller gets the same array.
+    depth.flags.writeable = False
+    return depth, int(told["stride"])

@@ -12,7 +12,7 @@ from thesisrecon.types import TexturedMesh
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.metrics.record import Metric
 from validation.references.fundamental import estimate_with
-from validation.references.open3d_meshes import distances
+from validation.references.open3d_meshes import Nearest
 from validation.references.triangulation import colmap_points, opencv_linear
 
 METHODS = ("cv2", "pycolmap", "poselib", "open3d")
@@ -47,7 +47,7 @@ class ReferenceStage:
         if task.method == "poselib":
             estimate_with("PoseLib", 100.0 * xy[0], 100.0 * xy[1], threshold_px=1.0, seed=0)
         if task.method == "open3d":
-            distances(X, TexturedMesh(np.eye(3), np.array([[0, 1, 2]])))
+            Nearest(TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))).distances(X)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
         values: dict[str, float | None] = {name: 1.0 if o.ok else None for name, o in outcomes.items()}

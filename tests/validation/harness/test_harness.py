@@ -157,6 +157,7 @@ def test_no_gate_without_its_reason(tmp_path: Path) -> None:
         (["report", "-o", "OUT", "--images", "nowhere"], "there is no folder of photographs nowhere"),
         (["report", "-o", "OUT", "--against", "nowhere"], "nowhere holds no report to compare with"),
         (["check", "-o", "OUT", "--threads", "0"], "more than zero"),
+        (["report", "-o", "OUT", "--max-side", "10"], "--max-side is at least 64 px"),
     ],
 )
 def test_wrong_wishes_are_named(

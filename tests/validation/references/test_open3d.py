@@ -55,7 +55,7 @@ def test_meshes_lie_on_the_sphere_and_distances_are_right() -> None:
     for mesh in (fused, open3d_surfaces.poisson_mesh(maps, depth=7)):
         assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1.0)) < 0.006
     away = np.array([[0.0, 0.0, -3.0], [2.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    np.testing.assert_allclose(open3d_meshes.distances(away, fused), [2.0, 1.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(open3d_meshes.Nearest(fused).distances(away), [2.0, 1.0, 0.0], atol=0.01)
     assert fused.colors is not None
     assert np.median(np.abs(fused.colors - paint(fused.vertices))) < 12.0
 

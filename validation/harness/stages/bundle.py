@@ -15,7 +15,7 @@ from thesisrecon.optimize.metric_bundle import (
     refine_metric_bundle,
 )
 from thesisrecon.types import F64, Reconstruction
-from validation.checks.bundle import FOCAL_K1, LOSS_PX, WITH_CENTRE, perturbed_model
+from validation.checks.bundle import FOCAL_K1, LOSS_PX, WITH_CENTRE, model_as_bundle, perturbed_model
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import OURS as OUR_CAMERAS
@@ -37,7 +37,9 @@ class BundleStage:
     definition = (
         "The final model of our run, every camera and point moved (focal length by 2 %), adjusted to "
         "convergence by ours and by COLMAP's Ceres from the same start, soft L1 loss. Cost is computed here, "
-        "by one function, from the cameras and points that each leaves. On the synthetic street: covariances."
+        "by one function, from the cameras and points that each leaves. Covariances, ours beside COLMAP's "
+        "estimate_ba_covariance: of the saved model (and of a synthetic street), each at its own optimum, "
+        "squared loss, focal length, principal point and k1 free, two views fixed."
     )
 
     def takes(self, scene: str, wishes: Wishes) -> bool:
@@ -51,9 +53,10 @@ class BundleStage:
 
     def run(self, task: Task, wishes: Wishes) -> None:
         place = wishes.place(task.stage, task.scene, task.method)
+        exact, points, given, size = _optimum(task.scene, wishes)
+        poses, camera = _covariances(task.method, exact, points, given, size)
+        np.savez(place / "covariances.npz", poses=poses, camera=camera)
         if task.scene == STREET:
-            poses, camera = _covariances(task.method)
-            np.savez(place / "covariances.npz", poses=poses, camera=camera)
             return
         cameras, X, seen, size = _problem(task.scene, wishes)
         adjusted, points, seconds = _adjust(task.method, cameras, X, seen, size)
@@ -78,30 +81,48 @@ class BundleStage:
         ours, ceres = costs[OURS], costs[CERES]
         over = ours / ceres - 1.0 if ours is not None and ceres else None
         notes.append(f"{2 * len(seen.xy)} residuals.")
+        cost_words = "1/2 sum of rho(r^2), soft L1 at 0.2 px"
         return Judgement(
             [
-                Metric(
-                    scene, "cost", "px^2", costs, OURS, definition="1/2 sum of rho(r^2), soft L1 at 0.2 px"
-                ),
+                Metric(scene, "cost", "px^2", costs, OURS, definition=cost_words),
                 Metric(
                     scene, "cost above Ceres", "", {OURS: over}, OURS, definition="ratio of costs minus 1"
                 ),
                 Metric(scene, "focal length", "px", focals, OURS, definition="of the first camera"),
                 Metric(scene, "time", "s", seconds, OURS, definition="processor time of the second run"),
+                *_covariance_metrics(scene, outcomes),
             ],
             notes=notes,
         )
 
 
-def _problem(scene: str, wishes: Wishes) -> tuple[MetricCameras, F64, Observations, tuple[int, int]]:
+Problem = tuple[MetricCameras, F64, Observations, tuple[int, int]]
+
+
+def _problem(scene: str, wishes: Wishes) -> Problem:
+    """The saved model, moved off its optimum."""
+    model = _saved(scene, wishes)
+    cameras, X, seen = perturbed_model(model, np.random.default_rng(wishes.seed))
+    return cameras, X, seen, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
+
+
+def _optimum(scene: str, wishes: Wishes) -> Problem:
+    """Where covariances are asked for: the true street, or the saved model as it is."""
+    if scene == STREET:
+        walk = make_walk(12, "street", np.random.default_rng(4))
+        return walk.cameras, walk.X, walk.seen, SIZE
+    model = _saved(scene, wishes)
+    cameras, X, seen = model_as_bundle(model)
+    return cameras, X, seen, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
+
+
+def _saved(scene: str, wishes: Wishes) -> Reconstruction:
     photographs = load_photographs(scene, wishes)
     outcome = Outcome(wishes.place("cameras", scene, OUR_CAMERAS))
     model = read_model(photographs, OUR_CAMERAS, outcome)
     if model is None:
         raise ValueError(f"there is no model of ours of {scene} to adjust: run the stage cameras too")
-    model = _registered_only(model)
-    cameras, X, seen = perturbed_model(model, np.random.default_rng(wishes.seed))
-    return cameras, X, seen, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
+    return _registered_only(model)
 
 
 def _registered_only(model: Reconstruction) -> Reconstruction:
@@ -144,14 +165,15 @@ def _cost(kept: Mapping[str, F64], group: np.ndarray, seen: Observations) -> flo
     return float(LOSS_PX**2 * np.sum(np.sqrt(1.0 + s) - 1.0))
 
 
-def _covariances(method: str) -> tuple[F64, F64]:
+def _covariances(
+    method: str, cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int]
+) -> tuple[F64, F64]:
     """Of poses (V, 6, 6) and of (f, cx, cy, k1) at one optimum, for noise of 1 px, two views fixed."""
-    walk = make_walk(12, "street", np.random.default_rng(4))
     if method == CERES:
-        return ceres_covariances(walk.cameras, walk.X, walk.seen, SIZE, (0, 1))
-    fixed = np.arange(12) < 2
+        return ceres_covariances(cameras, X, seen, size, (0, 1))
+    fixed = np.arange(len(cameras.R)) < 2
     options = BundleOptions(loss="squared", max_iterations=100, covariance=True, fixed_views=fixed)
-    fit = refine_metric_bundle(walk.cameras, walk.X, walk.seen, free=WITH_CENTRE, options=options)
+    fit = refine_metric_bundle(cameras, X, seen, free=WITH_CENTRE, options=options)
     assert fit.pose_covariance is not None
     some = [0, 3, 4, 5]
     camera = fit.intrinsics_covariance[0][np.ix_(some, some)]

@@ -1,0 +1,255 @@
+"""Section 2.6: the model seen from a photograph that it was not made of, beside that photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.model import SurfaceModel
+from thesisrecon.model.texture import BlendedViews, SingleView, TextureAtlas
+from thesisrecon.types import B8, DepthMap, PinholeView, RenderedView, TexturedMesh
+from thesisrecon.views import render
+from thesisrecon.views.likeness import exposed_alike, psnr_db, ssim, whole_pixels
+from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
+from validation.harness.scenes import load_photographs
+from validation.harness.stages.depth import COURTYARD, OURS, model_of, read_maps, views_of
+from validation.metrics.depth import coloured
+from validation.metrics.record import Metric
+from validation.references.open3d_meshes import render_open3d
+from validation.references.open3d_surfaces import OpenTsdf
+
+U8 = NDArray[np.uint8]
+SINGLE = "ours (one photograph each)"
+TSDF, FINE, LEVELLED = "Open3D TSDF, 1.5 px", "Open3D TSDF, 1 px", "Open3D TSDF, 1 px, levelled"
+OWN_PICTURE = "Open3D TSDF, 1 px, its own picture"
+VOXELS_PX = {TSDF: 1.5, FINE: 1.0, LEVELLED: 1.0}
+SCENES = (COURTYARD, "Herz-Jesus-P8")
+LEFT_OUT = 2
+RED_LEVELS = 64.0
+"""Difference in grey levels that is red in the pictures."""
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """Of pictures to photographs, means over those that were left out: made equally bright (``psnr_db``,
+    ``ssim``) and as they are, and the share of the frame that is ``covered``."""
+
+    psnr_db: float
+    ssim: float
+    psnr_as_is_db: float
+    ssim_as_is: float
+    covered: float
+
+
+class ViewsStage:
+    """Photographs that are left out, one by one."""
+
+    name = "views"
+    title = "Views of the model"
+    definition = (
+        f"{LEFT_OUT} photographs are left out, one by one: neither "
+        "their depth map nor their colours go into a model. (Other depth maps were matched with them, for "
+        "all alike.) Ours is textured; Open3D's is its grid of truncated signed distances with coloured "
+        "vertices, from the same depth maps and photographs, once from photographs that our gains had made "
+        "equally bright. All are drawn by our renderer at the camera that was left out, Open3D's finer one "
+        "(but for a quick report) also by its own, and compared over the pixels that all cover whole. How "
+        "an unseen photograph was exposed nobody knows: each picture is first multiplied by one factor a "
+        "channel that fits best."
+    )
+
+    def takes(self, scene: str, wishes: Wishes) -> bool:
+        return scene in SCENES or scene in wishes.folders
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        sternest = (OURS, FINE, LEVELLED)
+        return sternest if wishes.quick or wishes.gates_only else (OURS, SINGLE, TSDF, FINE, LEVELLED)
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return (("depth", OURS), *(((self.name, OURS),) if method in (SINGLE, LEVELLED) else ()))
+
+    def run(self, task: Task, wishes: Wishes) -> None:
+        photographs = load_photographs(task.scene, wishes)
+        maps = read_maps(wishes.place("depth", task.scene, OURS))
+        if not maps:
+            raise ValueError(f"there are no depth maps of {task.scene}: run the stage depth too")
+        views = views_of(photographs, model_of(photographs, wishes), wishes)
+        place = wishes.place(task.stage, task.scene, task.method)
+        shared = wishes.place(task.stage, task.scene, OURS)
+        for k in _left_out(sorted(maps)):
+            others = [i for i in sorted(maps) if i != k]
+            seen = [views[i] for i in others]
+            mesh = _model(task.method, [maps[i] for i in others], seen, shared / f"surface-{k:04d}.npz")
+            camera = PinholeCamera.from_matrix(views[k].P, (views[k].rgb.shape[1], views[k].rgb.shape[0]))
+            drawn = render(mesh, camera)
+            _save(place / f"{k:04d}.png", drawn.color)
+            _save(place / f"{k:04d}-covered.png", np.where(drawn.valid, 255, 0).astype(np.uint8))
+            if task.method == FINE and not wishes.quick:
+                _draw_by_open3d(place / f"{k:04d}-own.png", mesh, camera)
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+        photographs = load_photographs(scene, wishes)
+        views = views_of(photographs, model_of(photographs, wishes), wishes)
+        left_out = _left_out(sorted(read_maps(wishes.place("depth", scene, OURS))))
+        place, pictures = wishes.place(self.name, scene), list[Picture]()
+        found: dict[str, list[Likeness]] = {}
+        for k in left_out:
+            drawn = _drawn(outcomes, k)
+            likenesses, compared = compare(views[k], drawn)
+            for name, one in likenesses.items():
+                found.setdefault(name, []).append(one)
+            shown = {n: drawn[n].color for n in (OURS, FINE) if n in drawn}
+            file = f"left-out-{k:02d}.png"
+            _save(place / file, _beside(views[k].rgb, shown, compared))
+            words = (
+                f"The photograph, then {', '.join(shown)}; below the differences, blue (none) to red "
+                f"({RED_LEVELS:g} grey levels or more), black where not compared."
+            )
+            pictures.append(Picture(file, f"Photograph {k + 1}, left out", words))
+        names = [*outcomes, *([OWN_PICTURE] if OWN_PICTURE in found else [])]
+        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
+        numbers = ", ".join(str(k + 1) for k in left_out)
+        notes.append(f"Left out: photograph{'s' * (len(left_out) > 1)} {numbers}.")
+        return Judgement(_metrics(scene, {n: _mean(found.get(n)) for n in names}), (), pictures, notes)
+
+
+def _left_out(views: Sequence[int]) -> list[int]:
+    """Some of the views, evenly, without the first and the last where there are others."""
+    places = np.linspace(0, len(views) - 1, LEFT_OUT + 2)[1:-1]
+    return sorted({views[round(float(place))] for place in places})
+
+
+def _model(
+    method: str, maps: Sequence[DepthMap], views: Sequence[PinholeView], surface: Path
+) -> TexturedMesh:
+    """A model with colours; ours leaves its ``surface`` for the methods that start from it."""
+    if method == OURS:
+        bare = SurfaceModel().surface_of(maps)
+        np.savez(surface, vertices=bare.vertices, faces=bare.faces)
+        return SurfaceModel().color(bare, views)
+    if method == SINGLE:
+        return TextureAtlas(painter=SingleView()).texture(_read_surface(surface), views)
+    if method == LEVELLED:
+        views = _equally_bright(_read_surface(surface), views)
+    return OpenTsdf(voxel_px=VOXELS_PX[method]).fuse(maps, views)
+
+
+def _read_surface(path: Path) -> TexturedMesh:
+    with np.load(path) as kept:
+        return TexturedMesh(kept["vertices"], kept["faces"])
+
+
+def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list[PinholeView]:
+    """The photographs with one exposure, by the gains that our texture finds."""
+    gains = BlendedViews().prepare(surface, views).gains
+    return [
+        replace(view, rgb=np.clip(np.rint(view.rgb * gain), 0, 255).astype(np.uint8))
+        for view, gain in zip(views, gains, strict=True)
+    ]
+
+
+def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: PinholeCamera) -> None:
+    """Open3D's own picture, where the machine has graphics that it can use."""
+    try:
+        _save(path, render_open3d(mesh, camera))
+    except RuntimeError as error:
+        print(f"Open3D cannot draw here: {error}")
+
+
+def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[str, Likeness], B8]:
+    """Pictures of one camera beside its photograph, and the pixels (H, W) compared: those that all of them
+    cover whole."""
+    whole = {name: whole_pixels(picture) & view.seen for name, picture in drawn.items()}
+    compared = np.logical_and.reduce([view.seen, *whole.values()])
+    found = {
+        name: _likeness(view.rgb, picture.color, compared, float(whole[name].mean()))
+        for name, picture in drawn.items()
+    }
+    return found, compared
+
+
+def _drawn(outcomes: Mapping[str, Outcome], view: int) -> dict[str, RenderedView]:
+    """The saved pictures of a camera, without their depths."""
+    drawn = {}
+    for name, outcome in outcomes.items():
+        place = Path(outcome.place)
+        if not outcome.ok:
+            continue
+        covered = _read(place / f"{view:04d}-covered.png") > 0
+        depth = np.full(covered.shape, np.nan, dtype=np.float32)
+        drawn[name] = RenderedView(_read(place / f"{view:04d}.png"), depth, covered)
+        if (place / f"{view:04d}-own.png").is_file():
+            drawn[OWN_PICTURE] = RenderedView(_read(place / f"{view:04d}-own.png"), depth, covered)
+    return drawn
+
+
+def _likeness(photograph: U8, color: U8, compared: B8, covered: float) -> Likeness:
+    alike = exposed_alike(photograph, color, compared)
+    return Likeness(
+        psnr_db(photograph, alike, compared),
+        ssim(photograph, alike, compared),
+        psnr_db(photograph, color, compared),
+        ssim(photograph, color, compared),
+        100.0 * covered,
+    )
+
+
+def _mean(found: Sequence[Likeness] | None) -> Likeness | None:
+    if not found:
+        return None
+    return Likeness(*np.mean([list(vars(one).values()) for one in found], axis=0).tolist())
+
+
+def _metrics(scene: str, found: Mapping[str, Likeness | None]) -> list[Metric]:
+    def row(name: str, unit: str, what: str, words: str) -> Metric:
+        values = {n: None if one is None else float(getattr(one, what)) for n, one in found.items()}
+        return Metric(scene, name, unit, values, OURS, at_most=False, definition=words)
+
+    peak = row("PSNR", "dB", "psnr_db", "made equally bright first; mean over the photographs left out")
+    like = row("SSIM", "", "ssim", "made equally bright first; mean over the photographs left out")
+    as_is = "exposures as they are; mean over the photographs left out"
+    return [
+        peak,
+        like,
+        row("PSNR as it is", "dB", "psnr_as_is_db", as_is),
+        row("SSIM as it is", "", "ssim_as_is", as_is),
+        row("covered", "%", "covered", "share of the frame that the model covers whole"),
+        _over(scene, peak, "dB"),
+        _over(scene, like, ""),
+    ]
+
+
+def _over(scene: str, metric: Metric, unit: str) -> Metric:
+    """Ours above the best of Open3D's."""
+    theirs = [v for n, v in metric.values.items() if n.startswith("Open3D") and v is not None]
+    ours = metric.values.get(OURS)
+    over = ours - max(theirs) if ours is not None and theirs else None
+    words = f"{metric.name} of ours less the best of Open3D's"
+    name = f"{metric.name} over Open3D"
+    return Metric(scene, name, unit, {OURS: over}, OURS, at_most=False, definition=words)
+
+
+def _beside(photograph: U8, shown: Mapping[str, U8], compared: B8) -> U8:
+    """Photograph and pictures in a row, differences of those made equally bright below."""
+    empty = np.zeros_like(photograph)
+    above, below = [photograph], [empty]
+    for color in shown.values():
+        alike = exposed_alike(photograph, color, compared)
+        off = np.abs(alike.astype(np.float64) - photograph).mean(axis=2) / RED_LEVELS
+        above.append(alike)
+        below.append(np.where(compared[..., None], coloured(off), 0).astype(np.uint8))
+    return np.concatenate([np.concatenate(above, axis=1), np.concatenate(below, axis=1)])
+
+
+def _save(path: Path, picture: U8) -> None:
+    PIL.Image.fromarray(picture).save(path, compress_level=1)
+
+
+def _read(path: Path) -> U8:
+    with PIL.Image.open(path) as opened:
+        return np.asarray(opened)

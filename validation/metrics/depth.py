@@ -1,0 +1,166 @@
+"""How right depth maps are: against true depths, and at the sparse points of a reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.geometry.alignment import Similarity, estimate_similarity
+from thesisrecon.types import B8, F32, F64, DepthMap, Reconstruction
+from validation.scenes.real import Scene, load_fixture_depth
+
+U8 = NDArray[np.uint8]
+SAME = 0.01
+"""Relative difference of depths up to which two views see the same place, and a depth is right."""
+NORMAL_MEDIAN = 0.6745
+"""Median absolute value of a normal variable of deviation 1."""
+NEAR_TO_FAR = np.array(
+    [[48, 18, 59], [70, 107, 227], [40, 187, 236], [50, 242, 152], [238, 207, 58], [208, 48, 5]]
+)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Of one map: relative ``error`` of its known depths (N,), ``deviations`` (N,) the same errors in units
+    of those it states, the share ``known`` and the share ``right`` of what can be known."""
+
+    error: F64
+    deviations: F64
+    known: float
+    right: float
+
+
+@dataclass(frozen=True)
+class JudgedMaps:
+    """Of all maps of a scene together: ``median`` relative error, the shares ``right`` and ``known`` of what
+    can be known (means over the maps, and the ``worst`` map's share right), the share ``right_of_known``, and
+    the median error in stated ``deviations``, 1 for those that are true."""
+
+    median: float
+    right: float
+    worst: float
+    known: float
+    right_of_known: float
+    deviations: float
+
+
+def together(judged: Sequence[Judged]) -> JudgedMaps:
+    """One judgement of the maps of a scene; ``ValueError`` where there is none."""
+    if not judged:
+        raise ValueError("there is no depth map to judge")
+    error = np.concatenate([one.error for one in judged])
+    off = [float(np.median(one.deviations)) / NORMAL_MEDIAN for one in judged if len(one.deviations)]
+    return JudgedMaps(
+        float(np.median(error)) if len(error) else float("nan"),
+        float(np.mean([one.right for one in judged])),
+        min(one.right for one in judged),
+        float(np.mean([one.known for one in judged])),
+        float(np.mean(error < SAME)) if len(error) else 0.0,
+        float(np.median(off)) if off else float("nan"),
+    )
+
+
+TrueDepth = tuple[F64, int, B8]
+"""True depth of a view (h, w), its stride in pixels of the photograph, and where another view sees the place
+too."""
+
+
+def true_depth(scene: Scene, view: int) -> TrueDepth:
+    """Of a view of the courtyard."""
+    assert scene.K is not None
+    assert scene.R is not None
+    assert scene.C is not None
+    depth, stride = load_fixture_depth(view)
+    rows, columns = depth.shape
+    x, y = np.meshgrid(stride * np.arange(float(columns)), stride * np.arange(float(rows)))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(scene.K[view]).T
+    X = (rays * depth[..., None]) @ scene.R[view] + scene.C[view]
+    seen = np.zeros(depth.shape, dtype=bool)
+    for j in range(len(scene.image_paths)):
+        if j != view:
+            q = (X - scene.C[j]) @ (scene.K[j] @ scene.R[j]).T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                at = q[..., :2] / q[..., 2:] / stride
+                inside = (q[..., 2] > 0.0) & np.all((at >= 0) & (at <= [columns - 1, rows - 1]), axis=-1)
+            place = np.rint(np.where(inside[..., None], at, 0.0)).astype(np.int64)
+            other = load_fixture_depth(j)[0][place[..., 1], place[..., 0]]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                seen |= inside & (np.abs(other / q[..., 2] - 1.0) < SAME)
+    return depth, stride, seen
+
+
+def true_from_maps(maps: Mapping[int, DepthMap], scene: Scene) -> Similarity:
+    """The similarity that lays the cameras of depth maps over the true ones."""
+    assert scene.C is not None
+    views = sorted(maps)
+    centres = [-np.linalg.solve(maps[i].P[:, :3], maps[i].P[:, 3]) for i in views]
+    return estimate_similarity(np.array(centres), scene.C[views])
+
+
+def at_true_places(found: DepthMap, shape: tuple[int, int], stride: int, width_px: int) -> tuple[F64, F64]:
+    """Depths and deviations of a map at the samples of a true one of this ``shape`` and ``stride``, nearest
+    pixel; ``width_px`` is that of the photograph whose pixels the stride counts."""
+    shrink = found.depth.shape[1] / width_px
+    rows, columns = (
+        np.clip(np.rint((stride * np.arange(n) + 0.5) * shrink - 0.5), 0, m - 1).astype(np.int64)
+        for n, m in zip(shape, found.depth.shape, strict=True)
+    )
+    place = np.ix_(rows, columns)
+    return found.depth[place].astype(np.float64), found.std[place].astype(np.float64)
+
+
+def judge_against_truth(found: DepthMap, truth: TrueDepth, scale: float) -> Judged:
+    """One map, ``scale`` true lengths over its own; what can be known is what two views see."""
+    depth, stride, seen = truth
+    own, std = at_true_places(found, depth.shape, stride, stride * depth.shape[1])
+    ours, std = scale * own, scale * std
+    known = seen & np.isfinite(ours)
+    error = np.abs(ours / depth - 1.0)[known]
+    return _judged(error, (np.abs(ours - depth) / std)[known], int(seen.sum()))
+
+
+def judge_against_points(found: DepthMap, model: Reconstruction) -> Judged:
+    """One map at the valid points of which its view has an inlying observation."""
+    tracks = model.tracks
+    mine = (tracks.view_index == found.view) & model.inlier & model.valid[tracks.point_index]
+    Xh = model.X[np.unique(tracks.point_index[mine])]
+    q = (Xh / Xh[:, 3:]) @ found.P.T
+    at = np.rint(q[:, :2] / q[:, 2:]).astype(np.int64)
+    inside = np.all((at >= 0) & (at < found.depth.shape[::-1]), axis=1)
+    (x, y), z = at[inside].T, q[inside, 2]
+    ours = found.depth[y, x].astype(np.float64)
+    known = np.isfinite(ours)
+    error = np.abs(ours / z - 1.0)[known]
+    return _judged(error, (np.abs(ours - z) / found.std[y, x])[known], len(z))
+
+
+def _judged(error: F64, deviations: F64, total: int) -> Judged:
+    total = max(total, 1)
+    return Judged(error, deviations, len(error) / total, float(np.sum(error < SAME)) / total)
+
+
+def depth_range(depths: Sequence[F32 | F64]) -> tuple[float, float]:
+    """1 and 99 % quantiles of the inverse depths, for :func:`depth_colours`; (0, 1) where none is known."""
+    known = np.concatenate([1.0 / d[np.isfinite(d)].astype(np.float64) for d in depths])
+    if not len(known):
+        return 0.0, 1.0
+    low, high = np.quantile(known, [0.01, 0.99])
+    return float(low), float(max(high, low + 1e-12))
+
+
+def depth_colours(depth: F32 | F64, limits: tuple[float, float]) -> U8:
+    """(H, W, 3): inverse depth between two ``limits``, near red, far blue, unknown black."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (1.0 / depth.astype(np.float64) - limits[0]) / (limits[1] - limits[0])
+    known = np.isfinite(share)
+    return np.where(known[..., None], coloured(np.where(known, share, 0.0)), 0).astype(np.uint8)
+
+
+def coloured(share: F64) -> U8:
+    """(..., 3): 0 blue to 1 red, beyond as at the end."""
+    stops = np.linspace(0.0, 1.0, len(NEAR_TO_FAR))
+    rgb = [np.interp(np.clip(share, 0.0, 1.0), stops, NEAR_TO_FAR[:, k]) for k in range(3)]
+    return np.stack(rgb, axis=-1).astype(np.uint8)

@@ -1,0 +1,106 @@
+"""How far surfaces are from the true one of the courtyard, and it from them; distances are Open3D's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.model import surface_from_depth
+from thesisrecon.model.mesh import face_areas
+from thesisrecon.types import F64, I64, DepthMap, TexturedMesh
+from validation.metrics.depth import true_depth
+from validation.references.open3d_meshes import Nearest
+from validation.scenes.real import Scene, load_fixture_depth, load_fixture_scene
+
+SAMPLES = 200_000
+"""Points on a surface that distances are taken from."""
+BEHIND = 0.05
+"""How far behind what a photograph truly shows a point may be and still be asked for, in units of depth."""
+CAPPED = 5.0
+"""Percent of the scene's depth beyond which the mean counts no more."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The true ``surface``, true ``points`` (N, 3) that two photographs show, and the scene's depth in
+    metres."""
+
+    scene: Scene
+    surface: Nearest
+    points: F64
+    depth_m: float
+
+
+def load_truth() -> Truth:
+    """The courtyard as its true depth maps have it, one sheet of triangles for each view."""
+    scene = load_fixture_scene("courtyard")
+    assert scene.K is not None
+    assert scene.R is not None
+    assert scene.C is not None
+    sheets, points, depths = [], [], []
+    for view in range(len(scene.image_paths)):
+        depth, stride, seen = true_depth(scene, view)
+        K = np.diag([1.0 / stride, 1.0 / stride, 1.0]) @ scene.K[view]
+        P = K @ scene.R[view] @ np.column_stack([np.eye(3), -scene.C[view]])
+        std = np.zeros(depth.shape, dtype=np.float32)
+        sheet = DepthMap(view, P, depth.astype(np.float32), std, np.ones(depth.shape, np.uint8))
+        sheets.append(surface_from_depth(sheet, grazing_deg=1.0))
+        y, x = np.nonzero(seen & (np.indices(depth.shape).sum(axis=0) % 2 == 0))
+        rays = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(K).T
+        points.append((rays * depth[y, x, None]) @ scene.R[view] + scene.C[view])
+        depths.append(depth[np.isfinite(depth)])
+    return Truth(
+        scene, Nearest(_together(sheets)), np.concatenate(points), float(np.median(np.concatenate(depths)))
+    )
+
+
+def _together(meshes: Sequence[TexturedMesh]) -> TexturedMesh:
+    first = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
+    faces = [m.faces + n for m, n in zip(meshes, first, strict=True)]
+    return TexturedMesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces))
+
+
+def points_on(mesh: TexturedMesh, count: int = SAMPLES) -> F64:
+    """(count, 3) points spread over a surface, as many on equal areas; the same ones each time."""
+    rng = np.random.default_rng(0)
+    area = np.cumsum(face_areas(mesh.vertices, mesh.faces))
+    face = np.searchsorted(area, (np.arange(count) + rng.random(count)) * (area[-1] / count))
+    s, t = rng.random((2, count, 1))
+    turned = s + t > 1.0
+    s, t = np.where(turned, 1.0 - s, s), np.where(turned, 1.0 - t, t)
+    a, b, c = (mesh.vertices[mesh.faces[np.minimum(face, len(area) - 1), k]] for k in range(3))
+    return np.asarray(a + s * (b - a) + t * (c - a))
+
+
+def asked_for(points: F64, scene: Scene) -> I64:
+    """(N,) in how many photographs points are in the frame and not hidden by what is truly there."""
+    assert scene.K is not None
+    assert scene.R is not None
+    assert scene.C is not None
+    count = np.zeros(len(points), dtype=np.int64)
+    for view in range(len(scene.image_paths)):
+        depth, stride = load_fixture_depth(view)
+        q = (points - scene.C[view]) @ (scene.K[view] @ scene.R[view]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = q[:, :2] / q[:, 2:] / stride
+            limit = np.array(depth.shape[::-1]) - 1
+            inside = (q[:, 2] > 0.0) & ((at >= 0.0) & (at <= limit)).all(axis=1)
+        x, y = np.rint(np.where(inside[:, None], at, 0.0)).astype(np.int64).T
+        with np.errstate(invalid="ignore"):
+            count += inside & (q[:, 2] <= (1.0 + BEHIND) * depth[y, x])
+    return count
+
+
+def judge_surface(mesh: TexturedMesh, truth: Truth, samples: int = SAMPLES) -> tuple[F64, F64]:
+    """Accuracy and completeness of a surface in the true frame, as distances in percent of the scene's depth.
+
+    Accuracy: from points spread evenly over the surface, where at least two photographs could show them, to
+    the true one. Completeness: from true points that two photographs show to the surface.
+    """
+    points = points_on(mesh, samples)
+    points = points[asked_for(points, truth.scene) >= 2]
+    unit = 100.0 / truth.depth_m
+    chosen = truth.points[:: max(1, len(truth.points) // samples)]
+    return unit * truth.surface.distances(points), unit * Nearest(mesh).distances(chosen)

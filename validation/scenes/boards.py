@@ -1,0 +1,152 @@
+"""Photographs of a chequered board by cameras that are known, made in three ways.
+
+The ray caster that made the courtyard, the library's renderer of models, and the library's own camera with
+radial distortion: what an independent calibration finds in them says whether the truth is true.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from thesisrecon.geometry.camera import project_camera, undistort
+from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.types import F64, TexturedMesh
+from thesisrecon.views import render
+from validation.scenes.materials import Material
+from validation.scenes.photograph import Sensor, expose, integrate_pixels
+from validation.scenes.pose import look_at
+from validation.scenes.raycast import Rays, Surface, World, build_world, trace
+
+U8 = NDArray[np.uint8]
+SIZE = (640, 480)
+K = np.array([[612.4, 0.0, 327.3], [0.0, 612.4, 233.6], [0.0, 0.0, 1.0]])
+K1 = -0.12
+CORNERS = (9, 6)
+"""Inner corners along and across."""
+SQUARE_M = 0.03
+MARGIN = 2
+"""Squares of white around the board."""
+TEXELS = 12
+"""Of a side of a square."""
+DARK, LIGHT = 0.05, 0.62
+PER_PIXEL = 2
+SENSOR = Sensor(vignetting=0.0)
+RAYCAST, RENDERED, LENS = "ray caster", "renderer", "lens"
+WAYS = (RAYCAST, RENDERED, LENS)
+
+
+@dataclass(frozen=True)
+class Board:
+    """Board ``X`` (N, 3) of inner corners in metres, row by row, and where cameras stand: R (V, 3, 3),
+    t (V, 3); ``radial`` distortion k1."""
+
+    X: F64
+    R: F64
+    t: F64
+    radial: float = 0.0
+
+    def projections(self) -> F64:
+        """(V, N, 2) true pixels of the corners."""
+        return np.array(
+            [project_camera(K, R, t, self.X, radial=self.radial) for R, t in zip(self.R, self.t, strict=True)]
+        )
+
+
+def make_board(way: str, views: int) -> Board:
+    """The board before ``views`` cameras that look at it from all sides, tilted up to 45 degrees."""
+    columns, rows = CORNERS
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    X = np.stack([SQUARE_M * x.ravel(), SQUARE_M * y.ravel(), np.zeros(x.size)], axis=1)
+    middle = X.mean(axis=0)
+    rng = np.random.default_rng(20)
+    poses = []
+    for n in range(views):
+        turn, tilt = 2.0 * np.pi * n / views, np.radians(15.0 + 10.0 * (n % 4))
+        away = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
+        centre = middle + (0.42 + 0.05 * (n % 3)) * away
+        aim = middle + np.append(rng.uniform(-0.035, 0.035, 2), 0.0)
+        # Cameras of this project's fixtures stand upright in a world whose z is up; here up is -y.
+        world = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+        R = look_at(world @ centre, world @ aim, rng.uniform(-0.1, 0.1)) @ world
+        poses.append((R, -R @ centre))
+    R, t = (np.array(part) for part in zip(*poses, strict=True))
+    return Board(X, R, t, K1 if way == LENS else 0.0)
+
+
+def photographs(way: str, board: Board) -> list[U8]:
+    """(480, 640, 3) pictures, each of a camera of the board; the noise is that of the courtyard's sensor."""
+    light = {RAYCAST: _raycast, RENDERED: _rendered, LENS: _through_a_lens}[way](board)
+    rng = np.random.default_rng(7)
+    return [expose(one, SENSOR, gains=(1.0, 1.0, 1.0), rng=rng) for one in light]
+
+
+def _pattern() -> NDArray[np.float32]:
+    """(H, W) light of the board by texels: the first inner corner is ``_FIRST`` texels from its edge."""
+    columns, rows = (n + 1 for n in CORNERS)
+    black = np.indices((rows, columns)).sum(axis=0) % 2 == 0
+    squares = np.pad(np.where(black, DARK, LIGHT), MARGIN, constant_values=LIGHT)
+    return np.kron(squares, np.ones((TEXELS, TEXELS))).astype(np.float32)
+
+
+FIRST = (MARGIN + 1) * TEXELS - 0.5
+"""Texel at which the first inner corner lies, both ways: between two samples."""
+TEXEL_M = SQUARE_M / TEXELS
+
+
+def _raycast(board: Board) -> list[NDArray[np.float32]]:
+    """By the tracer of the courtyard; its light falls straight on the board."""
+    world = _world()
+    found = []
+    for R, t in zip(board.R, board.t, strict=True):
+        light, _ = trace(world, Rays(K, R, -R.T @ t), SIZE, per_pixel=PER_PIXEL)
+        found.append(integrate_pixels(light, PER_PIXEL, SENSOR.blur_px))
+    return found
+
+
+def _world() -> World:
+    pattern = _pattern()
+    # u x v is the normal, which looks at the cameras, along -z: u runs along y, v along x.
+    rgb = np.repeat(np.ascontiguousarray(pattern.T)[..., None], 3, axis=2)
+    material = Material(rgb, np.zeros(rgb.shape[:2], np.float32), TEXEL_M)
+    corner = -FIRST * TEXEL_M * np.array([1.0, 1.0, 0.0])
+    size = ((pattern.shape[0] - 1) * TEXEL_M, (pattern.shape[1] - 1) * TEXEL_M)
+    plane = Surface(corner, np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0]), size, 0, flat=True)
+    return build_world([[plane]], [material], np.array([0.0, 0.0, -1.0]))
+
+
+def _rendered(board: Board) -> list[NDArray[np.float32]]:
+    """By the library's renderer: two triangles with a texture."""
+    pattern = _pattern()
+    height, width = pattern.shape
+    u, v = np.array([0.0, width - 1.0, width - 1.0, 0.0]), np.array([0.0, 0.0, height - 1.0, height - 1.0])
+    vertices = np.stack([(u - FIRST) * TEXEL_M, (v - FIRST) * TEXEL_M, np.zeros(4)], axis=1)
+    faces = np.array([[0, 2, 1], [0, 3, 2]])
+    texture = np.repeat(np.rint(255.0 * pattern).astype(np.uint8)[..., None], 3, axis=2)
+    mesh = TexturedMesh(vertices, faces, uv=np.stack([u, v], axis=1)[faces], texture=texture)
+    found = []
+    for R, t in zip(board.R, board.t, strict=True):
+        camera = PinholeCamera(K, R, t, SIZE)
+        fine = render(mesh, camera.resized(PER_PIXEL), samples=1).color.astype(np.float32) / np.float32(255.0)
+        found.append(integrate_pixels(fine, PER_PIXEL, SENSOR.blur_px))
+    return found
+
+
+def _through_a_lens(board: Board) -> list[NDArray[np.float32]]:
+    """By the library's camera: the ray of each sample, distortion taken off, meets the board."""
+    y, x = (np.indices((SIZE[1] * PER_PIXEL, SIZE[0] * PER_PIXEL)) + 0.5) / PER_PIXEL - 0.5
+    bent = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
+    rays = np.column_stack([undistort(bent, board.radial), np.ones(len(bent))])
+    pattern = _pattern()
+    found = []
+    for R, t in zip(board.R, board.t, strict=True):
+        centre, direction = -R.T @ t, rays @ R
+        place = centre[:2] - direction[:, :2] * (centre[2] / direction[:, 2:])
+        at = (place / TEXEL_M + FIRST).T[::-1]
+        grey = map_coordinates(pattern, at, order=1, cval=0.0).astype(np.float32).reshape(x.shape)
+        light = np.repeat(grey[..., None], 3, axis=2)
+        found.append(integrate_pixels(light, PER_PIXEL, SENSOR.blur_px))
+    return found
