@@ -1,0 +1,149 @@
+"""What the rows of our studies run: known answers, and the same as calling the stages."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import thesisrecon
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import UsageError
+from thesisrecon.selfcalibration import Stratified
+from validation.ablation import Place, Study, ablate
+from validation.ablation.tasks import TASKS, Reconstruction
+from validation.ablation.tasks.calibration import CalibrationOverNoise
+from validation.ablation.tasks.fundamental import FundamentalOfCube
+from validation.ablation.tasks.pairs import PairsOfPhotographs
+from validation.ablation.tasks.stereo import RectifiedPairs
+from validation.ablation.tasks.triangulation import TriangulationOverNoise
+from validation.scenes.real import ROOT, data_root
+
+CONFIG = PipelineConfig()
+NOWHERE = Place(Path(), Path())
+
+
+def test_exact_points_have_an_exact_fundamental_matrix() -> None:
+    for method in ("eight-point, normalised", "epipolar of the configuration"):
+        task = FundamentalOfCube(method=method, noise_px=0.0, pairs=3)
+        found = task.run(CONFIG, "cube", 0, NOWHERE)
+        assert found["distance_px"] < 1e-6
+        assert found["within_pct"] == 100.0
+        assert "over_bound" not in found, "without noise there is no bound"
+
+
+def test_wrong_matches_hurt_who_believes_them() -> None:
+    believing, doubting = (
+        FundamentalOfCube(method=method, noise_px=0.5, outliers=0.3, pairs=3).run(CONFIG, "cube", 1, NOWHERE)
+        for method in ("eight-point, normalised", "default")
+    )
+    assert doubting["distance_px"] < 0.5
+    assert believing["distance_px"] > 5.0
+
+
+def test_the_polynomial_method_does_not_care_in_which_frame_it_works() -> None:
+    found = [
+        TriangulationOverNoise(frame=frame, points=60).run(CONFIG, "two views beside each other", 3, NOWHERE)
+        for frame in ("metric", "projective")
+    ]
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+    with pytest.raises(ValueError, match="one of two views"):
+        TriangulationOverNoise().run(CONFIG, "five views", 0, NOWHERE)
+
+
+def test_exact_views_are_calibrated_exactly() -> None:
+    config = replace(CONFIG, selfcalibration=Stratified())
+    found = CalibrationOverNoise(noise_px=0.0, views=5).run(config, "cloud", 0, NOWHERE)
+    # What is told of the principal point is not exactly so.
+    assert found["focal_error_pct"] < 1.0
+    assert found["success_pct"] == 100.0
+
+
+@pytest.mark.parametrize(
+    ("task", "scene", "words"),
+    [
+        (FundamentalOfCube(), "cub", "unknown scene 'cub'; did you mean cube"),
+        (TriangulationOverNoise(), "six views", "did you mean five views"),
+        (CalibrationOverNoise(), "clod", "did you mean cloud"),
+        (PairsOfPhotographs(), "fountain-P11", "unknown pair"),
+        (RectifiedPairs(), "Tedy", "did you mean Teddy"),
+        (Reconstruction(), "courtyrd", "a folder of photographs is one too"),
+        (Reconstruction(), str(ROOT / "docs"), "there are no photographs in"),
+    ],
+)
+def test_a_scene_that_is_not_there_is_told(task: Any, scene: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        task.check(scene)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields"),
+    [
+        ("fundamental", {"method": "nine-point"}),
+        ("fundamental", {"noise_px": -1.0}),
+        ("triangulation", {"frame": "flat"}),
+        ("self-calibration", {"views": 2}),
+        ("self-calibration", {"mode": "zoom"}),
+        ("reconstruction", {"until": "never"}),
+    ],
+)
+def test_parameters_that_make_no_sense_are_refused(kind: str, fields: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"unknown|at least|between"):
+        TASKS[kind](**fields)
+
+
+@pytest.mark.real
+@pytest.mark.skipif(data_root() is None, reason="the photographs are not on this machine (THESISRECON_DATA)")
+def test_a_rectified_pair_has_few_bad_pixels() -> None:
+    found = RectifiedPairs().run(CONFIG, "Tsukuba", 0, NOWHERE)
+    assert found["bad1_pct"] < 5.0
+    assert found["bad2_pct"] < found["bad1_pct"]
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three photographs of the courtyard, with their cameras."""
+    folder, source = tmp_path_factory.mktemp("yard"), ROOT / "fixtures" / "courtyard"
+    (folder / "images").mkdir()
+    told = json.loads((source / "cameras.json").read_text(encoding="utf-8"))
+    names = sorted(told["cameras"])[4:7]
+    for name in names:
+        shutil.copy(source / "images" / name, folder / "images" / name)
+    cameras = {"cameras": {name: told["cameras"][name] for name in names}}
+    (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
+    return folder
+
+
+def test_a_reconstruction_in_a_study_is_the_one_outside(yard: Path, tmp_path: Path) -> None:
+    config = replace(CONFIG, images=replace(CONFIG.images, max_size_px=320))
+    study = Study(
+        {"selfcalibration": ["focal-scan"]},
+        [str(yard)],
+        seeds=[3],
+        config=config,
+        metrics=["focal_error_pct", "points", "verified"],
+    )
+    rows = ablate(study, tmp_path / "study", executor="local", threads=1)
+    assert [r.variant for r in rows] == ["unchanged", "focal-scan"]
+    assert not any(r.failure for r in rows)
+    result = thesisrecon.reconstruct(
+        yard / "images", tmp_path / "run", config=config, seed=3, until="metric", threads=1
+    )
+    assert result.metric is not None
+    assert result.metric.reconstruction.K is not None
+    assert rows[0].metrics["points"] == result.metric.reconstruction.valid.sum()
+    assert rows[0].metrics["verified"] == sum(pair.inliers for pair in result.pairs if pair.accepted)
+    # The truth is brought to the size at which the photographs were read.
+    f = float(np.sqrt(np.prod(np.diag(result.metric.reconstruction.K[0])[:2]))) / result.images[0].scale
+    truth = json.loads((yard / "cameras.json").read_text())["cameras"]
+    f_true = np.sqrt(np.prod(np.diag(next(iter(truth.values()))["K"])[:2]))
+    assert rows[0].metrics["focal_error_pct"] == pytest.approx(100.0 * abs(f / f_true - 1.0), rel=1e-6)
+    kept = tmp_path / "study" / "shared"
+    assert len(list((kept / "01-features").glob("*.npz"))) == 3
+    assert len(list((kept / "04-projective").glob("*.npz"))) >= 1
+    assert not list((tmp_path / "study").glob("work/*"))
