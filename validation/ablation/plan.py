@@ -7,7 +7,7 @@ import hashlib
 import itertools
 import platform
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -65,6 +65,11 @@ class Plan:
     rows: tuple[PlannedRow, ...]
     versions: Mapping[str, str]
 
+    def wanted(self, row: PlannedRow) -> list[str]:
+        """The numbers that a row should tell."""
+        missing = untold(row.setting.task, row.scene)
+        return [m.name for m in self.measures if m.name not in missing]
+
 
 def plan_study(study: Study) -> Plan:
     """The plan of a study.
@@ -99,7 +104,27 @@ def plan_study(study: Study) -> Plan:
         )
         for seed, scene, c, v in itertools.product(seeds, scenes, conditions, variants)
     )
-    return Plan(study, _measures(study, task), variants, conditions, seeds, baseline, rows, told)
+    measures = _told_somewhere(study, _measures(study, task), rows)
+    return Plan(study, measures, variants, conditions, seeds, baseline, rows, told)
+
+
+def untold(task: Any, scene: str) -> Collection[str]:
+    """The measures of a task that it cannot tell of a scene."""
+    found: Collection[str] = task.untold(scene) if hasattr(task, "untold") else ()
+    return found
+
+
+def _told_somewhere(
+    study: Study, measures: tuple[Measure, ...], rows: Sequence[PlannedRow]
+) -> tuple[Measure, ...]:
+    """The measures that some row can tell; one that was asked for and cannot be told is refused."""
+    missing = [set(untold(row.setting.task, row.scene)) for row in rows]
+    never = set.intersection(*missing)
+    if study.metrics and (wrong := [m.name for m in measures if m.name in never]):
+        raise UsageError(
+            f"no scene of this study can tell {wrong[0]}: its truth is not known, or the task ends before it"
+        )
+    return tuple(m for m in measures if m.name not in never)
 
 
 def _applied(start: Setting, variant: Variant, condition: Variant, folder: Path) -> Setting:

@@ -138,7 +138,6 @@ def read_rows(study: Study, out: str | Path) -> Rows:
 
 def _rows(plan: Plan, store: Store, lost: Mapping[str, Outcome]) -> Rows:
     rows = []
-    wanted = {m.name: m for m in plan.measures}
     for planned in plan.rows:
         outcome = store.load(planned.key) or lost.get(planned.key)
         if outcome is None:
@@ -147,7 +146,7 @@ def _rows(plan: Plan, store: Store, lost: Mapping[str, Outcome]) -> Rows:
         cost = outcome.cpu_s + sum(s.cpu_s for s in shared)
         metrics, failure = dict(outcome.metrics), outcome.failure
         if not failure:
-            metrics, failure = finite(metrics, wanted)
+            metrics, failure = finite(metrics, plan.wanted(planned))
         rows.append(
             Row(
                 planned.key,
@@ -310,7 +309,7 @@ class _Session:
             else:
                 self.store.save(row.key, outcome, _told_of_row(self.plan, row))
             state.done += 1
-            failed = outcome.failure or finite(outcome.metrics, {m.name: m for m in self.plan.measures})[1]
+            failed = outcome.failure or finite(outcome.metrics, self.plan.wanted(row))[1]
             state.failed += bool(failed)
             state.waiting[row.variant] -= 1
             state.spent.setdefault(row.variant, []).append(outcome.seconds)

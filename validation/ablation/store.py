@@ -6,7 +6,7 @@ Any number of processes may add rows; a row that is there is never computed agai
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,7 @@ class Store:
         write_json(self.path / kind / f"{key}.json", {**told, **found})
 
 
-def finite(metrics: Mapping[str, float], wanted: Mapping[str, Any]) -> tuple[dict[str, float], str]:
+def finite(metrics: Mapping[str, float], wanted: Collection[str]) -> tuple[dict[str, float], str]:
     """The finite numbers among ``metrics``, and a sentence of those that are ``wanted`` and are none."""
     good = {name: float(v) for name, v in metrics.items() if math.isfinite(float(v))}
     missing = [name for name in wanted if name not in metrics]

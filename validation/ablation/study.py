@@ -39,7 +39,9 @@ class Task(Protocol):
     a random seed, in an empty folder ``place`` that is removed after it; it tells its numbers by the names of
     the measures. ``StageFailure`` says that the data could not be worked with.
 
-    Tasks that begin alike for several rows have also the methods of :class:`SharingTask`.
+    A task that cannot tell each of its numbers everywhere has also a method ``untold(scene)`` that names
+    those it cannot tell of a scene. Tasks that begin alike for several rows have also the methods of
+    :class:`SharingTask`.
     """
 
     measures: ClassVar[Sequence[Measure]]

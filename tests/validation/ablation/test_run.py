@@ -114,7 +114,7 @@ def test_what_rows_begin_with_is_computed_once(tmp_path: Path) -> None:
 
 def test_the_same_rows_whoever_carries_them_out(tmp_path: Path) -> None:
     wish = study(tmp_path / "log", scenes=["a"], seeds=1)
-    kinds: dict[str, Any] = {"one": ("local", 1), "threads": ("local", 2), "processes": ("processes", 2)}
+    kinds: dict[str, Any] = {"one": ("local", 1), "threads": ("local", 2), "processes": ("processes", 1)}
     found = {
         name: [(r.key, r.metrics) for r in ablate(wish, tmp_path / name, executor=kind, threads=threads)]
         for name, (kind, threads) in kinds.items()

@@ -16,6 +16,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.selfcalibration import Stratified
 from validation.ablation import Place, Study, ablate
+from validation.ablation.plan import plan_study
 from validation.ablation.tasks import TASKS, Reconstruction
 from validation.ablation.tasks.calibration import CalibrationOverNoise
 from validation.ablation.tasks.fundamental import FundamentalOfCube
@@ -117,6 +118,25 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras = {"cameras": {name: told["cameras"][name] for name in names}}
     (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
     return folder
+
+
+def test_what_a_scene_cannot_tell_is_not_missed_but_refused_where_asked_for(
+    yard: Path, tmp_path: Path
+) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(yard / "images", bare / "images")
+    study = Study({"epipolar": ["thesis-ransac"]}, [str(bare)], seeds=1)
+    assert {m.name for m in plan_study(study).measures} >= {"points", "verified", "trusted"}
+    assert "focal_error_pct" not in [m.name for m in plan_study(study).measures]
+    with pytest.raises(UsageError, match="no scene of this study can tell focal_error_pct"):
+        plan_study(replace(study, metrics=["points", "focal_error_pct"]))
+    early = replace(study, task=Reconstruction(until="matches"), scenes=[str(yard)])
+    assert [m.name for m in plan_study(early).measures] == ["verified", "sigma_px"]
+    mixed = plan_study(replace(study, scenes=[str(yard), str(bare)], metrics=["focal_error_pct", "points"]))
+    assert {r.scene: mixed.wanted(r) for r in mixed.rows} == {
+        str(yard): ["focal_error_pct", "points"],
+        str(bare): ["points"],
+    }
 
 
 def test_a_reconstruction_in_a_study_is_the_one_outside(yard: Path, tmp_path: Path) -> None:

@@ -32,6 +32,13 @@ SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
     "model": ("model",),
 }
 """The settings that each step adds to those before it."""
+NEED_TRUTH = ("focal_error_pct", "centre_error_mm", "rotation_error_deg")
+TOLD_FROM: Mapping[str, tuple[str, ...]] = {
+    "matches": ("verified", "sigma_px"),
+    "projective": ("registered_pct", "points"),
+    "metric": ("reprojection_px", "trusted", *NEED_TRUTH),
+}
+"""The first step after which a number is known."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,13 @@ class Reconstruction:
         for path in _load(scene).image_paths:
             content.update(path.name.encode() + path.read_bytes())
         return content.hexdigest()[:32]
+
+    def untold(self, scene: str) -> set[str]:
+        """What needs true cameras, where there are none, and what needs a later step."""
+        steps = list(SETTINGS_OF)
+        reached = steps.index(self.until)
+        found = {name for step, names in TOLD_FROM.items() if reached < steps.index(step) for name in names}
+        return found if _load(scene).has_truth else found | set(NEED_TRUTH)
 
     def steps(self, config: PipelineConfig, scene: str, seed: int) -> list[tuple[str, str]]:
         """A step is named by all settings up to it; corners alone do not depend on the seed."""
