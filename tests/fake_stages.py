@@ -16,6 +16,7 @@ import PIL.Image
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.dense import MultiViewScene
+from thesisrecon.dense.multiview.neighbours import SparsePoints
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import compose_camera, project
 from thesisrecon.types import (
@@ -214,7 +215,11 @@ class FakeDense:
             for i, image in enumerate(images)
             if reconstruction.registered[i]
         }
-        return MultiViewScene(views, None, dict.fromkeys(views, ()))  # type: ignore[arg-type]
+        points = SparsePoints(np.zeros((0, 3)), np.zeros((len(P), 0), dtype=bool))
+        return MultiViewScene(views, points, dict.fromkeys(views, ()))
+
+    def surroundings(self, scene: MultiViewScene, view: int) -> frozenset[int]:
+        return frozenset({view, *list(scene.views)[:2]})
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
         CALLS.append(f"depth {view}")

@@ -184,7 +184,7 @@ def test_the_written_config_runs_again(
         (["reconstruct", ".", "-o", "out", "--set", "features.kin=x"], "did you mean features.kind"),
         (["reconstruct", ".", "-o", "out", "--config", "nowhere.toml"], "nowhere.toml cannot be read"),
         (["reconstruct", ".", "-o", "out", "--until", "surface"], "unknown stage"),
-        (["reconstruct", ".", "-o", "out", "--executor", "dask://x"], "does not exist yet"),
+        (["reconstruct", ".", "-o", "out", "--executor", "dask://x"], "given as dask://HOST:PORT"),
         (["reconstruct", ".", "-o", "out", "--max-size", "5"], "at least 64"),
         (["reconstruct", ".", "-o", "out", "--pairs", "window:0"], "a window of 0 gives no pairs"),
         (["reconstruct", ".", "-o", "out", "--pairs", "window"], "takes a whole number"),

@@ -455,7 +455,7 @@ class NamelessDetector(fakes.FakeDetector):
         ({"until": "surface"}, "unknown stage"),
         ({"until": "metrik"}, "did you mean metric"),
         ({"threads": -1}, "at least 1"),
-        ({"executor": "dask://there"}, "does not exist yet"),
+        ({"executor": "dask://there"}, "dask://HOST:PORT"),
         ({"executor": "proceses"}, "did you mean processes"),
         ({"seed": -1}, "at least 0"),
     ],

@@ -151,7 +151,12 @@ def reconstruct(
         ),
     ] = None,
     executor: Annotated[
-        str, typer.Option("--executor", help="Workers are threads (local) or processes.")
+        str,
+        typer.Option(
+            "--executor",
+            metavar="local|processes|dask://HOST:PORT",
+            help="Workers are threads (local), processes, or those of a Dask cluster.",
+        ),
     ] = "local",
     overwrite: Overwrite = False,
 ) -> None:

@@ -185,7 +185,8 @@ class DepthEstimator(Protocol):
     """Section 2.5: depth of every pixel of every view; one view at a time, so that a run can go on.
 
     ``match_rectified`` is its matcher alone, on a rectified pair of arrays; ``match_two_views`` rectifies two
-    photographs by their F, by homographies where ``planar``, and matches them from either side."""
+    photographs by their F, by homographies where ``planar``, and matches them from either side.
+    ``surroundings`` are the views that the map of a view takes, itself among them."""
 
     def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap: ...
 
@@ -194,6 +195,8 @@ class DepthEstimator(Protocol):
     ) -> RectifiedPair: ...
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene: ...
+
+    def surroundings(self, scene: MultiViewScene, view: int) -> frozenset[int]: ...
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap: ...
 

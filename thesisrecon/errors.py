@@ -23,6 +23,13 @@ class StageFailure(Exception):
         parts = [part.rstrip(".") for part in (reason, evidence, advice) if part]
         super().__init__("; ".join(parts) + ".")
 
+    def __reduce__(self) -> tuple[type[StageFailure], tuple[str, str, str]]:
+        return type(self), (self.reason, self.evidence, self.advice)
+
 
 class UsageError(ValueError):
     """A wrong wish of the user (an option, a path, a config key); exit code 2 on the command line."""
+
+
+class WorkersLost(UsageError):
+    """The workers of a run are gone: killed, or no longer reached. What was done is kept."""

@@ -159,7 +159,7 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         "seed": run.seed,
         "until": until,
         "threads": run.workers.threads,
-        "executor": run.workers.executor,
+        "executor": run.workers.name,
         "seconds": seconds | {"total": round(sum(seconds.values()), 3)},
         "elapsed_seconds": round(run.elapsed_s, 3),
         "resumed": list(run.resumed),

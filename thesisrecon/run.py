@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, Literal, TypedDict, get_args
 import numpy as np
 
 from thesisrecon.config import PipelineConfig, kind_of, tables_from_config
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io.run_directory import RunDirectory, code_key, key_of
 from thesisrecon.settings import table_from_dataclass, unknown_word
 from thesisrecon.types import StageReport
@@ -44,16 +45,22 @@ class RunOptions(TypedDict, total=False):
     """How a run is carried out, none of which changes what it finds.
 
     ``until`` : the last stage. None = "model", and a run that finds cameras and points but no surface ends
-    well, with a warning. ``threads`` : workers (all processors). ``executor`` : "local" threads or
-    "processes". ``overwrite`` : take over a folder that holds another run (False). ``shared`` : a folder
-    where results of stages are kept for other runs, and taken from where another run has found the same.
+    well, with a warning. ``threads`` : workers (all processors). ``executor`` : who works on photographs,
+    pairs and depth maps: "local" threads, "processes", a Dask cluster ("dask://HOST:PORT", which needs the
+    extra ``distributed``), or any :class:`concurrent.futures.Executor`; see :class:`Workers`. ``overwrite`` :
+    take over a folder that holds another run (False). ``shared`` : a folder where results of stages are kept
+    for other runs, and taken from where another run has found the same.
     """
 
     until: Until | None
     threads: int | None
-    executor: str
+    executor: str | Executor
     overwrite: bool
     shared: str | Path | None
+
+
+Batch = tuple[Sequence[int], tuple[Any, ...]]
+"""The numbers of some items, and the arguments of the function that computes their records."""
 
 
 def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
@@ -125,13 +132,14 @@ class Run:
         self,
         stage: str,
         keys: Mapping[str, str],
-        function: Callable[..., Any],
-        arguments: Callable[[Sequence[int]], Sequence[tuple[Any, ...]]],
+        function: Callable[..., Sequence[Any]],
+        batches: Callable[[Sequence[int]], Iterable[Batch]],
     ) -> list[Any]:
         """The records of all items of a stage, in order; those that were not kept are computed by the
         workers.
 
-        ``arguments`` is given the numbers of the missing items and returns what ``function`` takes for each.
+        ``batches`` is given the numbers of the missing items and deals them out: the numbers of some, and
+        what ``function`` takes to make their records.
         """
         with self.clock(stage) as log:
             log.keys.update(keys)
@@ -141,18 +149,35 @@ class Run:
             missing = [n for n, record in enumerate(records) if record is None]
             done = len(names) - len(missing)
             self.progress(stage, done, len(names))
+            dealt: list[Sequence[int]] = []
 
-            def finished(k: int, record: Any) -> None:
+            def tasks() -> Iterator[tuple[Any, ...]]:
+                for numbers, given in batches(missing) if missing else ():
+                    dealt.append(numbers)
+                    yield given
+
+            def finished(k: int, found: Sequence[Any]) -> None:
                 nonlocal done
-                n = missing[k]
-                records[n] = record
-                folder.save(names[n], keys[names[n]], record)
-                done, log.computed = done + 1, log.computed + 1
+                for n, record in zip(dealt[k], found, strict=True):
+                    records[n] = record
+                    folder.save(names[n], keys[names[n]], record)
+                done, log.computed = done + len(found), log.computed + len(found)
                 self.progress(stage, done, len(names))
 
-            if missing:
-                self.workers.run(function, arguments(missing), finished)
+            with self.resumable(stage):
+                self.workers.run(function, tasks(), finished)
             return records
+
+    @contextmanager
+    def resumable(self, stage: str) -> Iterator[None]:
+        """Whoever loses the workers in this block is told how the run goes on."""
+        try:
+            yield
+        except WorkersLost as lost:
+            raise WorkersLost(
+                f"{lost} (in the stage {stage}); what was done is kept in {self.directory.path}, and the "
+                "same command goes on from there, with this executor or another"
+            ) from None
 
     def finish(
         self,

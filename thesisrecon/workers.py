@@ -1,23 +1,39 @@
-"""Many small independent tasks on a few workers, the same answers whatever their number.
+"""Many independent tasks on a few workers, the same answers whatever their number and wherever they are.
 
-Threads serve by default: the compiled kernels release the interpreter. Processes serve where the tasks do
-not.
+Threads serve by default: the compiled kernels release the interpreter. Any other
+:class:`concurrent.futures.Executor` serves too: a pool of processes, a Dask cluster, one of the caller's own.
+What such an executor is given is bytes, and bytes come back, so neither shared memory nor a shared disk is
+needed; a task that is given anew after its worker died finds all it needs in what it was given.
 """
 
 from __future__ import annotations
 
 import concurrent.futures as futures
 import multiprocessing
+import multiprocessing.connection
 import os
+import pickle
 import signal
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
 
-from thesisrecon.errors import UsageError
+from thesisrecon.cluster import Cluster, address_of, connected, is_address
+from thesisrecon.errors import UsageError, WorkersLost
+from thesisrecon.io.fingerprint import package_key
 from thesisrecon.settings import unknown_word
 
-Executor = Literal["local", "processes"]
+NAMES = ("local", "processes", "dask://HOST:PORT")
+AHEAD = 2
+"""Tasks an executor is given at a time, per worker: none waits for work, and few are in memory."""
+PATIENCE_S = 5.0
+"""How long nothing may end before it is asked whether the workers are still there."""
+
+Task = tuple[Any, ...]
+Finished = Callable[[int, Any], None]
 
 
 def available_threads() -> int:
@@ -26,58 +42,200 @@ def available_threads() -> int:
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
-@dataclass(frozen=True)
+@dataclass
 class Workers:
-    """``threads`` workers of one kind: threads of this process ("local") or processes of their own."""
+    """Who does the tasks: ``threads`` workers of one kind.
+
+    ``executor`` : threads of this process ("local"), "processes" of their own, a Dask cluster
+    ("dask://HOST:PORT"), or any :class:`concurrent.futures.Executor`, which is not shut down. Of a cluster or
+    an executor of the caller's, ``threads`` is how many of this process do what is not worth sending; the
+    latter is given twice as many tasks at a time. As a context manager it holds its processes or connection
+    from one :meth:`run` to the next; else each run has its own.
+
+    Raises :class:`UsageError` for a number below 1, an unknown name or an address that is none.
+    """
 
     threads: int
-    executor: str = "local"
+    executor: str | futures.Executor = "local"
+    _remote: _Remote | None = field(default=None, repr=False)
+    _kept: ExitStack | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.threads < 1:
             raise UsageError(f"threads must be at least 1; got {self.threads}")
-        if self.executor.startswith("dask"):
-            raise UsageError("the dask executor does not exist yet; use local or processes")
-        if self.executor not in ("local", "processes"):
-            raise UsageError(unknown_word("executor", self.executor, ["local", "processes"]))
+        if isinstance(self.executor, futures.Executor):
+            return
+        if not isinstance(self.executor, str):
+            raise UsageError(
+                f"an executor is {', '.join(NAMES)} or a concurrent.futures.Executor; got {self.executor!r}"
+            )
+        if is_address(self.executor):
+            address_of(self.executor)
+        elif self.executor not in NAMES:
+            raise UsageError(unknown_word("executor", self.executor, NAMES))
 
-    def run(
-        self,
-        function: Callable[..., Any],
-        arguments: Sequence[tuple[Any, ...]],
-        finished: Callable[[int, Any], None],
-    ) -> None:
-        """Call ``function(*arguments[n])`` for all n; ``finished(n, answer)`` hears of each as it ends, in
+    @property
+    def name(self) -> str:
+        """The executor in a word, for the summary."""
+        return self.executor if isinstance(self.executor, str) else type(self.executor).__name__
+
+    @property
+    def in_process(self) -> bool:
+        """Whether tasks see the memory of this process: then nothing is copied for them."""
+        return self.executor == "local" or isinstance(self.executor, futures.ThreadPoolExecutor)
+
+    def __enter__(self) -> Workers:
+        """Connect to the cluster; :class:`UsageError` where nobody answers. Processes start when needed."""
+        self._kept = ExitStack()
+        if isinstance(self.executor, str) and is_address(self.executor):
+            self._remote = self._kept.enter_context(self._opened(1))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        kept, self._kept, self._remote = self._kept, None, None
+        if kept is not None:
+            kept.__exit__(*error)  # type: ignore[arg-type]
+
+    def parallel(self) -> int:
+        """How many tasks are worked on at a time."""
+        return self.threads if self._remote is None else self._remote.parallel()
+
+    def run(self, function: Callable[..., Any], tasks: Iterable[Task], finished: Finished) -> None:
+        """Call ``function(*task)`` for all tasks; ``finished(n, answer)`` hears of the n-th as it ends, in
         this thread.
 
-        The first error ends the rest and is raised. With processes the function must stand in a module.
+        The first error ends the rest and is raised. Elsewhere than in this process the function must stand in
+        a module that the workers can import, and tasks are asked for only as workers become free.
+        :class:`WorkersLost` where the workers are gone.
         """
-        if self.threads == 1 and self.executor == "local":
-            for n, given in enumerate(arguments):
+        if self.executor == "local" and self.threads == 1:
+            for n, given in enumerate(tasks):
                 finished(n, function(*given))
-            return
-        pool = self._pool(len(arguments))
-        try:
-            numbers = {pool.submit(function, *given): n for n, given in enumerate(arguments)}
-            for future in futures.as_completed(numbers):
-                finished(numbers[future], future.result())
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        elif self.executor == "local":
+            with futures.ThreadPoolExecutor(self.threads) as pool:
+                _hand_out(_Remote(pool, lambda: self.threads), (function, False), tasks, finished)
+        else:
+            with self._remote_for(tasks) as remote:
+                _hand_out(remote, (function, not self.in_process), tasks, finished)
 
     def map_all(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """``function`` of each item in order, always in threads: for reading files."""
+        """``function`` of each item in order, always in threads: for reading files and what is soon done."""
         with futures.ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(function, items))
 
-    def _pool(self, tasks: int) -> futures.Executor:
-        if self.executor == "processes":
-            # Forking a process that runs threads can deadlock.
-            context = multiprocessing.get_context("spawn")
-            return futures.ProcessPoolExecutor(
-                max(1, min(self.threads, tasks)),
-                mp_context=context,
-                # Ctrl-C is for the process that hands out the tasks.
-                initializer=signal.signal,
-                initargs=(signal.SIGINT, signal.SIG_IGN),
-            )
-        return futures.ThreadPoolExecutor(self.threads)
+    @contextmanager
+    def _remote_for(self, tasks: Iterable[Task]) -> Iterator[_Remote]:
+        if self._kept is None:
+            with self._opened(len(tasks) if isinstance(tasks, Sequence) else self.threads) as remote:
+                yield remote
+            return
+        if self._remote is None:
+            self._remote = self._kept.enter_context(self._opened(self.threads))
+        yield self._remote
+
+    @contextmanager
+    def _opened(self, tasks: int) -> Iterator[_Remote]:
+        if isinstance(self.executor, futures.Executor):
+            yield _Remote(self.executor, lambda: self.threads)
+        elif is_address(self.executor):
+            with connected(self.executor) as cluster:
+                yield _Remote(cluster.executor, cluster.parallel, cluster)
+        else:
+            count = max(1, min(self.threads, tasks))
+            with _processes(count) as pool:
+                yield _Remote(pool, lambda: count)
+
+
+@dataclass(frozen=True)
+class _Remote:
+    """An executor that is ready: ``parallel`` tells its workers, ``cluster`` is what stands behind it."""
+
+    executor: futures.Executor
+    parallel: Callable[[], int]
+    cluster: Cluster | None = None
+
+
+def _hand_out(
+    remote: _Remote, wanted: tuple[Callable[..., Any], bool], tasks: Iterable[Task], finished: Finished
+) -> None:
+    """Keep the executor in work until all tasks are done; ``wanted`` is the function, and whether tasks
+    travel as bytes."""
+    function, travels = wanted
+    waiting: dict[futures.Future[Any], int] = {}
+    left = enumerate(tasks)
+    try:
+        while True:
+            for n, given in islice(left, AHEAD * remote.parallel() - len(waiting)):
+                what = (
+                    (_answer, package_key(), pickle.dumps((function, given), 5))
+                    if travels
+                    else (function, *given)
+                )
+                waiting[remote.executor.submit(*what)] = n
+            if not waiting:
+                return
+            done, _ = futures.wait(waiting, PATIENCE_S, return_when=futures.FIRST_COMPLETED)
+            if not done and remote.cluster is not None:
+                remote.cluster.check()
+            for future in sorted(done, key=waiting.__getitem__):
+                answer = future.result()
+                finished(waiting.pop(future), pickle.loads(answer) if travels else answer)
+    except (futures.BrokenExecutor, futures.CancelledError) as error:
+        raise _lost(remote, error) from None
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def _lost(remote: _Remote, error: BaseException) -> WorkersLost:
+    if remote.cluster is not None:
+        return remote.cluster.lost()
+    if isinstance(error, futures.BrokenExecutor):
+        return WorkersLost("a worker process ended unexpectedly (killed, or out of memory)")
+    return WorkersLost(f"the executor ({type(remote.executor).__name__}) cancelled what it was given")
+
+
+def _answer(key: str, task: bytes) -> bytes:
+    """Do a task somewhere else; both sides must run the same code, or what is kept would have a wrong key."""
+    if package_key() != key:
+        raise UsageError(
+            f"a worker ({multiprocessing.current_process().name} on {os.uname().nodename}) runs another "
+            "version of thesisrecon than this program; install the same one there"
+        )
+    try:
+        function, given = pickle.loads(task)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"a worker cannot load its task: {error}; install the module there too") from None
+    return pickle.dumps(function(*given), 5)
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[futures.Executor]:
+    """Processes that end with the block, at once where it ends by an error, and with this process, however
+    that ends."""
+    # Forking a process that runs threads can deadlock.
+    context = multiprocessing.get_context("spawn")
+    watched, held = context.Pipe(duplex=False)
+    pool = futures.ProcessPoolExecutor(count, mp_context=context, initializer=_obey, initargs=(watched,))
+    try:
+        yield pool
+        pool.shutdown(wait=True)
+    except BaseException:
+        held.close()
+        pool.shutdown(wait=True, cancel_futures=True)
+        raise
+    finally:
+        held.close()
+        watched.close()
+
+
+def _obey(watched: multiprocessing.connection.Connection) -> None:
+    """Of a worker process: Ctrl-C is for the process that hands out the tasks, and when that closes its end
+    of the pipe, or dies, there is nobody to work for."""
+
+    def end() -> None:
+        multiprocessing.connection.wait([watched])
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=end, daemon=True).start()

@@ -69,9 +69,7 @@ def maps_to_views(chains: Chains, corners: Sequence[F64], pairs: Sequence[TwoVie
     observation[chains.node] = np.arange(len(chains.node))
     order = sorted(range(len(pairs)), key=lambda n: (-pairs[n].inliers, pairs[n].i, pairs[n].j))
     edges = observation[_edges(first, pairs)]
-    xy = np.concatenate(
-        [corners[i][None, c] for i, c in zip(chains.view, chains.corner, strict=True)] or [np.empty((0, 2))]
-    )
+    xy = np.concatenate([*corners, np.empty((0, 2))])[chains.node]
     if not len(edges):
         return xy, np.tile(np.eye(2), (len(xy), 1, 1)), np.arange(len(xy))
     xy1 = np.concatenate([pairs[n].xy1 for n in order])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,10 @@ import numpy as np
 from thesisrecon.matching.alignment import align_corners
 from thesisrecon.matching.linking import Chains, link_matches, maps_to_views
 from thesisrecon.matching.prepared import PreparedView
-from thesisrecon.types import B8, F64, Tracks, TwoView
+from thesisrecon.types import B8, F64, I64, Tracks, TwoView
+
+NEAR = 8
+"""Views on either side that meet one another before the next ones."""
 
 
 @dataclass(frozen=True)
@@ -22,11 +25,9 @@ class PlainTracks:
     ) -> Tracks:
         """Scene points seen in at least two views; a track never has two corners in one view."""
         del rng
-        chains = link_matches([len(p.features.xy) for p in prepared], [p for p in pairs if p.accepted])
-        xy = np.empty((len(chains.view), 2))
-        for i, view in enumerate(prepared):
-            here = chains.view == i
-            xy[here] = view.features.xy[chains.corner[here]]
+        corners = [p.features.xy for p in prepared]
+        chains = link_matches([len(xy) for xy in corners], [p for p in pairs if p.accepted])
+        xy = np.concatenate([*corners, np.empty((0, 2))])[chains.node]
         return _tracks(chains, xy, np.ones(len(xy), np.bool_), len(prepared))
 
 
@@ -55,24 +56,37 @@ class AlignedTracks:
         """
         del rng
         accepted = [p for p in pairs if p.accepted]
-        chains = link_matches([len(p.features.xy) for p in prepared], accepted)
-        start, affine, middle = maps_to_views(chains, [p.features.xy for p in prepared], accepted)
+        corners = [p.features.xy for p in prepared]
+        chains = link_matches([len(xy) for xy in corners], accepted)
+        start, affine, middle = maps_to_views(chains, corners, accepted)
         xy, kept = start.copy(), np.ones(len(start), np.bool_)
-        for i, view1 in enumerate(prepared):
-            for j, view2 in enumerate(prepared):
-                group = np.flatnonzero((chains.view[middle] == i) & (chains.view == j))
-                if i == j or not len(group):
-                    continue
-                corner = chains.corner[middle[group]]
-                found, _, score = align_corners(
-                    view1,
-                    view2,
-                    (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group]),
-                    affine_std=self.affine_std,
-                    largest_shift=self.largest_shift,
-                )
-                xy[group], kept[group] = found, score >= self.least_correlation
+        for i, j, group in _groups(chains.view[middle], chains.view, len(prepared)):
+            view1, view2 = prepared[i], prepared[j]
+            corner = chains.corner[middle[group]]
+            found, _, score = align_corners(
+                view1,
+                view2,
+                (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group]),
+                affine_std=self.affine_std,
+                largest_shift=self.largest_shift,
+            )
+            xy[group], kept[group] = found, score >= self.least_correlation
         return _tracks(chains, xy, kept, len(prepared))
+
+
+def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64]]:
+    """The observations of each two different views (i, j), found by one sort and not by a search per pair.
+
+    Views with near numbers come together, for what is prepared of them serves again.
+    """
+    pair = first * views + second
+    order = np.flatnonzero(first != second)
+    order = order[np.argsort(pair[order], kind="stable")]
+    numbers, starts = np.unique(pair[order], return_index=True)
+    groups = np.split(order, starts[1:]) if len(numbers) else []
+    i, j = np.divmod(numbers, views)
+    for k in np.lexsort((j, i, j // NEAR, i // NEAR)):
+        yield int(i[k]), int(j[k]), groups[k]
 
 
 def _tracks(chains: Chains, xy: F64, kept: B8, n_views: int) -> Tracks:

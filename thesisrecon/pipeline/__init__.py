@@ -66,7 +66,7 @@ def reconstruct(
     Raises
     ------
     UsageError : no such folder of photographs, no photographs in it, an output folder that cannot be
-        written or holds another run.
+        written or holds another run, workers that cannot be reached or are lost (:class:`WorkersLost`).
     StageFailure : these photographs cannot be reconstructed. What was computed, the summary and the page are
         in ``out`` all the same.
     """
@@ -76,7 +76,7 @@ def reconstruct(
             raise UsageError(f"there are no photographs in {images} (folders in it are not searched)")
         run.title = scene_name(Path(images)) or run.title
     # Reading photographs takes long: whether the folder is free for this run is asked before.
-    with run.directory.claimed(wishes(run), overwrite=overwrite):
+    with run.workers, run.directory.claimed(wishes(run), overwrite=overwrite):
         photographs = read_set(run, images)
         check_pairs(run, photographs, until)
         run.directory.adopt(identity(run, photographs), overwrite=overwrite, results=RESULT_FILES)

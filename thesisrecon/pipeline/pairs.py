@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,11 +11,14 @@ import numpy as np
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
+from thesisrecon.pipeline.prepared import PreparedViews, batches_of_pairs, near_in_pairs
 from thesisrecon.pipeline.work import Work
-from thesisrecon.run import stream
+from thesisrecon.run import Batch, stream
 from thesisrecon.types import Features, Image, PairChoice, TwoView
 
 MIN_CORNERS = 16
+NEAR = 8
+"""Views on either side that meet one another before the next ones are prepared."""
 
 # ---------------------------------------------------------------- 4.2.1: features
 
@@ -28,7 +31,7 @@ def find_features(work: Work) -> None:
         for i, photograph in enumerate(work.photographs.photographs)
     }
     features = run.kept_all(
-        "features", keys, detect_features, lambda missing: [(work.config, images[i]) for i in missing]
+        "features", keys, _detect_all, lambda missing: (([i], (work.config, [images[i]])) for i in missing)
     )
     work.result = replace(work.result, features=tuple(features))
     counts = [len(f.xy) for f in features]
@@ -42,6 +45,10 @@ def find_features(work: Work) -> None:
         counts={"images": len(images), "corners": sum(counts), "fewest_in_one_image": min(counts)},
         warnings=poor,
     )
+
+
+def _detect_all(config: PipelineConfig, images: Sequence[Image]) -> list[Features]:
+    return [detect_features(config, image) for image in images]
 
 
 def detect_features(config: PipelineConfig, image: Image) -> Features:
@@ -82,13 +89,18 @@ def match_pairs(work: Work) -> None:
         for i, j in pairs
     }
 
-    def arguments(missing: Sequence[int]) -> list[tuple[Any, ...]]:
-        prepared = _prepared(work)
-        return [
-            (work.config, prepared[i], prepared[j], (i, j), run.seed) for i, j in (pairs[n] for n in missing)
-        ]
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        views = _prepared(work)
+        if run.workers.in_process:
+            dealt = [[n] for n in near_in_pairs(pairs, missing, NEAR)]
+        else:
+            dealt = batches_of_pairs(pairs, missing, run.workers.parallel())
+        for numbers in dealt:
+            some = [pairs[n] for n in numbers]
+            given = views if run.workers.in_process else views.part({view for pair in some for view in pair})
+            yield numbers, (work.config, given, some, run.seed)
 
-    two_views: list[TwoView] = run.kept_all("matches", keys, match_views, arguments)
+    two_views: list[TwoView] = run.kept_all("matches", keys, _match_all, batches)
     work.result = replace(result, pairs=tuple(two_views))
     accepted = [pair for pair in two_views if pair.accepted]
     counts = {"pairs": len(pairs), "accepted": len(accepted), "verified": sum(p.inliers for p in accepted)}
@@ -110,13 +122,18 @@ def _open_pairs(accepted: Sequence[TwoView]) -> list[str]:
     ]
 
 
-def _prepared(work: Work) -> dict[int, Any]:
-    """What matching needs of each view, made once and only when something must be computed from it."""
+def _prepared(work: Work) -> PreparedViews:
+    """What matching needs of each view, made only when something must be computed from it."""
     if work.prepared is None:
-        given = list(zip(work.result.images, work.result.features, strict=True))
-        matching = work.config.matching
-        work.prepared = dict(enumerate(work.run.workers.map_all(lambda view: matching.prepare(*view), given)))
+        given = zip(work.result.images, work.result.features, strict=True)
+        work.prepared = PreparedViews(work.config.matching, dict(enumerate(given)))
     return work.prepared
+
+
+def _match_all(
+    config: PipelineConfig, views: Sequence[Any], pairs: Sequence[tuple[int, int]], seed: int
+) -> list[TwoView]:
+    return [match_views(config, views[i], views[j], (i, j), seed) for i, j in pairs]
 
 
 def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
@@ -168,11 +185,7 @@ def build_tracks(work: Work) -> None:
         "tracks",
         "tracks",
         key,
-        lambda: work.config.tracks.build(
-            [_prepared(work)[i] for i in range(len(result.images))],
-            result.pairs,
-            stream(run.seed, "tracks"),
-        ),
+        lambda: work.config.tracks.build(_prepared(work), result.pairs, stream(run.seed, "tracks")),
     )
     work.result = replace(result, tracks=tracks)
     seen = np.bincount(tracks.point_index, minlength=tracks.n_points)

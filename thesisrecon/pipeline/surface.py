@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,8 +19,14 @@ RENDERER = "thesisrecon.views.render"
 """What a held-out picture depends on beside the model."""
 
 
-def depth_of_view(config: PipelineConfig, scene: MultiViewScene, view: int) -> DepthMap:
-    return config.dense.depth_map(scene, view)
+def _depths(config: PipelineConfig, scene: MultiViewScene, view: int) -> list[DepthMap]:
+    return [config.dense.depth_map(scene, view)]
+
+
+def _confirmed(
+    config: PipelineConfig, scene: MultiViewScene, maps: Mapping[int, DepthMap], view: int
+) -> DepthMap:
+    return config.dense.confirm(scene, maps, view)
 
 
 def match_densely(work: Work) -> None:
@@ -31,15 +38,31 @@ def match_densely(work: Work) -> None:
     order = sorted(scene.views)
     given = _given(reconstruction, result.images)
     keys = {f"{i:05d}": run.key("dense", run.variant_key("dense"), given, i) for i in order}
+
+    def seen_from(view: int) -> tuple[MultiViewScene, frozenset[int]]:
+        """What is sent for one view; in this process, everything as it is."""
+        near = work.config.dense.surroundings(scene, view)
+        return (scene if run.workers.in_process else scene.part(near)), near
+
     found = run.kept_all(
-        "dense", keys, depth_of_view, lambda missing: [(work.config, scene, order[n]) for n in missing]
+        "dense",
+        keys,
+        _depths,
+        lambda missing: (([n], (work.config, seen_from(order[n])[0], order[n])) for n in missing),
     )
-    maps = dict(zip(order, found, strict=True))
-    with run.clock("dense"):
-        confirmed = run.workers.map_all(lambda i: work.config.dense.confirm(scene, maps, i), order)
-    work.result = replace(result, depth_maps=tuple(confirmed), views=tuple(scene.views[i] for i in order))
-    known = [float(np.isfinite(m.depth).mean()) for m in confirmed]
-    counts = {"views": len(order), "depths": int(sum(np.isfinite(m.depth).sum() for m in confirmed))}
+    maps, confirmed = dict(zip(order, found, strict=True)), dict[int, DepthMap]()
+
+    def confirmations() -> Iterator[tuple[object, ...]]:
+        for view in order:
+            part, near = seen_from(view)
+            yield work.config, part, {j: maps[j] for j in sorted(near)}, view
+
+    with run.clock("dense"), run.resumable("dense"):
+        run.workers.run(_confirmed, confirmations(), lambda n, depths: confirmed.update({order[n]: depths}))
+    final = [confirmed[i] for i in order]
+    work.result = replace(result, depth_maps=tuple(final), views=tuple(scene.views[i] for i in order))
+    known = [float(np.isfinite(m.depth).mean()) for m in final]
+    counts = {"views": len(order), "depths": int(sum(np.isfinite(m.depth).sum() for m in final))}
     empty = [i for i, share in zip(order, known, strict=True) if not share]
     run.finish(
         "dense",

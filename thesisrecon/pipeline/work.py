@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from thesisrecon.assumptions import assumptions_of_views
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.images import PhotographSet
+from thesisrecon.pipeline.prepared import PreparedViews
 from thesisrecon.run import Run
 from thesisrecon.types import Assumptions, RunResult
 
@@ -23,7 +23,7 @@ class Work:
     photographs: PhotographSet
     result: RunResult
     until: str
-    prepared: dict[int, Any] | None = None
+    prepared: PreparedViews | None = None
 
     @property
     def config(self) -> PipelineConfig:

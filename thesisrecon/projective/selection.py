@@ -63,16 +63,17 @@ def spread_of_views(tracks: Tracks, chosen: B8, *, cells: int = 8) -> F64:
     The sum over a grid of ``cells`` x ``cells`` of the view's extent of the root of their number in the cell:
     many points count, and points all over the picture count more than a crowd in a corner.
     """
-    score = np.zeros(tracks.n_views)
-    for view in range(tracks.n_views):
-        mine = tracks.view_index == view
-        if not (mine & chosen).any():
-            continue
-        low, high = tracks.xy[mine].min(axis=0), tracks.xy[mine].max(axis=0)
-        place = (tracks.xy[mine & chosen] - low) / np.maximum(high - low, 1e-9) * cells
-        cell = np.minimum(place, cells - 1).astype(np.int64)
-        score[view] = np.sqrt(np.bincount(cell[:, 0] * cells + cell[:, 1])).sum()
-    return score
+    # It is asked for once per camera: a search through all observations for each view would be cubic.
+    shape = (tracks.n_views, 2)
+    low, high = np.full(shape, np.inf), np.full(shape, -np.inf)
+    np.minimum.at(low, tracks.view_index, tracks.xy)
+    np.maximum.at(high, tracks.view_index, tracks.xy)
+    view = tracks.view_index[chosen]
+    place = (tracks.xy[chosen] - low[view]) / np.maximum(high - low, 1e-9)[view] * cells
+    cell = np.minimum(place, cells - 1).astype(np.int64)
+    number = (view * cells + cell[:, 0]) * cells + cell[:, 1]
+    counts = np.bincount(number, minlength=tracks.n_views * cells * cells).reshape(tracks.n_views, -1)
+    return np.asarray(np.sqrt(counts).sum(axis=1))
 
 
 def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:

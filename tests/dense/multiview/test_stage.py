@@ -62,6 +62,31 @@ def test_the_same_bytes_whatever_the_number_of_threads_and_one_by_one(walled):
             assert getattr(one, field).tobytes() == getattr(together[i], field).tobytes()
 
 
+@pytest.mark.parametrize("linker", [STEREO.linker, SequenceLinking(length=1)], ids=lambda v: type(v).__name__)
+def test_the_surroundings_of_a_view_are_enough_for_its_map(linker):
+    """What is sent to a worker elsewhere: a part of the scene, and the same bytes come back."""
+    walled = make_walled(on_arc(tuple(np.linspace(-15.0, 15.0, 5))))
+    choice = replace(STEREO.choice, most=1)
+    stereo = replace(STEREO, linker=linker, choice=choice, least_partners=2, max_side=80, match_side=64)
+    scene = stereo.prepare(walled.images, walled.reconstruction)
+    raw = {i: stereo.depth_map(scene, i) for i in scene.views}
+    for i in (0, 2):
+        near = stereo.surroundings(scene, i)
+        assert i in near
+        assert len(near) < len(scene.views)
+        part = scene.part(near)
+        assert set(part.views) == set(part.matched) == near
+        assert len(part.points.X) < len(scene.points.X) or part.points.seen[sorted(near)].any(axis=0).all()
+        partly = {j: raw[j] for j in near}
+        for whole, alone in (
+            (raw[i], stereo.depth_map(part, i)),
+            (stereo.confirm(scene, raw, i), stereo.confirm(part, partly, i)),
+        ):
+            assert np.isfinite(whole.depth).any()
+            assert whole.depth.tobytes() == alone.depth.tobytes()
+            assert whole.std.tobytes() == alone.std.tobytes()
+
+
 def test_pairs_are_matched_smaller_and_depths_are_as_exact(walled):
     stereo = replace(STEREO, match_side=160)
     scene = stereo.prepare(walled.images, walled.reconstruction)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol
@@ -54,6 +54,9 @@ class Linker(Protocol):
     ) -> InverseDepth:
         """Inverse depths of the pixels of ``view``."""
 
+    def reach(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
+        """The numbers of the other views that :meth:`link` asks for."""
+
 
 @dataclass(frozen=True)
 class RobustFusion:
@@ -85,6 +88,11 @@ class RobustFusion:
             rho, std = (np.stack([one[k] for one in found]) for k in (0, 1))
             fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.rivals)
         return result
+
+    def reach(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
+        """The neighbours."""
+        del view, views
+        return set(neighbours)
 
 
 @dataclass(frozen=True)
@@ -121,6 +129,13 @@ class SequenceLinking:
         fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.rivals)
         result.views[:] = np.where(np.isfinite(result.value), np.maximum.reduce([e.views for e in ends]), 0)
         return result
+
+    def reach(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
+        """Those next in the sequence, on either side."""
+        del neighbours
+        order = sorted(views)
+        place = order.index(view)
+        return set(order[max(place - self.length, 0) : place + self.length + 1]) - {view}
 
     def _chain(
         self, chain: Sequence[int], views: Mapping[int, PinholeView], correspond: Correspond

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -41,6 +41,16 @@ class MultiViewScene:
     points: SparsePoints
     neighbours: Mapping[int, tuple[int, ...]]
     matched: Mapping[int, PinholeView] = field(default_factory=dict)
+
+    def part(self, numbers: Collection[int]) -> MultiViewScene:
+        """The photographs of these views alone, and the points that they see: enough for the map of a view
+        with its :meth:`MultiViewStereo.surroundings`, and much less to send."""
+        views, matched = (
+            {i: view for i, view in given.items() if i in numbers} for given in (self.views, self.matched)
+        )
+        seen = self.points.seen[sorted(numbers)].any(axis=0)
+        points = SparsePoints(self.points.X[seen], self.points.seen[:, seen])
+        return MultiViewScene(views, points, self.neighbours, matched)
 
 
 @dataclass(frozen=True)
@@ -128,6 +138,13 @@ class MultiViewStereo:
         if self.completion is not None and self.refinement is not None:
             own = self.completion.complete(own, others, scene.views, refinement=self.refinement)
         return self.consistency.confirm(own, others)
+
+    def surroundings(self, scene: MultiViewScene, view: int) -> frozenset[int]:
+        """The views whose photographs :meth:`depth_map` and :meth:`confirm` of ``view`` look at, itself among
+        them."""
+        near = scene.neighbours[view]
+        reached = self.linker.reach(view, scene.views, near)
+        return frozenset({view, *near, *reached, *self.partners(scene, view)})
 
     def partners(self, scene: MultiViewScene, view: int) -> tuple[int, ...]:
         """Views whose maps are held against that of ``view``: its neighbours, those it is one of, and as

@@ -1,0 +1,84 @@
+"""As many photographs of the courtyard as one likes, from as many places: what sets that grow are made of.
+
+They are rendered, not cut from others: photographs that share a centre would make pairs without parallax, and
+another cost than that of a walk. The first n of a longer set are the set of n, spread over the same arc.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from math import cos, pi, sin, tan
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from validation.scenes.courtyard import build_courtyard
+from validation.scenes.fixtures import Pose
+from validation.scenes.photograph import Sensor, expose, integrate_pixels
+from validation.scenes.pose import look_at
+from validation.scenes.raycast import Rays, World, trace
+
+U8 = NDArray[np.uint8]
+
+FOCAL_REL = 0.9
+"""Focal length as a share of the long side."""
+HALF_ARC_DEG = 55.0
+
+
+def walk(count: int, size: tuple[int, int], *, seed: int = 0) -> list[Pose]:
+    """``count`` true cameras about the yard, of one calibration, for photographs of ``size`` (width, height).
+
+    The angles are those of van der Corput's sequence, so that the first n of any walk are spread evenly;
+    heights, distances, rolls and what is looked at are drawn.
+    """
+    width, height = size
+    focal = FOCAL_REL * max(size)
+    K = np.array([[focal, 0.0, 0.51 * width], [0.0, focal, 0.48 * height], [0.0, 0.0, 1.0]])
+    poses = []
+    for k in range(count):
+        rng = np.random.Generator(np.random.PCG64([seed, k]))
+        angle = (2.0 * _van_der_corput(k + 1) - 1.0) * HALF_ARC_DEG * pi / 180.0
+        distance, eye = rng.uniform(5.6, 6.8), rng.uniform(1.1, 2.4)
+        C = np.array([distance * sin(angle), -1.4 - distance * cos(angle), eye])
+        target = rng.uniform([-0.5, -1.4, 1.5], [0.5, -0.8, 1.9])
+        roll = tan(0.5 * rng.uniform(-6.0, 6.0) * pi / 180.0)
+        poses.append(Pose(K, look_at(C, target, roll), C, float(rng.uniform(0.88, 1.12))))
+    return poses
+
+
+def _van_der_corput(k: int) -> float:
+    """The k-th number of the sequence with base 2: the binary digits of k behind the point, reversed."""
+    value, share = 0.0, 0.5
+    while k:
+        value += share * (k & 1)
+        k, share = k >> 1, 0.5 * share
+    return value
+
+
+def render(world: World, pose: Pose, size: tuple[int, int], *, seed: int) -> U8:
+    """The photograph (H, W, 3) of one camera."""
+    rows = (0, 2 * size[1])
+    light = trace(world, Rays(pose.K, pose.R, pose.C), size, per_pixel=2, rows=rows)[0]
+    sensor, gain = Sensor(), 0.82 * pose.exposure
+    linear = integrate_pixels(light, 2, sensor.blur_px)
+    return expose(linear, sensor, gains=(gain, gain, gain), rng=np.random.default_rng([2001, seed]))
+
+
+def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360), threads: int = 2) -> None:
+    """Photographs ``0000.png`` and so on of :func:`walk` in ``folder``; those that are there stay."""
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [k for k in range(count) if not (folder / f"{k:04d}.png").is_file()]
+    if not missing:
+        return
+    world, poses = build_courtyard(), walk(count, size)
+
+    def write(k: int) -> None:
+        partial = folder / f".{k:04d}.partial"
+        picture = PillowImage.fromarray(render(world, poses[k], size, seed=k))
+        picture.save(partial, "PNG", compress_level=1)
+        partial.replace(folder / f"{k:04d}.png")
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(write, missing))
