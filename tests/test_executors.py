@@ -287,6 +287,14 @@ def test_an_executor_is_given_few_tasks_at_a_time() -> None:
     assert done == 50
 
 
+def test_workers_may_become_fewer_in_the_middle() -> None:
+    there, done = iter([4]), list[int]()
+    with futures.ThreadPoolExecutor(1) as pool:
+        remote = workers._Remote(pool, lambda: next(there, 1))
+        workers._hand_out(remote, (abs, False), [(n,) for n in range(20)], lambda n, _: done.append(n))
+    assert sorted(done) == list(range(20))
+
+
 def test_what_is_prepared_stays_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
 

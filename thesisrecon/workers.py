@@ -165,7 +165,8 @@ def _hand_out(
     left = enumerate(tasks)
     try:
         while True:
-            for n, given in islice(left, AHEAD * remote.parallel() - len(waiting)):
+            # Where workers have died, more may be waiting than are now wanted.
+            for n, given in islice(left, max(AHEAD * remote.parallel() - len(waiting), 0)):
                 what = (
                     (_answer, package_key(), pickle.dumps((function, given), 5))
                     if travels
