@@ -23,6 +23,7 @@ from validation.harness.page import HERE as HARNESS
 HERE = Path(__file__).parent
 PAGE = "index.html"
 COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7a7a3a", "#b05c8a")
+SYMBOLS = ("circle", "square", "diamond")
 GOOD, BAD, NONE = "#2e7d4f", "#b3372b", "#7b8794"
 _MARGIN = {"l": 70, "r": 20, "t": 10, "b": 50}
 MOST_LEVELS = 40
@@ -98,6 +99,8 @@ def _findings(analysis: Analysis) -> list[str]:
                 c.variant for c in analysis.comparisons if (c.measure, c.verdict) == (measure, verdict)
             )
             names = [v if count == 1 else f"{v} (under {n} of {count} conditions)" for v, n in where.items()]
+            if count == 1 and len(names) > 2 and len(names) == len(analysis.plan.variants) - 1:
+                names = ["all others"]
             told += [f"{verdict}: {'; '.join(names)}"] if names else []
         said = ". ".join(told) or "no difference from the baseline is shown"
         found.append(f"{measure.name} {said}.")
@@ -295,27 +298,31 @@ def _cost(measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] 
         "hoverinfo": "skip",
         "showlegend": False,
     }
-    points = {
-        "type": "scatter",
-        "mode": "markers+text",
-        "x": [c.cost_s for c in known],
-        "y": [c.mean for c in known],
-        "text": [c.variant for c in known],
-        "textposition": "top center",
-        "textfont": {"size": 10},
-        "cliponaxis": False,
-        "marker": {"size": 10, "color": [GOOD if c.on_front else NONE for c in known]},
-        "showlegend": False,
-    }
+    points = [
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "name": cell.variant,
+            "x": [cell.cost_s],
+            "y": [cell.mean],
+            "marker": {
+                "size": 11,
+                "color": COLOURS[k % len(COLOURS)],
+                "symbol": SYMBOLS[k // len(COLOURS) % len(SYMBOLS)] + ("" if cell.on_front else "-open"),
+            },
+        }
+        for k, cell in enumerate(known)
+    ]
     log = measure.ratio and all(c.mean > 0 for c in known)
     layout = {
         "xaxis": {"title": {"text": "processor time of a row (s)"}, "rangemode": "tozero"},
         "yaxis": _axis(measure) | ({"type": "log"} if log else {}),
         "margin": _MARGIN,
-        "height": 420,
+        "legend": {"orientation": "h", "y": -0.2},
+        "height": 420 + 10 * len(known),
     }
-    words = "Green: nothing is both better and cheaper."
-    figure = {"data": [line, points], "layout": layout}
+    words = "Filled: nothing is both better and cheaper."
+    figure = {"data": [line, *points], "layout": layout}
     return _plot(f"plot-{slug}-cost", f"{measure.name} against what it costs", figure, words)
 
 
