@@ -17,6 +17,7 @@ from typing import Any
 import thesisrecon
 from thesisrecon.config import KINDS, PipelineConfig, tables_from_config
 from thesisrecon.errors import UsageError
+from thesisrecon.io.fingerprint import package_key
 from thesisrecon.io.run_directory import code_key, key_of
 from thesisrecon.settings import table_from_dataclass, unknown_word
 from validation.ablation.changes import STAGES, TASK, Setting, apply_changes, level_name
@@ -309,9 +310,8 @@ def _own_code(module: str) -> str:
 @cache
 def versions() -> dict[str, str]:
     """What a row was computed with: versions of what is installed, and a key for our code that rows run."""
-    content = hashlib.sha256()
-    package = Path(thesisrecon.__file__).parent
-    for root in (package, *(ROOT / part for part in _RUN_BY_ROWS)):
+    content = hashlib.sha256(package_key().encode())
+    for root in (ROOT / part for part in _RUN_BY_ROWS):
         for path in sorted(root.rglob("*.py")):
             content.update(f"{path.relative_to(root)}".encode() + path.read_bytes())
     return {

@@ -6,15 +6,17 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, overload
 
 from thesisrecon.config import tables_from_config
+from thesisrecon.errors import WorkersLost
 from thesisrecon.io.run_directory import write_json
 from thesisrecon.settings import table_from_dataclass
+from thesisrecon.workers import PATIENCE_S
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.row import Job, carry_out, pack
 from validation.ablation.store import STEPS, WORK, Outcome, Store, finite
@@ -238,8 +240,10 @@ class _Session:
                 running[self._submit(part, packed[part.row.key])] = part
                 if len(running) >= self.crew.most:
                     break
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            outcomes = [(running.pop(future), self._outcome(future)) for future in done]
+            done, _ = wait(running, PATIENCE_S, return_when=FIRST_COMPLETED)
+            if not done and self.crew.cluster is not None:
+                self.crew.cluster.check()
+            outcomes = [(running.pop(f), self._outcome(f)) for f in done if not f.cancelled()]
             if self.crew.renew is not None and any(outcome.lost for _, outcome in outcomes):
                 # Of a pool that broke no row ends any more.
                 outcomes += [(part, Outcome(failure=LOST, lost=True)) for part in running.values()]
@@ -251,6 +255,9 @@ class _Session:
                 else:
                     ended.add(part.name)
                     self._keep(part, outcome)
+            if any(future.cancelled() for future in done):
+                # Nothing here cancels rows that were handed out: it was the cluster that went away.
+                raise self._gone()
         return self.lost
 
     def _ready(self, waiting: Sequence[_Part], ended: set[str], running: int) -> Iterator[_Part]:
@@ -285,11 +292,18 @@ class _Session:
             return future.result()
         except BrokenProcessPool:
             return Outcome(failure=LOST, lost=True)
+        except CancelledError:
+            raise self._gone() from None
         except Exception as error:
             # An executor of the caller's tells in its own way that a worker is gone.
             if type(error).__name__ == "KilledWorker":
                 return Outcome(failure=LOST, lost=True)
             raise
+
+    def _gone(self) -> WorkersLost:
+        cluster = self.crew.cluster
+        lost = WorkersLost("the workers are gone") if cluster is None else cluster.lost()
+        return WorkersLost(f"{lost}; the rows that ended are kept, and the same command goes on from there")
 
     def _again(self, part: _Part) -> bool:
         """Whether a part whose process died is tried once more."""

@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
+from thesisrecon.cluster import Cluster, connected, is_address
 from thesisrecon.errors import UsageError
 from thesisrecon.settings import unknown_word
-from thesisrecon.workers import available_threads
+from thesisrecon.workers import NAMES, available_threads
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MANY = 64
@@ -29,6 +30,7 @@ class Crew:
     width: int
     by_thread: bool
     renew: Callable[[], Executor] | None = None
+    cluster: Cluster | None = None
 
     @property
     def most(self) -> int:
@@ -66,12 +68,12 @@ def crew_of(wish: str | Executor, threads: int | None) -> Iterator[Crew]:
         crew = Crew(ThreadPoolExecutor(count) if count > 1 else _Here(), count, count > 1)
     elif wish == "processes":
         crew = Crew(_processes(count), count, False, lambda: _processes(count))
-    elif wish.startswith("dask://"):
-        with _dask(wish.removeprefix("dask://")) as executor:
-            yield Crew(executor, threads or MANY, True)
+    elif is_address(wish):
+        with connected(wish) as cluster:
+            yield Crew(cluster.executor, cluster.parallel(), True, cluster=cluster)
         return
     else:
-        raise UsageError(unknown_word("executor", wish, ["local", "processes", "dask://HOST:PORT"]))
+        raise UsageError(unknown_word("executor", wish, NAMES))
     try:
         yield crew
     finally:
@@ -90,21 +92,3 @@ def _processes(count: int) -> ProcessPoolExecutor:
         initializer=signal.signal,
         initargs=(signal.SIGINT, signal.SIG_IGN),
     )
-
-
-@contextmanager
-def _dask(address: str) -> Iterator[Executor]:
-    try:
-        import distributed
-    except ImportError:
-        raise UsageError(
-            "the executor dask:// needs the extra distributed: pip install 'thesisrecon[distributed]'"
-        ) from None
-    try:
-        client: Any = cast(Any, distributed).Client(address, timeout="10s", set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise UsageError(f"no Dask scheduler answers at {address}: {error}") from None
-    try:
-        yield client.get_executor()
-    finally:
-        client.close()

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -209,7 +209,7 @@ def test_progress_hears_of_every_row(tmp_path: Path) -> None:
     assert heard[-1] == 12
 
 
-def test_a_dask_cluster_finds_the_same(tmp_path: Path) -> None:
+def test_a_dask_cluster_finds_the_same_and_is_missed_when_gone(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
     wish = study(tmp_path / "log", scenes=["a"], seeds=2)
     here = ablate(wish, tmp_path / "here", executor="local", threads=1)
@@ -217,9 +217,33 @@ def test_a_dask_cluster_finds_the_same(tmp_path: Path) -> None:
     with distributed.LocalCluster(protocol="tcp://", **options) as cluster:
         address = f"dask://{cluster.scheduler_address.removeprefix('tcp://')}"
         with distributed.Client(cluster, set_as_default=False) as client:
-            given = ablate(wish, tmp_path / "given", executor=client.get_executor())
+            given = ablate(wish, tmp_path / "given", executor=client.get_executor(pure=False))
         named = ablate(wish, tmp_path / "named", executor=address)
     told = [[(r.key, r.metrics) for r in rows] for rows in (here, given, named)]
     assert told[0] == told[1] == told[2]
-    with pytest.raises(UsageError, match="no Dask scheduler answers at"):
-        ablate(wish, tmp_path / "gone", executor=address)
+    with pytest.raises(UsageError, match="a Dask scheduler is given as dask://HOST:PORT"):
+        ablate(wish, tmp_path / "gone", executor="dask://nowhere")
+
+
+class Vanishing(Executor):
+    """An executor whose cluster goes away after the first row."""
+
+    def __init__(self) -> None:
+        self.done = 0
+
+    def submit(self, fn: Any, /, *args: Any, **_: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if self.done:
+            future.cancel()
+            future.set_running_or_notify_cancel()
+        else:
+            future.set_result(fn(*args))
+        self.done += 1
+        return future
+
+
+def test_workers_that_vanish_are_a_sentence_and_lose_nothing_that_ended(tmp_path: Path) -> None:
+    wish = study(tmp_path / "log", seeds=1)
+    with pytest.raises(UsageError, match="the workers are gone; the rows that ended are kept"):
+        ablate(wish, tmp_path / "out", executor=Vanishing(), threads=1)
+    assert len(read_rows(wish, tmp_path / "out")) == 1
