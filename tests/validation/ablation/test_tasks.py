@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import thesisrecon
-from thesisrecon.config import PipelineConfig
+from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import UsageError
 from thesisrecon.selfcalibration import Stratified
 from validation.ablation import Place, Study, ablate
@@ -140,7 +140,7 @@ def test_what_a_scene_cannot_tell_is_not_missed_but_refused_where_asked_for(
 
 
 def test_a_reconstruction_in_a_study_is_the_one_outside(yard: Path, tmp_path: Path) -> None:
-    config = replace(CONFIG, images=replace(CONFIG.images, max_size_px=320))
+    config = replace(preset("thesis"), images=replace(CONFIG.images, max_size_px=400))
     study = Study(
         {"selfcalibration": ["focal-scan"]},
         [str(yard)],
