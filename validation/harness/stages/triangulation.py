@@ -183,20 +183,18 @@ def _metrics(
         cost = np.concatenate([squared_distances(problems[n].P, X, problems[n].xy) for n, X in some.items()])
         least = np.concatenate([best[n] for n in some])
         above[name] = float(np.sqrt(cost.mean() / least.mean()) - 1.0)
-        apart[name] = float(
-            np.median(np.concatenate([_space_errors(problems[n], X) for n, X in some.items()]))
-        )
+        apart[name] = _median_space_error(problems, some)
+    optimum = _median_space_error(problems, {n: _least_near_truth(p) for n, p in problems.items()})
+    over = {name: None if value is None else value / optimum for name, value in apart.items()}
+    words = "of the median error in space over that of points found from the truth by descent"
     return [
         *(
-            Metric(
-                scene,
-                f"{name}: error in space, {where}",
-                "%",
-                {OURS: apart.get(name)},
-                OURS,
-                definition="of this variant",
-            )
-            for name in (LINEAR, MIDPOINT)
+            Metric(scene, f"{title}, {where}", "", {name: over.get(name)}, name, definition=words)
+            for name, title in {
+                OURS: "error in space over the optimum",
+                LINEAR: f"{LINEAR}: error in space over the optimum",
+                MIDPOINT: f"{MIDPOINT}: error in space over the optimum",
+            }.items()
         ),
         Metric(
             scene,
@@ -215,6 +213,11 @@ def _metrics(
             definition="median distance from the true point over its distance from the first camera",
         ),
     ]
+
+
+def _median_space_error(problems: Mapping[int, Problem], answers: Mapping[int, F64]) -> float:
+    """Over all points of all problems, %."""
+    return float(np.median(np.concatenate([_space_errors(problems[n], X) for n, X in answers.items()])))
 
 
 def _least_squared_distances(n: int, problem: Problem, kept: Mapping[str, Mapping[str, F64] | None]) -> F64:
