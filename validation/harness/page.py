@@ -87,6 +87,7 @@ def _page(
         links=links,
         verdict=verdict,
         sections=sections,
+        several=environment is not None,
         failures=failures,
         environment=environment,
         changes=changes,
