@@ -1,23 +1,30 @@
-"""All tasks of a report, as many at a time as there are cores, each in a process of its own."""
+"""All tasks of a report, as many at a time as there are cores, each in a process of its own.
+
+The first task of ours of a stage compiles its kernels. Until it ends no other of that stage begins, nor the
+first of another one, so that nothing is compiled twice; references have the other cores meanwhile.
+"""
 
 from __future__ import annotations
 
 import json
 import shutil
-import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
-from validation.harness.process import failure_of, last_words, own_cores, run_process
+from validation.harness.forks import Template
+from validation.harness.process import Process, failure_of, last_words, own_cores
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Task, Wishes
-from validation.harness.resume import take_over
+from validation.harness.resume import OURS, take_over
 from validation.harness.worker import JUDGEMENT, OUTCOMES
 from validation.metrics.record import Metric
 
 Told = Callable[[str], None]
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
 JUDGE = ""
 """The method of the task that judges all others of its stage and scene."""
 
@@ -47,11 +54,12 @@ def run_tasks(
     waiting = [task for task in tasks if task not in ended]
     running: dict[Future[Outcome], Task] = {}
     cores = own_cores()[: wishes.threads]
-    free, total = _Cores(cores), len(tasks)
-    with ThreadPoolExecutor(len(cores)) as pool:
+    total = len(tasks)
+    with ExitStack() as stack, ThreadPoolExecutor(len(cores)) as pool:
+        free = _Templates(cores, wishes, stack)
         while waiting or running:
             for task in [t for t in waiting if len(running) < len(cores)]:
-                if len(running) < len(cores) and _ready(task, waiting, running, stages):
+                if len(running) < len(cores) and _ready(task, waiting, running.values(), ended, stages):
                     waiting.remove(task)
                     running[pool.submit(_carry_out, task, wishes, dict(ended), free)] = task
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -65,57 +73,71 @@ def run_tasks(
     return {(t.stage, t.scene): (_judgement(ended[t]), _outcomes(t, ended)) for t in judged}
 
 
-class _Cores:
-    """Which cores no task has: each gets one of its own."""
+class _Templates:
+    """Processes that no task is running in: one a core."""
 
-    def __init__(self, cores: list[int]) -> None:
-        self._free, self._lock = list(cores), threading.Lock()
+    def __init__(self, cores: list[int], wishes: Wishes, stack: ExitStack) -> None:
+        self._modules = ("validation.harness.worker", wishes.stages_from)
+        self._stack, self._lock = stack, threading.Lock()
+        self._free = [(core, self._start(core)) for core in cores]
 
-    def take(self) -> int:
+    def _start(self, core: int) -> Template:
+        return self._stack.enter_context(Template(self._modules, core, ENVIRONMENT))
+
+    def run(self, arguments: list[str], log: Path, limit_s: float) -> Process:
+        """One task, on the core that has been free for longest."""
         with self._lock:
-            return self._free.pop(0)
-
-    def give_back(self, core: int) -> None:
-        with self._lock:
-            self._free.append(core)
+            core, template = self._free.pop(0)
+        try:
+            return template.run(arguments, log=log, limit_s=limit_s)
+        except RuntimeError as error:
+            log.write_text(f"{error}\n", encoding="utf-8")
+            template = self._start(core)
+            return Process(1, 0.0, 0.0, 0.0)
+        finally:
+            with self._lock:
+                self._free.append((core, template))
 
 
 def _ready(
-    task: Task, waiting: list[Task], running: Mapping[Future[Outcome], Task], stages: Mapping[str, Stage]
+    task: Task,
+    waiting: Collection[Task],
+    running: Collection[Task],
+    ended: Collection[Task],
+    stages: Mapping[str, Stage],
 ) -> bool:
-    """Whether nothing that the task starts from is still to come."""
-    open_tasks = set(waiting) | set(running.values())
+    """Whether nothing that the task starts from is still to come, and nobody compiles what it needs."""
+    open_tasks = {*waiting, *running}
     own = {t for t in open_tasks - {task} if (t.stage, t.scene) == (task.stage, task.scene)}
     if task.method == JUDGE and own:
         return False
+    if _is_ours(task):
+        compiled = {t.stage for t in ended if _is_ours(t)}
+        first = {t.stage for t in running if _is_ours(t)} - compiled
+        if task.stage in first or (first and task.stage not in compiled):
+            return False
     return not any(
         Task(stage, task.scene, method) in open_tasks
         for stage, method in stages[task.stage].needs(task.method)
     )
 
 
-def _carry_out(task: Task, wishes: Wishes, ended: Mapping[Task, Outcome], free: _Cores) -> Outcome:
+def _is_ours(task: Task) -> bool:
+    return task.method.startswith(OURS)
+
+
+def _carry_out(task: Task, wishes: Wishes, ended: Mapping[Task, Outcome], free: _Templates) -> Outcome:
     place = wishes.place(task.stage, task.scene, task.method)
     place.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "validation.harness.worker", str(wishes.out / "wishes.json")]
-    command += [task.stage, task.scene]
+    arguments = [str(wishes.out / "wishes.json"), task.stage, task.scene]
     if task.method == JUDGE:
         told = {name: asdict(o) | {"place": str(o.place)} for name, o in _outcomes(task, ended).items()}
         (place / OUTCOMES).write_text(json.dumps(told), encoding="utf-8")
     else:
-        command.append(task.method)
+        arguments.append(task.method)
     # Beside the place of the task, which may empty it.
-    core, log = free.take(), place.with_name(f"{place.name}.log")
-    try:
-        process = run_process(
-            command,
-            log=log,
-            cores=[core],
-            environment={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"},
-            limit_s=wishes.limit_s,
-        )
-    finally:
-        free.give_back(core)
+    log = place.with_name(f"{place.name}.log")
+    process = free.run(arguments, log, wishes.limit_s)
     failure = failure_of(process, last_words(log), wishes.limit_s)
     return Outcome(place, failure, process.wall_s, process.cpu_s, process.peak_mb)
 

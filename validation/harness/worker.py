@@ -1,4 +1,4 @@
-"""One task in a process of its own: ``python -m validation.harness.worker WISHES STAGE SCENE [METHOD]``.
+"""One task, in a process of its own: ``python -m validation.harness.worker WISHES STAGE SCENE [METHOD]``.
 
 Without a method, the judgement on the outcomes that stand in ``outcomes.json``.
 """

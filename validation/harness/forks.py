@@ -1,0 +1,145 @@
+"""Tasks as forks of a process that has imported everything once.
+
+To import the library and its stages takes two seconds, as long as many a task. Each task is still a process
+of its own, which may crash, hang or be killed, and whose seconds and memory are its own account.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+from validation.harness.process import Process
+from validation.scenes.real import ROOT
+
+KILLED = -int(signal.SIGKILL)
+
+
+class Template:
+    """A process on the core ``core`` that has imported ``modules``, the first of which has a ``main`` that
+    takes arguments and returns an exit code; it lives until :meth:`close`."""
+
+    def __init__(self, modules: Sequence[str], core: int, environment: Mapping[str, str]) -> None:
+        command = [sys.executable, "-m", "validation.harness.forks", str(core), *modules]
+        self._child = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, **environment},
+            cwd=ROOT,
+            start_new_session=True,
+            text=True,
+        )
+
+    def __enter__(self) -> Template:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process; nothing runs in it any more."""
+        for pipe in (self._child.stdin, self._child.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+        self._child.wait()
+
+    def run(self, arguments: Sequence[str], *, log: Path, limit_s: float) -> Process:
+        """``main`` of these arguments in a fork, which is killed with all it started after ``limit_s``; its
+        output goes to the file ``log``.
+
+        Raises ``RuntimeError`` where the template itself has ended.
+        """
+        log.parent.mkdir(parents=True, exist_ok=True)
+        assert self._child.stdin is not None
+        start = time.perf_counter()
+        try:
+            print(json.dumps([str(log), limit_s, *arguments]), file=self._child.stdin, flush=True)
+            told = self._read()
+        except BrokenPipeError:
+            told = ""
+        if not told:
+            raise RuntimeError(f"the process that tasks are forks of ended with {self._child.wait()}")
+        code, peak_mb, cpu_s, timed_out = json.loads(told)
+        return Process(code, time.perf_counter() - start, peak_mb, cpu_s, timed_out)
+
+    def _read(self) -> str:
+        source: IO[str] | None = self._child.stdout
+        assert source is not None
+        return source.readline()
+
+
+def serve(main: Callable[[list[str]], int], orders: IO[str], answers: IO[str]) -> None:
+    """Carry out one order after another, until there are no more: [log, seconds, *arguments], in JSON."""
+    for order in orders:
+        log, limit_s, *arguments = json.loads(order)
+        child = os.fork()
+        if child == 0:
+            _become(main, arguments, log)
+        code, peak_mb, cpu_s, timed_out = _wait(child, limit_s)
+        print(json.dumps([code, peak_mb, cpu_s, timed_out]), file=answers, flush=True)
+
+
+def _wait(child: int, limit_s: float) -> tuple[int, float, float, bool]:
+    """Exit code, peak memory in MB, processor seconds, and whether its time was up."""
+    killed = False
+
+    def kill(signum: int, frame: object) -> None:  # noqa: ARG001 (what a handler is given)
+        nonlocal killed
+        killed = True
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+            os.killpg(child, signal.SIGKILL)
+
+    signal.signal(signal.SIGALRM, kill)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    _, status, usage = os.wait4(child, 0)
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    code = os.waitstatus_to_exitcode(status)
+    return code, usage.ru_maxrss / 1024.0, usage.ru_utime + usage.ru_stime, killed and code == KILLED
+
+
+def _become(main: Callable[[list[str]], int], arguments: list[str], log: str) -> None:
+    """This fork is the task from here on, and ends with it."""
+    code = 1
+    try:
+        os.setsid()
+        nothing, sink = (
+            os.open(os.devnull, os.O_RDONLY),
+            os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644),
+        )
+        for place, file in ((0, nothing), (1, sink), (2, sink)):
+            os.dup2(file, place)
+        code = main(arguments)
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 1
+    except BaseException:  # nothing may get back to the loop of the template
+        traceback.print_exc()
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    os.sched_setaffinity(0, {int(sys.argv[1])})
+    # What is imported may print; the answers have a way of their own.
+    told = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    modules = [import_module(name) for name in sys.argv[2:]]
+    serve(modules[0].main, sys.stdin, told)
