@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -223,6 +224,42 @@ def test_a_dask_cluster_finds_the_same_and_is_missed_when_gone(tmp_path: Path) -
     assert told[0] == told[1] == told[2]
     with pytest.raises(UsageError, match="a Dask scheduler is given as dask://HOST:PORT"):
         ablate(wish, tmp_path / "gone", executor="dask://nowhere")
+
+
+@dataclass(frozen=True)
+class DeadlyOnce(Darts):
+    """Kills its process where the aim is 2, unless somebody has done so before."""
+
+    def run(self, *wish: Any) -> Any:
+        if self.aim == 2.0:
+            try:
+                os.close(os.open(f"{self.log}.killed", os.O_CREAT | os.O_EXCL))
+            except FileExistsError:
+                pass
+            else:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return super().run(*wish)
+
+
+def test_a_worker_of_a_cluster_that_is_killed_loses_no_row(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
+    log = tmp_path / "log"
+    wish = study(log, scenes=["a"], seeds=4, task=DeadlyOnce(log=str(log)))
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address=":0",
+        worker_dashboard_address=None,
+        silence_logs=logging.ERROR,
+    ) as cluster:
+        address = f"dask://{cluster.scheduler_address.removeprefix('tcp://')}"
+        rows = ablate(wish, tmp_path / "out", executor=address)
+    assert log.with_name("log.killed").exists()
+    assert not any(row.failure for row in rows)
+    # The file is there, so that nobody is killed this time.
+    undisturbed = ablate(wish, tmp_path / "here", executor="local", threads=1)
+    assert [(r.key, r.metrics) for r in rows] == [(r.key, r.metrics) for r in undisturbed]
 
 
 class Vanishing(Executor):
