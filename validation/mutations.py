@@ -9,18 +9,15 @@ a fault survives or the tree itself breaks a gate, 2 where the list is wrong.
 from __future__ import annotations
 
 import argparse
-import ast
 import json
-import os
-import shutil
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from validation.harness.gates import Gate, read_gates
+from validation.harness.planting import CopiedTree
 from validation.harness.process import last_words, own_cores, run_process
 from validation.harness.records import slug
 from validation.harness.results import Results, read_results
@@ -28,11 +25,8 @@ from validation.harness.stages import STAGES, available_scenes
 from validation.scenes.real import ROOT, data_root
 
 MUTATIONS_FILE = Path(__file__).with_suffix(".toml")
-COPIED = ("thesisrecon", "validation", "fixtures", "pyproject.toml")
 FIELDS = ("name", "file", "old", "new", "check")
 TASK_LIMIT_S = 900
-FAULTY_S = 4_000_000_000
-"""When a file with the first fault was changed, later than any other; a second more for each fault."""
 
 
 @dataclass(frozen=True)
@@ -116,59 +110,8 @@ def read_mutations(path: Path = MUTATIONS_FILE) -> list[Mutation]:
 
 
 @dataclass(frozen=True)
-class Bench:
-    """The copied tree and the folders beside it."""
-
-    out: Path
-
-    @property
-    def tree(self) -> Path:
-        """The copy."""
-        return self.out / "tree"
-
-    @property
-    def kernels(self) -> Path:
-        """Compiled kernels of the copy without faults."""
-        return self.out / "kernels"
-
-    def set_up(self) -> None:
-        """Copy the tree with the times of its files."""
-        shutil.rmtree(self.tree, ignore_errors=True)
-        self.tree.mkdir(parents=True)
-        self.kernels.mkdir(exist_ok=True)
-        for name in COPIED:
-            source, target = ROOT / name, self.tree / name
-            if source.is_dir():
-                shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
-            else:
-                shutil.copy2(source, target)
-
-    @contextmanager
-    def planted(self, mutation: Mutation, number: int) -> Iterator[Path]:
-        """The tree with the fault, and the folder of compiled kernels for it.
-
-        Of the fault and all that import it nothing is taken that was compiled without it, by Python (their
-        files count as newer) or by numba; what is compiled with it goes with it.
-        """
-        path = self.tree / mutation.file
-        sound, kernels = path.read_text(encoding="utf-8"), self.out / f"kernels-{number:02d}"
-        shutil.rmtree(kernels, ignore_errors=True)
-        shutil.copytree(self.kernels, kernels, copy_function=os.link)
-        for file in importers(self.tree, mutation.file):
-            # numba knows a change of a kernel's own file, and of no other that it is made of.
-            for stale in kernels.glob(f"{file.parent.name}_*/{file.stem}.*"):
-                stale.unlink()
-        newer = {file: file.stat().st_mtime for file in importers(self.tree, mutation.file)}
-        path.write_text(mutation.apply(self.tree), encoding="utf-8")
-        try:
-            for file in newer:
-                os.utime(file, (FAULTY_S + number, FAULTY_S + number))
-            yield kernels
-        finally:
-            path.write_text(sound, encoding="utf-8")
-            for file, before in newer.items():
-                os.utime(file, (before, before))
-            shutil.rmtree(kernels)
+class Bench(CopiedTree):
+    """The copied tree and the checks in it."""
 
     def check(self, name: str, wanted: Sequence[Mutation], kernels: Path, resume: str = "") -> Checked:
         """``python -m validation check`` in the tree, on what these faults ask for.
@@ -232,29 +175,6 @@ def _needed(stages: Sequence[str]) -> set[str]:
     return {stage for name in stages for method in methods for stage, _ in STAGES[name].needs(method)}
 
 
-def importers(root: Path, file: str) -> list[Path]:
-    """The module and all modules of the library that import it, themselves or through others."""
-    modules = {
-        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
-        for path in sorted((root / file.split("/")[0]).rglob("*.py"))
-    }
-    imports = {name: _imports(path) for name, path in modules.items()}
-    found = {name for name, path in modules.items() if path == root / file}
-    while more := {name for name, used in imports.items() if used & found} - found:
-        found |= more
-    return [modules[name] for name in sorted(found)]
-
-
-def _imports(path: Path) -> set[str]:
-    found = set[str]()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return found
-
-
 def plant_all(bench: Bench, mutations: Sequence[Mutation], *, sound: bool = False) -> Iterator[Fate]:
     """The fate of each fault, in order; where ``sound``, the first check stands there of an earlier run.
 
@@ -272,7 +192,7 @@ def plant_all(bench: Bench, mutations: Sequence[Mutation], *, sound: bool = Fals
             absent = f"{mutation.scenes[0]} is not on this machine"
             yield Fate(mutation.name, mutation.file, (), 0.0, skipped=absent)
             continue
-        with bench.planted(mutation, number) as kernels:
+        with bench.planted(mutation.file, mutation.apply(bench.tree), number) as kernels:
             found = bench.check(slug(mutation.name), [mutation], kernels, resume="sound")
         yield Fate(mutation.name, mutation.file, found.broken(gates), found.seconds, found.ended)
 

@@ -19,6 +19,7 @@ from validation.harness.scenes import PHOTOGRAPHS, available_scenes
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES
 
+pytestmark = pytest.mark.slow
 GATES = read_gates()
 ALWAYS = ("courtyard", "boards", "cloud", "street")
 """Scenes that this repository makes or ships."""

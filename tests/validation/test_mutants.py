@@ -1,0 +1,93 @@
+"""Small faults of the library, found and told; that tests catch them takes its time and is run by hand."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from validation import mutants
+from validation.harness.planting import imports_of
+from validation.mutants import PACKAGES, Bench, Mutant, Verdict, draw, mutants_of, table
+from validation.scenes.real import ROOT
+
+SOURCE = '''
+LIMIT = 3.0
+
+
+def distance(a: float, b: float = 2.0, *, whole: bool = True) -> float:
+    """A docstring with a + b."""
+    if len([a]) < 2 and not whole:
+        raise ValueError("1 + 1")
+    a += b  # über a + b
+    return (a) - (
+        -b
+    )
+'''
+
+
+def faults(root: Path) -> list[str]:
+    """The lines that the faults of a small module change, as they become."""
+    folder = root / "thesisrecon" / "geometry"
+    folder.mkdir(parents=True)
+    (folder / "small.py").write_text(SOURCE, encoding="utf-8")
+    found = []
+    for mutant in mutants_of(root, "geometry"):
+        text = mutant.apply(SOURCE)
+        ast.parse(text)
+        assert SOURCE[mutant.start : mutant.end] == mutant.old
+        found.append(text.splitlines()[mutant.line - 1].strip())
+    return found
+
+
+def test_one_thing_changes_in_functions_and_nothing_in_settings_or_words(tmp_path: Path) -> None:
+    assert sorted(faults(tmp_path)) == sorted(
+        [
+            "if (not (len([a]) < 2 and not whole)):",
+            "if len([a]) >= 2 and not whole:",
+            "if len([a]) <= 2 and not whole:",
+            "if len([a]) < 3 and not whole:",
+            "if len([a]) < 2 or not whole:",
+            "if len([a]) < 2 and whole:",
+            "a -= b  # über a + b",
+            "pass  # über a + b",
+            "return (a) + (",
+            "b",
+        ]
+    )
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_what_is_drawn_is_python_and_the_same_every_time(package: str) -> None:
+    drawn = draw(ROOT, package, 30, seed=1)
+    assert len(drawn) == 30
+    assert drawn == draw(ROOT, package, 30, seed=1) != draw(ROOT, package, 30, seed=2)
+    for mutant in drawn:
+        text = (ROOT / mutant.file).read_text(encoding="utf-8")
+        faulty = mutant.apply(text)
+        assert faulty != text
+        ast.parse(faulty)
+
+
+def test_tests_of_the_module_come_first_and_then_those_of_its_users(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Bench, "tree", ROOT)
+    own, others = Bench(Path("nowhere")).judges("thesisrecon/geometry/trifocal.py")
+    assert "thesisrecon.geometry.trifocal" in imports_of(ROOT / own[0])
+    assert all(file.startswith("tests/geometry/") for file in own)
+    assert others
+    assert not any(file.startswith(("tests/geometry/", "tests/validation/")) for file in others)
+
+
+def test_the_table_has_the_score_of_each_package_and_every_fault() -> None:
+    fault = Mutant("thesisrecon/geometry/a.py", 3, "a | b", "a & b", 0, 5)
+    verdicts = [Verdict(fault, "tests/geometry/test_a.py::test", 1.0), Verdict(fault, "", 2.0)]
+    text = table(verdicts)
+    assert "| geometry | 2 | 1 | 50 % |" in text
+    assert "| thesisrecon/geometry/a.py | 3 | `a \\| b` | `a & b` | **nobody** |" in text
+
+
+def test_a_bad_wish_ends_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        mutants.main(["--packages", "nothing"])
+    assert "invalid choice" in capsys.readouterr().err

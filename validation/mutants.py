@@ -1,0 +1,350 @@
+"""Proof that the tests notice: ``python -m validation.mutants -o OUT [--sample 25] [--packages ...]``.
+
+Small faults are drawn at random from all that can be made of a package's functions by changing one thing: an
+operator, a comparison, a condition, a number, a function for its opposite, or leaving a statement out. Each
+is put into a copy of the tree, where the tests of its package run, those of its module first; what survives
+them meets the tests of the modules that import it. Numbers of modules and classes are settings, which
+ablations are about, and are left alone. OUT gets ``mutants.md`` and ``mutants.json``; the exit code is 1
+where fewer than 85 % are caught.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from validation.harness.planting import CopiedTree, imports_of
+from validation.harness.process import own_cores, run_process
+from validation.scenes.real import ROOT
+
+PACKAGES = ("geometry", "epipolar", "selfcalibration", "optimize")
+LEAST_SCORE = 0.85
+LIMIT_S = 420.0
+"""A test run that takes longer hangs in the fault."""
+SIGNS: dict[type[ast.AST], tuple[str, str]] = {
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Div: ("/", "*"),
+    ast.FloorDiv: ("//", "*"),
+    ast.Mod: ("%", "*"),
+    ast.Pow: ("**", "*"),
+    ast.BitAnd: ("&", "|"),
+    ast.BitOr: ("|", "&"),
+    ast.LShift: ("<<", ">>"),
+    ast.RShift: (">>", "<<"),
+    ast.Lt: ("<", ">="),
+    ast.LtE: ("<=", ">"),
+    ast.Gt: (">", "<="),
+    ast.GtE: (">=", "<"),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+    ast.Is: ("is", "is not"),
+    ast.In: ("in", "not in"),
+    ast.And: ("and", "or"),
+    ast.Or: ("or", "and"),
+}
+BORDERS: dict[type[ast.AST], tuple[str, str]] = {
+    ast.Lt: ("<", "<="),
+    ast.LtE: ("<=", "<"),
+    ast.Gt: (">", ">="),
+    ast.GtE: (">=", ">"),
+}
+"""Of whole numbers; between numbers with a fraction nothing ever stands on the border."""
+OPPOSITES = {
+    a: b
+    for pair in (
+        ("min", "max"), ("minimum", "maximum"), ("argmin", "argmax"), ("any", "all"), ("sin", "cos"),
+        ("zeros", "ones"), ("zeros_like", "ones_like"), ("floor", "ceil"),
+    )
+    for a, b in (pair, pair[::-1])
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A fault: in ``file``, the characters from ``start`` to ``end`` become ``new``."""
+
+    file: str
+    line: int
+    old: str
+    new: str
+    start: int
+    end: int
+
+    def apply(self, text: str) -> str:
+        """The text of the file with the fault."""
+        return text[: self.start] + self.new + text[self.end :]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a fault: ``by`` says who caught it, empty where nobody did."""
+
+    mutant: Mutant
+    by: str
+    seconds: float
+
+
+def mutants_of(root: Path, package: str) -> list[Mutant]:
+    """All faults of a package of the library, file by file."""
+    found = []
+    for path in sorted((root / "thesisrecon" / package).rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        finder = _Finder(path.relative_to(root).as_posix(), text)
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                for statement in node.body:
+                    finder.visit(statement)
+        found += sorted(set(finder.found), key=lambda m: (m.start, m.end, m.new))
+    return found
+
+
+class _Finder(ast.NodeVisitor):
+    """Faults of one file."""
+
+    def __init__(self, file: str, text: str) -> None:
+        self.file, self.text = file, text
+        self.found: list[Mutant] = []
+        starts = [0]
+        for line in text.splitlines(keepends=True):
+            starts.append(starts[-1] + len(line))
+        self._starts, self._lines = starts, text.splitlines()
+
+    def _place(self, line: int, column: int) -> int:
+        """Characters before a place that is given in bytes of its line."""
+        return self._starts[line - 1] + len(self._lines[line - 1].encode()[:column].decode())
+
+    def _span(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
+        return self._place(node.lineno, node.col_offset), self._place(node.end_lineno, node.end_col_offset)
+
+    def _add(self, start: int, end: int, new: str) -> None:
+        line = self.text.count("\n", 0, start) + 1
+        self.found.append(Mutant(self.file, line, self.text[start:end], new, start, end))
+
+    def _between(self, left: ast.expr, right: ast.expr, signs: tuple[str, str]) -> None:
+        """The operator between two operands; brackets and line ends may stand beside it."""
+        start, end = self._span(left)[1], self._span(right)[0]
+        at = self.text.find(signs[0], start, end)
+        if at >= 0 and "#" not in self.text[start:end]:
+            self._add(at, at + len(signs[0]), signs[1])
+
+    def visit_BinOp(self, node: ast.BinOp) -> None:
+        if type(node.op) in SIGNS:
+            self._between(node.left, node.right, SIGNS[type(node.op)])
+        self.generic_visit(node)
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> None:
+        for left, right in zip(node.values, node.values[1:], strict=False):
+            self._between(left, right, SIGNS[type(node.op)])
+        self.generic_visit(node)
+
+    def visit_Compare(self, node: ast.Compare) -> None:
+        operands = [node.left, *node.comparators]
+        for left, right, sign in zip(operands, operands[1:], node.ops, strict=False):
+            if type(sign) in SIGNS:
+                self._between(left, right, SIGNS[type(sign)])
+            if type(sign) in BORDERS and (_is_whole(left) or _is_whole(right)):
+                self._between(left, right, BORDERS[type(sign)])
+        self.generic_visit(node)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
+        if isinstance(node.op, ast.USub | ast.Not):
+            start = self._span(node)[0]
+            self._add(start, start + (1 if isinstance(node.op, ast.USub) else 4), "")
+        self.generic_visit(node)
+
+    def visit_Constant(self, node: ast.Constant) -> None:
+        start, end = self._span(node)
+        value = node.value
+        if isinstance(value, bool):
+            self._add(start, end, str(not value))
+        elif isinstance(value, int):
+            self._add(start, end, str(value + 1))
+        elif isinstance(value, float):
+            self._add(start, end, repr(2.0 * value if value else 1.0))
+
+    def visit_Name(self, node: ast.Name) -> None:
+        if node.id in OPPOSITES and isinstance(node.ctx, ast.Load):
+            start, end = self._span(node)
+            self._add(start, end, OPPOSITES[node.id])
+
+    def visit_Attribute(self, node: ast.Attribute) -> None:
+        if node.attr in OPPOSITES:
+            end = self._span(node)[1]
+            self._add(end - len(node.attr), end, OPPOSITES[node.attr])
+        self.generic_visit(node)
+
+    def _condition(self, node: ast.If | ast.While | ast.IfExp) -> None:
+        start, end = self._span(node.test)
+        self._add(start, end, f"(not ({self.text[start:end]}))")
+        self.generic_visit(node)
+
+    visit_If = visit_While = visit_IfExp = _condition
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> None:
+        if type(node.op) in SIGNS:
+            self._between(node.target, node.value, SIGNS[type(node.op)])
+        self._leave_out(node)
+        self.generic_visit(node)
+
+    def visit_Assign(self, node: ast.Assign) -> None:
+        if isinstance(node.targets[0], ast.Subscript):
+            self._leave_out(node)
+        self.generic_visit(node)
+
+    def _leave_out(self, node: ast.stmt) -> None:
+        start, end = self._span(node)
+        self._add(start, end, "pass")
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
+        if node.value is not None:
+            self.visit(node.value)
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        """One inside another is visited on its own."""
+
+    def visit_Raise(self, node: ast.Raise) -> None:
+        """What is said of an error is not counted."""
+
+    def visit_Assert(self, node: ast.Assert) -> None:
+        """For the types."""
+
+
+def _is_whole(node: ast.expr) -> bool:
+    """Whether an operand is certainly a whole number."""
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, int)
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len"
+
+
+def draw(root: Path, package: str, count: int, seed: int) -> list[Mutant]:
+    """``count`` faults of a package, or all where there are fewer, in the order of the files."""
+    everything = mutants_of(root, package)
+    rng = np.random.default_rng([seed, PACKAGES.index(package)])
+    chosen = rng.permutation(len(everything))[:count]
+    return [everything[k] for k in sorted(chosen)]
+
+
+@dataclass(frozen=True)
+class Bench(CopiedTree):
+    """A copy of the library with its tests."""
+
+    copied: tuple[str, ...] = ("thesisrecon", "validation", "tests", "fixtures", "pyproject.toml")
+
+    def judges(self, file: str) -> list[list[str]]:
+        """Test files to run one list after the other: those of the module and of its package; then those of
+        the modules that import it."""
+        package = Path(file).parts[1]
+        tests = sorted((self.tree / "tests").rglob("test_*.py"))
+        own = [t for t in tests if (self.tree / "tests" / package) in t.parents]
+        near = {_module(file)}
+        modules = sorted((self.tree / "thesisrecon").rglob("*.py"))
+        users = {_module(str(m.relative_to(self.tree))) for m in modules if imports_of(m) & near}
+        own.sort(key=lambda t: not imports_of(t) & near)
+        others = [t for t in tests if t not in own and "validation" not in t.parts]
+        others = [t for t in others if imports_of(t) & (near | users)]
+        others.sort(key=lambda t: not imports_of(t) & near)
+        return [[str(t.relative_to(self.tree)) for t in chosen] for chosen in (own, others) if chosen]
+
+    def run_tests(self, files: Sequence[str], kernels: Path, name: str) -> tuple[int, float, str]:
+        """The exit code of pytest, 99 where its time was up, seconds, and the first test that failed."""
+        log = self.out / "logs" / f"{name}.log"
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no"]
+        command += ["-m", "not slow and not browser and not real", *files]
+        environment = {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(kernels)}
+        environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        process = run_process(
+            command,
+            log=log,
+            cores=own_cores(),
+            environment=environment,
+            limit_s=LIMIT_S,
+            cwd=self.tree,
+        )
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+        failed = [line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR")) and " " in line]
+        return 99 if process.timed_out else process.code, process.wall_s, failed[0] if failed else ""
+
+
+def _module(file: str) -> str:
+    return ".".join(Path(file).with_suffix("").parts).removesuffix(".__init__")
+
+
+def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterator[Verdict]:
+    """The verdict on each fault, in order.
+
+    Raises ``ValueError`` where a test fails without any fault.
+    """
+    bench.set_up()
+    if not warm:
+        for files in {tuple(files) for m in mutants for files in bench.judges(m.file)}:
+            code, _, failed = bench.run_tests(files, bench.kernels, "sound")
+            if code not in (0, 5):
+                raise ValueError(f"{failed or 'a test'} fails without any fault")
+    for number, mutant in enumerate(mutants):
+        text = mutant.apply((bench.tree / mutant.file).read_text(encoding="utf-8"))
+        by, seconds = "", 0.0
+        with bench.planted(mutant.file, text, number) as kernels:
+            for files in bench.judges(mutant.file):
+                code, spent, failed = bench.run_tests(files, kernels, f"{number:03d}")
+                seconds += spent
+                if code not in (0, 5):
+                    by = failed or ("its time was up" if code == 99 else f"pytest ended with {code}")
+                    break
+        yield Verdict(mutant, by, seconds)
+
+
+def table(verdicts: Sequence[Verdict]) -> str:
+    """Markdown: the score of each package, then every fault."""
+    lines = ["| package | faults | caught | score |", "| --- | --- | --- | --- |"]
+    for package in PACKAGES:
+        own = [v for v in verdicts if Path(v.mutant.file).parts[1] == package]
+        if own:
+            caught = sum(bool(v.by) for v in own)
+            lines.append(f"| {package} | {len(own)} | {caught} | {100.0 * caught / len(own):.0f} % |")
+    lines += ["", "| file | line | was | became | caught by |", "| --- | --- | --- | --- | --- |"]
+    for v in verdicts:
+        words = [" ".join(text.split()).replace("|", "\\|")[:60] for text in (v.mutant.old, v.mutant.new)]
+        by = v.by.replace("|", "\\|") or "**nobody**"
+        lines.append(f"| {v.mutant.file} | {v.mutant.line} | `{words[0]}` | `{words[1]}` | {by} |")
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """0: enough faults were caught; 1: too few, or a test fails without any."""
+    parser = argparse.ArgumentParser(prog="python -m validation.mutants", description=__doc__)
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/mutants"))
+    parser.add_argument("--packages", nargs="+", choices=PACKAGES, default=PACKAGES)
+    parser.add_argument("--sample", type=int, default=25, help="faults of each package")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--warm", action="store_true", help="the tests have run here without faults before")
+    told = parser.parse_args(arguments)
+    mutants = [m for package in told.packages for m in draw(ROOT, package, told.sample, told.seed)]
+    verdicts: list[Verdict] = []
+    told.out.mkdir(parents=True, exist_ok=True)
+    try:
+        for verdict in judge_all(Bench(told.out.resolve()), mutants, warm=told.warm):
+            verdicts.append(verdict)
+            print(f"{len(verdicts)} of {len(mutants)}: {table([verdict]).splitlines()[-1]}", flush=True)
+            (told.out / "mutants.md").write_text(table(verdicts) + "\n", encoding="utf-8")
+            (told.out / "mutants.json").write_text(json.dumps([asdict(v) for v in verdicts], indent=1))
+    except ValueError as error:
+        print(f"mutants: {error}", file=sys.stderr)
+        return 1
+    score = sum(bool(v.by) for v in verdicts) / max(len(verdicts), 1)
+    print(f"{len(verdicts)} faults, {100.0 * score:.0f} % caught; the table is {told.out / 'mutants.md'}")
+    return int(score < LEAST_SCORE)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
