@@ -287,8 +287,8 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterato
     """
     bench.set_up()
     if not warm:
-        for files in {tuple(files) for m in mutants for files in bench.judges(m.file)}:
-            code, _, failed = bench.run_tests(files, bench.kernels, "sound")
+        for chosen in {tuple(files) for m in mutants for files in bench.judges(m.file)}:
+            code, _, failed = bench.run_tests(chosen, bench.kernels, "sound")
             if code not in (0, 5):
                 raise ValueError(f"{failed or 'a test'} fails without any fault")
     for number, mutant in enumerate(mutants):
