@@ -111,7 +111,15 @@ def test_undistortion_inverts_distortion() -> None:
     xy = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
     np.testing.assert_allclose(distort(xy, np.array([0.15])), distort(xy, 0.15), rtol=1e-15)
     for k1 in (-0.2, 0.0, 0.15, np.array([-0.1, 0.05, -0.02])):
-        np.testing.assert_allclose(undistort(distort(xy, k1), k1), xy, atol=1e-9)
+        np.testing.assert_allclose(undistort(distort(xy, k1), k1), xy, atol=1e-14)
+    each = np.tile([-0.1, 0.05], (100, 1))
+    np.testing.assert_allclose(undistort(distort(xy, each), each), xy, atol=1e-14)
+
+
+def test_what_no_distortion_reaches_stays_where_it_is() -> None:
+    # r - 0.3 r^3 is never above 0.703.
+    far = np.array([[3.0, 0.0], [0.6, 0.6], [0.0, 0.0]])
+    np.testing.assert_array_equal(undistort(far, -0.3), far)
 
 
 def _two_views(sigma_px: float, n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

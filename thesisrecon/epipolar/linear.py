@@ -36,8 +36,8 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
     T2 = normalizing_transform(xy2) if normalized else np.eye(3)
     x1, x2 = homogenize(xy1) @ T1.T, homogenize(xy2) @ T2.T
     A = (x2[:, :, None] * x1[:, None, :]).reshape(len(x1), 9)
-    # Only eight equations need the full basis: with more, U would have N columns.
-    _, s, Vt = np.linalg.svd(A, full_matrices=len(A) < 9)
+    # The triangular factor has the singular values and right vectors of all rows, and nine rows.
+    _, s, Vt = np.linalg.svd(np.linalg.qr(A, mode="r"))
     if not s[7] > UNDETERMINED_REL * s[0] * (1.0 if normalized else 1e-4):
         raise StageFailure(
             "the matches leave the fundamental matrix free",

@@ -12,6 +12,9 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 
 F64 = NDArray[np.float64]
 
+SETTLED = 1e-9
+"""Relative step after which Newton's method has no digit left to find: the next error is its square."""
+
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:
     """P = K [R t]; K, R (..., 3, 3), t (..., 3) -> (..., 3, 4)."""
@@ -133,13 +136,27 @@ def distort(xy_normalized: F64, radial: float | F64) -> F64:
     return np.asarray(xy_normalized * _radial_factor(radial, r2))
 
 
-def undistort(xy_normalized: F64, radial: float | F64, *, iterations: int = 30) -> F64:
-    """Inverse of :func:`distort` by fixed-point iteration; exact to rounding for |k1| r^2 < 0.3."""
-    undistorted = xy_normalized
-    for _ in range(iterations):
-        r2 = np.sum(undistorted**2, axis=-1, keepdims=True)
-        undistorted = xy_normalized / _radial_factor(radial, r2)
-    return undistorted
+def undistort(xy_normalized: F64, radial: float | F64, *, iterations: int = 20) -> F64:
+    """Inverse of :func:`distort`, exact to rounding wherever the distortion grows with the radius.
+
+    Newton's method on r^2 (1 + k1 r^2 + ...)^2 = r_d^2, from r = r_d, for all points until none moves.
+    Points beyond the largest radius that the distortion reaches have no inverse; they stay where they are.
+    """
+    distorted = np.sum(xy_normalized**2, axis=-1, keepdims=True)
+    k = np.atleast_1d(radial)
+    slopes = k * np.arange(1, k.shape[-1] + 1)
+    r2 = distorted
+    with np.errstate(all="ignore"):
+        for _ in range(iterations):
+            factor = _radial_factor(k, r2)
+            slope = factor * (factor + 2.0 * (_radial_factor(slopes, r2) - 1.0))
+            step = (r2 * factor**2 - distorted) / slope
+            r2 = r2 - step
+            if np.all(np.abs(step) <= SETTLED * np.abs(r2)):
+                break
+        factor = _radial_factor(k, r2)
+        reached = np.abs(r2 * factor**2 - distorted) <= 1e-9 * distorted
+    return np.asarray(xy_normalized / np.where(reached & (factor > 0.0), factor, 1.0))
 
 
 def _radial_factor(radial: float | F64, r2: F64) -> F64:

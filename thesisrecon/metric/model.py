@@ -72,7 +72,7 @@ def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     y = (xy[:, 1] - cy) / (aspect * f)
     distorted = np.column_stack([(xy[:, 0] - cx - skew * y) / f, y])
     radial = rows[:, K1:]
-    return undistort(distorted, radial, iterations=10) if radial.any() else distorted
+    return undistort(distorted, radial) if radial.any() else distorted
 
 
 def retriangulate(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
