@@ -21,7 +21,7 @@ from validation.metrics.record import Metric
 from validation.references.libraries import PACKAGES
 
 OWN_PACKAGES = ("thesisrecon", "numpy", "scipy", "numba")
-TIME_UNITS = ("s", "s processor", "us", "ms", "MB")
+TIME_UNITS = ("s", "s processor", "s / s", "us", "ms", "MB")
 """Units of numbers that are never the same twice."""
 
 

@@ -51,7 +51,9 @@ def run_tasks(
     tasks = tasks_of(wishes, stages)
     place_of = {task: n for n, task in enumerate(tasks)}
     ended = take_over(wishes, tasks, stages)
-    waiting = [task for task in tasks if task not in ended]
+    behind = tasks_behind(tasks, stages)
+    # Long chains first, so that nobody waits for one at the end.
+    waiting = sorted((task for task in tasks if task not in ended), key=lambda task: -behind[task])
     running: dict[Future[Outcome], Task] = {}
     cores = own_cores()[: wishes.threads]
     total = len(tasks)
@@ -71,6 +73,26 @@ def run_tasks(
                 tell(f"[{len(ended)}/{total}] {_words(task, ended[task])}")
     judged = [task for task in ended if task.method == JUDGE]
     return {(t.stage, t.scene): (_judgement(ended[t]), _outcomes(t, ended)) for t in judged}
+
+
+def tasks_behind(tasks: list[Task], stages: Mapping[str, Stage]) -> dict[Task, int]:
+    """How many tasks start, directly or through others, from the results of each."""
+    followers: dict[Task, set[Task]] = {task: set() for task in tasks}
+    for task in tasks:
+        before = [Task(s, task.scene, method) for s, method in stages[task.stage].needs(task.method)]
+        if task.method == JUDGE:
+            before += [t for t in tasks if (t.stage, t.scene) == (task.stage, task.scene) and t != task]
+        for other in before:
+            if other in followers:
+                followers[other].add(task)
+
+    def reached(task: Task, seen: set[Task]) -> set[Task]:
+        for follower in followers[task] - seen:
+            seen.add(follower)
+            reached(follower, seen)
+        return seen
+
+    return {task: len(reached(task, set())) for task in tasks}
 
 
 class _Templates:

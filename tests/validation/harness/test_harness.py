@@ -14,9 +14,11 @@ from tests.validation.harness.toy_stages import STAGES, WAYS
 from validation.__main__ import main
 from validation.harness.gates import Gate, read_gates
 from validation.harness.page import write_pages
-from validation.harness.records import Judgement, Outcome, Wishes, slug
+from validation.harness.records import Judgement, Outcome, Task, Wishes, slug
 from validation.harness.results import Results, collect, compare, read_results, write_results
-from validation.harness.schedule import run_tasks
+from validation.harness.scenes import QUICK
+from validation.harness.schedule import run_tasks, tasks_behind, tasks_of
+from validation.harness.stages import STAGES as REPORTED
 
 LIMIT_S = 8.0
 GATES = {
@@ -79,6 +81,24 @@ def test_gates_judge_numbers_and_a_number_nobody_told_breaks_its_gate(
     assert set(results.failures) == {f"toy/yard/{n}" for n in ("missing", "failing", "crashing", "hanging")}
     strict = {row.key: dataclasses.replace(GATES[row.key], limit=0.4)}
     assert collect(wishes, judged, strict).broken[0].key == row.key
+
+
+def test_tasks_that_many_wait_for_come_first() -> None:
+    tasks = tasks_of(toy_wishes(Path("nowhere"), quick=False), STAGES)
+    behind = tasks_behind(tasks, STAGES)
+    assert [behind[Task("toy", "yard", method)] for method in ("good", "after", "ours", "")] == [2, 1, 1, 0]
+
+
+@pytest.mark.parametrize("name", REPORTED)
+def test_a_quick_report_leaves_out_nothing_that_a_gate_asks_for(name: str, tmp_path: Path) -> None:
+    quick = Wishes(tmp_path, ("courtyard",), (name,), quick=True)
+    asked = dataclasses.replace(quick, gates_only=True)
+    stage = REPORTED[name]
+    scenes = [s for s in QUICK if stage.takes(s, quick)]
+    for scene in scenes:
+        keys = [key for key in read_gates() if key.startswith(f"{name}/{scene}/")]
+        if keys:
+            assert set(stage.methods(scene, asked)) <= set(stage.methods(scene, quick)), keys
 
 
 @pytest.mark.parametrize(

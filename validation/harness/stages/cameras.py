@@ -61,8 +61,10 @@ class CamerasStage:
 
     def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
         if wishes.gates_only:
-            return (OURS, PER_IMAGE, THESIS) if scene == FIXTURE else (OURS, PER_IMAGE)
-        return (OURS, MATCHES, COLMAP) if wishes.quick else (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
+            return (OURS, THESIS) if scene == FIXTURE else (OURS, PER_IMAGE)
+        return (
+            (OURS, MATCHES, COLMAP, THESIS) if wishes.quick else (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
+        )
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         if method == PER_IMAGE:

@@ -107,7 +107,7 @@ class DisparityStage:
             Metric(
                 scene,
                 "time over SGBM HH",
-                "",
+                "s / s",
                 {OURS: _ratio(spent[OURS], spent[HH])},
                 OURS,
                 definition="processor time, a ratio of two runs on the same machine",
