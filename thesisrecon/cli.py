@@ -6,9 +6,11 @@ thread gives the same bytes however many workers there are, and the workers are 
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from enum import StrEnum
@@ -20,6 +22,7 @@ import typer
 from thesisrecon import __version__
 from thesisrecon.console import summary_text
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io.text import printable, shortened
 from thesisrecon.workers import available_threads
 
 if TYPE_CHECKING:
@@ -32,6 +35,7 @@ DEBUG_VARIABLE = "THESISRECON_DEBUG"
 DEMO_SCENE = Path("fixtures") / "courtyard"
 DEMO_SETTINGS: dict[str, Any] = {"dense": {"max_side": 512, "match_side": 512}}
 """Whoever tries it wants to see a model soon."""
+MOST_THREADS = 1024
 STAGE_WORDS = {
     "features": "corners",
     "pairs": "choice of pairs",
@@ -90,7 +94,9 @@ class Lamp(StrEnum):
     sun = "sun"
 
 
-Threads = Annotated[int, typer.Option("--threads", min=0, help="Workers; 0 = one per processor.")]
+Threads = Annotated[
+    int, typer.Option("--threads", min=0, max=MOST_THREADS, help="Workers; 0 = one per processor.")
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Take over an output folder that holds another run.")
 ]
@@ -199,9 +205,10 @@ def inspect(
     if not isinstance(summary, dict):
         raise UsageError(f"{out} holds no summary of a run (summary.json); has a run ended there?")
     try:
-        typer.echo(summary_text(summary, out))
-    except (KeyError, TypeError, AttributeError):
+        text = summary_text(summary, out)
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError, RecursionError):
         raise UsageError(f"{out / 'summary.json'} is not a summary of this program") from None
+    typer.echo(text)
 
 
 @app.command()
@@ -265,7 +272,7 @@ def views(
         _refuse(of_run, "a run, not between photographs")
         _views_between(what, method or Method.interpolation, frames, (seed or 0, max_size), folder, threads)
         return
-    if not what[0].is_dir() and what[0].is_file():
+    if what[0].is_file():
         raise UsageError(f"views takes the folder of a run, or 2 or 3 photographs; got one file, {what[0]}")
     _refuse(between, "views between photographs, not of a run")
     from thesisrecon.view_command import ViewWishes, color_from_text, size_from_text, write_views
@@ -313,14 +320,14 @@ def _views_between(
             progress=progress,
         )
     _say_views(written)
-    typer.echo(f"the page of them is {written.folder / STRIP}")
+    typer.echo(f"the page of them is {printable(str(written.folder / STRIP))}")
 
 
 def _say_views(written: ViewFiles) -> None:
     width, height = written.size
     typer.echo(
         f"{len(written.frames)} pictures of {width} x {height} px and {written.animation.name} are in "
-        f"{written.folder}"
+        f"{printable(str(written.folder))}"
     )
 
 
@@ -439,7 +446,10 @@ def _progress_bars() -> Iterator[Any]:
 def run_command(arguments: list[str]) -> int:
     """Run one command line; errors become one sentence on stderr and an exit code."""
     try:
-        code = app(arguments, standalone_mode=False)
+        with warnings.catch_warnings():
+            # What Pillow thinks of a file is said by us, in one sentence, or is not worth saying.
+            warnings.filterwarnings("ignore", module=r"PIL\.")
+            code = app(arguments, standalone_mode=False)
         return code if isinstance(code, int) else DONE
     except UsageError as error:
         return _say(str(error), USAGE)
@@ -449,6 +459,9 @@ def run_command(arguments: list[str]) -> int:
         return _say(str(stop) or "interrupted", INTERRUPTED)
     except MemoryError:
         return _say("out of memory; try a smaller --max-size or fewer --threads", IMPOSSIBLE)
+    except OSError as error:
+        place = f"{shortened(str(error.filename))}: " if error.filename is not None else ""
+        return _say(f"{place}{error.strerror or error}", USAGE)
     except Exception as error:
         # The parser's own errors carry their sentence; its classes differ between its versions.
         if hasattr(error, "format_message"):
@@ -462,10 +475,14 @@ def run_command(arguments: list[str]) -> int:
 
 
 def _say(sentence: str, code: int) -> int:
-    typer.echo(f"thesisrecon: {' '.join(sentence.split())}", err=True)
+    typer.echo(f"thesisrecon: {printable(' '.join(sentence.split()))}", err=True)
     return code
 
 
 def main() -> None:
     """The entry point of the command."""
+    for stream in (sys.stdout, sys.stderr):
+        # A name that a terminal has no letters for is told all the same.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     sys.exit(run_command(sys.argv[1:]))

@@ -47,6 +47,7 @@ from thesisrecon.selfcalibration import (
 from thesisrecon.settings import (
     Table,
     dataclass_from_table,
+    in_words,
     parse_word,
     table_from_dataclass,
     toml_from_tables,
@@ -75,6 +76,9 @@ from thesisrecon.types import (
 
 PRECISE_SIGMAS = 2.5
 """Matches in the tail of the noise are right, but tracks are made of precise ones."""
+
+DEEPEST = 16
+"""Names of a setting, from its stage to its field."""
 
 EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
 
@@ -312,9 +316,9 @@ PRESETS: Mapping[str, PipelineConfig] = {
 }
 
 
-def preset(name: str) -> PipelineConfig:
+def preset(name: Any) -> PipelineConfig:
     """The configuration of that name; :class:`UsageError` names the known ones."""
-    if name not in PRESETS:
+    if not isinstance(name, str) or name not in PRESETS:
         raise UsageError(unknown_word("preset", name, PRESETS))
     return PRESETS[name]
 
@@ -357,11 +361,13 @@ def config_from_toml(
     """
     try:
         tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise UsageError(f"the configuration is not TOML: {error}") from None
+    except RecursionError:
+        raise UsageError("the configuration is no table of settings: its lists are too deep") from None
     name = tables.pop("preset", None)
     if name is not None and not fixed_preset:
-        base = preset(str(name))
+        base = preset(name)
     base = base or PipelineConfig()
     merged: dict[str, Any] = {}
     for change in (tables, *changes):
@@ -402,7 +408,7 @@ def config_from_tables(tables: Mapping[str, Any], base: PipelineConfig | None = 
         if stage not in stages:
             raise UsageError(unknown_word("stage", stage, ["preset", *stages]))
         if not isinstance(table, Mapping):
-            raise UsageError(f"{stage} takes a table of settings; got {table!r}")
+            raise UsageError(f"{stage} takes a table of settings; got {in_words(table)}")
         config = dataclasses.replace(
             config, **{stage: _stage_from_table(stage, table, getattr(config, stage))}
         )
@@ -414,8 +420,8 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
         return dataclass_from_table(type(current), table, stage, current)
     fields = {key: value for key, value in table.items() if key != "kind"}
     kind = table.get("kind", kind_of(stage, current))
-    if kind not in KINDS[stage] and type(current).__name__ != kind:
-        raise UsageError(unknown_word(f"kind of {stage}", str(kind), KINDS[stage]))
+    if not isinstance(kind, str) or (kind not in KINDS[stage] and type(current).__name__ != kind):
+        raise UsageError(unknown_word(f"kind of {stage}", kind, KINDS[stage]))
     variant = KINDS[stage].get(kind, type(current))
     names = [item.name for item in dataclasses.fields(variant)]
     for key in fields:
@@ -432,9 +438,9 @@ def tables_from_settings(settings: Sequence[str]) -> dict[str, Any]:
     for setting in settings:
         place, equals, text = setting.partition("=")
         path = place.strip().split(".")
-        if not equals or len(path) < 2 or not all(path):
+        if not equals or not 2 <= len(path) <= DEEPEST or not all(path):
             raise UsageError(
-                f"--set takes stage.field=value, as in features.kind=harris-corners; got {setting!r}"
+                f"--set takes stage.field=value, as in features.kind=harris-corners; got {in_words(setting)}"
             )
         value = parse_word(text)
         for key in reversed(path):

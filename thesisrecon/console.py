@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from thesisrecon.io.text import printable
+
 
 def summary_text(summary: Mapping[str, Any], out: Path) -> str:
     """What the command says of a run whose folder is ``out``, a fact a line.
@@ -26,7 +28,7 @@ def summary_text(summary: Mapping[str, Any], out: Path) -> str:
     if summary["failure"]:
         lines.append(f"failed: {summary['failure']}")
     lines.append(f"{time_taken(summary)}; the page is {out / 'report.html'}")
-    return "\n".join(lines)
+    return "\n".join(printable(line) for line in lines)
 
 
 def time_taken(summary: Mapping[str, Any]) -> str:

@@ -21,6 +21,8 @@ T = TypeVar("T")
 Table = dict[str, Any]
 NONE = "none"
 KIND = "kind"
+LONGEST_WORDS = 120
+"""Characters of a value that a sentence repeats."""
 GIVEN = {"given": True}
 """Metadata of a field that the composer fills with data: it is no setting."""
 
@@ -96,16 +98,29 @@ def coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
     if origin is Literal:
         if value in arguments and isinstance(value, str):
             return value
-        raise UsageError(unknown_word(f"value of {where}", str(value), [str(a) for a in arguments]))
+        raise UsageError(unknown_word(f"value of {where}", value, [str(a) for a in arguments]))
     if origin is tuple and isinstance(value, list | tuple):
         return _coerce_tuple(value, arguments, where)
     if dataclasses.is_dataclass(annotation) and isinstance(annotation, type) and isinstance(value, Mapping):
         return dataclass_from_table(annotation, value, where, current)
-    if annotation is float and type(value) in (int, float) and not math.isnan(value):
+    if annotation is float and _is_number(value):
         return float(value)
-    if annotation in (int, str, bool) and type(value) is annotation:
+    if annotation in (str, bool) and type(value) is annotation:
         return value
-    raise UsageError(f"{where} takes {_type_words(annotation)}; got {value!r}")
+    if annotation is int and type(value) is int and _fits(value):
+        return value
+    raise UsageError(f"{where} takes {_type_words(annotation)}; got {in_words(value)}")
+
+
+def _fits(number: int) -> bool:
+    """Whether arrays can hold it."""
+    return abs(number) < 2**63
+
+
+def _is_number(value: Any) -> bool:
+    if type(value) is int:
+        return _fits(value)
+    return type(value) is float and not math.isnan(value)
 
 
 def _coerce_optional(value: Any, arguments: tuple[Any, ...], where: str, current: Any) -> Any:
@@ -121,10 +136,11 @@ def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str
     """One of several dataclasses: its word alone, or a table whose ``kind`` is the word (else as before)."""
     table = {KIND: value} if isinstance(value, str) else value
     if not isinstance(table, Mapping):
-        raise UsageError(f"{where} takes one of {', '.join(several)} or a table of settings; got {value!r}")
+        one_of = f"one of {', '.join(several)} or a table of settings"
+        raise UsageError(f"{where} takes {one_of}; got {in_words(value)}")
     kind = table.get(KIND, word_of(type(current)))
-    if kind not in several:
-        raise UsageError(unknown_word(f"kind of {where}", str(kind), several))
+    if not isinstance(kind, str) or kind not in several:
+        raise UsageError(unknown_word(f"kind of {where}", kind, several))
     fields = {key: v for key, v in table.items() if key != KIND}
     base = current if type(current) is several[kind] else None
     return dataclass_from_table(several[kind], fields, where, base)
@@ -147,29 +163,44 @@ def _type_words(annotation: Any) -> str:
     return "a list" if typing.get_origin(annotation) is tuple else "a table of settings"
 
 
+def in_words(value: Any) -> str:
+    """A value as it was written, or how it begins where that is long."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        # Python prints no number of thousands of digits and no endless nest of tables.
+        text = f"{type(value).__name__} beyond measure"
+    return text if len(text) <= LONGEST_WORDS else text[: LONGEST_WORDS - 3] + "..."
+
+
 def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
     """The refusal of a key that the table at ``where`` does not have; it names the nearest of ``names``."""
     near = difflib.get_close_matches(key, names := list(names), n=3, cutoff=0.6)
     known = " or ".join(f"{where}.{name}" for name in near)
     hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names)}"
-    return UsageError(f"unknown setting '{where}.{key}'; {hint}")
+    return UsageError(f"unknown setting {in_words(f'{where}.{key}')}; {hint}")
 
 
-def unknown_word(what: str, word: str, known: Iterable[str]) -> str:
+def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
     """'unknown <what> <word>; did you mean ...?': the nearest known words, or all where none is near."""
     known = list(known)
-    near = difflib.get_close_matches(word, known, n=3, cutoff=0.6)
+    near = difflib.get_close_matches(word, known, n=3, cutoff=0.6) if isinstance(word, str) else []
     hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known)}"
-    return f"unknown {what} {word!r}; {hint}"
+    return f"unknown {what} {in_words(word)}; {hint}"
 
 
 def parse_word(text: str) -> Any:
     """The value of ``--set key=value``: true, false, a number, a list ``[a, b]``, else the text itself."""
     text = text.strip()
+    if text.startswith("[") and text.endswith("]"):
+        # Lists of lists are no settings.
+        return [_parse_plain(part.strip()) for part in text[1:-1].split(",") if part.strip()]
+    return _parse_plain(text)
+
+
+def _parse_plain(text: str) -> Any:
     if text in ("true", "false"):
         return text == "true"
-    if text.startswith("[") and text.endswith("]"):
-        return [parse_word(part) for part in text[1:-1].split(",") if part.strip()]
     for number in (int, float):
         try:
             return number(text)

@@ -22,7 +22,7 @@ from thesisrecon.io.frames import animation_suffix, frame_name, write_animation,
 from thesisrecon.io.meshes import read_mesh
 from thesisrecon.io.run_directory import read_json, write_atomically, write_json
 from thesisrecon.report.strip import strip_page
-from thesisrecon.settings import unknown_word
+from thesisrecon.settings import in_words, unknown_word
 from thesisrecon.types import F64, TexturedMesh
 from thesisrecon.views import Light, Shading, interpolate, orbit, render, surface_points, upward
 from thesisrecon.workers import Workers
@@ -37,10 +37,19 @@ METHODS = {
 FRAMES_BETWEEN, BETWEEN_MS = 21, 100
 """Pictures where their number is not asked for, and how long each is shown."""
 LARGEST_PX = 8192
+MOST_FRAMES = 9999
+"""As many as the numbers of their files have room for."""
 LONG_SIDE_PX = 1000
 """Of the pictures where no size is asked for."""
 
 Progress = Callable[[str, int, int], None]
+
+
+def _check_frames(frames: int) -> None:
+    if frames < 1:
+        raise UsageError(f"--frames takes a whole number of at least 1; got {frames}")
+    if frames > MOST_FRAMES:
+        raise UsageError(f"--frames takes at most {MOST_FRAMES}; got {in_words(frames)}")
 
 
 @dataclass(frozen=True)
@@ -65,8 +74,7 @@ class ViewWishes:
         for kind, word, words in (("path", self.path, PATHS), ("light", self.light, LIGHTS)):
             if word not in words:
                 raise UsageError(unknown_word(kind, word, list(words)))
-        if self.frames < 1:
-            raise UsageError(f"--frames takes a whole number of at least 1; got {self.frames}")
+        _check_frames(self.frames)
         if self.size is not None and not all(1 <= side <= LARGEST_PX for side in self.size):
             width, height = self.size
             raise UsageError(f"--size takes sides of 1 to {LARGEST_PX} pixels; got {width}x{height}")
@@ -148,15 +156,14 @@ class BetweenWishes:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise UsageError(unknown_word("method", self.method, list(METHODS)))
-        if self.frames < 1:
-            raise UsageError(f"--frames takes a whole number of at least 1; got {self.frames}")
+        _check_frames(self.frames)
         if len(self.photographs) not in (2, 3):
             raise UsageError(f"views lie between 2 or 3 photographs; got {len(self.photographs)}")
         for path in self.photographs:
             if path.is_dir():
                 raise UsageError(f"{path} is a folder; views lie between photographs")
         for first, second in combinations(self.photographs, 2):
-            if first.resolve() == second.resolve():
+            if first.is_file() and second.is_file() and first.samefile(second):
                 raise UsageError(f"{first} is given twice; give different photographs")
 
 

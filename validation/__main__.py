@@ -7,6 +7,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from thesisrecon.errors import StageFailure
 from validation.ablation import command as ablation
 from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
@@ -14,6 +15,7 @@ from validation.harness.page import write_pages
 from validation.harness.process import own_cores
 from validation.harness.records import Wishes
 from validation.harness.results import Results, collect, compare, read_results, write_results
+from validation.harness.scenes import load_photographs
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
 
@@ -31,7 +33,9 @@ def main(arguments: list[str] | None = None) -> int:
         wishes = _wishes(told)
         other = read_results(told.against) if getattr(told, "against", None) else None
         gates = read_gates()
-    except ValueError as error:
+        for name in wishes.folders:
+            load_photographs(name, wishes)
+    except (ValueError, StageFailure) as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2
     for words in ask_canaries(wishes).values():

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from thesisrecon.errors import UsageError
+from thesisrecon.io.records import bytes_from_record
 from thesisrecon.io.run_directory import (
     RunDirectory,
     StageFolder,
-    bytes_from_record,
     code_key,
     key_of,
     read_json,

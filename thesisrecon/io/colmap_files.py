@@ -14,6 +14,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.io import colmap_binary, colmap_text
 from thesisrecon.io.colmap_model import ColmapModel, inconsistency
 from thesisrecon.io.colmap_records import broken_file
+from thesisrecon.io.run_directory import write_atomically
 
 _NEEDED = ("cameras", "images", "points3D")
 
@@ -23,7 +24,7 @@ def write_colmap_model(path: Path, model: ColmapModel, *, binary: bool = True) -
 
     Each file appears whole or not at all. The same model always gives the same bytes. Raises ``ValueError``
     for a model that breaks a rule of :func:`~thesisrecon.io.colmap_model.inconsistency`, and in text for
-    names with blanks, which COLMAP's text reader cuts off.
+    names with blanks, which COLMAP's text reader cuts off; :class:`UsageError` where it cannot be written.
     """
     problem = inconsistency(model)
     if problem:
@@ -32,13 +33,9 @@ def write_colmap_model(path: Path, model: ColmapModel, *, binary: bool = True) -
         len(image.name.split()) > 1 or image.name != image.name.strip() for image in model.images
     ):
         raise ValueError("a name with blanks cannot be written as COLMAP text; write binary")
-    path.mkdir(parents=True, exist_ok=True)
     encoders = colmap_binary.ENCODERS if binary else colmap_text.ENCODERS
     for name, encode in encoders.items():
-        target = path / f"{name}{'.bin' if binary else '.txt'}"
-        partial = target.with_name(target.name + ".partial")
-        partial.write_bytes(encode(model))
-        partial.replace(target)
+        write_atomically(path / f"{name}{'.bin' if binary else '.txt'}", encode(model))
 
 
 def read_colmap_model(path: Path) -> ColmapModel:
@@ -76,3 +73,5 @@ def _content(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise broken_file(path, error.strerror or "it cannot be read") from error
+    except MemoryError:
+        raise broken_file(path, "it does not fit in memory") from None

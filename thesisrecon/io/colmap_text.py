@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.io.colmap_model import ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
 from thesisrecon.io.colmap_records import TRACK_ENTRY, broken_file, points_of_records
+from thesisrecon.io.text import shortened
 
 
 def _numbers(values: NDArray[np.float64] | tuple[float, ...]) -> str:
@@ -148,4 +149,4 @@ def read_points(data: bytes, path: Path) -> ColmapPoints:
 
 
 def _short(line: str) -> str:
-    return repr(line if len(line) <= 60 else line[:57] + "...")
+    return repr(shortened(line))

@@ -9,9 +9,10 @@ from __future__ import annotations
 import hashlib
 import math
 import stat
-import unicodedata
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,6 +22,7 @@ import PIL.ImageOps
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io.text import NO_FILE, printable
 from thesisrecon.types import F64, Image
 
 U8 = NDArray[np.uint8]
@@ -33,12 +35,18 @@ SUFFIXES = (
     *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2"),
 )
 COMMON_NAMES = ("images", "photographs", "photos", "pictures", "dcim")
+LARGEST_FILE = 2**31
+"""Bytes; the largest sensors without any compression stay below half of it."""
 MIN_SIDE = 64
+STRIPE = 256
+"""Rows that are counted in double precision at a time."""
 BLANK_RANGE = 8
-_CONTROLS = ("Cc", "Zl", "Zp")
-"""Unicode's categories of control characters and of what ends lines and paragraphs."""
+READ = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "GIF", "JPEG2000", "AVIF", "HEIF", "PPM")
+"""What Pillow may take a file for, whatever it is called: some of its other readers start programs."""
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _WIDTH_35MM = 36.0
+_FOCALS_35MM = (1.0, 1e5)
+"""mm; what a header says beyond is a mistake."""
 
 
 class _Refused(Exception):
@@ -157,15 +165,17 @@ def read_photographs(
 
 def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
     if isinstance(source, str | Path):
-        return [(printable(path.name), path) for path in list_images(Path(source))]
+        paths = list_images(Path(source))
+        return sorted(zip(_names(path.name for path in paths), paths, strict=True), key=lambda pair: pair[0])
     paths = [Path(item) for item in source if isinstance(item, str | Path)]
     # Files of one name from several folders are told apart by their whole path.
     full = len({path.name for path in paths}) < len(paths)
+    names = iter(_names(str(path) if full else path.name for path in paths))
     width = len(str(len(source)))
     items: list[tuple[str, Any]] = []
     for n, item in enumerate(source):
         if isinstance(item, str | Path):
-            items.append((printable(str(item) if full else Path(item).name), Path(item)))
+            items.append((next(names), Path(item)))
         elif isinstance(item, Image):
             items.append((item.name, item))
         else:
@@ -173,12 +183,13 @@ def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
     return sorted(items, key=lambda pair: pair[0])
 
 
-def printable(name: str) -> str:
-    """A file name as text that can be written anywhere, in one line: bytes that are no UTF-8 become the
-    replacement mark, line ends and other control characters their codes.
-    """
-    text = name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
-    return "".join(f"\\x{ord(c):02x}" if unicodedata.category(c) in _CONTROLS else c for c in text)
+def _names(names: Iterable[str]) -> list[str]:
+    """What the files are called in print: those that would look alike there are numbered."""
+    taken: dict[str, None] = {}
+    for name in map(printable, names):
+        alike = (f"{name} ({n})" for n in count(2))
+        taken[next(one for one in chain([name], alike) if one not in taken)] = None
+    return list(taken)
 
 
 def _read(name: str, item: Any, max_size_px: int) -> Photograph:
@@ -218,7 +229,8 @@ def _decode(name: str, path: Path, max_size_px: int) -> tuple[U8, Photograph]:
     """Pixels at working size, and the record that waits for them."""
     _require_file(path)
     try:
-        with PIL.Image.open(path) as file:
+        # Opened here, since Pillow does not close what it cannot read.
+        with path.open("rb") as stream, PIL.Image.open(stream, formats=_formats()) as file:
             note = "only its first frame is used" if getattr(file, "n_frames", 1) > 1 else ""
             focal_35mm, upright = _exif(file)
             file.load()
@@ -236,7 +248,8 @@ def _decode(name: str, path: Path, max_size_px: int) -> tuple[U8, Photograph]:
         raise _Refused(
             f"cannot be decoded: {printable(getattr(error, 'strerror', None) or str(error))}"
         ) from None
-    focal = focal_35mm / _WIDTH_35MM * max(picture.size) if focal_35mm > 0 else math.nan
+    said = _FOCALS_35MM[0] <= focal_35mm <= _FOCALS_35MM[1]
+    focal = focal_35mm / _WIDTH_35MM * max(picture.size) if said else math.nan
     record = Photograph(Image(name, np.zeros((0, 0, 3), np.uint8), picture.size), "", focal, note)
     return _reduced(picture, max_size_px), record
 
@@ -244,11 +257,20 @@ def _decode(name: str, path: Path, max_size_px: int) -> tuple[U8, Photograph]:
 def _require_file(path: Path) -> None:
     """Refuse what is no regular file: reading a pipe waits for ever, a device never ends."""
     try:
-        regular = stat.S_ISREG(path.stat().st_mode)
+        found = path.stat()
     except OSError as error:
         raise _Refused(f"cannot be read: {error.strerror}") from None
-    if not regular:
-        raise _Refused("is a pipe, a device or a socket, not a file")
+    if not stat.S_ISREG(found.st_mode):
+        raise _Refused(f"is {NO_FILE}, not a file")
+    if found.st_size > LARGEST_FILE:
+        raise _Refused(f"is a file of {found.st_size / 2**30:.1f} GiB, which no photograph is")
+
+
+@cache
+def _formats() -> tuple[str, ...]:
+    """Those of ``READ`` that this Pillow knows."""
+    PIL.Image.init()
+    return tuple(name for name in READ if name in PIL.Image.OPEN)
 
 
 def _exif(file: PIL.Image.Image) -> tuple[float, Callable[[PIL.Image.Image], PIL.Image.Image]]:
@@ -281,15 +303,25 @@ def _eight_bit(file: PIL.Image.Image) -> U8:
     """Grey of more than 8 bits as 8-bit RGB: whole numbers by their bit depth, real numbers by their
     range.
     """
-    values = np.asarray(file).astype(np.float64)
-    values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
-    if file.mode == "F":
-        low, high = values.min(), values.max()
-    else:
+    values = np.asarray(file)
+    lows, highs = zip(*((part.min(), part.max()) for _, part in _stripes(values)), strict=True)
+    low, high = min(lows), max(highs)
+    if file.mode != "F":
         # A 12-bit sensor in a 16-bit file must not come out nearly black.
-        low, high = 0.0, 2.0 ** max(8, int(values.max()).bit_length()) - 1
-    grey = (values - low) * (255.0 / max(high - low, 1e-12))
-    return np.repeat(np.rint(np.clip(grey, 0, 255)).astype(np.uint8)[..., None], 3, axis=2)
+        low, high = 0.0, 2.0 ** max(8, int(high).bit_length()) - 1
+    rgb = np.empty((*values.shape, 3), dtype=np.uint8)
+    for rows, part in _stripes(values):
+        grey = (part - low) * (255.0 / max(high - low, 1e-12))
+        rgb[rows] = np.rint(np.clip(grey, 0, 255))[..., None]
+    return rgb
+
+
+def _stripes(values: NDArray[Any]) -> Iterator[tuple[slice, F64]]:
+    """Some rows after others as finite real numbers: all at once take eight times the room of their grey."""
+    for start in range(0, len(values), STRIPE):
+        rows = slice(start, start + STRIPE)
+        part = values[rows].astype(np.float64)
+        yield rows, np.nan_to_num(part, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _rgb(file: PIL.Image.Image) -> PIL.Image.Image:

@@ -15,13 +15,17 @@ from trimesh.visual import material as materials
 from trimesh.visual import texture as textures
 
 from thesisrecon.errors import UsageError
+from thesisrecon.io.glb import require_plain_glb
 from thesisrecon.io.run_directory import write_atomically
+from thesisrecon.io.text import read_bytes
 from thesisrecon.types import F64, I64, TexturedMesh
 
 JPEG_QUALITY = 92
 """Of the texture inside a GLB: a quarter of the size of PNG, and no difference that one sees."""
 
 FORMATS = ("glb", "obj", "ply")
+LARGEST_MESH = 2**31
+"""Bytes of a file that is read: many times what a run writes."""
 
 TURN = np.array([1.0, -1.0, -1.0])
 """Half a turn about x, between the axes of cameras and those of glTF; its own inverse."""
@@ -47,39 +51,45 @@ def read_mesh(path: Path) -> TexturedMesh:
     Vertices that differ in their place in the texture alone are one again, in their old order, without those
     that no face names; coordinates have the precision of float32, and the texture went through JPEG. Which
     faces no view had seen is not kept. Raises ``ValueError`` for other endings, :class:`UsageError` where the
-    file is absent, damaged, or holds no mesh.
+    file is absent, damaged, names other files, or holds no mesh; memory stays within a multiple of its size
+    and that of its texture.
     """
     if path.suffix.lower() != ".glb":
         raise ValueError(f"a mesh is read from .glb; got {path.name}")
-    loaded = _loaded(path)
+    if not path.is_file():
+        raise UsageError(f"there is no mesh {path}")
+    try:
+        content = read_bytes(path, largest=LARGEST_MESH)
+        require_plain_glb(content)
+        return _turned_back(trimesh.load(io.BytesIO(content), file_type="glb", process=False, force="mesh"))
+    except OSError as error:
+        raise UsageError(f"the mesh {path} cannot be read: {error.strerror or error}") from None
+    except Exception as error:
+        # What a damaged file makes the parser raise is of any kind.
+        raise UsageError(f"the mesh {path} cannot be read: {error}") from None
+
+
+def _turned_back(loaded: Any) -> TexturedMesh:
+    """The mesh of trimesh's record; ``ValueError`` where that is not sound."""
     vertices = np.asarray(loaded.vertices, dtype=np.float64) * TURN
     faces = np.asarray(loaded.faces, dtype=np.int64)
+    if len(faces) == 0 or not np.isfinite(vertices).all():
+        raise ValueError("it holds no surface")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError("its faces name vertices that it does not have")
     uv = getattr(loaded.visual, "uv", None)
     image = getattr(getattr(loaded.visual, "material", None), "baseColorTexture", None)
     if uv is not None and image is not None:
         texture = np.asarray(image.convert("RGB"))
         corners = _texels(np.asarray(uv, dtype=np.float64), texture)[faces]
+        if not np.isfinite(corners).all():
+            raise ValueError("its places in the texture are not finite")
         vertices, faces = _merged(vertices, faces)
         return TexturedMesh(vertices, faces, uv=corners, texture=texture)
     colors = None
     if loaded.visual.kind == "vertex":
         colors = np.array(loaded.visual.vertex_colors[:, :3], dtype=np.uint8)
     return TexturedMesh(vertices, faces, colors=colors)
-
-
-def _loaded(path: Path) -> Any:
-    """trimesh's own record of the file."""
-    if not path.is_file():
-        raise UsageError(f"there is no mesh {path}")
-    try:
-        loaded: Any = trimesh.load(path, process=False, force="mesh")
-        whole = len(loaded.faces) > 0 and np.isfinite(loaded.vertices).all()
-    except Exception as error:
-        # What a damaged file makes the parser raise is of any kind.
-        raise UsageError(f"the mesh {path} cannot be read: {error}") from None
-    if not whole:
-        raise UsageError(f"the mesh {path} holds no surface")
-    return loaded
 
 
 def _merged(vertices: F64, faces: I64) -> tuple[F64, I64]:

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.io.run_directory import write_atomically
+
 F64 = NDArray[np.float64]
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
@@ -16,7 +18,8 @@ def write_point_cloud(path: Path, xyz: F64, rgb: NDArray[np.uint8]) -> None:
     """Write points ``xyz`` (N, 3) with colours ``rgb`` (N, 3) uint8 as binary little-endian PLY.
 
     Coordinates are stored as float32, about their own origin, as viewers expect. The file appears whole or
-    not at all. Raises ``ValueError`` for other shapes and for coordinates that are not finite in float32.
+    not at all. Raises ``ValueError`` for other shapes and for coordinates that are not finite in float32,
+    :class:`UsageError` where it cannot be written.
     """
     if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape or rgb.dtype != np.uint8:
         raise ValueError(
@@ -35,7 +38,4 @@ def write_point_cloud(path: Path, xyz: F64, rgb: NDArray[np.uint8]) -> None:
         *properties,
         "end_header",
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes("".join(f"{line}\n" for line in header).encode("ascii") + vertices.tobytes())
-    partial.replace(path)
+    write_atomically(path, "".join(f"{line}\n" for line in header).encode("ascii") + vertices.tobytes())

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 import json
 import os
 import shutil
 import sys
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -24,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon import types as records
 from thesisrecon.errors import UsageError
+from thesisrecon.io.records import bytes_from_record, read_record
+from thesisrecon.io.text import read_bytes
 from thesisrecon.types import StageReport
 
 try:
@@ -35,7 +34,6 @@ except ImportError:  # pragma: no cover - only where there is no POSIX
 
 FORMAT = 1
 RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
-_DESCRIPTION = "description"
 _CODE_OF_ALL_STAGES = ("types", "geometry", "robust", "optimize")
 
 
@@ -84,7 +82,9 @@ def write_atomically(path: Path, content: bytes) -> None:
     partial = path.with_name(f".{path.name}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
+        # What stands there may be a link to something else, which must not be written over.
+        partial.unlink(missing_ok=True)
+        with partial.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -118,69 +118,10 @@ def _finite(value: Any) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file, None where it is absent or damaged."""
+    """The content of a JSON file, None where it is absent, damaged, no regular file or too large."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-
-
-def bytes_from_record(record: Any, key: str) -> bytes:
-    """A record of :mod:`thesisrecon.types` as the bytes of an npz file; equal records give equal bytes."""
-
-    arrays: dict[str, np.ndarray[Any, Any]] = {}
-    description = json.dumps({"key": key, "record": _describe(record, arrays)}, sort_keys=True)
-    stream = io.BytesIO()
-    named: dict[str, Any] = {_DESCRIPTION: np.frombuffer(description.encode(), dtype=np.uint8), **arrays}
-    np.savez(stream, **named)
-    return stream.getvalue()
-
-
-def _describe(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
-    """``value`` as JSON in which an array is ``{"array": name}``; the arrays themselves go to ``arrays``."""
-    if isinstance(value, np.ndarray):
-        arrays[f"array{len(arrays)}"] = value
-        return {"array": f"array{len(arrays) - 1}"}
-    if isinstance(value, np.generic):
-        return value.item()
-    if dataclasses.is_dataclass(value):
-        fields = {f.name: _describe(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
-        return {"type": type(value).__name__, "fields": fields}
-    if isinstance(value, Mapping):
-        return {"mapping": {str(k): _describe(v, arrays) for k, v in value.items()}}
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return {"tuple": [_describe(v, arrays) for v in value]}
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    raise TypeError(f"a record holds arrays, numbers, text and records; got {type(value).__name__}")
-
-
-def _rebuild(value: Any, arrays: Mapping[str, Any]) -> Any:
-    if not isinstance(value, dict):
-        return value
-    if "array" in value:
-        return arrays[value["array"]]
-    if "tuple" in value:
-        return tuple(_rebuild(v, arrays) for v in value["tuple"])
-    if "mapping" in value:
-        return {k: _rebuild(v, arrays) for k, v in value["mapping"].items()}
-    kind = getattr(records, value["type"])
-    return kind(**{name: _rebuild(v, arrays) for name, v in value["fields"].items()})
-
-
-def read_record(path: Path, key: str) -> Any:
-    """The record kept in ``path`` under ``key``; None where it is absent, damaged or made from something
-    else.
-    """
-    try:
-        # np.load would leave a file it cannot understand open.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            description = json.loads(bytes(file[_DESCRIPTION]).decode())
-            if description["key"] != key:
-                return None
-            return _rebuild(description["record"], {name: file[name] for name in file.files})
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
-        # Whatever a half-written or edited file makes the readers raise: it is computed again.
+        return json.loads(read_bytes(path).decode("utf-8"))
+    except (OSError, ValueError, RecursionError):
         return None
 
 
@@ -227,10 +168,19 @@ class StageFolder:
         try:
             if content["keys"] != dict(keys):
                 return None
-            report = content["report"]
-            return StageReport(**{**report, "warnings": tuple(report["warnings"])})
-        except (TypeError, KeyError):
+            return _report(**content["report"])
+        except (TypeError, KeyError, AttributeError):
             return None
+
+
+def _report(*, seconds: Any, counts: Any, metrics: Any, warnings: Any, stage: Any) -> StageReport:
+    """A report of these values as JSON has them; ``TypeError`` where one is not what it should be."""
+    numbers = [seconds, *counts.values(), *(value for value in metrics.values() if value is not None)]
+    if not all(isinstance(number, int | float) for number in numbers):
+        raise TypeError("a report counts in numbers")
+    if not all(isinstance(word, str) for word in (stage, *warnings)):
+        raise TypeError("a report warns in words")
+    return StageReport(stage, seconds, counts, metrics, tuple(warnings))
 
 
 def _link(source: Path, target: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from thesisrecon.config import PipelineConfig, config_from_tables, preset
 from thesisrecon.errors import UsageError
+from thesisrecon.io.text import read_bytes
 from thesisrecon.settings import dataclass_from_table, unknown_word
 from validation.ablation.own import is_own, load_own
 from validation.ablation.study import Measure, Study
@@ -28,10 +29,10 @@ def read_study(path: str | Path) -> Study:
     """
     path = Path(path)
     try:
-        told = tomllib.loads(path.read_text(encoding="utf-8"))
+        told = tomllib.loads(read_bytes(path).decode("utf-8"))
     except OSError as error:
         raise UsageError(f"the study {path} cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(f"the study {path} is not TOML: {error}") from None
     try:
         return study_from_table(told, path.parent)
@@ -64,7 +65,7 @@ def study_from_table(told: Mapping[str, Any], folder: Path = Path()) -> Study:
 
 
 def _config(told: Mapping[str, Any]) -> PipelineConfig:
-    base, changes = preset(str(told.get("preset", "default"))), told.get("config", {})
+    base, changes = preset(told.get("preset", "default")), told.get("config", {})
     if not isinstance(changes, Mapping):
         raise UsageError(f"config takes a table of stages; got {changes!r}")
     return config_from_tables(changes, base)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.io.text import read_bytes
 from validation.harness.canaries import read_refused
 from validation.harness.gates import Gate
 from validation.harness.records import Judgement, Outcome, Wishes, key_of
@@ -143,7 +144,7 @@ def read_results(out: Path) -> Results:
     Raises ``ValueError`` where there is none.
     """
     try:
-        told = json.loads((out / "results.json").read_text(encoding="utf-8"))
+        told = json.loads(read_bytes(out / "results.json").decode("utf-8"))
         return Results(
             [Row(**row) for row in told["rows"]],
             told["missing"],
@@ -151,7 +152,7 @@ def read_results(out: Path) -> Results:
             told["environment"],
             told["wishes"],
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{out} holds no report to compare with (results.json): {error}") from None
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from thesisrecon.io.run_directory import read_json
 
 F64 = NDArray[np.float64]
 
@@ -53,7 +57,7 @@ def data_root() -> Path | None:
 def read_scene(folder: Path, name: str) -> Scene:
     """A folder with images/ and perhaps cameras.json.
 
-    Raises ``ValueError`` where there are no images, or cameras.json lacks one of them.
+    Raises ``ValueError`` where there are no images, or cameras.json lacks one of them or is damaged.
     """
     images = folder / "images"
     found = sorted(images.iterdir(), key=lambda p: p.name) if images.is_dir() else []
@@ -63,12 +67,26 @@ def read_scene(folder: Path, name: str) -> Scene:
     truth = folder / "cameras.json"
     if not truth.is_file():
         return Scene(name, paths)
-    cameras = json.loads(truth.read_text(encoding="utf-8"))["cameras"]
+    told = read_json(truth)
+    cameras = told.get("cameras") if isinstance(told, dict) else None
+    if not isinstance(cameras, dict):
+        raise ValueError(f"{truth} must hold cameras, a table of photographs by their names")
     missing = [p.name for p in paths if p.name not in cameras]
     if missing:
         raise ValueError(f"cameras.json must name every photograph; it lacks {missing} of {folder}")
-    K, R, C = (np.array([cameras[p.name][key] for p in paths], dtype=np.float64) for key in ("K", "R", "C"))
-    return Scene(name, paths, K, R, C)
+    return Scene(name, paths, *(_numbers(truth, cameras, paths, key) for key in ("K", "R", "C")))
+
+
+def _numbers(truth: Path, cameras: dict[str, Any], paths: Sequence[Path], key: str) -> F64:
+    """K, R (V, 3, 3) or C (V, 3) of the photographs."""
+    shape = (len(paths), 3) if key == "C" else (len(paths), 3, 3)
+    try:
+        numbers = np.array([cameras[path.name][key] for path in paths], dtype=np.float64)
+    except (TypeError, KeyError, ValueError, OverflowError):
+        numbers = np.zeros(0)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ValueError(f"{truth} must give every photograph a finite {key} {shape[1:]}")
+    return numbers
 
 
 def real_folder(name: str) -> Path | None:

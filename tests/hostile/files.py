@@ -1,0 +1,164 @@
+"""Files that a careless or ill-meaning hand may leave in a folder, made from nothing and small."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import socket
+import struct
+import unicodedata
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+
+Make = Callable[[Path], object]
+FEATURES = ["--until", "features", "--threads", "1", "--max-size", "1600"]
+TOO_LONG = "x" * 5000
+
+
+def picture(seed: int = 0, size: tuple[int, int] = (96, 80)) -> PIL.Image.Image:
+    """A colourful picture without two equal corners."""
+    rng = np.random.default_rng(seed)
+    coarse = PIL.Image.fromarray(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8))
+    return coarse.resize(size, PIL.Image.Resampling.BICUBIC)
+
+
+def encoded(kind: str, image: PIL.Image.Image | None = None, **options: object) -> bytes:
+    """The bytes of a picture in that format."""
+    stream = io.BytesIO()
+    (image or picture()).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def png(width: int, height: int, *, pixels: bytes = b"", before: bytes = b"") -> bytes:
+    """A PNG that claims this size, whatever of its ``pixels`` there is; ``before`` stands ahead of them."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + before + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def bomb() -> bytes:
+    """30,000 x 30,000 pixels, all of them there, in a few hundred kilobytes: rows of one colour."""
+    packer, rows = zlib.compressobj(9), bytes(3 * 30_000 + 1) * 100
+    data = b"".join(packer.compress(rows) for _ in range(4)) + packer.flush()
+    header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+def text_bomb() -> bytes:
+    """A good PNG with a note of 256 MiB, packed."""
+    note = b"Comment\0\0" + zlib.compress(bytes(2**28), 9)
+    whole = encoded("PNG")
+    return whole[:33] + chunk(b"zTXt", note) + whole[33:]
+
+
+def writes(content: bytes | str) -> Make:
+    """The maker of a file of this content."""
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    return lambda path: path.write_bytes(data)
+
+
+def links(target: str) -> Make:
+    """The maker of a symbolic link; ``{here}`` is the folder it stands in."""
+    return lambda path: path.symlink_to(target.format(here=path.parent))
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def listens(path: Path) -> None:
+    """A socket that nobody listens to any more."""
+    with socket.socket(socket.AF_UNIX) as ear:
+        # Names of sockets are short.
+        here = Path.cwd()
+        os.chdir(path.parent)
+        try:
+            ear.bind(path.name)
+        finally:
+            os.chdir(here)
+
+
+def sparse(size: int, begin: bytes = b"") -> Make:
+    """The maker of a file that claims this size and takes no room."""
+
+    def make(path: Path) -> None:
+        path.write_bytes(begin)
+        os.truncate(path, size)
+
+    return make
+
+
+def unreadable(path: Path) -> None:
+    """A file that opens and cannot be read, not even by root."""
+    if os.geteuid() == 0:
+        path.symlink_to("/proc/self/mem")
+    else:
+        path.write_bytes(encoded("PNG"))
+        path.chmod(0)
+
+
+def deep_json(depth: int = 200_000) -> str:
+    return "[" * depth + "]" * depth
+
+
+def glb(header: object, data: bytes = b"") -> bytes:
+    """A GLB of this header and these numbers."""
+    told = json.dumps(header).encode()
+    told += b" " * (-len(told) % 4)
+    data += b"\0" * (-len(data) % 4)
+    parts = struct.pack("<II", len(told), 0x4E4F534A) + told
+    parts += struct.pack("<II", len(data), 0x004E4942) + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
+
+
+def triangle(**changes: object) -> tuple[dict[str, object], bytes]:
+    """The header and the numbers of a GLB of one triangle."""
+    data = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + np.arange(3, dtype="<u4").tobytes()
+    header: dict[str, object] = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 4}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 36, "byteLength": 12},
+        ],
+        "buffers": [{"byteLength": 48}],
+    }
+    return header | changes, data
+
+
+def glb_of(told: bytes) -> bytes:
+    """A GLB of this text alone."""
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(told), len(told), 0x4E4F534A) + told
+
+
+def folder_of(place: Path, name: str) -> Path:
+    """A folder of photographs with a snare."""
+    folder = place / name
+    folder.mkdir()
+    (folder / "a.png").write_bytes(encoded("PNG"))
+    return folder
+
+
+def require_sentence(said: str) -> None:
+    """One line for a person: no trace, no control characters, not endless."""
+    assert said.endswith("\n")
+    assert not any(unicodedata.category(c) == "Cc" for c in said[:-1])
+    assert "Traceback" not in said
+    assert "an error in the program" not in said
+    assert len(said) < 1500

@@ -1,0 +1,234 @@
+"""Run folders that are damaged, of another version, or laid as a snare."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.hostile import files
+from tests.hostile.files import FEATURES, links, pipe, sparse, writes
+
+
+def finished_run(tmp_path: Path, told: Callable[..., str]) -> tuple[list[str], Path]:
+    """A command that was carried out, and its folder."""
+    out = tmp_path / "out"
+    command = ["reconstruct", str(files.folder_of(tmp_path, "in")), "-o", str(out), *FEATURES]
+    told(command, 0)
+    return command, out
+
+
+def pickled(path: Path) -> None:
+    """An npz whose description runs a program when it is unpickled."""
+
+    class Snare:
+        def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+            return os.system, (f"touch {path.parent / 'sprung'}",)
+
+    np.savez(path, description=np.array([Snare()], dtype=object))
+
+
+def packed_bomb(path: Path) -> None:
+    np.savez_compressed(path, description=np.zeros(2**27, np.uint8))
+
+
+RECORDS: list[tuple[str, files.Make]] = [
+    ("pickle", pickled),
+    ("packed", packed_bomb),
+    ("empty", writes(b"")),
+    ("text", writes("dear reader")),
+    ("zip of nothing", writes(b"PK\x05\x06" + bytes(18))),
+    ("pipe", pipe),
+    ("device", links("/dev/zero")),
+    ("round", links("{here}/00000.npz")),
+    ("folder", lambda path: path.mkdir()),
+    ("10 TiB", sparse(10**13, b"PK\x03\x04")),
+]
+
+
+@pytest.mark.parametrize("make", [make for _, make in RECORDS], ids=[name for name, _ in RECORDS])
+def test_a_record_that_is_none_is_computed_again_or_refused(
+    make: files.Make, tmp_path: Path, told: Callable[..., str]
+) -> None:
+    command, out = finished_run(tmp_path, told)
+    (record,) = (out / "01-features").glob("*.npz")
+    whole = record.read_bytes()
+    record.unlink()
+    make(record)
+    if record.is_dir():
+        assert "cannot be written: Is a directory" in told(command, 2)
+        return
+    told(command, 0)
+    assert record.read_bytes() == whole
+    assert not (out / "01-features" / "sprung").exists()
+
+
+def manifest(report: object) -> Callable[[Path], None]:
+    def make(path: Path) -> None:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        path.write_text(json.dumps({**content, "report": report}), encoding="utf-8")
+
+    return make
+
+
+GOOD_REPORT = {"stage": "features", "seconds": 1.0, "counts": {}, "metrics": {}, "warnings": []}
+MANIFESTS: list[tuple[str, Callable[[Path], object]]] = [
+    ("deep", writes(files.deep_json())),
+    ("list", writes("[]")),
+    ("no report", manifest(None)),
+    ("words", manifest("soup")),
+    ("seconds in words", manifest({**GOOD_REPORT, "seconds": "soup"})),
+    ("counts in words", manifest({**GOOD_REPORT, "counts": "soup"})),
+    ("counts of tables", manifest({**GOOD_REPORT, "counts": {"images": {}}})),
+    ("a number as warning", manifest({**GOOD_REPORT, "warnings": [3]})),
+]
+
+
+@pytest.mark.parametrize("make", [make for _, make in MANIFESTS], ids=[name for name, _ in MANIFESTS])
+def test_a_manifest_that_is_none_is_written_again(
+    make: Callable[[Path], object], tmp_path: Path, told: Callable[..., str]
+) -> None:
+    command, out = finished_run(tmp_path, told)
+    make(out / "01-features" / "manifest.json")
+    told(command, 0)
+    report = json.loads((out / "01-features" / "manifest.json").read_text(encoding="utf-8"))["report"]
+    assert report["counts"]
+    assert isinstance(report["seconds"], float)
+
+
+RUN_FILES: list[tuple[str, files.Make, str]] = [
+    ("another version", writes('{"version": 2, "seed": 0}'), "version was 2 there and is 1 here"),
+    ("a list", writes("[1, 2]"), "holds another run"),
+    ("wrong types", writes('{"version": 1, "seed": {}, "settings": []}'), "seed was {} there"),
+    ("wrong photographs", writes('{"version": 1, "photographs": [3]}'), "holds another run"),
+]
+
+
+@pytest.mark.parametrize(("make", "words"), [r[1:] for r in RUN_FILES], ids=[r[0] for r in RUN_FILES])
+def test_the_folder_of_another_version(
+    make: files.Make, words: str, tmp_path: Path, told: Callable[..., str]
+) -> None:
+    folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
+    out.mkdir()
+    make(out / "run.json")
+    command = ["reconstruct", str(folder), "-o", str(out), *FEATURES]
+    said = told(command, 2)
+    assert words in said
+    assert "choose another folder, or --overwrite" in said
+    told([*command, "--overwrite"], 0)
+
+
+@pytest.mark.parametrize("make", [pipe, links("/dev/zero"), writes(files.deep_json()), sparse(10**13)])
+def test_a_run_file_that_is_none_is_another_run(
+    make: files.Make, tmp_path: Path, told: Callable[..., str]
+) -> None:
+    """What names no run may be replaced: nothing of a run stands beside it."""
+    folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
+    out.mkdir()
+    make(out / "run.json")
+    told(["reconstruct", str(folder), "-o", str(out), *FEATURES], 0)
+    assert json.loads((out / "run.json").read_text(encoding="utf-8"))["seed"] == 0
+
+
+def test_nothing_is_written_through_the_links_of_a_folder(tmp_path: Path, told: Callable[..., str]) -> None:
+    """A folder from elsewhere may hold links where files are begun or stand when they are whole."""
+    command, out = finished_run(tmp_path, told)
+    victim = tmp_path / "letter.txt"
+    victim.write_text("dear", encoding="utf-8")
+    for name in ("run.json", "summary.json", "report.html", "config.toml"):
+        (out / f".{name}.partial").symlink_to(victim)
+        (out / name).unlink()
+        (out / name).symlink_to(victim)
+    (out / "01-features" / ".manifest.json.partial").symlink_to(tmp_path / "new.txt")
+    (out / "01-features" / "manifest.json").unlink()
+    told(command, 0)
+    assert victim.read_text(encoding="utf-8") == "dear"
+    assert not (tmp_path / "new.txt").exists()
+    assert not any(path.is_symlink() for path in out.rglob("*.*"))
+
+
+def summary_of_run(**changes: object) -> str:
+    whole: dict[str, object] = {
+        "images": 2, "registered": 2, "points": 9, "stratum": "metric", "reprojection_rms_px": 0.1,
+        "reprojection_median_px": 0.1, "cameras": [], "refused": [], "warnings": [], "failure": "",
+        "pairs": {"matched": 1, "accepted": 1, "verified_matches": 9}, "resumed": [],
+        "seconds": {"total": 1.0},
+    }  # fmt: skip
+    return json.dumps(whole | changes)
+
+
+SUMMARIES: list[tuple[str, files.Make, str]] = [
+    ("absent", lambda _: None, "holds no summary of a run"),
+    ("pipe", pipe, "holds no summary of a run"),
+    ("device", links("/dev/zero"), "holds no summary of a run"),
+    ("10 TiB", sparse(10**13), "holds no summary of a run"),
+    ("deep", writes(files.deep_json()), "holds no summary of a run"),
+    ("list", writes("[]"), "holds no summary of a run"),
+    ("bytes", writes(b"\xff\xfe"), "holds no summary of a run"),
+    ("digits", writes("9" * 9000), "holds no summary of a run"),
+    ("another program's", writes('{"a": 1}'), "is not a summary of this program"),
+    ("words for numbers", writes(summary_of_run(reprojection_rms_px="x")), "is not a summary"),
+    ("a number for a list", writes(summary_of_run(cameras=3)), "is not a summary"),
+    ("beyond numbers", writes(summary_of_run(reprojection_rms_px=10**400)), "is not a summary"),
+    ("a camera of nothing", writes(summary_of_run(cameras=[{"focal_px": None}])), "is not a summary"),
+    ("refused in words", writes(summary_of_run(refused=["a.png"])), "is not a summary"),
+    ("no seconds", writes(summary_of_run(seconds=[])), "is not a summary"),
+]
+
+
+@pytest.mark.parametrize(("make", "words"), [s[1:] for s in SUMMARIES], ids=[s[0] for s in SUMMARIES])
+def test_inspect_refuses_what_is_no_summary(
+    make: files.Make, words: str, tmp_path: Path, told: Callable[..., str]
+) -> None:
+    make(tmp_path / "summary.json")
+    assert words in told(["inspect", str(tmp_path)], 2)
+
+
+def test_inspect_lets_nothing_through_to_the_terminal(tmp_path: Path, told: Callable[..., str]) -> None:
+    warnings = ["\x1b]0;title\x07", "two\nlines", "\ud800", "\u202eturned"]
+    (tmp_path / "summary.json").write_text(summary_of_run(warnings=warnings), encoding="utf-8")
+    said = told(["inspect", str(tmp_path)], 0).splitlines()
+    assert said[2:6] == [
+        "warning: \\x1b]0;title\\x07",
+        "warning: two\\x0alines",
+        "warning: \\ud800",
+        "warning: \\u202eturned",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["reconstruct", "in", "-o", "out", "--until", "features"], 3),
+        (["inspect", "in"], 2),
+        (["views", "in"], 2),
+    ],
+)
+def test_programs_of_their_own_end_so_too(arguments: list[str], code: int, tmp_path: Path) -> None:
+    """With an address space of 6 GiB, and another alphabet on the terminal."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / "böm\u5199.png").write_bytes(files.bomb())
+    pipe(folder / "pipe\x1b[31m.jpg")
+    for name in ("summary.json", "model.glb", "cameras.json", "run.json"):
+        (folder / name).symlink_to("/dev/zero")
+    done = subprocess.run(
+        [sys.executable, "-m", "thesisrecon", *arguments],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONIOENCODING": "latin-1", "PYTHONPATH": str(Path(__file__).parents[2])},
+        capture_output=True,
+        timeout=120,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30, 6 * 2**30)),
+    )
+    assert done.returncode == code, done.stderr
+    assert done.stdout == b""
+    files.require_sentence(done.stderr.decode("latin-1"))
+    assert done.stderr.count(b"thesisrecon: ") == 1

@@ -1,0 +1,246 @@
+"""Readers given random bytes, and good files with something changed: they read, or raise what they say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.hostile.files import glb, require_sentence, triangle
+from tests.io.test_colmap import _SMALL, _plain_names
+from tests.io.test_images import picture
+from tests.io.test_meshes import roof
+from tests.io.test_run_directory import some_metric
+from thesisrecon.cli import run_command
+from thesisrecon.config import PipelineConfig, config_from_tables, config_from_toml, toml_from_config
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io.cameras import read_cameras
+from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap, write_colmap_model
+from thesisrecon.io.images import read_photographs
+from thesisrecon.io.meshes import read_mesh, write_mesh
+from thesisrecon.io.pairs import read_pairs
+from thesisrecon.io.records import bytes_from_record, read_record
+from thesisrecon.io.run_directory import StageFolder, read_json
+from thesisrecon.io.text import read_text
+
+few = settings(
+    derandomize=True,
+    deadline=None,
+    max_examples=60,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+NUMBERS = (b"\xff" * 8, b"\0" * 8, np.array([np.nan]).tobytes(), np.array([1e308]).tobytes(), b"\x80" * 4)
+WORDS = (b"nan", b"1e999", b"-1", b"9" * 400, b"null", b"[[", b'"', b"\n", b"\xff", b"{}")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A file ``name`` that ``make`` puts into a folder with all that belongs to it, and how it is read."""
+
+    name: str
+    make: Callable[[Path], Any]
+    read: Callable[[Path], Any]
+    raises: tuple[type[Exception], ...] = ()
+
+
+def colmap(name: str) -> Reader:
+    """One file of a COLMAP model."""
+
+    def make(folder: Path) -> None:
+        write_colmap_model(folder, _plain_names(_SMALL), binary=name.endswith(".bin"))
+
+    def read(path: Path) -> None:
+        reconstruction_from_colmap(read_colmap_model(path.parent))
+
+    return Reader(name, make, read, (StageFailure,))
+
+
+def saved(kind: str) -> Reader:
+    """A photograph; one that is damaged is refused, and nothing is raised."""
+    name = f"a.{kind.lower()}"
+
+    def make(folder: Path) -> None:
+        PIL.Image.fromarray(picture()).save(folder / name, kind)
+
+    return Reader(name, make, lambda path: read_photographs(path.parent, max_size_px=99))
+
+
+CAMERAS = {
+    "cameras": [
+        {
+            "name": "a.png", "width": 160, "height": 120, "K": [[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]],
+            "R": np.eye(3).tolist(), "t": [0.0, 0.0, 3.0],
+        }
+    ]
+}  # fmt: skip
+REPORT = {"stage": "x", "seconds": 1.0, "counts": {"a": 1}, "metrics": {"b": 0.5}, "warnings": ["c"]}
+MANIFEST = {"keys": {"a": "1"}, "report": REPORT}
+SUMMARY = {
+    "images": 2, "registered": 2, "points": 9, "stratum": "metric", "reprojection_rms_px": 0.1,
+    "reprojection_median_px": 0.1, "refused": [{"name": "a", "reason": "b"}], "warnings": ["c"],
+    "failure": "", "pairs": {"matched": 1, "accepted": 1, "verified_matches": 9}, "resumed": [],
+    "seconds": {"total": 1.0},
+    "cameras": [{"camera": 0, "corners": 9, **{
+        name: {"value": 1.0, "std": 0.1, "source": "data"}
+        for name in ("focal_px", "principal_x_px", "principal_y_px", "aspect", "skew_px")
+    }}],
+}  # fmt: skip
+
+
+def as_json(content: object) -> Callable[[Path, str], None]:
+    return lambda folder, name: (folder / name).write_text(json.dumps(content), encoding="utf-8") and None
+
+
+def text_file(name: str, text: str, read: Callable[[Path], Any]) -> Reader:
+    return Reader(
+        name, lambda folder: (folder / name).write_text(text, encoding="utf-8"), read, (UsageError,)
+    )
+
+
+def inspected(path: Path) -> None:
+    assert run_command(["inspect", str(path.parent)]) in (0, 2)
+
+
+READERS = [
+    *(colmap(f"{name}{suffix}") for name in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")),
+    *(saved(kind) for kind in ("JPEG", "PNG", "TIFF", "GIF", "WEBP", "BMP", "PPM")),
+    text_file("cameras.json", json.dumps(CAMERAS), read_cameras),
+    text_file("config.toml", toml_from_config(PipelineConfig()), lambda p: config_from_toml(read_text(p))),
+    text_file("pairs.txt", '# list\na.png b.png\n"c d.png"\te.png\n', read_pairs),
+    text_file("manifest.json", json.dumps(MANIFEST), lambda p: StageFolder(p.parent).finished({"a": "1"})),
+    text_file("summary.json", json.dumps(SUMMARY), inspected),
+    text_file("run.json", json.dumps(MANIFEST), read_json),
+    Reader(
+        "a.npz",
+        lambda folder: (folder / "a.npz").write_bytes(bytes_from_record(some_metric(), "key")),
+        lambda path: read_record(path, "key"),
+    ),
+    Reader("model.glb", lambda folder: write_mesh(folder / "model.glb", roof()), read_mesh, (UsageError,)),
+    Reader(
+        "plain.glb",
+        lambda folder: (folder / "plain.glb").write_bytes(glb(*triangle())),
+        read_mesh,
+        (UsageError,),
+    ),
+]
+
+
+@st.composite
+def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
+    """The bytes with a few of them changed, cut off, put in or said twice."""
+    data = bytearray(whole)
+    for _ in range(draw(st.integers(1, 4))):
+        # The beginning of a file has what the rest hangs on.
+        at = draw(st.one_of(st.integers(0, min(len(data), 64)), st.integers(0, len(data))))
+        what = draw(st.sampled_from(["one", "number", "word", "cut", "put", "twice"]))
+        if what == "one" and at < len(data):
+            data[at] = draw(st.integers(0, 255))
+        elif what == "number":
+            new = draw(st.sampled_from(NUMBERS))
+            data[at : at + len(new)] = new
+        elif what == "word":
+            data[at : at + draw(st.integers(0, 8))] = draw(st.sampled_from(WORDS))
+        elif what == "cut":
+            del data[at : at + draw(st.integers(1, 400))]
+        elif what == "put":
+            data[at:at] = draw(st.binary(max_size=40))
+        else:
+            data[at:at] = data[at : at + draw(st.integers(1, 200))]
+    return bytes(data)
+
+
+def read(reader: Reader, path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    with suppress(*reader.raises):
+        reader.read(path)
+
+
+@pytest.fixture
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Reader, Path, bytes]:
+    """A reader, the file it reads and what that holds."""
+    reader: Reader = request.param
+    reader.make(tmp_path)
+    whole = (tmp_path / reader.name).read_bytes()
+    reader.read(tmp_path / reader.name)
+    return reader, tmp_path / reader.name, whole
+
+
+each_reader = pytest.mark.parametrize("place", READERS, indirect=True, ids=[r.name for r in READERS])
+
+
+@each_reader
+@few
+@given(data=st.data())
+def test_a_damaged_file_raises_only_what_its_reader_says(
+    place: tuple[Reader, Path, bytes], data: st.DataObject
+) -> None:
+    reader, path, whole = place
+    read(reader, path, data.draw(damaged(whole)))
+
+
+@each_reader
+@settings(few, max_examples=25)
+@given(content=st.binary(max_size=300), head=st.sampled_from([0, 4, 8, 40]))
+def test_random_bytes_raise_only_what_their_reader_says(
+    place: tuple[Reader, Path, bytes], content: bytes, head: int
+) -> None:
+    """As they are, and after the beginning of a good file."""
+    reader, path, whole = place
+    read(reader, path, whole[:head] + content)
+
+
+plain = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.just(10**400)
+values = st.recursive(
+    plain,
+    lambda v: st.lists(v, max_size=3) | st.dictionaries(st.text(max_size=4), v, max_size=3),
+    max_leaves=6,
+)
+
+
+@st.composite
+def mistyped(draw: st.DrawFn, content: Any) -> Any:
+    """The tables with one of their parts of another type, or gone."""
+    if isinstance(content, dict) and content and draw(st.booleans()):
+        key = draw(st.sampled_from(sorted(content)))
+        rest = {k: v for k, v in content.items() if k != key}
+        return rest if draw(st.integers(0, 4)) == 0 else content | {key: draw(mistyped(content[key]))}
+    if isinstance(content, list) and content and draw(st.booleans()):
+        at = draw(st.integers(0, len(content) - 1))
+        return [*content[:at], draw(mistyped(content[at])), *content[at + 1 :]]
+    return draw(values)
+
+
+TABLES = [(reader, content) for reader in READERS for name, content in (
+    ("cameras.json", CAMERAS), ("manifest.json", MANIFEST), ("summary.json", SUMMARY)
+) if reader.name == name]  # fmt: skip
+
+
+@pytest.mark.parametrize(("reader", "content"), TABLES, ids=[reader.name for reader, _ in TABLES])
+@settings(few, max_examples=150)
+@given(data=st.data())
+def test_tables_of_other_types_raise_only_what_their_reader_says(
+    reader: Reader, content: Any, tmp_path: Path, data: st.DataObject
+) -> None:
+    told = json.dumps(data.draw(mistyped(content)))
+    read(reader, tmp_path / reader.name, told.encode("utf-8", "surrogatepass"))
+
+
+@settings(few, max_examples=150)
+@given(data=st.data())
+def test_settings_of_other_types_are_refused_in_a_sentence(data: st.DataObject) -> None:
+    whole = {"features": {"kind": "harris-corners"}, "intrinsics": {"focal_px": 9.0, "focal_std_rel": 0.1}}
+    whole |= {"dense": {"linker": {"kind": "sequence-linking"}}, "images": {"max_size_px": 640}}
+    try:
+        told = data.draw(mistyped(whole).filter(lambda tables: isinstance(tables, dict)))
+        toml_from_config(config_from_tables(told))
+    except UsageError as refusal:
+        require_sentence(f"{refusal}\n")

@@ -1,0 +1,148 @@
+"""What photographs, folders and headers are called cannot become part of a page: the page of a run with evil
+names has the elements and attributes of the page of the same run with plain ones, and runs nothing of theirs.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from tests.report.opened import Witness
+from thesisrecon.cli import run_command
+from thesisrecon.report.strip import strip_page
+
+COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
+MARK = "header-of-a-photograph"
+SNARES = [
+    "<img src=x onerror=alert(1)>",
+    "\"><script>alert('2')",
+    "' onload='alert(3)' x='",
+    "]]>--><svg onload=alert(4)>",
+    "{{ self }}{% raw %}${alert(5)}`",
+    "\u2028<\u202ebody onpageshow=alert(6)>",
+]
+PLAIN = ["a", "b", "c", "d", "e", "f"]
+TEXTS = (0x010E, 0x010F, 0x0110, 0x013B, 0x8298)
+"""Description, make, model, artist and copyright."""
+
+
+def photographs(folder: Path, names: list[str], *, snare: str) -> Path:
+    """Two photographs of a scene, an animation, and three files that are none, by these names."""
+    folder.mkdir()
+    exif = PIL.Image.Exif()
+    for tag in TEXTS:
+        exif[tag] = f"{MARK}{snare}</script></style></textarea>"
+    exif[0x8769] = {0x9286: b"ASCII\0\0\0" + f"{MARK}{snare}".encode(), 0xA434: f"{MARK}{snare}"}
+    for k, name in enumerate(names[:2]):
+        with PIL.Image.open(COURTYARD / f"000{k + 6}.jpg") as picture:
+            picture.reduce(4).save(folder / f"{name}.jpg", exif=exif, comment=f"{MARK}{snare}", quality=95)
+    rng = np.random.default_rng(0)
+    film = [PIL.Image.fromarray(rng.integers(0, 256, (96, 128), dtype=np.uint8)) for _ in range(2)]
+    film[0].save(folder / f"{names[2]}.gif", save_all=True, append_images=film[1:], comment=snare.encode())
+    for name in names[3:]:
+        (folder / f"{name}.png").write_text(snare, encoding="utf-8")
+    return folder
+
+
+def page_of(place: Path, names: list[str], title: str, snare: str) -> Path:
+    """The page of a run."""
+    place.mkdir()
+    folder, out = photographs(place / title, names, snare=snare), place / f"out {title}"
+    command = ["reconstruct", str(folder), "-o", str(out), "--until", "matches", "--threads", "2"]
+    assert run_command([*command, "--set", "pairs.kind=all-pairs"]) == 0
+    return out / "report.html"
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The same run with plain names and with evil ones."""
+    place = tmp_path_factory.mktemp("pages")
+    return (
+        page_of(place / "plain", PLAIN, "scene", "nothing"),
+        page_of(place / "evil", SNARES, "<script>alert(7)", SNARES[0]),
+    )
+
+
+class Structure(HTMLParser):
+    """Elements with the names of their attributes, in order, and what stands in those that are not shown."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, tuple[str, ...]]] = []
+        self.hidden: list[str] = []
+        self.words: list[str] = []
+        self._inside = ""
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, tuple(name for name, _ in attrs)))
+        self._inside = tag
+
+    def handle_endtag(self, tag: str) -> None:
+        self.elements.append((f"/{tag}", ()))
+        self._inside = ""
+
+    def handle_comment(self, data: str) -> None:
+        self.elements.append((f"comment {data}", ()))
+
+    def handle_data(self, data: str) -> None:
+        (self.hidden if self._inside in ("script", "style") else self.words).append(data)
+
+
+def scripts(page: str) -> list[str]:
+    """The programs on a page; data are none."""
+    return re.findall(r"<script>(.*?)</script>", page, re.S)
+
+
+def test_names_add_no_element_and_no_attribute(pages: tuple[Path, Path]) -> None:
+    plain, evil = (path.read_text(encoding="utf-8") for path in pages)
+    one, other = Structure(plain), Structure(evil)
+    # How a number is worded may differ between runs; what stands around it may not.
+    assert one.elements == other.elements
+    assert not any(name.startswith("on") for _, names in other.elements for name in names)
+    assert scripts(plain) == scripts(evil)
+    assert len(scripts(evil)) == len(re.findall(r"sha256-", evil))
+    told = "".join(other.words)
+    for name in SNARES[:5]:
+        assert name in told
+    assert "\\u2028<\\u202ebody" in told
+    assert "<script>alert(7)" in told
+    for block in re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', evil, re.S):
+        json.loads(block)
+
+
+def test_headers_of_photographs_are_nowhere(pages: tuple[Path, Path]) -> None:
+    for path in pages[1].parent.rglob("*"):
+        if path.is_file():
+            assert MARK.encode() not in path.read_bytes()
+
+
+def test_names_add_nothing_to_a_strip() -> None:
+    frames = [("0 %", np.zeros((60, 80, 3), np.uint8)), ("100 %", np.zeros((60, 80, 3), np.uint8))]
+    plain = strip_page("Between a and b", frames, notes=["c"])
+    for snare in (*SNARES, "</script>", "</title>", "</style>"):
+        named = [(f"{caption} {snare}", rgb) for caption, rgb in frames]
+        evil = strip_page(f"Between {snare} and b", named, notes=[snare])
+        assert Structure(evil).elements == Structure(plain).elements
+        assert scripts(evil) == scripts(plain)
+
+
+@pytest.mark.browser
+def test_nothing_of_theirs_runs_in_a_browser(pages: tuple[Path, Path], browser: Any) -> None:
+    opened = Witness(browser, pages[1], 1000, drawn=("matrix-figure",))
+    opened.page.hover("#matrix-figure .nsewdrag")
+    opened.page.wait_for_timeout(300)
+    assert opened.errors == []
+    assert all(url.startswith(("file:", "data:", "blob:")) for url in opened.requests)
+    assert opened.page.locator("img[src='x'], [onload], [onerror], [onpageshow]").count() == 0
+    shown = opened.page.locator(".card .name").all_inner_texts()
+    assert any(f"{SNARES[0]}.jpg" in text for text in shown)
+    opened.context.close()
