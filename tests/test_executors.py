@@ -24,7 +24,7 @@ from thesisrecon import cluster, workers
 from thesisrecon.cli import run_command
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
-from thesisrecon.io.run_directory import read_json
+from thesisrecon.io.files import read_json
 from thesisrecon.pipeline import prepared as preparing
 from thesisrecon.pipeline import reconstruct
 from thesisrecon.pipeline.prepared import PreparedViews, batches_of_pairs

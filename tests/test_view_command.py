@@ -14,8 +14,8 @@ from tests.model.sphere import SHAPE, photograph, ring_of
 from thesisrecon.cli import run_command
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera import decompose_camera
+from thesisrecon.io.files import write_json
 from thesisrecon.io.meshes import write_mesh
-from thesisrecon.io.run_directory import write_json
 from thesisrecon.model import VolumetricFusion
 from thesisrecon.model.texture import TextureAtlas
 from thesisrecon.report.summary import cameras_table

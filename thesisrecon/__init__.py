@@ -5,10 +5,12 @@ The front doors are loaded when they are first used, so that importing the packa
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+# Not of typing, which takes longer to load than all of this.
+TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from typing import Any
+
     from thesisrecon.between import interpolate_view
     from thesisrecon.beyond import synthesize_view
     from thesisrecon.config import PipelineConfig
@@ -61,6 +63,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOME_OF:
         raise AttributeError(f"module 'thesisrecon' has no attribute {name!r}")
+    from importlib import import_module
+
     return getattr(import_module(f"thesisrecon.{_HOME_OF[name]}"), name)
 
 

@@ -1,6 +1,17 @@
-"""``python -m thesisrecon``: the same as the command ``thesisrecon``."""
+"""``python -m thesisrecon``, and the command ``thesisrecon``."""
 
-from thesisrecon.cli import main
+from __future__ import annotations
+
+from thesisrecon.stops import obey_signals
+
+
+def main() -> None:
+    """The entry point of the command; the rest is loaded when Ctrl-C is already obeyed."""
+    obey_signals("thesisrecon")
+    from thesisrecon.cli import main as run
+
+    run()
+
 
 if __name__ == "__main__":
     main()

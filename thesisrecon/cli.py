@@ -15,14 +15,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
+from signal import SIGINT
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from thesisrecon import __version__
 from thesisrecon.console import summary_text
-from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.errors import DISK, StageFailure, Unwritable, UsageError
 from thesisrecon.io.text import printable, shortened
+from thesisrecon.stops import CODES, REASONS, advised
 from thesisrecon.workers import available_threads
 
 if TYPE_CHECKING:
@@ -30,12 +32,13 @@ if TYPE_CHECKING:
     from thesisrecon.types import RunResult
     from thesisrecon.view_command import ViewFiles
 
-DONE, INTERNAL, USAGE, IMPOSSIBLE, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
 DEBUG_VARIABLE = "THESISRECON_DEBUG"
 DEMO_SCENE = Path("fixtures") / "courtyard"
 DEMO_SETTINGS: dict[str, Any] = {"dense": {"max_side": 512, "match_side": 512}}
 """Whoever tries it wants to see a model soon."""
 MOST_THREADS = 1024
+VIEWS_AGAIN = "the same command makes all pictures anew"
 STAGE_WORDS = {
     "features": "corners",
     "pairs": "choice of pairs",
@@ -107,10 +110,6 @@ def _folder(text: str | Path) -> Path:
     if not str(text).strip():
         raise typer.BadParameter("the folder has no name; write . for the current one")
     return Path(text)
-
-
-class _Interrupted(Exception):
-    """Ctrl-C during a run."""
 
 
 @app.command()
@@ -199,7 +198,7 @@ def inspect(
     out: Annotated[Path, typer.Argument(parser=_folder, metavar="OUT", help="The output folder of a run.")],
 ) -> None:
     """Print what a run found."""
-    from thesisrecon.io.run_directory import read_json
+    from thesisrecon.io.files import read_json
 
     summary = read_json(out / "summary.json")
     if not isinstance(summary, dict):
@@ -281,7 +280,7 @@ def views(
     way, lamp = path or Way.orbit, light or Lamp.none
     color = color_from_text("black" if background is None else background)
     wishes = ViewWishes(way.value, 90 if frames is None else frames, wanted, lamp.value, color)
-    with _progress_bars() as progress:
+    with advised(VIEWS_AGAIN), _progress_bars() as progress:
         written = write_views(
             what[0],
             folder or what[0] / "views" / way.value,
@@ -312,7 +311,7 @@ def _views_between(
     if reading[1] is not None and reading[1] < 64:
         raise UsageError(f"--max-size takes at least 64 px; got {reading[1]}")
     wishes = BetweenWishes(tuple(photographs), method.value, count, *reading)
-    with _progress_bars() as progress:
+    with advised(VIEWS_AGAIN), _progress_bars() as progress:
         written = write_between(
             folder or Path("views") / method.value,
             wishes,
@@ -410,15 +409,9 @@ def _run(images: Path, out: Path, config: PipelineConfig, seed: int, options: Ma
     from thesisrecon.pipeline import reconstruct as run_pipeline
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    try:
-        with _progress_bars() as progress:
-            result: RunResult = run_pipeline(
-                images, out, config=config, seed=seed, progress=progress, **options
-            )
-    except KeyboardInterrupt:
-        raise _Interrupted(
-            f"interrupted; the same command goes on where it stopped (kept in {out})"
-        ) from None
+    advice = f"the same command goes on where it stopped (what was done is kept in {out})"
+    with advised(advice), _progress_bars() as progress:
+        result: RunResult = run_pipeline(images, out, config=config, seed=seed, progress=progress, **options)
     typer.echo(summary_text(result.summary, out))
 
 
@@ -455,11 +448,15 @@ def run_command(arguments: list[str]) -> int:
         return _say(str(error), USAGE)
     except StageFailure as failure:
         return _say(str(failure), IMPOSSIBLE)
-    except (_Interrupted, KeyboardInterrupt) as stop:
-        return _say(str(stop) or "interrupted", INTERRUPTED)
+    except KeyboardInterrupt as stop:
+        # Where somebody else's program runs the command: ours is ended by `obey_signals`.
+        return _say("; ".join((REASONS[SIGINT], *map(str, stop.args))), CODES[SIGINT])
     except MemoryError:
         return _say("out of memory; try a smaller --max-size or fewer --threads", IMPOSSIBLE)
     except OSError as error:
+        if error.errno in DISK:
+            # Kernels are kept on a disk too, and what is printed may go to a file.
+            return _say(str(Unwritable(error.filename or "what the command writes", error)), USAGE)
         place = f"{shortened(str(error.filename))}: " if error.filename is not None else ""
         return _say(f"{place}{error.strerror or error}", USAGE)
     except Exception as error:

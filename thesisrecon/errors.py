@@ -2,6 +2,27 @@
 
 from __future__ import annotations
 
+import errno
+from os import PathLike, fspath
+
+MEND = {
+    errno.ENOSPC: "make room there",
+    errno.EDQUOT: "make room there, or ask for more",
+    errno.EFBIG: "allow larger files (ulimit -f), or choose a place that takes them",
+    errno.EROFS: "make the place writable, or choose another one",
+    errno.EACCES: "make the place writable, or choose another one",
+    errno.EPERM: "make the place writable, or choose another one",
+    errno.EEXIST: "move away the file that stands where a folder belongs",
+    errno.ENOTDIR: "move away the file that stands where a folder belongs",
+    errno.EISDIR: "move away the folder that stands where a file belongs",
+    errno.ENAMETOOLONG: "choose a place with a shorter name",
+    errno.EIO: "see whether the disk is sound, or choose another one",
+    errno.ENOENT: "see whether the folder is still there",
+}
+"""What helps where a file cannot be written."""
+DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Errors that only writing can end in."""
+
 
 class StageFailure(Exception):
     """Data that a stage cannot work with: what was found, what it needs, what to try.
@@ -33,3 +54,23 @@ class UsageError(ValueError):
 
 class WorkersLost(UsageError):
     """The workers of a run are gone: killed, or no longer reached. What was done is kept."""
+
+
+class Unwritable(UsageError):
+    """A ``place`` that cannot be written as ``error`` tells: its disk is full, or it is not for us to write.
+
+    What stood there before is still there. With ``kept``, the folder of a run, the sentence says how the run
+    goes on.
+    """
+
+    def __init__(self, place: str | PathLike[str], error: OSError, kept: str | PathLike[str] = "") -> None:
+        self.place, self.error, self.kept = place, error, kept
+        number = error.errno or 0
+        reason = error.strerror or str(error)
+        sentence = f"{fspath(place)} cannot be written: {reason}; {MEND.get(number, 'choose another place')}"
+        if fspath(kept):
+            sentence += f", then the same command goes on from what is kept in {fspath(kept)}"
+        super().__init__(sentence)
+
+    def __reduce__(self) -> tuple[type[Unwritable], tuple[str | PathLike[str], OSError, str | PathLike[str]]]:
+        return type(self), (self.place, self.error, self.kept)

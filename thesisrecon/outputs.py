@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from thesisrecon import __version__
 from thesisrecon.affine import affine_of, write_affine
 from thesisrecon.config import toml_from_config
-from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views, write_colmap_model
+from thesisrecon.io.files import read_json, write_json, write_text
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.io.pointcloud import write_point_cloud
-from thesisrecon.io.run_directory import RunDirectory, read_json, write_atomically, write_json
+from thesisrecon.io.run_directory import RunDirectory
 from thesisrecon.model import coarser
 from thesisrecon.model.texture import TextureAtlas
 from thesisrecon.report import Photograph, ReportData, write_report
@@ -43,21 +44,16 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
     """Write whatever was found, and return it with its summary.
 
     A run that ends early, as asked, leaves the files of a longer one that has ended in this folder; files of
-    a model are removed where there is none. Raises :class:`UsageError` where the output folder cannot be
+    a model are removed where there is none. Raises :class:`Unwritable` where the output folder cannot be
     written.
     """
     later = _later_end(run.directory.path, until) if failure is None else None
-    try:
-        if later is not None:
-            run.warnings.append(
-                f"the folder holds the result of this run up to {later}: its summary and page are kept"
-            )
-            return _described(run, result, until, failure)
+    if later is None:
         return _write(run, result, until, failure)
-    except OSError as error:
-        raise UsageError(
-            f"the output folder {run.directory.path} cannot be written: {error.strerror}"
-        ) from None
+    run.warnings.append(
+        f"the folder holds the result of this run up to {later}: its summary and page are kept"
+    )
+    return _described(run, result, until, failure)
 
 
 def _later_end(out: Path, until: str) -> str | None:
@@ -94,7 +90,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         else:
             run.directory.remove(MODEL_FILES)
         result = _described(run, result, until, failure)
-        write_atomically(out / "config.toml", toml_from_config(run.config).encode())
+        write_text(out / "config.toml", toml_from_config(run.config))
         page = _report_data(run, result, colours, failure)
         write_report(out / PAGE, replace(page, until=None if until == "model" else until))
     run.finish("outputs", counts={})

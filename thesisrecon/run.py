@@ -16,7 +16,7 @@ from typing import Any, Literal, TypedDict, get_args
 import numpy as np
 
 from thesisrecon.config import PipelineConfig, kind_of, tables_from_config
-from thesisrecon.errors import UsageError, WorkersLost
+from thesisrecon.errors import Unwritable, UsageError, WorkersLost
 from thesisrecon.io.run_directory import RunDirectory, code_key, key_of
 from thesisrecon.settings import table_from_dataclass, unknown_word
 from thesisrecon.types import StageReport
@@ -178,6 +178,14 @@ class Run:
                 f"{lost} (in the stage {stage}); what was done is kept in {self.directory.path}, and the "
                 "same command goes on from there, with this executor or another"
             ) from None
+
+    @contextmanager
+    def kept_in_folder(self) -> Iterator[None]:
+        """Whoever cannot write in this block is told how the run goes on."""
+        try:
+            yield
+        except Unwritable as refused:
+            raise Unwritable(refused.place, refused.error, self.directory.path) from None
 
     def finish(
         self,

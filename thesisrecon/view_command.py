@@ -15,12 +15,12 @@ import PIL.ImageColor
 
 from thesisrecon.between import Film, named_photograph
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import Unwritable, UsageError
 from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.io.cameras import read_cameras
+from thesisrecon.io.files import is_partial, read_json, write_json, write_text
 from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io.meshes import read_mesh
-from thesisrecon.io.run_directory import read_json, write_atomically, write_json
 from thesisrecon.report.strip import strip_page
 from thesisrecon.settings import in_words, unknown_word
 from thesisrecon.types import F64, TexturedMesh
@@ -204,7 +204,7 @@ def write_between(
     )
     tell("views", count + 1, count + 2)
     title = "Between " + " and ".join(image.name for image in photographs)
-    write_atomically(folder / STRIP, strip_page(title, frames, notes=film.notes).encode("utf-8", "replace"))
+    write_text(folder / STRIP, strip_page(title, frames, notes=film.notes))
     tell("views", count + 2, count + 2)
     height, width = frames[0][1].shape[:2]
     return ViewFiles(folder, tuple(files), animation, (width, height))
@@ -249,9 +249,10 @@ def _claim(folder: Path) -> None:
     if isinstance(read_json(folder / FRAMES), dict):
         return
     try:
-        strange = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+        names = [path.name for path in folder.iterdir()] if folder.exists() else []
     except OSError as error:
         raise UsageError(f"the folder {folder} cannot be used: {error.strerror}") from None
+    strange = sorted(name for name in names if not is_partial(name))
     if strange:
         raise UsageError(
             f"the folder {folder} holds {strange[0]!r}, which is not of this command; choose an empty or a "
@@ -263,12 +264,12 @@ def _remove_old(folder: Path, frames: int) -> None:
     names = {frame_name(k + 1) for k in range(frames)}
     old = [p for p in folder.glob("frame-*.png") if p.name not in names]
     old += [folder / f"{path}{suffix}" for path in (*PATHS, *METHODS) for suffix in (".webp", ".png")]
-    old += [folder / STRIP]
+    old += [folder / STRIP, *folder.glob(".*.partial")]
     try:
         for path in old:
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise UsageError(f"old frames in {folder} cannot be removed: {error.strerror}") from None
+        raise Unwritable(f"the folder {folder}, of which old frames must go,", error) from None
 
 
 def _cameras_on_path(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import concurrent.futures as futures
 import multiprocessing
 import multiprocessing.connection
+import multiprocessing.resource_tracker
 import os
 import pickle
 import signal
@@ -19,12 +20,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from thesisrecon.cluster import Cluster, address_of, connected, is_address
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io.fingerprint import package_key
 from thesisrecon.settings import unknown_word
+from thesisrecon.stops import starting_processes
 
 NAMES = ("local", "processes", "dask://HOST:PORT")
 AHEAD = 2
@@ -32,6 +34,8 @@ AHEAD = 2
 PATIENCE_S = 5.0
 """How long nothing may end before it is asked whether the workers are still there."""
 
+P = ParamSpec("P")
+T = TypeVar("T")
 Task = tuple[Any, ...]
 Finished = Callable[[int, Any], None]
 
@@ -210,24 +214,37 @@ def _answer(key: str, task: bytes) -> bytes:
     return pickle.dumps(function(*given), 5)
 
 
+class ProcessPool(futures.ProcessPoolExecutor):
+    """``count`` processes that Ctrl-C does not reach, and that end with this process, however that ends."""
+
+    def __init__(self, count: int) -> None:
+        # Forking a process that runs threads can deadlock.
+        context = multiprocessing.get_context("spawn")
+        # Else the first process starts it, and lets Ctrl-C through again with that.
+        multiprocessing.resource_tracker.ensure_running()
+        watched, self._held = context.Pipe(duplex=False)
+        super().__init__(count, mp_context=context, initializer=_obey, initargs=(watched,))
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
+        """As of any executor."""
+        with starting_processes():
+            return super().submit(fn, *args, **kwargs)
+
+    def abandon(self) -> None:
+        """End the processes at once, whatever they are at."""
+        self._held.close()
+        self.shutdown(wait=True, cancel_futures=True)
+
+
 @contextmanager
 def _processes(count: int) -> Iterator[futures.Executor]:
-    """Processes that end with the block, at once where it ends by an error, and with this process, however
-    that ends."""
-    # Forking a process that runs threads can deadlock.
-    context = multiprocessing.get_context("spawn")
-    watched, held = context.Pipe(duplex=False)
-    pool = futures.ProcessPoolExecutor(count, mp_context=context, initializer=_obey, initargs=(watched,))
+    """Processes that end with the block, at once where it ends by an error."""
+    pool = ProcessPool(count)
     try:
         yield pool
         pool.shutdown(wait=True)
-    except BaseException:
-        held.close()
-        pool.shutdown(wait=True, cancel_futures=True)
-        raise
     finally:
-        held.close()
-        watched.close()
+        pool.abandon()
 
 
 def _obey(watched: multiprocessing.connection.Connection) -> None:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from thesisrecon.errors import StageFailure
+from thesisrecon.stops import advised, obey_signals
 from validation.ablation import command as ablation
 from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
@@ -38,13 +39,14 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, StageFailure) as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2
-    for words in ask_canaries(wishes).values():
-        print(f"validation: {words}", file=sys.stderr)
-    try:
-        judged = run_tasks(wishes, STAGES, _tell)
-    except ValueError as error:
-        print(f"validation: {error}", file=sys.stderr)
-        return 2
+    with advised("the same command begins again"):
+        for words in ask_canaries(wishes).values():
+            print(f"validation: {words}", file=sys.stderr)
+        try:
+            judged = run_tasks(wishes, STAGES, _tell)
+        except ValueError as error:
+            print(f"validation: {error}", file=sys.stderr)
+            return 2
     results = collect(wishes, judged, gates)
     write_results(wishes.out, results)
     changes = None if other is None else compare(other, results)
@@ -140,4 +142,5 @@ def _print_gates(results: Results) -> None:
 
 
 if __name__ == "__main__":
+    obey_signals("validation")
     raise SystemExit(main())

@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from thesisrecon.io.files import write_text
+
 OURS = "ours"
 
 
@@ -58,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(ratio_table(groups))
     if wishes.out is not None:
         told = {"seconds": groups, "ours_over": ratios_to_ours(groups)}
-        wishes.out.write_text(json.dumps(told, indent=1), encoding="utf-8")
+        write_text(wishes.out, json.dumps(told, indent=1))
     return 0
 
 

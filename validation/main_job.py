@@ -20,6 +20,7 @@ from typing import Any
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.io.files import write_text
 from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS, THESIS, Outcome, check_reconstruction
 from validation.harness.process import Process, own_cores, run_process
 from validation.metrics.cameras import TrueCameras
@@ -171,8 +172,8 @@ def write_results(
             "refused": refused,
         }
     out.mkdir(parents=True, exist_ok=True)
-    (out / "main_job.md").write_text("\n".join(text), encoding="utf-8")
-    (out / "main_job.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    write_text(out / "main_job.md", "\n".join(text))
+    write_text(out / "main_job.json", json.dumps(told, indent=1) + "\n")
 
 
 def write_readme(readme: Path, rows: dict[str, list[Metric]], facts: dict[str, Any]) -> None:
@@ -183,7 +184,7 @@ def write_readme(readme: Path, rows: dict[str, list[Metric]], facts: dict[str, A
     table = summary_table([metric for metrics in rows.values() for metric in metrics], README_ROWS)
     told = "; ".join(f"{name}: {value}" for name, value in facts.items())
     measured = f"{README_BEGIN}\n{table}\n\n{told}.\n{README_END}"
-    readme.write_text(before + measured + after, encoding="utf-8")
+    write_text(readme, before + measured + after)
 
 
 def main(arguments: list[str] | None = None) -> int:

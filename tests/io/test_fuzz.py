@@ -25,11 +25,12 @@ from thesisrecon.config import PipelineConfig, config_from_tables, config_from_t
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.cameras import read_cameras
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap, write_colmap_model
+from thesisrecon.io.files import read_json
 from thesisrecon.io.images import read_photographs
 from thesisrecon.io.meshes import read_mesh, write_mesh
 from thesisrecon.io.pairs import read_pairs
 from thesisrecon.io.records import bytes_from_record, read_record
-from thesisrecon.io.run_directory import StageFolder, read_json
+from thesisrecon.io.run_directory import StageFolder
 from thesisrecon.io.text import read_text
 
 few = settings(

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from thesisrecon.errors import UsageError
+from thesisrecon.io.files import read_json, write_atomically
 from thesisrecon.io.records import bytes_from_record
 from thesisrecon.io.run_directory import (
     RunDirectory,
     StageFolder,
     code_key,
     key_of,
-    read_json,
-    write_atomically,
-    write_json,
 )
 from thesisrecon.types import (
     Features,
@@ -209,16 +207,6 @@ def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path: Path) -> None:
         RunDirectory(tmp_path / "file" / "out").claimed(IDENTITY, overwrite=False),
     ):
         pass
-    with pytest.raises(UsageError, match="cannot be written"):
-        write_atomically(tmp_path / "file" / "x", b"")
-
-
-def test_json_has_no_nan(tmp_path: Path) -> None:
-    write_json(
-        tmp_path / "a.json",
-        {"a": float("nan"), "b": [np.float64(1.5), np.int64(2)], "c": np.array([np.inf, 1])},
-    )
-    assert read_json(tmp_path / "a.json") == {"a": None, "b": [1.5, 2], "c": [None, 1.0]}
 
 
 def test_what_one_run_kept_another_takes_by_its_key(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.io.run_directory import read_json
+from thesisrecon.io.files import read_json
 
 LARGEST_SIDE = 2**24
 """px; far above what any photograph has."""

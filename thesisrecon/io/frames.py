@@ -12,7 +12,7 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from thesisrecon.errors import UsageError
-from thesisrecon.io.run_directory import write_atomically
+from thesisrecon.io.files import write_atomically
 
 WEBP_QUALITY = 85
 """Of animated WebP: lossy (38 dB on frames with much texture), an eighth of the size of APNG and, with all

@@ -15,8 +15,8 @@ from trimesh.visual import material as materials
 from trimesh.visual import texture as textures
 
 from thesisrecon.errors import UsageError
+from thesisrecon.io.files import write_atomically
 from thesisrecon.io.glb import require_plain_glb
-from thesisrecon.io.run_directory import write_atomically
 from thesisrecon.io.text import read_bytes
 from thesisrecon.types import F64, I64, TexturedMesh
 

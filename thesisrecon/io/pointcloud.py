@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.io.run_directory import write_atomically
+from thesisrecon.io.files import write_atomically
 
 F64 = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ def write_point_cloud(path: Path, xyz: F64, rgb: NDArray[np.uint8]) -> None:
 
     Coordinates are stored as float32, about their own origin, as viewers expect. The file appears whole or
     not at all. Raises ``ValueError`` for other shapes and for coordinates that are not finite in float32,
-    :class:`UsageError` where it cannot be written.
+    :class:`~thesisrecon.errors.Unwritable` where it cannot be written.
     """
     if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape or rgb.dtype != np.uint8:
         raise ValueError(

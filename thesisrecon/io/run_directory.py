@@ -11,10 +11,9 @@ import dataclasses
 import hashlib
 import json
 import os
-import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import Unwritable, UsageError
+from thesisrecon.io.files import as_read, is_partial, link, read_json, write_atomically, write_json
 from thesisrecon.io.records import bytes_from_record, read_record
-from thesisrecon.io.text import read_bytes
 from thesisrecon.types import StageReport
 
 try:
@@ -74,57 +73,6 @@ def _file_of(module: str) -> list[Path]:
     return [Path(file)] if file is not None and Path(file).is_file() else []
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, and on the disk when this returns.
-
-    Raises :class:`UsageError` where the place cannot be written.
-    """
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # What stands there may be a link to something else, which must not be written over.
-        partial.unlink(missing_ok=True)
-        with partial.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            partial.unlink()
-        raise UsageError(f"{path} cannot be written: {error.strerror or error}") from None
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON for people and machines; NaN and infinity become null."""
-    text = json.dumps(_finite(value), indent=2, ensure_ascii=False, default=_number)
-    write_atomically(path, (text + "\n").encode("utf-8", "replace"))
-
-
-def _number(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return _finite(value.tolist())
-    if isinstance(value, np.generic):
-        return _finite(value.item())
-    raise TypeError(f"{type(value).__name__} is not JSON")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def read_json(path: Path) -> Any:
-    """The content of a JSON file, None where it is absent, damaged, no regular file or too large."""
-    try:
-        return json.loads(read_bytes(path).decode("utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return None
-
-
 @dataclass(frozen=True)
 class StageFolder:
     """The folder of one stage: a file per item, and a manifest that people can read.
@@ -142,7 +90,7 @@ class StageFolder:
         if record is None and self.shared is not None:
             record = read_record(self.shared / f"{key}.npz", key)
             if record is not None:
-                _link(self.shared / f"{key}.npz", own)
+                link(self.shared / f"{key}.npz", own)
         return record
 
     def save(self, item: str, key: str, record: Any) -> None:
@@ -150,15 +98,18 @@ class StageFolder:
         own = self.path / f"{item}.npz"
         write_atomically(own, bytes_from_record(record, key))
         if self.shared is not None:
-            _link(own, self.shared / f"{key}.npz")
+            link(own, self.shared / f"{key}.npz")
 
     def finish(self, report: StageReport, settings: Mapping[str, Any], keys: Mapping[str, str]) -> None:
-        """Write the manifest of a stage that is done; files of items that are no longer part of it are
-        removed.
+        """Write the manifest of a stage that is done; files of items that are no longer part of it, and what
+        a kill left of one that was being written, are removed.
         """
-        for stale in self.path.glob("*.npz"):
-            if stale.stem not in keys:
-                stale.unlink(missing_ok=True)
+        try:
+            for stale in [*self.path.glob("*.npz"), *self.path.glob(".*.partial")]:
+                if is_partial(stale.name) or stale.stem not in keys:
+                    stale.unlink(missing_ok=True)
+        except OSError as error:
+            raise Unwritable(self.path, error) from None
         content = {"format": FORMAT, "settings": settings, "keys": keys, "report": dataclasses.asdict(report)}
         write_json(self.path / MANIFEST_FILE, content)
 
@@ -181,26 +132,6 @@ def _report(*, seconds: Any, counts: Any, metrics: Any, warnings: Any, stage: An
     if not all(isinstance(word, str) for word in (stage, *warnings)):
         raise TypeError("a report warns in words")
     return StageReport(stage, seconds, counts, metrics, tuple(warnings))
-
-
-def _link(source: Path, target: Path) -> None:
-    """The file under a second name, whole or not at all: files are only ever replaced, never changed.
-
-    Raises :class:`UsageError` where the place cannot be written.
-    """
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.link(source, partial)
-        except OSError:
-            shutil.copyfile(source, partial)
-        partial.replace(target)
-    except OSError as error:
-        raise UsageError(f"{target} cannot be written: {error.strerror or error}") from None
-    finally:
-        # Renaming one name of a file to another name of it does nothing at all.
-        partial.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -246,16 +177,14 @@ class RunDirectory:
                     if parent.is_dir() and not any(parent.iterdir()):
                         parent.rmdir()
         except OSError as error:
-            raise UsageError(
-                f"old results in the output folder {self.path} cannot be removed: {error.strerror}"
-            ) from None
+            raise Unwritable(f"the output folder {self.path}, of which old results must go,", error) from None
 
     def _check(self, identity: Mapping[str, Any], overwrite: bool) -> bool:
         """Whether the folder holds a run that differs in what ``identity`` tells."""
         there = read_json(self.path / RUN_FILE)
         if there is None:
             strange = sorted(p.name for p in self.path.iterdir() if p.name != LOCK_FILE)
-            if strange and RUN_FILE not in strange and not _only_unfinished(strange):
+            if strange and RUN_FILE not in strange and not all(map(is_partial, strange)):
                 raise UsageError(
                     f"the output folder {self.path} holds {strange[0]!r}, which is of no run; "
                     "choose an empty or a new folder"
@@ -264,17 +193,13 @@ class RunDirectory:
             return bool(strange)
         if isinstance(there, dict):
             there = {name: value for name, value in there.items() if name in identity}
-        difference = next(_differences(there, _finite(json.loads(json.dumps(identity, default=_number)))), "")
+        difference = next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
             raise UsageError(
                 f"the output folder {self.path} holds another run ({difference}); choose another folder, or "
                 "--overwrite to replace what differs and keep the rest"
             )
         return bool(difference)
-
-
-def _only_unfinished(names: list[str]) -> bool:
-    return all(name.startswith(".") and name.endswith(".partial") for name in names)
 
 
 def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
@@ -312,7 +237,7 @@ def _locked(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
-        raise UsageError(f"the output folder {folder} cannot be written: {error.strerror}") from None
+        raise Unwritable(f"the output folder {folder}", error) from None
     try:
         _lock(handle, folder)
         yield

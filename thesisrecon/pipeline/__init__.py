@@ -76,7 +76,8 @@ def reconstruct(
             raise UsageError(f"there are no photographs in {images} (folders in it are not searched)")
         run.title = scene_name(Path(images)) or run.title
     # Reading photographs takes long: whether the folder is free for this run is asked before.
-    with run.workers, run.directory.claimed(wishes(run), overwrite=overwrite):
+    claim = run.directory.claimed(wishes(run), overwrite=overwrite)
+    with run.workers, claim, run.kept_in_folder():
         photographs = read_set(run, images)
         check_pairs(run, photographs, until)
         run.directory.adopt(identity(run, photographs), overwrite=overwrite, results=RESULT_FILES)

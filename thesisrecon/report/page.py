@@ -17,7 +17,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from thesisrecon.io.run_directory import write_atomically
+from thesisrecon.io.files import write_text
 from thesisrecon.report.data import ReportData
 from thesisrecon.report.drawing import (
     DIFFERENCE_LIMIT,
@@ -106,7 +106,7 @@ def write_report(path: str | os.PathLike[str], data: ReportData) -> None:
     Raises ``UsageError`` where the place cannot be written.
     """
     # File names need not be Unicode: what cannot be encoded becomes a question mark.
-    write_atomically(Path(path), render_report(data).encode("utf-8", "replace"))
+    write_text(Path(path), render_report(data))
 
 
 def render_report(data: ReportData) -> str:

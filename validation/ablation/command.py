@@ -6,8 +6,10 @@ import argparse
 import sys
 from collections import Counter
 from pathlib import Path
+from signal import SIGINT
 
 from thesisrecon.errors import UsageError
+from thesisrecon.stops import CODES, advised
 from validation.ablation.analysis import analyse
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import Plan, plan_study
@@ -15,6 +17,7 @@ from validation.ablation.progress import progress_view
 from validation.ablation.run import Rows, ablate, parts_of, read_rows
 from validation.ablation.toml import read_study
 
+KEPT = "the same command goes on from the rows that ended, which are in {}"
 STUDIES = Path(__file__).parent / "studies"
 
 
@@ -43,15 +46,15 @@ def run_command(told: argparse.Namespace) -> int:
         if told.read:
             rows = read_rows(study, told.out)
         else:
-            with progress_view() as heard:
+            with advised(KEPT.format(told.out)), progress_view() as heard:
                 rows = ablate(study, told.out, executor=told.executor, threads=told.threads, heard=heard)
         page = write_analysis(analyse(rows), told.out)
     except UsageError as error:
         print(f"ablate: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print(f"stopped; the rows that ended are in {told.out}, the same command goes on", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as stop:
+        print("; ".join(("ablate: interrupted", *map(str, stop.args))), file=sys.stderr)
+        return CODES[SIGINT]
     print(_last_words(rows, page))
     return 3 if rows and all(r.failure for r in rows) else 0
 

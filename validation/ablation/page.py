@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon import __version__
-from thesisrecon.errors import UsageError
+from thesisrecon.io.files import write_text
 from thesisrecon.report.html import page_resource, plotly_script, script_hashes, template_environment
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_told
 from validation.ablation.plan import Plan
@@ -33,15 +33,11 @@ MOST_LEVELS = 40
 def write_analysis(analysis: Analysis, out: str | Path) -> Path:
     """Write ``index.html`` and the tables into ``out``; the path of the page.
 
-    Raises :class:`UsageError` where the folder cannot be written.
+    Raises :class:`~thesisrecon.errors.Unwritable` where the folder cannot be written.
     """
     out = Path(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        tables = write_tables(analysis, out)
-        (out / PAGE).write_text(_page(analysis, [t.name for t in tables]), encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"the output folder {out} cannot be written: {error.strerror}") from None
+    tables = write_tables(analysis, out)
+    write_text(out / PAGE, _page(analysis, [t.name for t in tables]))
     return out / PAGE
 
 

@@ -14,7 +14,7 @@ from typing import Any, overload
 
 from thesisrecon.config import tables_from_config
 from thesisrecon.errors import WorkersLost
-from thesisrecon.io.run_directory import write_json
+from thesisrecon.io.files import write_json
 from thesisrecon.settings import table_from_dataclass
 from thesisrecon.workers import PATIENCE_S
 from validation.ablation.plan import Plan, PlannedRow, plan_study

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from thesisrecon.io.files import write_atomically, write_text
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_told
 from validation.ablation.study import Measure
 
@@ -82,7 +84,7 @@ def cell_records(cells: Iterable[Cell]) -> list[Record]:
 def write_tables(analysis: Analysis, out: Path) -> list[Path]:
     """``rows``, ``comparisons`` and ``means`` as CSV, and as Parquet where pyarrow is installed; the tables
     for people as ``tables.md``."""
-    (out / "tables.md").write_text(text_of(analysis) + "\n", encoding="utf-8")
+    write_text(out / "tables.md", text_of(analysis) + "\n")
     written = [out / "tables.md"]
     for name, records in (
         ("rows", row_records(analysis)),
@@ -96,10 +98,11 @@ def write_tables(analysis: Analysis, out: Path) -> list[Path]:
 
 
 def _write_csv(path: Path, records: Sequence[Record]) -> Path:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(records[0]) if records else [])
-        writer.writeheader()
-        writer.writerows({k: _cell_text(v) for k, v in r.items()} for r in records)
+    sink = io.StringIO(newline="")
+    writer = csv.DictWriter(sink, list(records[0]) if records else [])
+    writer.writeheader()
+    writer.writerows({k: _cell_text(v) for k, v in r.items()} for r in records)
+    write_text(path, sink.getvalue())
     return path
 
 
@@ -108,7 +111,9 @@ def _write_parquet(path: Path, records: Sequence[Record]) -> Path:
     import pyarrow.parquet
 
     columns = {name: [_no_nan(r[name]) for r in records] for name in records[0]}
-    pyarrow.parquet.write_table(pyarrow.table(columns), path)
+    sink = io.BytesIO()
+    pyarrow.parquet.write_table(pyarrow.table(columns), sink)
+    write_atomically(path, sink.getvalue())
     return path
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,7 +12,7 @@ from typing import Any
 from thesisrecon.cluster import Cluster, connected, is_address
 from thesisrecon.errors import UsageError
 from thesisrecon.settings import unknown_word
-from thesisrecon.workers import NAMES, available_threads
+from thesisrecon.workers import NAMES, ProcessPool, available_threads
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MANY = 64
@@ -76,19 +74,16 @@ def crew_of(wish: str | Executor, threads: int | None) -> Iterator[Crew]:
         raise UsageError(unknown_word("executor", wish, NAMES))
     try:
         yield crew
+    except BaseException:
+        if isinstance(crew.executor, ProcessPool):
+            crew.executor.abandon()
+        raise
     finally:
         crew.executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _processes(count: int) -> ProcessPoolExecutor:
+def _processes(count: int) -> ProcessPool:
     for name in ONE_THREAD:
         # As many processes as cores: each has one, and NumPy's own threads would fight for them.
         os.environ.setdefault(name, "1")
-    return ProcessPoolExecutor(
-        count,
-        # Forking a process that runs threads can deadlock.
-        mp_context=multiprocessing.get_context("spawn"),
-        # Ctrl-C is for the process that hands out the rows.
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
-    )
+    return ProcessPool(count)

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 import thesisrecon
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.io.files import write_text
 from thesisrecon.optimize.losses import LossName
 from thesisrecon.optimize.metric_bundle import (
     BundleOptions,
@@ -360,7 +361,7 @@ def main(arguments: list[str] | None = None) -> int:
     wishes = parser.parse_args(arguments)
     if wishes.child:
         told = measure_walk(wishes.child[0], int(wishes.child[1]), wishes.child[2])
-        wishes.out.write_text(json.dumps(told), encoding="utf-8")
+        write_text(wishes.out, json.dumps(told))
         return 0
     rows: list[Metric] = []
     if "same" in wishes.parts:

@@ -21,6 +21,7 @@ import numpy as np
 from thesisrecon.assumptions import assume
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
+from thesisrecon.io.files import write_text
 from thesisrecon.run import stream
 from thesisrecon.types import B8, MetricResult
 from validation.checks.calibration_parts import (
@@ -158,8 +159,8 @@ def main(arguments: list[str] | None = None) -> int:
         text += [f"## {rows[0].scene}", "", markdown_table(rows), ""]
     told = [{**asdict(metric), "verdict": metric.verdict} for rows in tables for metric in rows]
     wishes.out.mkdir(parents=True, exist_ok=True)
-    (wishes.out / "calibration_coverage.md").write_text("\n".join(text), encoding="utf-8")
-    (wishes.out / "calibration_coverage.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    write_text(wishes.out / "calibration_coverage.md", "\n".join(text))
+    write_text(wishes.out / "calibration_coverage.json", json.dumps(told, indent=1) + "\n")
     print("\n".join(text))
     return int(any(metric.verdict == "missed" for rows in tables for metric in rows))
 

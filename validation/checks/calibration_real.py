@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
+from thesisrecon.io.files import write_text
 from thesisrecon.selfcalibration import HypothesesAndRefinement
 from thesisrecon.types import Reconstruction
 from validation.checks.calibration_bench import Bench, Config, Rows, model_of, truth_of
@@ -215,8 +216,8 @@ def write_results(out: Path, tables: Sequence[Sequence[Metric]]) -> None:
     for rows in tables:
         text += [f"## {rows[0].scene}", "", markdown_table(list(rows)), ""]
     told = [{**asdict(metric), "verdict": metric.verdict} for rows in tables for metric in rows]
-    (out / "calibration_real.md").write_text("\n".join(text), encoding="utf-8")
-    (out / "calibration_real.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    write_text(out / "calibration_real.md", "\n".join(text))
+    write_text(out / "calibration_real.json", json.dumps(told, indent=1) + "\n")
 
 
 def measure(bench: Bench, parts: Sequence[str], seeds: Sequence[int]) -> list[list[Metric]]:

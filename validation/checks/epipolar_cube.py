@@ -23,6 +23,7 @@ from plotly.colors import qualitative
 from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.geometry.camera import compose_camera
 from thesisrecon.geometry.multiview import epipoles, symmetric_residuals
+from thesisrecon.io.files import write_text
 from validation.checks.epipolar_catalogue import METHODS, THRESHOLD_PX, TOLD_SIGMAS, Method
 from validation.scenes.cube import CubeSequence, make_cube
 
@@ -245,7 +246,7 @@ def main() -> int:
     print(text)
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)
-        (arguments.out / "cube.md").write_text(text, encoding="utf-8")
+        write_text(arguments.out / "cube.md", text)
         draw(rows).write_html(arguments.out / "cube.html", include_plotlyjs=True)
     return 0
 

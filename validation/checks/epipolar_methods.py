@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from thesisrecon.epipolar.degeneracy import Configuration
 from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.geometry.multiview import symmetric_residuals
+from thesisrecon.io.files import write_text
 from validation.checks.epipolar_catalogue import DEFAULT, GOLD, METHODS, THRESHOLD_PX, TOLD_SIGMAS, Method
 from validation.references.libraries import PACKAGES, one_thread
 from validation.scenes.two_views import make_two_views
@@ -194,7 +195,7 @@ def write_results(path: Path, results: Sequence[Result]) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     content = {"made_with": made, "results": [asdict(r) for r in results]}
-    path.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1))
 
 
 def merged(old: Sequence[Result], new: Sequence[Result]) -> list[Result]:

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from thesisrecon.io.files import write_text
 from validation.checks.front_end_invariance import check_invariance, measure_invariance
 from validation.checks.front_end_kermit import check_kermit, kermit_table, measure_kermit
 from validation.checks.front_end_pairs import check_pairs, measure_pairs, pair_table
@@ -70,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
         if wishes.out is not None:
             # After each block, so that a run cut short keeps what it has.
             wishes.out.parent.mkdir(parents=True, exist_ok=True)
-            wishes.out.write_text("\n".join(told), encoding="utf-8")
+            write_text(wishes.out, "\n".join(told))
     if not told:
         print("the photographs are not on this machine (THESISRECON_DATA)", file=sys.stderr)
         return 3

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.config import PipelineConfig
+from thesisrecon.io.files import write_text
 from thesisrecon.io.images import list_images, read_photographs
 from thesisrecon.pipeline import detect_features, match_views
 from thesisrecon.workers import Workers
@@ -134,7 +135,7 @@ def main() -> None:
     start = time.process_time()
     seconds, _ = relate_all(paths, threads=wishes.threads)
     told = {**seconds, CPU: time.process_time() - start}
-    wishes.out.write_text(json.dumps(told), encoding="utf-8")
+    write_text(wishes.out, json.dumps(told))
 
 
 if __name__ == "__main__":

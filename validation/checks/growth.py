@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.config import PipelineConfig, preset
+from thesisrecon.io.files import write_text
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate
 from thesisrecon.pipeline import reconstruct
 from thesisrecon.types import RunResult
@@ -219,7 +220,7 @@ def main(arguments: list[str] | None = None) -> int:
     if wishes.child:
         method, count = wishes.child
         row = measure_here(wishes, method, int(count))
-        wishes.out.write_text(json.dumps(asdict(row)), encoding="utf-8")
+        write_text(wishes.out, json.dumps(asdict(row)))
         return 0
     # Compiling the kernels would take the most memory of all, in whichever process comes first.
     measure(wishes, "overlap-estimate", 4)
@@ -237,7 +238,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"\n{facts}, {os.cpu_count()} cores\n")
     print(table(rows))
     if wishes.out is not None:
-        wishes.out.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
+        write_text(wishes.out, json.dumps([asdict(row) for row in rows], indent=1) + "\n")
     return 0
 
 

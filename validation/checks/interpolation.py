@@ -22,6 +22,7 @@ from thesisrecon.between import rectified_pair, relate
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.camera import camera_from_centre, project
 from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.io.files import write_text
 from thesisrecon.types import Image
 from thesisrecon.views.interpolation import InterpolatedPair
 from validation.checks.tensor_views import (
@@ -304,7 +305,7 @@ def main(arguments: list[str] | None = None) -> int:
     told = "\n\n".join(text)
     print(told)
     if wishes.out is not None:
-        (wishes.out / "interpolation.md").write_text(told + "\n", encoding="utf-8")
+        write_text(wishes.out / "interpolation.md", told + "\n")
     return int(any(row.verdict == "missed" for row in rows))
 
 

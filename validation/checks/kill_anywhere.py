@@ -27,7 +27,6 @@ CLEAN = ("seconds", "elapsed_seconds", "resumed", "peak_memory_mb", "threads", "
 """Of a summary: what may differ between runs of one answer."""
 TORN = """
 import os, signal, sys
-import thesisrecon.io.run_directory as store
 left = int(sys.argv.pop(1))
 sync = os.fsync
 def torn(descriptor):
@@ -37,7 +36,7 @@ def torn(descriptor):
         os.ftruncate(descriptor, os.fstat(descriptor).st_size // 2)
         os.kill(os.getpid(), signal.SIGKILL)
     sync(descriptor)
-store.os.fsync = torn
+os.fsync = torn
 from thesisrecon.cli import run_command
 sys.exit(run_command(sys.argv[1:]))
 """
@@ -80,13 +79,13 @@ def different(one: dict[str, bytes], other: dict[str, bytes]) -> tuple[str, ...]
 class Runs:
     """Runs of one set of photographs with one command, in folders of ``place``."""
 
-    def __init__(self, place: Path, options: list[str]) -> None:
-        self.place, self.options = place, options
+    def __init__(self, place: Path, options: list[str], images: Path = COURTYARD / "images") -> None:
+        self.place, self.options, self.images = place, options, images
         self.environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
     def arguments(self, out: Path) -> list[str]:
         """The command line but for the program."""
-        return ["reconstruct", str(COURTYARD / "images"), "-o", str(out), *self.options]
+        return ["reconstruct", str(self.images), "-o", str(out), *self.options]
 
     def whole(self, out: Path) -> float:
         """Run to the end; returns the seconds it took."""

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, PairMatcher, SemiGlobal
+from thesisrecon.io.files import write_text
 from thesisrecon.types import DisparityMap
 from validation.metrics.record import Metric, markdown_table, summary_table
 from validation.references.libraries import one_thread
@@ -184,8 +185,8 @@ def write_results(out: Path, tables: Sequence[Sequence[Metric]]) -> None:
     for rows in tables:
         text += [f"## {rows[0].scene}", "", markdown_table(list(rows)), ""]
     told = [{**asdict(metric), "verdict": metric.verdict} for rows in tables for metric in rows]
-    (out / "stereo.md").write_text("\n".join(text), encoding="utf-8")
-    (out / "stereo.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    write_text(out / "stereo.md", "\n".join(text))
+    write_text(out / "stereo.json", json.dumps(told, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from thesisrecon.io.files import write_text
 from validation.harness.process import failure_of, last_words, own_cores, run_process
 from validation.harness.records import Wishes
 from validation.references.libraries import NAMES
@@ -27,7 +28,7 @@ def ask_canaries(wishes: Wishes) -> dict[str, str]:
         told = {library: future.result() for library, future in zip(NAMES, asked, strict=True)}
     refused = {library: words for library, words in told.items() if words}
     wishes.out.mkdir(parents=True, exist_ok=True)
-    (wishes.out / FILE).write_text(json.dumps(refused), encoding="utf-8")
+    write_text(wishes.out / FILE, json.dumps(refused))
     return refused
 
 

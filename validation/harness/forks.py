@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -51,7 +52,7 @@ class Template:
         self.close()
 
     def close(self) -> None:
-        """End the process; nothing runs in it any more."""
+        """End the process, and the task that runs in it."""
         for pipe in (self._child.stdin, self._child.stdout):
             if pipe is not None:
                 with contextlib.suppress(BrokenPipeError):
@@ -84,33 +85,39 @@ class Template:
 
 
 def serve(main: Callable[[list[str]], int], orders: IO[str], answers: IO[str]) -> None:
-    """Carry out one order after another, until there are no more: [log, seconds, *arguments], in JSON."""
+    """Carry out one order after another, until there are no more: [log, seconds, *arguments], in JSON. Where
+    the other end of ``orders`` is closed, or dies, the task that runs is killed."""
     for order in orders:
         log, limit_s, *arguments = json.loads(order)
         child = os.fork()
         if child == 0:
             _become(main, arguments, log)
-        code, peak_mb, cpu_s, timed_out = _wait(child, limit_s)
+        ended = _wait(child, limit_s, orders)
+        if ended is None:
+            return
+        code, peak_mb, cpu_s, timed_out = ended
         print(json.dumps([code, peak_mb, cpu_s, timed_out]), file=answers, flush=True)
 
 
-def _wait(child: int, limit_s: float) -> tuple[int, float, float, bool]:
-    """Exit code, peak memory in MB, processor seconds, and whether its time was up."""
-    killed = False
-
-    def kill(signum: int, frame: object) -> None:  # noqa: ARG001 (what a handler is given)
-        nonlocal killed
-        killed = True
+def _wait(child: int, limit_s: float, orders: IO[str]) -> tuple[int, float, float, bool] | None:
+    """Exit code, peak memory in MB, processor seconds, and whether its time was up; None where nobody wants
+    to know any more."""
+    ended = os.pidfd_open(child)
+    either = select.poll()
+    either.register(ended, select.POLLIN)
+    # Of a pipe that is told in any case: that its other end is closed.
+    either.register(orders, 0)
+    heard = {place for place, _ in either.poll(limit_s * 1000.0)}
+    if ended not in heard:
         with contextlib.suppress(ProcessLookupError):
             os.kill(child, signal.SIGKILL)
             os.killpg(child, signal.SIGKILL)
-
-    signal.signal(signal.SIGALRM, kill)
-    signal.setitimer(signal.ITIMER_REAL, limit_s)
     _, status, usage = os.wait4(child, 0)
-    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    os.close(ended)
+    if heard - {ended}:
+        return None
     code = os.waitstatus_to_exitcode(status)
-    return code, usage.ru_maxrss / 1024.0, usage.ru_utime + usage.ru_stime, killed and code == KILLED
+    return code, usage.ru_maxrss / 1024.0, usage.ru_utime + usage.ru_stime, not heard and code == KILLED
 
 
 def _become(main: Callable[[list[str]], int], arguments: list[str], log: str) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import PIL.Image
 
 from thesisrecon import __version__
+from thesisrecon.io.files import write_text
 from thesisrecon.report.html import page_resource, plotly_script, script_hashes, template_environment
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Wishes, key_of, slug
 from validation.harness.results import Change, Results, Row
@@ -54,7 +55,7 @@ def write_pages(
         failures = [(k, why) for k, why in results.failures.items() if k.split("/")[1] == scene]
         missing = [k for k in results.missing if k.split("/")[1] == scene]
         page = _page(scene, links, _verdict(rows, missing), sections, failures, None, None)
-        (wishes.out / f"scene-{slug(scene)}.html").write_text(page, encoding="utf-8")
+        write_text(wishes.out / f"scene-{slug(scene)}.html", page)
     whole = [_section(stages[name], results, names) for name in wishes.stages]
     page = _page(
         "Ours beside the references",
@@ -65,7 +66,7 @@ def write_pages(
         list(results.environment.items()),
         changes,
     )
-    (wishes.out / "index.html").write_text(page, encoding="utf-8")
+    write_text(wishes.out / "index.html", page)
     return wishes.out / "index.html"
 
 

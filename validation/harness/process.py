@@ -9,8 +9,10 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from thesisrecon.stops import killed_by
 from validation.scenes.real import ROOT
 
 POLL_S = 0.02
@@ -63,17 +65,19 @@ def run_process(
             cwd=cwd,
             start_new_session=True,
         )
+        kill = partial(os.killpg, child.pid, signal.SIGKILL)
         try:
-            while True:
-                pid, status, usage = os.wait4(child.pid, os.WNOHANG)
-                if pid:
-                    break
-                if not timed_out and limit_s is not None and time.perf_counter() - start > limit_s:
-                    timed_out = True
-                    os.killpg(child.pid, signal.SIGKILL)
-                time.sleep(POLL_S)
+            with killed_by(kill):
+                while True:
+                    pid, status, usage = os.wait4(child.pid, os.WNOHANG)
+                    if pid:
+                        break
+                    if not timed_out and limit_s is not None and time.perf_counter() - start > limit_s:
+                        timed_out = True
+                        kill()
+                    time.sleep(POLL_S)
         except BaseException:
-            os.killpg(child.pid, signal.SIGKILL)
+            kill()
             raise
     child.returncode = os.waitstatus_to_exitcode(status)
     wall_s, cpu_s = time.perf_counter() - start, usage.ru_utime + usage.ru_stime

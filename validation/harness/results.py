@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import platform
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.io.files import write_text
 from thesisrecon.io.text import read_bytes
 from validation.harness.canaries import read_refused
 from validation.harness.gates import Gate
@@ -129,9 +131,7 @@ def write_results(out: Path, results: Results) -> None:
         "environment": dict(results.environment),
         "wishes": dict(results.wishes),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "results.json").write_text(json.dumps(told, indent=1, allow_nan=False), encoding="utf-8")
-    (out / "tables").mkdir(exist_ok=True)
+    write_text(out / "results.json", json.dumps(told, indent=1, allow_nan=False))
     for stage in dict.fromkeys(row.key.split("/")[0] for row in results.rows):
         _write_csv(
             out / "tables" / f"{stage}.csv", [r for r in results.rows if r.key.startswith(f"{stage}/")]
@@ -187,15 +187,16 @@ def compare(before: Results, now: Results) -> list[Change]:
 
 def _write_csv(path: Path, rows: Sequence[Row]) -> None:
     references = list(dict.fromkeys(name for row in rows for name in row.reference))
-    with path.open("w", newline="", encoding="utf-8") as sink:
-        writer = csv.writer(sink)
-        writer.writerow(
-            ["key", "unit", "ours", *references, "direction", "limit", "verdict", "definition", "reason"]
-        )
-        for row in rows:
-            others = [row.reference.get(name) for name in references]
-            told = [row.direction, row.limit, row.verdict, row.source, row.reason]
-            writer.writerow([row.key, row.unit, row.value, *others, *told])
+    sink = io.StringIO(newline="")
+    writer = csv.writer(sink)
+    writer.writerow(
+        ["key", "unit", "ours", *references, "direction", "limit", "verdict", "definition", "reason"]
+    )
+    for row in rows:
+        others = [row.reference.get(name) for name in references]
+        told = [row.direction, row.limit, row.verdict, row.source, row.reason]
+        writer.writerow([row.key, row.unit, row.value, *others, *told])
+    write_text(path, sink.getvalue())
 
 
 def _finite(value: float | None) -> float | None:

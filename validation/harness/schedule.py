@@ -16,6 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from thesisrecon.io.files import write_text
 from validation.harness.forks import Template
 from validation.harness.process import Process, failure_of, last_words, own_cores
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Task, Wishes
@@ -47,7 +48,7 @@ def run_tasks(
     """The judgement and outcomes of each (stage, scene); nothing that fails stops the others."""
     shutil.rmtree(wishes.out / "data", ignore_errors=True)
     wishes.out.mkdir(parents=True, exist_ok=True)
-    (wishes.out / "wishes.json").write_text(json.dumps(wishes.to_json()), encoding="utf-8")
+    write_text(wishes.out / "wishes.json", json.dumps(wishes.to_json()))
     tasks = tasks_of(wishes, stages)
     place_of = {task: n for n, task in enumerate(tasks)}
     ended = take_over(wishes, tasks, stages)
@@ -57,7 +58,8 @@ def run_tasks(
     running: dict[Future[Outcome], Task] = {}
     cores = own_cores()[: wishes.threads]
     total = len(tasks)
-    with ExitStack() as stack, ThreadPoolExecutor(len(cores)) as pool:
+    # Where the main thread is interrupted the processes end first: their threads wait for nothing else.
+    with ThreadPoolExecutor(len(cores)) as pool, ExitStack() as stack:
         free = _Templates(cores, wishes, stack)
         while waiting or running:
             for task in [t for t in waiting if len(running) < len(cores)]:
@@ -102,6 +104,11 @@ class _Templates:
         self._modules = ("validation.harness.worker", wishes.stages_from)
         self._stack, self._lock = stack, threading.Lock()
         self._free = [(core, self._start(core)) for core in cores]
+        self._over = False
+        stack.callback(self._end)
+
+    def _end(self) -> None:
+        self._over = True
 
     def _start(self, core: int) -> Template:
         return self._stack.enter_context(Template(self._modules, core, ENVIRONMENT))
@@ -113,7 +120,9 @@ class _Templates:
         try:
             return template.run(arguments, log=log, limit_s=limit_s)
         except RuntimeError as error:
-            log.write_text(f"{error}\n", encoding="utf-8")
+            if self._over:
+                raise
+            write_text(log, f"{error}\n")
             template = self._start(core)
             return Process(1, 0.0, 0.0, 0.0)
         finally:
@@ -154,7 +163,7 @@ def _carry_out(task: Task, wishes: Wishes, ended: Mapping[Task, Outcome], free: 
     arguments = [str(wishes.out / "wishes.json"), task.stage, task.scene]
     if task.method == JUDGE:
         told = {name: asdict(o) | {"place": str(o.place)} for name, o in _outcomes(task, ended).items()}
-        (place / OUTCOMES).write_text(json.dumps(told), encoding="utf-8")
+        write_text(place / OUTCOMES, json.dumps(told))
     else:
         arguments.append(task.method)
     # Beside the place of the task, which may empty it.

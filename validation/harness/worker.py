@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import StageFailure
+from thesisrecon.io.files import write_text
 from validation.harness.canaries import read_refused
 from validation.harness.records import Judgement, Outcome, Stage, Task, Wishes
 from validation.references.libraries import refuse
@@ -44,7 +45,7 @@ def _judge(wishes: Wishes, stage: Stage, scene: str) -> None:
     outcomes = {name: Outcome(**{**o, "place": Path(o["place"])}) for name, o in told.items()}
     judgement = stage.judge(scene, outcomes, wishes)
     text = json.dumps(_plain(judgement), default=_plain_number)
-    (place / JUDGEMENT).write_text(text, encoding="utf-8")
+    write_text(place / JUDGEMENT, text)
 
 
 def _plain(judgement: Judgement) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from typing import Literal
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.io.files import write_text
 from thesisrecon.types import F64, Reconstruction
 from validation.references.colmap_matching import DEFAULT_FOCAL_REL, forget_focal_priors
 from validation.references.libraries import pycolmap
@@ -110,7 +111,7 @@ def map_incrementally(images: Path, out: Path, options: pycolmap.IncrementalPipe
     start = time.perf_counter()
     map_database(out / "database.db", images, out / "sparse", options)
     seconds["map"] = time.perf_counter() - start
-    (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    write_text(out / "seconds.json", json.dumps(seconds))
     return read_run(images, out)
 
 
@@ -121,7 +122,7 @@ def _map_globally(images: Path, out: Path, threads: int) -> ReferenceRun:
     (out / "sparse").mkdir(exist_ok=True)
     pycolmap.global_mapping(out / "database.db", images, out / "sparse", options)
     seconds["map"] = time.perf_counter() - start
-    (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    write_text(out / "seconds.json", json.dumps(seconds))
     return read_run(images, out)
 
 

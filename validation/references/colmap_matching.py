@@ -11,6 +11,7 @@ import shutil
 import time
 from pathlib import Path
 
+from thesisrecon.io.files import write_text
 from validation.references.libraries import pycolmap
 
 DEFAULT_FOCAL_REL = 1.2
@@ -41,7 +42,7 @@ def match_with_pycolmap(
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
     seconds["match"] = time.perf_counter() - start
-    (out / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    write_text(out / "seconds.json", json.dumps(seconds))
     return seconds
 
 

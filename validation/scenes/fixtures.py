@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import features
 
+from thesisrecon.io.files import write_atomically, write_text
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.cube import make_cube
 from validation.scenes.photograph import Sensor, encode_jpeg, expose, integrate_pixels
@@ -111,7 +112,7 @@ def versions() -> dict[str, str]:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Indented JSON with a final newline."""
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def write_courtyard(folder: Path, *, threads: int = 2) -> None:
@@ -122,8 +123,8 @@ def write_courtyard(folder: Path, *, threads: int = 2) -> None:
     with ThreadPoolExecutor(threads) as pool:
         views = pool.map(lambda item: render_photograph(world, item[1], item[0]), enumerate(poses))
         for k, (jpeg, depth) in enumerate(views):
-            (folder / "images" / f"{k:04d}.jpg").write_bytes(jpeg)
-            (folder / "depth" / f"{k:04d}.png").write_bytes(encode_depth(depth))
+            write_atomically(folder / "images" / f"{k:04d}.jpg", jpeg)
+            write_atomically(folder / "depth" / f"{k:04d}.png", encode_depth(depth))
     cameras = {
         f"{k:04d}.jpg": {
             "width": SIZE[0],

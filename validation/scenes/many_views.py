@@ -6,6 +6,7 @@ another cost than that of a walk. The first n of a longer set are the set of n, 
 
 from __future__ import annotations
 
+import io
 from concurrent.futures import ThreadPoolExecutor
 from math import cos, pi, sin, tan
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from thesisrecon.io.files import write_atomically
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import Pose
 from validation.scenes.photograph import Sensor, expose, integrate_pixels
@@ -75,10 +77,10 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
     world, poses = build_courtyard(), walk(count, size)
 
     def write(k: int) -> None:
-        partial = folder / f".{k:04d}.partial"
-        picture = PillowImage.fromarray(render(world, poses[k], size, seed=k))
-        picture.save(partial, "PNG", compress_level=1)
-        partial.replace(folder / f"{k:04d}.png")
+        picture = io.BytesIO()
+        photograph = PillowImage.fromarray(render(world, poses[k], size, seed=k))
+        photograph.save(picture, "PNG", compress_level=1)
+        write_atomically(folder / f"{k:04d}.png", picture.getvalue())
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(write, missing))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.io.run_directory import read_json
+from thesisrecon.io.files import read_json
 
 F64 = NDArray[np.float64]
 

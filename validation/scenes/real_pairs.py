@@ -5,6 +5,7 @@ SIFT matches are OpenCV's and kept in a folder, so that they are found once.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from thesisrecon.geometry.camera import compose_camera
 from thesisrecon.geometry.multiview import fundamental_from_cameras, sampson_residuals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.io.files import write_atomically
 from validation.references.sift import SiftKeypoints, detect_sift, match_sift
 from validation.scenes.real import Scene, data_root
 
@@ -58,8 +60,9 @@ def match_photographs(
     first, second = (_sift(path) for path in paths)
     index = match_sift(first, second, ratio=ratio, mutual=mutual)
     found = np.hstack([first.xy[index[:, 0]], second.xy[index[:, 1]]])
-    cache.mkdir(parents=True, exist_ok=True)
-    np.save(kept, found)
+    whole = io.BytesIO()
+    np.save(whole, found)
+    write_atomically(kept, whole.getvalue())
     return found[:, :2].copy(), found[:, 2:].copy()
 
 

@@ -3,6 +3,7 @@ which only a part is left. The truth of each is exact: the pixels are moved, and
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from thesisrecon.io.files import write_atomically
 from validation.scenes.real import Scene
 
 F64 = NDArray[np.float64]
@@ -125,8 +127,9 @@ def _read(path: Path) -> U8:
 
 def _write(folder: Path, stem: str, rgb: U8) -> Path:
     """Kept as it is where it is there already: the pixels follow from the folder's name."""
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{stem}.png"
     if not path.is_file():
-        PillowImage.fromarray(rgb).save(path, compress_level=1)
+        picture = io.BytesIO()
+        PillowImage.fromarray(rgb).save(picture, "PNG", compress_level=1)
+        write_atomically(path, picture.getvalue())
     return path

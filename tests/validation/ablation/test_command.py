@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +13,13 @@ from typing import Any
 import pytest
 
 from tests.report.opened import Witness
-from tests.validation.ablation.toy import Darts
+from tests.validation.ablation.toy import Darts, marks
 from validation.__main__ import main
 from validation.ablation import Measure, Study, ablate, analyse, write_analysis
 from validation.ablation.progress import duration, words_of
 from validation.ablation.run import State
+from validation.checks.stop_anywhere import stopped
+from validation.scenes.real import ROOT
 
 EVIL = "<img src=x onerror=alert(1)>"
 STUDY = """
@@ -51,6 +56,31 @@ def test_a_study_of_a_file_leaves_a_page_and_tables(
     assert "aim = 4" in page
     assert (tmp_path / "out" / "rows.csv").is_file()
     assert main([*wish, "--read"]) == 0
+
+
+def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path: Path) -> None:
+    file = write_study(tmp_path)
+    file.write_text(file.read_text().replace(":Darts", f':Darts", pause_s = 600, log = "{tmp_path / "log"}'))
+    wish = ["ablate", str(file), "-o", str(tmp_path / "out"), "--threads", "2"]
+    stop = stopped(
+        [sys.executable, "-m", "validation", *wish],
+        lambda: len(marks(tmp_path / "log")) == 2,
+        signal.SIGINT,
+        environment={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    kept = f"the same command goes on from the rows that ended, which are in {tmp_path / 'out'}"
+    assert (stop.code, stop.said, stop.left) == (130, f"validation: interrupted; {kept}\n", 0)
+
+
+def test_an_interrupt_in_a_program_is_told_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("validation.ablation.command.ablate", interrupt)
+    assert main(["ablate", str(write_study(tmp_path)), "-o", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err.startswith("ablate: interrupted; the same command goes on from the rows")
 
 
 def test_rows_that_all_fail_and_wrong_wishes_end_otherwise(

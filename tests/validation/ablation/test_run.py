@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from tests.validation.ablation.toy import Darts, Steps, area, marks
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import Unwritable, UsageError
 from validation.ablation import Study, ablate, analyse, read_rows
 from validation.ablation.run import State
 from validation.ablation.workers import crew_of
@@ -185,6 +185,18 @@ def test_a_killed_study_loses_no_more_than_the_rows_in_flight(tmp_path: Path) ->
     assert len(rows) == 48
     assert not any(r.failure for r in rows)
     assert len(marks(tmp_path / "log")) == 48 + begun - kept
+
+
+@pytest.mark.parametrize("executor", ["local", "processes"])
+def test_a_row_on_a_full_disk_has_not_failed(executor: str, tmp_path: Path) -> None:
+    log, out = tmp_path / "log", tmp_path / "out"
+    crowded = study(log, scenes=["full"], seeds=1)
+    with pytest.raises(Unwritable, match=r"throws\.txt cannot be written: .* make room there"):
+        ablate(crowded, out, executor=executor, threads=1)
+    assert len(read_rows(crowded, out)) == 0
+    (tmp_path / "log.room").touch()
+    rows = ablate(crowded, out, executor="local")
+    assert [r.failure for r in rows] == [""] * 3
 
 
 def test_the_time_left_is_that_of_rows_of_the_same_variant() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,8 @@ from validation.ablation.study import Measure, Place
 class Darts:
     """A draw about ``aim``, and a mark in ``log`` whenever one is made.
 
-    ``refuses`` and ``empty`` are scenes where nothing, or no number, is found.
+    ``refuses`` and ``empty`` are scenes where nothing, or no number, is found, and ``full`` is one without
+    room, until there is a file ``LOG.room``.
     """
 
     aim: float = 0.0
@@ -52,6 +54,8 @@ class Darts:
             raise StageFailure("no board", "nothing hangs there", "hang one up")
         if scene == "breaks":
             raise KeyError("board")
+        if scene == "full" and not Path(f"{self.log}.room").exists():
+            raise OSError(errno.ENOSPC, "No space left on device", "throws.txt")
         rng = np.random.default_rng((seed, len(scene)))
         threshold = getattr(config.epipolar, "threshold_px", 1.0)
         miss = self.aim + self.spread * float(rng.normal()) + threshold

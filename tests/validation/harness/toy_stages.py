@@ -45,6 +45,7 @@ class ToyStage:
         if task.method == "crashing":
             os.kill(os.getpid(), signal.SIGSEGV)
         if task.method == "hanging":
+            (place / "process").write_text(str(os.getpid()))
             time.sleep(600)
         value = VALUES[task.method]
         if task.method == "after":

@@ -14,7 +14,8 @@ import thesisrecon
 from thesisrecon.config import PipelineConfig, config_from_tables, preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
-from thesisrecon.io.run_directory import MANIFEST_FILE, RunDirectory, read_json
+from thesisrecon.io.files import read_json
+from thesisrecon.io.run_directory import MANIFEST_FILE, RunDirectory
 from thesisrecon.run import FOLDERS
 from thesisrecon.types import Reconstruction
 from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes

@@ -12,6 +12,7 @@ import PIL.Image
 
 from thesisrecon.config import preset
 from thesisrecon.dense.multiview import MultiViewStereo, pinhole_view
+from thesisrecon.io.files import write_text
 from thesisrecon.io.images import read_photographs
 from thesisrecon.types import F32, DepthMap, Image, PinholeView, Reconstruction
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
@@ -81,7 +82,7 @@ class DepthStage:
             np.savez(
                 place / f"{view:04d}.npz", P=found.P, depth=found.depth, std=found.std, views=found.views
             )
-        (place / "seconds.txt").write_text(f"{seconds / max(len(maps), 1)}\n", encoding="utf-8")
+        write_text(place / "seconds.txt", f"{seconds / max(len(maps), 1)}\n")
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
         photographs = load_photographs(scene, wishes)

@@ -1,0 +1,82 @@
+"""A report that is told to stop leaves no task behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.test_stops import is_alive
+from tests.validation.harness.test_harness import toy_wishes
+from tests.validation.harness.toy_stages import ToyStage
+from validation.checks.stop_anywhere import stopped
+from validation.harness.records import Wishes
+from validation.harness.schedule import run_tasks
+from validation.scenes.real import ROOT
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from tests.validation.harness.test_harness import toy_wishes
+from tests.validation.harness.test_stops import hanging_stages
+from thesisrecon.stops import advised, obey_signals
+from validation.harness.schedule import run_tasks
+obey_signals("toy")
+with advised("begin again"):
+    run_tasks(toy_wishes(Path(sys.argv[1]), quick=False), hanging_stages(), print)
+"""
+
+
+class HangingStage(ToyStage):
+    """All its methods hang."""
+
+    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002
+        return ("hanging",)
+
+
+def hanging_stages() -> dict[str, HangingStage]:
+    return {"toy": HangingStage()}
+
+
+def process_of(out: Path) -> int:
+    """The process of the task that hangs, 0 where it is not there yet."""
+    told = list(out.rglob("hanging/process"))
+    return int(told[0].read_text() or 0) if told else 0
+
+
+def is_gone(number: int) -> bool:
+    """Whether the process ends soon: it is told by the end of its parent."""
+    end = time.monotonic() + 10.0
+    while is_alive(number) and time.monotonic() < end:
+        time.sleep(0.02)
+    return not is_alive(number)
+
+
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGKILL])
+def test_a_report_that_is_ended_takes_its_tasks_along(asked: signal.Signals, tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    program = [sys.executable, "-c", PROGRAM, str(tmp_path)]
+    stop = stopped(program, lambda: process_of(tmp_path) > 0, asked, environment=environment)
+    assert is_gone(process_of(tmp_path))
+    if asked == signal.SIGINT:
+        assert (stop.code, stop.said, stop.left) == (130, "toy: interrupted; begin again\n", 0)
+
+
+def test_an_interrupt_in_a_program_ends_the_tasks(tmp_path: Path) -> None:
+    wishes = replace(toy_wishes(tmp_path, quick=False), limit_s=120.0)
+
+    def interrupt() -> None:
+        while not process_of(tmp_path):
+            time.sleep(0.02)
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks(wishes, hanging_stages(), print)
+    assert is_gone(process_of(tmp_path))
