@@ -112,6 +112,10 @@ def _folder(text: str | Path) -> Path:
     return Path(text)
 
 
+class _Interrupted(Exception):
+    """Ctrl-C in a command."""
+
+
 @app.command()
 def reconstruct(
     images: Annotated[
@@ -280,7 +284,7 @@ def views(
     way, lamp = path or Way.orbit, light or Lamp.none
     color = color_from_text("black" if background is None else background)
     wishes = ViewWishes(way.value, 90 if frames is None else frames, wanted, lamp.value, color)
-    with advised(VIEWS_AGAIN), _progress_bars() as progress:
+    with _interruptible(VIEWS_AGAIN), _progress_bars() as progress:
         written = write_views(
             what[0],
             folder or what[0] / "views" / way.value,
@@ -311,7 +315,7 @@ def _views_between(
     if reading[1] is not None and reading[1] < 64:
         raise UsageError(f"--max-size takes at least 64 px; got {reading[1]}")
     wishes = BetweenWishes(tuple(photographs), method.value, count, *reading)
-    with advised(VIEWS_AGAIN), _progress_bars() as progress:
+    with _interruptible(VIEWS_AGAIN), _progress_bars() as progress:
         written = write_between(
             folder or Path("views") / method.value,
             wishes,
@@ -410,9 +414,20 @@ def _run(images: Path, out: Path, config: PipelineConfig, seed: int, options: Ma
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     advice = f"the same command goes on where it stopped (what was done is kept in {out})"
-    with advised(advice), _progress_bars() as progress:
+    with _interruptible(advice), _progress_bars() as progress:
         result: RunResult = run_pipeline(images, out, config=config, seed=seed, progress=progress, **options)
     typer.echo(summary_text(result.summary, out))
+
+
+@contextmanager
+def _interruptible(advice: str) -> Iterator[None]:
+    """What is advised where the block is interrupted; the parser has words of its own for a
+    ``KeyboardInterrupt``."""
+    try:
+        with advised(advice):
+            yield
+    except KeyboardInterrupt as stop:
+        raise _Interrupted(*stop.args) from None
 
 
 @contextmanager
@@ -448,7 +463,7 @@ def run_command(arguments: list[str]) -> int:
         return _say(str(error), USAGE)
     except StageFailure as failure:
         return _say(str(failure), IMPOSSIBLE)
-    except KeyboardInterrupt as stop:
+    except (_Interrupted, KeyboardInterrupt) as stop:
         # Where somebody else's program runs the command: ours is ended by `obey_signals`.
         return _say("; ".join((REASONS[SIGINT], *map(str, stop.args))), CODES[SIGINT])
     except MemoryError:
