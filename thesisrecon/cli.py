@@ -413,7 +413,7 @@ def _run(images: Path, out: Path, config: PipelineConfig, seed: int, options: Ma
     from thesisrecon.pipeline import reconstruct as run_pipeline
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    advice = f"the same command goes on where it stopped (what was done is kept in {out})"
+    advice = f"the same command goes on where it stopped (what was done is kept in {printable(str(out))})"
     with _interruptible(advice), _progress_bars() as progress:
         result: RunResult = run_pipeline(images, out, config=config, seed=seed, progress=progress, **options)
     typer.echo(summary_text(result.summary, out))

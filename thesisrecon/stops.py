@@ -15,6 +15,7 @@ import select
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
@@ -28,6 +29,7 @@ _SHOW_CURSOR = "\x1b[?25h\n"
 
 _advice: list[str] = []
 _kills: list[Callable[[], object]] = []
+_leaving: list[signal.Signals] = []
 _starting = threading.RLock()
 
 
@@ -79,10 +81,12 @@ def killed_by(kill: Callable[[], object]) -> Iterator[None]:
 
 @contextmanager
 def starting_processes() -> Iterator[None]:
-    """Processes started in this block do not hear Ctrl-C, which a terminal sends to all of a program, from
-    their first moment on; and the program does not end before they can be killed."""
+    """Processes started in this block leave both signals waiting from their first moment on, for a terminal
+    sends them to all of a program; and the program does not end before they can be killed."""
+    while _leaving:
+        time.sleep(START_S)
     with _starting:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, CODES)
         try:
             yield
         finally:
@@ -102,9 +106,10 @@ def _obey(program: str, heard: int) -> None:
     while number not in CODES:
         # Other handlers of the program write here too.
         number = os.read(heard, 1)[0]
-    # Never let go of: nothing is started any more.
-    _starting.acquire(timeout=START_S)
     asked = signal.Signals(number)
+    # Nothing more is started from here on; what is being started is waited for.
+    _leaving.append(asked)
+    _starting.acquire(timeout=START_S)
     _say(f"{program}: {REASONS[asked]}; {_advice[-1]}")
     for kill in [*_kills, _kill_children]:
         with suppress(Exception):

@@ -16,6 +16,7 @@ import os
 import pickle
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -26,11 +27,13 @@ from thesisrecon.cluster import Cluster, address_of, connected, is_address
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io.fingerprint import package_key
 from thesisrecon.settings import unknown_word
-from thesisrecon.stops import starting_processes
+from thesisrecon.stops import CODES, starting_processes
 
 NAMES = ("local", "processes", "dask://HOST:PORT")
 AHEAD = 2
 """Tasks an executor is given at a time, per worker: none waits for work, and few are in memory."""
+TOLD_S = 1.0
+"""How long a worker process that is told to end waits for the end of its program."""
 PATIENCE_S = 5.0
 """How long nothing may end before it is asked whether the workers are still there."""
 
@@ -220,7 +223,7 @@ class ProcessPool(futures.ProcessPoolExecutor):
     def __init__(self, count: int) -> None:
         # Forking a process that runs threads can deadlock.
         context = multiprocessing.get_context("spawn")
-        # Else the first process starts it, and lets Ctrl-C through again with that.
+        # Else the first process starts it, and lets signals through again with that.
         multiprocessing.resource_tracker.ensure_running()
         watched, self._held = context.Pipe(duplex=False)
         super().__init__(count, mp_context=context, initializer=_obey, initargs=(watched,))
@@ -248,12 +251,19 @@ def _processes(count: int) -> Iterator[futures.Executor]:
 
 
 def _obey(watched: multiprocessing.connection.Connection) -> None:
-    """Of a worker process: Ctrl-C is for the process that hands out the tasks, and when that closes its end
+    """Of a worker process: signals are for the process that hands out the tasks, and when that closes its end
     of the pipe, or dies, there is nobody to work for."""
 
-    def end() -> None:
+    def end_with_program() -> None:
         multiprocessing.connection.wait([watched])
         os._exit(1)
 
+    def end_when_told() -> None:
+        signal.sigwait({signal.SIGTERM})
+        # Where the whole program is told, it is the first to go, and takes this process along.
+        time.sleep(TOLD_S)
+        os._exit(CODES[signal.SIGTERM])
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end, daemon=True).start()
+    for end in (end_with_program, end_when_told):
+        threading.Thread(target=end, daemon=True).start()
