@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from tests.clusters import dask_cluster
+
+__all__ = ["dask_cluster"]
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with a test that is marked slow come first, otherwise the order stays."""

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from tests import fake_stages as fakes
+from tests.clusters import address
 from tests.fake_stages import fake_config, photographs
 from thesisrecon import cluster, workers
 from thesisrecon.cli import run_command
@@ -33,25 +34,6 @@ from thesisrecon.workers import Workers
 COURTYARD = Path(__file__).parents[1] / "fixtures" / "courtyard" / "images"
 NO_RESULT = ("seconds", "elapsed_seconds", "peak_memory_mb", "threads", "executor", "resumed")
 """What a summary says of how it came about."""
-
-
-@pytest.fixture(scope="module")
-def dask_cluster() -> Iterator[Any]:
-    """A scheduler and two worker processes on loopback."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        dashboard_address=":0",
-        worker_dashboard_address=None,
-        silence_logs=logging.ERROR,
-    ) as running:
-        yield running
-
-
-def address(running: Any) -> str:
-    return str(running.scheduler_address).replace("tcp://", "dask://")
 
 
 def results(out: Path) -> dict[str, Any]:

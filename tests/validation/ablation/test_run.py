@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.clusters import address
 from tests.validation.ablation.toy import Darts, Steps, area, marks
 from thesisrecon.errors import Unwritable, UsageError
 from validation.ablation import Study, ablate, analyse, read_rows
@@ -253,20 +253,10 @@ class DeadlyOnce(Darts):
         return super().run(*wish)
 
 
-def test_a_worker_of_a_cluster_that_is_killed_loses_no_row(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
+def test_a_worker_of_a_cluster_that_is_killed_loses_no_row(dask_cluster: Any, tmp_path: Path) -> None:
     log = tmp_path / "log"
     wish = study(log, scenes=["a"], seeds=4, task=DeadlyOnce(log=str(log)))
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        dashboard_address=":0",
-        worker_dashboard_address=None,
-        silence_logs=logging.ERROR,
-    ) as cluster:
-        address = f"dask://{cluster.scheduler_address.removeprefix('tcp://')}"
-        rows = ablate(wish, tmp_path / "out", executor=address)
+    rows = ablate(wish, tmp_path / "out", executor=address(dask_cluster))
     assert log.with_name("log.killed").exists()
     assert not any(row.failure for row in rows)
     # The file is there, so that nobody is killed this time.

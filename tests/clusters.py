@@ -1,0 +1,29 @@
+"""A Dask cluster on loopback."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def dask_cluster() -> Iterator[Any]:
+    """A scheduler and two worker processes on loopback."""
+    distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address=":0",
+        worker_dashboard_address=None,
+        silence_logs=logging.ERROR,
+    ) as running:
+        yield running
+
+
+def address(running: Any) -> str:
+    """What the command line calls it."""
+    return str(running.scheduler_address).replace("tcp://", "dask://")
