@@ -491,10 +491,25 @@ def _say(sentence: str, code: int) -> int:
     return code
 
 
+def _keep_stderr_to_ourselves() -> None:
+    """Libraries in C write what they like to the terminal (libtiff a line for every bad byte): theirs goes
+    nowhere, ours goes on."""
+    try:
+        ours, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    except OSError:
+        # Whoever closed it wants to hear nothing.
+        return
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    encoding = getattr(sys.stderr, "encoding", None)
+    sys.stderr = os.fdopen(ours, "w", buffering=1, encoding=encoding, errors="backslashreplace")
+
+
 def main() -> None:
     """The entry point of the command."""
-    for stream in (sys.stdout, sys.stderr):
-        # A name that a terminal has no letters for is told all the same.
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+    # A name that a terminal has no letters for is told all the same.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    if not os.environ.get(DEBUG_VARIABLE):
+        _keep_stderr_to_ourselves()
     sys.exit(run_command(sys.argv[1:]))

@@ -46,7 +46,7 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def bomb() -> bytes:
-    """30,000 x 30,000 pixels, all of them there, in a few hundred kilobytes: rows of one colour."""
+    """30,000 x 30,000 pixels, of which the first 400 rows are there, in 100 kB."""
     packer, rows = zlib.compressobj(9), bytes(3 * 30_000 + 1) * 100
     data = b"".join(packer.compress(rows) for _ in range(4)) + packer.flush()
     header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)

@@ -217,6 +217,8 @@ def test_programs_of_their_own_end_so_too(arguments: list[str], code: int, tmp_p
     folder.mkdir()
     (folder / "böm\u5199.png").write_bytes(files.bomb())
     pipe(folder / "pipe\x1b[31m.jpg")
+    packed = files.encoded("TIFF", compression="tiff_lzw")
+    (folder / "packed.tif").write_bytes(packed[:200] + b"\xff" * 200 + packed[400:])
     for name in ("summary.json", "model.glb", "cameras.json", "run.json"):
         (folder / name).symlink_to("/dev/zero")
     done = subprocess.run(

@@ -20,6 +20,12 @@ WISHES: list[tuple[str, list[str], Callable[[Path], object], str]] = [
     ("out a device", ["in", "-o", "/dev/null"], lambda _: None, "cannot be written"),
     ("out of the system", ["in", "-o", "/proc/thesisrecon"], lambda _: None, "cannot be written"),
     ("out round", ["in", "-o", "round"], lambda p: links("{here}/round")(p / "round"), "cannot be written"),
+    (
+        "lock a link",
+        ["in", "-o", "out"],
+        lambda p: ((p / "out").mkdir(), (p / "out" / ".lock").symlink_to(p / "elsewhere")),
+        "cannot be written: Too many levels",
+    ),
     ("lock a folder", ["in", "-o", "out"], lambda p: (p / "out" / ".lock").mkdir(parents=True), "written"),
     ("threads", ["in", "-o", "out", "--threads", "9" * 400], lambda _: None, "--threads"),
     ("seed", ["in", "-o", "out", "--seed", "-1"], lambda _: None, "--seed"),
@@ -58,6 +64,7 @@ def test_wishes_that_cannot_be_granted(
     monkeypatch.chdir(tmp_path)
     assert words in told(["reconstruct", *arguments], 2)
     assert not (tmp_path / "out" / "run.json").exists()
+    assert not (tmp_path / "elsewhere").exists()
 
 
 CONFIGS: list[tuple[str, str | bytes]] = [
@@ -122,3 +129,12 @@ def test_lists_of_pairs_that_are_none(
     writes(text)(tmp_path / "pairs.txt")
     arguments = ["reconstruct", str(folder), "-o", str(tmp_path / "out"), "--until", "matches"]
     assert words in told([*arguments, "--pairs", str(tmp_path / "pairs.txt")], 2)
+
+
+@pytest.mark.parametrize(
+    ("out", "words"),
+    [("/dev/null", "cannot be written"), (files.TOO_LONG, "File name too long"), (" ", "has no name")],
+    ids=["device", "too long", "nothing"],
+)
+def test_the_demo_is_as_careful(out: str, words: str, told: Callable[..., str]) -> None:
+    assert words in told(["demo", "-o", out], 2)

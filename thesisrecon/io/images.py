@@ -137,7 +137,8 @@ def read_photographs(
     Returns
     -------
     PhotographSet : what was read, sorted by name; what cannot be decoded, is blank, too small, or has the
-        very pixels of an earlier one stands under ``refused``.
+        very pixels of an earlier one stands under ``refused``. Files are called what :func:`printable` shows
+        of their names, and numbered where two would be called alike.
 
     Raises
     ------
