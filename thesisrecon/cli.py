@@ -24,7 +24,7 @@ from thesisrecon import __version__
 from thesisrecon.console import summary_text
 from thesisrecon.errors import DISK, StageFailure, Unwritable, UsageError
 from thesisrecon.io.text import printable, shortened
-from thesisrecon.stops import CODES, REASONS, advised
+from thesisrecon.stops import CODES, REASONS, advised, speak_through
 from thesisrecon.workers import available_threads
 
 if TYPE_CHECKING:
@@ -472,6 +472,8 @@ def run_command(arguments: list[str]) -> int:
         if error.errno in DISK:
             # Kernels are kept on a disk too, and what is printed may go to a file.
             return _say(str(Unwritable(error.filename or "what the command writes", error)), USAGE)
+        if os.environ.get(DEBUG_VARIABLE):
+            raise
         place = f"{shortened(str(error.filename))}: " if error.filename is not None else ""
         return _say(f"{place}{error.strerror or error}", USAGE)
     except Exception as error:
@@ -501,6 +503,7 @@ def _keep_stderr_to_ourselves() -> None:
         return
     os.dup2(nowhere, 2)
     os.close(nowhere)
+    speak_through(ours)
     encoding = getattr(sys.stderr, "encoding", None)
     sys.stderr = os.fdopen(ours, "w", buffering=1, encoding=encoding, errors="backslashreplace")
 

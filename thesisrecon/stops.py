@@ -27,6 +27,7 @@ START_S = 0.5
 STDERR = 2
 _SHOW_CURSOR = "\x1b[?25h\n"
 
+_stderr = [STDERR]
 _advice: list[str] = []
 _kills: list[Callable[[], object]] = []
 _leaving: list[signal.Signals] = []
@@ -53,6 +54,11 @@ def obey_signals(program: str, advice: str = "give the same command again") -> N
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
     os.register_at_fork(after_in_child=_forget)
     threading.Thread(target=_obey, args=(program, heard), daemon=True).start()
+
+
+def speak_through(descriptor: int) -> None:
+    """The error stream of the program is from now on this descriptor."""
+    _stderr.append(descriptor)
 
 
 @contextmanager
@@ -122,9 +128,11 @@ def _say(sentence: str) -> None:
     does not read."""
     with suppress(OSError, ValueError):
         # A bar of progress has hidden the cursor and stands in the middle of a line.
-        start = _SHOW_CURSOR if os.isatty(STDERR) else ""
-        if select.select([], [STDERR], [], START_S)[1]:
-            os.write(STDERR, f"{start}{' '.join(sentence.split())}\n".encode("utf-8", "backslashreplace"))
+        start = _SHOW_CURSOR if os.isatty(_stderr[-1]) else ""
+        if select.select([], [_stderr[-1]], [], START_S)[1]:
+            os.write(
+                _stderr[-1], f"{start}{' '.join(sentence.split())}\n".encode("utf-8", "backslashreplace")
+            )
 
 
 def _kill_children() -> None:

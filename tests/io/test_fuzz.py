@@ -226,7 +226,7 @@ TABLES = [(reader, content) for reader in READERS for name, content in (
 
 
 @pytest.mark.parametrize(("reader", "content"), TABLES, ids=[reader.name for reader, _ in TABLES])
-@settings(few, max_examples=150)
+@few
 @given(data=st.data())
 def test_tables_of_other_types_raise_only_what_their_reader_says(
     reader: Reader, content: Any, tmp_path: Path, data: st.DataObject
@@ -235,7 +235,7 @@ def test_tables_of_other_types_raise_only_what_their_reader_says(
     read(reader, tmp_path / reader.name, told.encode("utf-8", "surrogatepass"))
 
 
-@settings(few, max_examples=150)
+@few
 @given(data=st.data())
 def test_settings_of_other_types_are_refused_in_a_sentence(data: st.DataObject) -> None:
     whole = {"features": {"kind": "harris-corners"}, "intrinsics": {"focal_px": 9.0, "focal_std_rel": 0.1}}

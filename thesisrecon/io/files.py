@@ -96,6 +96,7 @@ def link(source: Path, target: Path) -> None:
     partial = target.with_name(f".{target.name}.{os.getpid()}{_PARTIAL}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        partial.unlink(missing_ok=True)
         try:
             os.link(source, partial)
         except OSError:
