@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import thesisrecon.cli as cli
+import thesisrecon.io.demo as demo
 from thesisrecon.cli import run_command
 from thesisrecon.console import intrinsic_lines, time_taken
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
@@ -291,12 +292,23 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
         assert option in printed
 
 
-def test_the_demo_without_its_photographs_says_where_they_are(
+def test_the_demo_without_its_photographs_says_where_they_were_looked_for(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cli, "DEMO_SCENE", Path("fixtures") / "absent")
+    monkeypatch.setattr(demo, "files", lambda _: tmp_path / "thesisrecon")
     assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
-    assert "come with the source" in capsys.readouterr().err
+    assert str(tmp_path / "thesisrecon" / "courtyard") in capsys.readouterr().err
+
+
+def test_kernels_that_can_be_kept_nowhere_are_told_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise RuntimeError("cannot cache function 'f': no locator available for file 'g'")
+
+    monkeypatch.setattr(cli, "_run", refuse)
+    assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
+    assert "NUMBA_CACHE_DIR" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -125,8 +125,36 @@ def test_mathematics_touches_no_file_and_no_global_randomness(path: Path) -> Non
             assert called.split(".")[-1] not in GLOBAL_RANDOMNESS, f"{called} is global randomness"
 
 
+HEAVY = {"numpy", "scipy", "numba", "PIL", "trimesh", "plotly", "jinja2", "rich", "typer"}
+LATE = {
+    "trimesh",
+    "plotly",
+    "jinja2",
+    "rich",
+    "scipy.stats",
+    "scipy.optimize",
+    "scipy.spatial",
+    "scipy.linalg",
+}
+
+
+def loaded_by(code: str, names: set[str]) -> str:
+    """Which of the modules a new interpreter has loaded after ``code``."""
+    program = f"import sys\n{code}\nprint(sorted({names!r} & set(sys.modules)))"
+    run = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return run.stdout.splitlines()[-1]
+
+
 def test_importing_the_package_loads_nothing_heavy() -> None:
-    heavy = "{'numpy', 'scipy', 'numba', 'PIL', 'plotly', 'typer'}"
-    code = f"import sys, thesisrecon; thesisrecon.__version__; print(sorted({heavy} & set(sys.modules)))"
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "[]"
+    assert loaded_by("import thesisrecon; thesisrecon.__version__", HEAVY) == "[]"
+
+
+def test_the_version_and_the_help_load_only_what_parses_the_command() -> None:
+    code = "from thesisrecon.cli import run_command; run_command(['--version']); run_command(['--help'])"
+    assert loaded_by(code, HEAVY - {"typer", "rich"}) == "[]"
+
+
+def test_a_front_door_loads_what_only_a_run_needs_when_a_run_needs_it() -> None:
+    assert loaded_by("import thesisrecon; thesisrecon.reconstruct; thesisrecon.match_pair", LATE) == "[]"

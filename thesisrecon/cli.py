@@ -34,11 +34,15 @@ if TYPE_CHECKING:
 
 DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
 DEBUG_VARIABLE = "THESISRECON_DEBUG"
-DEMO_SCENE = Path("fixtures") / "courtyard"
 DEMO_SETTINGS: dict[str, Any] = {"dense": {"max_side": 512, "match_side": 512}}
 """Whoever tries it wants to see a model soon."""
 MOST_THREADS = 1024
 VIEWS_AGAIN = "the same command makes all pictures anew"
+NO_CACHE = (
+    "the compiled kernels can be kept neither beside the code nor in the user's cache folder; name a folder "
+    "that can be written in the variable NUMBA_CACHE_DIR"
+)
+"""numba's own words for that name one of our functions and no remedy."""
 STAGE_WORDS = {
     "features": "corners",
     "pairs": "choice of pairs",
@@ -184,17 +188,13 @@ def demo(
     ] = Path("out/demo"),
     threads: Threads = 0,
 ) -> None:
-    """Reconstruct the courtyard that comes with the source of the project."""
+    """Reconstruct the photographs of a courtyard that come with the package."""
     _cap_threads(threads)
-    scene = Path(__file__).resolve().parent.parent / DEMO_SCENE / "images"
-    if not scene.is_dir():
-        raise UsageError(
-            f"the demo needs the photographs of {DEMO_SCENE}, which come with the source of the project, not "
-            "with the installed package; run scripts/demo there, or reconstruct a folder of your own"
-        )
+    from thesisrecon.io.demo import demo_photographs
+
     # The folder of an older demo may hold other settings: the demo is always that of today.
     options = {"threads": threads or None, "overwrite": True}
-    _run(scene, out, _config(None, None, DEMO_SETTINGS, []), 0, options)
+    _run(demo_photographs(), out, _config(None, None, DEMO_SETTINGS, []), 0, options)
 
 
 @app.command()
@@ -409,7 +409,9 @@ def _config(
     )
 
 
-def _run(images: Path, out: Path, config: PipelineConfig, seed: int, options: Mapping[str, Any]) -> None:
+def _run(
+    images: Path | list[Path], out: Path, config: PipelineConfig, seed: int, options: Mapping[str, Any]
+) -> None:
     from thesisrecon.pipeline import reconstruct as run_pipeline
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
@@ -482,6 +484,8 @@ def run_command(arguments: list[str]) -> int:
             return _say(f"{error.format_message()} (see thesisrecon --help)", USAGE)
         if os.environ.get(DEBUG_VARIABLE):
             raise
+        if "no locator available" in str(error):
+            return _say(NO_CACHE, USAGE)
         return _say(
             f"an error in the program: {type(error).__name__}: {error}; {DEBUG_VARIABLE}=1 shows where",
             INTERNAL,

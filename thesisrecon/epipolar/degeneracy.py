@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import fdtri, stdtrit
 
 from thesisrecon.epipolar.certainty.kernels import geometries_of_plane, refine_plane
 from thesisrecon.epipolar.certainty.plane import (
@@ -245,7 +245,7 @@ def _turning(H: F64, covariance: F64) -> tuple[float, float]:
 
 def _turn_limit(n: int) -> float:
     """Standard errors that the turning of a rotation keeps to: Student's, since the noise is estimated."""
-    return float(stdtrit(n - 7, 1.0 - TURN_RISK))
+    return float(scipy.special.stdtrit(n - 7, 1.0 - TURN_RISK))
 
 
 def _translation_ratio(case: _Case) -> float:
@@ -265,7 +265,9 @@ def _translation_ratio(case: _Case) -> float:
     rss_simple = float(np.sum(np.asarray(sampson_distances(f, near)) ** 2))
     rss = min(rss_simple, *(_least_squares(start, near) for start in (case.f, f)))
     limit = (
-        BEYOND_TRANSLATION * float(fdtri(BEYOND_TRANSLATION, degrees, 1.0 - RISK)) * max(rss / degrees, 1e-24)
+        BEYOND_TRANSLATION
+        * float(scipy.special.fdtri(BEYOND_TRANSLATION, degrees, 1.0 - RISK))
+        * max(rss / degrees, 1e-24)
     )
     strays = case.chance * float(case.weights[~case.agree].sum())
     return (rss_simple - rss) / (limit * (1.0 + ALLOWANCE * min(strays, 1.0)))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from thesisrecon.epipolar.covariance import fundamental_covariance
 from thesisrecon.epipolar.frame import PairFrame, as_matches, check_matches
@@ -33,7 +33,7 @@ def student_95(degrees_of_freedom: float) -> float:
     """95 % of a Student variable lie within it; 1.96 for infinite degrees of freedom."""
     if not degrees_of_freedom > 0.0:
         raise ValueError(f"degrees of freedom must be positive; got {degrees_of_freedom}")
-    return float(stdtrit(min(degrees_of_freedom, 1e9), 0.975))
+    return float(scipy.special.stdtrit(min(degrees_of_freedom, 1e9), 0.975))
 
 
 def ellipse_95(degrees_of_freedom: float) -> float:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from scipy.special import fdtri
 
 from thesisrecon.geometry.multiview import homography_distances
 from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
@@ -25,7 +24,7 @@ def turned_camera(parameters: F64) -> F64:
     f, (x, y) = float(np.exp(np.clip(parameters[0], -20.0, 20.0))), parameters[1:3]
     K = np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
     back = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, f]]) / f
-    H: F64 = K @ Rotation.from_rotvec(parameters[3:]).as_matrix() @ back
+    H: F64 = K @ scipy.spatial.transform.Rotation.from_rotvec(parameters[3:]).as_matrix() @ back
     return H
 
 
@@ -44,7 +43,9 @@ def turning_ratio(H: F64, xy1: F64, xy2: F64, *, risk: float) -> float:
     costs = [float(np.sum(residuals(start) ** 2)) for start in starts]
     rss = float(np.sum(homography_distances(H, xy1, xy2) ** 2))
     degrees = 2 * len(xy1) - 8
-    limit = CONSTRAINTS * float(fdtri(CONSTRAINTS, degrees, 1.0 - risk)) * max(rss, 1e-24) / degrees
+    limit = (
+        CONSTRAINTS * float(scipy.special.fdtri(CONSTRAINTS, degrees, 1.0 - risk)) * max(rss, 1e-24) / degrees
+    )
     ratio = np.inf
     for k in np.argsort(costs, kind="stable")[:REFINED]:
         if np.isfinite(costs[k]):
@@ -61,4 +62,4 @@ def _start(H: F64, f: float) -> F64:
     A = A * np.sign(np.linalg.det(A))
     U, _, Vt = np.linalg.svd(A)
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return np.array([np.log(f), 0.0, 0.0, *Rotation.from_matrix(R).as_rotvec()])
+    return np.array([np.log(f), 0.0, 0.0, *scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()])

@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.geometry.homogeneous import inverse_of, require_finite
 
@@ -75,7 +75,7 @@ def random_transform(group: Group, rng: np.random.Generator) -> F64:
     t, scale = rng.normal(size=3), float(np.exp(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 1.0)))
     if group == "affine":
         return affine_transform(scale * (np.eye(3) + _shift_of_norm(rng, (3, 3), 0.5)), t)
-    R = Rotation.random(random_state=rng).as_matrix()
+    R = scipy.spatial.transform.Rotation.random(random_state=rng).as_matrix()
     return affine_transform(scale * R if group == "metric" else R, t)
 
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import compose_camera, project_camera
@@ -191,7 +191,7 @@ def _images(
     for i, (R, t) in poses.items():
         here = np.flatnonzero(view == i)
         row[here] = np.arange(len(here))
-        quaternion = np.roll(Rotation.from_matrix(R).as_quat(canonical=True), 1)
+        quaternion = np.roll(scipy.spatial.transform.Rotation.from_matrix(R).as_quat(canonical=True), 1)
         images.append(ColmapImage(i + 1, quaternion, t, camera_ids[i], names[i], xy[here], point[here] + 1))
     return tuple(images), row
 
@@ -254,7 +254,10 @@ def reconstruction_from_colmap(model: ColmapModel, *, names: Sequence[str] | Non
             image = by_name[name]
             camera = cameras[image.camera_id]
             K[i], radial[i] = _intrinsics(camera)
-            poses[i] = Rotation.from_quat(np.roll(image.quaternion_wxyz, -1)).as_matrix(), image.translation
+            poses[i] = (
+                scipy.spatial.transform.Rotation.from_quat(np.roll(image.quaternion_wxyz, -1)).as_matrix(),
+                image.translation,
+            )
             P[i], sizes[i] = compose_camera(K[i], *poses[i]), (camera.width, camera.height)
     return _with_observations(model, names, (P, K, radial, sizes), poses)
 

@@ -1,6 +1,8 @@
 """Meshes as files: GLB for browsers, OBJ with MTL and PNG for modelling programs, PLY with vertex colours.
 
-A GLB can be read again."""
+A GLB can be read again. trimesh is imported where it is used: it takes longer to import than the rest of the
+package that surrounds it, and not every run has a mesh.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,6 @@ from typing import Any, cast
 
 import numpy as np
 import PIL.Image
-import trimesh
-from trimesh.visual import material as materials
-from trimesh.visual import texture as textures
 
 from thesisrecon.errors import UsageError
 from thesisrecon.io.files import write_atomically
@@ -58,6 +57,8 @@ def read_mesh(path: Path) -> TexturedMesh:
         raise ValueError(f"a mesh is read from .glb; got {path.name}")
     if not path.is_file():
         raise UsageError(f"there is no mesh {path}")
+    import trimesh
+
     try:
         content = read_bytes(path, largest=LARGEST_MESH)
         require_plain_glb(content)
@@ -127,6 +128,10 @@ def _texels(uv: F64, texture: np.ndarray) -> F64:
 
 
 def _trimesh(mesh: TexturedMesh, *, turned: bool) -> Any:
+    import trimesh
+    from trimesh.visual import material as materials
+    from trimesh.visual import texture as textures
+
     turn = TURN if turned else np.ones(3)
     if mesh.texture is None or mesh.uv is None:
         colors = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from thesisrecon.matching.kernels import align_windows
 from thesisrecon.matching.prepared import PreparedView
@@ -101,7 +101,7 @@ def strongest_distinct(matches: Matches, *, apart_px: float = 1.0) -> I64:
     keep = np.ones(len(rows), np.bool_)
     if len(rows) >= 2:
         places = np.hstack([matches.xy1, matches.xy2])[rows]
-        for a, b in sorted(cKDTree(places).query_pairs(apart_px)):
+        for a, b in sorted(scipy.spatial.cKDTree(places).query_pairs(apart_px)):
             if keep[a]:
                 keep[b] = False
     kept: I64 = np.sort(rows[keep])

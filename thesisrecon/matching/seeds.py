@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from thesisrecon.matching.kernels import scan_correlations, update_column_best
 from thesisrecon.types import B8, F32, F64, I64, Seeds
@@ -104,7 +104,7 @@ def neighbour_support(matches: SeedMatches, *, neighbours: int = 10, tolerance: 
     k = min(neighbours + 1, len(matches))
     support = np.zeros(len(matches))
     for here, there in ((u, v), (v, u)):
-        near = cKDTree(here).query(here, k)[1][:, 1:]
+        near = scipy.spatial.cKDTree(here).query(here, k)[1][:, 1:]
         apart = np.linalg.norm(here[near] - here[:, None], axis=2)
         strain = np.linalg.norm((there[near] - there[:, None]) - (here[near] - here[:, None]), axis=2)
         support += np.exp(-0.5 * (strain / (tolerance * apart + 1.0)) ** 2).sum(axis=1)
@@ -119,9 +119,9 @@ def corners_of_seeds(
 
     ``xy1`` (N, 2), ``xy2`` (K, 2) the corners px. Returns their numbers (M,), (M,) and the matches.
     """
-    apart1, one = cKDTree(xy1).query(known.xy1)
+    apart1, one = scipy.spatial.cKDTree(xy1).query(known.xy1)
     led = known.xy2 + np.einsum("mij,mj->mi", known.affine, xy1[one] - known.xy1)
-    apart2, two = cKDTree(xy2).query(led)
+    apart2, two = scipy.spatial.cKDTree(xy2).query(led)
     order = np.argsort(-known.score, kind="stable")
     order = order[(apart1[order] <= reach_px) & (apart2[order] <= reach_px)]
     for corner in (one, two):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.matching.alignment import aligned_matches, strongest_distinct
@@ -181,7 +181,7 @@ class SeedsAndGrowth:
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
         # Asked for a list of ranks, the tree answers with a row a corner even where that is one neighbour.
         ranks = np.arange(1, min(self.neighbours, len(known)) + 1)
-        near = cKDTree(known.xy1).query(xy1, ranks)[1]
+        near = scipy.spatial.cKDTree(known.xy1).query(xy1, ranks)[1]
         affine, place, spread = fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, self.radius_rel * long_side)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from thesisrecon.matching.alignment import aligned_matches
 from thesisrecon.matching.kernels import SIDE, strength_of_match
@@ -119,6 +119,6 @@ class StrengthOfMatch:
 
 def _nearest(xy: F64, count: int, radius: float) -> I64:
     """(N, count) the nearest other corners within ``radius``, -1 where there are fewer."""
-    distance, index = cKDTree(xy).query(xy, count + 1, distance_upper_bound=radius)
+    distance, index = scipy.spatial.cKDTree(xy).query(xy, count + 1, distance_upper_bound=radius)
     near = np.where(np.isfinite(distance), index, -1)[:, 1:]
     return np.ascontiguousarray(near, dtype=np.int64)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.stats import t as student_t
+import scipy
 
 from thesisrecon.metric.model import ASPECT, CENTRE, FOCAL, K1, SKEW, MetricModel
 from thesisrecon.metric.model_error import LEAST_BLOCKS, USUAL_INFLATION, model_error_floor
@@ -90,7 +90,7 @@ def _inflation(scatter: BlockScatter, g: int, column: int) -> float:
     ratio = float(scatter.ratio[g, column])
     if scatter.blocks < LEAST_BLOCKS or not np.isfinite(ratio):
         return USUAL_INFLATION
-    return float(np.sqrt(ratio) * student_t.ppf(0.975, scatter.blocks - 1) / NORMAL_95)
+    return float(np.sqrt(ratio) * scipy.special.stdtrit(scatter.blocks - 1, 0.975) / NORMAL_95)
 
 
 def _source(measured: float, floor: float, factor: float) -> str:

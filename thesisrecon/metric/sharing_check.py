@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from thesisrecon.metric.adjustment import Adjustment
 from thesisrecon.metric.model import CENTRE, FOCAL, MetricModel
@@ -108,7 +108,7 @@ def _contradicted(
 ) -> list[_Set]:
     """All sets where values of their own explain more than chance lets expect, else none."""
     saved = 2.0 * (before.cost - after.cost) / USUAL_INFLATION**2
-    return sets if saved > chi2.isf(ALARM, values * sum(s.freedoms for s in sets)) else []
+    return sets if saved > scipy.special.chdtri(values * sum(s.freedoms for s in sets), ALARM) else []
 
 
 def _focal_std(alone: MetricBundleResult, s: _Set) -> F64:

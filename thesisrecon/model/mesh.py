@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from thesisrecon.types import B8, F64, I64, TexturedMesh
 
@@ -50,8 +49,10 @@ def parts_of(faces: I64, vertices: int) -> I64:
     if not len(faces):
         return np.zeros(0, dtype=np.int64)
     row, column = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
-    graph = coo_array((np.ones(len(row), dtype=np.int8), (row, column)), shape=(vertices, vertices))
-    label = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(row), dtype=np.int8), (row, column)), shape=(vertices, vertices)
+    )
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     return np.asarray(label[faces[:, 0]], dtype=np.int64)
 
 
@@ -115,8 +116,10 @@ def _clusters(mesh: TexturedMesh, cell: float) -> I64:
     start, stop = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     within = (place[start] == place[stop]).all(axis=1)
     start, stop = start[within], stop[within]
-    graph = coo_array((np.ones(len(start), dtype=np.int8), (start, stop)), shape=(len(place), len(place)))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(start), dtype=np.int8), (start, stop)), shape=(len(place), len(place))
+    )
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _distinct_faces(faces: I64) -> I64:

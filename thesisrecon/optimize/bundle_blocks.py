@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
 
 from thesisrecon.optimize import kernels
 from thesisrecon.optimize.bundle_covariance import gauge_directions, invert_in_inner_gauge
@@ -81,8 +81,8 @@ class _Linearised:
     elimination of the points takes from it (3N, D), and which point each residual is of."""
 
     residual: F64
-    J: csr_matrix
-    taken: csr_matrix
+    J: scipy.sparse.csr_matrix
+    taken: scipy.sparse.csr_matrix
     point: I64
 
 
@@ -165,14 +165,18 @@ def _linearise(
     J = _sparse(weighted.A, column, first + values.size)
     B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
     E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
-    return _Linearised(residual - E @ (E.T @ residual), J, csr_matrix(E.T @ J), np.repeat(o.point_index, 2))
+    return _Linearised(
+        residual - E @ (E.T @ residual), J, scipy.sparse.csr_matrix(E.T @ J), np.repeat(o.point_index, 2)
+    )
 
 
-def _sparse(values: F64, column: I64, width: int) -> csr_matrix:
+def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:
     """Rows (2K, width) with values (K, 2, n) in the columns (K, n)."""
     K, _, n = values.shape
     rows = np.repeat(np.arange(2 * K), n)
-    return csr_matrix((values.ravel(), (rows, np.repeat(column, 2, axis=0).ravel())), (2 * K, width))
+    return scipy.sparse.csr_matrix(
+        (values.ravel(), (rows, np.repeat(column, 2, axis=0).ravel())), (2 * K, width)
+    )
 
 
 def _orthonormal(B: F64, point: I64, n: int) -> F64:

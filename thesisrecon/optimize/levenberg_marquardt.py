@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from thesisrecon.optimize.losses import LOSSES, loss_code
 
@@ -134,7 +134,7 @@ def solve_positive(A: F64, b: F64) -> F64 | None:
         return None
     if len(b) == 0:
         return np.zeros_like(b)
-    _, x, info = lapack.dposv(A, b, lower=1)
+    _, x, info = scipy.linalg.lapack.dposv(A, b, lower=1)
     return None if info != 0 or not np.isfinite(x).all() else np.asarray(x).reshape(b.shape)
 
 

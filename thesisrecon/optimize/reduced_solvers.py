@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import lapack
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from thesisrecon.optimize import kernels
 from thesisrecon.optimize.kernels import Sums
@@ -84,7 +82,7 @@ class BandedFactor:
         """views^-1 right for right (b C, m)."""
         b, C, _ = self.border.shape
         ordered = right.reshape(b, C, -1)[np.argsort(self.place)].reshape(b * C, -1)
-        solved, _ = lapack.dpbtrs(self.factor, ordered, lower=1)
+        solved, _ = scipy.linalg.lapack.dpbtrs(self.factor, ordered, lower=1)
         return np.asarray(solved.reshape(b, C, -1)[self.place].reshape(b * C, -1))
 
     def solve(self, right: F64) -> F64 | None:
@@ -135,7 +133,7 @@ class BandedCholesky:
         kernels.fill_band(s.blocks, system.row, system.column, self.place, band)
         if not np.isfinite(band).all():
             return None
-        factor, info = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
+        factor, info = scipy.linalg.lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
         if info != 0:
             return None
         flat = s.border.reshape(b * C, e)
@@ -212,8 +210,8 @@ def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) 
 
 def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:
     """The order of the views in which neighbours stand close (reverse Cuthill-McKee)."""
-    graph = coo_array((np.ones(len(row)), (row, column)), shape=(n_views, n_views)).tocsr()
-    order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    graph = scipy.sparse.coo_array((np.ones(len(row)), (row, column)), shape=(n_views, n_views)).tocsr()
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
     place = np.empty(n_views, dtype=np.int64)
     place[order] = np.arange(n_views)
     return BandedCholesky(place, int(np.abs(place[row] - place[column]).max(initial=0)))

@@ -1,4 +1,7 @@
-"""What every page of ours is made with: a template that escapes, and scripts that are known by their hash."""
+"""What every page of ours is made with: a template that escapes, and scripts that are known by their hash.
+
+What only pages need is imported when one is made.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,16 @@ import base64
 import hashlib
 from collections.abc import Sequence
 from importlib.resources import files
+from typing import TYPE_CHECKING
 
-import jinja2
-from plotly.offline import get_plotlyjs
+if TYPE_CHECKING:
+    import jinja2
 
 
 def template_environment() -> jinja2.Environment:
     """Jinja with all text escaped, no undefined names, and no NaN in JSON."""
+    import jinja2
+
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -28,6 +34,8 @@ def page_resource(name: str) -> str:
 
 def plotly_script() -> str:
     """The text of plotly.js that can stand in an element of a page."""
+    from plotly.offline import get_plotlyjs
+
     return str(get_plotlyjs()).replace("</script", "<\\/script")
 
 

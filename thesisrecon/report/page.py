@@ -12,9 +12,8 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jinja2
 import numpy as np
 
 from thesisrecon.io.files import write_text
@@ -55,6 +54,9 @@ from thesisrecon.report.wording import (
     significant,
 )
 from thesisrecon.types import F64, IntrinsicInterval, StageReport, TwoView
+
+if TYPE_CHECKING:
+    import jinja2
 
 HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 200.0, 44.0
 MAX_LISTED_PAIRS = 120

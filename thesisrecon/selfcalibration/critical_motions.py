@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 F64 = NDArray[np.float64]
 
@@ -80,7 +80,9 @@ class UpgradedCameras:
 
     def infinite_homographies(self) -> F64:
         """(V, 3, 3) how the picture of infinity moves from the view that turned least to each view."""
-        angles = Rotation.from_matrix(self.R @ Rotation.from_matrix(self.R).mean().as_matrix().T).magnitude()
+        angles = scipy.spatial.transform.Rotation.from_matrix(
+            self.R @ scipy.spatial.transform.Rotation.from_matrix(self.R).mean().as_matrix().T
+        ).magnitude()
         middle = int(angles.argmin())
         K = np.stack([self.focal, self.focal, np.ones_like(self.focal)], axis=1)
         return np.asarray(K[:, :, None] * (self.R @ self.R[middle].T) / K[middle])
@@ -184,7 +186,7 @@ def common_axis(R: F64) -> tuple[F64, float, float]:
     """
     i, j = np.triu_indices(len(R), 1)
     relative = R[j].swapaxes(1, 2) @ R[i]
-    vectors = Rotation.from_matrix(relative).as_rotvec()
+    vectors = scipy.spatial.transform.Rotation.from_matrix(relative).as_rotvec()
     value, vector = np.linalg.eigh(vectors.T @ vectors / len(vectors))
     turn = float(np.degrees(np.linalg.norm(vectors, axis=1).max()))
     return vector[:, 2], turn, float(np.degrees(np.sqrt(max(value[1], 0.0))))
@@ -193,7 +195,7 @@ def common_axis(R: F64) -> tuple[F64, float, float]:
 def rms_turn(R: F64) -> float:
     """Rms angle (deg) of the turns between all pairs of views."""
     i, j = np.triu_indices(len(R), 1)
-    angle = Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).magnitude()
+    angle = scipy.spatial.transform.Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).magnitude()
     return float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 

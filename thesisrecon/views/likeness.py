@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, gaussian_filter
 
 from thesisrecon.types import B8, F64, RenderedView
 
@@ -23,7 +23,7 @@ FLOOR_LUMINANCE, FLOOR_CONTRAST = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 def whole_pixels(rendered: RenderedView) -> B8:
     """(H, W) pixels that the surface covers together with their eight neighbours: the colour of others is
     partly that of the background."""
-    return np.asarray(binary_erosion(rendered.valid, np.ones((3, 3))))
+    return np.asarray(scipy.ndimage.binary_erosion(rendered.valid, np.ones((3, 3))))
 
 
 def exposed_alike(real: U8, rendered: U8, compared: B8) -> U8:
@@ -89,4 +89,4 @@ def _check(real: U8, rendered: U8, compared: B8) -> None:
 
 def _windowed(values: F64) -> F64:
     """(H, W) means in Gaussian windows, nothing beyond the border."""
-    return np.asarray(gaussian_filter(values, WINDOW_PX, mode="constant", truncate=3.5))
+    return np.asarray(scipy.ndimage.gaussian_filter(values, WINDOW_PX, mode="constant", truncate=3.5))

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation, Slerp
+import scipy
 
 from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.types import F64, TexturedMesh
@@ -113,9 +112,9 @@ def interpolate(
     if len(shown) == 1 or frames == 1:
         return [shown[0]] * frames
     centres = np.array([camera.centre for camera in shown])
-    turns = Rotation.from_matrix(np.array([camera.R for camera in shown]))
+    turns = scipy.spatial.transform.Rotation.from_matrix(np.array([camera.R for camera in shown]))
     place = _evenly(centres, (turns[1:] * turns[:-1].inv()).magnitude(), frames)
-    R = Slerp(np.arange(len(shown)), turns)(place).as_matrix()
+    R = scipy.spatial.transform.Slerp(np.arange(len(shown)), turns)(place).as_matrix()
     K = np.array([camera.K for camera in shown])
     start = np.minimum(place.astype(np.int64), len(shown) - 2)
     share = (place - start)[:, None, None]
@@ -227,7 +226,7 @@ def _widening(
 ) -> float:
     """The first factor of the radius that keeps clear of X and shows enough of it; else, of those that keep
     clear, the one that shows most; else the largest."""
-    tree, nearest = cKDTree(X), [1 + len(X) // 1000]
+    tree, nearest = scipy.spatial.cKDTree(X), [1 + len(X) // 1000]
 
     def distances(path: Sequence[PinholeCamera]) -> F64:
         # Not the very nearest: single points float before every reconstruction.

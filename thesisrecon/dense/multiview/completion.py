@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+import scipy
 
 from thesisrecon.dense.multiview.consistency import transfer
 from thesisrecon.dense.multiview.kernels import splat_depths
@@ -48,7 +48,7 @@ class Completion:
         if not best:
             return own
         nearest = np.fmin.reduce([offers[k] for k in best])
-        wanted = unknown & binary_dilation(np.isfinite(nearest), np.ones((3, 3)), self.gap_px)
+        wanted = unknown & scipy.ndimage.binary_dilation(np.isfinite(nearest), np.ones((3, 3)), self.gap_px)
         rho = (np.float32(1.0) / np.where(unknown, nearest, own.depth)).astype(np.float32)
         photographs = [views[others[k].view] for k in best]
         found = refinement.search(views[own.view], photographs, rho, wanted=wanted, sweeps=self.sweeps)

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from thesisrecon.dense.multiview.kernels import continue_surface, count_agreement
 from thesisrecon.dense.multiview.refinement.planes import ALIKE
@@ -94,8 +93,10 @@ def piece_sizes(depth: F32, step: float) -> F64:
         joined = np.abs(log[a] - log[b]) <= step
         pairs.append(np.stack([number[a][joined], number[b][joined]]))
     row, column = np.concatenate(pairs, axis=1)
-    graph = coo_matrix((np.ones(len(row), dtype=bool), (row, column)), shape=(depth.size, depth.size))
-    label = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_matrix(
+        (np.ones(len(row), dtype=bool), (row, column)), shape=(depth.size, depth.size)
+    )
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     sizes = np.bincount(label)[label].reshape(depth.shape)
     return np.where(np.isfinite(depth), sizes, 0.0)
 

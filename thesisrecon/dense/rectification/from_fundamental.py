@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import least_squares, minimize_scalar
+import scipy
 
 from thesisrecon.dense.rectification.pair import LEAST_MATCHES, EpipolarPair
 from thesisrecon.dense.rectification.planar import (
@@ -120,7 +120,7 @@ class LeastDistortion:
             [np.clip(calmest_line(pair), low + 2.0 * inset, high - 2.0 * inset), 0.0, 0.0, 0.0, 0.0]
         )
         bound = np.array([0.0, self.most_scale, self.most_shear, self.most_scale, self.most_shear])
-        found = least_squares(
+        found = scipy.optimize.least_squares(
             lambda q: _distortion_residuals(pair, *_adjusted(pair, q)),
             start,
             bounds=(np.append(low + inset, -bound[1:]), np.append(high - inset, bound[1:])),
@@ -180,7 +180,7 @@ def _search(pair: EpipolarPair, cost: Callable[[float], float]) -> float:
         raise StageFailure("no line can be sent to infinity", "", "rectify in polar coordinates")
     k = int(np.nanargmin(costs))
     step = (high - low) / SEARCH
-    found = minimize_scalar(
+    found = scipy.optimize.minimize_scalar(
         cost, bounds=(max(low, tried[k] - step), min(high, tried[k] + step)), method="bounded"
     )
     return float(found.x) if found.fun <= costs[k] else float(tried[k])

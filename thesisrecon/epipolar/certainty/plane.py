@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy.special import betainc, gammaln
 
 from thesisrecon.epipolar.certainty.kernels import (
     dominant_plane,
@@ -101,8 +101,13 @@ def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: in
     rest, hits = tried - free, agreeing - free
     if hits <= 0.0 or rest <= 0.0:
         return 0.0
-    tail = float(betainc(hits, max(rest - hits, 0.0) + 1.0, min(chance, 1.0)))
-    ways = gammaln(tried + 1.0) - gammaln(free + 1.0) - gammaln(rest + 1.0) + np.log(max(rest, 1.0))
+    tail = float(scipy.special.betainc(hits, max(rest - hits, 0.0) + 1.0, min(chance, 1.0)))
+    ways = (
+        scipy.special.gammaln(tried + 1.0)
+        - scipy.special.gammaln(free + 1.0)
+        - scipy.special.gammaln(rest + 1.0)
+        + np.log(max(rest, 1.0))
+    )
     return float((ways + np.log(max(tail, 1e-300))) / np.log(10.0))
 
 

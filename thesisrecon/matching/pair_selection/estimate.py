@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.sparse.csgraph import minimum_spanning_tree
+import scipy
 
 from thesisrecon.errors import UsageError
 from thesisrecon.matching.pair_selection.overlap import OverlapTest, Sketch, sketch_seeds
@@ -135,6 +135,6 @@ def bridges(chosen: I64, order: F64) -> I64:
     cost = np.zeros((n, n))
     cost[i, j] = rank + len(i)
     cost[chosen[:, 0], chosen[:, 1]] -= len(i)
-    tree = minimum_spanning_tree(cost).tocoo()
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(cost).tocoo()
     new = tree.data > len(i)
     return np.column_stack([tree.row[new], tree.col[new]]).astype(np.int64).reshape(-1, 2)

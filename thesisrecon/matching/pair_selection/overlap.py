@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import bdtrc
+import scipy
 
 from thesisrecon.matching.pair_selection.kernels import most_agreeing, mutual_best
 from thesisrecon.types import F32, F64, I64, Seeds
@@ -101,5 +101,5 @@ class OverlapTest:
 
 def _log10_false_alarms(k: int, matches: int, chance: float) -> float:
     """log10 of M times the probability that of M - 1 others at least k agree by chance."""
-    tail = float(bdtrc(k - 1, matches - 1, chance)) if k > 0 else 1.0
+    tail = float(scipy.special.bdtrc(k - 1, matches - 1, chance)) if k > 0 else 1.0
     return float(np.log10(matches)) + max(float(np.log10(max(tail, 1e-320))), LEAST_LOG10)

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+import scipy
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import decompose_camera
@@ -184,8 +184,10 @@ def leaning(depth: F32, K: F64) -> F32:
     with np.errstate(divide="ignore"):
         inverse = np.float32(1.0) / depth
     known = np.isfinite(inverse)
-    share = np.maximum(uniform_filter(known.astype(np.float32), 3), np.float32(1e-6))
-    a, b = (uniform_filter(np.nan_to_num(_gentler(inverse, axis)), 3) / share for axis in (1, 0))
+    share = np.maximum(scipy.ndimage.uniform_filter(known.astype(np.float32), 3), np.float32(1e-6))
+    a, b = (
+        scipy.ndimage.uniform_filter(np.nan_to_num(_gentler(inverse, axis)), 3) / share for axis in (1, 0)
+    )
     y, x = np.indices(inverse.shape, dtype=np.float32)
     # Pixels (x, y, 1) of inverse depth (a, b, c) . (x, y, 1) are of the plane with the normal K' (a, b, c).
     c = inverse - a * x - b * y

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+import scipy
 
 from thesisrecon.model.surfaces.basis import basis
 from thesisrecon.model.surfaces.pieces import Pieces, domain_of, pieces_of
@@ -100,7 +100,7 @@ class BSplineSurface:
         y, x = np.indices(residual.shape) // self.knot_px
         number = (y * cells[1] + x).ravel()
         sums = [
-            uniform_filter(
+            scipy.ndimage.uniform_filter(
                 np.bincount(number, part.ravel(), cells[0] * cells[1]).reshape(cells),
                 self.window,
                 mode="constant",

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from thesisrecon.model.depth_surface import one_surface, steepest_slope
 from thesisrecon.model.surfaces.kernels import label_pieces, number_coefficients
@@ -61,7 +59,7 @@ def domain_of(depth_map: DepthMap, *, grazing_deg: float, least: int, reach: flo
     speaks = known & (_sizes(joined, known) >= least)
     if not speaks.any():
         return Domain(speaks, speaks, joined[1], joined[0])
-    away, (y, x) = distance_transform_edt(~speaks, return_indices=True)
+    away, (y, x) = scipy.ndimage.distance_transform_edt(~speaks, return_indices=True)
     held = known & (away <= reach)
     for axis in (0, 1):
         # The depth of a pixel that does not speak is lent by the nearest that does.
@@ -113,8 +111,10 @@ def _sizes(joined: Sequence[B8], counted: B8) -> I64:
     start, stop = (
         np.concatenate([_pairs(number, axis)[end][joined[axis]] for axis in (0, 1)]) for end in (0, 1)
     )
-    graph = coo_array((np.ones(len(start), dtype=np.int8), (start, stop)), shape=(number.size, number.size))
-    label = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(start), dtype=np.int8), (start, stop)), shape=(number.size, number.size)
+    )
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     return np.asarray(np.bincount(label, counted.ravel())[label].reshape(shape), dtype=np.int64)
 
 

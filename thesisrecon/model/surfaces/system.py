@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
 from thesisrecon.model.surfaces.basis import basis, energies
 from thesisrecon.model.surfaces.kernels import evaluate_pixels, sum_squares
@@ -68,9 +67,11 @@ class NormalEquations:
         entries = matrix + stiffness[:, None, None] * self.energy
         data = np.bincount(self.place.ravel(), entries.ravel(), len(self.rows))
         count = self.pieces.count
-        A = csc_array((data, self.rows, self.starts), shape=(count, count))
+        A = scipy.sparse.csc_array((data, self.rows, self.starts), shape=(count, count))
         b = np.bincount(self.pieces.coefficient.ravel(), right.ravel(), count)
-        factor = splu(A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        factor = scipy.sparse.linalg.splu(
+            A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
         return np.asarray(factor.solve(b))
 
     def values(self, c: F64) -> F64:

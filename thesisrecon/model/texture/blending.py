@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
 from thesisrecon.geometry.zbuffer import rasterize
 from thesisrecon.geometry.zbuffer.kernels import rasterize_rows
@@ -196,15 +196,15 @@ def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> Prepa
     depth = rasterize(mesh.vertices, mesh.faces, camera).depth
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     # Pixels without a surface say nothing: something may stand there, or there is only a hole.
-    far = maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)
-    near = minimum_filter(depth, 3)
+    far = scipy.ndimage.maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)
+    near = scipy.ndimage.minimum_filter(depth, 3)
     with np.errstate(invalid="ignore"):
         outline = far - near > OUTLINE_PX / focal * near
     inside = np.pad(np.ones_like(view.seen[1:-1, 1:-1]), 1)
-    distance = distance_transform_edt(inside & view.seen & ~outline)
+    distance = scipy.ndimage.distance_transform_edt(inside & view.seen & ~outline)
     clear = np.clip(distance / feather_px, FAINT, 1.0)
     # Between pixels, colours are mixed: none of the four may be one that the photograph lacks.
-    clear[minimum_filter(view.seen, 3) == 0] = 0.0
+    clear[scipy.ndimage.minimum_filter(view.seen, 3) == 0] = 0.0
     return PreparedView(view, depth, clear.astype(np.float32), TOLERANCE_PX / focal)
 
 

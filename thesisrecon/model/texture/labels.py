@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from thesisrecon.model.texture.kernels import spread_shares
 from thesisrecon.types import F32, I64
@@ -44,10 +43,10 @@ def charts_of(label: I64, neighbours: I64) -> I64:
     face = np.repeat(np.arange(len(label)), 3)
     other = neighbours.ravel()
     same = (other >= 0) & (label[face] == label[other])
-    graph = coo_array(
+    graph = scipy.sparse.coo_array(
         (np.ones(same.sum(), dtype=np.int8), (face[same], other[same])), shape=(len(label),) * 2
     )
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _join_small(label: I64, visible: np.ndarray, neighbours: I64, least_faces: int) -> I64:

@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array, diags_array
-from scipy.sparse.linalg import LinearOperator, cg
 
 from thesisrecon.geometry.raster import smooth
 from thesisrecon.geometry.zbuffer.kernels import interpolate_corners, rasterize_rows
@@ -108,17 +106,17 @@ def _solve(color: F64, seams: tuple[I64, I64], sides: tuple[I64, I64]) -> F32:
     row = np.concatenate([seams[0], sides[0]])
     column = np.concatenate([seams[1], sides[1]])
     weight = np.concatenate([np.ones(len(seams[0])), np.full(len(sides[0]), SMOOTHNESS)])
-    W = coo_array((weight, (row, column)), shape=(count, count)).tocsr()
+    W = scipy.sparse.coo_array((weight, (row, column)), shape=(count, count)).tocsr()
     W = W + W.T
     degree = np.asarray(W.sum(axis=1)).ravel() + ANCHOR
-    A = (diags_array(degree) - W).tocsr()
-    M = LinearOperator(A.shape, matvec=lambda x: x / degree)
+    A = (scipy.sparse.diags_array(degree) - W).tocsr()
+    M = scipy.sparse.linalg.LinearOperator(A.shape, matvec=lambda x: x / degree)
     difference = color[seams[1]] - color[seams[0]]
     solution = np.zeros((count, 3), dtype=np.float32)
     for k in range(3):
         b = np.bincount(seams[0], difference[:, k], minlength=count)
         b -= np.bincount(seams[1], difference[:, k], minlength=count)
-        solution[:, k] = cg(A, b, rtol=1e-4, maxiter=500, M=M)[0]
+        solution[:, k] = scipy.sparse.linalg.cg(A, b, rtol=1e-4, maxiter=500, M=M)[0]
     return solution
 
 
@@ -132,7 +130,7 @@ def _added(texture: np.ndarray, uv: F64, values: F32, seen: I64) -> np.ndarray:
     rasterize_rows(np.ascontiguousarray(corners), 1e-3, (0, height), depth, face, weights)
     offset = np.zeros((height, width, 3), dtype=np.float32)
     interpolate_corners(face, weights, np.ascontiguousarray(values[seen]), offset)
-    distance, nearest = distance_transform_edt(face < 0, return_indices=True)
+    distance, nearest = scipy.ndimage.distance_transform_edt(face < 0, return_indices=True)
     offset = offset[tuple(nearest)]
     offset[distance > BEYOND] = 0.0
     return np.asarray(np.clip(np.rint(texture + offset), 0, 255), dtype=np.uint8)

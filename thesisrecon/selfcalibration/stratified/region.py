@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from thesisrecon.geometry.camera import camera_centre
 from thesisrecon.geometry.cheirality import orient_signs
@@ -160,7 +160,7 @@ def deepest_plane(X: F64, C: F64) -> F64 | None:
     exists."""
     rows = np.concatenate([X, C])
     A = np.column_stack([-rows, np.ones(len(rows))])
-    answer = linprog(
+    answer = scipy.optimize.linprog(
         [0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=[(-1, 1)] * 4 + [(None, None)]
     )
     if answer.x is None or not answer.x[4] > 0:
@@ -191,7 +191,9 @@ def plane_box(X: F64, C: F64) -> F64 | None:
         for side, sign in enumerate((1.0, -1.0)):
             goal = np.zeros(3)
             goal[k] = sign
-            answer = linprog(goal, A_ub=-rows[:, :3], b_ub=rows[:, 3], bounds=[(None, None)] * 3)
+            answer = scipy.optimize.linprog(
+                goal, A_ub=-rows[:, :3], b_ub=rows[:, 3], bounds=[(None, None)] * 3
+            )
             if answer.x is None or not answer.success:
                 return None
             box[k, side] = answer.x[k]

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -38,7 +38,7 @@ class LineSegments:
 
     def detect(self, gray: F32) -> F64:
         """Segments (S, 4) = (x1, y1, x2, y2) px of a grey image (H, W), the longest first."""
-        gx, gy = (ndimage.gaussian_filter(gray, self.sigma_px, order=o) for o in ((0, 1), (1, 0)))
+        gx, gy = (scipy.ndimage.gaussian_filter(gray, self.sigma_px, order=o) for o in ((0, 1), (1, 0)))
         size = np.hypot(gx, gy)
         region = support_regions(np.arctan2(gy, gx), size > self.min_gradient)
         xy, of = edge_points(gx, gy, size, region)
@@ -75,7 +75,7 @@ def _label_bins(bins: I64, strong: B8) -> I64:
     labels = np.zeros(bins.shape, dtype=np.int64)
     count = 0
     for b in range(_BINS):
-        mine, n = ndimage.label(strong & (bins == b), structure=_ANY_NEIGHBOUR)
+        mine, n = scipy.ndimage.label(strong & (bins == b), structure=_ANY_NEIGHBOUR)
         labels += np.where(mine > 0, mine + count, 0)
         count += int(n)
     return labels

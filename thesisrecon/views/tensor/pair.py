@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import calibration_matrix, rq
@@ -117,7 +117,7 @@ class SmallRotation:
                 "no rotation near none explains the fundamental matrix",
                 "take the rotation for any instead",
             )
-        R = Rotation.from_rotvec(solution[1:] / solution[0]).as_matrix()
+        R = scipy.spatial.transform.Rotation.from_rotvec(solution[1:] / solution[0]).as_matrix()
         return [(R, t), (R, -t)]
 
 

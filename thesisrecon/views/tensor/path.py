@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from thesisrecon.types import F64
 from thesisrecon.views.tensor.pair import (
@@ -71,7 +71,9 @@ def camera_at(
     third: tuple[F64, F64] | None = None,
 ) -> VirtualCamera:
     """The camera at ``s`` baselines from the first photograph to the second; see :func:`cameras_along`."""
-    turned = Rotation.from_rotvec(s * Rotation.from_matrix(pair.R).as_rotvec()).as_matrix()
+    turned = scipy.spatial.transform.Rotation.from_rotvec(
+        s * scipy.spatial.transform.Rotation.from_matrix(pair.R).as_rotvec()
+    ).as_matrix()
     share = min(max(s, 0.0), 1.0) if sizes[0] == sizes[1] else 1.0
     K = (1.0 - share) * pair.K1 + share * pair.K2
     # X_s = turned (X_1 - s C_2) and X_1 = R_3'(X_3 - t_3).

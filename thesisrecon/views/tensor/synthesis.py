@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.types import B8, F32
@@ -53,7 +53,7 @@ class TensorSynthesis:
     def along(self, frames: int, *, beyond: float = 0.0) -> list[VirtualCamera]:
         """Cameras from the first photograph to the second and beyond; see :func:`cameras_along`."""
         third = np.linalg.inv(self.seeds[0].K) @ self.seeds[0].P3
-        R3 = Rotation.from_matrix(third[:, :3] @ self.pair.K1).as_matrix()
+        R3 = scipy.spatial.transform.Rotation.from_matrix(third[:, :3] @ self.pair.K1).as_matrix()
         return cameras_along(self.pair, frames, sizes=self.sizes, beyond=beyond, third=(R3, third[:, 3]))
 
     def render(self, camera: VirtualCamera, *, threads: int = 1) -> U8:

@@ -1,0 +1,73 @@
+"""A small program of somebody else's that uses every front door: mypy --strict reads it beside the installed
+package, and ``assert_type`` says that what it gets back has a type, and which.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import assert_type
+
+import numpy as np
+from numpy.typing import NDArray
+
+import thesisrecon
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.types import DisparityMap, RenderedView, RunResult, SelfCalibration, TexturedMesh, TwoView
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+
+def points_of_two(first: Path, second: Path) -> F64:
+    """Space points of two photographs in a projective frame."""
+    pair = thesisrecon.match_pair(first, second, seed=1)
+    assert_type(pair, TwoView)
+    assert_type(pair.sigma_px, float)
+    fit = thesisrecon.estimate_fundamental(pair.xy1, pair.xy2, threshold_px=1.0)
+    assert_type(fit.F, F64)
+    P = np.stack([np.eye(3, 4), np.eye(3, 4)])
+    X = thesisrecon.triangulate(P, np.stack([pair.xy1, pair.xy2]), method="polynomial")
+    return assert_type(X, F64)
+
+
+def focal_lengths(photographs: Path, out: Path) -> dict[str, float]:
+    """Focal length (px) of every photograph of a folder, by the run and by its projective part alone."""
+    config = thesisrecon.PipelineConfig()
+    result = thesisrecon.reconstruct(photographs, out, config=config, seed=0, until="metric", threads=2)
+    assert_type(result, RunResult)
+    if result.projective is not None:
+        calibration = thesisrecon.self_calibrate(result.projective, config=config)
+        assert_type(calibration, SelfCalibration)
+        assert_type(calibration.reasons, tuple[str, ...])
+    if result.metric is None or result.metric.reconstruction.K is None:
+        return {}
+    K = assert_type(result.metric.reconstruction.K, F64)
+    return {image.name: float(k[0, 0]) for image, k in zip(result.images, K, strict=True)}
+
+
+def pictures(left: U8, right: U8, mesh: TexturedMesh) -> list[U8]:
+    """Views between two rectified photographs, beside them, and of a model."""
+    found = thesisrecon.match_rectified(left, right, max_disparity_px=64)
+    assert_type(found, DisparityMap)
+    between = thesisrecon.interpolate_view(left, right, 0.5, disparity=found)
+    beside = thesisrecon.synthesize_view(left, right, np.eye(3), np.zeros(3))
+    camera = thesisrecon.PinholeCamera(np.diag([500.0, 500.0, 1.0]), np.eye(3), np.zeros(3), (640, 480))
+    drawn = thesisrecon.render(mesh, camera)
+    assert_type(drawn, RenderedView)
+    return [assert_type(between, U8), assert_type(beside, U8), assert_type(drawn.color, U8)]
+
+
+def main() -> int:
+    """What photographs of a folder tell, or why nothing."""
+    try:
+        for name, focal_px in focal_lengths(Path(sys.argv[1]), Path(sys.argv[2])).items():
+            print(f"{name}: {focal_px:.1f} px")
+    except (StageFailure, UsageError) as error:
+        print(error)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
