@@ -86,7 +86,7 @@ def test_metric_jacobians_match_finite_differences(lens):
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-5, 1e-3, 1.0, 3.0])
 def test_poses_move_by_the_exponential_map(size):
     rng = np.random.default_rng(3)
-    R, t = Rotation.random(9, rng=rng).as_matrix(), rng.normal(size=(9, 3))
+    R, t = Rotation.random(9, random_state=rng).as_matrix(), rng.normal(size=(9, 3))
     step = size * rng.normal(size=(9, 6))
     R_out, t_out = np.empty_like(R), np.empty_like(t)
     kernels.move_poses(R, t, step, R_out, t_out)
