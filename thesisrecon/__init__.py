@@ -14,8 +14,13 @@ if TYPE_CHECKING:
     from thesisrecon.between import interpolate_view
     from thesisrecon.beyond import synthesize_view
     from thesisrecon.config import PipelineConfig
-    from thesisrecon.doors import match_pair, match_rectified, self_calibrate, upgrade_affine
-    from thesisrecon.epipolar import estimate_fundamental
+    from thesisrecon.doors import (
+        estimate_fundamental,
+        match_pair,
+        match_rectified,
+        self_calibrate,
+        upgrade_affine,
+    )
     from thesisrecon.geometry.pinhole import PinholeCamera
     from thesisrecon.geometry.triangulation import triangulate
     from thesisrecon.pipeline import reconstruct
@@ -26,7 +31,7 @@ __version__ = "0.1.0"
 _HOME_OF = {
     "PinholeCamera": "geometry.pinhole",
     "PipelineConfig": "config",
-    "estimate_fundamental": "epipolar",
+    "estimate_fundamental": "doors",
     "interpolate_view": "between",
     "match_pair": "doors",
     "match_rectified": "doors",
