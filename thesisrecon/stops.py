@@ -39,8 +39,8 @@ def obey_signals(program: str, advice: str = "give the same command again") -> N
     :data:`CODES`.
 
     To be called once, by a program and not by a library, from the main thread; ``advice`` is said where
-    nothing else was. A signal that this process was
-    started to ignore (``nohup``, a command in the background of a script) stays ignored.
+    nothing else is to be. A signal that this process was started to ignore (``nohup``, a command in the
+    background of a script) stays ignored.
     """
     _advice.append(advice)
     heard, written = os.pipe()

@@ -43,7 +43,10 @@ class Stop:
     different: tuple[str, ...] = ()
 
     def wrong(self, asked: signal.Signals) -> str:
-        """What is not as it should be, in a few words; empty where all is well."""
+        """What is not as it should be, in a few words; empty where all is well, and where the run had ended
+        by itself."""
+        if self.code == 0:
+            return f"differs: {', '.join(self.different)}" if self.different else ""
         found = {
             f"took {self.seconds:.1f} s": self.seconds > LIMIT_S,
             f"exit code {self.code}": self.code != CODES[asked],
@@ -143,7 +146,7 @@ def table(rows: list[Stop], asked: signal.Signals) -> str:
     """Every stop in Markdown."""
     lines = ["| stopped at | seconds to stop | exit code | stage files kept | wrong |", "| --- " * 5 + "|"]
     lines += [
-        f"| {row.when} | {row.seconds:.2f} | {row.code} | {row.kept} | {row.wrong(asked) or 'nothing'} |"
+        f"| {row.when} | {row.seconds:.2f} | {row.code} | {row.kept} | {row.wrong(asked) or ('nothing' if row.code else 'had ended')} |"
         for row in rows
     ]
     return "\n".join(lines)
@@ -159,11 +162,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--until", default="model")
     parser.add_argument("--threads", default="2")
     parser.add_argument("--executor", default="local")
+    parser.add_argument("--set", action="append", default=[], metavar="STAGE.FIELD=VALUE")
     parser.add_argument("--cold", action="store_true", help="begin each run with no kernel compiled")
     wishes = parser.parse_args(arguments)
     asked = signal.Signals[f"SIG{wishes.signal}"]
     options = ["--max-size", wishes.max_size, "--until", wishes.until, "--threads", wishes.threads]
-    options += ["--executor", wishes.executor]
+    options += ["--executor", wishes.executor, *(word for wish in wishes.set for word in ("--set", wish))]
     with tempfile.TemporaryDirectory() as place:
         runs = Runs(Path(place), options, wishes.images)
         rows = measure(runs, wishes.moments, asked, cold=wishes.cold)
