@@ -145,10 +145,9 @@ def measure(runs: Runs, moments: int, asked: signal.Signals, *, cold: bool) -> l
 def table(rows: list[Stop], asked: signal.Signals) -> str:
     """Every stop in Markdown."""
     lines = ["| stopped at | seconds to stop | exit code | stage files kept | wrong |", "| --- " * 5 + "|"]
-    lines += [
-        f"| {row.when} | {row.seconds:.2f} | {row.code} | {row.kept} | {row.wrong(asked) or ('nothing' if row.code else 'had ended')} |"
-        for row in rows
-    ]
+    for row in rows:
+        wrong = row.wrong(asked) or ("nothing" if row.code else "nothing (had ended)")
+        lines.append(f"| {row.when} | {row.seconds:.2f} | {row.code} | {row.kept} | {wrong} |")
     return "\n".join(lines)
 
 
