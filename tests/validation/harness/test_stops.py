@@ -76,7 +76,12 @@ def test_an_interrupt_in_a_program_ends_the_tasks(tmp_path: Path) -> None:
             time.sleep(0.02)
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
-    threading.Thread(target=interrupt, daemon=True).start()
-    with pytest.raises(KeyboardInterrupt):
-        run_tasks(wishes, hanging_stages(), print)
+    # What a shell starts in the background ignores the signal, and so would this test.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        threading.Thread(target=interrupt, daemon=True).start()
+        with pytest.raises(KeyboardInterrupt):
+            run_tasks(wishes, hanging_stages(), print)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert is_gone(process_of(tmp_path))
