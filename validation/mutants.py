@@ -286,8 +286,9 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterato
     Raises ``ValueError`` where a test fails without any fault.
     """
     bench.set_up()
+    judges = {file: bench.judges(file) for file in dict.fromkeys(m.file for m in mutants)}
     if not warm:
-        for chosen in {tuple(files) for m in mutants for files in bench.judges(m.file)}:
+        for chosen in dict.fromkeys(tuple(files) for lists in judges.values() for files in lists):
             code, _, failed = bench.run_tests(chosen, bench.kernels, "sound")
             if code not in (0, 5):
                 raise ValueError(f"{failed or 'a test'} fails without any fault")
@@ -295,7 +296,7 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterato
         text = mutant.apply((bench.tree / mutant.file).read_text(encoding="utf-8"))
         by, seconds = "", 0.0
         with bench.planted(mutant.file, text, number) as kernels:
-            for files in bench.judges(mutant.file):
+            for files in judges[mutant.file]:
                 code, spent, failed = bench.run_tests(files, kernels, f"{number:03d}")
                 seconds += spent
                 if code not in (0, 5):
