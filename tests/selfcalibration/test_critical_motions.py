@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.assumptions import IntrinsicsAssumption, assume
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.selfcalibration import HypothesesAndRefinement
 from thesisrecon.selfcalibration.critical_motions import (
     UpgradedCameras,
@@ -19,9 +21,9 @@ from thesisrecon.selfcalibration.critical_motions import (
     thickness,
 )
 from thesisrecon.selfcalibration.frame import assumed_frame
-from thesisrecon.selfcalibration.limits import MOST_NOISE
+from thesisrecon.selfcalibration.limits import LEAST_MOVE, MAX_FOCAL_STD, MIN_SIGNIFICANCE, MOST_NOISE
 from thesisrecon.selfcalibration.verdict import judge_motion, spare_equations, verdict_without_an_answer
-from thesisrecon.types import MotionVerdict, Reconstruction, Upgrade
+from thesisrecon.types import MotionVerdict, Reconstruction, Tracks, Upgrade
 from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
 
 CRITICAL = [motion for motion in Motion if motion is not Motion.GENERAL]
@@ -131,6 +133,23 @@ def test_a_camera_that_rolled_only_is_refused_and_told_what_to_do() -> None:
         assert not verdict.identifiable
         assert verdict.motion == "rotation about the optical axis"
         assert any("point the camera in different directions" in sentence for sentence in verdict.sentences)
+
+
+def test_a_turn_no_larger_than_what_lens_models_leave_out_tells_no_focal() -> None:
+    """Turned by less than a tenth of a degree, thousands of points: as rectified photographs seem to be."""
+    scene, rng = make_sequence(Motion.TRANSLATION, np.random.default_rng(0)), np.random.default_rng(1)
+    turns = Rotation.from_rotvec(np.radians(rng.normal(0.0, 0.07, (len(scene.R), 3)))).as_matrix()
+    scene = replace(scene, R=turns @ scene.R, X=rng.uniform(-0.6, 0.6, (9000, 3)), sigma_px=0.05)
+    view, point = np.divmod(np.arange(len(scene.R) * len(scene.X)), len(scene.X))
+    x = np.einsum("kij,kj->ki", scene.P[view], homogenize(scene.X)[point])
+    xy = dehomogenize(x) + scene.sigma_px * rng.standard_normal((len(view), 2))
+    tracks = Tracks(view, point, xy, len(scene.R), len(scene.X))
+    verdict = verdict_at_the_truth(replace(scene, tracks=tracks))
+    assert verdict.evidence["turn_significance"] > MIN_SIGNIFICANCE
+    assert verdict.evidence["focal_std_rel"] < MAX_FOCAL_STD
+    assert verdict.evidence["image_shift_beyond_roll"] < LEAST_MOVE
+    assert not verdict.identifiable
+    assert any("what a lens model leaves out" in sentence for sentence in verdict.sentences)
 
 
 def test_a_general_motion_needs_no_words() -> None:

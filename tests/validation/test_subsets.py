@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.synthetic import make_scene, true_pairs
-from validation.checks.subsets import Matched, Trial, run_trial, table_row, take_views
+from validation.checks.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
 
 
 def matched_scene() -> Matched:
@@ -39,9 +39,22 @@ def test_a_trial_finds_the_focal_length_and_is_the_same_twice() -> None:
     assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
 
 
-def test_a_wrong_answer_that_is_trusted_and_a_crash_are_told_apart() -> None:
+def test_what_came_of_a_trial_is_told_apart() -> None:
     wrong = Trial(0, (0, 1), 2, 10.0, 12.0, (), 1, 1.0)
-    flagged = replace(wrong, doubts=("no",))
-    crash = replace(wrong, median_pct=np.nan, crash="ValueError: no")
-    assert [t.unflagged_failure for t in (wrong, flagged, crash)] == [True, False, False]
-    assert "| 0 / 3 |" in table_row("s", "shared", [wrong, flagged, crash])
+    shifted = replace(wrong, median_pct=np.nan, reasons=("pure translation",))
+    trials = {
+        "right": replace(wrong, median_pct=1.0),
+        "open": replace(wrong, interval_pct=11.0),
+        "refused": replace(shifted, doubts=("close to a pure translation",)),
+        "refused, another reason": replace(shifted, doubts=("too few points",)),
+        "right, doubted": replace(wrong, median_pct=1.0, doubts=("no",)),
+        "wrong": wrong,
+        "crash": replace(wrong, median_pct=np.nan, crash="ValueError: no"),
+    }
+    assert tuple(trials) == OUTCOMES
+    assert [trial.outcome for trial in trials.values()] == list(OUTCOMES)
+    assert replace(wrong, doubts=("no",)).outcome == "refused"
+    assert shifted.outcome == "wrong"
+    assert "| s | shared | 7 | 1 | 1 | 1 | 1 | 1 | 1 | 1 | 5.50 |" in table_row(
+        "s", "shared", [*trials.values()]
+    )

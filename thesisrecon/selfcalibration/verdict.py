@@ -31,7 +31,7 @@ from thesisrecon.selfcalibration.critical_motions import (
     shifts_without_an_answer,
 )
 from thesisrecon.selfcalibration.frame import build_frame
-from thesisrecon.selfcalibration.limits import MAX_FOCAL_STD, MIN_SIGNIFICANCE, MOST_NOISE
+from thesisrecon.selfcalibration.limits import LEAST_MOVE, MAX_FOCAL_STD, MIN_SIGNIFICANCE, MOST_NOISE
 from thesisrecon.selfcalibration.wording import motion_sentences
 from thesisrecon.types import B8, I64, Assumptions, MotionVerdict, Reconstruction, Upgrade
 
@@ -263,7 +263,10 @@ def _verdict(
     }
     undetermined = views[std >= MAX_FOCAL_STD]
     # A prior that fixes the focal does so whatever the cameras did.
-    turned = evidence["turn_significance"] >= MIN_SIGNIFICANCE
+    turned = (
+        evidence["turn_significance"] >= MIN_SIGNIFICANCE
+        and evidence["image_shift_beyond_roll"] >= LEAST_MOVE
+    )
     settled = bool((problem.prior.std[:, 0] < MAX_FOCAL_STD).all())
     identifiable = (
         len(views) - len(undetermined) >= max(3, (len(views) + 1) // 2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from thesisrecon.selfcalibration import critical_motions as critical
-from thesisrecon.selfcalibration.limits import MAX_FOCAL_STD, MIN_SIGNIFICANCE, MOST_NOISE
+from thesisrecon.selfcalibration.limits import LEAST_MOVE, MAX_FOCAL_STD, MIN_SIGNIFICANCE, MOST_NOISE
 
 _FOUND: Mapping[str, str] = {
     critical.PLANE: (
@@ -130,6 +130,11 @@ def _what_fails(motion: str, evidence: Mapping[str, float], is_critical: bool, f
     std = evidence["focal_std_rel_median"]
     if evidence["turn_significance"] < MIN_SIGNIFICANCE and std < MAX_FOCAL_STD:
         return [f"the turns cannot be told from noise, and no focal length can be had from them; {advice}"]
+    if evidence["image_shift_beyond_roll"] < LEAST_MOVE and std < MAX_FOCAL_STD:
+        return [
+            f"the turns move the picture by {evidence['image_shift_beyond_roll']:.2%} of its width, as "
+            f"little as what a lens model leaves out, and no focal length can be had from them; {advice}"
+        ]
     if std >= MAX_FOCAL_STD:
         return [f"the cameras fix the focal length only to {_percent(std)}; {advice}"]
     # No turn of the camera mends cameras that are not what they are said to be.
