@@ -22,7 +22,7 @@ STAGES = {
     "model",
     "views",
 }
-COMMON = {"types", "errors", "geometry", "robust", "optimize"}
+COMMON = {"types", "errors", "visits", "geometry", "robust", "optimize"}
 REFERENCES = {"cv2", "pycolmap", "open3d", "poselib", "validation"}
 CORE = {"numpy", "scipy", "numba", "PIL", "trimesh", "jinja2", "plotly", "rich", "typer"}
 OPTIONAL = {"cluster": {"dask", "distributed"}}

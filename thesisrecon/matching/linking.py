@@ -72,11 +72,13 @@ def maps_to_views(chains: Chains, corners: Sequence[F64], pairs: Sequence[TwoVie
     xy = np.concatenate([*corners, np.empty((0, 2))])[chains.node]
     if not len(edges):
         return xy, np.tile(np.eye(2), (len(xy), 1, 1)), np.arange(len(xy))
-    xy1 = np.concatenate([pairs[n].xy1 for n in order])
-    xy2 = np.concatenate([pairs[n].xy2 for n in order])
-    affine = np.concatenate([pairs[n].affine for n in order])
     inside = chains.track[edges[:, 0]] == chains.track[edges[:, 1]]
-    edges, xy1, xy2, affine = edges[inside], xy1[inside], xy2[inside], affine[inside]
+    edges = edges[inside]
+    # Pair by pair: all matches of hundreds of photographs are gigabytes.
+    used = np.split(inside, np.cumsum([len(pairs[n].xy1) for n in order])[:-1])
+    xy1 = np.concatenate([pairs[n].xy1[rows] for n, rows in zip(order, used, strict=True)])
+    xy2 = np.concatenate([pairs[n].xy2[rows] for n, rows in zip(order, used, strict=True)])
+    affine = np.concatenate([pairs[n].affine[rows] for n, rows in zip(order, used, strict=True)])
     degree = np.bincount(edges.ravel(), minlength=len(xy))
     best = np.lexsort((np.arange(len(xy)), -degree, chains.track))
     middle_of = best[np.searchsorted(chains.track[best], np.arange(chains.count))]

@@ -11,9 +11,7 @@ from thesisrecon.matching.alignment import align_corners
 from thesisrecon.matching.linking import Chains, link_matches, maps_to_views
 from thesisrecon.matching.prepared import PreparedView
 from thesisrecon.types import B8, F64, I64, Tracks, TwoView
-
-NEAR = 8
-"""Views on either side that meet one another before the next ones."""
+from thesisrecon.visits import order_of_visits
 
 
 @dataclass(frozen=True)
@@ -75,17 +73,15 @@ class AlignedTracks:
 
 
 def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64]]:
-    """The observations of each two different views (i, j), found by one sort and not by a search per pair.
-
-    Views with near numbers come together, for what is prepared of them serves again.
-    """
+    """The observations of each two different views (i, j), found by one sort and not by a search per pair,
+    in an order in which what is prepared of a view serves again."""
     pair = first * views + second
     order = np.flatnonzero(first != second)
     order = order[np.argsort(pair[order], kind="stable")]
     numbers, starts = np.unique(pair[order], return_index=True)
     groups = np.split(order, starts[1:]) if len(numbers) else []
     i, j = np.divmod(numbers, views)
-    for k in np.lexsort((j, i, j // NEAR, i // NEAR)):
+    for k in order_of_visits(i, j):
         yield int(i[k]), int(j[k]), groups[k]
 
 

@@ -17,8 +17,6 @@ from thesisrecon.run import Batch, stream
 from thesisrecon.types import Features, Image, PairChoice, TwoView
 
 MIN_CORNERS = 16
-NEAR = 8
-"""Views on either side that meet one another before the next ones are prepared."""
 
 # ---------------------------------------------------------------- 4.2.1: features
 
@@ -92,7 +90,7 @@ def match_pairs(work: Work) -> None:
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
         views = _prepared(work)
         if run.workers.in_process:
-            dealt = [[n] for n in near_in_pairs(pairs, missing, NEAR)]
+            dealt = [[n] for n in near_in_pairs(pairs, missing)]
         else:
             dealt = batches_of_pairs(pairs, missing, run.workers.parallel())
         for numbers in dealt:

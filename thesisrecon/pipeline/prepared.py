@@ -6,13 +6,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from math import isqrt
 from typing import Any, overload
 
 import numpy as np
 
 from thesisrecon.config import Matcher
 from thesisrecon.types import Features, Image
+from thesisrecon.visits import order_of_visits
 
 KEPT_BYTES = 2**30
 """What is prepared takes several times the room of its photograph, and takes little time to make again."""
@@ -84,10 +84,10 @@ def _size_of(value: Any) -> int:
     return 0
 
 
-def near_in_pairs(pairs: Sequence[tuple[int, int]], numbers: Iterable[int], width: int) -> list[int]:
-    """The numbers in an order in which ``width`` views on either side meet before the next ones: what was
-    prepared serves again."""
-    return sorted(numbers, key=lambda n: (pairs[n][0] // width, pairs[n][1] // width, *pairs[n]))
+def near_in_pairs(pairs: Sequence[tuple[int, int]], numbers: Sequence[int]) -> list[int]:
+    """The numbers in an order in which what was prepared of a view serves again."""
+    first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
+    return [numbers[k] for k in order_of_visits(first, second)]
 
 
 def batches_of_pairs(
@@ -95,5 +95,5 @@ def batches_of_pairs(
 ) -> list[list[int]]:
     """The numbers dealt into batches whose pairs have views in common, enough of them for all workers."""
     size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), LARGEST_BATCH)
-    ordered = near_in_pairs(pairs, numbers, max(isqrt(size), 1))
+    ordered = near_in_pairs(pairs, numbers)
     return [ordered[k : k + size] for k in range(0, len(ordered), size)]

@@ -110,13 +110,16 @@ def nearest_critical_motion(measures: Mapping[str, float]) -> tuple[str, float]:
     """Its name and how near it is: the largest of its measures over their tolerances, below 1 where the
     motion cannot be told from it by what a photographer does anyhow.
 
-    Of several below 1 the one that leaves most open is meant.
+    Of several below 1 the one that leaves most open is meant, and of a rotation and a translation, of cameras
+    that hardly turned nor moved, the nearer.
     """
     near: dict[str, float] = {}
     for name, needed in _NAMED_BY.items():
         if all(key in measures for key in needed):
             near[name] = max(_nearness(measures, key) for key in needed)
     within = [name for name, distance in near.items() if distance < 1.0]
+    if ROTATION in within and near.get(TRANSLATION, 1.0) < near[ROTATION]:
+        within.remove(ROTATION)
     chosen = within[0] if within else min(near, key=lambda name: near[name])
     return chosen, near[chosen]
 
