@@ -15,11 +15,12 @@ def test_smoothing_equals_its_numpy_twin() -> None:
     assert np.abs(smooth(image, 1.5) - twin).max() < 1e-3
 
 
-def test_halving_equals_its_numpy_twin() -> None:
-    image = texture(31, 44).astype(np.float32)
+@pytest.mark.parametrize(("height", "width"), [(31, 44), (30, 45)])
+def test_halving_equals_its_numpy_twin(height: int, width: int) -> None:
+    image = texture(height, width).astype(np.float32)
     padded = np.pad(image, 1, mode="edge")
-    rows = (padded[0:-3:2] + 3 * padded[1:-2:2] + 3 * padded[2:-1:2] + padded[3::2])[: 31 // 2] / 8
-    twin = (rows[:, 0:-3:2] + 3 * rows[:, 1:-2:2] + 3 * rows[:, 2:-1:2] + rows[:, 3::2])[:, : 44 // 2] / 8
+    rows = (padded[0:-3:2] + 3 * padded[1:-2:2] + 3 * padded[2:-1:2] + padded[3::2])[: height // 2] / 8
+    twin = (rows[:, 0:-3:2] + 3 * rows[:, 1:-2:2] + 3 * rows[:, 2:-1:2] + rows[:, 3::2])[:, : width // 2] / 8
     assert halve(image).shape == (15, 22)
     assert np.abs(halve(image) - twin).max() < 1e-3
 

@@ -19,6 +19,7 @@ from thesisrecon.geometry.invariants import (
     length_ratio,
     parallelism_sine,
     segment_ratio,
+    volume,
     volume_ratio,
 )
 from thesisrecon.geometry.lines_and_planes import (
@@ -254,3 +255,9 @@ def test_3_4_4_conics_of_no_metric_frame_are_refused() -> None:
         metric_from_affine(np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(ValueError, match="semi-definite"):
         metric_from_projective(np.diag([1.0, 1.0, -1.0, 0.0]))
+
+
+def test_the_corner_of_a_cube_holds_a_sixth_of_it() -> None:
+    corner = np.column_stack([2.0 * np.vstack([np.zeros(3), np.eye(3)]), np.ones(4)])
+    assert volume(corner) == pytest.approx(8.0 / 6.0, rel=1e-12)
+    assert volume(corner[[1, 0, 2, 3]]) == pytest.approx(-8.0 / 6.0, rel=1e-12)

@@ -182,7 +182,9 @@ def run_trial(
     count = int(rng.integers(min(views[0], most), most + 1))
     chosen = np.sort(rng.choice(matched.tracks.n_views, count, replace=False))
     kept = rng.random(matched.tracks.n_points) < rng.uniform(LEAST_SHARE, 1.0)
-    subset, first = take_views(matched, chosen, kept), int(rng.integers(LATEST_START))
+    subset = take_views(matched, chosen, kept)
+    # Two photographs have one pair to begin with.
+    first = int(rng.integers(max(min(LATEST_START, sum(pair.accepted for pair in subset.pairs)), 1)))
     wish = IntrinsicsAssumption(cameras="shared" if mode == "shared" else "per-image")
     start, names = time.perf_counter(), tuple(int(view) for view in chosen)
     nothing = Trial(number, names, 0, np.nan, np.nan, (), 0, 0.0, reasons=matched.reasons)
