@@ -37,6 +37,7 @@ DEBUG_VARIABLE = "THESISRECON_DEBUG"
 DEMO_SETTINGS: dict[str, Any] = {"dense": {"max_side": 512, "match_side": 512}}
 """Whoever tries it wants to see a model soon."""
 MOST_THREADS = 1024
+PICTURE_BLOCKS = "64m"
 VIEWS_AGAIN = "the same command makes all pictures anew"
 NO_CACHE = (
     "the compiled kernels can be kept neither beside the code nor in the user's cache folder; name a folder "
@@ -348,10 +349,12 @@ def _root(
 
 
 def _cap_threads(threads: int) -> None:
-    """The one setting that caps every kind of thread; must run before NumPy is imported."""
+    """The one setting that caps every kind of thread; must run before NumPy and Pillow are imported."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
         os.environ[name] = "1"
     os.environ["NUMBA_NUM_THREADS"] = str(threads or available_threads())
+    # Pillow keeps pictures in blocks; of large ones nothing stays with the thread that read the picture.
+    os.environ.setdefault("PILLOW_BLOCK_SIZE", PICTURE_BLOCKS)
 
 
 def _option_tables(

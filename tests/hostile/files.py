@@ -53,6 +53,19 @@ def bomb() -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
+def large_palette() -> bytes:
+    """10,000 x 8000 pixels of one transparent colour of a palette, in 80 kB."""
+    header = struct.pack(">IIBBBBB", 10_000, 8000, 8, 3, 0, 0, 0)
+    pixels = _rows_of_nothing(10_001, 8000)
+    parts = (b"IHDR", header), (b"PLTE", bytes(3)), (b"tRNS", b"\0"), (b"IDAT", pixels)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts) + chunk(b"IEND", b"")
+
+
+def _rows_of_nothing(width: int, count: int) -> bytes:
+    packer = zlib.compressobj(9)
+    return b"".join(packer.compress(bytes(width)) for _ in range(count)) + packer.flush()
+
+
 def text_bomb() -> bytes:
     """A good PNG with a note of 256 MiB, packed."""
     note = b"Comment\0\0" + zlib.compress(bytes(2**28), 9)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import unicodedata
 from collections.abc import Callable
 from pathlib import Path
@@ -64,6 +65,16 @@ def test_what_is_no_photograph_is_refused(
     assert f"{name} {words}" in said
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert [entry["name"] for entry in summary["refused"]] == [name]
+
+
+def test_a_picture_below_the_limit_is_held_once(tmp_path: Path, told: Callable[..., str]) -> None:
+    """80 megapixels of one byte each; as colours with alpha they would take 320 MB, several times over."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "large.png").write_bytes(files.large_palette())
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    said = told(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
+    assert "large.png is blank" in said
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 250 * 2**10
 
 
 def with_exif(data: bytes) -> bytes:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import math
 import stat
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain, count
@@ -18,10 +19,20 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import PIL.Image
-import PIL.ImageOps
 from numpy.typing import NDArray
 
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io.pixels import (
+    AS_STORED,
+    TURNS,
+    Picture,
+    Refused,
+    Room,
+    Turn,
+    at_working_size,
+    bytes_to_decode,
+    picture_from_array,
+)
 from thesisrecon.io.text import NO_FILE, printable
 from thesisrecon.types import F64, Image
 
@@ -37,9 +48,10 @@ SUFFIXES = (
 COMMON_NAMES = ("images", "photographs", "photos", "pictures", "dcim")
 LARGEST_FILE = 2**31
 """Bytes; the largest sensors without any compression stay below half of it."""
+LARGEST_DECODED = 3 * 2**29
+"""Bytes that one photograph may take while it is decoded, and several together that are read at one time: 151
+megapixels, the largest sensors, in the costliest kind of JPEG."""
 MIN_SIDE = 64
-STRIPE = 256
-"""Rows that are counted in double precision at a time."""
 BLANK_RANGE = 8
 READ = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "GIF", "JPEG2000", "AVIF", "HEIF", "PPM")
 """What Pillow may take a file for, whatever it is called: some of its other readers start programs."""
@@ -47,10 +59,7 @@ _ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _WIDTH_35MM = 36.0
 _FOCALS_35MM = (1.0, 1e5)
 """mm; what a header says beyond is a mistake."""
-
-
-class _Refused(Exception):
-    """One photograph cannot be used; the text is the reason."""
+_room = Room(LARGEST_DECODED)
 
 
 @dataclass(frozen=True)
@@ -149,7 +158,7 @@ def read_photographs(
     def read(item: tuple[str, Any]) -> Photograph | str:
         try:
             return _read(*item, max_size_px)
-        except _Refused as refusal:
+        except Refused as refusal:
             return str(refusal)
 
     read_items = list(map_all(read, items))
@@ -197,62 +206,68 @@ def _read(name: str, item: Any, max_size_px: int) -> Photograph:
     if isinstance(item, Image):
         return _finish(Photograph(item, ""))
     if isinstance(item, Path):
-        rgb, photograph = _decode(name, item, max_size_px)
-    else:
-        rgb = _rgb_from_array(item)
-        photograph = Photograph(Image(name, rgb, (rgb.shape[1], rgb.shape[0])), "")
-        rgb = _reduced(PIL.Image.fromarray(rgb), max_size_px)
-    return _finish(replace(photograph, image=replace(photograph.image, rgb=rgb)))
+        return _finish(_decode(name, item, max_size_px))
+    picture = picture_from_array(item)
+    return _finish(Photograph(Image(name, at_working_size(picture, max_size_px), picture.size), ""))
 
 
 def _finish(photograph: Photograph) -> Photograph:
     """Refuse what shows nothing, and name the content by its hash."""
     rgb = photograph.image.rgb
     if min(rgb.shape[:2]) < MIN_SIDE:
-        raise _Refused(
+        raise Refused(
             f"is only {rgb.shape[1]} x {rgb.shape[0]} pixels; {MIN_SIDE} x {MIN_SIDE} are the least"
         )
     if np.ptp(rgb.reshape(-1, 3), axis=0).max() < BLANK_RANGE:
-        raise _Refused("is blank: all its pixels have nearly the same colour")
+        raise Refused("is blank: all its pixels have nearly the same colour")
     content = hashlib.sha256(repr((rgb.shape, photograph.image.original_size)).encode())
     content.update(np.ascontiguousarray(rgb).data)
     return replace(photograph, digest=content.hexdigest()[:32])
 
 
-def _rgb_from_array(array: Any) -> U8:
-    array = np.asarray(array)
-    if array.dtype != np.uint8 or array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
-        raise ValueError(f"an image array must be (H, W) or (H, W, 3) uint8; got {array.shape} {array.dtype}")
-    return np.repeat(array[..., None], 3, axis=2) if array.ndim == 2 else array
-
-
-def _decode(name: str, path: Path, max_size_px: int) -> tuple[U8, Photograph]:
-    """Pixels at working size, and the record that waits for them."""
+def _decode(name: str, path: Path, max_size_px: int) -> Photograph:
     _require_file(path)
     try:
         # Opened here, since Pillow does not close what it cannot read.
         with path.open("rb") as stream, PIL.Image.open(stream, formats=_formats()) as file:
-            note = "only its first frame is used" if getattr(file, "n_frames", 1) > 1 else ""
-            focal_35mm, upright = _exif(file)
-            file.load()
-            picture = PIL.Image.fromarray(_eight_bit(file)) if _is_deep(file.mode) else _rgb(file)
-        picture = upright(picture)
+            needed = bytes_to_decode(file)
+            if needed > LARGEST_DECODED:
+                raise Refused(_too_large(file, needed))
+            with _room.taken(needed), closing(file):
+                return _photograph(name, file, max_size_px)
+    except Refused:
+        raise
     except PIL.Image.DecompressionBombError:
         limit = 2 * (PIL.Image.MAX_IMAGE_PIXELS or 0) // 10**6
-        raise _Refused(f"claims more than {limit} megapixels, which no photograph has") from None
+        raise Refused(f"claims more than {limit} megapixels, which no photograph has") from None
     except PIL.UnidentifiedImageError:
-        raise _Refused("is not an image of a known format") from None
+        raise Refused("is not an image of a known format") from None
     except MemoryError:
-        raise _Refused("does not fit in memory") from None
+        raise Refused("does not fit in memory") from None
     except Exception as error:
         # Decoders raise whatever they stumble over in a damaged file; the other photographs go on.
-        raise _Refused(
+        raise Refused(
             f"cannot be decoded: {printable(getattr(error, 'strerror', None) or str(error))}"
         ) from None
+
+
+def _photograph(name: str, file: PIL.Image.Image, max_size_px: int) -> Photograph:
+    note = "only its first frame is used" if getattr(file, "n_frames", 1) > 1 else ""
+    focal_35mm, turn = _exif(file)
+    file.load()
+    picture = Picture(file, turn)
     said = _FOCALS_35MM[0] <= focal_35mm <= _FOCALS_35MM[1]
     focal = focal_35mm / _WIDTH_35MM * max(picture.size) if said else math.nan
-    record = Photograph(Image(name, np.zeros((0, 0, 3), np.uint8), picture.size), "", focal, note)
-    return _reduced(picture, max_size_px), record
+    return Photograph(Image(name, at_working_size(picture, max_size_px), picture.size), "", focal, note)
+
+
+def _too_large(file: PIL.Image.Image, needed: int) -> str:
+    kind = "JPEG in several scans" if file.format == "JPEG" else file.format
+    return (
+        f"has {file.size[0] * file.size[1] / 1e6:.0f} megapixels, and reading a {kind} of that size takes "
+        f"{needed / 2**30:.1f} GiB of memory, where one photograph may have {LARGEST_DECODED / 2**30:.1f}; "
+        "save it as PNG or TIFF"
+    )
 
 
 def _require_file(path: Path) -> None:
@@ -260,11 +275,11 @@ def _require_file(path: Path) -> None:
     try:
         found = path.stat()
     except OSError as error:
-        raise _Refused(f"cannot be read: {error.strerror}") from None
+        raise Refused(f"cannot be read: {error.strerror}") from None
     if not stat.S_ISREG(found.st_mode):
-        raise _Refused(f"is {NO_FILE}, not a file")
+        raise Refused(f"is {NO_FILE}, not a file")
     if found.st_size > LARGEST_FILE:
-        raise _Refused(f"is a file of {found.st_size / 2**30:.1f} GiB, which no photograph is")
+        raise Refused(f"is a file of {found.st_size / 2**30:.1f} GiB, which no photograph is")
 
 
 @cache
@@ -274,79 +289,12 @@ def _formats() -> tuple[str, ...]:
     return tuple(name for name in READ if name in PIL.Image.OPEN)
 
 
-def _exif(file: PIL.Image.Image) -> tuple[float, Callable[[PIL.Image.Image], PIL.Image.Image]]:
-    """The 35 mm focal length (0 = not said) and the rotation that puts the photograph upright."""
-    turns = PIL.Image.Transpose
-    by_orientation = {
-        2: turns.FLIP_LEFT_RIGHT,
-        3: turns.ROTATE_180,
-        4: turns.FLIP_TOP_BOTTOM,
-        5: turns.TRANSPOSE,
-        6: turns.ROTATE_270,
-        7: turns.TRANSVERSE,
-        8: turns.ROTATE_90,
-    }
+def _exif(file: PIL.Image.Image) -> tuple[float, Turn]:
+    """The 35 mm focal length (0 = not said) and what puts the photograph upright."""
     try:
         exif = file.getexif()
         orientation, focal = exif.get(_ORIENTATION), float(exif.get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
     except Exception:
         # A damaged header says nothing; the pixels may still be good.
-        orientation, focal = None, 0.0
-    turn = by_orientation.get(orientation) if isinstance(orientation, int) else None
-    return focal, lambda picture: picture if turn is None else picture.transpose(turn)
-
-
-def _is_deep(mode: str) -> bool:
-    return mode.startswith("I") or mode == "F"
-
-
-def _eight_bit(file: PIL.Image.Image) -> U8:
-    """Grey of more than 8 bits as 8-bit RGB: whole numbers by their bit depth, real numbers by their
-    range.
-    """
-    values = np.asarray(file)
-    lows, highs = zip(*((part.min(), part.max()) for _, part in _stripes(values)), strict=True)
-    low, high = min(lows), max(highs)
-    if file.mode != "F":
-        # A 12-bit sensor in a 16-bit file must not come out nearly black.
-        low, high = 0.0, 2.0 ** max(8, int(high).bit_length()) - 1
-    rgb = np.empty((*values.shape, 3), dtype=np.uint8)
-    for rows, part in _stripes(values):
-        grey = (part - low) * (255.0 / max(high - low, 1e-12))
-        rgb[rows] = np.rint(np.clip(grey, 0, 255))[..., None]
-    return rgb
-
-
-def _stripes(values: NDArray[Any]) -> Iterator[tuple[slice, F64]]:
-    """Some rows after others as finite real numbers: all at once take eight times the room of their grey."""
-    for start in range(0, len(values), STRIPE):
-        rows = slice(start, start + STRIPE)
-        part = values[rows].astype(np.float64)
-        yield rows, np.nan_to_num(part, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def _rgb(file: PIL.Image.Image) -> PIL.Image.Image:
-    """RGB; what is transparent becomes mid-grey, since the colours under it mean nothing."""
-    if "A" in file.getbands() or "a" in file.getbands() or "transparency" in file.info:
-        layered = file.convert("RGBA")
-        ground = PIL.Image.new("RGBA", layered.size, (128, 128, 128, 255))
-        return PIL.Image.alpha_composite(ground, layered).convert("RGB")
-    return file.convert("RGB")
-
-
-def _reduced(picture: PIL.Image.Image, max_size_px: int) -> U8:
-    """The picture with its long side at most ``max_size_px``, at one exact scale."""
-    width, height = picture.size
-    scale = max_size_px / max(width, height)
-    if scale >= 1:
-        return np.array(picture)
-    size = (
-        (max_size_px, math.floor(height * scale))
-        if width >= height
-        else (math.floor(width * scale), max_size_px)
-    )
-    if min(size) < 1:
-        raise _Refused(f"is {width} x {height} pixels: too narrow to be reduced to {max_size_px}")
-    box = (0.0, 0.0, min(width, size[0] / scale), min(height, size[1] / scale))
-    resized = picture.resize(size, PIL.Image.Resampling.LANCZOS, box=box, reducing_gap=3.0)
-    return np.array(resized)
+        return 0.0, AS_STORED
+    return focal, TURNS.get(orientation, AS_STORED) if isinstance(orientation, int) else AS_STORED
