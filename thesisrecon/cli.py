@@ -23,7 +23,7 @@ import typer
 from thesisrecon import __version__
 from thesisrecon.console import summary_text
 from thesisrecon.errors import DISK, StageFailure, Unwritable, UsageError
-from thesisrecon.io.text import printable, shortened
+from thesisrecon.io.text import printable, shortened, without_middle
 from thesisrecon.stops import CODES, REASONS, advised, speak_through
 from thesisrecon.workers import available_threads
 
@@ -482,9 +482,10 @@ def run_command(arguments: list[str]) -> int:
         place = f"{shortened(str(error.filename))}: " if error.filename is not None else ""
         return _say(f"{place}{error.strerror or error}", USAGE)
     except Exception as error:
-        # The parser's own errors carry their sentence; its classes differ between its versions.
+        # The parser's own errors carry their sentence, in some versions with all that was given; its classes
+        # differ between its versions.
         if hasattr(error, "format_message"):
-            return _say(f"{error.format_message()} (see thesisrecon --help)", USAGE)
+            return _say(f"{without_middle(error.format_message())} (see thesisrecon --help)", USAGE)
         if os.environ.get(DEBUG_VARIABLE):
             raise
         if "no locator available" in str(error):

@@ -41,7 +41,7 @@ NO_PHOTOGRAPHS: list[tuple[str, files.Make, str]] = [
     ("broken.png", writes(files.encoded("PNG").replace(b"IDAT", b"IDOT", 1)), "is not an image"),
     ("bomb.png", writes(files.bomb()), "claims more than 178 megapixels"),
     ("claim.png", writes(files.png(2**31 - 1, 2**31 - 1)), "claims more than 178 megapixels"),
-    ("note.png", writes(files.text_bomb()), "cannot be decoded: Decompressed data too large"),
+    ("note.png", writes(files.text_bomb()), "cannot be decoded: Decompressed "),
     ("one.png", writes(files.encoded("PNG", picture(size=(1, 1)))), "is only 1 x 1 pixels"),
     (
         "narrow.png",

@@ -30,6 +30,7 @@ WISHES: list[tuple[str, list[str], Callable[[Path], object], str]] = [
     ("threads", ["in", "-o", "out", "--threads", "9" * 400], lambda _: None, "--threads"),
     ("seed", ["in", "-o", "out", "--seed", "-1"], lambda _: None, "--seed"),
     ("seed of digits", ["in", "-o", "out", "--seed", "9" * 5000], lambda _: None, "--seed"),
+    ("size of words", ["in", "-o", "out", "--max-size", "9 " * 5000], lambda _: None, "--max-size"),
     ("executor", ["in", "-o", "out", "--executor", "dask://[::1"], lambda _: None, "dask"),
     ("pairs too long", ["in", "-o", "out", "--pairs", files.TOO_LONG], lambda _: None, "File name too long"),
     ("pairs a device", ["in", "-o", "out", "--pairs", "/dev/zero"], lambda _: None, "there is no file"),

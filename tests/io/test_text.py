@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from thesisrecon.errors import UsageError
-from thesisrecon.io.text import printable, read_bytes, read_text, shortened
+from thesisrecon.io.text import printable, read_bytes, read_text, shortened, without_middle
 
 
 @pytest.mark.parametrize(
@@ -32,6 +32,13 @@ def test_names_are_shown_in_one_line_and_in_their_order(name: str, shown: str) -
 def test_long_text_is_begun() -> None:
     assert shortened("x" * 60) == "x" * 60
     assert shortened("x" * 61) == "x" * 57 + "..."
+
+
+def test_a_long_sentence_keeps_its_beginning_and_its_end() -> None:
+    said = f"'--seed': '{'9' * 50}' is no integer"
+    assert without_middle(said, len(said)) == said
+    assert without_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
+    assert len(without_middle(said, 60)) == 60
 
 
 def test_only_regular_files_of_a_size_are_read(tmp_path: Path) -> None:

@@ -44,6 +44,13 @@ def shortened(text: str, longest: int = 60) -> str:
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
+def without_middle(text: str, longest: int = 600) -> str:
+    """The text, or where it is long its beginning and its end, which often tells the rule."""
+    if len(text) <= longest:
+        return text
+    return f"{text[: longest - longest // 4 - 5]} ... {text[-(longest // 4) :]}"
+
+
 def read_bytes(path: Path, *, largest: int = LARGEST_TEXT) -> bytes:
     """The content of a regular file of at most ``largest`` bytes.
 

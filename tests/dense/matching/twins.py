@@ -25,6 +25,12 @@ def bounds(channels):
     return three.min(axis=0), three.max(axis=0)
 
 
+def ones(words):
+    """How many bits are set in each of (N,) words."""
+    octets = np.ascontiguousarray(words).view(np.uint8).reshape(len(words), -1)
+    return np.unpackbits(octets, axis=1).sum(axis=1, dtype=np.int64)
+
+
 def costs(left, right, first, n, weights, outside):
     """(H, D, W); each side is (census, channels, low, high, valid)."""
     height, width = left[0].shape
@@ -33,7 +39,7 @@ def costs(left, right, first, n, weights, outside):
         j = x - first - q
         if not 0 <= j < width:
             continue
-        differing = np.bitwise_count(left[0][:, x] ^ right[0][:, j]).astype(np.int64)
+        differing = ones(left[0][:, x] ^ right[0][:, j])
         a, b = left[1][:, :, x].astype(np.int64), right[1][:, :, j].astype(np.int64)
         apart = np.abs(a - b)
         if weights[3]:

@@ -3,8 +3,9 @@
 ``build`` makes wheel and sdist in OUT/dist and looks into them; the steps after it take what it made.
 ``install`` puts the wheel into an empty environment; ``imports``, ``typed``, ``quiet`` and ``demo`` use it
 from empty folders. ``lowest`` and ``newest`` run the quick suite with the lowest and newest versions of the
-dependencies that pyproject.toml allows; what follows ``--`` goes to pytest in place of the whole suite.
-``--python`` is the interpreter of the new environments. The exit code is 1 where something is wrong.
+dependencies that pyproject.toml allows, part by part; what follows ``--`` goes to pytest in place of it.
+``--python`` is the interpreter of the new environments, each of which is made once and keeps what pytest said
+of each part in ``logs/``. The exit code is 1 where something is wrong.
 """
 
 from __future__ import annotations
@@ -29,10 +30,8 @@ from validation.checks.package.environments import (
 )
 from validation.checks.package.imports import check_imports
 from validation.checks.package.quiet import trespasses, watch
-from validation.scenes.real import ROOT
+from validation.checks.package.suite import quick_parts, run_part, suite_environment, suite_faults
 
-QUICK = ("tests", "--ignore=tests/validation", "-m", "not slow and not real and not browser")
-TOOLS = ("pytest>=8.2", "hypothesis>=6.100", "pytest-benchmark>=4.0")
 FOCAL_WITHIN = 0.01
 """Of the truth: the demo calibrates itself."""
 
@@ -128,21 +127,9 @@ class Checks:
         return self._suite("newest", [])
 
     def _suite(self, name: str, constraints: list[str]) -> list[str]:
-        place = self.out / f"{name}-{Path(self.python).name}"
-        interpreter = place / "bin" / "python"
-        if not interpreter.exists():
-            make_environment(place, self.python)
-            install(interpreter, *dependencies(), *TOOLS, constraints=constraints)
-        environment = bare(
-            PYTHONPATH=str(ROOT), NUMBA_CACHE_DIR=str(place / "kernels"), OPENBLAS_NUM_THREADS="1"
-        )
-        run = subprocess.run(
-            [str(interpreter), "-m", "pytest", "-q", *(self.pytest or QUICK)],
-            cwd=ROOT,
-            env=environment,
-            check=False,
-        )
-        return [] if run.returncode == 0 else [f"the suite fails with the {name} versions"]
+        place = suite_environment(self.out, name, self.python, constraints)
+        parts = {" ".join(self.pytest): self.pytest} if self.pytest else quick_parts()
+        return suite_faults([run_part(place, part, words) for part, words in parts.items()])
 
 
 STEPS: dict[str, Callable[[Checks], list[str]]] = {

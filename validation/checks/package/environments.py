@@ -54,6 +54,16 @@ def install(interpreter: Path, *what: str, constraints: Sequence[str] = ()) -> N
     subprocess.run(command, check=True, env=bare())
 
 
+def installed_versions(interpreter: Path) -> str:
+    """The version of Python and of each dependency, as one line."""
+    names = [re.split("[>=<]", line)[0].strip() for line in dependencies()]
+    asked = "import sys, platform, importlib.metadata as found\n"
+    asked += "print(platform.python_version(), *(f'{n} {found.version(n)}' for n in sys.argv[1:]), sep=', ')"
+    command = [str(interpreter), "-c", asked, *names]
+    run = subprocess.run(command, check=True, env=bare(), capture_output=True, text=True)
+    return f"Python {run.stdout.strip()}"
+
+
 def bare(**more: str) -> Mapping[str, str]:
     """This environment without what leads Python to the source tree, with what is given."""
     left = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")}
