@@ -63,6 +63,17 @@ def test_what_is_seen_is_what_rays_meet(seed: int, distance: float) -> None:
     np.testing.assert_allclose(raster.depth[seen], depth[seen], rtol=1e-5)
 
 
+@pytest.mark.parametrize("unit", [2.0**-30, 2.0**30])
+def test_the_unit_of_length_changes_nothing(unit: float) -> None:
+    vertices, faces = soup(np.random.default_rng(6))
+    camera = camera_at(np.random.default_rng(7), -4.5)
+    other = PinholeCamera(camera.K, camera.R, unit * camera.t, SIZE)
+    one, scaled = rasterize(vertices, faces, camera), rasterize(unit * vertices, faces, other)
+    assert (one.face >= 0).mean() > 0.1
+    np.testing.assert_array_equal(scaled.face, one.face)
+    np.testing.assert_array_equal(scaled.depth, np.float32(unit) * one.depth)
+
+
 def test_points_are_where_the_corners_say() -> None:
     rng = np.random.default_rng(5)
     vertices, faces = soup(rng)
