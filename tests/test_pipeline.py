@@ -219,11 +219,15 @@ def test_a_damaged_result_is_computed_again(tmp_path: Path) -> None:
     run(tmp_path)
     before = kept_bytes(tmp_path)
     CALLS.clear()
-    (tmp_path / "02-matches" / "00001-00002.npz").write_bytes(b"damaged")
+    for name in ("00001-00002", "00000-00001"):
+        (tmp_path / "02-matches" / f"{name}.npz").write_bytes(b"damaged")
     (tmp_path / "01-features" / "00003.npz").unlink()
-    run(tmp_path)
-    assert [c for c in CALLS if not c.startswith("prepare")] == ["detect 03.png", "match (1, 2)"]
+    result = run(tmp_path)
+    called = sorted(c for c in CALLS if not c.startswith("prepare"))
+    assert called == ["detect 03.png", "match (0, 1)", "match (1, 2)"]
     assert kept_bytes(tmp_path) == before
+    told = "02-matches/00000-00001.npz and 1 more were damaged or changed by another program"
+    assert f"{told}, and are computed again" in result.warnings
 
 
 @pytest.mark.parametrize("options", [{"threads": 1}, {"threads": 3}, {"threads": 2, "executor": "processes"}])

@@ -17,6 +17,7 @@ import numpy as np
 
 from thesisrecon.config import PipelineConfig, kind_of, tables_from_config
 from thesisrecon.errors import Unwritable, UsageError, WorkersLost
+from thesisrecon.io.records import ChangedRecord
 from thesisrecon.io.run_directory import RunDirectory, code_key, key_of
 from thesisrecon.settings import table_from_dataclass, unknown_word
 from thesisrecon.types import StageReport
@@ -120,13 +121,29 @@ class Run:
         """
         with self.clock(stage) as log:
             log.keys[item] = key
-            folder = self.directory.stage(FOLDERS[stage])
-            record = folder.load(item, key)
+            (record,) = self._loaded(stage, {item: key})
             if record is None:
                 record = compute()
                 log.computed += 1
-                folder.save(item, key, record)
+                self.directory.stage(FOLDERS[stage]).save(item, key, record)
             return record
+
+    def _loaded(self, stage: str, keys: Mapping[str, str]) -> list[Any]:
+        """What was kept of these items, None where nothing was; of records that were changed is told."""
+        folder = self.directory.stage(FOLDERS[stage])
+        records: list[Any] = []
+        changed: list[str] = []
+        for item, key in keys.items():
+            try:
+                records.append(folder.load(item, key))
+            except ChangedRecord:
+                records.append(None)
+                changed.append(f"{FOLDERS[stage]}/{item}.npz")
+        if changed:
+            more = f" and {len(changed) - 1} more were" if len(changed) > 1 else " was"
+            again = "are computed again" if len(changed) > 1 else "is computed again"
+            self.warnings.append(f"{changed[0]}{more} damaged or changed by another program, and {again}")
+        return records
 
     def kept_all(
         self,
@@ -145,7 +162,7 @@ class Run:
             log.keys.update(keys)
             folder = self.directory.stage(FOLDERS[stage])
             names = list(keys)
-            records = [folder.load(name, keys[name]) for name in names]
+            records = self._loaded(stage, keys)
             missing = [n for n, record in enumerate(records) if record is None]
             done = len(names) - len(missing)
             self.progress(stage, done, len(names))

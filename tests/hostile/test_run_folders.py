@@ -16,6 +16,8 @@ import pytest
 from tests.hostile import files
 from tests.hostile.files import FEATURES, links, pipe, sparse, writes
 
+CHANGED = "01-features/00000.npz was damaged or changed by another program, and is computed again"
+
 
 def finished_run(tmp_path: Path, told: Callable[..., str]) -> tuple[list[str], Path]:
     """A command that was carried out, and its folder."""
@@ -53,6 +55,28 @@ RECORDS: list[tuple[str, files.Make]] = [
 ]
 
 
+def rewritten(change: Callable[[dict[str, np.ndarray]], object]) -> Callable[[Path], None]:
+    """A record as another program writes it that has changed its arrays: a good npz."""
+
+    def make(path: Path) -> None:
+        with np.load(path) as file:
+            arrays = {name: file[name].copy() for name in file.files}
+        change(arrays)
+        path.unlink()
+        np.savez(path, **arrays)
+
+    return make
+
+
+REWRITTEN: list[tuple[str, Callable[[Path], None]]] = [
+    ("NaN", rewritten(lambda arrays: arrays["array0"].fill(np.nan))),
+    ("far outside", rewritten(lambda arrays: arrays["array0"].fill(1e9))),
+    ("no corners", rewritten(lambda arrays: arrays.update(array0=arrays["array0"][:0]))),
+    ("integers", rewritten(lambda arrays: arrays.update(array0=arrays["array0"].astype(int)))),
+    ("nothing", rewritten(lambda _: None)),
+]
+
+
 @pytest.mark.parametrize("make", [make for _, make in RECORDS], ids=[name for name, _ in RECORDS])
 def test_a_record_that_is_none_is_computed_again_or_refused(
     make: files.Make, tmp_path: Path, told: Callable[..., str]
@@ -65,9 +89,24 @@ def test_a_record_that_is_none_is_computed_again_or_refused(
     if record.is_dir():
         assert "cannot be written: Is a directory" in told(command, 2)
         return
-    told(command, 0)
+    assert CHANGED in told(command, 0)
     assert record.read_bytes() == whole
     assert not (out / "01-features" / "sprung").exists()
+    assert CHANGED not in told(command, 0)
+
+
+@pytest.mark.parametrize("make", [make for _, make in REWRITTEN], ids=[name for name, _ in REWRITTEN])
+def test_a_record_that_another_program_wrote_is_computed_again(
+    make: Callable[[Path], None], tmp_path: Path, told: Callable[..., str]
+) -> None:
+    command, out = finished_run(tmp_path, told)
+    (record,) = (out / "01-features").glob("*.npz")
+    whole = record.read_bytes()
+    make(record)
+    assert record.read_bytes() != whole
+    assert CHANGED in told(command, 0)
+    assert record.read_bytes() == whole
+    assert CHANGED in json.loads((out / "summary.json").read_text(encoding="utf-8"))["warnings"]
 
 
 def manifest(report: object) -> Callable[[Path], None]:

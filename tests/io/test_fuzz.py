@@ -29,7 +29,7 @@ from thesisrecon.io.files import read_json
 from thesisrecon.io.images import read_photographs
 from thesisrecon.io.meshes import read_mesh, write_mesh
 from thesisrecon.io.pairs import read_pairs
-from thesisrecon.io.records import bytes_from_record, read_record
+from thesisrecon.io.records import ChangedRecord, bytes_from_record, read_record
 from thesisrecon.io.run_directory import StageFolder
 from thesisrecon.io.text import read_text
 
@@ -111,6 +111,11 @@ def inspected(path: Path) -> None:
     assert run_command(["inspect", str(path.parent)]) in (0, 2)
 
 
+def as_written(path: Path) -> None:
+    record = read_record(path, "key")
+    assert record is None or bytes_from_record(record, "key") == bytes_from_record(some_metric(), "key")
+
+
 READERS = [
     *(colmap(f"{name}{suffix}") for name in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")),
     *(saved(kind) for kind in ("JPEG", "PNG", "TIFF", "GIF", "WEBP", "BMP", "PPM")),
@@ -123,7 +128,8 @@ READERS = [
     Reader(
         "a.npz",
         lambda folder: (folder / "a.npz").write_bytes(bytes_from_record(some_metric(), "key")),
-        lambda path: read_record(path, "key"),
+        as_written,
+        (ChangedRecord,),
     ),
     Reader("model.glb", lambda folder: write_mesh(folder / "model.glb", roof()), read_mesh, (UsageError,)),
     Reader(

@@ -11,7 +11,7 @@ import pytest
 
 from thesisrecon.errors import UsageError
 from thesisrecon.io.files import read_json, write_atomically
-from thesisrecon.io.records import bytes_from_record
+from thesisrecon.io.records import ChangedRecord, bytes_from_record
 from thesisrecon.io.run_directory import (
     RunDirectory,
     StageFolder,
@@ -73,7 +73,7 @@ def test_equal_records_give_equal_bytes() -> None:
     assert bytes_from_record(some_features(1.0), "k") != bytes_from_record(some_features(2.0), "k")
 
 
-def test_another_key_damage_and_absence_all_mean_compute_again(tmp_path: Path) -> None:
+def test_another_key_and_absence_mean_compute_and_damage_is_told(tmp_path: Path) -> None:
     folder = StageFolder(tmp_path)
     assert folder.load("a", "key") is None
     folder.save("a", "key", some_features())
@@ -81,12 +81,14 @@ def test_another_key_damage_and_absence_all_mean_compute_again(tmp_path: Path) -
     good = (tmp_path / "a.npz").read_bytes()
     for bad in (b"", b"text", good[: len(good) // 2], good[:300] + b"\0" * 40 + good[340:]):
         (tmp_path / "a.npz").write_bytes(bad)
-        assert folder.load("a", "key") is None
+        with pytest.raises(ChangedRecord, match=r"a\.npz: "):
+            folder.load("a", "key")
 
 
 def test_a_pickle_is_never_loaded(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", description=np.array([{"key": "key"}], dtype=object))
-    assert StageFolder(tmp_path).load("a", "key") is None
+    with pytest.raises(ChangedRecord, match="allow_pickle"):
+        StageFolder(tmp_path).load("a", "key")
 
 
 def test_the_manifest_ends_a_stage_and_sweeps_what_is_no_longer_part_of_it(tmp_path: Path) -> None:
@@ -224,6 +226,20 @@ def test_what_one_run_kept_another_takes_by_its_key(tmp_path: Path) -> None:
     two.save("00007", "new", some_features(3.0))
     one.save("00000", "key", some_features(2.0))
     assert two.load("00007", "new") is not None
+
+
+def test_what_is_damaged_in_one_place_is_taken_from_the_other(tmp_path: Path) -> None:
+    one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01") for name in "ab")
+    one.save("0", "key", some_features())
+    own, kept = tmp_path / "b" / "01" / "0.npz", tmp_path / "shared" / "01" / "key.npz"
+    write_atomically(own, b"damaged")
+    assert two.load("0", "key") is not None
+    assert own.read_bytes() == kept.read_bytes()
+    write_atomically(kept, b"damaged")
+    assert two.load("0", "key") is not None
+    write_atomically(own, b"damaged")
+    with pytest.raises(ChangedRecord):
+        two.load("0", "key")
 
 
 def test_code_of_the_caller_counts_by_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

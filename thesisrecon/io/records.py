@@ -1,9 +1,16 @@
 """Records of :mod:`thesisrecon.types` as npz files with a JSON description inside: plain arrays and plain
-text, nothing that a reader would have to run."""
+text, nothing that a reader would have to run.
+
+A record is used as it was written or not at all, for kernels do not ask whether what they are given fits.
+Its seal, in the comment of the archive, is made of the checksums that a zip file keeps of its parts. A
+damaged part contradicts its checksum, as reading finds out anyway; a part that another program has written
+anew, with a checksum of its own, contradicts the seal. Who knows how a seal is made can still make one.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import io
 import json
 import os
@@ -19,6 +26,10 @@ from thesisrecon import types as records
 _DESCRIPTION = "description"
 
 
+class ChangedRecord(Exception):
+    """What stands in the place of a record is not as it was written."""
+
+
 def bytes_from_record(record: Any, key: str) -> bytes:
     """A record of :mod:`thesisrecon.types` as the bytes of an npz file; equal records give equal bytes."""
     arrays: dict[str, np.ndarray[Any, Any]] = {}
@@ -26,7 +37,15 @@ def bytes_from_record(record: Any, key: str) -> bytes:
     stream = io.BytesIO()
     named: dict[str, Any] = {_DESCRIPTION: np.frombuffer(description.encode(), dtype=np.uint8), **arrays}
     np.savez(stream, **named)
+    with zipfile.ZipFile(stream, "a") as archive:
+        archive.comment = _seal(archive)
     return stream.getvalue()
+
+
+def _seal(archive: zipfile.ZipFile) -> bytes:
+    """A short name for the content of all parts."""
+    parts = [(part.filename, part.CRC, part.file_size) for part in archive.infolist()]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32].encode()
 
 
 def _describe(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
@@ -64,30 +83,44 @@ def _rebuild(value: Any, arrays: Mapping[str, Any]) -> Any:
 
 
 def read_record(path: Path, key: str) -> Any:
-    """The record kept in ``path`` under ``key``; None where it is absent, damaged or made from something
-    else.
+    """The record kept in ``path`` under ``key``; None where it is absent or made from something else.
+
+    Raises :class:`ChangedRecord` where something stands there that is no record as :func:`bytes_from_record`
+    makes them: damaged, written by another program, or no file at all.
     """
+    if not os.path.lexists(path):
+        return None
     try:
-        if not path.is_file():
-            return None
+        # A pipe would be waited for.
+        _require(path.is_file(), "a record is a file")
         # np.load would leave a file it cannot understand open.
         with path.open("rb") as stream:
-            _require_plain(stream)
+            seal = _seal_of_plain(stream)
             with np.load(stream, allow_pickle=False) as file:
                 description = json.loads(bytes(file[_DESCRIPTION]).decode())
                 if description["key"] != key:
                     return None
+                _require(file.zip.comment == seal, "a record has the seal of its content")
                 return _rebuild(description["record"], {name: file[name] for name in file.files})
-    except Exception:
-        # Whatever a half-written or edited file makes the readers raise: it is computed again.
-        return None
+    except Exception as error:
+        # Whatever a damaged or edited file makes the readers raise.
+        raise ChangedRecord(f"{path}: {error}") from None
 
 
-def _require_plain(stream: BinaryIO) -> None:
-    """Refuse an archive that is larger unpacked than packed: ours are not compressed."""
+def _require(holds: bool, rule: str) -> None:
+    if not holds:
+        raise ValueError(rule)
+
+
+def _seal_of_plain(stream: BinaryIO) -> bytes:
+    """The seal that the content of an archive should have.
+
+    Refused is what is larger unpacked than packed: ours are not compressed.
+    """
     with zipfile.ZipFile(stream) as archive:
         packed = [entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()]
         size = sum(entry.file_size for entry in archive.infolist())
-    if any(packed) or size > stream.seek(0, os.SEEK_END):
-        raise ValueError("a record is not compressed")
+        seal = _seal(archive)
+    _require(not any(packed) and size <= stream.seek(0, os.SEEK_END), "a record is not compressed")
     stream.seek(0)
+    return seal

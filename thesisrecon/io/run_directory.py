@@ -1,8 +1,8 @@
 """The run directory: what a stage computed, kept so that a kill at any point loses little.
 
 Each result is one npz file with a JSON description inside, written whole or not at all. It carries the key
-of what it was made from (settings, code and inputs, all the way up), and is used again only under that key;
-a damaged file counts as absent.
+of what it was made from (settings, code and inputs, all the way up), and is used again only under that key
+and as it was written.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from thesisrecon.errors import Unwritable, UsageError
 from thesisrecon.io.files import as_read, is_partial, link, read_json, write_atomically, write_json
-from thesisrecon.io.records import bytes_from_record, read_record
+from thesisrecon.io.records import ChangedRecord, bytes_from_record, read_record
 from thesisrecon.types import StageReport
 
 try:
@@ -31,7 +31,7 @@ try:
 except ImportError:  # pragma: no cover - only where there is no POSIX
     fcntl = None  # type: ignore[assignment]
 
-FORMAT = 1
+FORMAT = 2
 RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
 _CODE_OF_ALL_STAGES = ("types", "geometry", "robust", "optimize")
 
@@ -84,14 +84,25 @@ class StageFolder:
     shared: Path | None = None
 
     def load(self, item: str, key: str) -> Any:
-        """The kept record of this item, from this run or another; None where it must be computed."""
-        own = self.path / f"{item}.npz"
-        record = read_record(own, key)
-        if record is None and self.shared is not None:
-            record = read_record(self.shared / f"{key}.npz", key)
+        """The kept record of this item, from this run or another; None where it must be computed.
+
+        Raises :class:`ChangedRecord` where it must be computed since a file of it is not as it was written.
+        """
+        own, changed = self.path / f"{item}.npz", None
+        places = [own] if self.shared is None else [own, self.shared / f"{key}.npz"]
+        for place in places:
+            try:
+                record = read_record(place, key)
+            except ChangedRecord as error:
+                changed = error
+                continue
             if record is not None:
-                link(self.shared / f"{key}.npz", own)
-        return record
+                if place != own:
+                    link(place, own)
+                return record
+        if changed is not None:
+            raise changed
+        return None
 
     def save(self, item: str, key: str, record: Any) -> None:
         """Keep the record of this item."""
