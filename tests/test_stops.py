@@ -39,6 +39,19 @@ import os, signal, sys
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 os.execv(sys.argv[1], sys.argv[1:])
 """
+LOADING = """
+import runpy, sys, time
+from pathlib import Path
+ready, name, slow = sys.argv[1:]
+class Slow:
+    def find_spec(self, wanted, *_):
+        if wanted == slow:
+            Path(ready).touch()
+            time.sleep(600)
+sys.meta_path.insert(0, Slow())
+runpy.run_module(name, run_name="__main__", alter_sys=True)
+"""
+"""A command, one of whose modules is never loaded."""
 AT_WORK = {
     "in compiled code": "Path(sys.argv[1]).touch(); " + ENDLESS,
     "at the end of a pool of threads": f"""
@@ -81,6 +94,19 @@ def test_a_program_is_ended_whatever_it_is_at(what: str, asked: signal.Signals, 
     stop = stopped(program(tmp_path, AT_WORK[what]), ready.exists, asked, environment=environment)
     word = "interrupted" if asked == signal.SIGINT else "told to end"
     assert (stop.code, stop.said, stop.left) == (CODES[asked], f"toy: {word}; it goes on later\n", 0)
+
+
+@pytest.mark.parametrize(("name", "slow"), [("thesisrecon", "cli"), ("validation", "command")])
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_is_ended_while_it_is_loaded(
+    name: str, slow: str, asked: signal.Signals, tmp_path: Path
+) -> None:
+    ready = tmp_path / "ready"
+    program = [sys.executable, "-c", LOADING, str(ready), name, f"{name}.{slow}"]
+    stop = stopped(program, ready.exists, asked, environment={**os.environ, "PYTHONPATH": str(ROOT)})
+    word = "interrupted" if asked == signal.SIGINT else "told to end"
+    assert stop.code == CODES[asked]
+    assert stop.said == f"{name}: {word}; give the same command again\n"
 
 
 def test_what_a_program_was_started_to_ignore_it_ignores(tmp_path: Path) -> None:

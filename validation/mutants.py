@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thesisrecon.stops import obey_signals
 from validation.harness.planting import CopiedTree, imports_of
 from validation.harness.process import own_cores, run_process
 from validation.scenes.real import ROOT
@@ -348,4 +349,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    obey_signals("mutants")
     raise SystemExit(main())

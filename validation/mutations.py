@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from thesisrecon.stops import obey_signals
 from validation.harness.gates import Gate, read_gates
 from validation.harness.planting import CopiedTree
 from validation.harness.process import last_words, own_cores, run_process
@@ -250,4 +251,5 @@ def _chosen(mutations: Mapping[str, Mutation], only: Sequence[str] | None) -> li
 
 
 if __name__ == "__main__":
+    obey_signals("mutations")
     raise SystemExit(main())

@@ -10,7 +10,7 @@ import pytest
 
 from tests.hostile import files
 from thesisrecon.cli import run_command
-from validation.__main__ import main as run_validation
+from validation.command import main as run_validation
 
 GROWTH_MB = 600
 """What one case may add to the peak of the memory: a photograph of 89 megapixels takes 360."""

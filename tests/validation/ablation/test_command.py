@@ -14,11 +14,11 @@ import pytest
 
 from tests.report.opened import Witness
 from tests.validation.ablation.toy import Darts, marks
-from validation.__main__ import main
 from validation.ablation import Measure, Study, ablate, analyse, write_analysis
 from validation.ablation.progress import duration, words_of
 from validation.ablation.run import State
 from validation.checks.stop_anywhere import stopped
+from validation.command import main
 from validation.scenes.real import ROOT
 
 EVIL = "<img src=x onerror=alert(1)>"

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.validation.harness.toy_stages import STAGES, WAYS
-from validation.__main__ import main
+from validation.command import main
 from validation.harness.gates import Gate, read_gates
 from validation.harness.page import write_pages
 from validation.harness.records import Judgement, Outcome, Task, Wishes, slug

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.validation.harness.reference_stages import METHODS, STAGES
-from validation.__main__ import main
+from validation.command import main
 from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
