@@ -8,10 +8,12 @@ import pytest
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar import estimate_fundamental, judge_certainty
 from thesisrecon.epipolar.certainty.kernels import (
+    NEIGHBOURS,
     contradicted_shares,
     count_transferred,
     geometries_of_plane,
     plane_distances,
+    plane_normal_equations,
     refine_plane,
 )
 from thesisrecon.epipolar.certainty.plane import (
@@ -165,6 +167,46 @@ def test_plane_distances_match_their_numpy_twin():
     H = estimate_homography(pair.xy1, pair.xy2)
     expected = np.sum(homography_distances(H, xy1, xy2) ** 2, axis=1)
     np.testing.assert_allclose(plane_distances(H.ravel(), np.hstack([xy1, xy2])), expected, rtol=1e-6)
+
+
+def test_normal_equations_of_a_plane_match_their_numpy_twin():
+    rng = np.random.default_rng(5)
+    h = np.array([1.1, 0.2, -0.1, -0.15, 0.9, 0.3, 0.2, -0.3, 1.0])
+    xy1 = rng.uniform(-1.0, 1.0, (30, 2))
+    p = np.column_stack([xy1, np.ones(30)])
+    images = p @ h.reshape(3, 3).T
+    xy2 = images[:, :2] / images[:, 2:] + rng.normal(0.0, 0.05, (30, 2))
+    expected, total = np.zeros((9, 9)), 0.0
+    for one, two in zip(p, xy2, strict=True):
+        A = np.vstack([np.kron([1.0, 0.0, -two[0]], one), np.kron([0.0, 1.0, -two[1]], one)])
+        w = one @ h[6:]
+        J = np.hstack([(h[:6].reshape(2, 3) - np.outer(two, h[6:]))[:, :2], -w * np.eye(2)])
+        inverse = np.linalg.inv(J @ J.T)
+        share = min((A @ h) @ inverse @ (A @ h) / 0.08**2, 1.0)
+        total += share
+        expected += (1.0 - share) ** 2 * A.T @ inverse @ A
+    G = np.empty((9, 9))
+    assert plane_normal_equations(h, np.hstack([xy1, xy2]), 0.08, G) == pytest.approx(total, rel=1e-9)
+    assert 1.0 < total < 29.0
+    np.testing.assert_allclose(G, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+
+
+def test_contradicted_shares_match_their_numpy_twin():
+    rng = np.random.default_rng(8)
+    h = np.array([1.1, 0.2, -0.1, -0.15, 0.9, 0.3, 0.2, -0.3, 1.0])
+    points = np.hstack([rng.uniform(-1.0, 1.0, (60, 2)), np.zeros((60, 2))])
+    images = np.column_stack([points[:, :2], np.ones(60)]) @ h.reshape(3, 3).T
+    points[:, 2:] = images[:, :2] / images[:, 2:] + rng.normal(0.0, 0.15, (60, 2))
+    parallax = points[:, 2:] - images[:, :2] / images[:, 2:]
+    on_plane, chosen = rng.random(60) < 0.7, np.arange(0, 60, 3)
+    expected = []
+    for k in chosen:
+        apart = np.linalg.norm(points[:, :2] - points[k, :2], axis=1)
+        near = np.argsort(np.where(apart < 0.05, np.inf, apart))[:NEIGHBOURS]
+        over = np.linalg.norm(parallax[near] - parallax[k], axis=1) > apart[near]
+        expected.append(np.mean(on_plane[near] & over))
+    assert 0.1 < np.mean(expected) < 0.9
+    np.testing.assert_allclose(contradicted_shares(h, points, on_plane, chosen, 0.05), expected)
 
 
 def test_transfers_are_counted_as_by_numpy():

@@ -10,16 +10,20 @@ from thesisrecon.types import F64, I64
 
 @njit(cache=True, nogil=True)
 def unite(edges: I64, view_of: I64, n_views: int) -> I64:
-    """(N,) the root of each corner after uniting along ``edges`` (E, 2) in their order.
+    """(N,) the first corner of each corner's set, after uniting along ``edges`` (E, 2) in their order.
 
-    An edge between two sets that share a view is refused. ``view_of`` (N,) is the view of each corner.
+    An edge between two sets that share a view is refused. ``view_of`` (N,) is the view of each corner. Sets
+    that share a view are known by the views of the smaller one alone, so that an edge costs the same however
+    many photographs there are.
     """
     count = len(view_of)
     parent = np.arange(count)
-    # Sets are lists linked through ``following``, so that their views can be compared.
-    following = np.full(count, -1, np.int64)
-    last = np.arange(count)
-    seen = np.zeros(n_views, np.bool_)
+    # Sets are lists linked through ``following``, the smaller one joins the larger.
+    following, last, size = np.full(count, -1, np.int64), np.arange(count), np.ones(count, np.int64)
+    # Which views the set of a root has: root times views plus view.
+    has = {np.int64(-1)}
+    for n in range(count):
+        has.add(n * n_views + view_of[n])
     for e in range(len(edges)):
         a, b = edges[e, 0], edges[e, 1]
         while parent[a] != a:
@@ -30,32 +34,32 @@ def unite(edges: I64, view_of: I64, n_views: int) -> I64:
             b = parent[b]
         if a == b:
             continue
-        if b < a:
+        if size[b] > size[a]:
             a, b = b, a
-        n = a
-        while n >= 0:
-            seen[view_of[n]] = True
-            n = following[n]
-        clash = False
         n = b
-        while n >= 0 and not clash:
-            clash = seen[view_of[n]]
+        while n >= 0 and a * n_views + view_of[n] not in has:
             n = following[n]
-        n = a
-        while n >= 0:
-            seen[view_of[n]] = False
-            n = following[n]
-        if clash:
+        if n >= 0:
             continue
+        n = b
+        while n >= 0:
+            has.discard(b * n_views + view_of[n])
+            has.add(a * n_views + view_of[n])
+            n = following[n]
         parent[b] = a
         following[last[a]] = b
         last[a] = last[b]
+        size[a] += size[b]
+    first = np.full(count, -1, np.int64)
+    root = np.empty(count, np.int64)
     for n in range(count):
         a = n
         while parent[a] != a:
             a = parent[a]
-        parent[n] = a
-    return parent
+        if first[a] < 0:
+            first[a] = n
+        root[n] = first[a]
+    return root
 
 
 @njit(cache=True, nogil=True)
