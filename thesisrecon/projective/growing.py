@@ -11,6 +11,8 @@ from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.optimize.conditioning import whitening_transform
 from thesisrecon.optimize.projective_bundle import refine_projective_bundle
 from thesisrecon.optimize.triangulation_refine import refine_points
+from thesisrecon.projective.kernels import project_observations
+from thesisrecon.projective.selection import grid_cells
 from thesisrecon.robust.noise import noise_from_distances
 from thesisrecon.types import B8, I64, Reconstruction, Tracks
 
@@ -30,6 +32,7 @@ class GrowingModel:
     ``P`` (V, 3, 4) and ``X`` (N, 4), zeros where there is none yet, their signs such that depths are
     positive; ``ok`` (K,) marks the observations that the current cameras explain. ``reasons`` says of each
     view why it waits; the gate ``postponed`` it, or it was in the model, proved wrong, and is ``barred``.
+    ``cell`` (K,) is the observation's cell in a grid of its view.
     """
 
     tracks: Tracks
@@ -43,6 +46,7 @@ class GrowingModel:
     reasons: list[str] = field(default_factory=list)
     postponed: B8 = field(default_factory=lambda: np.zeros(0, dtype=bool))
     barred: B8 = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    cell: I64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @staticmethod
     def empty(tracks: Tracks, sizes: I64, *, sigma_px: float, noise_floor_px: float) -> GrowingModel:
@@ -51,7 +55,7 @@ class GrowingModel:
         return GrowingModel(
             tracks, sizes, np.zeros((n, 3, 4)), np.zeros((tracks.n_points, 4)), np.zeros(n, dtype=bool),
             np.zeros(len(tracks.xy), dtype=bool), max(sigma_px, noise_floor_px), noise_floor_px,
-            [""] * n, np.zeros(n, dtype=bool), np.zeros(n, dtype=bool),
+            [""] * n, np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), grid_cells(tracks),
         )  # fmt: skip
 
     @property
@@ -142,16 +146,11 @@ def _residuals(P: F64, X: F64, xy: F64) -> F64:
 def mark(model: GrowingModel, sigmas: float) -> None:
     """Signs of the points made those of their cameras, then ``ok`` = in front and within the gate (6.5)."""
     t = model.tracks
-    k = np.flatnonzero(model.registered[t.view_index] & (np.abs(model.X).sum(axis=1) > 0)[t.point_index])
-    point = t.point_index[k]
-    xh = np.einsum("kab,kb->ka", model.P[t.view_index[k]], model.X[point])
-    flip = np.where(np.bincount(point, np.sign(xh[:, 2]), minlength=t.n_points) < 0, -1.0, 1.0)
+    chosen = model.registered[t.view_index] & (np.abs(model.X).sum(axis=1) > 0)[t.point_index]
+    depth, distance = project_observations(model.P, model.X, t.view_index, t.point_index, t.xy, chosen)
+    flip = np.where(np.bincount(t.point_index, np.sign(depth), minlength=t.n_points) < 0, -1.0, 1.0)
     model.X = model.X * flip[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        residual = np.linalg.norm(xh[:, :2] / xh[:, 2:] - t.xy[k], axis=1)
-    within = np.nan_to_num(residual, nan=np.inf) < sigmas * model.sigma_px
-    model.ok = np.zeros(len(t.xy), dtype=bool)
-    model.ok[k] = within & (xh[:, 2] * flip[point] > 0)
+    model.ok = (distance < sigmas * model.sigma_px) & (depth * flip[t.point_index] > 0)
     model.ok &= model.valid[t.point_index]
 
 

@@ -191,7 +191,7 @@ class GatedIncremental:
         ready = model.valid[t.point_index]
         counts = np.bincount(t.view_index[ready], minlength=t.n_views)
         waiting = ~model.registered & ~model.barred
-        spread = np.where(waiting, spread_of_views(t, ready), 0.0)
+        spread = np.where(waiting, spread_of_views(model.cell, ready, t.n_views), 0.0)
         for view in np.argsort(-spread, kind="stable"):
             if spread[view] <= 0.0:
                 return None

@@ -10,6 +10,9 @@ import numpy as np
 from thesisrecon.projective.initial_pair import NO_PARALLAX
 from thesisrecon.types import B8, F64, I64, Reconstruction, Tracks, TwoView
 
+CELLS = 8
+"""Of the grid over a view, along each side."""
+
 
 def tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> B8:
     """Tracks that are not seen from one standpoint only; -> (n_points,) bool.
@@ -28,7 +31,7 @@ def tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView], *, most: floa
     return np.asarray(((apart @ seen) * seen).any(axis=0))
 
 
-def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int, cells: int = 8) -> B8:
+def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int, cells: int = CELLS) -> B8:
     """The longest ``usable`` tracks, until each view has about ``points_per_view``; -> (n_points,) bool.
 
     Every view's points are spread over a grid of ``cells`` x ``cells`` of its own extent: within a cell the
@@ -57,22 +60,24 @@ def _first_in_turn(tracks: Tracks, k: I64, length: I64, cells: int) -> I64:
     return by_length[np.lexsort((by_length, -length[tracks.point_index[k]][by_length], turn))]
 
 
-def spread_of_views(tracks: Tracks, chosen: B8, *, cells: int = 8) -> F64:
-    """How much of each view its ``chosen`` (K,) observations hold; -> (V,).
-
-    The sum over a grid of ``cells`` x ``cells`` of the view's extent of the root of their number in the cell:
-    many points count, and points all over the picture count more than a crowd in a corner.
-    """
-    # It is asked for once per camera: a search through all observations for each view would be cubic.
-    shape = (tracks.n_views, 2)
-    low, high = np.full(shape, np.inf), np.full(shape, -np.inf)
+def grid_cells(tracks: Tracks, *, cells: int = CELLS) -> I64:
+    """(K,) the cell of each observation in a grid of ``cells`` x ``cells`` of its view's extent, the cells of
+    all views counted through."""
+    low, high = np.full((2, tracks.n_views, 2), np.inf)
     np.minimum.at(low, tracks.view_index, tracks.xy)
-    np.maximum.at(high, tracks.view_index, tracks.xy)
-    view = tracks.view_index[chosen]
-    place = (tracks.xy[chosen] - low[view]) / np.maximum(high - low, 1e-9)[view] * cells
-    cell = np.minimum(place, cells - 1).astype(np.int64)
-    number = (view * cells + cell[:, 0]) * cells + cell[:, 1]
-    counts = np.bincount(number, minlength=tracks.n_views * cells * cells).reshape(tracks.n_views, -1)
+    np.minimum.at(high, tracks.view_index, -tracks.xy)
+    view, extent = tracks.view_index, np.maximum(-high - low, 1e-9)
+    cell = np.minimum((tracks.xy - low[view]) / extent[view] * cells, cells - 1).astype(np.int64)
+    return np.asarray((view * cells + cell[:, 0]) * cells + cell[:, 1], dtype=np.int64)
+
+
+def spread_of_views(cell: I64, chosen: B8, n_views: int, *, cells: int = CELLS) -> F64:
+    """How much of each view its ``chosen`` (K,) observations hold, from :func:`grid_cells`; -> (V,).
+
+    The sum over the grid of the root of their number in the cell: many points count, and points all over the
+    picture count more than a crowd in a corner.
+    """
+    counts = np.bincount(cell[chosen], minlength=n_views * cells * cells).reshape(n_views, -1)
     return np.asarray(np.sqrt(counts).sum(axis=1))
 
 
