@@ -163,7 +163,7 @@ def test_almost_featureless_images(folder: Path, reconstruct: Callable[..., Answ
     answer = reconstruct()
     assert answer.code == 3
     assert "no two photographs could be matched" in answer.sentence
-    assert "the best of 1 pairs has 0 verified matches" in answer.sentence
+    assert "the best of 1 pair has 0 verified matches" in answer.sentence
 
 
 def test_two_views_are_too_few_for_self_calibration(folder: Path, reconstruct: Callable[..., Answer]) -> None:

@@ -142,7 +142,7 @@ def test_an_early_end_prints_what_its_stage_found(
         shutil.copy(path, few)
     wanted = {
         "features": r"^\d{3,} corners in 2 photographs\n",
-        "matches": r"^1 of 1 pairs .*, \d\d+ verified",
+        "matches": r"^1 of 1 pair of .*, \d\d+ verified",
     }
     for until, words in wanted.items():
         arguments = ["reconstruct", str(few), "-o", str(out), "--until", until, "--max-size", "480"]

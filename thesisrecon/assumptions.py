@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, counted
 from thesisrecon.types import F64, I64, INTRINSICS, Assumptions, Reconstruction
 
 Mode = Literal["known", "constant", "free"]
@@ -240,5 +240,7 @@ def prior_warnings(wish: IntrinsicsAssumption, exif_focal_px: F64) -> list[str]:
     instead = ", so it is not known: it is taken to be one value per camera (constant), and estimated"
     rest = instead if wish.focal == "known" else ""
     if silent == total:
-        return [f"none of the {total} photographs names its focal length{rest or '; no prior was used'}"]
-    return [f"{silent} of the {total} photographs name no focal length{rest or ' and have no prior'}"]
+        none = f"none of the {counted(total, 'photograph')} names its focal length"
+        return [f"{none}{rest or '; no prior was used'}"]
+    name = "names" if silent == 1 else "name"
+    return [f"{silent} of the {total} photographs {name} no focal length{rest or ' and have no prior'}"]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from thesisrecon.errors import counted
 from thesisrecon.io.text import printable
 
 
@@ -22,7 +23,7 @@ def summary_text(summary: Mapping[str, Any], out: Path) -> str:
         )
     lines += intrinsic_lines(summary["cameras"])
     if summary.get("model"):
-        lines.append(f"model of {summary['model']['faces']} triangles: {out / 'model.glb'}")
+        lines.append(f"model of {counted(summary['model']['faces'], 'triangle')}: {out / 'model.glb'}")
     lines += [f"refused: {refused['name']}: {refused['reason']}" for refused in summary["refused"]]
     lines += [f"warning: {warning}" for warning in summary["warnings"]]
     if summary["failure"]:
@@ -43,18 +44,19 @@ def _found(summary: Mapping[str, Any]) -> str:
     images, pairs = summary["images"], summary["pairs"]
     if summary["stratum"] is not None:
         kind = " in projective cameras" if summary["stratum"] == "projective" else ""
-        return f"{summary['registered']} of {images} photographs registered{kind}, {summary['points']} points"
+        found = f"{summary['registered']} of {counted(images, 'photograph')} registered"
+        return f"{found}{kind}, {counted(summary['points'], 'point')}"
     if pairs["matched"]:
         possible = pairs.get("possible", pairs["matched"])
         chosen = f" ({possible} are possible)" if possible > pairs["matched"] else ""
         return (
-            f"{pairs['accepted']} of {pairs['matched']} pairs of photographs accepted{chosen}, "
-            f"{pairs['verified_matches']} verified matches"
+            f"{pairs['accepted']} of {counted(pairs['matched'], 'pair')} of photographs accepted{chosen}, "
+            f"{counted(pairs['verified_matches'], 'verified match')}"
         )
     corners = [view["corners"] for view in summary["cameras"] if view["corners"] is not None]
     if corners:
-        return f"{sum(corners)} corners in {len(corners)} photographs"
-    return f"{len(summary['cameras'])} of {images} photographs read"
+        return f"{counted(sum(corners), 'corner')} in {counted(len(corners), 'photograph')}"
+    return f"{len(summary['cameras'])} of {counted(images, 'photograph')} read"
 
 
 def intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:

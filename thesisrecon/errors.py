@@ -24,6 +24,12 @@ DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors that only writing can end in."""
 
 
+def counted(number: int, noun: str, shown: str = "") -> str:
+    """``1 photograph``, ``2 photographs``, ``2 matches``; the number is ``shown`` as that says."""
+    ending = "" if number == 1 else "es" if noun.endswith("ch") else "s"
+    return f"{shown or number} {noun}{ending}"
+
+
 class StageFailure(Exception):
     """Data that a stage cannot work with: what was found, what it needs, what to try.
 

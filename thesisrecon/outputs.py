@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from thesisrecon import __version__
 from thesisrecon.affine import affine_of, write_affine
 from thesisrecon.config import toml_from_config
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views, write_colmap_model
 from thesisrecon.io.files import read_json, write_json, write_text
 from thesisrecon.io.meshes import write_mesh
@@ -128,8 +128,8 @@ def write_model(
     if len(skewed):
         directory.remove(COLMAP_FILES)
         said.append(
-            f"sparse/0 is not written: COLMAP has no camera with skew, and {len(skewed)} of the "
-            f"{int(reconstruction.registered.sum())} cameras have it; cameras.json holds them"
+            f"sparse/0 is not written: COLMAP has no camera with skew, as {len(skewed)} of "
+            f"{counted(int(reconstruction.registered.sum()), 'camera')} would need; cameras.json holds them"
         )
     else:
         model = colmap_from_reconstruction(

@@ -7,7 +7,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.stops import advised
 from validation.ablation import command as ablation
 from validation.harness.canaries import ask_canaries
@@ -53,7 +53,8 @@ def main(arguments: list[str] | None = None) -> int:
     page = write_pages(wishes, STAGES, judged, results, changes)
     if told.command == "check":
         _print_gates(results)
-    print(f"{len(results.broken) + len(results.missing)} gates broken; the page is {page}")
+    broken = counted(len(results.broken) + len(results.missing), "gate")
+    print(f"{broken} broken; the page is {page}")
     return int(told.command == "check" and bool(results.broken or results.missing))
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thesisrecon.errors import counted
 from thesisrecon.stops import obey_signals
 from validation.harness.planting import CopiedTree, imports_of
 from validation.harness.process import own_cores, run_process
@@ -344,7 +345,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"mutants: {error}", file=sys.stderr)
         return 1
     score = sum(bool(v.by) for v in verdicts) / max(len(verdicts), 1)
-    print(f"{len(verdicts)} faults, {100.0 * score:.0f} % caught; the table is {told.out / 'mutants.md'}")
+    faults = counted(len(verdicts), "fault")
+    print(f"{faults}, {100.0 * score:.0f} % caught; the table is {told.out / 'mutants.md'}")
     return int(score < LEAST_SCORE)
 
 

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from thesisrecon.errors import counted
 from thesisrecon.stops import obey_signals
 from validation.harness.gates import Gate, read_gates
 from validation.harness.planting import CopiedTree
@@ -239,7 +240,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"mutations: {error}", file=sys.stderr)
         return 1
     survived = sum(fate.survived for fate in fates)
-    print(f"{len(fates)} faults, {survived} survived; the table is {told.out / 'mutations.md'}")
+    print(f"{counted(len(fates), 'fault')}, {survived} survived; the table is {told.out / 'mutations.md'}")
     return int(survived > 0)
 
 

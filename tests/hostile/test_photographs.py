@@ -138,7 +138,7 @@ def test_odd_photographs_are_read(
     (tmp_path / "in" / name).write_bytes(content)
     wish = ["--set", "intrinsics.exif=true", "--set", "intrinsics.focal_std_rel=0.1"]
     said = told(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES, *wish], 0)
-    assert "corners in 1 photographs" in said or "1 of 1 photographs read" in said
+    assert "corners in 1 photograph" in said or "1 of 1 photograph read" in said
 
 
 def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(

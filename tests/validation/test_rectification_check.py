@@ -44,7 +44,7 @@ def test_what_the_other_photograph_cannot_show_does_not_count(pair):
 
 def test_the_table_has_every_method_and_judges_the_choice(pair):
     rows = {row.name: row for row in check_scene("synthetic", [pair])}
-    assert set(rows["done, of 1 pairs"].values) == set(METHODS)
+    assert set(rows["done, of 1 pair"].values) == set(METHODS)
     judged = [row for row in rows.values() if row.target is not None]
     assert len(judged) == 4
     assert all(row.judged == BEST_F and row.verdict == "reached" for row in judged)

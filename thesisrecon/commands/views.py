@@ -11,7 +11,7 @@ import typer
 
 from thesisrecon.commands.common import Threads, cap_threads, named_folder, progress_bars
 from thesisrecon.commands.endings import interruptible
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, counted
 from thesisrecon.io.text import printable
 from thesisrecon.workers import available_threads
 
@@ -158,7 +158,5 @@ def _views_between(
 
 def _say_views(written: ViewFiles) -> None:
     width, height = written.size
-    typer.echo(
-        f"{len(written.frames)} pictures of {width} x {height} px and {written.animation.name} are in "
-        f"{printable(str(written.folder))}"
-    )
+    pictures = f"{counted(len(written.frames), 'picture')} of {width} x {height} px"
+    typer.echo(f"{pictures} and {written.animation.name} are in {printable(str(written.folder))}")

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.epipolar.certainty import judge_certainty
 from thesisrecon.epipolar.degeneracy import MINIMUM, Configuration, classify_configuration
 from thesisrecon.epipolar.planarity import homography_share
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.types import Certainty, FundamentalFit, Matches, TwoView
 
 HOMOGRAPHY_SIGMAS = 4.3
@@ -75,13 +75,13 @@ class PairVerification:
     def _objection(self, verified: int, candidates: int) -> str:
         if verified < self.min_inliers:
             return (
-                f"only {verified} of {candidates} matches agree with one epipolar geometry; "
+                f"only {verified} of {counted(candidates, 'match')} agree with one epipolar geometry; "
                 f"{self.min_inliers} are needed to tell it from chance and repeated patterns"
             )
         if verified < self.min_share * candidates:
             return (
-                f"only {100.0 * verified / candidates:.0f} % of {candidates} matches agree with one epipolar "
-                f"geometry; {100.0 * self.min_share:.0f} % are needed"
+                f"only {100.0 * verified / candidates:.0f} % of {counted(candidates, 'match')} agree with "
+                f"one epipolar geometry; {100.0 * self.min_share:.0f} % are needed"
             )
         return ""
 

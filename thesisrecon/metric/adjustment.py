@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.metric.model import CENTRE, FOCAL, K1, WIDTH, MetricModel, residual_norms
 from thesisrecon.optimize.bundle_blocks import BlockScatter, block_scatter
 from thesisrecon.optimize.metric_bundle import (
@@ -139,7 +139,7 @@ def explained(model: MetricModel) -> Observations:
     if len(k) < MIN_OBSERVATIONS:
         raise StageFailure(
             "hardly any point survives the metric upgrade",
-            f"{len(k)} observations fit the cameras at sufficient angles",
+            f"{counted(len(k), 'observation')} left that the cameras explain at sufficient angles",
             "walk further around the scene between photographs",
         )
     return Observations(t.view_index[k], t.point_index[k], t.xy[k])

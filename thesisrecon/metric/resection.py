@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.errors import counted
 from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.metric.model import MetricModel, normalized_observations
 from thesisrecon.optimize.triangulation_refine import refine_pose
@@ -69,7 +70,8 @@ def add_missing_cameras(
             continue
         if counts[view] < min_points:
             refused[int(view)] = (
-                f"sees only {counts[view]} points of the model (needs {min_points}): too little overlap"
+                f"sees only {counted(counts[view], 'point')} of the model (needs {min_points}): "
+                "too little overlap"
             )
             continue
         added = _add(model, int(view), sigmas, rng, min_points)
@@ -91,7 +93,7 @@ def _add(
     found = _pose_and_focal(model, k, row, 2.0 * sigmas * model.gate_px, (ZOOMS if alone else (1.0,), rng))
     support = 0 if found is None else int(found[3].sum())
     if found is None or support < min_points or support < 0.3 * len(k):
-        return f"only {support} of its {len(k)} points agree with one camera"
+        return f"only {support} of its {counted(len(k), 'point')} agree with one camera"
     R, translation, start, inlier = found
     pose = refine_pose(
         R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],

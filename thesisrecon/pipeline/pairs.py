@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.pipeline.prepared import PreparedViews, batches_of_pairs, near_in_pairs
 from thesisrecon.pipeline.work import Work
 from thesisrecon.run import Batch, stream
@@ -34,7 +34,7 @@ def find_features(work: Work) -> None:
     work.result = replace(work.result, features=tuple(features))
     counts = [len(f.xy) for f in features]
     poor = [
-        f"{image.name} has only {n} corners"
+        f"{image.name} has only {counted(n, 'corner')}"
         for image, n in zip(images, counts, strict=True)
         if n < MIN_CORNERS
     ]
@@ -175,7 +175,8 @@ def build_tracks(work: Work) -> None:
         best = max(result.pairs, key=lambda pair: pair.inliers)
         raise StageFailure(
             "no two photographs could be matched",
-            f"the best of {len(result.pairs)} pairs has {best.inliers} verified matches: {best.reason}",
+            f"the best of {counted(len(result.pairs), 'pair')} has "
+            f"{counted(best.inliers, 'verified match')}: {best.reason}",
             "take photographs with more overlap of a scene with texture, all of the same scene",
         )
     key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)

@@ -8,7 +8,7 @@ import numpy as np
 
 from thesisrecon.assumptions import assumptions_of_views
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io.images import PhotographSet
 from thesisrecon.pipeline.prepared import PreparedViews
 from thesisrecon.run import Run
@@ -45,7 +45,7 @@ class Work:
             why = "; ".join([*told, f"and {len(refused) - 3} more"] if len(refused) > 3 else told)
             wanted = "two different ones are" if needed == 2 else "one is"
             raise StageFailure(
-                f"{found or 'no'} usable photograph{'s' if found != 1 else ''}",
+                counted(found, "usable photograph") if found else "no usable photographs",
                 f"at least {wanted} needed{'; ' + why if why else ''}",
                 "take more photographs of the scene from other places",
             )

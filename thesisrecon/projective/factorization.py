@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.cheirality import orient_signs
 from thesisrecon.geometry.multiview import estimate_homography, homography_distances
 from thesisrecon.projective.growing import GrowingModel, adjust, finish, retriangulate
@@ -76,7 +76,7 @@ class Factorization:
         if attempt >= len(ranked):
             raise StageFailure(
                 "no two photographs to begin a factorisation with",
-                f"{len(ranked)} of {len(pairs)} pairs were accepted",
+                f"accepted: {len(ranked)} of {counted(len(pairs), 'pair')}",
                 "take photographs that overlap by more than half and show texture",
             )
         usable = tracks_with_parallax(tracks, pairs)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.optimize.triangulation_refine import refine_camera
 from thesisrecon.projective.agreement import contradicted_view
 from thesisrecon.projective.gate import predicted_spread_px
@@ -102,7 +102,7 @@ class GatedIncremental:
         if not ranked:
             raise StageFailure(
                 "no two photographs could be tied together",
-                f"{len(pairs)} pairs were compared and none was accepted",
+                f"none of {counted(len(pairs), 'pair')} was accepted",
                 "take photographs that overlap by more than half and show texture",
             )
         require_parallax(pairs)
@@ -197,7 +197,7 @@ class GatedIncremental:
                 return None
             if counts[view] < self.min_points:
                 model.reasons[view] = (
-                    f"sees only {counts[view]} points of the model (needs {self.min_points})"
+                    f"sees only {counted(counts[view], 'point')} of the model (needs {self.min_points})"
                 )
             elif self._try_camera(model, int(view), rng):
                 return int(view)

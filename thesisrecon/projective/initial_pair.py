@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.multiview import canonical_cameras, rotation_planes
 from thesisrecon.geometry.triangulation import triangulate_linear
@@ -82,7 +82,8 @@ def require_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> 
         )
         raise StageFailure(
             f"the photographs show no parallax: {told}",
-            f"in the least planar of {len(shares)} pairs a homography explains {min(shares):.0%} of all",
+            f"in the least planar of {counted(len(shares), 'pair')} a homography explains "
+            f"{min(shares):.0%} of all",
             "walk around the scene between photographs, and have things at different depths in the picture",
         )
 

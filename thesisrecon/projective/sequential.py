@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.projective.growing import adjust, finish
 from thesisrecon.projective.incremental import GatedIncremental
 from thesisrecon.projective.initial_pair import require_parallax
@@ -42,7 +42,7 @@ class SequentialProjective:
         candidates = sorted(candidates, key=lambda p: (-p.inliers, p.i, p.j))
         if attempt >= len(candidates):
             raise StageFailure(
-                "no pair of photographs to begin with", f"{len(candidates)} pairs were accepted"
+                "no pair of photographs to begin with", f"{counted(len(candidates), 'pair')} accepted"
             )
         engine = GatedIncremental(
             min_points=self.min_points,

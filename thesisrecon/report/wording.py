@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon.errors import counted
 from thesisrecon.report.data import ReportData
 from thesisrecon.report.residuals import ResidualSummary
 from thesisrecon.types import IntrinsicInterval, TexturedMesh, TwoView
@@ -62,7 +63,7 @@ def judge(data: ReportData) -> Verdict:
         return Verdict("open", "Ended early", f"As asked, the run ended there: {done}.")
     registered = int(data.metric.reconstruction.registered.sum())
     have = "has a metric camera" if registered == 1 else "have a metric camera"
-    found = f"{registered} of {total} photographs {have}."
+    found = f"{registered} of {count_of(total, 'photograph')} {have}."
     if not data.metric.trusted:
         doubts = tuple(_sentence(doubt) for doubt in data.metric.doubts) or ("The self-check failed.",)
         return Verdict(
@@ -83,7 +84,7 @@ def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact
     elif data.pairs:
         facts.append(_pair_fact(data.pairs))
     if overall is not None:
-        note = f"{overall.rms_px:.2f} px RMS over {grouped(overall.count)} observations"
+        note = f"{overall.rms_px:.2f} px RMS over {count_of(overall.count, 'observation')}"
         scales = {photograph.scale for photograph in data.photographs}
         if len(scales) == 1 and scales != {1.0}:
             note += f"; at working size {overall.median_px * scales.pop():.2f} px median"
@@ -119,9 +120,10 @@ def _registered(data: ReportData) -> Fact:
 
 def _pair_fact(pairs: Sequence[TwoView]) -> Fact:
     accepted = [pair for pair in pairs if pair.accepted]
-    note = f"{grouped(sum(pair.inliers for pair in accepted))} verified matches in them"
+    note = f"{count_of(sum(pair.inliers for pair in accepted), 'verified match')} in them"
     if undetermined := sum(pair.undetermined for pair in accepted):
-        note += f"; {undetermined} leave their epipolar geometry undetermined"
+        leave = "leaves its" if undetermined == 1 else "leave their"
+        note += f"; {undetermined} {leave} epipolar geometry undetermined"
     return Fact("Pairs accepted", f"{len(accepted)} of {len(pairs)}", note)
 
 
@@ -131,7 +133,8 @@ def chosen_pairs(data: ReportData) -> str:
         return ""
     views = len(data.photographs)
     possible, tried = views * (views - 1) // 2, len(data.pairs)
-    return f"{grouped(tried)} of {grouped(possible)} pairs were tried: {data.pair_choice.how}."
+    were = "was" if tried == 1 else "were"
+    return f"{grouped(tried)} of {count_of(possible, 'pair')} {were} tried: {data.pair_choice.how}."
 
 
 def model_words(mesh: TexturedMesh) -> str:
@@ -262,7 +265,7 @@ def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tupl
 
 def count_of(number: int, noun: str) -> str:
     """``1 file``, ``2 files``."""
-    return f"{grouped(number)} {noun}{'' if number == 1 else 's'}"
+    return counted(number, noun, grouped(number))
 
 
 def _sentence(text: str) -> str:

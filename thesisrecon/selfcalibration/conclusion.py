@@ -14,7 +14,7 @@ from typing import ParamSpec
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.selfcalibration.frame import ReferenceFrame, metric_from_calibration
 from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std
 from thesisrecon.selfcalibration.verdict import judge_motion, verdict_without_an_answer
@@ -167,7 +167,7 @@ def conclude(
 def _nothing_in_front(frame: ReferenceFrame, reconstruction: Reconstruction, tried: int) -> StageFailure:
     """The failure of a method none of whose answers can be carried out."""
     assert frame.assumed is not None
-    evidence = f"{tried} answers were tried over {len(frame.views)} cameras"
+    evidence = f"{counted(tried, 'answer')} tried over {counted(len(frame.views), 'camera')}"
     given = frame.views[frame.assumed.focal_known[frame.views]]
     if len(given):
         # All answers were drawn to it: whoever gave a focal length cannot mend this by giving one.

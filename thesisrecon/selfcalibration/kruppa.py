@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
 from thesisrecon.selfcalibration.conclusion import (
     Answer,
@@ -168,6 +168,6 @@ def require_pairs(pairs: PairGeometry, min_common: int) -> None:
     if len(pairs.i) < 2:
         raise StageFailure(
             "focal lengths from fundamental matrices need at least 2 pairs of photographs",
-            f"{len(pairs.i)} pairs share {min_common} points or more",
+            f"{counted(len(pairs.i), 'pair')} with {min_common} points or more in common",
             "add photographs with more overlap",
         )

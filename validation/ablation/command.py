@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 from signal import SIGINT
 
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, counted
 from thesisrecon.stops import CODES, advised
 from validation.ablation.analysis import analyse
 from validation.ablation.page import write_analysis
@@ -70,10 +70,11 @@ def plan_words(plan: Plan) -> str:
     shared = Counter(part.step for part in parts_of(unique) if part.step)
     steps = ", ".join(f"{step} ({count})" for step, count in shared.items())
     parts = [
-        f"{len(plan.variants)} variants: {'; '.join(v.name for v in plan.variants)}",
+        f"{counted(len(plan.variants), 'variant')}: {'; '.join(v.name for v in plan.variants)}",
         f"baseline: {plan.baseline}",
         f"{len(plan.conditions)} conditions" if len(plan.conditions) > 1 else "",
-        f"{len({r.scene for r in unique})} scenes, {len(plan.seeds)} seeds: {len(unique)} rows",
+        f"{counted(len({r.scene for r in unique}), 'scene')}, {counted(len(plan.seeds), 'seed')}: "
+        f"{counted(len(unique), 'row')}",
         f"computed once for several rows: {steps}" if steps else "",
     ]
     return "\n".join(part for part in parts if part)
@@ -81,5 +82,5 @@ def plan_words(plan: Plan) -> str:
 
 def _last_words(rows: Rows, page: Path) -> str:
     failed = sum(bool(r.failure) for r in rows)
-    told = f"{len(rows)} rows" + f", {failed} of them failed" * bool(failed)
+    told = counted(len(rows), "row") + f", {failed} of them failed" * bool(failed)
     return f"{told}; the page is {page}"

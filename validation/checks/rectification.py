@@ -34,7 +34,7 @@ from thesisrecon.dense.rectification import (
     rectify,
 )
 from thesisrecon.dense.rectification.quality import jacobians
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera import project, undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate_linear
@@ -214,7 +214,13 @@ def check_scene(name: str, pairs: Sequence[RealPair]) -> list[Metric]:
     found = {method: [measure(pair, method) for pair in pairs] for method in METHODS}
     done = {method: [m for m in each if m is not None] for method, each in found.items()}
     rows = [
-        Metric(name, f"done, of {len(pairs)} pairs", "", {k: float(len(v)) for k, v in done.items()}, BEST_F),
+        Metric(
+            name,
+            f"done, of {counted(len(pairs), 'pair')}",
+            "",
+            {k: float(len(v)) for k, v in done.items()},
+            BEST_F,
+        ),
         Metric(
             name,
             "polar chosen",

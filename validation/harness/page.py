@@ -12,6 +12,7 @@ from typing import Any
 import PIL.Image
 
 from thesisrecon import __version__
+from thesisrecon.errors import counted
 from thesisrecon.io.files import write_text
 from thesisrecon.report.html import page_resource, plotly_script, script_hashes, template_environment
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Wishes, key_of, slug
@@ -105,13 +106,14 @@ def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> _Verdict:
     judged = [row for row in rows if row.limit is not None]
     broken = [row for row in judged if row.verdict != "reached"]
     if not judged and not missing:
-        return _Verdict("open", "Nothing promised here", f"{len(rows)} numbers are told, none has a limit.")
+        words = f"{counted(len(rows), 'number')} told, none with a limit."
+        return _Verdict("open", "Nothing promised here", words)
     told = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
     reasons = tuple(f"{r.key}: {short(r.value)} {r.unit}, {r.direction} {short(r.limit)}" for r in broken)
     reasons += tuple(f"{key}: nobody told this number" for key in missing)
     if reasons:
         return _Verdict("bad", "Broken", f"{told}.", reasons)
-    return _Verdict("good", "Reached", f"{told}; {len(rows)} numbers in all.")
+    return _Verdict("good", "Reached", f"{told}; {counted(len(rows), 'number')} in all.")
 
 
 def _section(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.dense.rectification.pencil import EpipolarPencil, orient, pencil_of_fundamental
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera import camera_centre, project
 from thesisrecon.geometry.cheirality import depth
 from thesisrecon.geometry.homogeneous import require_finite
@@ -74,7 +74,7 @@ def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) ->
     if len(xy1) < LEAST_MATCHES:
         raise StageFailure(
             "the pair has too few matches to rectify it",
-            f"{len(xy1)} matches, needed at least {LEAST_MATCHES}",
+            f"{counted(len(xy1), 'match')}, needed at least {LEAST_MATCHES}",
             "match the photographs anew, or rectify from cameras",
         )
     pencil, ratio = pencil_of_fundamental(F, sizes)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.selfcalibration.stratified.descent import descend
 from thesisrecon.selfcalibration.stratified.region import PlaneRegion, distinct_planes
 from thesisrecon.selfcalibration.stratified.scene import PlaneCandidates, ProjectiveScene
@@ -93,7 +93,7 @@ class ModulusConstraint:
         if len(pairs) < 3:
             raise StageFailure(
                 "the modulus constraint needs three photographs of one camera with constant intrinsics",
-                f"{len(pairs)} pairs of views share all intrinsics",
+                f"{counted(len(pairs), 'pair')} of views with all intrinsics in common",
                 "assume a constant camera, or use another way to the plane at infinity",
             )
         region = PlaneRegion.of(frame, scene.reconstruction, max_points=self.max_points, rng=rng)
