@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from thesisrecon.geometry.trifocal import (
     transfer_lines,
     transfer_points,
 )
-from thesisrecon.geometry.trifocal_linear import estimate_tensor_linear, tensor_equations
+from thesisrecon.geometry.trifocal_linear import TensorEquations, estimate_tensor_linear, tensor_equations
 
 F64 = NDArray[np.float64]
 DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).resolve().parents[2] / "../shared/data"))
@@ -83,6 +84,31 @@ def test_exact_matches_give_the_tensor_of_their_cameras(n, m):
     for v in range(3):
         if n:
             np.testing.assert_allclose(project(fit.P[v], fit.X), points[v], atol=1e-4)
+
+
+@dataclass(frozen=True)
+class FickleEquations(TensorEquations):
+    """Equations whose solution has the other sign each time, as a singular vector may have."""
+
+    calls: list[int] = field(default_factory=list)
+
+    def solve_with_epipoles(self, e2, e3):
+        self.calls.append(1)
+        return super().solve_with_epipoles(e2, e3) * (-1.0) ** len(self.calls)
+
+
+def test_the_least_error_does_not_hang_on_the_signs_of_singular_vectors():
+    rng = np.random.default_rng(3)
+    equations = tensor_equations(*matches(three_cameras(rng), rng, 30, 0, 0.5))
+    start = equations.solve()
+    expected = minimize_algebraic_error(equations, start)
+    fickle = FickleEquations(equations.A, equations.noise, equations.transforms)
+    found = minimize_algebraic_error(fickle, start)
+    assert len(fickle.calls) > 5
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert np.linalg.norm(equations.A @ expected.ravel()) < 1.0001 * np.linalg.norm(
+        equations.A @ found.ravel()
+    )
 
 
 @pytest.mark.parametrize(("n", "m"), [(50, 0), (0, 50), (30, 30)])

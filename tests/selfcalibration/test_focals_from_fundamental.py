@@ -16,6 +16,7 @@ from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.selfcalibration import FocalsFromFundamental
 from thesisrecon.selfcalibration.conclusion import square_calibrations
 from thesisrecon.selfcalibration.focal_from_fundamental import (
+    _dual_with_changes,
     bougnoux_focals,
     kruppa_chi_square,
     kruppa_whitening,
@@ -187,3 +188,17 @@ def test_fit_starts_anywhere_near_and_does_not_raise_the_cost() -> None:
     F, covariance = fit_fundamental(random_pair(1)[0], x[0], x[1])
     assert np.isfinite(F).all()
     assert (np.linalg.eigvalsh(covariance) > -1e-6 * np.trace(covariance)).all()
+
+
+def test_the_changes_of_the_dual_conic_are_its_derivatives() -> None:
+    def dual(log_f: float, x: float, y: float) -> np.ndarray:
+        K = np.array([[np.exp(log_f), 0.0, x], [0.0, np.exp(log_f), y], [0.0, 0.0, 1.0]])
+        return K @ K.T
+
+    log_f, h = np.array([0.3, -0.5]), 1e-6
+    found = _dual_with_changes(log_f)
+    for one, value in zip(found, log_f, strict=True):
+        np.testing.assert_allclose(one[0], dual(value, 0.0, 0.0))
+        for n, step in enumerate(h * np.eye(3)):
+            up, down = dual(value + step[0], *step[1:]), dual(value - step[0], *-step[1:])
+            np.testing.assert_allclose(one[1 + n], (up - down) / (2.0 * h), atol=1e-8)

@@ -11,8 +11,9 @@ from tests.synthetic import TrueScene, make_scene, projective_reconstruction, wi
 from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.errors import StageFailure
 from thesisrecon.selfcalibration import HypothesesAndRefinement, Stratified
-from thesisrecon.selfcalibration.focal_scan import plane_from_focals
-from thesisrecon.selfcalibration.frame import build_frame
+from thesisrecon.selfcalibration.conclusion import conclude
+from thesisrecon.selfcalibration.focal_scan import WEIGHTS, plane_from_focals, scan_cost
+from thesisrecon.selfcalibration.frame import assumed_frame, build_frame
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion
 from thesisrecon.types import SelfCalibration
@@ -125,3 +126,23 @@ def test_a_focal_that_leaves_no_answer_is_named_and_not_asked_for() -> None:
     assert "1 px (+- 5.0%)" in failure.value.evidence
     assert "the photographs contradict it" in failure.value.advice
     assert "give the focal length" not in str(failure.value)
+
+
+@pytest.mark.parametrize(
+    ("focals", "told"), [((900.0,), "900 px"), ((800.0, 900.0, 1000.0), "800 to 1000 px")]
+)
+def test_given_focals_that_leave_no_answer_are_named(focals: tuple[float, ...], told: str) -> None:
+    estimate = projective_reconstruction(make_scene(seed=6), seed=6)
+    assumed = assume(estimate, IntrinsicsAssumption(focal_px=900.0, focal="known", cameras="per-image"))
+    mean = assumed.mean.copy()
+    mean[:, 0] = np.resize(focals, len(mean))
+    frame = assumed_frame(estimate, replace(assumed, mean=mean))
+    with pytest.raises(StageFailure, match="near the focal length that was given") as failure:
+        conclude(frame, estimate, RotationCriterion(), [], kept=3, min_positive=0.9)
+    assert f"{told} (+-" in failure.value.evidence
+
+
+def test_the_cost_of_the_scan_is_its_formula() -> None:
+    K = np.array([[[[2.0, 0.1, 0.3], [0.0, 1.6, -0.2], [0.0, 0.0, 1.0]], np.diag([0.8, 0.8, 1.0])]])
+    first = (np.array([0.1, 0.4, 0.3, 0.2]) @ WEIGHTS / 1.6) ** 2
+    np.testing.assert_allclose(scan_cost(K), [first])
