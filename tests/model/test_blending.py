@@ -14,6 +14,7 @@ from thesisrecon.model.mesh import face_neighbours, vertex_normals
 from thesisrecon.model.texture import BlendedViews
 from thesisrecon.model.texture.blending import equalizing_gains
 from thesisrecon.model.texture.kernels import (
+    SeenSurface,
     combine_colors,
     continue_faces,
     grow_colors,
@@ -121,7 +122,8 @@ def test_observe_points_matches_its_twin(sphere: TexturedMesh) -> None:
     weight, color = np.zeros(400, np.float32), np.zeros((400, 3), np.float32)
     gain = np.array([1.0, 2.0, 0.5], np.float32)
     P, rgb = view.view.P, view.view.rgb
-    observe_points(points, normals, P, view.depth, view.clear, view.slack, rgb, gain, weight, color)
+    seen = SeenSurface(P, view.depth, view.clear, view.slack, rgb, gain)
+    observe_points(points, normals, seen, weight, color)
     wanted = observed(points, normals, P, view.depth, view.clear, view.slack)
     np.testing.assert_allclose(weight, wanted, rtol=1e-4, atol=1e-6)
     assert 50 < (weight > 0).sum() < 350

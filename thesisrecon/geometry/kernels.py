@@ -7,6 +7,7 @@ observations come out as zeros, all others with unit norm (mid-points with X4 = 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -17,6 +18,15 @@ I64 = NDArray[np.int64]
 
 PASSES = 10
 """Of the iterated linear method; Hartley and Sturm found that those that converge have done so by then."""
+
+
+class Sightings(NamedTuple):
+    """Observations sorted by point: the number of the ``view`` (K,), the pixels ``xy`` (K, 2), and the
+    ``weight`` (K,) of the two equations of each."""
+
+    view: I64
+    xy: F64
+    weight: F64
 
 
 @njit(cache=True, nogil=True)
@@ -116,10 +126,10 @@ def jacobi_least(R: F64, x: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def least_algebraic(
-    P: F64, weight: F64, first: int, last: int, view: I64, xy: F64, R: F64, row: F64, x: F64
-) -> None:
-    """x (4,) of least sum of (weight (u p3'x - p1'x))^2 + (weight (v p3'x - p2'x))^2 over k = first..last."""
+def least_algebraic(P: F64, sightings: Sightings, first: int, last: int, R: F64, row: F64, x: F64) -> None:
+    """x (4,) of least sum of (weight (u p3'x - p1'x))^2 + (weight (v p3'x - p2'x))^2 over k = first..last; R
+    (4, 4) and row (4,) are scratch."""
+    view, xy, weight = sightings
     R[:] = 0.0
     for k in range(first, last):
         p, w = P[view[k]], weight[k]
@@ -155,6 +165,7 @@ def triangulate_linearly(
     """
     R, row, x, y = np.zeros((4, 4)), np.empty(4), np.empty(4), np.empty(4)
     weight = np.empty(len(xy))
+    sightings = Sightings(view, xy, weight)
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
         X[j] = 0.0
@@ -162,7 +173,7 @@ def triangulate_linearly(
             continue
         for k in range(first, last):
             weight[k] = scale[view[k]]
-        least_algebraic(P, weight, first, last, view, xy, R, row, x)
+        least_algebraic(P, sightings, first, last, R, row, x)
         X[j] = x
         y[:] = x
         rest = False
@@ -176,7 +187,7 @@ def triangulate_linearly(
             rest = n > 0 and change < tolerance
             if rest or not math.isfinite(weight[first:last].sum()):
                 break
-            least_algebraic(P, weight, first, last, view, xy, R, row, y)
+            least_algebraic(P, sightings, first, last, R, row, y)
         if passes > 0 and (
             rest
             or reprojection_cost(P, y, first, last, view, xy) < reprojection_cost(P, x, first, last, view, xy)

@@ -10,12 +10,14 @@ part, which needs no epipole in a finite place. Forms B are stored as (B00, B01,
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
+Two = tuple[float, float]
 Four = tuple[float, float, float, float]
 
 DEGREE = 6
@@ -97,12 +99,22 @@ def form(B: F64, p0: float, p1: float, q0: float, q1: float) -> float:
     return value
 
 
+class PencilCost(NamedTuple):
+    """The cost G x^2 / (1 + kappa x^2) + (n0 + n1 x)^2 / (E0 + 2 E1 x + E2 x^2) of a member x of a pencil."""
+
+    n0: float
+    n1: float
+    E0: float
+    E1: float
+    E2: float
+    G: float
+    kappa: float
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def stationary_polynomial(
-    n0: float, n1: float, E0: float, E1: float, E2: float, G: float, kappa: float, c: F64
-) -> None:
-    """Half the numerator of the derivative of G x^2 / (1 + kappa x^2) + (n0 + n1 x)^2 / (E0 + 2 E1 x + E2
-    x^2)."""
+def stationary_polynomial(cost: PencilCost, c: F64) -> None:
+    """Half the numerator of the derivative of the cost as a polynomial c (7,)."""
+    n0, n1, E0, E1, E2, G, kappa = cost
     m0, m1 = n1 * E0 - n0 * E1, n1 * E1 - n0 * E2
     s0, s1, s2 = n0 * m0, n0 * m1 + n1 * m0, n1 * m1
     c[0] = s0
@@ -115,11 +127,10 @@ def stationary_polynomial(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def least_stationary(
-    c: F64, n0: float, n1: float, E0: float, E1: float, E2: float, G: float, kappa: float, whole: bool
-) -> float:
+def least_stationary(pencil: PencilCost, c: F64, whole: bool) -> float:
     """The x of least cost among the real roots of c in [-1, 1], or on the ``whole`` line, infinity
     included; NaN where there is none."""
+    n0, n1, E0, E1, E2, G, kappa = pencil
     roots, backward = np.empty(DEGREE + 2), np.empty(DEGREE + 1)
     best, least = math.nan, math.inf
     for k in range(roots_in_unit_interval(c, roots)):
@@ -142,15 +153,14 @@ def least_stationary(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def turn_from(
-    a: float, b: float, B: F64, Q: float, D: float, other: tuple[float, float], E: F64, most: float, c: F64
-) -> Four:
+def turn_from(own: Two, B: F64, Q: float, D: float, other: Two, E: F64, most: float, c: F64) -> Four:
     """The best member q of the pencil, counted from the line through one image's point; -> q, and n of both.
 
-    The first image has x'L = (a, b), the form B, Q = q'Bq of the line q through its point, and D = det B; the
-    second ``other`` and E. ``most`` is a bound on the cost, which keeps the search to the sector of lines
+    The first image has x'L = ``own``, the form B, Q = q'Bq of the line q through its point, and D = det B;
+    the second ``other`` and E. ``most`` is a bound on the cost, which keeps the search to the sector of lines
     that pass the first point within its root.
     """
+    a, b = own
     q0, q1 = b, -a
     p0, p1 = B[1] * b - B[2] * a, B[1] * a - B[0] * b
     n0, n1 = other[0] * q0 + other[1] * q1, other[0] * p0 + other[1] * p1
@@ -159,7 +169,8 @@ def turn_from(
     n1 *= h
     E0, E1, E2 = form(E, q0, q1, q0, q1), h * form(E, q0, q1, p0, p1), h * h * form(E, p0, p1, p0, p1)
     G, kappa = Q * h * h, D * h * h
-    stationary_polynomial(n0, n1, E0, E1, E2, G, kappa, c)
+    cost = PencilCost(n0, n1, E0, E1, E2, G, kappa)
+    stationary_polynomial(cost, c)
     bend = 2.0 * abs(c[2]) + 3.0 * abs(c[3]) + 4.0 * abs(c[4]) + 5.0 * abs(c[5]) + 6.0 * abs(c[6])
     if proper and c[1] > MONOTONE * bend:
         # A monotone derivative: the only stationary point of the sector is the global minimum.
@@ -171,7 +182,7 @@ def turn_from(
             if abs(x - before) <= 4e-16 * abs(x):
                 break
     else:
-        x = least_stationary(c, n0, n1, E0, E1, E2, G, kappa, not proper)
+        x = least_stationary(cost, c, not proper)
     if math.isinf(x):
         return p0, p1, -Q, n1 / h
     return q0 + h * x * p0, q1 + h * x * p1, -h * x * Q, n0 + n1 * x
@@ -196,9 +207,9 @@ def best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64,
     D1, D2 = max(B1[0] * B1[2] - B1[1] ** 2, 0.0), max(B2[0] * B2[2] - B2[1] ** 2, 0.0)
     # Q / D is the squared distance of a point from its epipole: the farther one gives the narrower sector.
     if Q1 * D2 > Q2 * D1 or (D1 == 0.0 and D2 == 0.0):
-        q0, q1, n1, n2 = turn_from(a1, b1, B1, Q1, D1, (a2, b2), B2, most, c)
+        q0, q1, n1, n2 = turn_from((a1, b1), B1, Q1, D1, (a2, b2), B2, most, c)
     else:
-        q0, q1, n2, n1 = turn_from(a2, b2, B2, Q2, D2, (a1, b1), B1, most, c)
+        q0, q1, n2, n1 = turn_from((a2, b2), B2, Q2, D2, (a1, b1), B1, most, c)
     cost = n1 * n1 / form(B1, q0, q1, q0, q1) + n2 * n2 / form(B2, q0, q1, q0, q1)
     if not cost <= most:
         return (b1, -a1, 0.0, cross) if through1 <= through2 else (b2, -a2, -cross, 0.0)

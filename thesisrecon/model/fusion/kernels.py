@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -15,6 +17,24 @@ SIDE = 8
 
 BEYOND = 0.1
 """Weight of a depth half a pixel and more beyond the last that is known."""
+
+
+class Surface(NamedTuple):
+    """What one depth map tells: ``depth`` and its deviation ``std`` (H, W), ``lean`` (H, W) how far a ray
+    comes off the surface for a unit of depth, and ``slope``, the largest relative step in depth from one
+    pixel to the next on one surface."""
+
+    depth: F32
+    std: F32
+    lean: F32
+    slope: float
+
+
+class Distances(NamedTuple):
+    """Of the voxels of blocks (B, 8, 8, 8): the weighted mean distance to the surface, and its weight."""
+
+    value: F32
+    weight: F32
 
 
 @njit(cache=True, nogil=True)
@@ -49,27 +69,18 @@ def touched_blocks(
 
 @njit(cache=True, nogil=True)
 def integrate_view(
-    blocks: I64,
-    P: F64,
-    voxel: float,
-    depth: F32,
-    std: F32,
-    lean: F32,
-    slope: float,
-    truncation: float,
-    value: F32,
-    weight: F32,
+    blocks: I64, voxel: float, P: F64, surface: Surface, truncation: float, sums: Distances
 ) -> None:
     """Add one depth map to the signed distances of blocks (Curless and Levoy 1996).
 
     ``blocks`` (B, 3) grid places; ``P`` (3, 4) = K [R t] of the map, the centre of the first voxel the
-    origin; ``lean`` (H, W) how far a ray comes off the surface for a unit of depth. ``value`` and ``weight``
-    (B, 8, 8, 8) are updated: the weighted mean of the distance to the surface, in units of ``truncation``,
-    cut at 1. What lies more than ``truncation`` behind a surface is not seen. A view weighs by
-    lean^4 / (s^2 + (truncation / 8)^2), s the deviation across the surface: the surface is taken to be plane
-    as far as the ray is near it, and the error of that grows with 1 / lean^2. ``slope`` is the largest
-    relative step in depth from one pixel to the next on one surface.
+    origin. ``sums`` are updated, in units of ``truncation`` and cut at 1. What lies more than ``truncation``
+    behind a surface is not seen. A view weighs by lean^4 / (s^2 + (truncation / 8)^2), s the deviation
+    across the surface: the surface is taken to be plane as far as the ray is near it, and the error of that
+    grows with 1 / lean^2.
     """
+    depth, std, lean, slope = surface
+    value, weight = sums
     height, width = depth.shape
     base = (truncation / 8.0) ** 2
     for b in range(blocks.shape[0]):

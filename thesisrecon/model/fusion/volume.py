@@ -20,6 +20,8 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera import decompose_camera
 from thesisrecon.model.fusion.kernels import (
     SIDE,
+    Distances,
+    Surface,
     integrate_view,
     join_vertices,
     place_vertices,
@@ -152,18 +154,9 @@ def _measured(depth_map: DepthMap, grazing_deg: float) -> Measured:
 def _integrate(grid: Grid, truncation: float, one: Measured, some: slice, value: F32, weight: F32) -> None:
     K, R, t = decompose_camera(one.P)
     P = K @ np.column_stack([R, t + R @ grid.origin])
-    integrate_view(
-        grid.blocks[some],
-        P,
-        grid.voxel,
-        one.depth,
-        one.std,
-        one.lean,
-        one.slope,
-        truncation,
-        value[some],
-        weight[some],
-    )
+    surface = Surface(one.depth, one.std, one.lean, one.slope)
+    sums = Distances(value[some], weight[some])
+    integrate_view(grid.blocks[some], grid.voxel, P, surface, truncation, sums)
 
 
 def nothing_to_fuse() -> StageFailure:

@@ -21,7 +21,13 @@ from thesisrecon.geometry.zbuffer import rasterize
 from thesisrecon.geometry.zbuffer.kernels import rasterize_rows
 from thesisrecon.model.mesh import vertex_normals
 from thesisrecon.model.texture.charts import Charts
-from thesisrecon.model.texture.kernels import combine_colors, continue_faces, grow_colors, observe_points
+from thesisrecon.model.texture.kernels import (
+    SeenSurface,
+    combine_colors,
+    continue_faces,
+    grow_colors,
+    observe_points,
+)
 from thesisrecon.model.texture.visibility import TOLERANCE_PX, camera_of
 from thesisrecon.types import B8, F32, F64, I64, PinholeView, TexturedMesh
 
@@ -165,18 +171,8 @@ class PreparedBlending:
         weight = np.zeros((len(self.views), len(points)), dtype=np.float32)
         color = np.zeros((len(self.views), len(points), 3), dtype=np.float32)
         for v, one in enumerate(self.views):
-            observe_points(
-                points,
-                normals,
-                one.view.P,
-                one.depth,
-                one.clear,
-                one.slack,
-                one.view.rgb,
-                self.gains[v],
-                weight[v],
-                color[v],
-            )
+            seen = SeenSurface(one.view.P, one.depth, one.clear, one.slack, one.view.rgb, self.gains[v])
+            observe_points(points, normals, seen, weight[v], color[v])
         return weight, color
 
     def colors(self, points: F64, normals: F64) -> tuple[F32, B8]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -9,6 +11,19 @@ from numpy.typing import NDArray
 from thesisrecon.types import B8, F32, F64, I64
 
 U8 = NDArray[np.uint8]
+
+
+class SeenSurface(NamedTuple):
+    """A view of a surface: ``P`` (3, 4) = K [R t]; ``depth`` (H, W) nearest surface, inf where none;
+    ``clear`` (H, W) 0..1 trust in each pixel; ``slack``, the part of its depth by which a point may lie
+    behind what is seen; ``rgb`` (H, W, 3), and ``gain`` (3,) by which its colours are multiplied."""
+
+    P: F64
+    depth: F32
+    clear: F32
+    slack: float
+    rgb: U8
+    gain: F32
 
 
 @njit(cache=True, nogil=True)
@@ -31,25 +46,14 @@ def spread_shares(share: F32, neighbours: I64, keep: float, spread: F32, out: F3
 
 
 @njit(cache=True, nogil=True)
-def observe_points(
-    points: F64,
-    normals: F64,
-    P: F64,
-    depth: F32,
-    clear: F32,
-    slack: float,
-    rgb: U8,
-    gain: F32,
-    weight: F32,
-    color: F32,
-) -> None:
+def observe_points(points: F64, normals: F64, view: SeenSurface, weight: F32, color: F32) -> None:
     """What one view shows at points (N, 3) with outer normals (N, 3).
 
-    ``P`` (3, 4) = K [R t]; ``depth`` (H, W) nearest surface, inf where none; ``clear`` (H, W) 0..1 trust in
-    each pixel; a point is seen where it lies at most ``slack`` of its depth behind the farthest of the four
-    pixels around it. ``weight`` (N,) gets the pixels a unit of area covers, times ``clear``, 0 where the
-    point is not seen from outside; ``color`` (N, 3) its bilinear colour times ``gain`` (3,).
+    A point is seen where it lies at most ``view.slack`` of its depth behind the farthest of the four pixels
+    around it. ``weight`` (N,) gets the pixels a unit of area covers, times the trust in them, 0 where the
+    point is not seen from outside; ``color`` (N, 3) its bilinear colour times the gain.
     """
+    P, depth, clear, slack, rgb, gain = view
     height, width = depth.shape
     M = np.ascontiguousarray(P[:, :3])
     # (u, v, 1) z = M X + p: pixels per area are det M times the distance to the tangent plane over z^3.
