@@ -25,7 +25,7 @@ from thesisrecon.selfcalibration.focal_from_fundamental import (
 from thesisrecon.selfcalibration.focal_vote import independent_share, vote_on_focals
 from thesisrecon.selfcalibration.frame import assumed_frame
 from thesisrecon.selfcalibration.intrinsics import focal_prior
-from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_residuals
+from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_cost, kruppa_residuals
 from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs, fit_fundamental
 
 
@@ -202,3 +202,13 @@ def test_the_changes_of_the_dual_conic_are_its_derivatives() -> None:
         for n, step in enumerate(h * np.eye(3)):
             up, down = dual(value + step[0], *step[1:]), dual(value - step[0], *-step[1:])
             np.testing.assert_allclose(one[1 + n], (up - down) / (2.0 * h), atol=1e-8)
+
+
+def test_the_kruppa_cost_is_the_square_of_small_residuals_and_linear_in_large_ones() -> None:
+    F, K1, K2 = random_pair(7)
+    pairs = PairGeometry(np.array([0]), np.array([1]), F[None], np.zeros((1, 9, 9)))
+    wrong = np.stack([K1 @ np.diag([1.2, 1.2, 1.0]), K2])[None]
+    size = np.linalg.norm(kruppa_residuals(F[None], *(dual_images(wrong)[:, k : k + 1] for k in (0, 1))))
+    assert size > 1e-3
+    np.testing.assert_allclose(kruppa_cost(pairs, wrong, scale=1e3 * size), [size**2], rtol=1e-5)
+    np.testing.assert_allclose(kruppa_cost(pairs, wrong, scale=1e-3 * size), [2e-3 * size**2], rtol=2e-3)

@@ -32,7 +32,7 @@ SUCCESS_PCT = 3.0
 LEAST_SUCCESS = 0.98
 MIN_VIEWS, MAX_VIEWS = 5, 8
 SHIFTED = "Cones9"
-SHIFTED_REASONS = ("pure translation", "leaves the focal length open")
+SHIFTED_REASONS = ("pure translation", "leaves the focal length open", "at least 3 photographs")
 LEAST_SHARE = 0.3
 LATEST_START = 4
 

@@ -24,6 +24,7 @@ from thesisrecon.selfcalibration.stratified import (
     PollefeysQuadric,
     Stratified,
 )
+from thesisrecon.selfcalibration.stratified.cheirality_search import local_minima
 from thesisrecon.selfcalibration.stratified.descent import descend
 from thesisrecon.selfcalibration.stratified.modulus import (
     modulus_coefficients,
@@ -166,3 +167,17 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
             for _ in range(2)
         )
         assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()
+
+
+def test_local_minima_are_no_worse_than_any_of_their_neighbours() -> None:
+    score = np.random.default_rng(0).uniform(size=(5, 5, 5))
+    score[2, 2, :] = np.inf
+    expected = []
+    for cell in np.ndindex(score.shape):
+        near = [np.add(cell, step) for step in np.vstack([np.eye(3, dtype=int), -np.eye(3, dtype=int)])]
+        inside = [tuple(n) for n in near if (n >= 0).all() and (n < 5).all()]
+        if np.isfinite(score[cell]) and all(score[cell] <= score[n] for n in inside):
+            expected.append(cell)
+    expected.sort(key=lambda cell: score[cell])
+    found = local_minima(score)
+    assert [tuple(np.array(np.unravel_index(k, score.shape)).tolist()) for k in found] == expected
