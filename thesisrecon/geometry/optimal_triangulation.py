@@ -163,5 +163,5 @@ def triangulate_polynomial(P: F64, xy: F64) -> F64:
     q, X = np.empty((xy.shape[1], 2)), np.empty((xy.shape[1], 4))
     L, B = p.lines, p.forms
     correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], q)
-    meet_in_pencil(p.P[0], p.P[1], L[0], L[1], p.planes, p.back, moved[0], moved[1], q, X)
+    meet_in_pencil(p.P, L, p.planes, p.back, moved, q, X)
     return X

@@ -256,15 +256,15 @@ def point_of_planes(a: F64, b: F64, c: F64, X: F64) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def meet_in_pencil(
-    P1: F64, P2: F64, L1: F64, L2: F64, N: F64, back: F64, xy1: F64, xy2: F64, pencil: F64, X: F64
-) -> None:
+def meet_in_pencil(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: F64) -> None:
     """Fill X (M, 4), unit norm: where the rays of exact matches meet in their epipolar planes N q.
 
+    P (2, 3, 4) cameras, L (2, 3, 2) the epipolar lines of the two images, xy (2, M, 2), ``pencil`` (M, 2) q.
     Each ray is the epipolar plane's meet with the plane of the line across it, so nothing has to be solved. N
     (4, 3) ends with the sum of the centres, which stands for the baseline where both points are on their
     epipoles. ``back`` (4, 4) takes the point to the caller's frame. q = 0 gives a zero point.
     """
+    P1, P2, L1, L2, xy1, xy2 = P[0], P[1], L[0], L[1], xy[0], xy[1]
     plane, across1, across2, Y = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     for k in range(len(X)):
         q0, q1 = pencil[k, 0], pencil[k, 1]

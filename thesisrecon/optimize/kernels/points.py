@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -11,6 +13,18 @@ from thesisrecon.optimize.kernels.scalars import away_from_zero, invert_positive
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+Loss = tuple[int, float]
+"""Number of a robust loss, and where it turns."""
+
+
+class Sightings(NamedTuple):
+    """Observations ``first`` to ``last`` of one point, among all sorted by point: ``view_index`` (K,), ``xy``
+    (K, 2)."""
+
+    first: int
+    last: int
+    view_index: I64
+    xy: F64
 
 
 @njit(cache=True, nogil=True)
@@ -36,10 +50,10 @@ def hold_flipping_points(
 
 
 @njit(cache=True, nogil=True)
-def point_cost(
-    P: F64, x: F64, first: int, last: int, view_index: I64, xy: F64, code: int, delta: float
-) -> tuple[float, int]:
-    """1/2 sum rho of one point's observations first..last, and how many of them lie behind their camera."""
+def point_cost(P: F64, x: F64, sightings: Sightings, loss: Loss) -> tuple[float, int]:
+    """1/2 sum rho of one point's observations, and how many of them lie behind their camera."""
+    first, last, view_index, xy = sightings
+    code, delta = loss
     cost, behind = 0.0, 0
     for k in range(first, last):
         p = P[view_index[k]]
@@ -56,21 +70,13 @@ def point_cost(
 
 @njit(cache=True, nogil=True)
 def linearize_point(
-    P: F64,
-    x: F64,
-    v: F64,
-    beta: float,
-    first: int,
-    last: int,
-    view_index: I64,
-    xy: F64,
-    code: int,
-    delta: float,
-    H: F64,
-    g: F64,
+    P: F64, x: F64, tangent: tuple[F64, float], sightings: Sightings, loss: Loss, H: F64, g: F64
 ) -> None:
-    """Fill J'J (3, 3) and J'r (3,) of one unit point in its tangent space (Householder vector v, factor
+    """Fill J'J (3, 3) and J'r (3,) of one unit point in its ``tangent`` space (Householder vector v, factor
     beta)."""
+    v, beta = tangent
+    first, last, view_index, xy = sightings
+    code, delta = loss
     H[:] = 0.0
     g[:] = 0.0
     J = np.empty((2, 4))
@@ -114,13 +120,14 @@ def refine_each_point(
         x = X[j : j + 1]
         if x[0, 0] == 0.0 and x[0, 1] == 0.0 and x[0, 2] == 0.0 and x[0, 3] == 0.0:
             continue
-        cost, behind = point_cost(P, x[0], first, last, view_index, xy, code, delta)
+        sightings, loss = Sightings(first, last, view_index, xy), (code, delta)
+        cost, behind = point_cost(P, x[0], sightings, loss)
         damping = 1e-4
         fresh = True
         for _ in range(iterations):
             if fresh:
                 tangent_reflectors(x, v, beta)
-                linearize_point(P, x[0], v[0], beta[0], first, last, view_index, xy, code, delta, H, g)
+                linearize_point(P, x[0], (v[0], beta[0]), sightings, loss, H, g)
             for m in range(3):
                 for n in range(3):
                     M[m, n] = H[m, n]
@@ -130,7 +137,7 @@ def refine_each_point(
             for m in range(3):
                 step[0, m] = -(Mi[m, 0] * g[0] + Mi[m, 1] * g[1] + Mi[m, 2] * g[2])
             tangent_step(x, v, beta, step, moved)
-            candidate, flipped = point_cost(P, moved[0], first, last, view_index, xy, code, delta)
+            candidate, flipped = point_cost(P, moved[0], sightings, loss)
             fresh = candidate < cost and flipped == behind
             if fresh:
                 x[0] = moved[0]
