@@ -40,6 +40,21 @@ def test_exact_observations_give_the_true_calibration_and_shape(groups):
     np.testing.assert_allclose(seen - block.xy, result.residual_px, atol=1e-6)
 
 
+def test_pixels_that_are_neither_square_nor_upright_are_those_of_the_model():
+    block = make_block(k1=0.03)
+    c = block.cameras
+    rows = c.intrinsics.copy()
+    rows[:, 1:3] = 1.2, 5.0
+    cameras = MetricCameras(c.R, c.t, rows, c.group)
+    xy = project_block(cameras, block.X, block.view, block.point)
+    there = _refine(cameras, block.X, _seen(block, xy), free=FOCAL, max_iterations=0)
+    np.testing.assert_allclose(there.residual_px, 0.0, atol=1e-9)
+    start = MetricCameras(c.R, c.t, rows * [1.05, 1.03, 1.0, 1.0, 1.0, 1.0], c.group)
+    free = np.array([True, True, True, False, False, True])
+    result = _refine(start, block.X, _seen(block, xy), free=free, max_iterations=100)
+    np.testing.assert_allclose(result.cameras.intrinsics, rows, rtol=1e-3, atol=2e-3)
+
+
 def test_a_lens_of_three_coefficients_comes_back():
     block = make_block(k1=0.03, lens=(-0.04, 0.05), points=150)
     cameras, X = perturbed(block)
@@ -356,3 +371,26 @@ def test_the_population_is_the_quadratic_form_of_deviations_from_its_mean():
     step = 1e-6 * np.eye(6)
     slope = [(values.links.cost(x + h) - values.links.cost(x - h)) / 2e-6 for h in step]
     np.testing.assert_allclose(values.links.gradient(x), slope, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("shared", "distinct"), [(None, [0, 1, 2, 3, 4, 5]), ([0, 0, 1, 2, 2, 3], [0, 2, 3, 5])]
+)
+def test_a_population_counts_a_value_that_cameras_share_once(shared, distinct):
+    cameras, _ = _varied(make_block(), np.array([1000.0, 1100.0, 1200.0, 1300.0, 1400.0, 1500.0]))
+    table = None
+    if shared is not None:
+        table = np.tile(np.arange(6)[:, None], (1, 6))
+        table[:, 0] = shared
+        first = np.array([distinct[value] for value in shared])
+        cameras.intrinsics[:, 0] = cameras.intrinsics[first, 0]
+    cameras = MetricCameras(cameras.R, cameras.t, cameras.intrinsics, cameras.group, table)
+    nothing = np.full_like(cameras.intrinsics, np.inf)
+    prior = IntrinsicsPrior(
+        cameras.intrinsics, nothing, np.zeros(6, np.int64), np.array([0.05, *[np.inf] * 5])
+    )
+    values, x, _ = number_values(cameras, np.ones(6, bool), FOCAL, prior)
+    log_f = np.log(cameras.intrinsics[distinct, 0])
+    assert values.size == len(distinct) + 1
+    x[-1] = log_f.mean()
+    assert values.links.cost(x) == pytest.approx(np.sum((log_f - log_f.mean()) ** 2) / 0.05**2 / 2.0)

@@ -165,6 +165,7 @@ def test_a_turn_no_larger_than_what_lens_models_leave_out_tells_no_focal() -> No
 
 def test_a_general_motion_needs_no_words() -> None:
     verdict = verdict_at_the_truth(make_sequence(Motion.GENERAL, np.random.default_rng(6)))
+    assert 1e-4 < verdict.evidence["principal_point_std_free"] < 0.2
     assert verdict.identifiable
     assert not verdict.critical
     assert verdict.sentences == ()

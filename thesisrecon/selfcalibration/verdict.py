@@ -199,13 +199,14 @@ def _usable_observations(reconstruction: Reconstruction, cameras: MetricCameras,
 
 
 def _thinned(point: I64, seen: I64) -> I64:
-    """Places of observations of the points seen most often, about ``MOST_OBSERVATIONS`` of them."""
+    """Places of about ``MOST_OBSERVATIONS`` observations, of points drawn evenly over how often they were
+    seen."""
     if len(point) <= MOST_OBSERVATIONS:
         return np.arange(len(point))
     numbers = np.unique(point)
     step = len(point) / MOST_OBSERVATIONS
     order = numbers[np.argsort(-seen[numbers], kind="stable")]
-    # Every other of the best, not the best alone: these may all lie in one corner of the scene.
+    # Every other of all, not those seen most often alone: these may lie in one corner of the scene.
     wanted = order[np.unique(np.arange(0, len(order), step).astype(np.int64))]
     chosen = np.zeros(int(point.max()) + 1, dtype=bool)
     chosen[wanted] = True
