@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,26 @@ def test_the_table_has_the_score_of_each_package_and_every_fault() -> None:
     text = table(verdicts)
     assert "| geometry | 2 | 1 | 50 % |" in text
     assert "| thesisrecon/geometry/a.py | 3 | `a \\| b` | `a & b` | **nobody** |" in text
+
+
+def test_what_nobody_caught_is_judged_again_and_the_rest_is_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    judged: list[int] = []
+
+    def judge_all(bench: object, chosen: Sequence[Mutant], *, warm: bool) -> Iterator[Verdict]:
+        judged.append(len(chosen))
+        for number, mutant in enumerate(chosen):
+            yield Verdict(mutant, "a test" if number or len(judged) > 1 else "", 1.0)
+
+    monkeypatch.setattr(mutants, "judge_all", judge_all)
+    wish = ["-o", str(tmp_path), "--packages", "geometry", "--sample", "4", "--warm"]
+    assert mutants.main(wish) == 1
+    assert "4 faults, 75 % caught" in capsys.readouterr().out
+    assert mutants.main([*wish, "--again"]) == 0
+    assert judged == [4, 1]
+    assert "4 faults, 100 % caught" in capsys.readouterr().out
+    assert len(mutants.read_verdicts(tmp_path / "mutants.json")) == 4
 
 
 def test_a_bad_wish_ends_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
