@@ -94,6 +94,7 @@ def test_what_nobody_caught_is_judged_again_and_the_rest_is_kept(
     judged: list[int] = []
 
     def judge_all(bench: object, chosen: Sequence[Mutant], *, warm: bool) -> Iterator[Verdict]:
+        del bench, warm
         judged.append(len(chosen))
         for number, mutant in enumerate(chosen):
             yield Verdict(mutant, "a test" if number or len(judged) > 1 else "", 1.0)
