@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from thesisrecon.io.images import read_photographs
-from thesisrecon.types import Image
+from thesisrecon.records import Image
 from validation.references.libraries import NoReference, one_thread
 from validation.scenes.real import load_fixture_scene
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
-from thesisrecon.epipolar.degeneracy import Configuration
+from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_optimal
-from thesisrecon.optimize.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from validation.checks.bundle import FOCAL_K1
 from validation.references.ceres_bundle import CeresOptions, bundle_adjuster
 from validation.references.colmap_model import colmap_model

@@ -9,14 +9,18 @@ import pytest
 
 from benchmarks.conftest import Bench
 from thesisrecon.config import preset
-from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, PairMatcher, SemiGlobal
-from thesisrecon.dense.rectification import Hartley, PlanarRectification, pair_of_fundamental, rectify
-from thesisrecon.epipolar.degeneracy import Configuration
-from thesisrecon.features import HarrisCorners
-from thesisrecon.geometry.multiview import fundamental_from_cameras
-from thesisrecon.matching.kernels.correlation import scan_correlations
-from thesisrecon.pipeline import detect_features, match_views
-from thesisrecon.types import Image
+from thesisrecon.epipolar.configuration import Configuration
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.geometry.two_view import fundamental_from_cameras
+from thesisrecon.matching.seeds import scan_correlations
+from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
+from thesisrecon.records import Image
+from thesisrecon.stereo.epipolar_pair import pair_of_fundamental
+from thesisrecon.stereo.planar import PlanarRectification
+from thesisrecon.stereo.planar_methods import Hartley
+from thesisrecon.stereo.rectification import rectify
+from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
+from thesisrecon.stereo.semi_global import CohesiveScanlines, PairMatcher, SemiGlobal
 from validation.references.corners import harris_corners
 from validation.references.pictures import warp_perspective
 from validation.references.rectification import opencv_uncalibrated

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
-from thesisrecon.epipolar.degeneracy import Configuration
+from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
-from thesisrecon.geometry.alignment import estimate_similarity
-from thesisrecon.geometry.camera import distort, project_camera, undistort
-from thesisrecon.geometry.multiview import estimate_homography
+from thesisrecon.geometry.camera_matrix import distort, project_camera, undistort
 from thesisrecon.geometry.resection import pose_from_three_points
+from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.two_view import estimate_homography
 from validation.checks.triangulation import beside, cameras_of
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point
 from validation.references.geometry import (
@@ -61,7 +61,7 @@ def test_projection(bench: Bench, method: str) -> None:
     X = np.random.default_rng(3).uniform([-2.0, -2.0, 4.0], [2.0, 2.0, 8.0], (10000, 3))
     K, R, t = np.diag([700.0, 700.0, 1.0]), np.eye(3), np.zeros(3)
     solve = project_camera if method == "ours" else opencv_projection
-    bench("projection of 10000 points", method, lambda: solve(K, R, t, X, radial=RADIAL))
+    bench("projection of 10000 points", method, lambda: solve(K, R, t, X, distortion=RADIAL))
 
 
 @pytest.mark.parametrize("method", ["ours", "OpenCV"])
@@ -69,7 +69,7 @@ def test_undistortion(bench: Bench, method: str) -> None:
     xy = distort(np.random.default_rng(3).uniform(-0.5, 0.5, (10000, 2)), RADIAL)
     calls = {
         "ours": lambda: undistort(xy, RADIAL),
-        "OpenCV": lambda: opencv_undistortion(xy, radial=RADIAL),
+        "OpenCV": lambda: opencv_undistortion(xy, distortion=RADIAL),
     }
     bench("undistortion of 10000 points", method, calls[method])
 

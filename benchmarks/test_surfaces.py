@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
-from thesisrecon.model import VolumetricFusion
-from thesisrecon.types import DepthMap, PinholeView
+from thesisrecon.records import DepthMap, PinholeView
+from thesisrecon.surface.fusion import VolumetricFusion
 from validation.checks.rendering import courtyard
 from validation.references.open3d_surfaces import OpenTsdf
 

@@ -15,11 +15,9 @@ import numpy as np
 import PIL.Image
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.dense import MultiViewScene
-from thesisrecon.dense.multiview.neighbours import SparsePoints
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import compose_camera, project
-from thesisrecon.types import (
+from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.records import (
     DepthMap,
     Features,
     FundamentalFit,
@@ -34,6 +32,8 @@ from thesisrecon.types import (
     TwoView,
     Upgrade,
 )
+from thesisrecon.stereo.depth import MultiViewScene
+from thesisrecon.stereo.neighbours import SparsePoints
 
 CALLS: list[str] = []
 WIDTH, HEIGHT, POINTS = 96, 80, 30
@@ -124,7 +124,7 @@ class FakeVerifier:
             xy2=matches.xy2,
             affine=matches.affine,
             candidates=len(matches.xy1),
-            homography_share=0.1,
+            homography_inlier_ratio=0.1,
             accepted=self.accept,
             reason="" if self.accept else "too few verified matches",
         )
@@ -182,7 +182,7 @@ class FakeCalibrator:
 @dataclass(frozen=True)
 class FakeMetric:
     trusted_from: int = 0
-    doubts: tuple[str, ...] = ("odd focal",)
+    failed_checks: tuple[str, ...] = ("odd focal",)
 
     def refine(
         self, reconstruction: Reconstruction, calibration: Any, *, assumed: Any, rng: Any
@@ -196,9 +196,11 @@ class FakeMetric:
             "principal_y_px": IntrinsicInterval(40.0, 0.5, "fake"),
             "k1": IntrinsicInterval(0.0, 0.0, "fake"),
         }
-        metric = replace(reconstruction, stratum="metric", K=calibration.K, radial=np.zeros((views, 3)))
+        metric = replace(reconstruction, stratum="metric", K=calibration.K, distortion=np.zeros((views, 3)))
         trusted = attempt >= self.trusted_from
-        return MetricResult(metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else self.doubts)
+        return MetricResult(
+            metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else self.failed_checks
+        )
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.geometry.camera import compose_camera, project_camera
-from thesisrecon.types import Reconstruction, Tracks, TwoView
+from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def make_scene(
     xy = np.empty((len(view), 2))
     for v in range(views):
         mine = view == v
-        xy[mine] = project_camera(Ka[v], Ra[v], ta[v], X[point[mine]], radial=k1)
+        xy[mine] = project_camera(Ka[v], Ra[v], ta[v], X[point[mine]], distortion=k1)
     xy += rng.normal(0.0, sigma_px, xy.shape) if sigma_px else 0.0
     tracks = Tracks(view, point, xy, views, points)
     return TrueScene(Ka, Ra, ta, X, k1, tracks, np.tile(size, (views, 1)))
@@ -86,7 +86,7 @@ def with_poses(scene: TrueScene, R: np.ndarray, centres: np.ndarray) -> TrueScen
     xy = np.empty((len(view), 2))
     for v in range(len(R)):
         mine = view == v
-        xy[mine] = project_camera(scene.K[v], R[v], t[v], scene.X[point[mine]], radial=scene.k1)
+        xy[mine] = project_camera(scene.K[v], R[v], t[v], scene.X[point[mine]], distortion=scene.k1)
     return replace(scene, R=R, t=t, tracks=replace(scene.tracks, xy=xy))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from thesisrecon.cli import run_command
+from thesisrecon.cli.main import run_command
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 SMALL = ["--max-size", "480", "--threads", "2", "--until", "metric"]

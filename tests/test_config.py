@@ -19,9 +19,12 @@ from thesisrecon.config import (
     toml_from_config,
 )
 from thesisrecon.errors import UsageError
-from thesisrecon.model import BSplineSurface, DepthSheets
-from thesisrecon.selfcalibration import ModulusConstraint, PollefeysQuadric, Stratified
+from thesisrecon.selfcalibration.hartley import PollefeysQuadric
+from thesisrecon.selfcalibration.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.stratified import Stratified
 from thesisrecon.settings import parse_word, toml_from_tables
+from thesisrecon.surface.bspline import BSplineSurface
+from thesisrecon.surface.fusion import DepthSheets
 
 
 def apply_settings(*settings: str) -> PipelineConfig:

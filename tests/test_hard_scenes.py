@@ -17,19 +17,19 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.dense.multiview.hard_scenes import (
+from tests.fake_stages import FakeMetric, fake_config
+from tests.stereo.depth_scenes import Walled
+from tests.stereo.hard_scenes import (
     blank_wall,
     fence,
     looking_ahead,
     photograph_scene,
     tunnel,
 )
-from tests.dense.multiview.scenes import Walled
-from tests.fake_stages import FakeMetric, fake_config
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.types import Image, MetricResult, Reconstruction, RunResult, Tracks
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import Image, MetricResult, Reconstruction, RunResult, Tracks
 
 
 def abreast(baseline: float, views: int = 3) -> Walled:
@@ -105,7 +105,7 @@ class Given:
     def reconstruct(
         self, tracks: Any, pairs: Any, sizes: Any, *, rng: Any, attempt: int = 0
     ) -> Reconstruction:
-        return replace(self.truth, stratum="projective", K=None, radial=None)
+        return replace(self.truth, stratum="projective", K=None, distortion=None)
 
     def refine(self, reconstruction: Any, calibration: Any, *, assumed: Any, rng: Any) -> MetricResult:
         told = FakeMetric().refine(reconstruction, calibration, assumed=assumed, rng=rng)

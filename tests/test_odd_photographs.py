@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from tests.textures import texture
-from thesisrecon.cli import run_command
+from thesisrecon.cli.main import run_command
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 

@@ -18,16 +18,16 @@ import trimesh
 
 from tests import fake_stages as fakes
 from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
-from thesisrecon.assumptions import IntrinsicsAssumption, camera_groups, prior_warnings
+from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.intrinsics import IntrinsicsAssumption, camera_groups, prior_warnings
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.run import stream
-from thesisrecon.types import Image, RunResult
-from thesisrecon.views import render
-from thesisrecon.workers import Workers
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import Image, RunResult
+from thesisrecon.runtime.executors import Workers
+from thesisrecon.runtime.run import stream
+from thesisrecon.views.render import render
 
 
 @pytest.fixture(autouse=True)
@@ -157,7 +157,7 @@ def test_a_run_to_its_end_leaves_a_textured_model(tmp_path: Path) -> None:
     model = trimesh.load(tmp_path / "a" / "model.glb", force="mesh", process=False)
     assert len(model.faces) == len(result.mesh.faces)
     assert model.visual.kind == "texture"
-    seen = render(result.mesh, PinholeCamera.from_matrix(result.views[1].P, (fakes.WIDTH, fakes.HEIGHT)))
+    seen = render(result.mesh, Camera.from_matrix(result.views[1].P, (fakes.WIDTH, fakes.HEIGHT)))
     assert seen.valid[8:-8, 8:-8].mean() > 0.9
     assert {"dense", "model"} <= set(result.summary["seconds"])
     for options in ({"threads": 3}, {"threads": 2, "executor": "processes"}):
@@ -272,7 +272,7 @@ def test_the_folder_is_judged_before_any_photograph_is_read(
     def read_nothing(*_: Any, **__: Any) -> None:
         raise AssertionError("photographs were read")
 
-    monkeypatch.setattr("thesisrecon.intake.read_photographs", read_nothing)
+    monkeypatch.setattr("thesisrecon.io.images.read_photographs", read_nothing)
     with pytest.raises(UsageError, match="seed was 0 there and is 1 here"):
         run(tmp_path / "out", seed=1)
     with pytest.raises(UsageError, match="cannot be written"):
@@ -366,7 +366,7 @@ def test_a_result_that_nobody_trusts_is_written_with_its_warning(tmp_path: Path)
 
 def test_every_doubt_is_said_once(tmp_path: Path) -> None:
     doubted = fake_config(
-        metric=fakes.FakeMetric(trusted_from=9, doubts=("odd focal", "the camera only rotates")),
+        metric=fakes.FakeMetric(trusted_from=9, failed_checks=("odd focal", "the camera only rotates")),
         selfcalibration=fakes.FakeCalibrator(identifiable=False),
     )
     warnings = run(tmp_path, config=doubted).warnings

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from thesisrecon.types import B8, F64, FundamentalFit, Image
+from thesisrecon.arrays import B8, F64
+from thesisrecon.records import FundamentalFit, Image
 
 
 def texture(height: int, width: int, seed: int = 0) -> F64:

@@ -11,40 +11,36 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from thesisrecon.between import interpolate_view
-    from thesisrecon.beyond import synthesize_view
+    from thesisrecon.api import match_pair, match_rectified, self_calibrate
+    from thesisrecon.camera import Camera
     from thesisrecon.config import PipelineConfig
-    from thesisrecon.doors import (
-        estimate_fundamental,
-        match_pair,
-        match_rectified,
-        self_calibrate,
-        upgrade_affine,
-    )
-    from thesisrecon.geometry.pinhole import PinholeCamera
+    from thesisrecon.epipolar.estimation import estimate_fundamental
     from thesisrecon.geometry.triangulation import triangulate
-    from thesisrecon.pipeline import reconstruct
-    from thesisrecon.views import render
+    from thesisrecon.pipeline.outputs import upgrade_affine
+    from thesisrecon.pipeline.reconstruction import reconstruct
+    from thesisrecon.view_interpolation import interpolate_view
+    from thesisrecon.view_synthesis import synthesize_view
+    from thesisrecon.views.render import render
 
 __version__ = "0.1.0"
 
 _HOME_OF = {
-    "PinholeCamera": "geometry.pinhole",
+    "Camera": "camera",
     "PipelineConfig": "config",
-    "estimate_fundamental": "doors",
-    "interpolate_view": "between",
-    "match_pair": "doors",
-    "match_rectified": "doors",
-    "reconstruct": "pipeline",
-    "render": "views",
-    "self_calibrate": "doors",
-    "synthesize_view": "beyond",
+    "estimate_fundamental": "epipolar.estimation",
+    "interpolate_view": "view_interpolation",
+    "match_pair": "api",
+    "match_rectified": "api",
+    "reconstruct": "pipeline.reconstruction",
+    "render": "views.render",
+    "self_calibrate": "api",
+    "synthesize_view": "view_synthesis",
     "triangulate": "geometry.triangulation",
-    "upgrade_affine": "doors",
+    "upgrade_affine": "pipeline.outputs",
 }
 
 __all__ = [
-    "PinholeCamera",
+    "Camera",
     "PipelineConfig",
     "__version__",
     "estimate_fundamental",

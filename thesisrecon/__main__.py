@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from thesisrecon.stops import obey_signals
+from thesisrecon.runtime.signals import obey_signals
 
 
 def main() -> None:
     """The entry point of the command; the rest is loaded when Ctrl-C is already obeyed."""
     obey_signals("thesisrecon")
-    from thesisrecon.cli import main as run
+    from thesisrecon.cli.main import main as run
 
     run()
 

@@ -15,48 +15,24 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
-from thesisrecon.assumptions import IntrinsicsAssumption
-from thesisrecon.dense import MultiViewScene, MultiViewStereo
-from thesisrecon.dense import RectifiedPair as RectifiedPair
-from thesisrecon.dense.matching import MaximumLikelihoodScanline
-from thesisrecon.dense.multiview import PairMatching, SequenceLinking
-from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification, ThesisRansac
+from thesisrecon.arrays import F64, I64
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.ransac import ThesisRansac
+from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import UsageError
-from thesisrecon.features import HarrisCorners, MultiScaleCorners
-from thesisrecon.matching import AlignedTracks, PlainTracks, SeedsAndGrowth, StrengthOfMatch
-from thesisrecon.matching.pair_selection import (
-    AllPairs,
-    ListedPairs,
-    MapAll,
-    OverlapEstimate,
-    SequenceWindow,
-)
-from thesisrecon.metric import UpgradeAndBundle
-from thesisrecon.model import BSplineSurface, DepthSheets, SurfaceModel
-from thesisrecon.projective import Factorization, GatedIncremental, SequentialProjective
-from thesisrecon.selfcalibration import (
-    FocalScan,
-    FocalsFromFundamental,
-    HypothesesAndRefinement,
-    KruppaEquations,
-    LinearQuadric,
-    NonlinearQuadric,
-    ScannedQuadric,
-    Stratified,
-)
-from thesisrecon.settings import (
-    Table,
-    dataclass_from_table,
-    in_words,
-    parse_word,
-    table_from_dataclass,
-    toml_from_tables,
-    unknown_setting,
-    unknown_word,
-)
-from thesisrecon.types import (
-    F64,
-    I64,
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.intrinsics import IntrinsicsAssumption
+from thesisrecon.matching.growth import SeedsAndGrowth
+from thesisrecon.matching.overlap import MapAll
+from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
+from thesisrecon.matching.strength import StrengthOfMatch
+from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.projective.factorization import Factorization
+from thesisrecon.projective.incremental import GatedIncremental
+from thesisrecon.projective.sequential import SequentialProjective
+from thesisrecon.records import (
     Assumptions,
     DepthMap,
     DisparityMap,
@@ -73,6 +49,29 @@ from thesisrecon.types import (
     Tracks,
     TwoView,
 )
+from thesisrecon.selfcalibration.focal_scan import FocalScan
+from thesisrecon.selfcalibration.focals_from_fundamental import FocalsFromFundamental
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.kruppa import KruppaEquations
+from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric, ScannedQuadric
+from thesisrecon.selfcalibration.stratified import Stratified
+from thesisrecon.settings import (
+    Table,
+    dataclass_from_table,
+    in_words,
+    parse_word,
+    table_from_dataclass,
+    toml_from_tables,
+    unknown_setting,
+    unknown_word,
+)
+from thesisrecon.stereo.correspondence import PairMatching, RectifiedPair
+from thesisrecon.stereo.depth import MultiViewScene, MultiViewStereo
+from thesisrecon.stereo.depth_fusion import SequenceLinking
+from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
+from thesisrecon.surface.bspline import BSplineSurface
+from thesisrecon.surface.fusion import DepthSheets
+from thesisrecon.surface.model import SurfaceModel
 
 PRECISE_SIGMAS = 2.5
 """Matches in the tail of the noise are right, but tracks are made of precise ones."""
@@ -166,9 +165,9 @@ class SelfCalibrator(Protocol):
     ) -> SelfCalibration: ...
 
 
-def seeing(variant: SelfCalibrator, photographs: Sequence[Image]) -> SelfCalibrator:
+def with_images(variant: SelfCalibrator, photographs: Sequence[Image]) -> SelfCalibrator:
     """The variant with the photographs, where it looks at them (for parallel lines); else as it is."""
-    given = getattr(variant, "with_photographs", None)
+    given = getattr(variant, "with_images", None)
     return variant if given is None else cast(SelfCalibrator, given(photographs))
 
 
@@ -253,7 +252,7 @@ class PipelineConfig:
     tracks: TrackBuilder = field(default_factory=AlignedTracks)
     projective: ProjectiveReconstructor = field(default_factory=GatedIncremental)
     selfcalibration: SelfCalibrator = field(default_factory=HypothesesAndRefinement)
-    metric: MetricRefiner = field(default_factory=UpgradeAndBundle)
+    metric: MetricRefiner = field(default_factory=MetricRefinement)
     dense: DepthEstimator = field(default_factory=MultiViewStereo)
     model: ModelBuilder = field(default_factory=SurfaceModel)
 
@@ -286,7 +285,7 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
         "focals-from-fundamental": FocalsFromFundamental,
         "focal-scan": FocalScan,
     },
-    "metric": {"upgrade-and-bundle": UpgradeAndBundle},
+    "metric": {"metric-refinement": MetricRefinement},
     "dense": {"multi-view-stereo": MultiViewStereo},
     "model": {"surface-model": SurfaceModel},
 }

@@ -62,7 +62,7 @@ class WorkersLost(UsageError):
     """The workers of a run are gone: killed, or no longer reached. What was done is kept."""
 
 
-class Unwritable(UsageError):
+class OutputError(UsageError):
     """A ``place`` that cannot be written as ``error`` tells: its disk is full, or it is not for us to write.
 
     What stood there before is still there. With ``kept``, the folder of a run, the sentence says how the run
@@ -78,5 +78,7 @@ class Unwritable(UsageError):
             sentence += f", then the same command goes on from what is kept in {fspath(kept)}"
         super().__init__(sentence)
 
-    def __reduce__(self) -> tuple[type[Unwritable], tuple[str | PathLike[str], OSError, str | PathLike[str]]]:
+    def __reduce__(
+        self,
+    ) -> tuple[type[OutputError], tuple[str | PathLike[str], OSError, str | PathLike[str]]]:
         return type(self), (self.place, self.error, self.kept)

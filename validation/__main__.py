@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thesisrecon.stops import obey_signals
+from thesisrecon.runtime.signals import obey_signals
 
 
 def main() -> int:

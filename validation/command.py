@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.stops import advised
+from thesisrecon.runtime.signals import advised
 from validation.ablation import command as ablation
 from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates

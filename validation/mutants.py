@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon.errors import counted
-from thesisrecon.stops import obey_signals
+from thesisrecon.runtime.signals import obey_signals
 from validation.harness.planting import CopiedTree, imports_of
 from validation.harness.process import own_cores, run_process
 from validation.scenes.real import ROOT

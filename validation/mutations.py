@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from thesisrecon.errors import counted
-from thesisrecon.stops import obey_signals
+from thesisrecon.runtime.signals import obey_signals
 from validation.harness.gates import Gate, read_gates
 from validation.harness.planting import CopiedTree
 from validation.harness.process import last_words, own_cores, run_process

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.epipolar import estimate_fundamental, judge_certainty
-from thesisrecon.epipolar.certainty.kernels import (
+from thesisrecon.epipolar.degeneracy import (
+    assess_degeneracy,
+    find_dominant_plane,
+    log10_false_alarms,
+    multiplicity_weights,
+    plane_covariance,
+)
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.frame import PairFrame
+from thesisrecon.epipolar.plane_kernels import (
     NEIGHBOURS,
     contradicted_shares,
     count_transferred,
@@ -16,15 +24,8 @@ from thesisrecon.epipolar.certainty.kernels import (
     plane_normal_equations,
     refine_plane,
 )
-from thesisrecon.epipolar.certainty.plane import (
-    find_dominant_plane,
-    log10_false_alarms,
-    once_each,
-    plane_covariance,
-)
-from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.multiview import (
+from thesisrecon.geometry.two_view import (
     epipoles,
     estimate_homography,
     homography_distances,
@@ -33,13 +34,13 @@ from thesisrecon.geometry.multiview import (
     symmetric_residuals,
     unit_norm,
 )
-from thesisrecon.types import FundamentalFit
+from thesisrecon.records import FundamentalFit
 from validation.scenes.facade import FacadeMaker
 
 
 def judged(xy1, xy2, seed=0):
     fit = estimate_fundamental(xy1, xy2, seed=seed)
-    return fit, judge_certainty(fit, xy1, xy2, rng=np.random.default_rng(seed))
+    return fit, assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
@@ -47,11 +48,11 @@ def test_a_general_scene_is_sure(outliers):
     for seed in range(5):
         pair = make_pair(400, np.random.default_rng(seed))
         xy1, xy2, _ = spoil(pair, np.random.default_rng(seed), sigma=0.5, outliers=outliers)
-        _, certainty = judged(xy1, xy2)
-        assert certainty.determined, certainty.reasons
-        assert certainty.reasons == ()
-        assert certainty.log10_false_alarms < -10
-        assert certainty.expected_error_px < 0.5
+        _, degeneracy = judged(xy1, xy2)
+        assert degeneracy.determined, degeneracy.reasons
+        assert degeneracy.reasons == ()
+        assert degeneracy.log10_false_alarms < -10
+        assert degeneracy.expected_error_px < 0.5
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
@@ -59,10 +60,10 @@ def test_a_plane_is_not_sure_however_many_inliers(outliers):
     for seed in range(8):
         pair = make_pair(500, np.random.default_rng(seed), planar=True)
         xy1, xy2, _ = spoil(pair, np.random.default_rng(seed), sigma=0.4, outliers=outliers)
-        fit, certainty = judged(xy1, xy2)
+        fit, degeneracy = judged(xy1, xy2)
         assert fit.inliers.sum() > 300
-        assert not certainty.determined
-        assert certainty.reasons
+        assert not degeneracy.determined
+        assert degeneracy.reasons
 
 
 def test_relief_makes_a_facade_sure():
@@ -72,9 +73,9 @@ def test_relief_makes_a_facade_sure():
         facade = FacadeMaker(
             matches=500, relief=0.03, off_plane=0.15, wrong=0.2, repeated=0.2, sigma_px=0.3
         ).make(rng)
-        fit, certainty = judged(facade.xy1, facade.xy2)
+        fit, degeneracy = judged(facade.xy1, facade.xy2)
         assert np.sqrt(np.mean(symmetric_residuals(fit.F, facade.exact1, facade.exact2) ** 2) / 2.0) < 1.0
-        sure += certainty.determined
+        sure += degeneracy.determined
     assert sure >= 6
 
 
@@ -85,11 +86,11 @@ def test_matches_between_windows_do_not_make_a_facade_sure():
         facade = FacadeMaker(
             matches=500, relief=0.0, off_plane=0.0, wrong=0.4, repeated=0.7, sigma_px=0.3
         ).make(rng)
-        fit, certainty = judged(facade.xy1, facade.xy2)
-        assert not certainty.determined
+        fit, degeneracy = judged(facade.xy1, facade.xy2)
+        assert not degeneracy.determined
         # More matches agree than are right: the row of windows has an epipolar geometry of its own.
         assert fit.inliers.sum() > 0.95 * facade.right.sum()
-        contradicted += certainty.contradicted > 0.5 * certainty.off_plane
+        contradicted += degeneracy.contradicted > 0.5 * degeneracy.off_plane
     assert contradicted >= 9
 
 
@@ -110,12 +111,12 @@ def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_rival():
     inliers = np.abs(sampson_residuals(F, xy1, xy2)) < 0.75
     assert inliers[:300].mean() > 0.95
     fit = FundamentalFit(F, inliers, 0.3, 1e-12 * np.eye(9))
-    certainty = judge_certainty(fit, xy1, xy2, rng=np.random.default_rng(0))
-    assert not certainty.determined
-    assert certainty.rival is not None
-    assert certainty.rival_margin < 0.0
-    assert np.mean(np.abs(sampson_residuals(certainty.rival, xy1, xy2)) < 0.9) > 0.97
-    assert any("another geometry" in reason for reason in certainty.reasons)
+    degeneracy = assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(0))
+    assert not degeneracy.determined
+    assert degeneracy.competing_model is not None
+    assert degeneracy.competing_margin < 0.0
+    assert np.mean(np.abs(sampson_residuals(degeneracy.competing_model, xy1, xy2)) < 0.9) > 0.97
+    assert any("another geometry" in reason for reason in degeneracy.reasons)
 
 
 def test_a_wide_covariance_is_a_reason():
@@ -123,19 +124,19 @@ def test_a_wide_covariance_is_a_reason():
     xy1, xy2, _ = spoil(pair, np.random.default_rng(0), sigma=0.3, outliers=0.0)
     fit = estimate_fundamental(xy1, xy2)
     vague = FundamentalFit(fit.F, fit.inliers, fit.sigma_px, fit.covariance * 1e4)
-    certainty = judge_certainty(vague, xy1, xy2, rng=np.random.default_rng(0))
-    assert not certainty.determined
-    assert certainty.expected_error_px > 1.0
-    assert "covariance" in certainty.reasons[0]
+    degeneracy = assess_degeneracy(vague, xy1, xy2, rng=np.random.default_rng(0))
+    assert not degeneracy.determined
+    assert degeneracy.expected_error_px > 1.0
+    assert "covariance" in degeneracy.reasons[0]
 
 
 def test_the_front_door_judges_when_asked():
     pair = make_pair(200, np.random.default_rng(1))
     xy1, xy2, _ = spoil(pair, np.random.default_rng(1), sigma=0.3, outliers=0.2)
     plain, told = estimate_fundamental(xy1, xy2), estimate_fundamental(xy1, xy2, judge=True)
-    assert plain.certainty is None
-    assert told.certainty is not None
-    assert told.certainty.determined
+    assert plain.degeneracy is None
+    assert told.degeneracy is not None
+    assert told.degeneracy.determined
     np.testing.assert_array_equal(plain.F, told.F)
 
 
@@ -144,18 +145,18 @@ def test_the_same_generator_gives_the_same_verdict():
     facade = FacadeMaker().make(rng)
     first, second = (judged(facade.xy1, facade.xy2, seed=4)[1] for _ in range(2))
     assert first.reasons == second.reasons
-    assert first.rival_margin == second.rival_margin
+    assert first.competing_margin == second.competing_margin
 
 
 def test_wrong_and_hopeless_calls():
     pair = make_pair(40, np.random.default_rng(0))
     fit = FundamentalFit(pair.F, np.ones(39, bool), 0.3, np.eye(9))
     with pytest.raises(ValueError, match="39"):
-        judge_certainty(fit, pair.xy1, pair.xy2, rng=np.random.default_rng(0))
+        assess_degeneracy(fit, pair.xy1, pair.xy2, rng=np.random.default_rng(0))
     with pytest.raises(StageFailure, match="needed at least 8"):
-        judge_certainty(fit, pair.xy1[:7], pair.xy2[:7], rng=np.random.default_rng(0))
+        assess_degeneracy(fit, pair.xy1[:7], pair.xy2[:7], rng=np.random.default_rng(0))
     nobody = FundamentalFit(pair.F, np.zeros(40, bool), 0.3, np.eye(9))
-    assert not judge_certainty(nobody, pair.xy1, pair.xy2, rng=np.random.default_rng(0)).determined
+    assert not assess_degeneracy(nobody, pair.xy1, pair.xy2, rng=np.random.default_rng(0)).determined
 
 
 # ---------------------------------------------------------------- the pieces
@@ -280,7 +281,7 @@ def test_chance_and_surprise():
 def test_matches_that_share_a_place_count_once():
     xy1 = np.array([[10.0, 10.0], [50.0, 80.0], [90.0, 20.0], [200.0, 200.0]])
     xy2 = np.array([[30.0, 30.0], [30.2, 30.1], [30.4, 30.3], [90.0, 90.0]])
-    np.testing.assert_allclose(once_each(xy1, xy2), [1 / 3, 1 / 3, 1 / 3, 1.0])
+    np.testing.assert_allclose(multiplicity_weights(xy1, xy2), [1 / 3, 1 / 3, 1 / 3, 1.0])
 
 
 def test_one_that_would_change_places_with_the_wall_is_contradicted():

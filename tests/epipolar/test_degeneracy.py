@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.epipolar import estimate_eight_point, estimate_fundamental
-from thesisrecon.epipolar.degeneracy import (
+from thesisrecon.epipolar.configuration import (
     Configuration,
     classify_configuration,
+    turned_camera,
+    turning_ratio,
 )
-from thesisrecon.epipolar.turning import turned_camera, turning_ratio
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import project
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.multiview import homography_distances, homography_residuals
-from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
+from thesisrecon.geometry.two_view import homography_distances, homography_residuals
+from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 from validation.scenes.two_views import make_two_views
 
 

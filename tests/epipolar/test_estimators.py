@@ -8,20 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.epipolar.pairs import Pair, angle_between, make_pair, spoil
-from thesisrecon.epipolar import (
-    LeastMedianOfSquares,
-    LocallyOptimisedRansac,
-    ThesisRansac,
-    estimate_eight_point,
-    estimate_fundamental,
-    estimate_seven_point,
-    refine_epipolar_distance,
-    refine_gradient,
-    refine_reprojection,
-)
-from thesisrecon.epipolar.outliers import discard_outliers
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
+from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.multiview import sampson_residuals, symmetric_residuals
+from thesisrecon.geometry.two_view import sampson_residuals, symmetric_residuals
 
 seeds = st.integers(0, 2**31)
 ROBUST = [
@@ -78,7 +71,7 @@ def test_seven_point_of_degenerate_matches_is_empty():
     assert estimate_seven_point(np.ones((7, 2)), pair.xy2).shape == (0, 3, 3)
 
 
-@pytest.mark.parametrize("refine", [refine_gradient, refine_epipolar_distance, refine_reprojection])
+@pytest.mark.parametrize("refine", [refine_sampson, refine_epipolar_distance, refine_reprojection])
 def test_refinement_reaches_the_bound_of_the_noise(refine):
     """Sampson distances of a fit with 7 parameters have mean square sigma^2 (n - 7) / n (HZ 5.1)."""
     n, sigma, ratios = 60, 0.4, []
@@ -100,7 +93,7 @@ def test_gradient_criterion_beats_the_linear_estimate():
         xy1, xy2, _ = spoil(pair, rng, sigma=0.5, outliers=0.0)
         F = estimate_eight_point(xy1, xy2)
         linear.append(error_px(F, pair))
-        refined.append(error_px(refine_gradient(F, xy1, xy2), pair))
+        refined.append(error_px(refine_sampson(F, xy1, xy2), pair))
     assert np.mean(refined) < np.mean(linear)
 
 
@@ -285,6 +278,6 @@ def test_linear_estimate_of_a_plane_is_refused():
 def test_refinement_refuses_a_start_without_rank(F):
     pair = make_pair(10, np.random.default_rng(0))
     with pytest.raises(ValueError, match="rank 2"):
-        refine_gradient(F, pair.xy1, pair.xy2)
+        refine_sampson(F, pair.xy1, pair.xy2)
     with pytest.raises(ValueError, match="loss_px"):
-        refine_gradient(pair.F, pair.xy1, pair.xy2, loss_px=0.0)
+        refine_sampson(pair.F, pair.xy1, pair.xy2, loss_px=0.0)

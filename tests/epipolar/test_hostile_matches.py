@@ -9,20 +9,13 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.epipolar import (
-    LeastMedianOfSquares,
-    ThesisRansac,
-    estimate_eight_point,
-    estimate_fundamental,
-    estimate_seven_point,
-    refine_epipolar_distance,
-    refine_gradient,
-    refine_reprojection,
-)
-from thesisrecon.epipolar.degeneracy import classify_configuration
-from thesisrecon.epipolar.outliers import discard_outliers
+from thesisrecon.epipolar.configuration import classify_configuration
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.precision import epipolar_distance_interval, epipoles_of
-from thesisrecon.epipolar.row_parameterization import refine_gradient_by_rows
+from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
+from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
+from thesisrecon.epipolar.row_parameterization import refine_sampson_by_rows
 from thesisrecon.errors import StageFailure
 
 PAIR = make_pair(60, np.random.default_rng(0))
@@ -99,10 +92,10 @@ FUNCTIONS: dict[str, Callable[..., object]] = {
     "eight-point": estimate_eight_point,
     "eight-point raw": lambda a, b: estimate_eight_point(a, b, normalized=False),
     "seven-point": lambda a, b: estimate_seven_point(a[:7], b[:7]),
-    "gradient": lambda a, b: refine_gradient(PAIR.F, a, b),
+    "gradient": lambda a, b: refine_sampson(PAIR.F, a, b),
     "epipolar distance": lambda a, b: refine_epipolar_distance(PAIR.F, a, b),
     "reprojection": lambda a, b: refine_reprojection(PAIR.F, a, b),
-    "rows": lambda a, b: refine_gradient_by_rows(PAIR.F, a, b),
+    "rows": lambda a, b: refine_sampson_by_rows(PAIR.F, a, b),
     "configuration": lambda a, b: classify_configuration(PAIR.F, a, b),
     "noise": lambda a, b: discard_outliers(PAIR.F, a, b),
 }

@@ -7,9 +7,14 @@ import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
 from tests.geometry.properties import holds_for_every
-from thesisrecon.epipolar import ThesisRansac
-from thesisrecon.epipolar.outliers import BothLinesTest, SampsonTest, SumOfLinesTest, discard_outliers
-from thesisrecon.geometry.multiview import (
+from thesisrecon.epipolar.ransac import (
+    BothLinesTest,
+    SampsonTest,
+    SumOfLinesTest,
+    ThesisRansac,
+    discard_outliers,
+)
+from thesisrecon.geometry.two_view import (
     algebraic_residuals,
     epipolar_distances,
     fundamental_from_cameras,

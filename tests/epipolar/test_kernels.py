@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.epipolar.pairs import make_pair
-from thesisrecon.epipolar import kernels
+from thesisrecon.epipolar import refinement as rank2
+from thesisrecon.epipolar import search as kernels
 from thesisrecon.epipolar.frame import PairFrame
-from thesisrecon.epipolar.rank2 import kernels as rank2
-from thesisrecon.geometry.multiview import algebraic_residuals, sampson_residuals, symmetric_residuals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
+from thesisrecon.geometry.two_view import algebraic_residuals, sampson_residuals, symmetric_residuals
 
 seeds = st.integers(0, 2**31)
 
@@ -159,7 +159,7 @@ def robust_cost(f, points, criterion, gate, delta):
     return float(np.where(r <= delta, 0.5 * r**2, delta * (r - 0.5 * delta)).sum())
 
 
-@pytest.mark.parametrize("criterion", [rank2.GRADIENT, rank2.DISTANCE])
+@pytest.mark.parametrize("criterion", [rank2.SAMPSON, rank2.DISTANCE])
 @pytest.mark.parametrize(("gate", "delta"), [(1.0, 0.7), (2e-3, 1e-3)])
 def test_normal_equations_are_the_derivatives_of_the_cost(criterion, gate, delta):
     points, f = noisy_points(4, n=300)
@@ -217,7 +217,7 @@ def test_damped_solve_refuses_what_is_not_positive():
 
 
 @settings(max_examples=20, deadline=None)
-@given(seeds, st.sampled_from([rank2.GRADIENT, rank2.DISTANCE]))
+@given(seeds, st.sampled_from([rank2.SAMPSON, rank2.DISTANCE]))
 def test_refinement_never_raises_the_cost_and_keeps_rank_two(seed, criterion):
     points, f = noisy_points(seed)
     start = f + np.random.default_rng(seed).normal(0.0, 0.02, 9)

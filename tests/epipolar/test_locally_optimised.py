@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.epipolar import LocallyOptimisedRansac, estimate_fundamental, refine_reprojection
-from thesisrecon.geometry.multiview import sampson_residuals, symmetric_residuals
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.refinement import refine_reprojection
+from thesisrecon.geometry.two_view import sampson_residuals, symmetric_residuals
 
 FAST = LocallyOptimisedRansac()
 
@@ -69,7 +71,9 @@ def test_other_ends_of_the_search_are_told_as_rivals():
     noisy1, noisy2 = (xy + rng.normal(0.0, 0.2, xy.shape) for xy in (xy1, xy2))
     fit = LocallyOptimisedRansac(starts=8).estimate(noisy1, noisy2, np.random.default_rng(0))
     everyone = np.ones(60, dtype=bool)
-    errors = [[squared_error(F, pair, everyone) for pair in (one, other)] for F in (fit.F, *fit.rivals)]
+    errors = [
+        [squared_error(F, pair, everyone) for pair in (one, other)] for F in (fit.F, *fit.competing_models)
+    ]
     taken = int(np.argmin(errors[0]))
     assert errors[0][taken] < 0.5
     assert min(error[1 - taken] for error in errors[1:]) < 0.5

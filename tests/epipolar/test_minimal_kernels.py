@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.epipolar.pairs import make_pair
-from thesisrecon.epipolar import kernels
+from thesisrecon.epipolar import search as kernels
+from thesisrecon.epipolar import seven_point as minimal
 from thesisrecon.epipolar.frame import PairFrame
-from thesisrecon.epipolar.minimal import kernels as minimal
-from thesisrecon.robust.kernels import draw_sample
+from thesisrecon.numerics.noise import draw_sample
 
 seeds = st.integers(0, 2**31)
 

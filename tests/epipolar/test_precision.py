@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from tests.epipolar.pairs import make_pair
-from thesisrecon.epipolar.degeneracy import Configuration
+from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.precision import (
     Epipole,
     degrees_of_freedom,
@@ -20,8 +20,8 @@ from thesisrecon.epipolar.precision import (
     student_95,
 )
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.multiview import enforce_rank_two, epipolar_lines, epipoles
-from thesisrecon.types import FundamentalFit
+from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
+from thesisrecon.records import FundamentalFit
 from validation.checks.epipolar import DEFAULT, GOLD, check_precision
 from validation.scenes.two_views import make_two_views
 

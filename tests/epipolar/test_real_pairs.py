@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thesisrecon.epipolar import LocallyOptimisedRansac, ThesisRansac, estimate_fundamental
-from thesisrecon.geometry.multiview import fundamental_from_cameras, sampson_residuals
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.ransac import ThesisRansac
+from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 
 pytestmark = pytest.mark.real
 DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).resolve().parents[2] / "../shared/data"))

@@ -9,19 +9,15 @@ import pytest
 
 from tests.epipolar.pairs import angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
-from thesisrecon.epipolar import (
-    estimate_eight_point,
-    refine_epipolar_distance,
-    refine_gradient,
-    refine_reprojection,
-)
+from thesisrecon.epipolar.linear import estimate_eight_point
+from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
 from thesisrecon.epipolar.row_parameterization import (
     RowColumnParameterization,
     refine_epipolar_distance_by_rows,
-    refine_gradient_by_rows,
     refine_reprojection_by_rows,
+    refine_sampson_by_rows,
 )
-from thesisrecon.geometry.multiview import enforce_rank_two, epipoles
+from thesisrecon.geometry.two_view import enforce_rank_two, epipoles
 
 
 @holds_for_every()
@@ -60,7 +56,7 @@ def test_epipoles_at_infinity_and_on_axes_are_reached(where):
 @pytest.mark.parametrize(
     ("by_rows", "orthonormal"),
     [
-        (refine_gradient_by_rows, refine_gradient),
+        (refine_sampson_by_rows, refine_sampson),
         (refine_epipolar_distance_by_rows, refine_epipolar_distance),
         (refine_reprojection_by_rows, refine_reprojection),
     ],

@@ -8,19 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.epipolar.pairs import angle_between, make_pair, spoil
-from thesisrecon.epipolar import (
-    estimate_eight_point,
-    refine_epipolar_distance,
-    refine_gradient,
-    refine_reprojection,
-)
+from thesisrecon.epipolar.linear import estimate_eight_point
+from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
 from thesisrecon.epipolar.row_parameterization import (
     RowParameterization,
     refine_epipolar_distance_by_rows,
-    refine_gradient_by_rows,
     refine_reprojection_by_rows,
+    refine_sampson_by_rows,
 )
-from thesisrecon.geometry.multiview import enforce_rank_two
+from thesisrecon.geometry.two_view import enforce_rank_two
 
 
 @settings(max_examples=50, deadline=None)
@@ -57,7 +53,7 @@ def test_every_map_has_the_tangent_of_its_matrix(dependent, fixed):
 @pytest.mark.parametrize(
     ("by_rows", "orthonormal"),
     [
-        (refine_gradient_by_rows, refine_gradient),
+        (refine_sampson_by_rows, refine_sampson),
         (refine_epipolar_distance_by_rows, refine_epipolar_distance),
         (refine_reprojection_by_rows, refine_reprojection),
     ],
@@ -73,4 +69,4 @@ def test_same_minimum_as_the_orthonormal_representation(by_rows, orthonormal):
 def test_a_start_without_rank_is_refused():
     pair = make_pair(10, np.random.default_rng(0))
     with pytest.raises(ValueError, match="rank 2"):
-        refine_gradient_by_rows(np.zeros((3, 3)), pair.xy1, pair.xy2)
+        refine_sampson_by_rows(np.zeros((3, 3)), pair.xy1, pair.xy2)

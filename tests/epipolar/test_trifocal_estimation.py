@@ -8,30 +8,37 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
     NO_SEGMENTS,
+    TrifocalReprojection,
+    TrifocalStep,
     estimate_trifocal,
     minimize_algebraic_error,
     refine_trifocal,
 )
-from thesisrecon.epipolar.trifocal_reprojection import TrifocalReprojection, TrifocalStep
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import calibration_matrix, camera_from_centre, decompose_camera, project
+from thesisrecon.geometry.camera_matrix import (
+    calibration_matrix,
+    camera_from_centre,
+    decompose_camera,
+    project,
+)
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
-from thesisrecon.geometry.trifocal import (
+from thesisrecon.geometry.three_view import (
+    TensorEquations,
     cameras_from_tensor,
+    estimate_tensor_linear,
+    tensor_equations,
     tensor_from_cameras,
     transfer_lines,
     transfer_points,
 )
-from thesisrecon.geometry.trifocal_linear import TensorEquations, estimate_tensor_linear, tensor_equations
 
-F64 = NDArray[np.float64]
 DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).resolve().parents[2] / "../shared/data"))
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from tests.epipolar.test_trifocal_estimation import (
     DATA,
@@ -19,8 +18,8 @@ from tests.epipolar.test_trifocal_estimation import (
     three_cameras,
 )
 from tests.geometry.properties import holds_for_every
-from thesisrecon.epipolar import TrifocalFit, TrifocalRansac, estimate_trifocal
-from thesisrecon.epipolar.six_point.kernels import (
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.six_point import (
     SAMPLE,
     draw_samples,
     reprojection_distances,
@@ -28,17 +27,22 @@ from thesisrecon.epipolar.six_point.kernels import (
     search,
     six_point,
 )
-from thesisrecon.epipolar.trifocal_estimation import NO_POINTS, NO_SEGMENTS, refine_trifocal
-from thesisrecon.epipolar.trifocal_ransac import line_distances_px, noise_of_tracks
-from thesisrecon.epipolar.trifocal_reprojection import _off_principal_planes
+from thesisrecon.epipolar.trifocal_estimation import (
+    NO_POINTS,
+    NO_SEGMENTS,
+    TrifocalFit,
+    _off_principal_planes,
+    estimate_trifocal,
+    refine_trifocal,
+)
+from thesisrecon.epipolar.trifocal_ransac import TrifocalRansac, line_distances_px, noise_of_tracks
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import camera_from_centre, decompose_camera, project
+from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera, project
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.three_view import tensor_from_cameras
 from thesisrecon.geometry.triangulation import triangulate_linear
-from thesisrecon.geometry.trifocal import tensor_from_cameras
-from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
+from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 
-F64 = NDArray[np.float64]
 SCALE = 1.0 / 300.0
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import SIZE, Pair, make_pair, spoil
-from thesisrecon.epipolar import PairVerification, estimate_fundamental
-from thesisrecon.epipolar.planarity import homography_share, plane_homographies
-from thesisrecon.geometry.camera import project
-from thesisrecon.geometry.multiview import homography_residuals
-from thesisrecon.types import FundamentalFit, Matches
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.verification import PairVerification, homography_inlier_ratio, plane_homographies
+from thesisrecon.geometry.camera_matrix import project
+from thesisrecon.geometry.two_view import homography_residuals
+from thesisrecon.records import FundamentalFit, Matches
 
 
 def as_matches(xy1, xy2) -> Matches:
@@ -38,20 +38,20 @@ def test_a_good_pair_keeps_its_inliers_and_is_accepted():
     np.testing.assert_array_equal(pair.index1, np.flatnonzero(fit.inliers))
     np.testing.assert_array_equal(pair.index2, 299 - np.flatnonzero(fit.inliers))
     assert len(pair.affine) == pair.inliers
-    assert pair.homography_share < 0.5
+    assert pair.homography_inlier_ratio < 0.5
     assert pair.configuration == "general"
     assert not pair.undetermined
-    assert pair.certainty is not None
+    assert pair.degeneracy is not None
 
 
 def test_a_plane_is_accepted_and_says_so():
     pair, _, _ = verified(make_pair(300, np.random.default_rng(1), planar=True), outliers=0.2)
     assert pair.accepted
-    assert pair.homography_share > 0.97
+    assert pair.homography_inlier_ratio > 0.97
     assert pair.configuration == "plane"
     assert pair.undetermined
-    assert pair.certainty is not None
-    assert "one homography explains the matches (plane)" in pair.certainty.reasons
+    assert pair.degeneracy is not None
+    assert "one homography explains the matches (plane)" in pair.degeneracy.reasons
 
 
 def test_a_turned_camera_is_a_homography_too():
@@ -61,7 +61,7 @@ def test_a_turned_camera_is_a_homography_too():
     moved = np.c_[scene.xy1, np.ones(200)] @ H.T
     turned = Pair(scene.xy1, moved[:, :2] / moved[:, 2:], scene.F, scene.P1, scene.P2)
     pair, _, _ = verified(turned, outliers=0.1)
-    assert pair.homography_share > 0.97
+    assert pair.homography_inlier_ratio > 0.97
     assert pair.undetermined
 
 
@@ -96,7 +96,7 @@ def test_share_of_a_dominant_plane_is_measured():
     X = rng.uniform((-1.2, -1.2, 3.8), (1.2, 1.2, 6.2), (60, 3))
     xy1 = np.r_[flat.xy1, project(flat.P1, X)]
     xy2 = np.r_[flat.xy2, project(flat.P2, X)]
-    share = homography_share(flat.F, xy1, xy2, tolerance_px=2.0, rng=np.random.default_rng(0))
+    share = homography_inlier_ratio(flat.F, xy1, xy2, tolerance_px=2.0, rng=np.random.default_rng(0))
     assert 0.69 < share < 0.8
 
 
@@ -116,9 +116,9 @@ def test_verification_is_the_same_every_time_and_safe_on_nothing():
         first, second = (
             PairVerification().verify(as_matches(xy, xy), fit, np.random.default_rng(0)) for _ in range(2)
         )
-        assert first.homography_share == second.homography_share
+        assert first.homography_inlier_ratio == second.homography_inlier_ratio
         assert first.configuration == second.configuration
-        assert np.isfinite(first.homography_share)
+        assert np.isfinite(first.homography_inlier_ratio)
         assert not first.accepted
 
 

@@ -5,10 +5,10 @@ import pytest
 from scipy.special import erf
 
 from tests.textures import photograph, texture
-from thesisrecon.features import CornerMeasure, HarrisCorners, MultiScaleCorners
-from thesisrecon.features.harris import select_spread
-from thesisrecon.features.measure import find_corners
-from thesisrecon.types import F64, Image
+from thesisrecon.arrays import F64
+from thesisrecon.features.harris import CornerMeasure, HarrisCorners, find_corners, select_spread
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.records import Image
 
 HARRIS = CornerMeasure(formula="harris", integration_sigma_px=1.0, integration_taps=9, colour=True)
 VARIANTS = [

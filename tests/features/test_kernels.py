@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordinates, maximum_filter
 
 from tests.textures import texture
+from thesisrecon.arrays import F32, F64
 from thesisrecon.features.kernels import (
     corner_response,
     fit_maxima,
@@ -13,7 +14,6 @@ from thesisrecon.features.kernels import (
     squared_suppression_radii,
 )
 from thesisrecon.geometry.raster import gaussian_taps
-from thesisrecon.types import F32, F64
 
 
 def moments_twin(channels: F32, derivative: F32, taps: F32) -> F64:

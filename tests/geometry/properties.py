@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.geometry.camera import calibration_matrix, camera_from_centre
-
-F64 = NDArray[np.float64]
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_centre
 
 
 def holds_for_every(*more: Any, examples: int = 30) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from tests.geometry.properties import gap, holds_for_every, random_camera, random_points
-from thesisrecon.geometry.camera import (
+from thesisrecon.geometry.camera_matrix import (
     back_project,
     calibration_matrix,
     camera_centre,
     camera_from_centre,
+    cheirality,
     compose_camera,
     decompose_camera,
+    depth,
     normalize_camera,
     principal_plane,
     principal_point,
@@ -20,7 +22,6 @@ from thesisrecon.geometry.camera import (
     project,
     project_camera,
 )
-from thesisrecon.geometry.cheirality import cheirality, depth
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.lines_and_planes import (
     incidence_sine,

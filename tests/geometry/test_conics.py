@@ -7,25 +7,23 @@ import pytest
 from hypothesis import strategies as st
 
 from tests.geometry.properties import gap, holds_for_every, random_camera, random_points
-from thesisrecon.geometry.absolute_conic import (
+from thesisrecon.geometry.conics import (
     ABSOLUTE_CONIC,
     ABSOLUTE_DUAL_QUADRIC,
     angle_between_pixels,
     angle_between_planes,
     calibration_from_dual_image,
     calibration_from_image,
-    dual_image_of_absolute_conic,
-    dual_quadric_of_plane,
-    image_of_absolute_conic,
-    image_of_infinity,
-    plane_at_infinity,
-)
-from thesisrecon.geometry.conics import (
     conic_through,
     dual,
+    dual_image_of_absolute_conic,
+    dual_quadric_of_plane,
     form,
+    image_of_absolute_conic,
+    image_of_infinity,
     incidence_residual,
     meet_line,
+    plane_at_infinity,
     project_dual_quadric,
     tangency_discriminant,
     tangent,

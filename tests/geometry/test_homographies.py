@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.geometry.properties import gap, holds_for_every, random_camera, random_points
-from thesisrecon.geometry.camera import camera_centre, project
+from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.homographies import (
     compatibility_residual,
@@ -20,7 +20,8 @@ from thesisrecon.geometry.homographies import (
     second_camera,
 )
 from thesisrecon.geometry.lines_and_planes import incidence_sine, plane_through
-from thesisrecon.geometry.multiview import (
+from thesisrecon.geometry.strata import random_transform, transform_cameras, transform_planes
+from thesisrecon.geometry.two_view import (
     canonical_cameras,
     epipolar_lines,
     epipoles,
@@ -28,7 +29,6 @@ from thesisrecon.geometry.multiview import (
     homography_residuals,
     symmetric_residuals,
 )
-from thesisrecon.geometry.strata import random_transform, transform_cameras, transform_planes
 
 
 def _canonical(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.epipolar.pairs import angle_between, make_pair
-from thesisrecon.geometry.camera import camera_centre, project
+from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
-from thesisrecon.geometry.multiview import (
+from thesisrecon.geometry.two_view import (
     algebraic_residuals,
     canonical_cameras,
     enforce_rank_two,

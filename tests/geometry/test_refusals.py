@@ -6,26 +6,32 @@ import numpy as np
 import pytest
 
 from thesisrecon.geometry import strata
-from thesisrecon.geometry.absolute_conic import image_of_absolute_conic, plane_at_infinity
-from thesisrecon.geometry.alignment import estimate_similarity
-from thesisrecon.geometry.camera import back_project, decompose_camera, normalize_camera
-from thesisrecon.geometry.conics import curvature_sign, dual, meet_line, tangents_from
+from thesisrecon.geometry.camera_matrix import back_project, decompose_camera, normalize_camera
+from thesisrecon.geometry.conics import (
+    curvature_sign,
+    dual,
+    image_of_absolute_conic,
+    meet_line,
+    plane_at_infinity,
+    tangents_from,
+)
 from thesisrecon.geometry.homogeneous import normalizing_transform
 from thesisrecon.geometry.homographies import infinite_homography, plane_homography
-from thesisrecon.geometry.multiview import (
+from thesisrecon.geometry.optimal_triangulation import correct_matches
+from thesisrecon.geometry.resection import resect_linear
+from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.three_view import (
+    fundamentals_from_tensor,
+    tensor_from_cameras,
+    transfer_lines,
+    transform_tensor,
+)
+from thesisrecon.geometry.two_view import (
     canonical_cameras,
     enforce_rank_two,
     epipoles,
     estimate_homography,
     fundamental_from_cameras,
-)
-from thesisrecon.geometry.optimal_triangulation import correct_matches
-from thesisrecon.geometry.resection import resect_linear
-from thesisrecon.geometry.trifocal import (
-    fundamentals_from_tensor,
-    tensor_from_cameras,
-    transfer_lines,
-    transform_tensor,
 )
 
 RNG = np.random.default_rng(0)

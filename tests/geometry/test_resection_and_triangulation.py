@@ -8,8 +8,16 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, projective_reconstruction
-from thesisrecon.geometry.camera import camera_centre, decompose_camera, distort, project, undistort
-from thesisrecon.geometry.cheirality import cheirality, depth, orient_signs
+from thesisrecon.geometry.camera_matrix import (
+    camera_centre,
+    cheirality,
+    decompose_camera,
+    depth,
+    distort,
+    orient_signs,
+    project,
+    undistort,
+)
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
 from thesisrecon.geometry.triangulation import triangulate, triangulate_linear, triangulate_observations
 

@@ -7,21 +7,17 @@ import pytest
 from hypothesis import strategies as st
 
 from tests.geometry.properties import gap, holds_for_every, random_camera, random_points
-from thesisrecon.geometry.absolute_conic import ABSOLUTE_CONIC, ABSOLUTE_DUAL_QUADRIC, plane_at_infinity
-from thesisrecon.geometry.camera import camera_centre
-from thesisrecon.geometry.conics import curvature_sign, dual, incidence_residual, tangent
-from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.geometry.invariants import (
-    angle,
-    centroid,
-    cross_ratio,
-    length,
-    length_ratio,
-    parallelism_sine,
-    segment_ratio,
-    volume,
-    volume_ratio,
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.conics import (
+    ABSOLUTE_CONIC,
+    ABSOLUTE_DUAL_QUADRIC,
+    curvature_sign,
+    dual,
+    incidence_residual,
+    plane_at_infinity,
+    tangent,
 )
+from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.lines_and_planes import (
     dual_line,
     incidence_sine,
@@ -34,15 +30,24 @@ from thesisrecon.geometry.strata import (
     PLANE_AT_INFINITY,
     affine_from_projective,
     affine_transform,
+    angle,
+    centroid,
+    cross_ratio,
     group_of,
+    length,
+    length_ratio,
     metric_from_affine,
     metric_from_projective,
+    parallelism_sine,
     random_transform,
+    segment_ratio,
     transform_cameras,
     transform_conics,
     transform_dual_conics,
     transform_planes,
     transform_points,
+    volume,
+    volume_ratio,
 )
 
 groups = st.sampled_from(list(DEGREES_OF_FREEDOM))

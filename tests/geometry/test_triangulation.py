@@ -5,28 +5,30 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import thesisrecon
 from tests.geometry import triangulation_twins as twins
 from tests.geometry.properties import holds_for_every, random_camera
-from thesisrecon.geometry.camera import camera_centre, compose_camera, project
-from thesisrecon.geometry.kernels import jacobi_least, reduce_reprojection
-from thesisrecon.geometry.multiview import fundamental_from_cameras
-from thesisrecon.geometry.optimal_triangulation import correct_matches
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import camera_centre, compose_camera, project
+from thesisrecon.geometry.optimal_triangulation import (
+    correct_matches,
+    roots_in_unit_interval,
+    triangulate_polynomial,
+)
 from thesisrecon.geometry.triangulation import (
+    jacobi_least,
+    reduce_reprojection,
     triangulate,
     triangulate_iterated,
     triangulate_linear,
     triangulate_midpoint,
     triangulate_observations,
     triangulate_optimal,
-    triangulate_polynomial,
 )
-from thesisrecon.geometry.two_view.kernels import roots_in_unit_interval
+from thesisrecon.geometry.two_view import fundamental_from_cameras
 
-F64 = NDArray[np.float64]
 METHODS = ["polynomial", "linear", "midpoint", "iterated", "optimal"]
 KINDS = [
     "general",

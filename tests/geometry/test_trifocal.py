@@ -9,13 +9,13 @@ import pytest
 from hypothesis import strategies as st
 
 from tests.geometry.properties import gap, holds_for_every, random_camera
-from thesisrecon.geometry.camera import camera_centre, project
+from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
-from thesisrecon.geometry.multiview import fundamental_from_cameras, symmetric_residuals
 from thesisrecon.geometry.strata import random_transform, transform_cameras
-from thesisrecon.geometry.trifocal import (
+from thesisrecon.geometry.three_view import (
     cameras_from_tensor,
+    estimate_tensor_linear,
     fundamentals_from_tensor,
     incidences,
     line_residuals,
@@ -23,6 +23,7 @@ from thesisrecon.geometry.trifocal import (
     point_transfer_homography,
     reordered_tensor,
     tensor_epipoles,
+    tensor_equations,
     tensor_from_cameras,
     transfer_by_epipolar_lines,
     transfer_lines,
@@ -31,7 +32,7 @@ from thesisrecon.geometry.trifocal import (
     transform_tensor,
     unit_tensor,
 )
-from thesisrecon.geometry.trifocal_linear import estimate_tensor_linear, tensor_equations
+from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_residuals
 
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 

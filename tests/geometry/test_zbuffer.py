@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from thesisrecon.arrays import F64, I64
+from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.pinhole import PinholeCamera
 from thesisrecon.geometry.zbuffer import Raster, rasterize
-from thesisrecon.types import F64, I64
 
 K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])
 SIZE = (64, 48)
@@ -21,7 +21,7 @@ def soup(rng: np.random.Generator, count: int = 60) -> tuple[F64, I64]:
     return vertices, np.arange(3 * count).reshape(-1, 3)
 
 
-def cast_rays(vertices: F64, faces: I64, camera: PinholeCamera) -> tuple[F64, I64]:
+def cast_rays(vertices: F64, faces: I64, camera: Camera) -> tuple[F64, I64]:
     """Depth (H, W) and face by intersecting every ray with every triangle: the plain twin."""
     width, height = camera.size
     y, x = np.mgrid[:height, :width]
@@ -40,12 +40,12 @@ def cast_rays(vertices: F64, faces: I64, camera: PinholeCamera) -> tuple[F64, I6
     return depth.reshape(height, width), face.reshape(height, width)
 
 
-def camera_at(rng: np.random.Generator, distance: float = 0.0) -> PinholeCamera:
+def camera_at(rng: np.random.Generator, distance: float = 0.0) -> Camera:
     angle = rng.normal(0.0, 0.2, 3)
     turn = np.array([[0, -angle[2], angle[1]], [angle[2], 0, -angle[0]], [-angle[1], angle[0], 0]])
     R = np.linalg.qr(np.eye(3) + turn)[0]
     R *= np.sign(np.diag(R))[None, :]
-    return PinholeCamera(K, R * np.sign(np.linalg.det(R)), np.array([0.1, -0.2, distance]), SIZE)
+    return Camera(K, R * np.sign(np.linalg.det(R)), np.array([0.1, -0.2, distance]), SIZE)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -67,7 +67,7 @@ def test_what_is_seen_is_what_rays_meet(seed: int, distance: float) -> None:
 def test_the_unit_of_length_changes_nothing(unit: float) -> None:
     vertices, faces = soup(np.random.default_rng(6))
     camera = camera_at(np.random.default_rng(7), -4.5)
-    other = PinholeCamera(camera.K, camera.R, unit * camera.t, SIZE)
+    other = Camera(camera.K, camera.R, unit * camera.t, SIZE)
     one, scaled = rasterize(vertices, faces, camera), rasterize(unit * vertices, faces, other)
     assert (one.face >= 0).mean() > 0.1
     np.testing.assert_array_equal(scaled.face, one.face)
@@ -94,7 +94,7 @@ def test_no_crack_opens_between_faces() -> None:
     vertices = np.stack([8 * u - 4, 8 * v - 4, 4 + rng.normal(0, 0.05, u.shape)], axis=-1).reshape(-1, 3)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
-    assert (rasterize(vertices, faces, PinholeCamera(K, np.eye(3), np.zeros(3), SIZE)).face >= 0).all()
+    assert (rasterize(vertices, faces, Camera(K, np.eye(3), np.zeros(3), SIZE)).face >= 0).all()
 
 
 def test_threads_change_nothing() -> None:
@@ -107,7 +107,7 @@ def test_threads_change_nothing() -> None:
 
 def test_a_camera_is_that_of_its_matrix() -> None:
     camera = camera_at(np.random.default_rng(4), 1.0)
-    again = PinholeCamera.from_matrix(-3.0 * camera.P, SIZE)
+    again = Camera.from_matrix(-3.0 * camera.P, SIZE)
     np.testing.assert_allclose(again.P, camera.P, atol=1e-9)
     np.testing.assert_allclose(camera.P @ np.append(camera.centre, 1.0), 0.0, atol=1e-9)
     xy = homogenize(np.array([[0.3, -0.1, 4.0]])) @ camera.P.T

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-F64 = NDArray[np.float64]
+from thesisrecon.arrays import F64
 
 
 def reprojection_costs(P: F64, X: F64, xy: F64) -> F64:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from tests.hostile import files
-from thesisrecon.cli import run_command
+from thesisrecon.cli.main import run_command
 from validation.command import main as run_validation
 
 GROWTH_MB = 600

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from thesisrecon.errors import UsageError
-from thesisrecon.io.cameras import read_cameras
+from thesisrecon.io.exports import read_cameras
 
 ONE = {
     "name": "a.jpg",
     "width": 160,
     "height": 120,
     "K": [[150.0, 0, 79.5], [0, 151.0, 59.5], [0, 0, 1]],
-    "radial": [-0.05, 0, 0],
+    "distortion": [-0.05, 0, 0],
     "R": np.eye(3).tolist(),
     "t": [0.1, 0.2, 3.0],
     "centre": [-0.1, -0.2, -3.0],

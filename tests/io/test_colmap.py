@@ -11,16 +11,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import compose_camera, project_camera
-from thesisrecon.io.colmap import (
-    ColmapModel,
-    ColmapPoints,
-    colmap_from_reconstruction,
-    read_colmap_model,
-    reconstruction_from_colmap,
-    write_colmap_model,
-)
-from thesisrecon.types import Reconstruction, Tracks
+from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.io.colmap import colmap_from_reconstruction, reconstruction_from_colmap
+from thesisrecon.io.colmap_files import read_colmap_model, write_colmap_model
+from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints
+from thesisrecon.records import Reconstruction, Tracks
 
 V, N = 5, 40
 NAMES = ["a b.jpg", "böld.jpg", "c.jpg", "d.jpg", "e.jpg"]
@@ -39,7 +34,7 @@ def _scene(*, k1: float = 0.0, aspect: float = 1.0, noise_px: float = 0.3) -> Re
     view, point = (grid.ravel() for grid in np.meshgrid(np.arange(V), np.arange(N)))
     xy = np.array(
         [
-            project_camera(K[i], R[i], t[i], X[j : j + 1, :3], radial=k1)[0]
+            project_camera(K[i], R[i], t[i], X[j : j + 1, :3], distortion=k1)[0]
             for i, j in zip(view, point, strict=True)
         ]
     )
@@ -56,7 +51,7 @@ def _scene(*, k1: float = 0.0, aspect: float = 1.0, noise_px: float = 0.3) -> Re
         sigma_px=noise_px,
         reasons=tuple("" if known else "too few points" for known in registered),
         K=np.where(registered[:, None, None], K, 0.0),
-        radial=np.tile([k1, 0.0, 0.0], (V, 1)),
+        distortion=np.tile([k1, 0.0, 0.0], (V, 1)),
     )
 
 
@@ -108,7 +103,7 @@ def test_pycolmap_projects_as_we_do(
         pose = np.linalg.solve(ours.K[i], ours.P[i])
         for seen in image.points2D:
             j = seen.point3D_id - 1
-            xy = project_camera(ours.K[i], pose[:, :3], pose[:, 3], ours.X[j : j + 1, :3], radial=k1)[0]
+            xy = project_camera(ours.K[i], pose[:, :3], pose[:, 3], ours.X[j : j + 1, :3], distortion=k1)[0]
             projected = image.project_point(theirs.points3D[j + 1].xyz)
             np.testing.assert_allclose(projected, (xy + 0.5) * scale, atol=1e-6, rtol=0)
             k = int(j * V + i)
@@ -200,9 +195,9 @@ def test_import_gives_back_what_was_exported(tmp_path: Path) -> None:
     assert ours.K is not None
     assert back.K is not None
     np.testing.assert_allclose(back.K, ours.K, atol=1e-10)
-    assert back.radial is not None
-    np.testing.assert_array_equal(back.radial[:, 0], np.where(ours.registered, -0.08, 0.0))
-    assert not back.radial[:, 1:].any()
+    assert back.distortion is not None
+    np.testing.assert_array_equal(back.distortion[:, 0], np.where(ours.registered, -0.08, 0.0))
+    assert not back.distortion[:, 1:].any()
     assert back.reasons[3] == "not in the COLMAP model"
     assert back.sigma_px == pytest.approx(0.3, rel=0.3)
     kept = ours.inlier & ours.registered[ours.tracks.view_index] & ours.valid[ours.tracks.point_index]
@@ -290,30 +285,30 @@ def test_import_refuses_distortion_it_has_no_camera_for() -> None:
         reconstruction_from_colmap(replace(model, cameras=(tangential,)))
     harmless = replace(model.cameras[0], model="RADIAL", params=(500.0, 250.0, 200.0, 0.1, 0.0))
     back = reconstruction_from_colmap(replace(model, cameras=(harmless,)))
-    assert back.radial is not None
-    np.testing.assert_array_equal(back.radial[0], [0.1, 0.0, 0.0])
+    assert back.distortion is not None
+    np.testing.assert_array_equal(back.distortion[0], [0.1, 0.0, 0.0])
     with pytest.raises(ValueError, match="names must hold"):
         reconstruction_from_colmap(model, names=["other.jpg"])
 
 
 def test_a_lens_of_three_coefficients_goes_out_and_comes_back(tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
-    ours = replace(_scene(), radial=np.tile([-0.1, 0.05, -0.02], (V, 1)))
+    ours = replace(_scene(), distortion=np.tile([-0.1, 0.05, -0.02], (V, 1)))
     model = _plain_names(_export(ours))
     assert {camera.model for camera in model.cameras} == {"FULL_OPENCV"}
     write_colmap_model(tmp_path, model)
     theirs = pycolmap.Reconstruction(tmp_path)
     assert ours.K is not None
-    assert ours.radial is not None
+    assert ours.distortion is not None
     for i in np.flatnonzero(ours.registered):
         pose = np.linalg.solve(ours.K[i], ours.P[i])
         X = ours.X[ours.valid, :3]
-        xy = project_camera(ours.K[i], pose[:, :3], pose[:, 3], X, radial=ours.radial[i])
+        xy = project_camera(ours.K[i], pose[:, :3], pose[:, 3], X, distortion=ours.distortion[i])
         projected = [theirs.images[int(i) + 1].project_point(x) for x in X]
         np.testing.assert_allclose(projected, xy + 0.5, atol=1e-6, rtol=0)
     back = reconstruction_from_colmap(model)
-    assert back.radial is not None
-    np.testing.assert_allclose(back.radial[0], ours.radial[0])
+    assert back.distortion is not None
+    np.testing.assert_allclose(back.distortion[0], ours.distortion[0])
 
 
 def test_writing_refuses_an_inconsistent_model(tmp_path: Path) -> None:

@@ -19,19 +19,19 @@ from tests.hostile.files import glb, require_sentence, triangle
 from tests.io.test_colmap import _SMALL, _plain_names
 from tests.io.test_images import picture
 from tests.io.test_meshes import roof
-from tests.io.test_run_directory import some_metric
-from thesisrecon.cli import run_command
+from tests.runtime.test_run_folder import some_metric
+from thesisrecon.cli.main import run_command
 from thesisrecon.config import PipelineConfig, config_from_tables, config_from_toml, toml_from_config
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.cameras import read_cameras
-from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap, write_colmap_model
-from thesisrecon.io.files import read_json
+from thesisrecon.io.colmap import reconstruction_from_colmap
+from thesisrecon.io.colmap_files import read_colmap_model, write_colmap_model
+from thesisrecon.io.exports import read_cameras
+from thesisrecon.io.files import read_json, read_text
 from thesisrecon.io.images import read_photographs
+from thesisrecon.io.lists import read_pairs
 from thesisrecon.io.meshes import read_mesh, write_mesh
-from thesisrecon.io.pairs import read_pairs
-from thesisrecon.io.records import ChangedRecord, bytes_from_record, read_record
-from thesisrecon.io.run_directory import StageFolder
-from thesisrecon.io.text import read_text
+from thesisrecon.runtime.record_files import ChangedRecord, bytes_from_record, read_record
+from thesisrecon.runtime.run_folder import StageFolder
 
 few = settings(
     derandomize=True,

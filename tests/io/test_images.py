@@ -13,7 +13,7 @@ import pytest
 
 from thesisrecon.errors import UsageError
 from thesisrecon.io.images import list_images, read_photographs, scene_name
-from thesisrecon.types import Image
+from thesisrecon.records import Image
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (96, 80)) -> np.ndarray:

@@ -11,7 +11,7 @@ import trimesh
 
 from thesisrecon.errors import UsageError
 from thesisrecon.io.meshes import read_mesh, unmerged, write_mesh
-from thesisrecon.types import TexturedMesh
+from thesisrecon.records import TexturedMesh
 
 
 def roof() -> TexturedMesh:

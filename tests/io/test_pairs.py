@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from thesisrecon.errors import UsageError
-from thesisrecon.io.pairs import read_pairs
+from thesisrecon.io.lists import read_pairs
 
 
 def test_names_with_and_without_blanks(tmp_path: Path) -> None:

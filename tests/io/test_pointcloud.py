@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from thesisrecon.io.pointcloud import write_point_cloud
+from thesisrecon.io.exports import write_point_cloud
 
 
 def test_another_reader_finds_points_and_colours(tmp_path: Path) -> None:

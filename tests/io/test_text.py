@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from thesisrecon.errors import UsageError
-from thesisrecon.io.text import printable, read_bytes, read_text, shortened, without_middle
+from thesisrecon.io.files import printable, read_bytes, read_text, shortened, without_middle
 
 
 @pytest.mark.parametrize(

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from tests.textures import disparity, photograph, sideways_fundamental, stereo_scene, texture
 from thesisrecon import match_pair
+from thesisrecon.arrays import F64, U8
 from thesisrecon.config import preset
 from thesisrecon.errors import StageFailure
-from thesisrecon.features import HarrisCorners, MultiScaleCorners
-from thesisrecon.matching import SeedsAndGrowth, StrengthOfMatch
-from thesisrecon.types import F64, TwoView
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.matching.growth import SeedsAndGrowth
+from thesisrecon.matching.strength import StrengthOfMatch
+from thesisrecon.records import TwoView
 
-U8 = NDArray[np.uint8]
 SHAPE = (300, 420)
 PRESETS = pytest.mark.parametrize("name", ["default", "thesis"])
 

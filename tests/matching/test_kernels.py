@@ -5,22 +5,16 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.textures import disparity, photograph, stereo_scene, texture
-from thesisrecon.features import HarrisCorners, MultiScaleCorners
-from thesisrecon.matching.kernels import (
-    align_windows,
-    chain_maps,
-    corner_patches,
-    displacement_weight,
-    fit_local_affines,
-    grow_corners,
-    relative_difference_weight,
-    scan_correlations,
-    strength_of_match,
-    unite,
-    update_column_best,
-)
-from thesisrecon.matching.prepared import PreparedView, prepare_view
-from thesisrecon.types import F64, I64, Features, Image
+from thesisrecon.arrays import F64, I64
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.matching.alignment import align_windows
+from thesisrecon.matching.growth import fit_local_affines, grow_corners
+from thesisrecon.matching.prepared import PreparedView, corner_patches, prepare_view
+from thesisrecon.matching.seeds import scan_correlations, update_column_best
+from thesisrecon.matching.strength import displacement_weight, relative_difference_weight, strength_of_match
+from thesisrecon.matching.tracks import chain_maps, unite
+from thesisrecon.records import Features, Image
 
 RNG = np.random.default_rng(0)
 
@@ -38,12 +32,12 @@ def prepared(gray: F64) -> PreparedView:
 def test_scan_equals_its_numpy_twin() -> None:
     correlation = RNG.uniform(-1, 1, (40, 60)).astype(np.float32)
     xy = RNG.uniform(0, 50, (60, 2)).astype(np.float32)
-    index, value, rival = scan_correlations(correlation, xy, np.full(60, 15.0**2, np.float32))
+    index, value, competing_model = scan_correlations(correlation, xy, np.full(60, 15.0**2, np.float32))
     best = correlation.argmax(axis=1)
     elsewhere = ((xy[None] - xy[best][:, None]) ** 2).sum(-1) > 15.0**2
     assert np.array_equal(index, best)
     assert np.array_equal(value, correlation.max(axis=1))
-    assert np.allclose(rival, np.where(elsewhere, correlation, -1.0).max(axis=1))
+    assert np.allclose(competing_model, np.where(elsewhere, correlation, -1.0).max(axis=1))
 
 
 def test_column_best_over_blocks_equals_the_best_of_all_rows() -> None:
@@ -108,7 +102,7 @@ def test_growth_equals_its_numpy_twin() -> None:
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     affine, radius = np.tile(np.eye(2), (len(xy1), 1, 1)), np.full(len(xy1), 12.0)
     place = xy1 - (14.0, 0.0)
-    index, score, rival = grow_corners(
+    index, score, competing_model = grow_corners(
         one.pyramid,
         (xy1, one.features.scale),
         (affine, place, radius),
@@ -128,7 +122,7 @@ def test_growth_equals_its_numpy_twin() -> None:
     assert np.abs(score[inside] - np.where(expected >= 0, twin.max(axis=1), 0.0)[inside]).max() < 1e-4
     elsewhere = allowed & (np.linalg.norm(xy2[expected][:, None] - xy2[None], axis=2) > 3.0)
     second = np.where(elsewhere & (expected >= 0)[:, None], correlation, -1.0).max(axis=1)
-    assert np.abs(rival[inside] - second[inside]).max() < 1e-4
+    assert np.abs(competing_model[inside] - second[inside]).max() < 1e-4
 
 
 @pytest.mark.parametrize("affine_std", [0.0, 0.1])

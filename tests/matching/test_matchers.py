@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 
 from tests.textures import disparity, photograph, sideways_fundamental, stereo_scene, texture
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.features import HarrisCorners, MultiScaleCorners
-from thesisrecon.matching import PreparedView, SeedsAndGrowth, StrengthOfMatch
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.matching.growth import SeedsAndGrowth
+from thesisrecon.matching.prepared import PreparedView
 from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
-from thesisrecon.types import F64, FundamentalFit, Image, Matches
+from thesisrecon.matching.strength import StrengthOfMatch
+from thesisrecon.records import FundamentalFit, Image, Matches
 
 Detector = HarrisCorners | MultiScaleCorners
 Variant = SeedsAndGrowth | StrengthOfMatch

@@ -18,14 +18,25 @@ from scipy.sparse.csgraph import connected_components
 from tests.textures import photograph, texture
 from thesisrecon.config import PairSelector
 from thesisrecon.errors import UsageError
-from thesisrecon.features import HarrisCorners, MultiScaleCorners
-from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
-from thesisrecon.matching.pair_selection.estimate import bridges, most_alike
-from thesisrecon.matching.pair_selection.kernels import most_agreeing, mutual_best
-from thesisrecon.matching.pair_selection.overlap import OverlapTest, sketch_seeds
-from thesisrecon.matching.pair_selection.records import pair_array
-from thesisrecon.matching.pair_selection.words import likeness
-from thesisrecon.types import Features, PairChoice
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.matching.overlap import (
+    OverlapTest,
+    bow_similarity,
+    most_agreeing,
+    mutual_best,
+    pair_array,
+    subset_seeds,
+)
+from thesisrecon.matching.pair_selection import (
+    AllPairs,
+    ListedPairs,
+    OverlapEstimate,
+    SequenceWindow,
+    connecting_pairs,
+    most_alike,
+)
+from thesisrecon.records import Features, PairChoice
 
 SIDE, CROPS = 260, 14
 NO_FEATURES = Features(np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0, np.float32))
@@ -192,17 +203,19 @@ def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows: Windows)
     assert other is not None
     strange = [f.seeds for f in windows.features]
     for kind, least in ((True, 20.0), (False, -10.0)):
-        test, sketch = OverlapTest(), sketch_seeds(one, turned=kind, per_scale=200)
-        assert test.score(sketch, sketch_seeds(other, turned=kind, per_scale=200)) > least
+        test, sketch = OverlapTest(), subset_seeds(one, turned=kind, per_scale=200)
+        assert test.score(sketch, subset_seeds(other, turned=kind, per_scale=200)) > least
         assert test.score(sketch, sketch) > 20.0
         # The number of false alarms bounds how often chance reaches an evidence.
-        chance = [test.score(sketch, sketch_seeds(s, turned=kind, per_scale=200)) for s in strange if s]
+        chance = [test.score(sketch, subset_seeds(s, turned=kind, per_scale=200)) for s in strange if s]
         assert max(chance) < 2.0
 
 
 def test_photographs_of_one_wall_use_the_same_words(windows: Windows) -> None:
-    sketches = [sketch_seeds(f.seeds, turned=False, per_scale=200) for f in windows.features if f.seeds]
-    alike = likeness([s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0))
+    sketches = [subset_seeds(f.seeds, turned=False, per_scale=200) for f in windows.features if f.seeds]
+    alike = bow_similarity(
+        [s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
+    )
     np.testing.assert_allclose(alike, alike.T, atol=1e-12)
     np.testing.assert_allclose(np.diag(alike), 1.0)
     pairs = list(combinations(range(CROPS), 2))
@@ -232,7 +245,7 @@ def test_bridges_join_what_is_apart_by_the_best_pairs_and_nothing_else(n: int, s
     order += order.T
     every = list(combinations(range(n), 2))
     chosen = pair_array([pair for pair in every if rng.random() < 0.2])
-    added = bridges(chosen, order)
+    added = connecting_pairs(chosen, order)
     parts, part = _parts(n, chosen)
     assert len(added) == parts - 1
     assert _parts(n, np.concatenate([chosen, added]))[0] == 1
@@ -250,8 +263,8 @@ def mutual_best_numpy(correlation: Any, xy2: Any, apart2: Any) -> tuple[np.ndarr
     best, back = correlation.argmax(axis=1), correlation.argmax(axis=0)
     mutual = back[best] == np.arange(len(best))
     apart = ((xy2[None] - xy2[best][:, None]) ** 2).sum(axis=2) > apart2[best][:, None]
-    rival = np.where(apart, correlation, -1.0).max(axis=1)
-    return np.where(mutual, best, -1), np.where(mutual, rival, -1.0)
+    competing_model = np.where(apart, correlation, -1.0).max(axis=1)
+    return np.where(mutual, best, -1), np.where(mutual, competing_model, -1.0)
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
@@ -260,10 +273,10 @@ def test_mutual_best_is_its_numpy_twin(rows: int, columns: int, seed: int) -> No
     correlation = rng.uniform(-1.0, 1.0, (rows, columns)).astype(np.float32)
     xy2 = rng.uniform(0.0, 10.0, (columns, 2)).astype(np.float32)
     apart2 = rng.uniform(0.0, 40.0, columns).astype(np.float32)
-    index, rival = mutual_best(correlation, xy2, apart2)
+    index, competing_model = mutual_best(correlation, xy2, apart2)
     wanted, wanted_rival = mutual_best_numpy(correlation, xy2, apart2)
     assert index.tolist() == wanted.tolist()
-    np.testing.assert_array_equal(rival, wanted_rival.astype(np.float32))
+    np.testing.assert_array_equal(competing_model, wanted_rival.astype(np.float32))
 
 
 def most_agreeing_numpy(xy1: Any, xy2: Any, scale: Any, angle: Any, limits: Any) -> int:

@@ -5,9 +5,12 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.textures import photograph, sideways_fundamental, texture
-from thesisrecon.features import MultiScaleCorners
-from thesisrecon.matching import AlignedTracks, PlainTracks, PreparedView, SeedsAndGrowth
-from thesisrecon.types import F64, TwoView
+from thesisrecon.arrays import F64
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.matching.growth import SeedsAndGrowth
+from thesisrecon.matching.prepared import PreparedView
+from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
+from thesisrecon.records import TwoView
 
 SHIFTS = np.array([[0.0, 0.0], [7.3, 0.0], [15.6, 0.0], [24.1, 0.0]])
 

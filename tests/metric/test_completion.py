@@ -8,10 +8,10 @@ import numpy as np
 
 from tests.metric.test_population import true_calibration
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
-from thesisrecon.geometry.camera import project_camera
-from thesisrecon.metric import UpgradeAndBundle
-from thesisrecon.types import MetricResult, Reconstruction
+from thesisrecon.geometry.camera_matrix import project_camera
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.records import MetricResult, Reconstruction
 
 
 def refine(scene: TrueScene, *, start: Reconstruction | None = None, cameras: str = "shared") -> MetricResult:
@@ -19,23 +19,23 @@ def refine(scene: TrueScene, *, start: Reconstruction | None = None, cameras: st
     wish = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")
     rng = np.random.default_rng(0)
     assumed = assume(start, wish)
-    return UpgradeAndBundle().refine(start, true_calibration(scene), assumed=assumed, rng=rng)
+    return MetricRefinement().refine(start, true_calibration(scene), assumed=assumed, rng=rng)
 
 
 def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it() -> None:
     scene = make_scene(points=500, seed=2)
-    radial, t = np.array([-0.03, 0.02, -0.02]), scene.tracks
+    distortion, t = np.array([-0.03, 0.02, -0.02]), scene.tracks
     xy = np.empty_like(t.xy)
     for v in range(t.n_views):
         mine = t.view_index == v
         X = scene.X[t.point_index[mine]]
-        xy[mine] = project_camera(scene.K[v], scene.R[v], scene.t[v], X, radial=radial)
+        xy[mine] = project_camera(scene.K[v], scene.R[v], scene.t[v], X, distortion=distortion)
     xy += 0.05 * np.random.default_rng(0).normal(size=xy.shape)
     result = refine(replace(scene, tracks=replace(t, xy=xy)))
     r = np.linspace(0.1, 0.6, 20)
     powers = np.stack([r**2, r**4, r**6])
-    assert result.reconstruction.radial is not None
-    np.testing.assert_allclose(result.reconstruction.radial[0] @ powers, radial @ powers, atol=1e-3)
+    assert result.reconstruction.distortion is not None
+    np.testing.assert_allclose(result.reconstruction.distortion[0] @ powers, distortion @ powers, atol=1e-3)
     focal = result.intrinsics[0]["focal_px"]
     assert abs(focal.value - 1500.0) < 4.0 * focal.std < 6.0
 

@@ -9,19 +9,18 @@ import pytest
 
 from tests.metric.test_population import true_calibration
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
-from thesisrecon.metric import UpgradeAndBundle
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
 from thesisrecon.metric.adjustment import tail_width
-from thesisrecon.metric.model_error import model_error_share
-from thesisrecon.metric.population import Borrowing
-from thesisrecon.optimize.bundle_blocks import BlockScatter
-from thesisrecon.types import MetricResult
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.metric.uncertainty import Borrowing, model_error_share
+from thesisrecon.numerics.block_scatter import BlockScatter
+from thesisrecon.records import MetricResult
 
 
 def refine(scene: TrueScene) -> MetricResult:
     start = projective_reconstruction(scene)
     rng = np.random.default_rng(0)
-    return UpgradeAndBundle().refine(start, true_calibration(scene), assumed=assume(start), rng=rng)
+    return MetricRefinement().refine(start, true_calibration(scene), assumed=assume(start), rng=rng)
 
 
 def test_deviations_are_of_the_stated_size_on_normal_noise() -> None:
@@ -82,7 +81,7 @@ def test_what_else_is_estimated_has_an_interval_that_holds_it() -> None:
     scene = make_scene(sigma_px=0.5, points=300, seed=2)
     start = projective_reconstruction(scene)
     wish = IntrinsicsAssumption(aspect="constant", skew="constant", skew_std_px=50.0)
-    found = UpgradeAndBundle().refine(
+    found = MetricRefinement().refine(
         start, true_calibration(scene), assumed=assume(start, wish), rng=np.random.default_rng(0)
     )
     for name, truth in (("aspect", 1.0), ("skew_px", 0.0), ("k2", 0.0), ("k3", 0.0)):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
-from thesisrecon.metric import UpgradeAndBundle
-from thesisrecon.metric.population import OwnValues, estimate_population, measured_spread, outlying
-from thesisrecon.types import MetricResult, SelfCalibration, Upgrade
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.metric.uncertainty import OwnValues, estimate_population, measured_spread, outlying
+from thesisrecon.records import MetricResult, SelfCalibration, Upgrade
 
 
 def true_calibration(scene: TrueScene) -> SelfCalibration:
@@ -27,7 +27,7 @@ def refine(scene: TrueScene, *, alike: bool = True) -> MetricResult:
     start = projective_reconstruction(scene)
     assumed = assume(start, IntrinsicsAssumption(cameras="per-image", alike=alike))
     rng = np.random.default_rng(0)
-    return UpgradeAndBundle().refine(start, true_calibration(scene), assumed=assumed, rng=rng)
+    return MetricRefinement().refine(start, true_calibration(scene), assumed=assumed, rng=rng)
 
 
 def with_few_points(scene: TrueScene, view: int, count: int) -> TrueScene:

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
 from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.model import MetricModel, project_observations, retriangulate
-from thesisrecon.metric.prior_check import centre_of_a_bent_model, contradicted_focals
-from thesisrecon.metric.self_check import self_check
-from thesisrecon.metric.start import camera_rows
-from thesisrecon.metric.view_checks import check_views, within_reach
-from thesisrecon.optimize.bundle_blocks import BlockScatter
-from thesisrecon.optimize.metric_bundle import MetricCameras
-from thesisrecon.types import Assumptions, IntrinsicInterval, SelfCalibration, Tracks
+from thesisrecon.metric.checks import check_views, self_check, within_reach
+from thesisrecon.metric.model import MetricModel, camera_rows, project_observations, retriangulate
+from thesisrecon.metric.shared_camera import centre_of_a_bent_model, contradicted_focals
+from thesisrecon.numerics.block_scatter import BlockScatter
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.records import Assumptions, IntrinsicInterval, SelfCalibration, Tracks
 
 SIGMAS, ANGLE = 7.0, 1e-3
 
@@ -54,8 +52,8 @@ def setting(**known: object) -> tuple[TrueScene, Assumptions, MetricModel]:
 
 def test_a_right_model_is_not_doubted() -> None:
     scene, _, model = setting()
-    check, doubts = doubts_of(model, scene)
-    assert doubts == []
+    check, failed_checks = doubts_of(model, scene)
+    assert failed_checks == []
     assert check["confirmed_share_worst_view"] > 0.95
     assert check["noise_ratio_worst_view"] < 1.5
 
@@ -66,9 +64,9 @@ def test_a_camera_that_stands_elsewhere_is_named(view: int) -> None:
     t = model.cameras.t.copy()
     t[view] += [0.4, -0.3, 0.2]
     spoiled = retriangulate(model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE)
-    check, doubts = doubts_of(spoiled, scene)
+    check, failed_checks = doubts_of(spoiled, scene)
     assert check["confirmed_share_worst_view"] < 0.5
-    assert any(doubt.startswith(f"view {view}:") for doubt in doubts)
+    assert any(doubt.startswith(f"view {view}:") for doubt in failed_checks)
 
 
 def test_several_wrong_cameras_share_a_sentence() -> None:
@@ -76,8 +74,8 @@ def test_several_wrong_cameras_share_a_sentence() -> None:
     t = model.cameras.t.copy()
     t[[1, 6]] += [0.4, -0.3, 0.2]
     spoiled = retriangulate(model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE)
-    doubts = doubts_of(spoiled, scene)[1]
-    assert any("1" in doubt and "6" in doubt and doubt.startswith("views ") for doubt in doubts)
+    failed_checks = doubts_of(spoiled, scene)[1]
+    assert any("1" in doubt and "6" in doubt and doubt.startswith("views ") for doubt in failed_checks)
 
 
 def test_a_view_of_another_focal_asks_for_it() -> None:
@@ -111,18 +109,18 @@ def test_a_focal_that_the_photographs_contradict_is_told(off: float, deviation: 
     adjustment = Adjustment(assumed, 0.0, 0.02)
     model = adjustment.run(model, iterations=10)[0]
     model = retriangulate(model, sigmas=SIGMAS, min_angle=ANGLE)
-    doubts = contradicted_focals(model, adjustment)
-    assert len(doubts) == told
-    assert all("contradict the focal length" in doubt for doubt in doubts)
+    failed_checks = contradicted_focals(model, adjustment)
+    assert len(failed_checks) == told
+    assert all("contradict the focal length" in doubt for doubt in failed_checks)
 
 
 def test_a_known_focal_that_is_contradicted_is_told_once_and_no_weight_is_advised() -> None:
     _, assumed, model = setting(focal="known", focal_px=1600.0)
-    doubts = contradicted_focals(model, Adjustment(assumed, 0.0, 0.02))
-    assert len(doubts) == 1
-    assert "shorter" in doubts[0]
-    assert "px" not in doubts[0]
-    assert "focal_std_rel" not in doubts[0]
+    failed_checks = contradicted_focals(model, Adjustment(assumed, 0.0, 0.02))
+    assert len(failed_checks) == 1
+    assert "shorter" in failed_checks[0]
+    assert "px" not in failed_checks[0]
+    assert "focal_std_rel" not in failed_checks[0]
 
 
 def test_nothing_said_is_nothing_contradicted() -> None:
@@ -162,8 +160,8 @@ def test_two_photographs_from_one_place_are_not_doubted_for_what_only_they_share
     seen = [values[keep] for values in (t.view_index, t.point_index, xy)]
     scene = replace(scene, tracks=Tracks(*seen, t.n_views, t.n_points))
     model = true_model(scene, assume(projective_reconstruction(scene)))
-    check, doubts = doubts_of(model, scene)
-    assert doubts == []
+    check, failed_checks = doubts_of(model, scene)
+    assert failed_checks == []
     assert check["explained_share_worst_view"] > 0.9
     assert 0.2 < within_reach(model).mean() < 0.9
 

@@ -9,12 +9,12 @@ import pytest
 
 from tests.metric.test_self_check import ANGLE, SIGMAS, true_model
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
 from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.intervals import with_open_sharing
 from thesisrecon.metric.model import MetricModel, retriangulate
-from thesisrecon.metric.sharing_check import SharingCheck, check_sharing
-from thesisrecon.types import IntrinsicInterval
+from thesisrecon.metric.shared_camera import SharedCameraTest, check_shared_cameras
+from thesisrecon.metric.uncertainty import with_open_sharing
+from thesisrecon.records import IntrinsicInterval
 
 
 def settled(scene: TrueScene, **wish: object) -> tuple[MetricModel, Adjustment]:
@@ -39,42 +39,44 @@ def changed(scene: TrueScene, factors: np.ndarray, shift_px: np.ndarray) -> True
 
 def test_one_camera_is_not_doubted() -> None:
     for views in (3, 8):
-        assert check_sharing(*settled(make_scene(views=views, sigma_px=0.5, seed=5))).doubts == ()
+        assert (
+            check_shared_cameras(*settled(make_scene(views=views, sigma_px=0.5, seed=5))).failed_checks == ()
+        )
 
 
 @pytest.mark.parametrize("zoom", [1.04, 1.08])
 def test_two_near_zooms_by_turns_are_told(zoom: float) -> None:
     scene = make_scene(sigma_px=0.3, seed=6)
     factors = np.where(np.arange(8) % 2 == 0, 1.0, zoom)
-    doubts = check_sharing(*settled(changed(scene, factors, np.zeros((8, 2))))).doubts
-    assert len(doubts) == 1
-    assert "one focal length" in doubts[0]
+    failed_checks = check_shared_cameras(*settled(changed(scene, factors, np.zeros((8, 2))))).failed_checks
+    assert len(failed_checks) == 1
+    assert "one focal length" in failed_checks[0]
 
 
 def test_photographs_cropped_one_by_one_are_told() -> None:
     scene = make_scene(sigma_px=0.3, seed=7)
     shift = np.random.default_rng(1).uniform(-80.0, 80.0, (8, 2))
-    doubts = check_sharing(*settled(changed(scene, np.ones(8), shift))).doubts
-    assert len(doubts) == 1
-    assert "principal point" in doubts[0] or "one focal length" in doubts[0]
+    failed_checks = check_shared_cameras(*settled(changed(scene, np.ones(8), shift))).failed_checks
+    assert len(failed_checks) == 1
+    assert "principal point" in failed_checks[0] or "one focal length" in failed_checks[0]
 
 
 def test_where_nothing_is_shared_nothing_is_contradicted() -> None:
     scene = make_scene(sigma_px=0.3, zoom=0.2, seed=8)
-    assert check_sharing(*settled(scene, cameras="per-image")).doubts == ()
+    assert check_shared_cameras(*settled(scene, cameras="per-image")).failed_checks == ()
 
 
 @pytest.mark.parametrize("zoom", [1.03, 1.06])
 def test_one_zoomed_photograph_of_three_is_told(zoom: float) -> None:
     scene = make_scene(views=3, sigma_px=0.1, seed=9)
     factors = np.array([1.0, zoom, 1.0])
-    found = check_sharing(*settled(changed(scene, factors, np.zeros((3, 2)))))
-    assert len(found.doubts) + len(found.warnings) == 1
+    found = check_shared_cameras(*settled(changed(scene, factors, np.zeros((3, 2)))))
+    assert len(found.failed_checks) + len(found.warnings) == 1
 
 
 def test_photographs_that_cannot_tell_widen_the_interval_and_say_so() -> None:
-    found = check_sharing(*settled(make_scene(views=3, points=60, sigma_px=0.5, seed=2)))
-    assert found.doubts == ()
+    found = check_shared_cameras(*settled(make_scene(views=3, points=60, sigma_px=0.5, seed=2)))
+    assert found.failed_checks == ()
     assert len(found.warnings) == 1
     assert "cannot be checked" in found.warnings[0]
     assert (found.focal_std > 0.01).all()
@@ -91,15 +93,15 @@ def test_photographs_that_cannot_tell_widen_the_interval_and_say_so() -> None:
 def test_crops_are_told_whatever_is_assumed_of_focal_and_principal_point(wish: dict[str, str]) -> None:
     scene = make_scene(sigma_px=0.3, seed=7)
     shift = np.random.default_rng(1).uniform(-80.0, 80.0, (8, 2))
-    doubts = check_sharing(*settled(changed(scene, np.ones(8), shift), **wish)).doubts
-    assert len(doubts) == 1
+    failed_checks = check_shared_cameras(*settled(changed(scene, np.ones(8), shift), **wish)).failed_checks
+    assert len(failed_checks) == 1
     right = settled(scene, **wish)
-    assert check_sharing(*right).doubts == ()
+    assert check_shared_cameras(*right).failed_checks == ()
 
 
 def test_sentences_hold_at_any_size_of_the_photographs() -> None:
     scene = make_scene(sigma_px=0.3, seed=6)
     factors = np.where(np.arange(8) % 2 == 0, 1.0, 1.06)
-    found: SharingCheck = check_sharing(*settled(changed(scene, factors, np.zeros((8, 2)))))
-    assert "px" not in found.doubts[0]
-    assert "5." in found.doubts[0] or "6." in found.doubts[0]
+    found: SharedCameraTest = check_shared_cameras(*settled(changed(scene, factors, np.zeros((8, 2)))))
+    assert "px" not in found.failed_checks[0]
+    assert "5." in found.failed_checks[0] or "6." in found.failed_checks[0]

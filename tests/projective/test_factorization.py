@@ -10,12 +10,18 @@ import pytest
 from tests.projective.test_reconstruction import residuals
 from tests.synthetic import TrueScene, make_scene, true_pairs
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import project
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.projective import Factorization
-from thesisrecon.projective.factorization import factorize_robustly, grow_core, on_one_plane
-from thesisrecon.projective.sturm_triggs import balanced, depths_from_fundamentals, factorize
-from thesisrecon.types import Tracks
+from thesisrecon.projective.factorization import (
+    Factorization,
+    balanced,
+    depths_from_fundamentals,
+    factorize,
+    factorize_robustly,
+    grow_core,
+    on_one_plane,
+)
+from thesisrecon.records import Tracks
 
 STAR = [(0, k) for k in range(1, 6)]
 CHAIN = [(k, k + 1) for k in range(5)]
@@ -109,7 +115,7 @@ def test_points_that_disagree_are_left_out():
 def test_the_core_grows_by_the_view_that_shares_most_as_long_as_enough_is_shared():
     seen = np.zeros((4, 100), dtype=bool)
     seen[0], seen[1, :80], seen[2, :60], seen[3, :20] = True, True, True, True
-    pairs = [replace(p, homography_share=0.2) for p in true_pairs(make_scene(views=4, points=30))]
+    pairs = [replace(p, homography_inlier_ratio=0.2) for p in true_pairs(make_scene(views=4, points=30))]
     assert grow_core(seen, pairs, pairs[0], least=50)[1][1] == 2
     assert len(grow_core(seen, pairs, pairs[0], least=50)) == 2
     assert len(grow_core(seen, pairs, pairs[0], least=10)) == 3

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from tests.projective.test_reconstruction import projective_error, residuals
 from tests.synthetic import TrueScene, make_scene, true_pairs
-from thesisrecon.geometry.camera import project, project_camera
-from thesisrecon.projective import GatedIncremental
-from thesisrecon.projective.agreement import contradicted_view, epipolar_agreement
+from thesisrecon.geometry.camera_matrix import project, project_camera
 from thesisrecon.projective.growing import GrowingModel, agreeing_observations, retriangulate
+from thesisrecon.projective.incremental import GatedIncremental, contradicted_view, epipolar_agreement
 from thesisrecon.projective.initial_pair import rank_initial_pairs
-from thesisrecon.types import Certainty, Reconstruction, Tracks, TwoView
+from thesisrecon.records import DegeneracyReport, Reconstruction, Tracks, TwoView
 
 NOISE_PX = 0.3
 
@@ -54,7 +53,7 @@ def homography_like(pair: TwoView, scene: TrueScene) -> TwoView:
         return pair
     rng = np.random.default_rng([pair.i, pair.j])
     F = rng.normal(size=(3, 3))
-    return replace(pair, F=F / np.linalg.norm(F), homography_share=1.0)
+    return replace(pair, F=F / np.linalg.norm(F), homography_inlier_ratio=1.0)
 
 
 def test_turns_about_a_standpoint_among_the_views_harm_nothing() -> None:
@@ -97,7 +96,7 @@ def test_views_of_one_plane_wait_and_the_others_are_as_without_them(seed: int) -
     tracks = Tracks(t.view_index[keep], t.point_index[keep], xy[keep], 8, 400)
     scene = replace(base, X=X, tracks=tracks)
     pairs = [
-        replace(pair, homography_share=1.0) if pair.i >= 5 or pair.j >= 5 else pair
+        replace(pair, homography_inlier_ratio=1.0) if pair.i >= 5 or pair.j >= 5 else pair
         for pair in true_pairs(scene)
     ]
     found = reconstruct(scene, pairs, seed)
@@ -168,7 +167,7 @@ def test_each_attempt_begins_elsewhere_and_the_last_says_that_there_is_no_other(
 
 def test_a_pair_whose_f_is_open_is_not_the_first_choice() -> None:
     pairs = true_pairs(make_scene())
-    opened = [replace(p, certainty=Certainty(determined=(p.i, p.j) == (1, 4))) for p in pairs]
+    opened = [replace(p, degeneracy=DegeneracyReport(determined=(p.i, p.j) == (1, 4))) for p in pairs]
     best = rank_initial_pairs(make_scene().tracks, opened)[0]
     assert (best.i, best.j) == (1, 4)
 

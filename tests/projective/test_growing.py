@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from tests.synthetic import make_scene
-from thesisrecon.projective.growing import GrowingModel, mark
-from thesisrecon.projective.kernels import project_observations
-from thesisrecon.projective.selection import grid_cells, spread_of_views
+from thesisrecon.projective.growing import (
+    GrowingModel,
+    grid_cells,
+    mark,
+    project_observations,
+    spread_of_views,
+)
 
 
 def test_projected_observations_equal_their_numpy_twin() -> None:

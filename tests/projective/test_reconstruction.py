@@ -10,15 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import TrueScene, make_scene, true_pairs
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import project
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.triangulation import triangulate_linear
-from thesisrecon.projective import Factorization, GatedIncremental, SequentialProjective
-from thesisrecon.projective.gate import predicted_spread_px
+from thesisrecon.projective.factorization import Factorization
+from thesisrecon.projective.growing import select_tracks, tracks_with_parallax
+from thesisrecon.projective.incremental import GatedIncremental, predicted_spread_px, resect_robust
 from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs
-from thesisrecon.projective.resection import resect_robust
-from thesisrecon.projective.selection import select_tracks, tracks_with_parallax
-from thesisrecon.types import Reconstruction, Tracks
+from thesisrecon.projective.sequential import SequentialProjective
+from thesisrecon.records import Reconstruction, Tracks
 
 VARIANTS = [GatedIncremental(), SequentialProjective(), Factorization()]
 
@@ -105,7 +105,7 @@ def test_without_accepted_pairs_there_is_one_clear_sentence() -> None:
 
 def test_pairs_that_homographies_explain_are_refused_as_a_turning_camera_or_a_plane() -> None:
     scene = make_scene()
-    pairs = [replace(p, homography_share=0.99) for p in true_pairs(scene)]
+    pairs = [replace(p, homography_inlier_ratio=0.99) for p in true_pairs(scene)]
     for variant in VARIANTS:
         with pytest.raises(StageFailure, match="no parallax"):
             variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
@@ -151,7 +151,7 @@ def test_initial_cameras_put_infinity_beyond_the_scene_however_the_camera_is_hel
 
 def test_a_planar_pair_is_not_the_first_choice() -> None:
     pairs = true_pairs(make_scene())
-    flat = [replace(p, homography_share=1.0 if (p.i, p.j) != (2, 5) else 0.3) for p in pairs]
+    flat = [replace(p, homography_inlier_ratio=1.0 if (p.i, p.j) != (2, 5) else 0.3) for p in pairs]
     assert (
         rank_initial_pairs(make_scene().tracks, flat)[0].i,
         rank_initial_pairs(make_scene().tracks, flat)[0].j,
@@ -207,11 +207,13 @@ def test_selection_keeps_the_longest_tracks_of_every_view() -> None:
 
 def test_points_of_one_standpoint_do_not_take_part() -> None:
     scene = make_scene(points=200)
-    pairs = [replace(p, homography_share=1.0 if (p.i, p.j) == (0, 1) else 0.3) for p in true_pairs(scene)]
+    pairs = [
+        replace(p, homography_inlier_ratio=1.0 if (p.i, p.j) == (0, 1) else 0.3) for p in true_pairs(scene)
+    ]
     t = scene.tracks
     only = np.bincount(t.point_index[t.view_index >= 2], minlength=200) == 0
     np.testing.assert_array_equal(tracks_with_parallax(t, pairs), ~only)
-    assert tracks_with_parallax(t, [replace(p, homography_share=0.3) for p in pairs]).all()
+    assert tracks_with_parallax(t, [replace(p, homography_inlier_ratio=0.3) for p in pairs]).all()
 
 
 def test_every_photograph_twice_is_no_harder_than_once() -> None:
@@ -236,6 +238,8 @@ def test_every_photograph_twice_is_no_harder_than_once() -> None:
         tracks=tracks,
         sizes=np.repeat(scene.sizes, 2, axis=0),
     )
-    pairs = [replace(p, homography_share=1.0 if p.i // 2 == p.j // 2 else 0.3) for p in true_pairs(twins)]
+    pairs = [
+        replace(p, homography_inlier_ratio=1.0 if p.i // 2 == p.j // 2 else 0.3) for p in true_pairs(twins)
+    ]
     found = GatedIncremental().reconstruct(tracks, pairs, twins.sizes, rng=rng)
     assert found.registered.all(), found.reasons

@@ -6,12 +6,13 @@ from functools import cache
 
 import numpy as np
 
-from tests.model.sphere import SHAPE, K, photograph, ring_of
+from tests.surface.sphere import SHAPE, K, photograph, ring_of
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.model import VolumetricFusion, coarser
-from thesisrecon.model.texture import TextureAtlas
-from thesisrecon.report import Photograph, ReportData
-from thesisrecon.types import HeldOut, MetricResult, Reconstruction, StageReport, TexturedMesh, Tracks
+from thesisrecon.records import HeldOut, MetricResult, Reconstruction, StageReport, TexturedMesh, Tracks
+from thesisrecon.report.data import Photograph, ReportData
+from thesisrecon.surface.fusion import VolumetricFusion
+from thesisrecon.surface.mesh import coarser
+from thesisrecon.surface.texture_atlas import TextureAtlas
 
 SIZE = (SHAPE[1], SHAPE[0])
 NAMES = tuple(f"sphere {k} <b>.jpg" for k in range(8))
@@ -43,7 +44,7 @@ def sphere_reconstruction() -> Reconstruction:
         sigma_px=0.3,
         reasons=("",) * count,
         K=np.tile(K, (count, 1, 1)),
-        radial=np.zeros((count, 3)),
+        distortion=np.zeros((count, 3)),
     )
 
 

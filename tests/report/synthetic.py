@@ -8,11 +8,10 @@ import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw
 
-from thesisrecon.geometry.camera import compose_camera, project_camera
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.report import Photograph, ReportData
-from thesisrecon.types import (
-    F64,
+from thesisrecon.records import (
     IntrinsicInterval,
     MetricResult,
     Reconstruction,
@@ -20,6 +19,7 @@ from thesisrecon.types import (
     Tracks,
     TwoView,
 )
+from thesisrecon.report.data import Photograph, ReportData
 
 SIZE = (480, 320)
 K = np.array([[520.0, 0.0, 231.0], [0.0, 520.0, 166.0], [0.0, 0.0, 1.0]])
@@ -86,7 +86,7 @@ def made_up_pair(i: int, j: int, cameras: tuple[F64, F64], xy: list[F64], seen: 
         xy2=xy[j][both],
         affine=np.tile(np.eye(2), (len(both), 1, 1)),
         candidates=2 * len(both),
-        homography_share=0.35,
+        homography_inlier_ratio=0.35,
         accepted=accepted,
         reason="" if accepted else "too few verified matches",
     )
@@ -99,7 +99,7 @@ def made_up_run(*, names: list[str] | None = None, points: int = 1500, seed: int
     count = len(names)
     X, colours = made_up_points(rng, points)
     cameras = made_up_cameras(count)
-    xy = [project_camera(K, R, t, X, radial=K1) for R, t in zip(*cameras, strict=True)]
+    xy = [project_camera(K, R, t, X, distortion=K1) for R, t in zip(*cameras, strict=True)]
     seen = [((p > 5) & (p < np.array(SIZE) - 6)).all(axis=1) & (rng.random(points) < 0.7) for p in xy]
     reconstruction = _reconstruction(X, cameras, xy, seen, rng)
     photographs = tuple(
@@ -143,7 +143,7 @@ def projective_run() -> ReportData:
     data = made_up_run()
     assert data.metric is not None
     before = data.metric.reconstruction
-    undistorted = dataclasses.replace(before, stratum="projective", K=None, radial=None)
+    undistorted = dataclasses.replace(before, stratum="projective", K=None, distortion=None)
     return dataclasses.replace(
         data, metric=None, colours=None, reconstruction=undistorted, until="projective"
     )
@@ -170,7 +170,7 @@ def _reconstruction(
         sigma_px=NOISE_PX,
         reasons=(*[""] * (count - 1), "only 14 matches lead to known points (20 are needed)"),
         K=np.tile(K, (count, 1, 1)) * registered[:, None, None],
-        radial=np.tile([K1, 0.0, 0.0], (count, 1)),
+        distortion=np.tile([K1, 0.0, 0.0], (count, 1)),
     )
 
 

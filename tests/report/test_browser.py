@@ -12,7 +12,7 @@ import pytest
 
 from tests.report.opened import Witness
 from tests.report.synthetic import made_up_run
-from thesisrecon.report import write_report
+from thesisrecon.report.page import write_report
 
 pytestmark = pytest.mark.browser
 

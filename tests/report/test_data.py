@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.report.synthetic import made_up_run, projective_run
-from thesisrecon.types import HeldOut, TexturedMesh
+from thesisrecon.records import HeldOut, TexturedMesh
 
 
 def test_the_metric_reconstruction_goes_before_the_projective_one() -> None:

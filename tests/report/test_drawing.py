@@ -9,6 +9,7 @@ import pytest
 from PIL import Image as PillowImage
 
 from tests.report.synthetic import SIZE, made_up_run
+from thesisrecon.records import HeldOut
 from thesisrecon.report.drawing import (
     DIFFERENCE_LIMIT,
     HUES,
@@ -23,7 +24,6 @@ from thesisrecon.report.drawing import (
     spread_matches,
     thumbnail,
 )
-from thesisrecon.types import HeldOut
 
 
 def opened(uri: str) -> PillowImage.Image:

@@ -7,8 +7,7 @@ import numpy as np
 
 from tests.report.synthetic import made_up_run
 from thesisrecon.report import figures as figures_module
-from thesisrecon.report.figures import histogram_path, pair_matrix_figure, scene_figure
-from thesisrecon.report.scene import build_scene
+from thesisrecon.report.figures import build_scene, histogram_path, pair_matrix_figure, scene_figure
 
 
 def test_the_scene_is_valid_json_with_escaped_names() -> None:

@@ -15,8 +15,8 @@ import PIL.Image
 import pytest
 
 from tests.report.opened import Witness
-from thesisrecon.cli import run_command
-from thesisrecon.report.strip import strip_page
+from thesisrecon.cli.main import run_command
+from thesisrecon.report.page import strip_page
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 MARK = "header-of-a-photograph"

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.model.sphere import SHAPE, K, photograph, ring_of
 from tests.report.opened import Witness
 from tests.report.sphere_run import sphere_run
-from thesisrecon.report import write_report
-from thesisrecon.types import F64
+from tests.surface.sphere import SHAPE, K, photograph, ring_of
+from thesisrecon.arrays import F64
+from thesisrecon.report.page import write_report
 
 pytestmark = pytest.mark.browser
 CANVAS = "#model-figure canvas"

@@ -16,9 +16,9 @@ from PIL import Image as PillowImage
 from tests.report.sphere_run import NAMES, sphere_run
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.report import Photograph, ReportData, write_report
-from thesisrecon.report.page import render_report
-from thesisrecon.types import IntrinsicInterval, TexturedMesh
+from thesisrecon.records import IntrinsicInterval, TexturedMesh
+from thesisrecon.report.data import Photograph, ReportData
+from thesisrecon.report.page import render_report, write_report
 
 EVIL = [
     "<img src=x onerror=alert(1)>.jpg",
@@ -147,7 +147,7 @@ def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn() -> None:
         data.pairs[0],
         F=np.zeros((3, 3)),
         sigma_px=float("nan"),
-        homography_share=float("nan"),
+        homography_inlier_ratio=float("nan"),
         xy1=np.zeros((0, 2)),
         xy2=np.zeros((0, 2)),
         accepted=False,

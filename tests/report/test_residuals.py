@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.report.synthetic import NOISE_PX, made_up_run, projective_run
-from thesisrecon.report.residuals import (
+from thesisrecon.report.data import (
     BINS,
     common_limit_px,
     histogram_shares,

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from tests.report.synthetic import made_up_cameras, made_up_run
-from thesisrecon.report.scene import build_scene, upright_rotation
+from thesisrecon.report.figures import build_scene, upright_rotation
 
 
 def rotation(axis: np.ndarray, angle: float) -> np.ndarray:

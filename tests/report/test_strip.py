@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.report.opened import Witness
-from thesisrecon.report.strip import strip_page
+from thesisrecon.report.page import strip_page
 
 LEVELS = (20, 120, 220)
 

@@ -13,11 +13,12 @@ import pytest
 from PIL import Image as PillowImage
 
 from tests.report.sphere_run import NAMES, SIZE, sphere_model, sphere_reconstruction
-from thesisrecon.geometry.camera import decompose_camera
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.records import TexturedMesh
 from thesisrecon.report import viewer
-from thesisrecon.report.scene import upright_rotation
+from thesisrecon.report.figures import upright_rotation
 from thesisrecon.report.viewer import LEVELS, viewer_data
-from thesisrecon.types import F64, TexturedMesh
 
 
 def unpacked(text: str, kind: str, columns: int) -> np.ndarray:

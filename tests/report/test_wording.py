@@ -6,7 +6,8 @@ import pytest
 
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure
-from thesisrecon.report.residuals import ResidualSummary
+from thesisrecon.records import DegeneracyReport, IntrinsicInterval
+from thesisrecon.report.data import ResidualSummary
 from thesisrecon.report.wording import (
     decimals,
     duration,
@@ -17,7 +18,6 @@ from thesisrecon.report.wording import (
     named_number,
     plus_minus,
 )
-from thesisrecon.types import Certainty, IntrinsicInterval
 
 TIME = "Computing time of this result"
 
@@ -61,7 +61,7 @@ def test_the_verdict_is_honest() -> None:
     data = made_up_run(points=100)
     assert data.metric is not None
     assert judge(data).word == "Trusted, but incomplete"
-    doubt = dataclasses.replace(data.metric, trusted=False, doubts=("pure rotation",))
+    doubt = dataclasses.replace(data.metric, trusted=False, failed_checks=("pure rotation",))
     verdict = judge(dataclasses.replace(data, metric=doubt))
     assert (verdict.level, verdict.reasons) == ("doubt", ("Pure rotation.",))
     early = judge(projective_run())
@@ -91,9 +91,9 @@ def test_the_first_glance_tells_what_there_is() -> None:
 
 def test_pairs_that_leave_their_geometry_open_are_counted() -> None:
     run = dataclasses.replace(projective_run(), reconstruction=None)
-    unsure = Certainty(False, ("one homography explains the matches (plane)",))
+    unsure = DegeneracyReport(False, ("one homography explains the matches (plane)",))
     pairs = tuple(
-        dataclasses.replace(pair, certainty=unsure) if pair.accepted else pair for pair in run.pairs
+        dataclasses.replace(pair, degeneracy=unsure) if pair.accepted else pair for pair in run.pairs
     )
     early = dataclasses.replace(run, pairs=pairs)
     note = first_glance(early, None)[1].note

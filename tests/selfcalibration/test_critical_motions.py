@@ -9,10 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.selfcalibration import HypothesesAndRefinement
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.records import IdentifiabilityReport, Reconstruction, Tracks, Upgrade
 from thesisrecon.selfcalibration.critical_motions import (
+    LEAST_MOVE,
+    MAX_FOCAL_STD,
+    MIN_SIGNIFICANCE,
+    MOST_NOISE,
     UpgradedCameras,
     infinity_shift,
     measure_motion,
@@ -21,9 +25,12 @@ from thesisrecon.selfcalibration.critical_motions import (
     thickness,
 )
 from thesisrecon.selfcalibration.frame import assumed_frame
-from thesisrecon.selfcalibration.limits import LEAST_MOVE, MAX_FOCAL_STD, MIN_SIGNIFICANCE, MOST_NOISE
-from thesisrecon.selfcalibration.verdict import judge_motion, spare_equations, verdict_without_an_answer
-from thesisrecon.types import MotionVerdict, Reconstruction, Tracks, Upgrade
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.identifiability import (
+    check_identifiability,
+    spare_equations,
+    verdict_without_an_answer,
+)
 from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
 
 CRITICAL = [motion for motion in Motion if motion is not Motion.GENERAL]
@@ -33,7 +40,7 @@ def true_cameras(scene: Sequence) -> UpgradedCameras:
     return UpgradedCameras(scene.K[:, 0, 0] / scene.sizes.max(axis=1), scene.R, scene.C, scene.X)
 
 
-def verdict_at_the_truth(scene: Sequence, cameras: str = "shared") -> MotionVerdict:
+def verdict_at_the_truth(scene: Sequence, cameras: str = "shared") -> IdentifiabilityReport:
     """The verdict when self-calibration found the true answer."""
     rng = np.random.default_rng(0)
     estimate = projective_estimate(scene, rng)
@@ -178,12 +185,12 @@ def test_an_answer_that_explains_nothing_is_not_identifiable() -> None:
     assumed = assume(estimate)
     G = np.eye(4)
     G[3, :3] = np.linalg.svd(estimate.X[estimate.valid])[2][3][:3]
-    verdict = judge_motion(estimate, Upgrade(G, scene.K, 0.0, "made up"), assumed)
+    verdict = check_identifiability(estimate, Upgrade(G, scene.K, 0.0, "made up"), assumed)
     assert not verdict.identifiable
     assert verdict.sentences
 
 
-def bent_by_zooms() -> tuple[MotionVerdict, MotionVerdict]:
+def bent_by_zooms() -> tuple[IdentifiabilityReport, IdentifiabilityReport]:
     """Verdicts on zoomed photographs that are said to have one focal length, and each its own."""
     scene = make_sequence(Motion.GENERAL, np.random.default_rng(8), zoom=0.15)
     t = scene.tracks
@@ -195,7 +202,7 @@ def bent_by_zooms() -> tuple[MotionVerdict, MotionVerdict]:
     estimate = replace(projective_estimate(scene, np.random.default_rng(0)), sigma_px=0.3)
     upgrade = Upgrade(metric_frame(estimate, scene), scene.K, 0.0, "truth")
     shared, own = (
-        judge_motion(estimate, upgrade, assume(estimate, IntrinsicsAssumption(cameras=how)))
+        check_identifiability(estimate, upgrade, assume(estimate, IntrinsicsAssumption(cameras=how)))
         for how in ("shared", "per-image")
     )
     return shared, own

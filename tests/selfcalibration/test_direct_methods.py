@@ -12,21 +12,21 @@ from hypothesis import strategies as st
 
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
-from thesisrecon.optimize.projective_bundle import refine_projective_bundle
-from thesisrecon.selfcalibration import (
-    FocalScan,
-    FocalsFromFundamental,
-    KruppaEquations,
+from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.selfcalibration.focal_scan import FocalScan, calibrations_of, scan_cost
+from thesisrecon.selfcalibration.focals_from_fundamental import FocalsFromFundamental
+from thesisrecon.selfcalibration.frame import assumed_frame
+from thesisrecon.selfcalibration.kruppa import KruppaEquations
+from thesisrecon.selfcalibration.quadric import (
     LinearQuadric,
     NonlinearQuadric,
-    RotationCriterion,
     ScannedQuadric,
-    Stratified,
+    linear_quadric,
+    rank_three,
 )
-from thesisrecon.selfcalibration.focal_scan import calibrations_of, scan_cost
-from thesisrecon.selfcalibration.frame import assumed_frame
-from thesisrecon.selfcalibration.quadric import linear_quadric, rank_three
-from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.selfcalibration.stratified import Stratified
 
 FREE = RotationCriterion(focal_weight=0.0)
 EXACT = [

@@ -13,18 +13,18 @@ from scipy.spatial.transform import Rotation
 from tests.selfcalibration.test_direct_methods import adjusted, assume
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.selfcalibration import FocalsFromFundamental
-from thesisrecon.selfcalibration.conclusion import square_calibrations
-from thesisrecon.selfcalibration.focal_from_fundamental import (
+from thesisrecon.selfcalibration.candidates import square_calibrations
+from thesisrecon.selfcalibration.focals_from_fundamental import (
+    FocalsFromFundamental,
     _dual_with_changes,
     bougnoux_focals,
+    independent_share,
     kruppa_chi_square,
     kruppa_whitening,
     pair_focals,
+    vote_on_focals,
 )
-from thesisrecon.selfcalibration.focal_vote import independent_share, vote_on_focals
-from thesisrecon.selfcalibration.frame import assumed_frame
-from thesisrecon.selfcalibration.intrinsics import focal_prior
+from thesisrecon.selfcalibration.frame import assumed_frame, focal_prior
 from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_cost, kruppa_residuals
 from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs, fit_fundamental
 

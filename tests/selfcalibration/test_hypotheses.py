@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.errors import StageFailure
-from thesisrecon.selfcalibration import HypothesesAndRefinement, Stratified
-from thesisrecon.selfcalibration.conclusion import conclude
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.records import SelfCalibration
+from thesisrecon.selfcalibration.candidates import conclude
 from thesisrecon.selfcalibration.focal_scan import WEIGHTS, plane_from_focals, scan_cost
 from thesisrecon.selfcalibration.frame import assumed_frame, build_frame
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion
-from thesisrecon.types import SelfCalibration
+from thesisrecon.selfcalibration.stratified import Stratified
 
 METHODS = [HypothesesAndRefinement(), Stratified()]
 

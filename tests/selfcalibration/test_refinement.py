@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 
 from tests.selfcalibration.test_direct_methods import adjusted, assume, at_distance, reprojected
 from tests.synthetic import make_scene, projective_reconstruction
-from thesisrecon.selfcalibration import HypothesesAndRefinement, RotationCriterion
-from thesisrecon.selfcalibration.conclusion import Answer, distinct_answers, square_calibrations
+from thesisrecon.selfcalibration.candidates import Answer, distinct_answers, square_calibrations
 from thesisrecon.selfcalibration.focal_scan import planes_for_focals
-from thesisrecon.selfcalibration.frame import assumed_frame
-from thesisrecon.selfcalibration.intrinsics import unknown_intrinsics
-from thesisrecon.selfcalibration.nonlinear_quadric import dual_image_residuals
-from thesisrecon.selfcalibration.refinement import refine_hypotheses
+from thesisrecon.selfcalibration.frame import assumed_frame, unknown_intrinsics
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.quadric import dual_image_residuals
+from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
 
 FREE = RotationCriterion(focal_weight=0.0)
 

@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("pycolmap")
 
-from tests.optimize.bundle_scenes import make_block
-from thesisrecon.optimize.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.types import Reconstruction, Tracks
+from tests.numerics.bundle_scenes import make_block
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.records import Reconstruction, Tracks
 from validation.checks.bundle import (
     FOCAL_K1,
     Case,
@@ -56,9 +56,9 @@ def _model(block, sigma_px):
     tracks = Tracks(block.view, block.point, xy, V, N)
     sizes = np.tile([1030, 760], (V, 1))
     ones = np.ones(V, bool), np.ones(N, bool), np.ones(len(xy), bool)
-    radial = np.tile([c.intrinsics[0, 5], 0.0, 0.0], (V, 1))
+    distortion = np.tile([c.intrinsics[0, 5], 0.0, 0.0], (V, 1))
     return Reconstruction(
-        "metric", c.P, block.Xh, *ones, tracks, sizes, sigma_px, ("",) * V, K=c.K, radial=radial
+        "metric", c.P, block.Xh, *ones, tracks, sizes, sigma_px, ("",) * V, K=c.K, distortion=distortion
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.validation.test_cameras import _reconstruction, _truth
 from thesisrecon.config import PipelineConfig
-from thesisrecon.types import Reconstruction
+from thesisrecon.records import Reconstruction
 from validation.checks.calibration_bench import Rows
 from validation.checks.calibration_parts import keep_observations, one_camera
 from validation.checks.calibration_real import _change_pct, _pooled, _told

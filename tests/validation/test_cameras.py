@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.geometry.camera import compose_camera, project_camera
-from thesisrecon.types import Reconstruction, Tracks
+from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.records import Reconstruction, Tracks
 from validation.metrics.cameras import (
     TrueCameras,
     measure_cameras,
@@ -35,7 +35,7 @@ def _reconstruction(truth: TrueCameras, *, k1: float = 0.0) -> Reconstruction:
     X = np.column_stack([shrink * rng.normal(0, 1, (N, 3)) @ turn.T + move, np.ones(N)])
     view, point = (grid.ravel() for grid in np.meshgrid(np.arange(V), np.arange(N)))
     xy = np.concatenate(
-        [project_camera(K, r, s, X[:, :3], radial=k1) for K, r, s in zip(truth.K, R, t, strict=True)]
+        [project_camera(K, r, s, X[:, :3], distortion=k1) for K, r, s in zip(truth.K, R, t, strict=True)]
     )
     tracks = Tracks(view, point, xy.reshape(V, N, 2).transpose(1, 0, 2).reshape(-1, 2), V, N)
     every = np.ones

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.types import MetricResult
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import MetricResult
 from validation.checks import growth_of_cost, parallel, perturbation
 from validation.checks.growth_of_cost import Cost, Meter
 from validation.scenes.many_views import walk

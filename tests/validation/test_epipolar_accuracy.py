@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thesisrecon.epipolar import estimate_fundamental
+from thesisrecon.epipolar.estimation import estimate_fundamental
 from validation.metrics.epipolar import precision_recall, rms_epipolar_distance
 from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import RealPair, adelaide_pairs, camera_pairs, kusvod2_pairs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from thesisrecon.epipolar.degeneracy import Configuration
+from thesisrecon.epipolar.configuration import Configuration
 from validation.checks.epipolar_certainty import (
     certainty_metrics,
     certainty_table,

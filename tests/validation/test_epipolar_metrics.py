@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.geometry.multiview import symmetric_residuals
+from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.checks.epipolar_real import called_sure, check_cameras, least
 from validation.metrics.epipolar import (
     NONE_PX,

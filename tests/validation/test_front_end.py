@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thesisrecon.geometry.camera import calibration_matrix, compose_camera, project_camera
+from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project_camera
 from thesisrecon.io.images import read_photographs
-from thesisrecon.types import Features, Image, Reconstruction, Tracks, TwoView
+from thesisrecon.records import Features, Image, Reconstruction, Tracks, TwoView
 from validation.checks.front_end_invariance import Copy, make_copies, repeatability, score_copy
 from validation.checks.front_end_kermit import CONTRADICTS_PX, disagreement, judge
 from validation.checks.front_end_pairs import OURS, SIFT, check_pairs, front_ends, measure_pairs
@@ -106,7 +106,7 @@ def _model_and_pair(k1: float, moved: float) -> tuple[Reconstruction, TwoView]:
         np.eye(3),
         np.array([[0.0] * 3, [-0.8, 0.0, 0.1]]),
     )
-    xy1, xy2 = (project_camera(K, R, t[i], X, radial=k1) for i in range(2))
+    xy1, xy2 = (project_camera(K, R, t[i], X, distortion=k1) for i in range(2))
     nothing = np.zeros(0, dtype=np.int64)
     P = np.stack([compose_camera(K, R, t[0]), compose_camera(K, R, t[1] + [0.0, moved, 0.0])])
     model = Reconstruction(
@@ -121,7 +121,7 @@ def _model_and_pair(k1: float, moved: float) -> tuple[Reconstruction, TwoView]:
         sigma_px=0.1,
         reasons=("", ""),
         K=np.stack([K, K]),
-        radial=np.tile([k1, 0.0, 0.0], (2, 1)),
+        distortion=np.tile([k1, 0.0, 0.0], (2, 1)),
     )
     index = np.arange(50)
     affine = np.broadcast_to(np.eye(2), (50, 2, 2))

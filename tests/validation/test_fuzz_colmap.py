@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from thesisrecon.io.colmap import read_colmap_model
+from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.io.colmap_model import MODEL_NUMBERS, inconsistency
 from validation.checks import fuzz_colmap
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.textures import texture
-from thesisrecon.dense.rectification import rectify_cameras
-from thesisrecon.geometry.camera import camera_from_centre, project
+from thesisrecon.geometry.camera_matrix import camera_from_centre, project
+from thesisrecon.stereo.rectification import rectify_cameras
 from thesisrecon.views.interpolation import InterpolatedPair, unsure
 from validation.scenes.between import best_homography, camera_between, camera_centre_of, nearest_place, turned
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thesisrecon.types import IntrinsicInterval, MetricResult, Reconstruction, Tracks
+from thesisrecon.records import IntrinsicInterval, MetricResult, Reconstruction, Tracks
 from validation.checks.calibration_coverage import run_trial
 from validation.checks.calibration_parts import named, without
 from validation.checks.subsets import Matched

@@ -11,7 +11,8 @@ from PIL import Image
 pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.colmap import colmap_from_reconstruction, write_colmap_model
+from thesisrecon.io.colmap import colmap_from_reconstruction
+from thesisrecon.io.colmap_files import write_colmap_model
 from validation import main_job
 from validation.checks.reconstruction import COLMAP, OURS
 from validation.harness.process import own_cores, run_process

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.model.sphere import photograph, ring_of
-from thesisrecon.types import DepthMap, Reconstruction, TexturedMesh, Tracks
+from tests.surface.sphere import photograph, ring_of
+from thesisrecon.records import DepthMap, Reconstruction, TexturedMesh, Tracks
 from validation.harness.stages import surface as surface_stage
 from validation.harness.stages import views as views_stage
 from validation.metrics import depth, surfaces
@@ -111,7 +111,7 @@ def test_a_photograph_is_left_out(tmp_path: Path) -> None:
     views = {i: photograph(m, 0.9 if i % 2 else 1.1) for i, m in maps.items()}
     others = [i for i in maps if i != 3]
     given = [maps[i] for i in others], [views[i] for i in others]
-    camera = views_stage.PinholeCamera.from_matrix(views[3].P, (160, 120))
+    camera = views_stage.Camera.from_matrix(views[3].P, (160, 120))
     drawn = {}
     for method in (views_stage.OURS, views_stage.FINE, views_stage.LEVELLED):
         mesh = views_stage._model(method, *given, tmp_path / "surface.npz")

@@ -73,8 +73,8 @@ def test_what_is_drawn_is_python_and_the_same_every_time(package: str) -> None:
 
 def test_tests_of_the_module_come_first_and_then_those_of_its_users(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Bench, "tree", ROOT)
-    own, others = Bench(Path("nowhere")).judges("thesisrecon/geometry/trifocal.py")
-    assert "thesisrecon.geometry.trifocal" in imports_of(ROOT / own[0])
+    own, others = Bench(Path("nowhere")).judges("thesisrecon/geometry/three_view.py")
+    assert "thesisrecon.geometry.three_view" in imports_of(ROOT / own[0])
     assert all(file.startswith("tests/geometry/") for file in own)
     assert others
     assert not any(file.startswith(("tests/geometry/", "tests/validation/")) for file in others)

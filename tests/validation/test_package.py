@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from thesisrecon.io.demo import COUNT, demo_photographs
+from thesisrecon.io.lists import COUNT, demo_photographs
 from validation.checks.package.built import NEEDED, wheel_faults
 from validation.checks.package.environments import dependencies, lowest_versions
 from validation.checks.package.quiet import Watched, trespasses, watch
@@ -68,9 +68,9 @@ def test_a_suite_is_well_where_something_passed_and_nothing_broke() -> None:
 
 def test_what_is_missing_or_does_not_belong_in_a_wheel_is_told() -> None:
     photographs = [f"thesisrecon/courtyard/images/{i:04d}.jpg" for i in range(COUNT)]
-    good = [*NEEDED, *photographs, "thesisrecon/cli.py", "thesisrecon-0.1.0.dist-info/METADATA"]
+    good = [*NEEDED, *photographs, "thesisrecon/cli/main.py", "thesisrecon-0.1.0.dist-info/METADATA"]
     assert wheel_faults(good, 1_000_000) == []
-    strangers = ["tests/test_cli.py", "thesisrecon/__pycache__/cli.cpython-311.pyc"]
+    strangers = ["tests/cli/test_cli.py", "thesisrecon/__pycache__/cli.cpython-311.pyc"]
     told = wheel_faults([*good[1:], *strangers], 9_000_000)
     assert told[0] == "thesisrecon/py.typed is missing"
     assert told[1:3] == [f"{name} does not belong there" for name in strangers]

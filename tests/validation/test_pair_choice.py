@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from thesisrecon.types import PairChoice
+from thesisrecon.records import PairChoice
 from validation.checks.pair_choice import Choice, choose, to_metrics
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thesisrecon.views.likeness import GREY
+from thesisrecon.views.image_similarity import GREY
 from validation.metrics.pictures import psnr_db, ssim
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import thesisrecon
-from thesisrecon.assumptions import IntrinsicsAssumption
 from thesisrecon.config import PipelineConfig
+from thesisrecon.intrinsics import IntrinsicsAssumption
 from validation.metrics.intervals import focal_errors_pct, interval_scores
 from validation.scenes.real import load_real_scene
 from validation.scenes.zoomed import rezoom_scene
@@ -31,7 +31,7 @@ def test_zoomed_and_cropped_photographs_are_calibrated_each_for_itself(tmp_path:
         list(scene.image_paths), tmp_path / "out", config=config, seed=0, until="metric"
     )
     assert result.metric is not None
-    assert result.metric.trusted, result.metric.doubts
+    assert result.metric.trusted, result.metric.failed_checks
     found = result.metric.reconstruction
     assert found.registered.all()
     assert found.K is not None

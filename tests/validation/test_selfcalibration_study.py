@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from thesisrecon.geometry.camera import project
+from thesisrecon.geometry.camera_matrix import project
 from validation.checks.selfcalibration import (
     BOUND,
     WITH_BUNDLE,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.textures import texture
-from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline
+from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
+from thesisrecon.stereo.semi_global import CohesiveScanlines
 from validation.checks.stereo import DEFAULT, THESIS, bad_pixels, check_pair
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
 

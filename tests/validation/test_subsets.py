@@ -34,7 +34,7 @@ def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_se
 def test_a_trial_finds_the_focal_length_and_is_the_same_twice() -> None:
     first, again = (run_trial(matched_scene(), "shared", 3) for _ in range(2))
     assert first.right
-    assert not first.doubts
+    assert not first.failed_checks
     assert first.registered == len(first.views)
     assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
 
@@ -45,15 +45,15 @@ def test_what_came_of_a_trial_is_told_apart() -> None:
     trials = {
         "right": replace(wrong, median_pct=1.0),
         "open": replace(wrong, interval_pct=11.0),
-        "refused": replace(shifted, doubts=("close to a pure translation",)),
-        "refused, another reason": replace(shifted, doubts=("too few points",)),
-        "right, doubted": replace(wrong, median_pct=1.0, doubts=("no",)),
+        "refused": replace(shifted, failed_checks=("close to a pure translation",)),
+        "refused, another reason": replace(shifted, failed_checks=("too few points",)),
+        "right, doubted": replace(wrong, median_pct=1.0, failed_checks=("no",)),
         "wrong": wrong,
         "crash": replace(wrong, median_pct=np.nan, crash="ValueError: no"),
     }
     assert tuple(trials) == OUTCOMES
     assert [trial.outcome for trial in trials.values()] == list(OUTCOMES)
-    assert replace(wrong, doubts=("no",)).outcome == "refused"
+    assert replace(wrong, failed_checks=("no",)).outcome == "refused"
     assert shifted.outcome == "wrong"
     assert "| s | shared | 7 | 1 | 1 | 1 | 1 | 1 | 1 | 1 | 5.50 |" in table_row(
         "s", "shared", [*trials.values()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thesisrecon.views.tensor import CalibratedPair
+from thesisrecon.views.virtual_camera import CalibratedPair
 from validation.checks.tensor_views import Measured, Place, draw, linear_range
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.arrays import F32, F64
+from thesisrecon.camera import Camera
 from thesisrecon.geometry.zbuffer import rasterize, sample_texture
-from thesisrecon.types import F32, F64, TexturedMesh
-from thesisrecon.views.kernels import average_blocks, shade_points
-from thesisrecon.views.shading import Light, Shading, vertex_normals
+from thesisrecon.records import TexturedMesh
+from thesisrecon.views.render import Light, Shading, average_blocks, shade_points, vertex_normals
 
 
 def unit(vectors: F64) -> F64:
@@ -79,7 +79,7 @@ def test_values_of_vertices_and_corners_are_interpolated_alike() -> None:
     rng = np.random.default_rng(3)
     vertices, faces = rng.uniform([-2, -2, 3], [2, 2, 6], (30, 3)), rng.integers(0, 30, (20, 3))
     K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
-    raster = rasterize(vertices, faces, PinholeCamera(K, np.eye(3), np.zeros(3), (64, 48)))
+    raster = rasterize(vertices, faces, Camera(K, np.eye(3), np.zeros(3), (64, 48)))
     values = rng.uniform(size=(30, 4)).astype(np.float32)
     assert (raster.face >= 0).mean() > 0.2
     np.testing.assert_array_equal(

@@ -11,18 +11,19 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tests.model.sphere import K, looking_at_origin
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.types import F64, TexturedMesh
+from tests.surface.sphere import K, looking_at_origin
+from thesisrecon.arrays import F64
+from thesisrecon.camera import Camera
+from thesisrecon.records import TexturedMesh
 from thesisrecon.views.paths import fitted, geometric_median, interpolate, orbit, surface_points, upward
 
 SIZE = (160, 120)
 UP = np.array([0.0, -1.0, 0.0])  # of cameras whose y axis points down
 
 
-def ring(angles: F64, height: float = -1.0, distance: float = 3.5) -> list[PinholeCamera]:
+def ring(angles: F64, height: float = -1.0, distance: float = 3.5) -> list[Camera]:
     """Upright cameras about the origin."""
-    return [PinholeCamera.from_matrix(looking_at_origin(a, height, distance), SIZE) for a in angles]
+    return [Camera.from_matrix(looking_at_origin(a, height, distance), SIZE) for a in angles]
 
 
 def ball(count: int = 2000, seed: int = 0) -> F64:
@@ -31,16 +32,16 @@ def ball(count: int = 2000, seed: int = 0) -> F64:
     return X / np.linalg.norm(X, axis=1, keepdims=True)
 
 
-def moved(cameras: list[PinholeCamera], turn: F64, shift: F64) -> list[PinholeCamera]:
+def moved(cameras: list[Camera], turn: F64, shift: F64) -> list[Camera]:
     """The same cameras in a world that is turned and shifted."""
-    return [PinholeCamera(c.K, c.R @ turn.T, c.t - c.R @ turn.T @ shift, c.size) for c in cameras]
+    return [Camera(c.K, c.R @ turn.T, c.t - c.R @ turn.T @ shift, c.size) for c in cameras]
 
 
-def centres_of(path: list[PinholeCamera]) -> F64:
+def centres_of(path: list[Camera]) -> F64:
     return np.array([camera.centre for camera in path])
 
 
-def project(camera: PinholeCamera, X: F64) -> F64:
+def project(camera: Camera, X: F64) -> F64:
     x = camera.K @ (camera.R @ X + camera.t)
     return np.asarray(x[:2] / x[2])
 
@@ -119,12 +120,12 @@ def test_one_camera_swings_a_little(frames: int) -> None:
 def test_cameras_in_the_middle_that_look_away_see_their_surroundings() -> None:
     """Photographs from the middle of a room, outwards."""
     room = 5.0 * ball()
-    away = [PinholeCamera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 5, 7), 0.0)]
+    away = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 5, 7), 0.0)]
     for camera in orbit(away, room, 10):
         assert 0.1 < np.linalg.norm(camera.centre) < 2.5
         assert abs(camera.R[0] @ UP) < 1e-6
     behind = [
-        PinholeCamera(c.K, np.diag([-1.0, 1, -1]) @ c.R, np.diag([-1.0, 1, -1]) @ c.t, SIZE)
+        Camera(c.K, np.diag([-1.0, 1, -1]) @ c.R, np.diag([-1.0, 1, -1]) @ c.t, SIZE)
         for c in ring(np.zeros(3))
     ]
     for camera in orbit(behind, ball(), 4):
@@ -138,7 +139,7 @@ def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled() -> None:
     cameras = []
     for camera in ring(np.linspace(-1, 1, 12), -6.0):
         roll = Rotation.from_rotvec([0, 0, rng.normal(0.0, 0.06)]).as_matrix()
-        cameras.append(PinholeCamera(K, roll @ camera.R, roll @ camera.t, SIZE))
+        cameras.append(Camera(K, roll @ camera.R, roll @ camera.t, SIZE))
     assert np.degrees(np.arccos(upward(cameras) @ UP)) < 4.0
     (one,) = ring(np.array([0.7]))
     np.testing.assert_allclose(upward([one]), -one.R[1], atol=1e-9)
@@ -149,14 +150,14 @@ def test_of_cameras_that_look_straight_down_up_is_behind_them() -> None:
     for k in range(8):
         a = 2 * np.pi * k / 8
         R = np.array([[np.cos(a), 0, np.sin(a)], [np.sin(a), 0, -np.cos(a)], [0, 1.0, 0]])
-        down.append(PinholeCamera(K, R, -R @ np.array([0.5 * np.cos(a), -4.0, 0.5 * np.sin(a)]), SIZE))
+        down.append(Camera(K, R, -R @ np.array([0.5 * np.cos(a), -4.0, 0.5 * np.sin(a)]), SIZE))
     np.testing.assert_allclose(upward(down), UP, atol=1e-9)
     assert all(camera.centre[1] < -3.0 for camera in orbit(down, ball(), 6))
 
 
 def test_interpolation_ends_at_the_real_cameras_and_passes_all() -> None:
     cameras = ring(np.array([0.0, 0.3, 0.5, 1.1, 1.3]), -1.0)
-    cameras[2] = PinholeCamera(1.2 * K * [[1], [1], [1 / 1.2]], cameras[2].R, cameras[2].t, SIZE)
+    cameras[2] = Camera(1.2 * K * [[1], [1], [1 / 1.2]], cameras[2].R, cameras[2].t, SIZE)
     path = interpolate(cameras, 400)
     for real, frame in ((cameras[0], path[0]), (cameras[-1], path[-1])):
         np.testing.assert_allclose(frame.P, real.P)
@@ -185,14 +186,14 @@ def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed: int)
 
 
 def test_turning_on_the_spot_takes_its_time() -> None:
-    still = [PinholeCamera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 1, 4), 0.0)]
+    still = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 1, 4), 0.0)]
     path = interpolate(still, 31)
     turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
     np.testing.assert_allclose(turns, 1.0 / 30, rtol=1e-6)
     # Half a turn at one place of a way: no frame jumps.
-    far = [PinholeCamera(K, c.R, -c.R @ np.array([3.0 * k, 0, 0]), SIZE) for k, c in enumerate(still)]
+    far = [Camera(K, c.R, -c.R @ np.array([3.0 * k, 0, 0]), SIZE) for k, c in enumerate(still)]
     path = interpolate(
-        [*far[:2], PinholeCamera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE), *far[2:]],
+        [*far[:2], Camera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE), *far[2:]],
         100,
     )
     turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
@@ -223,7 +224,7 @@ def test_other_shapes_of_pictures_show_all_that_the_camera_saw() -> None:
         assert (x[:2].T - size < -0.5 + 1e-9).all()
         assert min(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) <= 1.0 + 1e-9
         assert max(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) == pytest.approx(1.0)
-    turned = PinholeCamera(K, camera.R, camera.t, (120, 160))
+    turned = Camera(K, camera.R, camera.t, (120, 160))
     assert {frame.size for frame in interpolate([camera, turned], 5)} == {SIZE}
     assert {frame.size for frame in orbit([camera, turned], ball(), 5, size=(70, 50))} == {(70, 50)}
 

@@ -10,12 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.model.sphere import looking_at_origin, paint, photograph, points_of, sphere_map
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.model.depth_surface import surface_from_depth
-from thesisrecon.model.texture import TextureAtlas, color_vertices
-from thesisrecon.types import DepthMap, TexturedMesh
-from thesisrecon.views import render
+from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, sphere_map
+from thesisrecon.camera import Camera
+from thesisrecon.records import DepthMap, TexturedMesh
+from thesisrecon.surface.linear import surface_from_depth
+from thesisrecon.surface.texture_atlas import TextureAtlas
+from thesisrecon.surface.texture_views import color_vertices
+from thesisrecon.views.render import render
 
 SIZE = (160, 120)
 
@@ -33,7 +34,7 @@ def test_from_its_own_camera_the_surface_shows_the_photograph_and_its_depth(
     angle: float, height: float, distance: float
 ) -> None:
     depth_map = sphere_map(0, looking_at_origin(angle, height, distance))
-    seen = render(textured(depth_map), PinholeCamera.from_matrix(depth_map.P, SIZE), samples=1)
+    seen = render(textured(depth_map), Camera.from_matrix(depth_map.P, SIZE), samples=1)
     known = np.isfinite(depth_map.depth)
     assert not (seen.valid & ~known).any()
     assert (seen.valid & known).sum() > 0.9 * known.sum()  # but a rim of grazing rays
@@ -44,7 +45,7 @@ def test_from_its_own_camera_the_surface_shows_the_photograph_and_its_depth(
 
 def test_averaged_pixels_are_those_of_the_photograph_but_for_its_finest_detail() -> None:
     depth_map = sphere_map(0, looking_at_origin(0.3, -1.0, 3.5))
-    seen = render(textured(depth_map), PinholeCamera.from_matrix(depth_map.P, SIZE), samples=2)
+    seen = render(textured(depth_map), Camera.from_matrix(depth_map.P, SIZE), samples=2)
     inside = np.isfinite(depth_map.depth)
     for _ in range(3):
         inside[1:-1, 1:-1] &= inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:]
@@ -59,7 +60,7 @@ def test_from_between_two_photographs_the_model_has_the_colours_of_the_scene(kin
     mesh = surface_from_depth(maps[0])
     mesh = TextureAtlas().texture(mesh, views) if kind == "texture" else color_vertices(mesh, views)
     between = sphere_map(2, looking_at_origin(0.0, -0.9, 3.5))
-    seen = render(mesh, PinholeCamera.from_matrix(between.P, SIZE))
+    seen = render(mesh, Camera.from_matrix(between.P, SIZE))
     inside = seen.valid & np.isfinite(between.depth)
     assert inside.mean() > 0.15
     apart = np.abs(seen.color - paint(points_of(between)))[inside]

@@ -1,326 +1,385 @@
-"""Section 5.5: is F determined at all, and what else would explain the matches: evidence, then a name.
+"""The plane that most matches of an F lie on, and which matches stand off it.
 
-Matches of one plane, and of a camera that only turned, are explained by a homography and leave the epipoles
-free; of a camera that moved without turning F is [e]x with two degrees of freedom in place of seven. Every
-test is against the noise: a simpler model is believed unless its residuals are larger than the noise allows,
-or more of the matches that it leaves agree with F than chance would have of the wrong ones.
+Other epipolar geometries of the same plane that explain about as many matches as the one found.
+
+Whether the matches of a pair determine its F, beyond agreeing with it: evidence, verdict, reasons.
+
+Where most matches lie on one plane, every [e]x H of its homography H explains them, and the epipole rests on
+the rest. A wrong F then has as many inliers as the right one, or more. It betrays itself in four ways: hardly
+more matches off the plane agree with it than chance would have; another epipole explains about as many; its
+covariance is large; or its matches off the plane lie amid those of the plane, where no surface could be, as
+matches from one window of a facade to the next do.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 import scipy
+from numpy.random import Generator
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar.certainty.kernels import geometries_of_plane, refine_plane
-from thesisrecon.epipolar.certainty.plane import (
-    chance_of_agreement,
-    find_dominant_plane,
-    log10_false_alarms,
-    once_each,
-    plane_covariance,
+from thesisrecon.arrays import B8, F64
+from thesisrecon.epipolar.frame import PairFrame, check_matches
+from thesisrecon.epipolar.plane_kernels import (
+    contradicted_shares,
+    dominant_plane,
+    geometries_of_plane,
+    plane_distances,
+    plane_normal_equations,
+    refine_plane,
+    unlike,
 )
-from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar.kernels import sampson_distances
-from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
-from thesisrecon.epipolar.refinement import UNBOUNDED
-from thesisrecon.epipolar.turning import turning_ratio
-from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.robust.noise import noise_scale, trimmed_noise_scale
+from thesisrecon.epipolar.precision import epipolar_distance_std
+from thesisrecon.epipolar.refinement import SAMPSON, refine
+from thesisrecon.epipolar.search import sampson_distances
+from thesisrecon.records import DegeneracyReport, FundamentalFit
 
-F64 = NDArray[np.float64]
-B8 = NDArray[np.bool_]
-
-MINIMUM = 12
-NEAR = 11.0
-NEAR_MEAN, CHI2_MEDIAN = 0.97743, 1.386294
-"""Squared distances from a homography, in sigma^2, are chi-square(2) with this median; of those below 11
-either half, the one across epipolar lines and the parallax along them, has this mean."""
-TRIMMINGS = 3
-STANDARD_ERRORS = 4.0
-"""The F of a plane may choose the epipole toward which the noise is least: 1.5 errors, give or take 1."""
-FAR = 16.0
-"""A match stands off a homography beyond this squared distance: noise does so once in 3000."""
-LARGEST_CHANCE = -3.0
-"""log10 of the false alarms that matches off the simpler model may be."""
-BAND = 2.5
-FLEXIBLE = 2.0
-"""An F of a plane is fitted to wrong matches too, and moves toward them: they agree so much more often."""
-EPIPOLE, BEYOND_TRANSLATION = 2, 5
-"""Degrees of freedom that F has beyond a homography, and beyond [e]x."""
-RISK, ALLOWANCE = 2e-3, 0.4
-"""Chance to take a pure translation for more than that, were all residuals normal; what is allowed beyond it
-where a wrong match or more is expected in the band, for F to bend to."""
-TURN_RISK = 1e-3
-"""Chance to take a rotation for a plane, by its eigenvalues (on either side) and as a camera's."""
-TRANSLATED = 3.3
-"""Matches within so many sigma of a translation are compared with F; more would be cut by what noise does."""
-CORRECTIONS, EXACT = 10, 1e-12
-
-
-class Configuration(Enum):
-    """What the matches of a pair show."""
-
-    GENERAL = "general"
-    PLANE = "plane"
-    ROTATION = "pure rotation"
-    TRANSLATION = "pure translation"
+TRIPLES, SUBSET = 100, 200
+"""Planes tried, and matches that each is judged on: a plane of a third of them is found with 98 %."""
+OFF_PLANE = 16.0
+"""Squared distance in sigma^2 beyond which a match stands off the plane: noise does so once in 3000."""
+GATE = 5.0
+SUBSET_STEPS, ALL_STEPS, MOST = 3, 4, 600
+SAME_PX = 2.0
 
 
 @dataclass(frozen=True)
-class Degeneracy:
-    """The name and the evidence that it rests on.
+class DominantPlane:
+    """``h`` (9,) unit norm in the frame of the points, ``squared`` (N,) distances of all, in sigma^2."""
 
-    Attributes
-    ----------
-    kind : what was found.
-    sigma_px : standard deviation of one coordinate, from the residuals of the general F.
-    homography_errors : excess of the squared parallax of the matches within 3.3 sigma of the best homography
-        over their squared distances from F, as a logarithm in its standard errors; above 4 they show relief.
-    off_homography : share of the inliers more than 4 sigma off it.
-    off_homography_chance : log10 of how often chance has as many of the wrong matches agree with F; below -3
-        they show relief.
-    turning_errors : |trace H - trace H^-1| (det H = 1), 0 for a rotation, in its standard errors.
-    turning_camera_ratio : increase of the squared residuals from the homography to that of a camera of square
-        pixels that turned, over its limit; at most 1 for a rotation, NaN where the eigenvalues told already.
-    turn_deg : the angle of that rotation, NaN where the eigenvalues are not those of one.
-    translation_ratio : increase of the squared residuals from F to [e]x, over its limit; at most 1 where F is
-        that of a translation, inf where more matches leave [e]x than chance would have.
+    h: F64
+    squared: F64
+
+    @property
+    def off(self) -> B8:
+        """(N,) which points stand off the plane."""
+        return np.asarray(self.squared > OFF_PLANE)
+
+
+def find_dominant_plane(
+    f: F64, points: F64, inliers: B8, *, sigma: float, rng: Generator
+) -> DominantPlane | None:
+    """The plane of F with most of its inliers, least squares over those within 5 sigma; None without one.
+
+    ``f`` (9,), ``points`` (N, 4) and ``sigma`` in one frame.
     """
-
-    kind: Configuration
-    sigma_px: float
-    homography_errors: float
-    off_homography: float
-    off_homography_chance: float
-    turning_errors: float
-    turning_camera_ratio: float
-    turn_deg: float
-    translation_ratio: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.kind.value}: noise {self.sigma_px:.2g} px, homography off by "
-            f"{self.homography_errors:.1f} standard errors with {100.0 * self.off_homography:.0f} % of the "
-            f"matches beyond it (10^{self.off_homography_chance:.0f} by chance), rotation "
-            f"off by {self.turning_errors:.1f}, translation at {self.translation_ratio:.2g} of its limit"
-        )
+    mine = points[inliers]
+    if len(mine) < 4:
+        return None
+    e2 = np.linalg.svd(f.reshape(3, 3))[0][:, 2].copy()
+    mine = mine[rng.permutation(len(mine))[:MOST]]
+    some = mine[:SUBSET]
+    triples = rng.integers(0, len(some), (TRIPLES, 3))
+    h = np.empty(9)
+    dominant_plane(f, e2, some, triples, GATE * sigma, h)
+    if not h.any():
+        return None
+    # A plane through three noisy matches is off elsewhere: the gate starts wide.
+    refine_plane(h, some, 2.0 * GATE * sigma, SUBSET_STEPS)
+    refine_plane(h, mine, GATE * sigma, ALL_STEPS)
+    squared = np.asarray(plane_distances(h, points)) / sigma**2
+    return DominantPlane(h, squared) if (squared < GATE**2).any() else None
 
 
-def classify_configuration(
-    F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None, seed: int = 0
-) -> Degeneracy:
-    """Name what the matches (N, 2) px that agree with F (3, 3) show.
+def plane_covariance(h: F64, points: F64, sigma: float) -> F64:
+    """Covariance (9, 9) of h, unit norm, from the points (N, 4) of the plane."""
+    G = np.empty((9, 9))
+    plane_normal_equations(h, points, 1e6 * sigma, G)
+    values, vectors = np.linalg.eigh(G)
+    # The least eigenvalue is the scale of H, which no distance sees.
+    half = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-14 * values[-1]))
+    return np.asarray(sigma**2 * half @ half.T)
 
-    ``inliers`` (N,), at least 12, are those that agree, all of them where None. Given the wrong ones too it
-    is known how many could agree by chance: an F fitted to a plane gathers wrong matches at will. Both images
-    are taken to share their intrinsics (else a rotation is named a plane, a translation general) and to have
-    square pixels, which tell a plane from a rotation where its eigenvalues happen to be those of one. GENERAL
-    where relief and baseline stand out of the noise. ``seed`` draws the planes that are tried. Raises as
-    :func:`~thesisrecon.epipolar.frame.check_matches`, and ``ValueError`` for an F below rank 2 and for flags
-    of another shape.
+
+def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
+    """Weights (N,): one over the number of matches that share a place (of 2 px) in either image.
+
+    At most one of the matches of one place is right, and all of them agree with every F whose epipole lies
+    there: they are one piece of evidence.
     """
-    xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
-    inliers = np.ones(len(xy1), dtype=bool) if inliers is None else inliers
-    if inliers.shape != (len(xy1),):
-        raise ValueError(f"classify_configuration got {inliers.shape} inlier flags for {len(xy1)} matches")
-    check_matches(xy1[inliers], xy2[inliers], needed=MINIMUM)
-    # One centre for both images: F of a translation is skew in it, H of a rotation keeps its eigenvalues.
-    own = PairFrame.of(xy1[inliers], xy2[inliers])
-    centre = 0.5 * (own.centroid1 + own.centroid2)
-    frame = PairFrame(centre, centre, own.scale)
-    points, f = frame.points(xy1, xy2), check_start(F, frame)
-    refine(f, points[inliers], GRADIENT, np.inf, _scale(f, points[inliers]) * 3.0, 15)
-    sigma = _scale(f, points[inliers])
-    agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
-    chance = chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
-    case = _Case(f, points, agree, once_each(xy1, xy2), sigma, chance)
-    return _classify(case, frame.scale, seed)
+    return 1.0 / np.maximum(_crowd(xy1), _crowd(xy2))
+
+
+def _crowd(xy: F64) -> F64:
+    cell = np.floor(xy / SAME_PX).astype(np.int64)
+    _, place, count = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True, return_counts=True)
+    return np.asarray(count[place], dtype=np.float64)
+
+
+def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: int) -> float:
+    """log10 of how often ``agreeing`` or more of ``tried`` wrong matches agree with the best model by chance.
+
+    The model is laid through ``free`` of them and each of the rest agrees with probability ``chance``: the
+    a-contrario bound (tried - free) C(tried, free) P(Binomial >= agreeing - free) of Moisan and Stival (IJCV
+    2004). 0 or more where that many are no surprise.
+    """
+    rest, hits = tried - free, agreeing - free
+    if hits <= 0.0 or rest <= 0.0:
+        return 0.0
+    tail = float(scipy.special.betainc(hits, max(rest - hits, 0.0) + 1.0, min(chance, 1.0)))
+    ways = (
+        scipy.special.gammaln(tried + 1.0)
+        - scipy.special.gammaln(free + 1.0)
+        - scipy.special.gammaln(rest + 1.0)
+        + np.log(max(rest, 1.0))
+    )
+    return float((ways + np.log(max(tail, 1e-300))) / np.log(10.0))
+
+
+def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:
+    """Probability that a wrong match lies within Sampson distance ``band_px`` of any F.
+
+    A band of width 2 sqrt(2) band_px across the picture, over the picture: the bounds of the matches.
+    """
+    narrow = min(float(np.ptp(xy)) for xy in (*xy1.T, *xy2.T))
+    return min(1.0, float(2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300)))
+
+
+PAIRS, COMPETING_SUBSET, RIVALS, LOOKED_AT = 300, 400, 3, 100
+"""Epipoles tried, matches off the plane that each is judged on, and how many of the best by all of these, and
+by those that the found F does not explain, are refined if they are unlike each other."""
+TYPICAL = 0.3
+"""Of the epipoles tried, so many are taken for wrong: what they explain, chance explains."""
+ALIKE = 0.8
+"""Share of its matches that two geometries have in common to count as one."""
+GATES, KNEE, STEPS = (2.4, 1.8, 1.2), 0.4, 5
+WIDE = 2.0
+"""In bands: two noisy matches and a plane that is known where its matches are do not make a good F."""
+FAR = 20.0
+"""Distances count to so many bands, or one wrong match would be the whole difference of two geometries."""
 
 
 @dataclass(frozen=True)
-class _Case:
-    """``points`` (N, 4), F and sigma in one frame, which ``agree``, ``weights``, the ``chance`` to agree."""
+class CompetingModel:
+    """Another F: ``f`` (9,) in the frame, and how it differs from the one that was found.
+
+    ``lost`` and ``gained`` are weights of matches that only the one or only the other explains; ``error`` is
+    the RMS distance of the rival's inliers to the found F, ``apart`` that or the other way round, whichever
+    is less, in the units of the frame.
+    """
 
     f: F64
-    points: F64
-    agree: B8
-    weights: F64
-    sigma: float
-    chance: float
+    lost: float
+    gained: float
+    error: float
+    apart: float
 
-    def false_alarms(self, off: B8, free: int) -> float:
-        """How often, log10, as many of the matches ``off`` a simpler model agree with a better one."""
-        agreeing, tried = self.weights[off & self.agree].sum(), self.weights[off].sum()
-        # What F can still choose beside the model, it chooses to agree with wrong matches.
-        chance = FLEXIBLE * self.chance if free == EPIPOLE else self.chance
-        return log10_false_alarms(float(agreeing), float(tried), chance=chance, free=free)
+    @property
+    def margin(self) -> float:
+        """By how many standard errors the found F explains more: McNemar's test."""
+        return (self.lost - self.gained) / float(np.sqrt(max(self.lost + self.gained, 1.0)))
 
 
-def _scale(f: F64, points: F64) -> float:
-    r = np.asarray(sampson_distances(f, points))
-    return max(trimmed_noise_scale(r, noise_scale(r)), 1e-12)
+def find_competing_models(
+    f: F64, points: F64, weights: F64, plane: DominantPlane, *, band: float, rng: Generator
+) -> tuple[list[CompetingModel], float]:
+    """The rivals of ``f`` and the share of the matches off the plane that a geometry explains by chance.
 
-
-def _classify(case: _Case, scale: float, seed: int) -> Degeneracy:
-    sigma = case.sigma
-    errors, off, chance, turning, angle, camera = np.inf, 1.0, -np.inf, np.inf, np.nan, np.nan
-    plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
-    if plane is not None:
-        squared = plane.squared * case.sigma**2
-        noise = _plane_noise(squared[case.agree])
-        near, far = squared < NEAR * noise**2, squared > FAR * noise**2
-        errors = _excess_errors(case, near, float(squared[near].sum()))
-        off, chance = float(np.mean(far[case.agree])), case.false_alarms(far, EPIPOLE)
-        # Least squares of all of them, for which the covariance holds.
-        refine_plane(plane.h, case.points[near], 1e6 * noise, 4)
-        turning, angle = _turning(plane.h.reshape(3, 3), plane_covariance(plane.h, case.points[near], noise))
-    ratio = _translation_ratio(case)
-    kind = Configuration.GENERAL
-    if plane is not None and errors < STANDARD_ERRORS and chance > LARGEST_CHANCE:
-        # F has fitted itself to the noise of a plane; the homography could not.
-        sigma = noise
-        turned = turning < _turn_limit(int(near.sum())) and np.isfinite(angle)
-        if turned:
-            xy1, xy2 = case.points[near, :2], case.points[near, 2:]
-            camera = turning_ratio(plane.h.reshape(3, 3), xy1, xy2, risk=TURN_RISK)
-            turned = camera <= 1.0
-        kind = Configuration.ROTATION if turned else Configuration.PLANE
-    elif ratio <= 1.0:
-        kind = Configuration.TRANSLATION
-    return Degeneracy(kind, sigma / scale, errors, off, chance, turning, camera, angle, ratio)
-
-
-def _plane_noise(squared: F64) -> float:
-    """Standard deviation of one coordinate from squared distances (N,) to a homography, some off it."""
-    variance = float(np.median(squared)) / CHI2_MEDIAN
-    for _ in range(TRIMMINGS):
-        near = squared[squared < NEAR * variance]
-        if len(near) < MINIMUM:
-            break
-        variance = float(near.sum()) / (2.0 * NEAR_MEAN * (len(near) - 4))
-    return float(np.sqrt(max(variance, 1e-24)))
-
-
-def _excess_errors(case: _Case, near: B8, rss_plane: float) -> float:
-    """By how many standard errors the squared parallax of the matches near the plane is more than noise.
-
-    A homography has 8 parameters for 2 K residuals, F takes 7 of the K across the lines: K - 1 are left along
-    them, and of the same variance if they are noise. The F of just these matches is compared.
+    [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005), right or wrong, are judged
+    on all matches off it; the best that are unlike each other are refined on all ``points`` (N, 4). Of half
+    of the pairs one match agrees with ``f`` and the other does not: a wrong F often has most of its matches
+    in common with the right one. Matches have ``weights`` (N,), and agree within ``band``.
     """
-    k = int(near.sum())
-    if k < MINIMUM - 4:
-        return float("inf")
-    across = _least_squares(case.f, case.points[near])
-    ratio = max(rss_plane - across, 1e-24) / (k - 1) * (k - 7) / max(across, 1e-24)
-    return float(np.log(ratio) / np.sqrt(2.0 / (k - 1) + 2.0 / (k - 7)))
-
-
-def _turning(H: F64, covariance: F64) -> tuple[float, float]:
-    """|trace H - trace H^-1| in standard errors and the angle, deg: H of a rotation has eigenvalues
-    1, exp(+-i angle) whatever the camera (HZ 13.2; Hartley 1994)."""
-    determinant = float(np.cbrt(np.linalg.det(H)))
-    if not abs(determinant) > 1e-4 * float(np.linalg.norm(H)):
-        return np.inf, np.nan
-    # Of unit determinant; what the covariance has along H itself is 0, and traces do not see it.
-    M, back = H / determinant, np.linalg.inv(H / determinant)
-    covariance = covariance / determinant**2
-    t, t_back = float(np.trace(M)), float(np.trace(back))
-    # d trace M = <I, dM>, d trace M^-1 = -<M^-2', dM>, for dM that keeps the determinant.
-    project = back.T / 3.0
-    slope: F64 = (np.eye(3) - project * t).ravel()
-    difference: F64 = slope - (project * t_back - (back @ back).T).ravel()
-    gap = float(np.sqrt(max(float(difference @ covariance @ difference), 1e-300)))
-    mean, error = 0.5 * (t + t_back), float(np.sqrt(max(float(slope @ covariance @ slope), 1e-300)))
-    still = bool(np.linalg.norm(M - np.eye(3)) ** 2 < 16.0 * np.trace(covariance) + 1e-18)
-    turned = -1.0 <= mean < 3.0 - 3.0 * error
-    angle = (
-        float(np.degrees(np.arccos(np.clip(0.5 * (mean - 1.0), -1.0, 1.0)))) if turned or still else np.nan
+    distances = np.asarray(sampson_distances(f, points))
+    inside = distances < band
+    off = np.flatnonzero(plane.off)
+    if len(off) < 3:
+        return [], 0.0
+    off = off[rng.permutation(len(off))[:COMPETING_SUBSET]]
+    w, mine = weights[off], inside[off]
+    F, agree, sums = geometries_of_plane(
+        plane.h, points[off], np.stack([w, w * ~mine]), _pairs(mine, rng), WIDE * band
     )
-    return abs(t - t_back) / gap, angle
+    # The two matches that made a geometry agree with it always.
+    beyond = np.maximum(sums[:, 0] - 2.0, 0.0) / max(float(w.sum()) - 2.0, 1.0)
+    chance = float(np.quantile(beyond, TYPICAL)) / WIDE
+    chosen, count = np.empty(2 * RIVALS, dtype=np.int64), 0
+    for k, value in enumerate((sums[:, 0], sums[:, 0] + sums[:, 1])):
+        order = np.argsort(-value, kind="stable")
+        count = unlike(order[:LOOKED_AT], agree, w, ALIKE, chosen, count, (k + 1) * RIVALS)
+    competing_models = [
+        _rival(_refined(F[s], points, band), points, weights, (distances, inside), band)
+        for s in chosen[:count]
+    ]
+    return competing_models, chance
 
 
-def _turn_limit(n: int) -> float:
-    """Standard errors that the turning of a rotation keeps to: Student's, since the noise is estimated."""
-    return float(scipy.special.stdtrit(n - 7, 1.0 - TURN_RISK))
+def _pairs(inside: B8, rng: Generator) -> NDArray[np.int64]:
+    pairs = rng.integers(0, len(inside), (PAIRS, 2))
+    mine, others = np.flatnonzero(inside), np.flatnonzero(~inside)
+    if len(mine) and len(others):
+        half = PAIRS // 2
+        pairs[:half, 0] = mine[rng.integers(0, len(mine), half)]
+        pairs[:half, 1] = others[rng.integers(0, len(others), half)]
+    return pairs
 
 
-def _translation_ratio(case: _Case) -> float:
-    """(RSS of [e]x - RSS of F) over the limit that noise keeps to, an F-test with 5 and n - 7 degrees."""
-    mine = case.points[case.agree]
-    f = _fit_translation(mine, case.sigma)
-    simple = np.asarray(sampson_distances(f, case.points))
-    off = simple > np.sqrt(FAR) * case.sigma
-    if case.false_alarms(off, BEYOND_TRANSLATION) < LARGEST_CHANCE:
-        return float("inf")
-    near = case.points[simple < TRANSLATED * case.sigma]
-    degrees = len(near) - 7
-    if degrees < MINIMUM - 7:
-        return float("inf")
-    # The same matches for both models, chosen by neither's favour: F would keep what it fits best.
-    _refine_translation(f, near, np.inf)
-    rss_simple = float(np.sum(np.asarray(sampson_distances(f, near)) ** 2))
-    rss = min(rss_simple, *(_least_squares(start, near) for start in (case.f, f)))
-    limit = (
-        BEYOND_TRANSLATION
-        * float(scipy.special.fdtri(BEYOND_TRANSLATION, degrees, 1.0 - RISK))
-        * max(rss / degrees, 1e-24)
-    )
-    strays = case.chance * float(case.weights[~case.agree].sum())
-    return (rss_simple - rss) / (limit * (1.0 + ALLOWANCE * min(strays, 1.0)))
-
-
-def _least_squares(f: F64, points: F64) -> float:
+def _refined(f: F64, points: F64, band: float) -> F64:
     f = f.copy()
-    refine(f, points, GRADIENT, np.inf, UNBOUNDED, CORRECTIONS)
-    return float(np.sum(np.asarray(sampson_distances(f, points)) ** 2))
-
-
-def _fit_translation(points: F64, sigma: float) -> F64:
-    """[e]x (9,) of most points: from pairs of them, then from all within a shrinking gate."""
-    rng = np.random.default_rng(len(points))
-    identity = np.eye(3).ravel() / np.sqrt(3.0)
-    some = points[rng.permutation(len(points))[:200]]
-    pairs = rng.integers(0, len(some), (100, 2))
-    weights = np.ones((1, len(some)))
-    F, _, found = geometries_of_plane(identity, some, weights, pairs, 4.0 * BAND * sigma)
-    f: F64 = F[int(np.argmax(found[:, 0]))].copy()
-    for gate in (4.0, 2.0, 1.5):
-        _refine_translation(f, points, gate * 4.0 * sigma)
+    for gate in GATES:
+        refine(f, points, SAMPSON, gate * band, KNEE * gate * band, STEPS)
     return f
 
 
-def _refine_translation(f: F64, points: F64, gate: float) -> None:
-    """Least squares of the Sampson distances of [e]x (9,) within the gate (in place), by Gauss-Newton."""
-    e = np.array([f[7], f[2], f[3]])
-    if not np.linalg.norm(e) > EXACT:
-        return
-    e /= np.linalg.norm(e)
-    kept = points[np.asarray(sampson_distances(f, points)) < gate]
-    if len(kept) < 5:
-        return
-    x1, x2 = homogenize(kept[:, :2]), homogenize(kept[:, 2:])
-    normal = np.cross(x1, x2)
-    for _ in range(CORRECTIONS):
-        # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two rows.
-        l2, l1 = np.cross(e, x1)[:, :2], np.cross(x2, e)[:, :2]
-        g = np.sum(l1**2, axis=1) + np.sum(l2**2, axis=1) + EXACT**2
-        value = normal @ e
-        size = 1.0 / np.sqrt(g)
-        # d g / d e = 2 (l1 . dl1 + l2 . dl2)
-        dg = np.zeros((len(kept), 3))
-        dg[:, 0] = l2[:, 1] * -x1[:, 2] + l1[:, 1] * x2[:, 2]
-        dg[:, 1] = l2[:, 0] * x1[:, 2] - l1[:, 0] * x2[:, 2]
-        dg[:, 2] = -l2[:, 0] * x1[:, 1] + l2[:, 1] * x1[:, 0] + l1[:, 0] * x2[:, 1] - l1[:, 1] * x2[:, 0]
-        J = normal * size[:, None] - (value * size**3)[:, None] * dg
-        basis = np.linalg.svd(e[None])[2][1:].T
-        Jb = J @ basis
-        step = basis @ np.linalg.lstsq(Jb, -(value * size), rcond=None)[0]
-        e = e + step
-        e /= np.linalg.norm(e)
-        if step @ step < 1e-20:
-            break
-    f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()
+def compare_competing_models(
+    others: list[F64], f: F64, points: F64, weights: F64, *, band: float
+) -> list[CompetingModel]:
+    """Other matrices (9,) in the frame as rivals of ``f``, each refined on all ``points`` (N, 4)."""
+    distances = np.asarray(sampson_distances(f, points))
+    found = (distances, distances < band)
+    return [_rival(_refined(other, points, band), points, weights, found, band) for other in others]
+
+
+def _rival(f: F64, points: F64, weights: F64, found: tuple[F64, B8], band: float) -> CompetingModel:
+    distances, inside = found
+    own = np.asarray(sampson_distances(f, points))
+    agreeing = own < band
+    lost, gained = weights[inside & ~agreeing].sum(), weights[agreeing & ~inside].sum()
+    if not agreeing.any() or not inside.any():
+        return CompetingModel(f, float(lost), float(gained), np.inf, np.inf)
+    error, back = (
+        np.sqrt(np.mean(np.minimum(d, FAR * band) ** 2)) for d in (distances[agreeing], own[inside])
+    )
+    return CompetingModel(f, float(lost), float(gained), float(error), float(min(error, back)))
+
+
+MINIMUM = 8
+BAND_SIGMAS, BAND_FLOOR_PX, SIGMA_FLOOR_PX = 2.5, 0.3, 0.1
+LARGEST_CHANCE = -2.0
+"""log10 of the false alarms that matches off the plane may be."""
+LEAST_MARGIN = 3.0
+"""Standard errors by which a rival must be worse. Right ones of real facades have 7 and more, wrong ones less
+than 2; it is no bound of a probability, since matches of repeated parts are not independent."""
+LEAST_GAIN = 0.05
+"""A rival that changes less than this share of the matches off the plane is F with other wrong matches."""
+LARGEST_ERROR_PX = 1.0
+"""Distance from epipolar lines that matters, in pixels, or 2 sigma where that is more."""
+CONTRADICTED, MOST_CONTRADICTED, JUDGED = 0.3, 0.2, 60
+"""A match is contradicted where more than this share of its neighbours does so; so many matches may be."""
+
+
+@dataclass(frozen=True)
+class _Support:
+    """Weights of matches off the plane: ``agreeing`` with F, all ``tried``, and what is ``contradicted``."""
+
+    agreeing: float
+    tried: float
+    contradicted: float
+
+
+def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) -> DegeneracyReport:
+    """Whether the matches (N, 2) px, wrong ones too, leave only ``fit`` as their epipolar geometry.
+
+    Undetermined where fewer matches off the dominant plane agree with F than would be a surprise by chance,
+    where another F, of that plane or from another search, explains about as many (McNemar's test, distances
+    that matter), where more than a fifth of those off the plane are contradicted by neighbours on it, or
+    where the covariance lets the inliers be more than a pixel off their lines. A pure translation is
+    determined. Wrong matches that are as coherent as a surface (a whole facade shifted by a window) cannot be
+    told from one.
+
+    Raises ``ValueError`` where ``fit`` and the matches do not belong together, and as
+    :func:`~thesisrecon.epipolar.frame.check_matches`.
+    """
+    xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
+    if fit.inliers.shape != (len(xy1),):
+        raise ValueError(f"the fit has {fit.inliers.shape} inlier flags for {len(xy1)} matches")
+    frame = PairFrame.of(xy1, xy2)
+    points, f = frame.points(xy1, xy2), frame.matrix_in_frame(fit.F)
+    sigma_px = max(fit.sigma_px, SIGMA_FLOOR_PX)
+    band_px = max(BAND_SIGMAS * fit.sigma_px, BAND_FLOOR_PX)
+    plane = find_dominant_plane(f, points, fit.inliers, sigma=sigma_px * frame.scale, rng=rng)
+    error_px = _expected_error(fit, xy1, xy2)
+    if plane is None:
+        return DegeneracyReport(
+            False, ("too few matches agree with the geometry",), expected_error_px=error_px
+        )
+    weights = multiplicity_weights(xy1, xy2)
+    competing_models, share = find_competing_models(
+        f, points, weights, plane, band=band_px * frame.scale, rng=rng
+    )
+    ends = [frame.matrix_in_frame(F) for F in fit.competing_models]
+    competing_models += compare_competing_models(ends, f, points, weights, band=band_px * frame.scale)
+    support = _support(points, fit.inliers, weights, plane, 2.0 * sigma_px * frame.scale)
+    by_chance = chance_of_agreement(xy1, xy2, band_px)
+    chance = log10_false_alarms(
+        support.agreeing - support.contradicted,
+        support.tried,
+        chance=max(share, by_chance),
+        free=2,
+    )
+    matters_px = max(LARGEST_ERROR_PX, 2.0 * fit.sigma_px)
+    least = _least_gain(support, by_chance)
+    different = [r for r in competing_models if r.gained >= least and _differs(r, matters_px * frame.scale)]
+    other = min(different, key=lambda r: r.margin, default=None)
+    return DegeneracyReport(
+        determined=not (reasons := tuple(_reasons(support, chance, other, error_px, matters_px))),
+        reasons=reasons,
+        off_plane=support.agreeing,
+        contradicted=support.contradicted,
+        log10_false_alarms=chance,
+        competing_margin=other.margin if other is not None else float("inf"),
+        competing_model=frame.matrix_in_pixels(other.f) if other is not None else None,
+        expected_error_px=error_px,
+    )
+
+
+def _least_gain(support: _Support, chance: float) -> float:
+    """Weight of matches that a rival must gain to be one: more than of the wrong ones agree by chance."""
+    expected = 2.0 * chance * (support.tried - support.agreeing)
+    return float(max(LEAST_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
+
+
+def _differs(competing_model: CompetingModel, matters: float) -> bool:
+    """Whether F is wrong if the rival is right; one that explains all that F does must explain much more, as
+    a wrong match or two that it gains are far from F too."""
+    return competing_model.apart > matters or (
+        competing_model.error > matters and competing_model.margin < -LEAST_MARGIN
+    )
+
+
+def _support(points: F64, inliers: B8, weights: F64, plane: DominantPlane, near: float) -> _Support:
+    mine = inliers & plane.off
+    chosen = np.flatnonzero(mine[inliers])
+    # Every k-th: enough to know a share.
+    chosen = chosen[:: max(1, len(chosen) // JUDGED)]
+    shares = contradicted_shares(plane.h, points[inliers], ~plane.off[inliers], chosen, near)
+    some = weights[inliers][chosen]
+    agreeing = float(weights[mine].sum())
+    part = float(some[shares > CONTRADICTED].sum() / max(some.sum(), 1e-300))
+    return _Support(agreeing, float(weights[plane.off].sum()), part * agreeing)
+
+
+def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
+    """RMS over the inliers of the distance of exact matches to their lines, px, from the covariance of F."""
+    some = np.flatnonzero(fit.inliers)
+    some = some[:: max(1, len(some) // JUDGED)]
+    std = epipolar_distance_std(fit.F, fit.covariance, xy1[some], xy2[some])
+    return float(np.sqrt(np.mean(std**2))) if len(std) else float("inf")
+
+
+def _reasons(
+    support: _Support,
+    chance: float,
+    competing_model: CompetingModel | None,
+    error_px: float,
+    matters_px: float,
+) -> list[str]:
+    off = f"{support.agreeing:.0f} of {support.tried:.0f} matches off the dominant plane agree with it"
+    reasons = []
+    if chance > LARGEST_CHANCE:
+        reasons.append(f"{off}, no more than chance gives")
+    if support.contradicted > MOST_CONTRADICTED * support.agreeing:
+        reasons.append(
+            f"{off}, but {support.contradicted:.0f} of them lie amid matches of the plane, as those between "
+            f"repeated parts do"
+        )
+    if competing_model is not None and competing_model.margin < LEAST_MARGIN:
+        reasons.append(
+            f"another geometry explains {competing_model.gained:.0f} matches that it does not, and "
+            f"leaves {competing_model.lost:.0f} of its own"
+        )
+    if error_px > matters_px:
+        reasons.append(f"its covariance allows epipolar lines to be {error_px:.2g} px off")
+    return reasons

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.multiview import unit_norm
-
-F64 = NDArray[np.float64]
+from thesisrecon.geometry.two_view import unit_norm
 
 COLLINEAR = 1e-9
 """Spread across the longest direction, relative to it, below which points count as lying on one line."""

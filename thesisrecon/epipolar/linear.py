@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import SMALLEST_PX, PairFrame, as_matches, check_matches
-from thesisrecon.epipolar.kernels import seven_point
+from thesisrecon.epipolar.search import seven_point
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
-from thesisrecon.geometry.multiview import enforce_rank_two, unit_norm
-
-F64 = NDArray[np.float64]
+from thesisrecon.geometry.two_view import enforce_rank_two, unit_norm
 
 UNDETERMINED_REL = 1e-12
 """Ratio of the eighth to the first singular value below which the matches leave F free."""

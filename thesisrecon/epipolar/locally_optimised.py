@@ -6,23 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
-from thesisrecon.epipolar.covariance import fundamental_covariance
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame, check_matches
-from thesisrecon.epipolar.kernels import sampson_distances, search, truncated_score
-from thesisrecon.epipolar.rank2.kernels import GRADIENT, refine
+from thesisrecon.epipolar.precision import fundamental_covariance
+from thesisrecon.epipolar.refinement import SAMPSON, refine
+from thesisrecon.epipolar.search import sampson_distances, search, truncated_score
 from thesisrecon.errors import StageFailure
-from thesisrecon.robust.noise import (
+from thesisrecon.numerics.noise import (
     NoiseMixture,
     best_huber_width,
     effective_noise,
     noise_scale,
     noise_width,
 )
-from thesisrecon.types import FundamentalFit
-
-F64 = NDArray[np.float64]
+from thesisrecon.records import FundamentalFit
 
 BATCH = 512
 MINIMUM = 8
@@ -126,9 +124,9 @@ class LocallyOptimisedRansac:
 
     def _candidate(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         ends, samples = self._starts(points, gate, rng)
-        f, rivals = _best_and_rivals(ends, _chance_of_scores(points))
+        f, competing_models = _best_and_rivals(ends, _chance_of_scores(points))
         noise, loss = _sharpen(f, points, gate) if f.any() else (None, (0.0, 0.0))
-        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, rivals)
+        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, competing_models)
 
     def _starts(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
         """Score and matrix (9,) where each search ended, until enough agree; and the samples drawn."""
@@ -150,9 +148,9 @@ class LocallyOptimisedRansac:
 
     def _refine_start(self, f: F64, points: F64, gate: float) -> None:
         for width in self.gates[:-1]:
-            refine(f, points[:START_POINTS], GRADIENT, width * gate, KNEE * width * gate, START_STEPS)
+            refine(f, points[:START_POINTS], SAMPSON, width * gate, KNEE * width * gate, START_STEPS)
         width = self.gates[-1]
-        refine(f, points, GRADIENT, width * gate, KNEE * width * gate, LAST_STEPS)
+        refine(f, points, SAMPSON, width * gate, KNEE * width * gate, LAST_STEPS)
 
     def _search(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
@@ -182,8 +180,12 @@ class LocallyOptimisedRansac:
         effective = effective_noise(r[fitted], found.loss[1], parameters=PARAMETERS)
         covariance = fundamental_covariance(frame, found.f, points[fitted], effective)
         F = frame.matrix_in_pixels(found.f)
-        rivals = np.array([frame.matrix_in_pixels(f) for f in found.rivals]).reshape(-1, 3, 3)
-        return FundamentalFit(F, inliers, noise.sigma / frame.scale, covariance, found.samples, rivals)
+        competing_models = np.array([frame.matrix_in_pixels(f) for f in found.competing_models]).reshape(
+            -1, 3, 3
+        )
+        return FundamentalFit(
+            F, inliers, noise.sigma / frame.scale, covariance, found.samples, competing_models
+        )
 
 
 @dataclass(frozen=True)
@@ -199,21 +201,21 @@ class _Candidate:
     residuals: F64
     noise: NoiseMixture | None
     loss: tuple[float, float]
-    rivals: list[F64]
+    competing_models: list[F64]
 
-    def explains_more_than(self, rival: _Candidate) -> bool:
+    def explains_more_than(self, competing_model: _Candidate) -> bool:
         """Whether this, found with a wider gate, is likelier and leaves few matches unexplained.
 
         A wide gate finds wrong matrices that many wrong matches are near to; noise beyond the threshold is
         believed only if it explains most of what the ``rival`` calls wrong, or nearly everything.
         """
-        if self.noise is None or rival.noise is None:
-            return rival.noise is None
+        if self.noise is None or competing_model.noise is None:
+            return competing_model.noise is None
         explained = int(np.count_nonzero(self.residuals < self.noise.limit))
-        more = explained - int(np.count_nonzero(rival.residuals < rival.noise.limit))
+        more = explained - int(np.count_nonzero(competing_model.residuals < competing_model.noise.limit))
         left = len(self.residuals) - explained
         few = left <= max(more, FEW_WRONG * len(self.residuals))
-        return few and self.noise.log_likelihood > rival.noise.log_likelihood
+        return few and self.noise.log_likelihood > competing_model.noise.log_likelihood
 
 
 def _chance_of_scores(points: F64) -> float:
@@ -224,14 +226,14 @@ def _chance_of_scores(points: F64) -> float:
 def _best_and_rivals(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:
     """The matrix with the lowest score, 0 where there is none, and the next, each ``same`` or more above."""
     best, last = np.zeros(9), -np.inf
-    rivals: list[F64] = []
+    competing_models: list[F64] = []
     for score, f in sorted(ends, key=lambda end: end[0]):
         if last == -np.inf:
             best = f
-        elif score - last >= same and len(rivals) < RIVALS:
-            rivals.append(f)
+        elif score - last >= same and len(competing_models) < RIVALS:
+            competing_models.append(f)
         last = score
-    return best, rivals
+    return best, competing_models
 
 
 def _noise(r: F64, gate: float) -> NoiseMixture | None:
@@ -261,7 +263,7 @@ def _sharpen(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tup
         # first refinement.
         width = best_huber_width(near, noise.sigma, parameters=PARAMETERS) if k > 0 else np.inf
         width = min(max(width, EXACT), limit)
-        refine(f, points, GRADIENT, limit, width, REFINEMENT_STEPS)
+        refine(f, points, SAMPSON, limit, width, REFINEMENT_STEPS)
         loss = (limit, width)
     return noise, loss
 

@@ -1,4 +1,7 @@
-"""Section 5.5: what the uncertainty of F means for epipolar lines and epipoles, and the least possible."""
+"""The uncertainty of an estimated F: from the curvature of the gradient criterion at its minimum.
+
+Section 5.5: what the uncertainty of F means for epipolar lines and epipoles, and the least possible.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,39 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar.covariance import fundamental_covariance
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame, as_matches, check_matches
-from thesisrecon.geometry.camera import project
+from thesisrecon.epipolar.refinement import SAMPSON, normal_equations, split, tangent
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.multiview import epipoles, fundamental_from_cameras, unit_norm
-from thesisrecon.types import FundamentalFit
+from thesisrecon.geometry.two_view import epipoles, fundamental_from_cameras, unit_norm
+from thesisrecon.records import FundamentalFit
 
-F64 = NDArray[np.float64]
+FLATTEST_REL = 1e-14
+"""Curvatures below this share of the largest are raised to it: a plane's F is uncertain, not inf."""
+
+
+def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) -> F64:
+    """Covariance (9, 9) of vec(F), F in pixels with unit norm, to first order: sigma^2 B (J'J)^-1 B'.
+
+    ``f`` (9,) and ``points`` (N, 4) (the inliers) in ``frame``, ``sigma`` of one image coordinate in its
+    units. J are the derivatives of the Sampson distances by the seven parameters, B those of vec(F). Rank 7.
+    """
+    U, V, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((9, 7))
+    G, h = np.empty((9, 9)), np.empty(9)
+    phi = split(f, U, V)
+    tangent(U, V, phi, B)
+    normal_equations(f, points, SAMPSON, np.inf, 1e150, G, h)
+    values, vectors = np.linalg.eigh(B.T @ G @ B)
+    half = B @ (vectors / np.sqrt(np.maximum(values, FLATTEST_REL * max(values[-1], 1e-300))))
+    to_pixels = frame.to_pixels
+    pixels = to_pixels @ f
+    norm = float(np.linalg.norm(pixels))
+    moved = to_pixels @ half / norm
+    moved -= np.outer(pixels, pixels @ moved) / norm**2
+    covariance: F64 = sigma**2 * moved @ moved.T
+    return covariance
+
 
 PARAMETERS = 7
 

@@ -1,20 +1,304 @@
-"""Section 5.3: F that minimises a geometric criterion over the seven degrees of freedom it has."""
+"""Compiled refinement of F over its seven degrees of freedom: F = U diag(cos phi, sin phi, 0) V'.
+
+Orthonormal representation of Bartoli and Sturm (IJCV 2004): singular by construction, without the thesis'
+special case of an epipole at infinity. Points are rows (x1, y1, x2, y2), F is a flat row-major vector of 9.
+
+Section 5.3: F that minimises a geometric criterion over the seven degrees of freedom it has.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar.rank2.kernels import DISTANCE, GRADIENT, REPROJECTION, refine
 
-F64 = NDArray[np.float64]
+SAMPSON, DISTANCE, REPROJECTION = 0, 1, 2
+CORRECTIONS = 8
+"""Steps to the nearest exact match; each leaves some (noise / distance to the epipole)^2 of the last."""
+BLOCK = 128
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+def weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta: float, D: F64) -> float:
+    """Derivatives of the residuals of at most BLOCK points by the entries of F: columns of ``D`` (11, BLOCK).
+
+    Row 9 is the residual with its sign, row 10 the weight rho'(r) / r, 0 beyond the gate. Returns the cost.
+    One loop without branches over contiguous rows, which the compiler turns into vector instructions.
+    """
+    X = np.empty((4, BLOCK))
+    for k in range(len(points)):
+        for c in range(4):
+            X[c, k] = points[k, c]
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f
+    outside = delta * (gate - 0.5 * delta)
+    cost = 0.0
+    for k in range(len(points)):
+        x1, y1, x2, y2 = X[0, k], X[1, k], X[2, k], X[3, k]
+        a0 = f0 * x1 + f1 * y1 + f2
+        a1 = f3 * x1 + f4 * y1 + f5
+        b0 = f0 * x2 + f3 * y2 + f6
+        b1 = f1 * x2 + f4 * y2 + f7
+        e = a0 * x2 + a1 * y2 + f6 * x1 + f7 * y1 + f8
+        g1 = a0 * a0 + a1 * a1 + 1e-60
+        g2 = b0 * b0 + b1 * b1 + 1e-60
+        if criterion == SAMPSON:
+            s = 1.0 / np.sqrt(g1 + g2)
+            p = q = -e * s * s * s
+        else:
+            s = np.sqrt(1.0 / g1 + 1.0 / g2)
+            p = -e / (s * g1 * g1)
+            q = -e / (s * g2 * g2)
+        r = abs(e * s)
+        inside = r < gate
+        bend = delta / max(r, delta)
+        w = bend if inside else 0.0
+        cost += bend * r * (r - 0.5 * bend * r) if inside else outside
+        # dr = s de + p (a0 da0 + a1 da1) + q (b0 db0 + b1 db1)
+        u0, u1, v0, v1 = p * a0, p * a1, q * b0, q * b1
+        s2, t2 = s * x2 + u0, s * y2 + u1
+        D[0, k] = s2 * x1 + v0 * x2
+        D[1, k] = s2 * y1 + v1 * x2
+        D[2, k] = s2
+        D[3, k] = t2 * x1 + v0 * y2
+        D[4, k] = t2 * y1 + v1 * y2
+        D[5, k] = t2
+        D[6, k] = s * x1 + v0
+        D[7, k] = s * y1 + v1
+        D[8, k] = s
+        D[9, k] = e * s
+        D[10, k] = w
+    return cost
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+def reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: F64) -> float:
+    """As :func:`weighted_derivatives`, of the distances r of (x1, y1, x2, y2) to the nearest exact match.
+
+    The nearest match p is found by the iteration of Kanatani, Sugaya and Niitsuma (BMVC 2008), and it need
+    not be moved with F: r is least there, so that dr = d(p2' F p1) / |gradient at p|.
+    """
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f
+    outside = delta * (gate - 0.5 * delta)
+    cost = 0.0
+    for k in range(len(points)):
+        x1, y1, x2, y2 = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
+        p1, q1, p2, q2 = x1, y1, x2, y2
+        r, size = 0.0, 1.0
+        for _ in range(CORRECTIONS):
+            a0 = f0 * p1 + f1 * q1 + f2
+            a1 = f3 * p1 + f4 * q1 + f5
+            b0 = f0 * p2 + f3 * q2 + f6
+            b1 = f1 * p2 + f4 * q2 + f7
+            e = a0 * p2 + a1 * q2 + f6 * p1 + f7 * q1 + f8
+            e += b0 * (x1 - p1) + b1 * (y1 - q1) + a0 * (x2 - p2) + a1 * (y2 - q2)
+            size = 1.0 / np.sqrt(a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1 + 1e-60)
+            r = e * size
+            step = r * size
+            p1, q1, p2, q2 = x1 - step * b0, y1 - step * b1, x2 - step * a0, y2 - step * a1
+        inside = abs(r) < gate
+        bend = delta / max(abs(r), delta)
+        cost += bend * abs(r) * (abs(r) - 0.5 * bend * abs(r)) if inside else outside
+        s2, t2 = size * p2, size * q2
+        D[0, k], D[1, k], D[2, k] = s2 * p1, s2 * q1, s2
+        D[3, k], D[4, k], D[5, k] = t2 * p1, t2 * q1, t2
+        D[6, k], D[7, k], D[8, k] = size * p1, size * q1, size
+        D[9, k] = r
+        D[10, k] = bend if inside else 0.0
+    return cost
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64) -> float:
+    """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by the entries of F.
+
+    rho is Huber's loss of width ``delta``, constant beyond ``gate``; r the Sampson distance (5.4), the root
+    of the sum of the two squared epipolar distances (5.6), or the distance to the nearest exact match.
+    Returns the cost.
+    """
+    G[:] = 0.0
+    h[:] = 0.0
+    cost = 0.0
+    D, wd = np.empty((11, BLOCK)), np.empty(BLOCK)
+    for start in range(0, len(points), BLOCK):
+        m = min(BLOCK, len(points) - start)
+        block = points[start : start + m]
+        if criterion == REPROJECTION:
+            cost += reprojection_derivatives(f, block, gate, delta, D)
+        else:
+            cost += weighted_derivatives(f, block, criterion, gate, delta, D)
+        for i in range(9):
+            for k in range(m):
+                wd[k] = D[10, k] * D[i, k]
+            for j in range(i, 9):
+                total = 0.0
+                for k in range(m):
+                    total += wd[k] * D[j, k]
+                G[i, j] += total
+            total = 0.0
+            for k in range(m):
+                total += wd[k] * D[9, k]
+            h[i] += total
+    for i in range(9):
+        for j in range(i):
+            G[i, j] = G[j, i]
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def residuals_and_derivatives(f: F64, points: F64, criterion: int) -> tuple[F64, F64]:
+    """Signed residuals (N,) of a criterion and their derivatives (N, 9) by the entries of F."""
+    r, J, D = np.empty(len(points)), np.empty((len(points), 9)), np.empty((11, BLOCK))
+    for start in range(0, len(points), BLOCK):
+        block = points[start : start + BLOCK]
+        if criterion == REPROJECTION:
+            reprojection_derivatives(f, block, np.inf, 1e150, D)
+        else:
+            weighted_derivatives(f, block, criterion, np.inf, 1e150, D)
+        for k in range(len(block)):
+            r[start + k] = D[9, k]
+            for m in range(9):
+                J[start + k, m] = D[m, k]
+    return r, J
+
+
+@njit(cache=True, nogil=True)
+def compose(U: F64, V: F64, phi: float, f: F64) -> None:
+    """F = U diag(cos phi, sin phi, 0) V': rank 2 and unit norm by construction."""
+    c, s = np.cos(phi), np.sin(phi)
+    for i in range(3):
+        for j in range(3):
+            f[3 * i + j] = c * U[i, 0] * V[j, 0] + s * U[i, 1] * V[j, 1]
+
+
+@njit(cache=True, nogil=True)
+def tangent(U: F64, V: F64, phi: float, B: F64) -> None:
+    """Derivatives (``B`` (9, 7)) of F by rotations of U (3) and of V (3) about their own axes, and by phi."""
+    c, s = np.cos(phi), np.sin(phi)
+    for i in range(3):
+        for j in range(3):
+            m = 3 * i + j
+            B[m, 0] = s * U[i, 2] * V[j, 1]
+            B[m, 1] = -c * U[i, 2] * V[j, 0]
+            B[m, 2] = c * U[i, 1] * V[j, 0] - s * U[i, 0] * V[j, 1]
+            B[m, 3] = s * U[i, 1] * V[j, 2]
+            B[m, 4] = -c * U[i, 0] * V[j, 2]
+            B[m, 5] = c * U[i, 0] * V[j, 1] - s * U[i, 1] * V[j, 0]
+            B[m, 6] = c * U[i, 1] * V[j, 1] - s * U[i, 0] * V[j, 0]
+
+
+@njit(cache=True, nogil=True)
+def rotate_columns(U: F64, a: F64, out: F64) -> None:
+    """out = U exp([a]x), by Rodrigues' formula."""
+    angle = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    if angle < 1e-12:
+        p, q = 1.0, 0.5
+    else:
+        p, q = np.sin(angle) / angle, (1.0 - np.cos(angle)) / (angle * angle)
+    for i in range(3):
+        u0, u1, u2 = U[i]
+        # row vector times [a]x is u x a read as a row: u [a]x = (u1 a2 - u2 a1, ...)
+        c0, c1, c2 = u1 * a[2] - u2 * a[1], u2 * a[0] - u0 * a[2], u0 * a[1] - u1 * a[0]
+        d0, d1, d2 = c1 * a[2] - c2 * a[1], c2 * a[0] - c0 * a[2], c0 * a[1] - c1 * a[0]
+        out[i, 0] = u0 + p * c0 + q * d0
+        out[i, 1] = u1 + p * c1 + q * d1
+        out[i, 2] = u2 + p * c2 + q * d2
+
+
+@njit(cache=True, nogil=True)
+def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
+    """Solve (H + damping diag H) step = -g by Cholesky; False where the matrix is not positive."""
+    n = len(g)
+    L = np.zeros((n, n))
+    floor = 0.0
+    for i in range(n):
+        floor = max(floor, H[i, i])
+    floor = 1e-14 * floor + 1e-300
+    for i in range(n):
+        for j in range(i + 1):
+            total = H[i, j]
+            if i == j:
+                total += damping * max(H[i, i], floor)
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 1e-3 * damping * floor:
+                    return False
+                L[i, i] = np.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    for i in range(n):
+        total = -g[i]
+        for k in range(i):
+            total -= L[i, k] * step[k]
+        step[i] = total / L[i, i]
+    for i in range(n - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, n):
+            total -= L[k, i] * step[k]
+        step[i] = total / L[i, i]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def split(f: F64, U: F64, V: F64) -> float:
+    """U, V and phi of the nearest matrix of rank 2; phi = atan2 of the two largest singular values."""
+    u, s, vt = np.linalg.svd(f.reshape((3, 3)))
+    U[:] = u
+    V[:] = vt.T
+    return float(np.arctan2(s[1], s[0]))
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def refine(
+    f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int
+) -> tuple[float, int]:
+    """Minimise the cost of :func:`normal_equations` from ``f`` (finite, changed in place); cost and steps.
+
+    Levenberg-Marquardt with at most ``iterations`` solves; the cost never rises above that of the nearest
+    matrix of rank 2.
+    """
+    U, V, Un, Vn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    phi = split(f, U, V)
+    G, h, Gn, hn = np.empty((9, 9)), np.empty(9), np.empty((9, 9)), np.empty(9)
+    B, step, trial = np.empty((9, 7)), np.empty(7), np.empty(9)
+    compose(U, V, phi, f)
+    cost = normal_equations(f, points, criterion, gate, delta, G, h)
+    exact = 1e-26 * len(points)
+    damping, steps = 1e-3, 0
+    while steps < iterations and cost > exact:
+        tangent(U, V, phi, B)
+        H = B.T @ (G @ B)
+        g = B.T @ h
+        accepted = False
+        while steps < iterations and not accepted:
+            steps += 1
+            if solve_damped(H, g, damping, step):
+                rotate_columns(U, step[0:3], Un)
+                rotate_columns(V, step[3:6], Vn)
+                compose(Un, Vn, phi + step[6], trial)
+                new_cost = normal_equations(trial, points, criterion, gate, delta, Gn, hn)
+                accepted = new_cost < cost
+            damping = max(1e-9, 0.1 * damping) if accepted else 10.0 * damping
+            if damping > 1e8:
+                return cost, steps
+        if not accepted:
+            break
+        gain = cost - new_cost
+        U, Un, V, Vn, phi = Un, U, Vn, V, phi + step[6]
+        G, Gn, h, hn, cost = Gn, G, hn, h, new_cost
+        f[:] = trial
+        if gain <= 1e-6 * cost:
+            break
+    return cost, steps
+
 
 UNBOUNDED = 1e150
 """Stands for an infinite width of the loss: its square is still a number."""
 
 
-def refine_gradient(
+def refine_sampson(
     F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50
 ) -> F64:
     """F (3, 3), unit norm, rank 2, that minimises the Sampson distances of (5.4) from the start ``F``.
@@ -25,20 +309,20 @@ def refine_gradient(
     noise. Raises as :func:`~thesisrecon.epipolar.frame.check_matches` with 7 matches needed, ``ValueError``
     for an F that is not a finite (3, 3) matrix of rank 2 or more.
     """
-    return _refine(F, xy1, xy2, GRADIENT, loss_px, max_iterations)
+    return _refine(F, xy1, xy2, SAMPSON, loss_px, max_iterations)
 
 
 def refine_epipolar_distance(
     F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50
 ) -> F64:
-    """As :func:`refine_gradient`, but for the squared distances to both epipolar lines (5.6)."""
+    """As :func:`refine_sampson`, but for the squared distances to both epipolar lines (5.6)."""
     return _refine(F, xy1, xy2, DISTANCE, loss_px, max_iterations)
 
 
 def refine_reprojection(
     F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50
 ) -> F64:
-    """As :func:`refine_gradient`, but for the distances of the matches to the nearest exact ones.
+    """As :func:`refine_sampson`, but for the distances of the matches to the nearest exact ones.
 
     The gold standard (HZ, algorithm 11.3): the maximum likelihood of F and of all points under Gaussian
     noise. Each point is eliminated by its optimal correction, so that seven parameters are left.

@@ -13,19 +13,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar.rank2.kernels import (
-    DISTANCE,
-    GRADIENT,
-    REPROJECTION,
-    residuals_and_derivatives,
-)
-from thesisrecon.geometry.multiview import epipoles, unit_norm
-from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
-
-F64 = NDArray[np.float64]
+from thesisrecon.epipolar.refinement import DISTANCE, REPROJECTION, SAMPSON, residuals_and_derivatives
+from thesisrecon.geometry.two_view import epipoles, unit_norm
+from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 
 MAPS_TRIED = 4
 
@@ -137,22 +130,22 @@ class RankTwoMap(Protocol):
         """Derivatives (9, 7) of F."""
 
 
-def refine_gradient_by_rows(F: F64, xy1: F64, xy2: F64, *, and_columns: bool = False) -> F64:
-    """Least squares of :func:`~thesisrecon.epipolar.refinement.refine_gradient` in the thesis' parameters.
+def refine_sampson_by_rows(F: F64, xy1: F64, xy2: F64, *, and_columns: bool = False) -> F64:
+    """Least squares of :func:`~thesisrecon.epipolar.refinement.refine_sampson` in the thesis' parameters.
 
     Reaches the same minimum, more slowly; the map is chosen again where the estimate has left it.
     ``and_columns`` takes the 36 maps of Luong and Faugeras in place of the 18 of rows. Raises as the other.
     """
-    return _refine_by_rows(F, xy1, xy2, GRADIENT, and_columns)
+    return _refine_by_rows(F, xy1, xy2, SAMPSON, and_columns)
 
 
 def refine_epipolar_distance_by_rows(F: F64, xy1: F64, xy2: F64, *, and_columns: bool = False) -> F64:
-    """As :func:`refine_gradient_by_rows`, for the squared distances to both epipolar lines (5.6)."""
+    """As :func:`refine_sampson_by_rows`, for the squared distances to both epipolar lines (5.6)."""
     return _refine_by_rows(F, xy1, xy2, DISTANCE, and_columns)
 
 
 def refine_reprojection_by_rows(F: F64, xy1: F64, xy2: F64, *, and_columns: bool = False) -> F64:
-    """As :func:`refine_gradient_by_rows`, for the distances to the nearest exact matches."""
+    """As :func:`refine_sampson_by_rows`, for the distances to the nearest exact matches."""
     return _refine_by_rows(F, xy1, xy2, REPROJECTION, and_columns)
 
 

@@ -12,15 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
-from thesisrecon.epipolar.six_point.kernels import (
-    SAMPLE,
-    WIDTHS,
-    draw_samples,
-    reprojection_distances,
-    search,
-)
+from thesisrecon.arrays import B8, F64
+from thesisrecon.epipolar.six_point import SAMPLE, WIDTHS, draw_samples, reprojection_distances, search
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_SEGMENTS,
     TrifocalFit,
@@ -30,13 +24,9 @@ from thesisrecon.epipolar.trifocal_estimation import (
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
-from thesisrecon.geometry.multiview import estimate_homography, homography_residuals
-from thesisrecon.geometry.trifocal import tensor_from_cameras
-from thesisrecon.geometry.trifocal_linear import check_triplets, tensor_equations
-from thesisrecon.robust.kernels import required_samples
-
-F64 = NDArray[np.float64]
-B8 = NDArray[np.bool_]
+from thesisrecon.geometry.three_view import check_triplets, tensor_equations, tensor_from_cameras
+from thesisrecon.geometry.two_view import estimate_homography, homography_residuals
+from thesisrecon.numerics.noise import required_samples
 
 CHUNK, COMPLETIONS = 200, 1000
 REFINEMENTS, SHORT = 3, 4

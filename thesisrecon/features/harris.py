@@ -1,4 +1,6 @@
-"""Section 4.2.1: the corner detector of Harris and Stephens with a surface fit and a selection that covers
+"""Section 4.2.1: the R-matrix, its parameters, and the maxima of the surface fitted to it.
+
+Section 4.2.1: the corner detector of Harris and Stephens with a surface fit and a selection that covers
 the image.
 
 C. Harris, M. Stephens, A combined corner and edge detector, Alvey Vision Conference 1988.
@@ -11,9 +13,119 @@ from typing import Literal
 
 import numpy as np
 
-from thesisrecon.features.kernels import keep_apart, squared_suppression_radii
-from thesisrecon.features.measure import CornerMeasure, find_corners
-from thesisrecon.types import F32, F64, I64, Features, Image
+from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.features.kernels import corner_response, fit_maxima, keep_apart, squared_suppression_radii
+from thesisrecon.geometry.raster import gaussian_taps, smooth
+from thesisrecon.records import Features, Image
+
+# Below this det / trace (grey levels squared) the corners are those of quantisation and compression noise.
+NOISE_RESPONSE = 0.05
+
+
+@dataclass(frozen=True)
+class CornerMeasure:
+    """How much of a corner each pixel is: R of section 4.2.1, and where its maxima lie.
+
+    M (2 x 2; the thesis' "4 x 4" is a slip) holds the products of the image gradient, smoothed by a Gaussian.
+    The thesis' formula for R lost two signs: what is left, M, and (M11 + M22), fits both det M / trace M
+    (Noble 1988) and det M - k (trace M)^2 (Harris and Stephens 1988); both are here.
+
+    Parameters
+    ----------
+    formula : "noble" is det / trace, "harris" is det - k trace^2.
+    harris_k : k of the second, in (0, 0.25).
+    derivative_sigma_px : Gaussian before the derivation; 0 for none.
+    derivative_taps : the derivation kernel along either axis, an odd number of taps whose sum is 0; scaled so
+        that a ramp of one grey level per pixel has slope 1.
+    integration_sigma_px, integration_taps : the Gaussian of M, and its number of taps (odd; 0: three sigma to
+        each side). The thesis' experiments have sigma 1 and 9 taps.
+    colour : M is the mean over red, green and blue of each one's products, else that of the grey values.
+    subpixel : a quadratic surface is fitted to the 3 x 3 pixels of each maximum, else it stays at the pixel.
+    """
+
+    formula: Literal["noble", "harris"] = "noble"
+    harris_k: float = 0.04
+    derivative_sigma_px: float = 1.0
+    derivative_taps: tuple[float, ...] = (-0.5, 0.0, 0.5)
+    integration_sigma_px: float = 1.5
+    integration_taps: int = 0
+    colour: bool = False
+    subpixel: bool = True
+
+    def __post_init__(self) -> None:
+        taps = np.array(self.derivative_taps)
+        if len(taps) < 3 or len(taps) % 2 == 0 or abs(taps.sum()) > 1e-6 * np.abs(taps).sum():
+            raise ValueError(f"derivative_taps must be an odd number of taps of sum 0; got {taps.tolist()}")
+        if not _slope(taps) > 0.0:
+            raise ValueError(f"derivative_taps must rise from left to right; got {taps.tolist()}")
+        if not 0.0 < self.harris_k < 0.25:
+            raise ValueError(f"harris_k must lie between 0 and 0.25; got {self.harris_k}")
+        if not (self.derivative_sigma_px >= 0.0 and self.integration_sigma_px > 0.0):
+            raise ValueError(
+                "derivative_sigma_px must be at least 0 and integration_sigma_px above 0; "
+                f"got {self.derivative_sigma_px} and {self.integration_sigma_px}"
+            )
+        if self.integration_taps < 0 or (self.integration_taps and self.integration_taps % 2 == 0):
+            raise ValueError(f"integration_taps must be odd, or 0; got {self.integration_taps}")
+
+    def channels(self, image: Image) -> F32:
+        """(C, H, W) what of a photograph the corners are found in: its grey values or its three colours."""
+        if not self.colour:
+            return image.gray[None]
+        return np.ascontiguousarray(np.moveaxis(image.rgb, 2, 0), dtype=np.float32)
+
+    def response(self, channels: F32) -> F32:
+        """R (H, W) of ``channels`` (C, H, W); zero near the border."""
+        derivative = np.array(self.derivative_taps)
+        derivative = (derivative / _slope(derivative)).astype(np.float32)
+        if self.derivative_sigma_px > 0.0:
+            channels = np.stack([smooth(channel, self.derivative_sigma_px) for channel in channels])
+        # The mean over the channels, so that grey photographs have one R whether taken as colour or not.
+        # The taps serve twice, down and across.
+        taps = self._integration() / np.float32(np.sqrt(len(channels)))
+        weight = self.harris_k if self.formula == "harris" else 0.0
+        return corner_response(channels, derivative, taps, weight)
+
+    @property
+    def noise_response(self) -> float:
+        """R of an isotropic corner whose det / trace is ``NOISE_RESPONSE``."""
+        if self.formula == "noble":
+            return NOISE_RESPONSE
+        return (2.0 * NOISE_RESPONSE) ** 2 * (1.0 - 4.0 * self.harris_k)
+
+    def _integration(self) -> F32:
+        if self.integration_taps == 0:
+            return gaussian_taps(self.integration_sigma_px)
+        x = np.arange(self.integration_taps) - self.integration_taps // 2
+        taps = np.exp(-0.5 * (x / self.integration_sigma_px) ** 2)
+        normalized: F32 = (taps / taps.sum()).astype(np.float32)
+        return normalized
+
+    @property
+    def least_side_px(self) -> int:
+        """A side below which no corner is sought: two windows."""
+        return 2 * len(self._integration())
+
+
+def _slope(taps: F64) -> float:
+    return float(taps @ (np.arange(len(taps)) - len(taps) // 2))
+
+
+def find_corners(channels: F32, measure: CornerMeasure) -> tuple[F64, F32]:
+    """All corners of (C, H, W) above the noise, strongest first: ``xy`` (N, 2) px and response (N,).
+
+    Maxima of 3 x 3 neighbourhoods of R, refined by a quadratic surface. Equal responses are ordered as they
+    are read, so the result is reproducible. None where the image is smaller than two windows. Values that are
+    not finite are no image: ``ValueError``.
+    """
+    if min(channels.shape[1:]) < measure.least_side_px:
+        return np.empty((0, 2)), np.empty(0, np.float32)
+    if not np.isfinite(channels).all():
+        raise ValueError("corners are found in finite grey values; got NaN or infinity among them")
+    xy, value = fit_maxima(measure.response(channels), measure.noise_response, measure.subpixel)
+    order = np.argsort(-value, kind="stable")
+    return xy[order], value[order]
+
 
 # How many times its share one part of the image may fill of the pool of strong corners.
 SHARE = 1.5

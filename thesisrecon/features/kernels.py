@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from thesisrecon.types import F32, F64, I64
+from thesisrecon.arrays import F32, F64, I64
 
 # Sums may be reordered; assuming that no NaN exists would undo the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thesisrecon.features.harris import select_spread
+from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.features.harris import CornerMeasure, find_corners, select_spread
 from thesisrecon.features.kernels import sample_patches
-from thesisrecon.features.measure import CornerMeasure, find_corners
 from thesisrecon.geometry.raster import halve, resample, smooth
-from thesisrecon.types import B8, F32, F64, I64, Features, Image, Seeds
+from thesisrecon.records import Features, Image, Seeds
 
 
 @dataclass(frozen=True)

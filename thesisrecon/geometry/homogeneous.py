@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from thesisrecon.arrays import F64
 
 
 def require_finite(caller: str, *arrays: F64) -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.camera import camera_centre
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, unit_of
-from thesisrecon.geometry.multiview import epipoles, unit_norm
-
-F64 = NDArray[np.float64]
+from thesisrecon.geometry.two_view import epipoles, unit_norm
 
 
 def image_from_plane(P: F64, plane: F64) -> F64:

@@ -8,11 +8,9 @@ L* = Pi Psi' - Psi Pi' of two of its planes (Hartley and Zisserman 3.2.2, which 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.camera import camera_centre
-
-F64 = NDArray[np.float64]
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import camera_centre
 
 
 def line_through(x: F64, y: F64) -> F64:

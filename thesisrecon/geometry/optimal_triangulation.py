@@ -1,4 +1,12 @@
-"""Section 6.3.3: the polynomial method, the optimal triangulation from two views.
+"""The best pair of epipolar lines for a match: the polynomial of degree 6 of section 6.3.3, compiled.
+
+All epipolar planes are q0 A + q1 B; their lines in the two images are ``L1 q`` and ``L2 q``, L (3, 2). The
+distance of x = (x, y, 1) from a line is the root of n^2 / (q'Bq) with n = (x'L) q linear in q and B =
+L[:2]'L[:2] of the pair alone, so that a point enters by four numbers. Hartley and Sturm (CVIU 68(2), 1997)
+turn and shift both images instead; here the line through the point and its B-orthogonal companion take that
+part, which needs no epipole in a finite place. Forms B are stored as (B00, B01, B11).
+
+Section 6.3.3: the polynomial method, the optimal triangulation from two views.
 
 Hartley and Sturm, "Triangulation", CVIU 68(2), 1997: the pair of points nearest to the measured one that
 satisfies the epipolar constraint is the best of at most six stationary points of a one-parameter cost, the
@@ -7,15 +15,289 @@ roots of a polynomial of degree 6. Their rays meet exactly. The parameter is the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
+from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, unit_of
-from thesisrecon.geometry.two_view.kernels import correct_each_match, meet_in_pencil
 
-F64 = NDArray[np.float64]
+Two = tuple[float, float]
+Four = tuple[float, float, float, float]
+
+DEGREE = 6
+MONOTONE = 3.0
+"""Where the linear coefficient outweighs the derivative of the others so often, Newton's steps contract."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def horner(c: F64, x: float) -> tuple[float, float]:
+    """Value and derivative of the polynomial c (7,), lowest power first."""
+    value, slope = c[DEGREE], 0.0
+    for k in range(DEGREE - 1, -1, -1):
+        slope = slope * x + value
+        value = value * x + c[k]
+    return value, slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def root_between(c: F64, low: float, high: float, rising: bool) -> float:
+    """The root of c (7,) in [low, high] where it changes its sign: Newton, halving where that leaves the
+    bracket."""
+    x = 0.5 * (low + high)
+    for _ in range(100):
+        value, slope = horner(c, x)
+        if value == 0.0:
+            break
+        if (value > 0.0) == rising:
+            high = x
+        else:
+            low = x
+        moved = x - value / slope
+        if not low < moved < high:
+            moved = 0.5 * (low + high)
+        # Both neighbours of the limit have been seen: nothing lies between.
+        if abs(moved - x) <= 1e-16 + 2e-16 * abs(x):
+            break
+        x = moved
+    return x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def roots_in_unit_interval(c: F64, roots: F64) -> int:
+    """Fill in the real roots in [-1, 1] at which the polynomial c (7,) changes sign; -> how many.
+
+    The roots of each derivative cut the interval into pieces on which the next lower one is monotone.
+    """
+    d = np.empty(DEGREE + 1)
+    cuts = np.empty(DEGREE + 2)
+    found = 0
+    for order in range(DEGREE - 1, -1, -1):
+        d[:] = 0.0
+        for k in range(order, DEGREE + 1):
+            factor = 1.0
+            for m in range(k - order + 1, k + 1):
+                factor *= m
+            d[k - order] = factor * c[k]
+        cuts[0] = -1.0
+        for k in range(found):
+            cuts[k + 1] = roots[k]
+        cuts[found + 1] = 1.0
+        pieces, found = found + 1, 0
+        left, _ = horner(d, -1.0)
+        for k in range(pieces):
+            right, _ = horner(d, cuts[k + 1])
+            if (left < 0.0 < right) or (right < 0.0 < left):
+                roots[found] = root_between(d, cuts[k], cuts[k + 1], left < 0.0)
+                found += 1
+            elif right == 0.0 and k + 1 < pieces:
+                roots[found] = cuts[k + 1]
+                found += 1
+            left = right
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def form(B: F64, p0: float, p1: float, q0: float, q1: float) -> float:
+    """p'Bq."""
+    value: float = p0 * (B[0] * q0 + B[1] * q1) + p1 * (B[1] * q0 + B[2] * q1)
+    return value
+
+
+class PencilCost(NamedTuple):
+    """The cost G x^2 / (1 + kappa x^2) + (n0 + n1 x)^2 / (E0 + 2 E1 x + E2 x^2) of a member x of a pencil."""
+
+    n0: float
+    n1: float
+    E0: float
+    E1: float
+    E2: float
+    G: float
+    kappa: float
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def stationary_polynomial(cost: PencilCost, c: F64) -> None:
+    """Half the numerator of the derivative of the cost as a polynomial c (7,)."""
+    n0, n1, E0, E1, E2, G, kappa = cost
+    m0, m1 = n1 * E0 - n0 * E1, n1 * E1 - n0 * E2
+    s0, s1, s2 = n0 * m0, n0 * m1 + n1 * m0, n1 * m1
+    c[0] = s0
+    c[1] = s1 + G * E0 * E0
+    c[2] = s2 + 2.0 * kappa * s0 + 4.0 * G * E0 * E1
+    c[3] = 2.0 * kappa * s1 + G * (4.0 * E1 * E1 + 2.0 * E0 * E2)
+    c[4] = 2.0 * kappa * s2 + kappa * kappa * s0 + 4.0 * G * E1 * E2
+    c[5] = kappa * kappa * s1 + G * E2 * E2
+    c[6] = kappa * kappa * s2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def least_stationary(pencil: PencilCost, c: F64, whole: bool) -> float:
+    """The x of least cost among the real roots of c in [-1, 1], or on the ``whole`` line, infinity
+    included; NaN where there is none."""
+    n0, n1, E0, E1, E2, G, kappa = pencil
+    roots, backward = np.empty(DEGREE + 2), np.empty(DEGREE + 1)
+    best, least = math.nan, math.inf
+    for k in range(roots_in_unit_interval(c, roots)):
+        x = roots[k]
+        cost = G * x * x / (1.0 + kappa * x * x) + (n0 + n1 * x) ** 2 / (E0 + 2.0 * E1 * x + E2 * x * x)
+        if cost < least:
+            best, least = x, cost
+    if whole:
+        for k in range(DEGREE + 1):
+            backward[k] = c[DEGREE - k]
+        # The reversed polynomial may vanish at 0 without a change of sign there: infinity is tried anyway.
+        count = roots_in_unit_interval(backward, roots)
+        roots[count] = 0.0
+        for k in range(count + 1):
+            y = roots[k]
+            cost = G / (y * y + kappa) + (n0 * y + n1) ** 2 / (E0 * y * y + 2.0 * E1 * y + E2)
+            if cost < least:
+                best, least = 1.0 / y, cost
+    return best
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def turn_from(own: Two, B: F64, Q: float, D: float, other: Two, E: F64, most: float, c: F64) -> Four:
+    """The best member q of the pencil, counted from the line through one image's point; -> q, and n of both.
+
+    The first image has x'L = ``own``, the form B, Q = q'Bq of the line q through its point, and D = det B;
+    the second ``other`` and E. ``most`` is a bound on the cost, which keeps the search to the sector of lines
+    that pass the first point within its root.
+    """
+    a, b = own
+    q0, q1 = b, -a
+    p0, p1 = B[1] * b - B[2] * a, B[1] * a - B[0] * b
+    n0, n1 = other[0] * q0 + other[1] * q1, other[0] * p0 + other[1] * p1
+    proper = Q - most * D > 0.5 * Q
+    h = math.sqrt(most / (Q - most * D)) if proper else 1.0 / math.sqrt(D)
+    n1 *= h
+    E0, E1, E2 = form(E, q0, q1, q0, q1), h * form(E, q0, q1, p0, p1), h * h * form(E, p0, p1, p0, p1)
+    G, kappa = Q * h * h, D * h * h
+    cost = PencilCost(n0, n1, E0, E1, E2, G, kappa)
+    stationary_polynomial(cost, c)
+    bend = 2.0 * abs(c[2]) + 3.0 * abs(c[3]) + 4.0 * abs(c[4]) + 5.0 * abs(c[5]) + 6.0 * abs(c[6])
+    if proper and c[1] > MONOTONE * bend:
+        # A monotone derivative: the only stationary point of the sector is the global minimum.
+        x = 0.0
+        for _ in range(30):
+            value, slope = horner(c, x)
+            before = x
+            x = min(max(x - value / slope, -1.0), 1.0)
+            if abs(x - before) <= 4e-16 * abs(x):
+                break
+    else:
+        x = least_stationary(cost, c, not proper)
+    if math.isinf(x):
+        return p0, p1, -Q, n1 / h
+    return q0 + h * x * p0, q1 + h * x * p1, -h * x * Q, n0 + n1 * x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64, c: F64) -> Four:
+    """q of least n1^2 / (q'B1q) + n2^2 / (q'B2q) with n = a q0 + b q1; -> q0, q1, n1, n2.
+
+    c (7,) is scratch.
+    """
+    cross = a2 * b1 - b2 * a1
+    Q1, Q2 = form(B1, b1, -a1, b1, -a1), form(B2, b2, -a2, b2, -a2)
+    if cross == 0.0:
+        # The match is exact, or a point is its epipole, through which every line goes.
+        if a1 == 0.0 and b1 == 0.0:
+            return (b2, -a2, 0.0, 0.0) if Q2 > 0.0 else (1.0, 0.0, 0.0, 0.0)
+        return b1, -a1, 0.0, 0.0
+    through1 = cross * cross / form(B2, b1, -a1, b1, -a1)
+    through2 = cross * cross / form(B1, b2, -a2, b2, -a2)
+    most = min(through1, through2)
+    D1, D2 = max(B1[0] * B1[2] - B1[1] ** 2, 0.0), max(B2[0] * B2[2] - B2[1] ** 2, 0.0)
+    # Q / D is the squared distance of a point from its epipole: the farther one gives the narrower sector.
+    if Q1 * D2 > Q2 * D1 or (D1 == 0.0 and D2 == 0.0):
+        q0, q1, n1, n2 = turn_from((a1, b1), B1, Q1, D1, (a2, b2), B2, most, c)
+    else:
+        q0, q1, n2, n1 = turn_from((a2, b2), B2, Q2, D2, (a1, b1), B1, most, c)
+    cost = n1 * n1 / form(B1, q0, q1, q0, q1) + n2 * n2 / form(B2, q0, q1, q0, q1)
+    if not cost <= most:
+        return (b1, -a1, 0.0, cross) if through1 <= through2 else (b2, -a2, -cross, 0.0)
+    return q0, q1, n1, n2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, pencil: F64) -> None:
+    """Move every match (N, 2), (N, 2) to its nearest exact one, in place; ``pencil`` (N, 2) tells q.
+
+    Matches with a NaN are left alone and have q = 0.
+    """
+    c = np.empty(DEGREE + 1)
+    for k in range(len(xy1)):
+        x1, y1, x2, y2 = xy1[k, 0], xy1[k, 1], xy2[k, 0], xy2[k, 1]
+        pencil[k, 0] = pencil[k, 1] = 0.0
+        if not math.isfinite(x1 + y1 + x2 + y2):
+            continue
+        a1, b1 = L1[0, 0] * x1 + L1[1, 0] * y1 + L1[2, 0], L1[0, 1] * x1 + L1[1, 1] * y1 + L1[2, 1]
+        a2, b2 = L2[0, 0] * x2 + L2[1, 0] * y2 + L2[2, 0], L2[0, 1] * x2 + L2[1, 1] * y2 + L2[2, 1]
+        q0, q1, n1, n2 = best_of_pencil(a1, b1, a2, b2, B1, B2, c)
+        size = 1.0 / math.sqrt(q0 * q0 + q1 * q1)
+        q0, q1, n1, n2 = q0 * size, q1 * size, n1 * size, n2 * size
+        pencil[k, 0], pencil[k, 1] = q0, q1
+        u, v = L1[0, 0] * q0 + L1[0, 1] * q1, L1[1, 0] * q0 + L1[1, 1] * q1
+        n1 = n1 / (u * u + v * v) if n1 != 0.0 else 0.0
+        xy1[k, 0], xy1[k, 1] = x1 - n1 * u, y1 - n1 * v
+        u, v = L2[0, 0] * q0 + L2[0, 1] * q1, L2[1, 0] * q0 + L2[1, 1] * q1
+        n2 = n2 / (u * u + v * v) if n2 != 0.0 else 0.0
+        xy2[k, 0], xy2[k, 1] = x2 - n2 * u, y2 - n2 * v
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def point_of_planes(a: F64, b: F64, c: F64, X: F64) -> float:
+    """Fill X (4,) with the common point of three planes, by minors; -> its norm over those of the planes."""
+    s01, s02, s03 = b[0] * c[1] - b[1] * c[0], b[0] * c[2] - b[2] * c[0], b[0] * c[3] - b[3] * c[0]
+    s12, s13, s23 = b[1] * c[2] - b[2] * c[1], b[1] * c[3] - b[3] * c[1], b[2] * c[3] - b[3] * c[2]
+    X[0] = a[1] * s23 - a[2] * s13 + a[3] * s12
+    X[1] = -a[0] * s23 + a[2] * s03 - a[3] * s02
+    X[2] = a[0] * s13 - a[1] * s03 + a[3] * s01
+    X[3] = -a[0] * s12 + a[1] * s02 - a[2] * s01
+    planes = (a @ a) * (b @ b) * (c @ c)
+    return math.sqrt((X @ X) / planes) if planes > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def meet_in_pencil(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: F64) -> None:
+    """Fill X (M, 4), unit norm: where the rays of exact matches meet in their epipolar planes N q.
+
+    P (2, 3, 4) cameras, L (2, 3, 2) the epipolar lines of the two images, xy (2, M, 2), ``pencil`` (M, 2) q.
+    Each ray is the epipolar plane's meet with the plane of the line across it, so nothing has to be solved. N
+    (4, 3) ends with the sum of the centres, which stands for the baseline where both points are on their
+    epipoles. ``back`` (4, 4) takes the point to the caller's frame. q = 0 gives a zero point.
+    """
+    P1, P2, L1, L2, xy1, xy2 = P[0], P[1], L[0], L[1], xy[0], xy[1]
+    plane, across1, across2, Y = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
+    for k in range(len(X)):
+        q0, q1 = pencil[k, 0], pencil[k, 1]
+        X[k] = 0.0
+        if q0 == 0.0 and q1 == 0.0:
+            continue
+        u, v = L1[0, 0] * q0 + L1[0, 1] * q1, L1[1, 0] * q0 + L1[1, 1] * q1
+        w = v * xy1[k, 0] - u * xy1[k, 1]
+        r, s = L2[0, 0] * q0 + L2[0, 1] * q1, L2[1, 0] * q0 + L2[1, 1] * q1
+        t = s * xy2[k, 0] - r * xy2[k, 1]
+        for m in range(4):
+            plane[m] = N[m, 0] * q0 + N[m, 1] * q1
+            across1[m] = -v * P1[0, m] + u * P1[1, m] + w * P1[2, m]
+            across2[m] = -s * P2[0, m] + r * P2[1, m] + t * P2[2, m]
+        if not point_of_planes(plane, across1, across2, Y) > 1e-14:
+            for m in range(4):
+                Y[m] = N[m, 2]
+        norm = 0.0
+        for m in range(4):
+            X[k, m] = back[m, 0] * Y[0] + back[m, 1] * Y[1] + back[m, 2] * Y[2] + back[m, 3] * Y[3]
+            norm += X[k, m] * X[k, m]
+        norm = 1.0 / math.sqrt(norm)
+        for m in range(4):
+            X[k, m] *= norm
+
 
 _RANK = 1e-13
 """Singular values below this share of the largest are zero."""

@@ -7,12 +7,9 @@ form of Haralick et al., IJCV 13(3), 1994).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import normalizing_transform, require_finite
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 def resection_rows(X: F64, xy: F64) -> F64:

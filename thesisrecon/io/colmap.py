@@ -14,23 +14,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import compose_camera, project_camera
-from thesisrecon.io.colmap_files import read_colmap_model, write_colmap_model
+from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.io.colmap_model import NO_POINT, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
-from thesisrecon.types import F64, I64, Reconstruction, Tracks
-
-__all__ = [
-    "ColmapCamera",
-    "ColmapImage",
-    "ColmapModel",
-    "ColmapPoints",
-    "colmap_from_reconstruction",
-    "read_colmap_model",
-    "reconstruction_from_colmap",
-    "skewed_views",
-    "write_colmap_model",
-]
+from thesisrecon.records import Reconstruction, Tracks
 
 _PIXEL_CENTRE = 0.5
 SKEW_REL = 1e-9
@@ -135,12 +123,16 @@ def _reproject(
     for i, (R, t) in poses.items():
         here = view == i
         Xh = reconstruction.X[point[here]]
-        xy[here] = project_camera(reconstruction.K[i], R, t, Xh[:, :3] / Xh[:, 3:], radial=lens[i])
+        xy[here] = project_camera(reconstruction.K[i], R, t, Xh[:, :3] / Xh[:, 3:], distortion=lens[i])
     return xy
 
 
 def _lens(reconstruction: Reconstruction) -> F64:
-    return np.zeros((len(reconstruction.P), 3)) if reconstruction.radial is None else reconstruction.radial
+    return (
+        np.zeros((len(reconstruction.P), 3))
+        if reconstruction.distortion is None
+        else reconstruction.distortion
+    )
 
 
 def _cameras(
@@ -160,7 +152,7 @@ def _cameras(
     return tuple(cameras.values()), numbers
 
 
-def _camera_params(K: F64, radial: F64, scale: F64) -> tuple[str, tuple[float, ...]]:
+def _camera_params(K: F64, distortion: F64, scale: F64) -> tuple[str, tuple[float, ...]]:
     """The smallest COLMAP model that holds K and (k1, k2, k3), and its parameters in original pixels."""
     if abs(K[0, 1]) > SKEW_REL * K[0, 0]:
         raise ValueError(
@@ -168,7 +160,7 @@ def _camera_params(K: F64, radial: F64, scale: F64) -> tuple[str, tuple[float, .
         )
     fx, fy = float(K[0, 0] * scale[0]), float(K[1, 1] * scale[1])
     centre = tuple(float(value) for value in (K[:2, 2] + _PIXEL_CENTRE) * scale)
-    k1, k2, k3 = radial.tolist()
+    k1, k2, k3 = distortion.tolist()
     if k2 or k3:
         return "FULL_OPENCV", (fx, fy, *centre, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)
     # Relative, and so small that taking one focal length for both moves no pixel by more than rounding.
@@ -246,20 +238,20 @@ def reconstruction_from_colmap(model: ColmapModel, *, names: Sequence[str] | Non
             f"names must hold each image of the model once; missing or doubled: {unknown[:3] or names[:3]}"
         )
     cameras = {camera.camera_id: camera for camera in model.cameras}
-    K, radial = np.zeros((len(names), 3, 3)), np.zeros((len(names), 3))
+    K, distortion = np.zeros((len(names), 3, 3)), np.zeros((len(names), 3))
     P, sizes = np.zeros((len(names), 3, 4)), np.zeros((len(names), 2), dtype=np.int64)
     poses = {}
     for i, name in enumerate(names):
         if name in by_name:
             image = by_name[name]
             camera = cameras[image.camera_id]
-            K[i], radial[i] = _intrinsics(camera)
+            K[i], distortion[i] = _intrinsics(camera)
             poses[i] = (
                 scipy.spatial.transform.Rotation.from_quat(np.roll(image.quaternion_wxyz, -1)).as_matrix(),
                 image.translation,
             )
             P[i], sizes[i] = compose_camera(K[i], *poses[i]), (camera.width, camera.height)
-    return _with_observations(model, names, (P, K, radial, sizes), poses)
+    return _with_observations(model, names, (P, K, distortion, sizes), poses)
 
 
 def _with_observations(
@@ -268,7 +260,7 @@ def _with_observations(
     cameras: tuple[F64, F64, F64, I64],
     poses: dict[int, tuple[F64, F64]],
 ) -> Reconstruction:
-    P, K, radial, sizes = cameras
+    P, K, distortion, sizes = cameras
     registered = np.isin(np.arange(len(names)), list(poses))
     tracks = _tracks(model, names)
     reconstruction = Reconstruction(
@@ -283,7 +275,7 @@ def _with_observations(
         sigma_px=0.0,
         reasons=tuple("" if known else "not in the COLMAP model" for known in registered),
         K=K,
-        radial=radial,
+        distortion=distortion,
     )
     # A model from elsewhere may hold points in a camera's plane, or so far away that their squares overflow.
     with np.errstate(all="ignore"):
@@ -321,9 +313,9 @@ def _intrinsics(camera: ColmapCamera) -> tuple[F64, F64]:
             "undistort the images, or reconstruct with SIMPLE_RADIAL",
         )
     focal, rest = ((params[0], params[0]), params[1:]) if single else ((params[0], params[1]), params[2:])
-    centre, distortion = rest[:2], (*rest[2:], *[0.0] * 8)
-    radial = np.array([distortion[0], distortion[1], 0.0 if single else distortion[4]])
-    if any(distortion[2:4]) or any(distortion[5:]):
+    centre, coefficients = rest[:2], (*rest[2:], *[0.0] * 8)
+    distortion = np.array([coefficients[0], coefficients[1], 0.0 if single else coefficients[4]])
+    if any(coefficients[2:4]) or any(coefficients[5:]):
         raise StageFailure(
             f"camera {camera.camera_id} of the COLMAP model has the distortion {rest[2:]}",
             "only three radial coefficients are supported",
@@ -334,4 +326,4 @@ def _intrinsics(camera: ColmapCamera) -> tuple[F64, F64]:
             f"camera {camera.camera_id} of the COLMAP model has a focal length that is not positive"
         )
     x, y = (value - _PIXEL_CENTRE for value in centre)
-    return np.array([[focal[0], 0.0, x], [0.0, focal[1], y], [0.0, 0.0, 1.0]]), radial
+    return np.array([[focal[0], 0.0, x], [0.0, focal[1], y], [0.0, 0.0, 1.0]]), distortion

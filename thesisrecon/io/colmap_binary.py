@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from thesisrecon.io.colmap_model import (
     MODEL_NUMBERS,
     PARAMETER_COUNTS,
+    TRACK_ENTRY,
     ColmapCamera,
     ColmapImage,
     ColmapModel,
     ColmapPoints,
+    broken_file,
+    points_of_records,
 )
-from thesisrecon.io.colmap_records import TRACK_ENTRY, broken_file, points_of_records
 
 _IMAGE_POINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _COUNT = struct.Struct("<Q")

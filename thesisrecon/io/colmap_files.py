@@ -12,8 +12,7 @@ from pathlib import Path
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io import colmap_binary, colmap_text
-from thesisrecon.io.colmap_model import ColmapModel, inconsistency
-from thesisrecon.io.colmap_records import broken_file
+from thesisrecon.io.colmap_model import ColmapModel, broken_file, inconsistency
 from thesisrecon.io.files import write_atomically
 
 _NEEDED = ("cameras", "images", "points3D")
@@ -24,7 +23,7 @@ def write_colmap_model(path: Path, model: ColmapModel, *, binary: bool = True) -
 
     Each file appears whole or not at all. The same model always gives the same bytes. Raises ``ValueError``
     for a model that breaks a rule of :func:`~thesisrecon.io.colmap_model.inconsistency`, and in text for
-    names with blanks, which COLMAP's text reader cuts off; :class:`~thesisrecon.errors.Unwritable` where the
+    names with blanks, which COLMAP's text reader cuts off; :class:`~thesisrecon.errors.OutputError` where the
     folder cannot be written.
     """
     problem = inconsistency(model)

@@ -2,18 +2,20 @@
 
 The numbers are COLMAP's own here: pixel (0.5, 0.5) is the centre of the top-left pixel, quaternions are
 (w, x, y, z), poses take world to camera, -1 marks an image point that belongs to no space point.
+
+What both forms of COLMAP's files share: the refusal of a broken file and the columns of points.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
+from thesisrecon.arrays import F64, I64, U8
+from thesisrecon.errors import StageFailure
 
 MODEL_NUMBERS = {
     "SIMPLE_PINHOLE": 0,
@@ -180,3 +182,29 @@ def _track_problem(model: ColmapModel) -> str:
     if np.count_nonzero(owners != NO_POINT) != len(seen):
         return "an image point refers to a point that does not list it"
     return ""
+
+
+TRACK_ENTRY = np.dtype([("image", "<u4"), ("xy", "<u4")])
+
+
+def broken_file(path: Path, what: str) -> StageFailure:
+    """The refusal of a file with the reason."""
+    return StageFailure(f"{path} is not a sound COLMAP file", what, "export the model again")
+
+
+def points_of_records(
+    heads: list[tuple[int | float, ...]], entries: NDArray[np.void], path: Path
+) -> ColmapPoints:
+    """Columns of points; ``heads`` hold (id, x, y, z, r, g, b, error, track length)."""
+    if any(head[0] >= 2**63 for head in heads):
+        raise broken_file(path, "a point has a number out of range")
+    lengths = np.array([head[8] for head in heads], dtype=np.int64)
+    return ColmapPoints(
+        ids=np.array([head[0] for head in heads], dtype=np.int64),
+        xyz=np.array([head[1:4] for head in heads], dtype=np.float64).reshape(-1, 3),
+        rgb=np.array([head[4:7] for head in heads], dtype=np.uint8).reshape(-1, 3),
+        error=np.array([head[7] for head in heads], dtype=np.float64),
+        track_start=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        track_image=entries["image"].astype(np.int64),
+        track_xy=entries["xy"].astype(np.int64),
+    )

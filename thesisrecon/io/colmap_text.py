@@ -8,9 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.io.colmap_model import ColmapCamera, ColmapImage, ColmapModel, ColmapPoints
-from thesisrecon.io.colmap_records import TRACK_ENTRY, broken_file, points_of_records
-from thesisrecon.io.text import shortened
+from thesisrecon.io.colmap_model import (
+    TRACK_ENTRY,
+    ColmapCamera,
+    ColmapImage,
+    ColmapModel,
+    ColmapPoints,
+    broken_file,
+    points_of_records,
+)
+from thesisrecon.io.files import shortened
 
 
 def _numbers(values: NDArray[np.float64] | tuple[float, ...]) -> str:

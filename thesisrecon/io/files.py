@@ -1,4 +1,6 @@
-"""Files that appear under their name when they are whole: every file of this project is written here.
+"""Small files of the user as text, and text that is safe to show.
+
+Files that appear under their name when they are whole: every file of this project is written here.
 
 Whoever ends the program in between, in whatever way, leaves the old file or the new one.
 """
@@ -6,17 +8,87 @@ Whoever ends the program in between, in whatever way, leaves the old file or the
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
+import stat
+import unicodedata
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from thesisrecon.errors import OutputError, UsageError
 
-from thesisrecon.errors import Unwritable
-from thesisrecon.io.text import read_bytes
+LARGEST_TEXT = 2**26
+"""Bytes of the largest text that is read: far above any list of pairs, and far below what fills a memory."""
+
+NO_FILE = "a pipe, a device or a socket"
+"""What has a name like a file and is none."""
+
+_CONTROLS = ("Cc", "Zl", "Zp")
+"""Unicode's categories of control characters and of what ends lines and paragraphs."""
+_TURNS = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+"""Marks that turn the direction of whatever is written after them."""
+
+
+def printable(name: str) -> str:
+    """A file name as text that can be shown anywhere, in one line and in its own order: bytes that are no
+    UTF-8, line ends, other control characters and turns of the direction become their codes.
+    """
+    text = name.encode("utf-8", "surrogateescape" if _from_bytes(name) else "backslashreplace")
+    return "".join(_shown(c) for c in text.decode("utf-8", "backslashreplace"))
+
+
+def _from_bytes(name: str) -> bool:
+    """Whether the halves of characters in a text are bytes of a file name, if there are any."""
+    return all("\udc80" <= c <= "\udcff" for c in name if "\ud800" <= c <= "\udfff")
+
+
+def _shown(c: str) -> str:
+    if unicodedata.category(c) not in _CONTROLS and c not in _TURNS:
+        return c
+    return f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}"
+
+
+def shortened(text: str, longest: int = 60) -> str:
+    """The text, or its beginning where it is long."""
+    return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def without_middle(text: str, longest: int = 600) -> str:
+    """The text, or where it is long its beginning and its end, which often tells the rule."""
+    if len(text) <= longest:
+        return text
+    return f"{text[: longest - longest // 4 - 5]} ... {text[-(longest // 4) :]}"
+
+
+def read_bytes(path: Path, *, largest: int = LARGEST_TEXT) -> bytes:
+    """The content of a regular file of at most ``largest`` bytes.
+
+    Nothing else is waited for: a pipe may never speak and a device never end. Raises ``OSError`` whose
+    ``strerror`` says why not.
+    """
+    found = path.stat()
+    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+        raise OSError(0, f"it is {NO_FILE}, not a file", str(path))
+    if found.st_size > largest:
+        raise OSError(0, f"it is larger than {largest / 2**20:.0f} MiB", str(path))
+    with path.open("rb") as file:
+        # Files of the system claim no size, and some of them have no end.
+        return file.read(found.st_size or largest)
+
+
+def read_text(path: Path) -> str:
+    """The text of a UTF-8 file, without the mark some editors begin it with; :class:`UsageError` where it
+    cannot be read."""
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise UsageError(f"{path} is not a UTF-8 text") from None
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}") from None
+
 
 _PARTIAL = ".partial"
 
@@ -29,7 +101,7 @@ def is_partial(name: str) -> bool:
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file whole or not at all, and on the disk when this returns; its folder is made where absent.
 
-    Raises :class:`Unwritable` where the place cannot be written; what stood there before stays.
+    Raises :class:`OutputError` where the place cannot be written; what stood there before stays.
     """
     partial = path.with_name(f".{path.name}{_PARTIAL}")
     try:
@@ -44,7 +116,7 @@ def write_atomically(path: Path, content: bytes) -> None:
     except OSError as error:
         with suppress(OSError):
             partial.unlink()
-        raise Unwritable(path, error) from None
+        raise OutputError(path, error) from None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -64,10 +136,9 @@ def as_read(value: Any) -> Any:
 
 
 def _number(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
+    # NumPy takes long to import: `thesisrecon --help` does without.
+    if hasattr(value, "tolist"):
         return _finite(value.tolist())
-    if isinstance(value, np.generic):
-        return _finite(value.item())
     raise TypeError(f"{type(value).__name__} is not JSON")
 
 
@@ -76,7 +147,7 @@ def _finite(value: Any) -> Any:
         return {str(k): _finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_json(path: Path) -> Any:
@@ -90,7 +161,7 @@ def read_json(path: Path) -> Any:
 def link(source: Path, target: Path) -> None:
     """The file under a second name, whole or not at all: files are only ever replaced, never changed.
 
-    Raises :class:`Unwritable` where the place cannot be written.
+    Raises :class:`OutputError` where the place cannot be written.
     """
     # Several programs may give a file the same name in a shared folder at one time.
     partial = target.with_name(f".{target.name}.{os.getpid()}{_PARTIAL}")
@@ -103,7 +174,7 @@ def link(source: Path, target: Path) -> None:
             shutil.copyfile(source, partial)
         partial.replace(target)
     except OSError as error:
-        raise Unwritable(target, error) from None
+        raise OutputError(target, error) from None
     finally:
         # Renaming one name of a file to another name of it does nothing at all.
         with suppress(OSError):

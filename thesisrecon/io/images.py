@@ -21,7 +21,9 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io.files import NO_FILE, printable
 from thesisrecon.io.pixels import (
     AS_STORED,
     TURNS,
@@ -33,10 +35,8 @@ from thesisrecon.io.pixels import (
     bytes_to_decode,
     picture_from_array,
 )
-from thesisrecon.io.text import NO_FILE, printable
-from thesisrecon.types import F64, Image
+from thesisrecon.records import Image
 
-U8 = NDArray[np.uint8]
 ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
 
 # What a photograph may be called. Raw and HEIC files are listed so that they are refused by name, not

@@ -16,11 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import PIL.Image
-from numpy.typing import NDArray
 
-from thesisrecon.types import F64
+from thesisrecon.arrays import F64, U8
 
-U8 = NDArray[np.uint8]
 STRIPE = 256
 """Rows that are converted at a time."""
 REDUCING_GAP = 3.0

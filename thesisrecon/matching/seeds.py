@@ -1,4 +1,7 @@
-"""First matches without a search radius: mutual best patches that have no rival elsewhere."""
+"""Best and second best of correlations between patches.
+
+First matches without a search radius: mutual best patches that have no rival elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,50 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from numba import njit
 
-from thesisrecon.matching.kernels import scan_correlations, update_column_best
-from thesisrecon.types import B8, F32, F64, I64, Seeds
+from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.records import Seeds
+
+
+@njit(cache=True, nogil=True)
+def scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
+    """Best column of each row, its value, and the best value of a rival that lies elsewhere.
+
+    ``correlation`` (B, N); ``xy2`` (N, 2) px; ``apart2`` (N,) squared distance within which a rival of column
+    n counts as the same place. Returns index (B,), value (B,), rival (B,); -1 where there is no rival.
+    """
+    rows, columns = correlation.shape
+    index = np.zeros(rows, np.int64)
+    value = np.full(rows, -1.0, np.float32)
+    competing_model = np.full(rows, -1.0, np.float32)
+    for b in range(rows):
+        row = correlation[b]
+        best, top = 0, np.float32(-2.0)
+        for n in range(columns):
+            if row[n] > top:
+                best, top = n, row[n]
+        second = np.float32(-1.0)
+        x, y, limit = xy2[best, 0], xy2[best, 1], apart2[best]
+        for n in range(columns):
+            if row[n] > second:
+                dx, dy = xy2[n, 0] - x, xy2[n, 1] - y
+                if dx * dx + dy * dy > limit:
+                    second = row[n]
+        index[b], value[b], competing_model[b] = best, top, second
+    return index, value, competing_model
+
+
+@njit(cache=True, nogil=True)
+def update_column_best(correlation: F32, first_row: int, value: F32, index: I64) -> None:
+    """Keep in ``value`` and ``index`` (N,) the best row of each column seen so far."""
+    for b in range(correlation.shape[0]):
+        row = correlation[b]
+        for n in range(len(value)):
+            if row[n] > value[n]:
+                value[n] = row[n]
+                index[n] = first_row + b
+
 
 ROWS_AT_ONCE = 256
 
@@ -42,9 +86,9 @@ def match_seeds(seeds1: Seeds, seeds2: Seeds, *, turned: bool, ratio: float) -> 
     if not (len(use1) and len(use2)):
         none = np.empty((0, 2))
         return SeedMatches(none, none, np.empty((0, 2, 2)), np.empty(0, np.float32))
-    index, value, rival, back = _correlate(seeds1, use1, seeds2, use2)
+    index, value, competing_model, back = _correlate(seeds1, use1, seeds2, use2)
     mutual = back[index] == np.arange(len(use1))
-    distinct = (1.0 - value) < ratio**2 * (1.0 - rival)
+    distinct = (1.0 - value) < ratio**2 * (1.0 - competing_model)
     rows = np.flatnonzero(mutual & distinct & (value > 0.5))
     one, two = use1[rows], use2[index[rows]]
     turn = (seeds2.angle[two] - seeds1.angle[one]).astype(np.float64)
@@ -64,8 +108,8 @@ def _correlate(seeds1: Seeds, use1: I64, seeds2: Seeds, use2: I64) -> tuple[I64,
         correlation = patches1[first : first + ROWS_AT_ONCE] @ patches2
         parts.append(scan_correlations(correlation, xy2, apart2))
         update_column_best(correlation, first, column_value, back)
-    index, value, rival = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return index, value, rival, back
+    index, value, competing_model = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return index, value, competing_model, back
 
 
 def similarity(scale: F64, angle: F64) -> F64:

@@ -1,4 +1,9 @@
-"""From pairs to scene points: chains of verified matches, each aligned towards its middle view."""
+"""Chains of matches over many views: which corners belong together, and the maps along them.
+
+Chains of matches: union of the pairs without two corners in one view, and local maps along a chain.
+
+From pairs to scene points: chains of verified matches, each aligned towards its middle view.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +11,199 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.matching.alignment import align_corners
-from thesisrecon.matching.linking import Chains, link_matches, maps_to_views
 from thesisrecon.matching.prepared import PreparedView
-from thesisrecon.types import B8, F64, I64, Tracks, TwoView
-from thesisrecon.visits import order_of_visits
+from thesisrecon.numerics.morton_order import morton_pair_order
+from thesisrecon.records import Tracks, TwoView
+
+
+@njit(cache=True, nogil=True)
+def unite(edges: I64, view_of: I64, n_views: int) -> I64:
+    """(N,) the first corner of each corner's set, after uniting along ``edges`` (E, 2) in their order.
+
+    An edge between two sets that share a view is refused. ``view_of`` (N,) is the view of each corner. Sets
+    that share a view are known by the views of the smaller one alone, so that an edge costs the same however
+    many photographs there are.
+    """
+    count = len(view_of)
+    parent = np.arange(count)
+    # Sets are lists linked through ``following``, the smaller one joins the larger.
+    following, last, size = np.full(count, -1, np.int64), np.arange(count), np.ones(count, np.int64)
+    # Which views the set of a root has: root times views plus view.
+    has = {np.int64(-1)}
+    for n in range(count):
+        has.add(n * n_views + view_of[n])
+    for e in range(len(edges)):
+        a, b = edges[e, 0], edges[e, 1]
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        while parent[b] != b:
+            parent[b] = parent[parent[b]]
+            b = parent[b]
+        if a == b:
+            continue
+        if size[b] > size[a]:
+            a, b = b, a
+        n = b
+        while n >= 0 and a * n_views + view_of[n] not in has:
+            n = following[n]
+        if n >= 0:
+            continue
+        n = b
+        while n >= 0:
+            has.discard(b * n_views + view_of[n])
+            has.add(a * n_views + view_of[n])
+            n = following[n]
+        parent[b] = a
+        following[last[a]] = b
+        last[a] = last[b]
+        size[a] += size[b]
+    first = np.full(count, -1, np.int64)
+    root = np.empty(count, np.int64)
+    for n in range(count):
+        a = n
+        while parent[a] != a:
+            a = parent[a]
+        if first[a] < 0:
+            first[a] = n
+        root[n] = first[a]
+    return root
+
+
+@njit(cache=True, nogil=True)
+def chain_maps(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64) -> tuple[F64, F64]:
+    """Breadth-first from the middle observation of every track: x2 = xy2 + A (x1 - xy1) along each edge.
+
+    ``edges`` (E, 2) observations; ``middle`` (T,). Returns the place (K, 2) of the middle's point in every
+    observation's view and the map (K, 2, 2) to it; an observation out of reach keeps its own corner.
+    """
+    count = len(xy)
+    place, maps = xy.copy(), np.zeros((count, 2, 2))
+    maps[:, 0, 0] = 1.0
+    maps[:, 1, 1] = 1.0
+    start = np.zeros(count + 1, np.int64)
+    for e in range(len(edges)):
+        start[edges[e, 0] + 1] += 1
+        start[edges[e, 1] + 1] += 1
+    start = np.cumsum(start)
+    fill = start[:-1].copy()
+    incident = np.empty(2 * len(edges), np.int64)
+    for e in range(len(edges)):
+        for side in range(2):
+            incident[fill[edges[e, side]]] = e
+            fill[edges[e, side]] += 1
+    reached = np.zeros(count, np.bool_)
+    queue = np.empty(count, np.int64)
+    head, tail = 0, 0
+    for t in range(len(middle)):
+        queue[tail] = middle[t]
+        reached[middle[t]] = True
+        tail += 1
+    inverse = np.empty((2, 2))
+    while head < tail:
+        k = queue[head]
+        head += 1
+        for at in range(start[k], start[k + 1]):
+            e = incident[at]
+            forward = edges[e, 0] == k
+            other = edges[e, 1] if forward else edges[e, 0]
+            if reached[other]:
+                continue
+            a = affine[e]
+            if forward:
+                place[other] = xy2[e] + a @ (place[k] - xy1[e])
+                maps[other] = a @ maps[k]
+            else:
+                determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+                if abs(determinant) < 1e-6:
+                    continue
+                inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
+                inverse[1, 0], inverse[1, 1] = -a[1, 0] / determinant, a[0, 0] / determinant
+                place[other] = xy1[e] + inverse @ (place[k] - xy2[e])
+                maps[other] = inverse @ maps[k]
+            reached[other] = True
+            queue[tail] = other
+            tail += 1
+    return place, maps
+
+
+@dataclass(frozen=True)
+class Chains:
+    """Corners that belong together: ``view, corner, track`` (K,), sorted by track, then view; ``count``
+    tracks.
+
+    ``node`` (K,) the corner's number when all corners of all views are counted through.
+    """
+
+    view: I64
+    corner: I64
+    track: I64
+    node: I64
+    count: int
+
+
+def link_matches(corners: Sequence[int], pairs: Sequence[TwoView]) -> Chains:
+    """Unite the matches of all pairs, the best pairs first; a union that would put two corners of one view
+    into one track is refused, so the weaker link breaks and the track splits."""
+    first = np.concatenate([[0], np.cumsum(corners)]).astype(np.int64)
+    view_of = np.repeat(np.arange(len(corners)), corners).astype(np.int64)
+    edges = _edges(first, pairs)
+    parent = unite(edges, view_of, len(corners))
+    used, size = np.unique(parent, return_counts=True)
+    root = used[size >= 2]
+    node = np.flatnonzero(np.isin(parent, root))
+    track = np.searchsorted(root, parent[node])
+    order = np.lexsort((node, track))
+    node, track = node[order], track[order]
+    return Chains(view_of[node], node - first[view_of[node]], track, node, len(root))
+
+
+def _edges(first: I64, pairs: Sequence[TwoView]) -> I64:
+    """(E, 2) corner numbers of all matches; pairs with more verified matches, the more certain ones, come
+    first."""
+    order = sorted(range(len(pairs)), key=lambda n: (-pairs[n].inliers, pairs[n].i, pairs[n].j))
+    if not order:
+        return np.empty((0, 2), np.int64)
+    return np.concatenate(
+        [
+            np.stack([first[pairs[n].i] + pairs[n].index1, first[pairs[n].j] + pairs[n].index2], 1)
+            for n in order
+        ]
+    )
+
+
+def maps_to_views(chains: Chains, corners: Sequence[F64], pairs: Sequence[TwoView]) -> tuple[F64, F64, I64]:
+    """Where the corner of each track's middle view lies in the other views, by chaining the matches' local
+    maps.
+
+    Returns the place (K, 2) px, the map from the middle view (K, 2, 2) and the observation (K,) that is the
+    middle of its track: the one with most matches in the track, the first of equals.
+    """
+    counts = [len(c) for c in corners]
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    observation = np.full(first[-1], -1, np.int64)
+    observation[chains.node] = np.arange(len(chains.node))
+    order = sorted(range(len(pairs)), key=lambda n: (-pairs[n].inliers, pairs[n].i, pairs[n].j))
+    edges = observation[_edges(first, pairs)]
+    xy = np.concatenate([*corners, np.empty((0, 2))])[chains.node]
+    if not len(edges):
+        return xy, np.tile(np.eye(2), (len(xy), 1, 1)), np.arange(len(xy))
+    inside = chains.track[edges[:, 0]] == chains.track[edges[:, 1]]
+    edges = edges[inside]
+    # Pair by pair: all matches of hundreds of photographs are gigabytes.
+    used = np.split(inside, np.cumsum([len(pairs[n].xy1) for n in order])[:-1])
+    xy1 = np.concatenate([pairs[n].xy1[rows] for n, rows in zip(order, used, strict=True)])
+    xy2 = np.concatenate([pairs[n].xy2[rows] for n, rows in zip(order, used, strict=True)])
+    affine = np.concatenate([pairs[n].affine[rows] for n, rows in zip(order, used, strict=True)])
+    degree = np.bincount(edges.ravel(), minlength=len(xy))
+    best = np.lexsort((np.arange(len(xy)), -degree, chains.track))
+    middle_of = best[np.searchsorted(chains.track[best], np.arange(chains.count))]
+    start, maps = chain_maps(edges, xy1, xy2, affine, xy, middle_of)
+    return start, maps, middle_of[chains.track]
 
 
 @dataclass(frozen=True)
@@ -81,7 +273,7 @@ def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64
     numbers, starts = np.unique(pair[order], return_index=True)
     groups = np.split(order, starts[1:]) if len(numbers) else []
     i, j = np.divmod(numbers, views)
-    for k in order_of_visits(i, j):
+    for k in morton_pair_order(i, j):
         yield int(i[k]), int(j[k]), groups[k]
 
 

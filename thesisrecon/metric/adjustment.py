@@ -5,22 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.metric.model import CENTRE, FOCAL, K1, WIDTH, MetricModel, residual_norms
-from thesisrecon.optimize.bundle_blocks import BlockScatter, block_scatter
-from thesisrecon.optimize.metric_bundle import (
-    BundleOptions,
-    IntrinsicsPrior,
-    MetricBundleResult,
-    Observations,
-    refine_metric_bundle,
-)
-from thesisrecon.robust.noise import best_huber_width, noise_from_distances
-from thesisrecon.types import B8, I64, Assumptions
-
-F64 = NDArray[np.float64]
+from thesisrecon.numerics.block_scatter import BlockScatter, block_scatter
+from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
+from thesisrecon.numerics.metric_cameras import IntrinsicsPrior
+from thesisrecon.numerics.noise import best_huber_width, noise_from_distances
+from thesisrecon.numerics.observations import Observations
+from thesisrecon.records import Assumptions
 
 MIN_OBSERVATIONS = 40
 # Where Huber's loss never turns, in sigmas.

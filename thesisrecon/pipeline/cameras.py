@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from thesisrecon.config import seeing
+from thesisrecon.config import with_images
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline.work import Work
-from thesisrecon.run import stream
-from thesisrecon.types import RunResult, SelfCalibration
+from thesisrecon.pipeline.state import Work
+from thesisrecon.records import RunResult, SelfCalibration
+from thesisrecon.runtime.run import stream
 
 ATTEMPTS = 3
 """Initial pairs that are tried until the self-check is content."""
@@ -48,7 +48,7 @@ def _calibrate(work: Work, attempt: int) -> None:
         "selfcalibration",
         f"attempt-{attempt}",
         key,
-        lambda: seeing(work.config.selfcalibration, work.result.images).calibrate(
+        lambda: with_images(work.config.selfcalibration, work.result.images).calibrate(
             projective,
             assumed=assumed,
             rng=stream(run.seed, "selfcalibration", attempt),

@@ -1,19 +1,72 @@
-"""Sections 2.5 and 2.6: depth maps of all views, and the model."""
+"""How like an unseen photograph the model is: one photograph gives no texture and is compared with it.
+
+Sections 2.5 and 2.6: depth maps of all views, and the model.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
-from thesisrecon.dense import MultiViewScene
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.run_directory import code_key
-from thesisrecon.pipeline.held_out import compare_held_out
-from thesisrecon.pipeline.work import Work
-from thesisrecon.types import DepthMap, Image, Reconstruction, TexturedMesh
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.pipeline.state import Work
+from thesisrecon.records import DepthMap, HeldOut, Image, PinholeView, Reconstruction, TexturedMesh
+from thesisrecon.runtime.run_folder import code_key
+from thesisrecon.stereo.depth import MultiViewScene
+from thesisrecon.views.image_similarity import exposed_alike, psnr_db, ssim, whole_pixels
+from thesisrecon.views.render import render
+
+FEWEST_VIEWS = 3
+"""With fewer, what the photograph left out shows may be seen by nobody else."""
+
+
+def middle_view(views: Sequence[PinholeView]) -> PinholeView:
+    """The view whose camera is nearest to all the others: what it shows, others see too."""
+    C = np.array([camera_centre(view.P) for view in views])
+    centres = C[:, :3] / C[:, 3:]
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2).sum(axis=1)
+    return views[int(np.argmin(apart))]
+
+
+def compare_held_out(
+    mesh: TexturedMesh,
+    views: Sequence[PinholeView],
+    color: Callable[[int], TexturedMesh],
+    *,
+    threads: int = 1,
+) -> HeldOut | None:
+    """The middle view beside the model that ``color`` (number of a view) paints without it.
+
+    The picture of the model is made as bright as the photograph, one factor a channel. None where there are
+    too few views, or the camera sees nothing of the model.
+    """
+    if len(views) < FEWEST_VIEWS or not len(mesh.faces):
+        return None
+    view = middle_view(views)
+    try:
+        painted = color(view.view)
+    except StageFailure:
+        return None
+    height, width = view.rgb.shape[:2]
+    rendered = render(painted, Camera.from_matrix(view.P, (width, height)), threads=threads)
+    compared = whole_pixels(rendered) & view.seen
+    if not compared.any():
+        return None
+    picture = exposed_alike(view.rgb, rendered.color, compared)
+    return HeldOut(
+        view.view,
+        view.rgb,
+        picture,
+        compared,
+        psnr_db(view.rgb, picture, compared),
+        ssim(view.rgb, picture, compared),
+    )
+
 
 RENDERER = "thesisrecon.views.render"
 """What a held-out picture depends on beside the model."""
@@ -81,7 +134,7 @@ def match_densely(work: Work) -> None:
 def _given(reconstruction: Reconstruction, images: tuple[Image, ...]) -> list[object]:
     """What depths are made from: cameras, points and pixels."""
     r = reconstruction
-    return [r.P, r.K, r.radial, r.X, r.registered, r.valid, r.inlier, [image.rgb for image in images]]
+    return [r.P, r.K, r.distortion, r.X, r.registered, r.valid, r.inlier, [image.rgb for image in images]]
 
 
 def build_model(work: Work) -> None:

@@ -1,22 +1,145 @@
-"""Sections 6.3 to 6.7 on a reconstruction that grows: its points, its outliers, its adjustment."""
+"""What is asked of all observations after every camera.
+
+Which tracks take part while the cameras are found: long ones, spread over every view.
+
+Sections 6.3 to 6.7 on a reconstruction that grows: its points, its outliers, its adjustment.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.optimize.conditioning import whitening_transform
-from thesisrecon.optimize.projective_bundle import refine_projective_bundle
-from thesisrecon.optimize.triangulation_refine import refine_points
-from thesisrecon.projective.kernels import project_observations
-from thesisrecon.projective.selection import grid_cells
-from thesisrecon.robust.noise import noise_from_distances
-from thesisrecon.types import B8, I64, Reconstruction, Tracks
+from thesisrecon.numerics.noise import noise_from_distances
+from thesisrecon.numerics.observations import whitening_transform
+from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.numerics.separate_refinement import refine_points
+from thesisrecon.projective.initial_pair import NO_PARALLAX
+from thesisrecon.records import Reconstruction, Tracks, TwoView
 
-F64 = NDArray[np.float64]
+
+@njit(cache=True, nogil=True)
+def project_observations(P: F64, X: F64, view: I64, point: I64, xy: F64, chosen: B8) -> tuple[F64, F64]:
+    """Of the ``chosen`` (K,) observations the depth w and the distance px of (u, v) / w from ``xy`` (K, 2).
+
+    (u, v, w) = P (V, 3, 4) of the view times X (N, 4) of the point. Of others, and in the focal plane, the
+    depth is 0 and the distance infinite.
+    """
+    depth, distance = np.zeros(len(xy)), np.full(len(xy), np.inf)
+    for k in range(len(xy)):
+        if not chosen[k]:
+            continue
+        p, x = P[view[k]], X[point[k]]
+        w = p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3]
+        if w == 0.0:
+            continue
+        u = (p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]) / w - xy[k, 0]
+        v = (p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]) / w - xy[k, 1]
+        depth[k] = w
+        if np.isfinite(u) and np.isfinite(v):
+            distance[k] = np.sqrt(u * u + v * v)
+    return depth, distance
+
+
+CELLS = 8
+"""Of the grid over a view, along each side."""
+
+
+def tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> B8:
+    """Tracks that are not seen from one standpoint only; -> (n_points,) bool.
+
+    Two views whose matches one homography explains to the share ``most`` show a point without parallax, or on
+    one plane: it may lie anywhere along its ray, and a crowd of such points bends the frame in which cameras
+    are judged. They come back in the metric stage where a ray of another view fixes them.
+    """
+    apart = np.ones((tracks.n_views, tracks.n_views), dtype=np.float32)
+    np.fill_diagonal(apart, 0.0)
+    for pair in pairs:
+        if pair.accepted and pair.homography_inlier_ratio >= most:
+            apart[pair.i, pair.j] = apart[pair.j, pair.i] = 0.0
+    seen = np.zeros((tracks.n_views, tracks.n_points), dtype=np.float32)
+    seen[tracks.view_index, tracks.point_index] = 1.0
+    return np.asarray(((apart @ seen) * seen).any(axis=0))
+
+
+def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int, cells: int = CELLS) -> B8:
+    """The longest ``usable`` tracks, until each view has about ``points_per_view``; -> (n_points,) bool.
+
+    Every view's points are spread over a grid of ``cells`` x ``cells`` of its own extent: within a cell the
+    longest tracks come first, and all cells get their turn before a cell gets its next, so that detail in a
+    corner of the picture is not starved by a textured middle.
+    """
+    length = np.bincount(tracks.point_index, minlength=tracks.n_points)
+    keep = np.zeros(tracks.n_points, dtype=bool)
+    for view in range(tracks.n_views):
+        k = np.flatnonzero((tracks.view_index == view) & usable[tracks.point_index])
+        keep[tracks.point_index[k][_first_in_turn(tracks, k, length, cells)[:points_per_view]]] = True
+    return keep
+
+
+def _first_in_turn(tracks: Tracks, k: I64, length: I64, cells: int) -> I64:
+    if len(k) == 0:
+        return k
+    xy = tracks.xy[k]
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    cell = np.minimum((xy - low) / np.maximum(high - low, 1e-9) * cells, cells - 1).astype(np.int64)
+    cell_number = cell[:, 0] * cells + cell[:, 1]
+    by_length = np.lexsort((k, -length[tracks.point_index[k]], cell_number))
+    sorted_cells = cell_number[by_length]
+    start = np.searchsorted(sorted_cells, sorted_cells)
+    turn = np.arange(len(k)) - start
+    return by_length[np.lexsort((by_length, -length[tracks.point_index[k]][by_length], turn))]
+
+
+def grid_cells(tracks: Tracks, *, cells: int = CELLS) -> I64:
+    """(K,) the cell of each observation in a grid of ``cells`` x ``cells`` of its view's extent, the cells of
+    all views counted through."""
+    low, high = np.full((2, tracks.n_views, 2), np.inf)
+    np.minimum.at(low, tracks.view_index, tracks.xy)
+    np.minimum.at(high, tracks.view_index, -tracks.xy)
+    view, extent = tracks.view_index, np.maximum(-high - low, 1e-9)
+    cell = np.minimum((tracks.xy - low[view]) / extent[view] * cells, cells - 1).astype(np.int64)
+    return np.asarray((view * cells + cell[:, 0]) * cells + cell[:, 1], dtype=np.int64)
+
+
+def spread_of_views(cell: I64, chosen: B8, n_views: int, *, cells: int = CELLS) -> F64:
+    """How much of each view its ``chosen`` (K,) observations hold, from :func:`grid_cells`; -> (V,).
+
+    The sum over the grid of the root of their number in the cell: many points count, and points all over the
+    picture count more than a crowd in a corner.
+    """
+    counts = np.bincount(cell[chosen], minlength=n_views * cells * cells).reshape(n_views, -1)
+    return np.asarray(np.sqrt(counts).sum(axis=1))
+
+
+def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:
+    """The tracks marked in ``keep`` (n_points,) bool, numbered anew in the same order."""
+    chosen = keep[tracks.point_index]
+    number = np.cumsum(keep) - 1
+    return Tracks(
+        tracks.view_index[chosen],
+        number[tracks.point_index[chosen]],
+        tracks.xy[chosen],
+        tracks.n_views,
+        int(keep.sum()),
+    )
+
+
+def onto_all_tracks(reconstruction: Reconstruction, tracks: Tracks, keep: B8) -> Reconstruction:
+    """A reconstruction of the tracks marked in ``keep``, told in the numbers of all ``tracks``."""
+    X = np.zeros((tracks.n_points, 4))
+    X[keep] = reconstruction.X
+    valid = np.zeros(tracks.n_points, dtype=bool)
+    valid[keep] = reconstruction.valid
+    inlier = np.zeros(len(tracks.xy), dtype=bool)
+    inlier[keep[tracks.point_index]] = reconstruction.inlier
+    return replace(reconstruction, X=X, valid=valid, inlier=inlier, tracks=tracks)
+
 
 # The bundle's loss turns from squares to distances here, in noise sigmas.
 LOSS_SIGMAS = 2.0
@@ -44,8 +167,8 @@ class GrowingModel:
     sigma_px: float
     noise_floor_px: float
     reasons: list[str] = field(default_factory=list)
-    postponed: B8 = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    barred: B8 = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    deferred: B8 = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    rejected: B8 = field(default_factory=lambda: np.zeros(0, dtype=bool))
     cell: I64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @staticmethod

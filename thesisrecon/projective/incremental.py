@@ -1,4 +1,16 @@
-"""Chapter 6 as a whole: from tracks and fundamental matrices to cameras and points in one projective frame.
+"""Section 6.4, robust: the camera that most points of the model agree with.
+
+The covariance gate: is a resected camera determined, or does it only fit?
+
+A camera that sees a single plane fits its points at sub-pixel residual with an arbitrary P. What tells is the
+covariance of P: where it would put points of the *whole* scene, not only those it sees.
+
+Whether the cameras of a model agree with the epipolar geometry that was found without it.
+
+A camera that a crowd of wrong matches placed fits those matches, and may well be determined by them. What it
+does not fit are the matches of its pairs, verified pair by pair before there was a model.
+
+Chapter 6 as a whole: from tracks and fundamental matrices to cameras and points in one projective frame.
 
 Begin with a pair, add one camera after the other by resection, triangulate, adjust, discard (Beardsley,
 Zisserman and Murray, IJCV 23, 1997). What makes it hold on photographs are its gates: a camera enters only
@@ -13,36 +25,148 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.optimize.triangulation_refine import refine_camera
-from thesisrecon.projective.agreement import contradicted_view
-from thesisrecon.projective.gate import predicted_spread_px
+from thesisrecon.geometry.resection import resect_linear
+from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
+from thesisrecon.numerics.observations import whitening_transform
+from thesisrecon.numerics.separate_refinement import refine_camera
 from thesisrecon.projective.growing import (
     LOSS_SIGMAS,
     GrowingModel,
     adjust,
     adjust_around,
     finish,
-    retriangulate,
-)
-from thesisrecon.projective.initial_pair import (
-    initial_cameras,
-    rank_initial_pairs,
-    require_parallax,
-)
-from thesisrecon.projective.resection import resect_robust
-from thesisrecon.projective.selection import (
     onto_all_tracks,
+    retriangulate,
     select_tracks,
     spread_of_views,
     subset_tracks,
     tracks_with_parallax,
 )
-from thesisrecon.types import I64, Reconstruction, Tracks, TwoView
+from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs, require_parallax
+from thesisrecon.records import Reconstruction, Tracks, TwoView
 
-F64 = NDArray[np.float64]
+_SAMPLE = 6
+
+
+def resect_robust(
+    X: F64, xy: F64, *, threshold_px: float, rng: np.random.Generator, batch: int = 64, max_batches: int = 12
+) -> tuple[F64 | None, B8]:
+    """RANSAC over six-point samples with a truncated-quadratic score; X (M, 4), xy (M, 2) px.
+
+    The signs of X must be such that their depths have one sign; points of the other one count as outliers.
+    Samples are drawn and solved a batch at a time; it stops when a sample free of outliers has been drawn
+    with probability 0.999 at the best inlier share so far. Returns the camera of the best sample
+    re-estimated from its inliers, depths positive (None where there are fewer than six), and the inliers
+    (M,).
+    """
+    none = np.zeros(len(X), dtype=bool)
+    if len(X) < _SAMPLE:
+        return None, none
+    # The points of one view may crowd in a corner of the model's frame: whitened anew, no digits are lost.
+    M = whitening_transform(X)
+    Y = X @ M.T
+    Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
+    best_cost, best, drawn = np.inf, None, 0
+    scored = rng.choice(len(Y), 1000, replace=False) if len(Y) > 1000 else np.arange(len(Y))
+    for _ in range(max_batches):
+        samples = rng.random((batch, len(Y))).argpartition(_SAMPLE - 1, axis=1)[:, :_SAMPLE]
+        P = resect_linear(Y[samples], xy[samples])
+        P = np.concatenate([P, -P])
+        squared = _squared_residuals(P, Y[scored], xy[scored]) / threshold_px**2
+        cost = np.minimum(squared, 1.0).sum(axis=1)
+        drawn += batch
+        if cost.min() < best_cost:
+            best_cost, best = float(cost.min()), P[cost.argmin()]
+        share = 1.0 - best_cost / len(scored)
+        if drawn * np.log1p(-min(share**_SAMPLE, 1 - 1e-9)) < np.log(1e-3):
+            break
+    if best is None:
+        return None, none
+    found, inlier = _polish(best, Y, xy, threshold_px)
+    return (None if found is None else found @ M), inlier
+
+
+def _polish(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8]:
+    inlier = _squared_residuals(P[None], X, xy)[0] < threshold_px**2
+    for _ in range(2):
+        if inlier.sum() < _SAMPLE:
+            return None, inlier
+        candidate = resect_linear(X[inlier], xy[inlier])
+        candidate *= np.sign(np.median(X[inlier] @ candidate[2])) or 1.0
+        support = _squared_residuals(candidate[None], X, xy)[0] < threshold_px**2
+        if support.sum() < inlier.sum():
+            break
+        P, inlier = candidate, support
+    return P, inlier
+
+
+def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
+    """(B, M) squared reprojection residuals, infinite for a point on or behind the principal plane."""
+    xh = np.einsum("bij,mj->bmi", P, X)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        squared = np.sum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=-1)
+    return np.where((xh[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
+
+
+def predicted_spread_px(P: F64, covariance: F64, X: F64) -> F64:
+    """Standard deviation (px) of the projection of each point under the camera's covariance.
+
+    P (3, 4), covariance (12, 12) of its row-major entries, X (N, 4) -> (N,): root of half the trace of J C
+    J'. Points near the camera's principal plane come out infinite.
+    """
+    xh = X @ P.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = xh[:, :2] / xh[:, 2:]
+        A = X / xh[:, 2:]
+    blocks = covariance.reshape(3, 4, 3, 4)
+    quadratic = np.einsum("na,rasb,nb->nrs", A, blocks, A)
+    var_u = quadratic[:, 0, 0] - 2 * uv[:, 0] * quadratic[:, 0, 2] + uv[:, 0] ** 2 * quadratic[:, 2, 2]
+    var_v = quadratic[:, 1, 1] - 2 * uv[:, 1] * quadratic[:, 1, 2] + uv[:, 1] ** 2 * quadratic[:, 2, 2]
+    spread = np.sqrt(np.maximum((var_u + var_v) / 2.0, 0.0))
+    return np.where(np.isfinite(spread), spread, np.inf)
+
+
+def epipolar_agreement(P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float) -> F64:
+    """Share of the verified matches of each pair within ``gate_px`` (Sampson) of the cameras' F; -> (M,).
+
+    P (V, 3, 4). NaN for pairs that are not accepted, of which a view is not registered, or whose cameras
+    have one centre.
+    """
+    shares = np.full(len(pairs), np.nan)
+    for n, pair in enumerate(pairs):
+        if not (pair.accepted and registered[pair.i] and registered[pair.j]):
+            continue
+        try:
+            F = fundamental_from_cameras(P[pair.i], P[pair.j])
+        except ValueError:
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.abs(sampson_residuals(F, pair.xy1, pair.xy2))
+        shares[n] = float(np.mean(distance < gate_px))
+    return shares
+
+
+def contradicted_view(
+    P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float, least: float
+) -> tuple[int, float] | None:
+    """The registered view that agrees least with its pairs, and its share; None where all reach ``least``.
+
+    A view's share is that of all its verified matches with other registered views. One view at a time: the
+    partners of a wrong camera look worse than they are as long as it is there.
+    """
+    shares = epipolar_agreement(P, registered, pairs, gate_px=gate_px)
+    total, agreed = np.zeros(len(P)), np.zeros(len(P))
+    for pair, share in zip(pairs, shares, strict=True):
+        if np.isfinite(share):
+            total[[pair.i, pair.j]] += pair.inliers
+            agreed[[pair.i, pair.j]] += share * pair.inliers
+    share_of_view = np.where(total > 0, agreed / np.maximum(total, 1.0), 1.0)
+    worst = int(np.argmin(share_of_view))
+    return (worst, float(share_of_view[worst])) if share_of_view[worst] < least else None
+
 
 MIN_SHARE = 0.3
 """Share of the points a camera sees that must agree with it."""
@@ -134,7 +258,7 @@ class GatedIncremental:
             found = self._from_pair(tracks, pairs, left.pop(0), sizes, rng)
             if best is None or _rank(found) > _rank(best):
                 best = found
-            out = [v for v in np.flatnonzero(~best.registered) if not best.postponed[v]]
+            out = [v for v in np.flatnonzero(~best.registered) if not best.deferred[v]]
             left = [pair for pair in left if pair.i in out or pair.j in out]
             if not left or (tried > 0 and best.registered.sum() >= half):
                 break
@@ -190,7 +314,7 @@ class GatedIncremental:
         t = model.tracks
         ready = model.valid[t.point_index]
         counts = np.bincount(t.view_index[ready], minlength=t.n_views)
-        waiting = ~model.registered & ~model.barred
+        waiting = ~model.registered & ~model.rejected
         spread = np.where(waiting, spread_of_views(model.cell, ready, t.n_views), 0.0)
         for view in np.argsort(-spread, kind="stable"):
             if spread[view] <= 0.0:
@@ -213,8 +337,8 @@ class GatedIncremental:
                 f"only {int(inlier.sum())} of {len(k)} points of the model agree with one camera"
             )
             return False
-        model.postponed[view], P = self._gate(model, view, P, X[inlier], xy[inlier])
-        if model.postponed[view]:
+        model.deferred[view], P = self._gate(model, view, P, X[inlier], xy[inlier])
+        if model.deferred[view]:
             return False
         model.P[view] = P
         model.registered[view] = True
@@ -261,7 +385,7 @@ class GatedIncremental:
             view, share = found
             reason = f"the model agrees with only {share:.0%} of its verified matches"
         model.registered[view] = False
-        model.barred[view] = True
+        model.rejected[view] = True
         model.reasons[view] = reason
         retriangulate(model, self.outlier_sigmas[0])
         return True

@@ -10,15 +10,13 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import pixel_from_unit
-from thesisrecon.geometry.multiview import canonical_cameras, rotation_planes
 from thesisrecon.geometry.triangulation import triangulate_linear
-from thesisrecon.types import I64, Tracks, TwoView
-
-F64 = NDArray[np.float64]
+from thesisrecon.geometry.two_view import canonical_cameras, rotation_planes
+from thesisrecon.records import Tracks, TwoView
 
 # Share of a pair's matches that one homography explains beyond which the pair shows no parallax: what is left
 # is of the size of the wrong matches that verification lets through.
@@ -49,7 +47,7 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
     def score(pair: TwoView) -> float:
         both = table[pair.i] & table[pair.j]
         shared = float(both.sum() + (both & long).sum())
-        return shared * (1.0 - pair.homography_share) * (0.1 if pair.undetermined else 1.0)
+        return shared * (1.0 - pair.homography_inlier_ratio) * (0.1 if pair.undetermined else 1.0)
 
     left = sorted((pair for pair in pairs if pair.accepted), key=lambda pair: (pair.i, pair.j))
     scores = np.array([score(pair) for pair in left])
@@ -74,7 +72,7 @@ def require_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> 
     accepted = [pair for pair in pairs if pair.accepted]
     if not accepted:
         return
-    shares = [pair.homography_share for pair in accepted]
+    shares = [pair.homography_inlier_ratio for pair in accepted]
     kinds = Counter(pair.configuration for pair in accepted)
     if min(shares) >= most or all(kind in NO_PARALLAX_BECAUSE for kind in kinds):
         told = NO_PARALLAX_BECAUSE.get(

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thesisrecon.arrays import I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.projective.growing import adjust, finish
 from thesisrecon.projective.incremental import GatedIncremental
 from thesisrecon.projective.initial_pair import require_parallax
-from thesisrecon.types import I64, Reconstruction, Tracks, TwoView
+from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 
 @dataclass(frozen=True)

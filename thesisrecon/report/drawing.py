@@ -1,5 +1,6 @@
 """Pictures of the page, drawn with Pillow: thumbnails, two photographs with their epipolar geometry, depth
-maps, and a photograph beside the model."""
+maps, and a photograph beside the model.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
+from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.records import HeldOut, TwoView
 from thesisrecon.report.data import Photograph
-from thesisrecon.types import F32, F64, I64, HeldOut, TwoView
 
 THUMBNAIL_BYTES = 2_000_000
 PANEL_LONG_SIDE = 640

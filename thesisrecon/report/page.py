@@ -1,4 +1,10 @@
-"""``report.html``: one file that opens from disk, with its scripts, style and pictures inside.
+"""What every page of ours is made with: a template that escapes, and scripts that are known by their hash.
+
+What only pages need is imported when one is made.
+
+A page of pictures in a row: one large, to turn through, and all of them below; it needs no network.
+
+``report.html``: one file that opens from disk, with its scripts, style and pictures inside.
 
 Nothing on the page may come from elsewhere, and nothing a file is named may run: the template escapes all
 text, data for the scripts is JSON that cannot close its element, and a content security policy names the
@@ -7,17 +13,31 @@ scripts by their hash and forbids every address but ``data:``.
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
 
+from thesisrecon.arrays import F64
 from thesisrecon.io.files import write_text
-from thesisrecon.report.data import ReportData
+from thesisrecon.records import IntrinsicInterval, StageReport, TwoView
+from thesisrecon.report.data import (
+    ReportData,
+    ResidualSummary,
+    common_limit_px,
+    histogram_shares,
+    reprojection_distances,
+    summarize_distances,
+)
 from thesisrecon.report.drawing import (
     DIFFERENCE_LIMIT,
     SCALE,
@@ -27,18 +47,16 @@ from thesisrecon.report.drawing import (
     draw_depth,
     draw_held_out,
     draw_pair,
+    embed_jpeg,
     thumbnail,
 )
-from thesisrecon.report.figures import histogram_path, pair_matrix_figure, scene_figure
-from thesisrecon.report.html import page_resource, plotly_script, script_hashes, template_environment
-from thesisrecon.report.residuals import (
-    ResidualSummary,
-    common_limit_px,
-    histogram_shares,
-    reprojection_distances,
-    summarize_distances,
+from thesisrecon.report.figures import (
+    MAX_POINTS,
+    build_scene,
+    histogram_path,
+    pair_matrix_figure,
+    scene_figure,
 )
-from thesisrecon.report.scene import MAX_POINTS, build_scene
 from thesisrecon.report.viewer import viewer_data
 from thesisrecon.report.wording import (
     chosen_pairs,
@@ -53,7 +71,74 @@ from thesisrecon.report.wording import (
     plus_minus,
     significant,
 )
-from thesisrecon.types import F64, IntrinsicInterval, StageReport, TwoView
+
+if TYPE_CHECKING:
+    import jinja2
+
+
+def template_environment() -> jinja2.Environment:
+    """Jinja with all text escaped, no undefined names, and no NaN in JSON."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    # NaN is no JSON: better an error here than a page whose script cannot read its data.
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    return environment
+
+
+def page_resource(name: str) -> str:
+    """A style, script or template of this folder."""
+    return files("thesisrecon.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def plotly_script() -> str:
+    """The text of plotly.js that can stand in an element of a page."""
+    from plotly.offline import get_plotlyjs
+
+    return str(get_plotlyjs()).replace("</script", "<\\/script")
+
+
+def script_hashes(scripts: Sequence[str]) -> str:
+    """What a content security policy names these scripts by."""
+    digests = (hashlib.sha256(script.encode("utf-8")).digest() for script in scripts)
+    found = [f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests]
+    return " ".join(found) or "'none'"
+
+
+LONG_SIDE_PX, QUALITY = 960, 85
+"""Of the pictures on the page; the files beside it are of full size and without loss."""
+
+
+def strip_page(
+    title: str, frames: Sequence[tuple[str, NDArray[np.uint8]]], *, notes: Sequence[str] = ()
+) -> str:
+    """The page as text: ``frames`` are captions and pictures (h, w, 3); ``notes`` sentences without full
+    stops.
+
+    Raises ``ValueError`` without a picture.
+    """
+    if not frames:
+        raise ValueError("a strip needs at least one picture")
+    script = page_resource("strip.js")
+    shown = [{"caption": caption, "image": _embedded(rgb)} for caption, rgb in frames]
+    template = template_environment().from_string(page_resource("strip.html.j2"))
+    return template.render(
+        title=title,
+        frames=shown,
+        notes=list(notes),
+        style=page_resource("style.css"),
+        script=script,
+        hashes=script_hashes([script]),
+    )
+
+
+def _embedded(rgb: NDArray[np.uint8]) -> str:
+    picture = PillowImage.fromarray(rgb)
+    picture.thumbnail((LONG_SIDE_PX, LONG_SIDE_PX), PillowImage.Resampling.LANCZOS)
+    return embed_jpeg(picture, quality=QUALITY).uri
+
 
 if TYPE_CHECKING:
     import jinja2
@@ -287,10 +372,10 @@ def _pair_words(pair: TwoView) -> str:
     words = f"{grouped(pair.inliers)} verified of {grouped(pair.candidates)} candidate matches{share}"
     if np.isfinite(pair.sigma_px):
         words += f", noise {pair.sigma_px:.2f} px per coordinate"
-    if np.isfinite(pair.homography_share):
-        words += f", one plane explains {100 * pair.homography_share:.0f} %"
-    if pair.undetermined and pair.certainty is not None:
-        words += f"; its epipolar geometry is undetermined: {pair.certainty.reasons[0]}"
+    if np.isfinite(pair.homography_inlier_ratio):
+        words += f", one plane explains {100 * pair.homography_inlier_ratio:.0f} %"
+    if pair.undetermined and pair.degeneracy is not None:
+        words += f"; its epipolar geometry is undetermined: {pair.degeneracy.reasons[0]}"
     return words
 
 

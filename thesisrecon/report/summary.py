@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.report.residuals import reprojection_distances, used_observations
-from thesisrecon.types import F64, Image, IntrinsicInterval, Reconstruction, RunResult
+from thesisrecon.arrays import F64
+from thesisrecon.records import Image, IntrinsicInterval, Reconstruction, RunResult
+from thesisrecon.report.data import reprojection_distances, used_observations
 
 
 def summarize(result: RunResult) -> dict[str, Any]:
@@ -34,7 +35,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "reprojection_median_px": _median(everything),
         "reprojection_median_working_px": _median(np.concatenate([np.zeros(0), *working])),
         "trusted": result.metric.trusted if result.metric is not None else None,
-        "doubts": list(result.metric.doubts) if result.metric is not None else [],
+        "failed_checks": list(result.metric.failed_checks) if result.metric is not None else [],
         "identifiable": result.calibration.identifiable if result.calibration is not None else None,
         "motion": _motion(result),
         "self_check": dict(result.metric.self_check) if result.metric is not None else {},
@@ -167,7 +168,7 @@ def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
     """``cameras.json``: K, R (world-to-camera), t, centre and lens of every registered view, in original
     pixels.
     """
-    if reconstruction.K is None or reconstruction.radial is None:
+    if reconstruction.K is None or reconstruction.distortion is None:
         raise ValueError(f"cameras_table needs a metric reconstruction; got {reconstruction.stratum}")
     cameras = []
     for i in np.flatnonzero(reconstruction.registered).tolist():
@@ -179,7 +180,7 @@ def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
                 "width": image.original_size[0],
                 "height": image.original_size[1],
                 "K": original_from_working(image.scale) @ K,
-                "radial": reconstruction.radial[i],
+                "distortion": reconstruction.distortion[i],
                 "R": Rt[:, :3],
                 "t": Rt[:, 3],
                 "centre": -Rt[:, :3].T @ Rt[:, 3],

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from thesisrecon.geometry.camera import decompose_camera
+from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.records import Reconstruction, TexturedMesh
 from thesisrecon.report.drawing import embed_jpeg
-from thesisrecon.report.scene import upright_rotation
-from thesisrecon.types import F64, I64, Reconstruction, TexturedMesh
+from thesisrecon.report.figures import upright_rotation
 
 LEVELS = 65535
 """Steps a side of the box about the model, and a side of the texture."""

@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.errors import counted
-from thesisrecon.report.data import ReportData
-from thesisrecon.report.residuals import ResidualSummary
-from thesisrecon.types import IntrinsicInterval, TexturedMesh, TwoView
+from thesisrecon.records import IntrinsicInterval, TexturedMesh, TwoView
+from thesisrecon.report.data import ReportData, ResidualSummary
 
 Level = Literal["good", "doubt", "open", "bad"]
 THIN = "\u202f"  # a narrow space that does not break groups thousands in any language
@@ -65,9 +64,14 @@ def judge(data: ReportData) -> Verdict:
     have = "has a metric camera" if registered == 1 else "have a metric camera"
     found = f"{registered} of {count_of(total, 'photograph')} {have}."
     if not data.metric.trusted:
-        doubts = tuple(_sentence(doubt) for doubt in data.metric.doubts) or ("The self-check failed.",)
+        failed_checks = tuple(_sentence(doubt) for doubt in data.metric.failed_checks) or (
+            "The self-check failed.",
+        )
         return Verdict(
-            "doubt", "Doubtful", f"{found} Do not rely on the result before you have looked at it.", doubts
+            "doubt",
+            "Doubtful",
+            f"{found} Do not rely on the result before you have looked at it.",
+            failed_checks,
         )
     if registered < total:
         return Verdict(

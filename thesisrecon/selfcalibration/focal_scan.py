@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.selfcalibration.conclusion import (
+from thesisrecon.arrays import F64
+from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.selfcalibration.candidates import (
     answers_from_theta,
     conclude,
     focals_of_groups,
@@ -21,9 +22,6 @@ from thesisrecon.selfcalibration.conclusion import (
 )
 from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
-from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
-
-F64 = NDArray[np.float64]
 
 WEIGHTS = (1.0 / 0.01, 1.0 / 0.2, 1.0 / 0.1, 1.0 / 0.1)
 """Of skew, aspect and the two coordinates of the principal point."""

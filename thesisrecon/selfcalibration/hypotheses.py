@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.selfcalibration.conclusion import (
+from thesisrecon.arrays import F64
+from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.selfcalibration.candidates import (
     Answer,
     answers_from_theta,
     conclude,
@@ -21,17 +22,16 @@ from thesisrecon.selfcalibration.conclusion import (
     guarded,
     require_cameras,
 )
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.focal_scan import focal_pairs, plane_from_focals
-from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
-from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
-from thesisrecon.selfcalibration.nonlinear_quadric import minimize_quadric
-from thesisrecon.selfcalibration.quadric import quadric_hypotheses
+from thesisrecon.selfcalibration.frame import (
+    ReferenceFrame,
+    UnknownIntrinsics,
+    assumed_frame,
+    unknown_intrinsics,
+)
+from thesisrecon.selfcalibration.quadric import minimize_quadric, quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
-from thesisrecon.selfcalibration.stratified import CheiralitySearch
-from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
-
-F64 = NDArray[np.float64]
-
 
 LOOSE = 0.02
 """Deviation of a principal point (long sides), an aspect or a skew beyond which focals alone do not do."""

@@ -16,11 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.optimize.levenberg_marquardt import minimize_residuals
-from thesisrecon.selfcalibration.conclusion import (
+from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
+from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.selfcalibration.candidates import (
     Answer,
     conclude,
     guarded,
@@ -29,13 +30,9 @@ from thesisrecon.selfcalibration.conclusion import (
     square_calibrations,
 )
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
-from thesisrecon.selfcalibration.frame import assumed_frame
-from thesisrecon.selfcalibration.intrinsics import UnknownIntrinsics, unknown_intrinsics
+from thesisrecon.selfcalibration.frame import UnknownIntrinsics, assumed_frame, unknown_intrinsics
 from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs
 from thesisrecon.selfcalibration.refinement import RotationCriterion
-from thesisrecon.types import Assumptions, Reconstruction, SelfCalibration
-
-F64 = NDArray[np.float64]
 
 _ROOT2 = np.sqrt(2.0)
 

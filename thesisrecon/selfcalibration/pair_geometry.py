@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.multiview import fundamental_from_cameras, unit_norm
+from thesisrecon.geometry.two_view import fundamental_from_cameras, unit_norm
+from thesisrecon.records import Reconstruction
 from thesisrecon.selfcalibration.frame import ReferenceFrame
-from thesisrecon.types import I64, Reconstruction
-
-F64 = NDArray[np.float64]
 
 FLATTEST_REL = 1e-12
 """Curvatures below this share of the largest are raised to it: an open direction is uncertain, not inf."""

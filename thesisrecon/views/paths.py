@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy
 
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.types import F64, TexturedMesh
+from thesisrecon.arrays import F64
+from thesisrecon.camera import Camera
+from thesisrecon.records import TexturedMesh
 
 ROUND_GAP = np.radians(120.0)
 """Cameras that leave no wider gap stand all round the scene, and an orbit closes the circle."""
@@ -41,18 +42,18 @@ SAMPLE = 5000
 """Points of the model that are looked at to choose an orbit."""
 
 
-def fitted(camera: PinholeCamera, size: tuple[int, int]) -> PinholeCamera:
+def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
     """The camera with a picture of ``size`` (width, height): all that it saw, as large as fits, with more at
     two sides where the shapes differ."""
     factor = min(size[0] / camera.size[0], size[1] / camera.size[1])
     S = np.diag([factor, factor, 1.0])
     S[:2, 2] = 0.5 * (np.array(size) - 1.0) - factor * 0.5 * (np.array(camera.size) - 1.0)
-    return PinholeCamera(S @ camera.K, camera.R, camera.t, size)
+    return Camera(S @ camera.K, camera.R, camera.t, size)
 
 
 def orbit(
-    cameras: Sequence[PinholeCamera], X: F64, frames: int, *, size: tuple[int, int] | None = None
-) -> list[PinholeCamera]:
+    cameras: Sequence[Camera], X: F64, frames: int, *, size: tuple[int, int] | None = None
+) -> list[Camera]:
     """Cameras on a circle about the middle of the scene, all looking at it, upright.
 
     The middle is the geometric median of X; radius and height above it are medians over the cameras, the
@@ -86,7 +87,7 @@ def orbit(
     right, ahead = _level_axes(up)
     azimuth = _azimuths(np.arctan2(offset @ ahead, offset @ right), frames)
 
-    def circle(factor: float) -> list[PinholeCamera]:
+    def circle(factor: float) -> list[Camera]:
         around = np.outer(np.cos(azimuth), right) + np.outer(np.sin(azimuth), ahead)
         # Below the middle the camera stays where it is: the ground may be there.
         lift = height * (factor if height > 0.0 else 1.0)
@@ -96,8 +97,8 @@ def orbit(
 
 
 def interpolate(
-    cameras: Sequence[PinholeCamera], frames: int, *, size: tuple[int, int] | None = None
-) -> list[PinholeCamera]:
+    cameras: Sequence[Camera], frames: int, *, size: tuple[int, int] | None = None
+) -> list[Camera]:
     """Cameras on a smooth way through ``cameras`` in their order, from the first to the last.
 
     Centres run on a centripetal Catmull-Rom spline (Yuksel et al. 2011), which makes no loops, at a constant
@@ -120,11 +121,11 @@ def interpolate(
     share = (place - start)[:, None, None]
     K = (1.0 - share) * K[start] + share * K[start + 1]
     t = -np.einsum("nij,nj->ni", R, _spline(centres, place))
-    between = [PinholeCamera(K[n], R[n], t[n], shown[0].size) for n in range(1, frames - 1)]
+    between = [Camera(K[n], R[n], t[n], shown[0].size) for n in range(1, frames - 1)]
     return [shown[0], *between, shown[-1]]
 
 
-def upward(cameras: Sequence[PinholeCamera]) -> F64:
+def upward(cameras: Sequence[Camera]) -> F64:
     """Unit vector (3,) that points up in the scene.
 
     It is the one to which the rows of the pictures are most nearly at right angles, and the optical axes a
@@ -167,7 +168,7 @@ def surface_points(mesh: TexturedMesh, count: int = SAMPLE) -> F64:
     return np.asarray(a + u * (b - a) + v * (c - a))
 
 
-def _check(cameras: Sequence[PinholeCamera], frames: int) -> None:
+def _check(cameras: Sequence[Camera], frames: int) -> None:
     if not cameras:
         raise ValueError("a path needs at least one camera; got none")
     if frames < 1:
@@ -213,26 +214,24 @@ def _azimuths(of_cameras: F64, frames: int) -> F64:
     return np.asarray(start + 0.5 * arc + 0.5 * max(arc, LEAST_SWING) * np.sin(phase))
 
 
-def _looking_at(K: F64, centre: F64, target: F64, up: F64, size: tuple[int, int]) -> PinholeCamera:
+def _looking_at(K: F64, centre: F64, target: F64, up: F64, size: tuple[int, int]) -> Camera:
     axis = (target - centre) / np.linalg.norm(target - centre)
     row = np.cross(axis, up)
     row /= np.linalg.norm(row)
     R = np.stack([row, np.cross(axis, row), axis])
-    return PinholeCamera(K, R, -R @ centre, size)
+    return Camera(K, R, -R @ centre, size)
 
 
-def _widening(
-    circle: Callable[[float], list[PinholeCamera]], cameras: Sequence[PinholeCamera], X: F64
-) -> float:
+def _widening(circle: Callable[[float], list[Camera]], cameras: Sequence[Camera], X: F64) -> float:
     """The first factor of the radius that keeps clear of X and shows enough of it; else, of those that keep
     clear, the one that shows most; else the largest."""
     tree, nearest = scipy.spatial.cKDTree(X), [1 + len(X) // 1000]
 
-    def distances(path: Sequence[PinholeCamera]) -> F64:
+    def distances(path: Sequence[Camera]) -> F64:
         # Not the very nearest: single points float before every reconstruction.
         return np.asarray(tree.query([camera.centre for camera in path], k=nearest)[0])
 
-    def shares(path: Sequence[PinholeCamera]) -> F64:
+    def shares(path: Sequence[Camera]) -> F64:
         return np.array([_share_in_view(camera, X) for camera in path])
 
     clear, shown = CLEARANCE * np.median(distances(cameras)), SHOWN * np.median(shares(cameras))
@@ -249,7 +248,7 @@ def _widening(
     return best
 
 
-def _share_in_view(camera: PinholeCamera, X: F64) -> float:
+def _share_in_view(camera: Camera, X: F64) -> float:
     """Share of the points X (N, 3) that the camera has in its picture, hidden or not."""
     x, y, z = camera.K @ (camera.R @ X.T + camera.t[:, None])
     width, height = camera.size

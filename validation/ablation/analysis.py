@@ -10,9 +10,10 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon.arrays import F64
 from validation.ablation.plan import Plan
 from validation.ablation.run import Row, Rows
-from validation.ablation.statistics import F64, Interval, holm, mean_ranks, on_front, paired_interval
+from validation.ablation.statistics import Interval, holm, mean_ranks, on_front, paired_interval
 from validation.ablation.study import Measure
 
 Verdict = Literal["better", "worse", "no difference shown", "too few pairs", "the baseline"]

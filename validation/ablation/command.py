@@ -9,7 +9,7 @@ from pathlib import Path
 from signal import SIGINT
 
 from thesisrecon.errors import UsageError, counted
-from thesisrecon.stops import CODES, advised
+from thesisrecon.runtime.signals import CODES, advised
 from validation.ablation.analysis import analyse
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import Plan, plan_study

@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon.io.files import write_text
-from thesisrecon.report.html import page_resource, plotly_script, script_hashes, template_environment
+from thesisrecon.report.page import page_resource, plotly_script, script_hashes, template_environment
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_told
 from validation.ablation.plan import Plan
 from validation.ablation.study import Measure
@@ -33,7 +33,7 @@ MOST_LEVELS = 40
 def write_analysis(analysis: Analysis, out: str | Path) -> Path:
     """Write ``index.html`` and the tables into ``out``; the path of the page.
 
-    Raises :class:`~thesisrecon.errors.Unwritable` where the folder cannot be written.
+    Raises :class:`~thesisrecon.errors.OutputError` where the folder cannot be written.
     """
     out = Path(out)
     tables = write_tables(analysis, out)

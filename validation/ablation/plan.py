@@ -17,8 +17,8 @@ from typing import Any
 import thesisrecon
 from thesisrecon.config import KINDS, PipelineConfig, tables_from_config
 from thesisrecon.errors import UsageError
-from thesisrecon.io.fingerprint import package_key
-from thesisrecon.io.run_directory import code_key, key_of
+from thesisrecon.runtime.executors import package_key
+from thesisrecon.runtime.run_folder import code_key, key_of
 from thesisrecon.settings import table_from_dataclass, unknown_word
 from validation.ablation.changes import STAGES, TASK, Setting, apply_changes, level_name
 from validation.ablation.own import PREFIX

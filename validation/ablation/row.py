@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.errors import DISK, StageFailure, Unwritable, UsageError
+from thesisrecon.errors import DISK, OutputError, StageFailure, UsageError
 from validation.ablation.changes import Setting
 from validation.ablation.own import Source, sources_of
 from validation.ablation.store import SHARED, WORK, Outcome
@@ -66,7 +66,7 @@ def _modules(value: Any) -> set[str]:
 
 def carry_out(job: Job) -> Outcome:
     """The row, or the step it is asked for. What goes wrong is told and not raised, but for a full disk
-    (:class:`Unwritable`): the row has not failed, it waits for room."""
+    (:class:`OutputError`): the row has not failed, it waits for room."""
     for source in job.sources:
         source.install()
     setting: Setting = pickle.loads(job.setting)
@@ -83,13 +83,13 @@ def carry_out(job: Job) -> Outcome:
             setting.task.prepare(setting.config, job.scene, job.seed, place, step=job.step)
         else:
             metrics = _plain(setting.task.run(setting.config, job.scene, job.seed, place))
-    except Unwritable:
+    except OutputError:
         raise
     except (StageFailure, UsageError) as error:
         failure = str(error)
     except Exception as error:
         if isinstance(error, OSError) and error.errno in DISK:
-            raise Unwritable(error.filename or own, error) from None
+            raise OutputError(error.filename or own, error) from None
         failure = f"{type(error).__name__}: {error}{_where(error)}"
     seconds, cpu_s = time.perf_counter() - start, clock() - cpu
     shutil.rmtree(own, ignore_errors=True)

@@ -15,8 +15,8 @@ from typing import Any, overload
 from thesisrecon.config import tables_from_config
 from thesisrecon.errors import WorkersLost
 from thesisrecon.io.files import write_json
+from thesisrecon.runtime.executors import PATIENCE_S
 from thesisrecon.settings import table_from_dataclass
-from thesisrecon.workers import PATIENCE_S
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.row import Job, carry_out, pack
 from validation.ablation.store import STEPS, WORK, Outcome, Store, finite

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-F64 = NDArray[np.float64]
+from thesisrecon.arrays import F64
+
 Unit = Literal["seeds", "scenes"]
 
 STUDENTISED_FROM = 12

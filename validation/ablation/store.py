@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.errors import Unwritable
+from thesisrecon.errors import OutputError
 from thesisrecon.io.files import read_json, write_json
 
 ROWS, STEPS, SHARED, WORK = "rows", "steps", "shared", "work"
@@ -41,12 +41,12 @@ class Store:
     path: Path
 
     def prepare(self) -> None:
-        """Make the folder; :class:`Unwritable` where it cannot be written."""
+        """Make the folder; :class:`OutputError` where it cannot be written."""
         try:
             for name in (ROWS, STEPS, SHARED, WORK):
                 (self.path / name).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise Unwritable(f"the output folder {self.path}", error) from None
+            raise OutputError(f"the output folder {self.path}", error) from None
 
     def load(self, key: str, kind: str = ROWS) -> Outcome | None:
         """The outcome kept under this key, None where it is absent or damaged."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from thesisrecon.config import PipelineConfig, config_from_tables, preset
 from thesisrecon.errors import UsageError
-from thesisrecon.io.text import read_bytes
+from thesisrecon.io.files import read_bytes
 from thesisrecon.settings import dataclass_from_table, unknown_word
 from validation.ablation.own import is_own, load_own
 from validation.ablation.study import Measure, Study

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from thesisrecon.cluster import Cluster, connected, is_address
 from thesisrecon.errors import UsageError
+from thesisrecon.runtime.dask_cluster import Cluster, connected, is_address
+from thesisrecon.runtime.executors import NAMES, ProcessPool, available_threads
 from thesisrecon.settings import unknown_word
-from thesisrecon.workers import NAMES, ProcessPool, available_threads
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MANY = 64

@@ -25,17 +25,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import thesisrecon
-from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.arrays import B8, F64
+from thesisrecon.io.colmap import reconstruction_from_colmap
+from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.io.files import write_text
-from thesisrecon.optimize.losses import LossName
-from thesisrecon.optimize.metric_bundle import (
-    BundleOptions,
-    MetricBundleResult,
-    MetricCameras,
-    Observations,
-    refine_metric_bundle,
-)
-from thesisrecon.types import B8, F64, Reconstruction
+from thesisrecon.numerics.levenberg_marquardt import LossName
+from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
+from thesisrecon.records import Reconstruction
 from validation.checks.growth import exponent
 from validation.harness.process import own_cores, run_process
 from validation.metrics.record import Metric, markdown_table
@@ -76,10 +74,10 @@ def model_as_bundle(model: Reconstruction) -> tuple[MetricCameras, F64, Observat
     """A saved model: all cameras with the first's intrinsics, as far as SIMPLE_RADIAL has them; its points
     and its observations."""
     assert model.K is not None
-    assert model.radial is not None
+    assert model.distortion is not None
     R, t = _poses(model)
     K = model.K[0]
-    row = [K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], float(model.radial[0, 0])]
+    row = [K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], float(model.distortion[0, 0])]
     seen = Observations(model.tracks.view_index, model.tracks.point_index, model.tracks.xy)
     X = model.X[:, :3] / model.X[:, 3:]
     return MetricCameras(R, t, np.array([row]), np.zeros(len(R), dtype=np.int64)), X, seen

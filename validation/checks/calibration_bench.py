@@ -11,8 +11,8 @@ import numpy as np
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.types import Reconstruction, RunResult
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import Reconstruction, RunResult
 from validation.checks.calibration_parts import LEAST_HOLDING, Cameras
 from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS
 from validation.metrics.cameras import CameraErrors, TrueCameras, measure_cameras

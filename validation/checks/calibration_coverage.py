@@ -18,12 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.assumptions import assume
+from thesisrecon.arrays import B8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
+from thesisrecon.intrinsics import assume
 from thesisrecon.io.files import write_text
-from thesisrecon.run import stream
-from thesisrecon.types import B8, MetricResult
+from thesisrecon.records import MetricResult
+from thesisrecon.runtime.run import stream
 from validation.checks.calibration_parts import (
     MODES,
     Cameras,

@@ -10,8 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.types import B8, F64, I64, MetricResult, Reconstruction, RunResult, Tracks
+from thesisrecon.records import MetricResult, Reconstruction, RunResult, Tracks
 from validation.checks.reconstruction import OURS
 from validation.checks.subsets import Matched, solve, take_views
 from validation.metrics.cameras import TrueCameras
@@ -223,7 +224,7 @@ def named(result: MetricResult, view: int) -> bool:
     if not result.reconstruction.registered[view]:
         return True
     sentence = re.compile(rf"\bviews?\b[^;:]*\b{view}\b")
-    if any(sentence.search(said) for said in (*result.warnings, *result.doubts)):
+    if any(sentence.search(said) for said in (*result.warnings, *result.failed_checks)):
         return True
     interval = result.intrinsics[view]["focal_px"]
     return interval.source.startswith("borrowed") or interval.std / interval.value >= WIDE_REL

@@ -21,8 +21,8 @@ import numpy as np
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.io.files import write_text
-from thesisrecon.selfcalibration import HypothesesAndRefinement
-from thesisrecon.types import Reconstruction
+from thesisrecon.records import Reconstruction
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.checks.calibration_bench import Bench, Config, Rows, model_of, truth_of
 from validation.checks.calibration_parts import LEAST_HOLDING, MODES, check_parts
 from validation.checks.calibration_wide import check_against_shared, check_wide

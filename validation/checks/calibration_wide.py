@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thesisrecon.types import Reconstruction, RunResult
+from thesisrecon.records import Reconstruction, RunResult
 from validation.checks.calibration_bench import Bench, Rows, model_of, reduced
 from validation.checks.calibration_parts import LEAST_HOLDING, MODES, SUCCESS_PCT, named
 from validation.checks.reconstruction import COLMAP, OURS

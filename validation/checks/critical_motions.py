@@ -17,14 +17,15 @@ from functools import partial
 
 import numpy as np
 
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
-from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.optimize.projective_bundle import refine_projective_bundle
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from thesisrecon.projective.initial_pair import require_parallax
-from thesisrecon.selfcalibration import HypothesesAndRefinement
-from thesisrecon.types import Matches, MotionVerdict, Reconstruction, TwoView
+from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur
@@ -124,7 +125,7 @@ def check_motion(
     return rows, line
 
 
-def dinosaur_verdict(reconstruction: Reconstruction, *, cameras: str = "shared") -> MotionVerdict:
+def dinosaur_verdict(reconstruction: Reconstruction, *, cameras: str = "shared") -> IdentifiabilityReport:
     """The verdict on projective cameras of the dinosaur; ``StageFailure`` where there is none."""
     wish = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")
     answer = HypothesesAndRefinement().calibrate(

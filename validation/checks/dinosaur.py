@@ -15,12 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.optimize.projective_bundle import refine_projective_bundle
-from thesisrecon.optimize.triangulation_refine import refine_points
-from thesisrecon.projective import GatedIncremental
-from thesisrecon.run import stream
-from thesisrecon.types import B8, F64, Reconstruction, Tracks
+from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.numerics.separate_refinement import refine_points
+from thesisrecon.projective.incremental import GatedIncremental
+from thesisrecon.records import Reconstruction, Tracks
+from thesisrecon.runtime.run import stream
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_tracks
 

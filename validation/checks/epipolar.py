@@ -5,24 +5,25 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.epipolar import estimate_eight_point, estimate_fundamental, refine_reprojection
-from thesisrecon.epipolar.covariance import fundamental_covariance
-from thesisrecon.epipolar.degeneracy import Configuration, classify_configuration
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.configuration import Configuration, classify_configuration
+from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.frame import PairFrame
+from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.precision import (
     epipolar_distance_interval,
     epipoles_of,
     fundamental_bound,
+    fundamental_covariance,
 )
+from thesisrecon.epipolar.refinement import refine_reprojection
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.multiview import epipolar_lines, epipoles, sampson_residuals, symmetric_residuals
-from thesisrecon.types import FundamentalFit
+from thesisrecon.geometry.two_view import epipolar_lines, epipoles, sampson_residuals, symmetric_residuals
+from thesisrecon.records import FundamentalFit
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.two_views import make_two_views
 
-F64 = NDArray[np.float64]
 GOLD, DEFAULT = "gold standard", "default"
 DISTANCES, EPIPOLES, PIXELS = INTERVALS = ("distances", "epipoles", "epipoles in pixels")
 NOISES_PX = (0.1, 0.25, 0.5, 1.0, 2.0)

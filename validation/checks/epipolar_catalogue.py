@@ -6,29 +6,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.epipolar import (
-    LeastMedianOfSquares,
-    LocallyOptimisedRansac,
-    ThesisRansac,
-    estimate_eight_point,
-    refine_epipolar_distance,
-    refine_gradient,
-    refine_reprojection,
-)
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame
+from thesisrecon.epipolar.linear import estimate_eight_point
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.ransac import LeastMedianOfSquares, SevenPointProblem, ThesisRansac
+from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
 from thesisrecon.epipolar.row_parameterization import (
     refine_epipolar_distance_by_rows,
-    refine_gradient_by_rows,
     refine_reprojection_by_rows,
+    refine_sampson_by_rows,
 )
-from thesisrecon.epipolar.thesis_ransac import SevenPointProblem
 from thesisrecon.errors import StageFailure
-from thesisrecon.robust.ransac import SampleConsensus
+from thesisrecon.numerics.ransac import SampleConsensus
 from validation.references.fundamental import SOLVERS, opencv_eight_point
 
-F64 = NDArray[np.float64]
 Estimate = Callable[[F64, F64, float, int], F64 | None]
 """F (3, 3) of matches (N, 2), (N, 2) px, with a threshold (px) and a seed; None where there is none."""
 
@@ -110,8 +103,8 @@ OURS = (
     Method("eight-point, raw pixels, rank 3", _linear(normalized=False, rank_two=False)),
     Method(RAW, _linear(normalized=False)),
     Method(NORMALISED, _linear(normalized=True)),
-    Method("gradient (5.4), thesis' rows", _refined(refine_gradient_by_rows)),
-    Method("gradient (5.4), orthonormal", _refined(refine_gradient)),
+    Method("gradient (5.4), thesis' rows", _refined(refine_sampson_by_rows)),
+    Method("gradient (5.4), orthonormal", _refined(refine_sampson)),
     Method("epipolar distance (5.6), thesis' rows", _refined(refine_epipolar_distance_by_rows)),
     Method("epipolar distance (5.6), orthonormal", _refined(refine_epipolar_distance)),
     Method("gold standard, thesis' rows", _refined(refine_reprojection_by_rows)),

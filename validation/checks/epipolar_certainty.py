@@ -16,20 +16,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.epipolar import estimate_eight_point, estimate_fundamental, judge_certainty
-from thesisrecon.epipolar.degeneracy import Configuration, classify_configuration
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.configuration import Configuration, classify_configuration
+from thesisrecon.epipolar.degeneracy import assess_degeneracy
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import compose_camera
-from thesisrecon.geometry.multiview import symmetric_residuals
+from thesisrecon.geometry.camera_matrix import compose_camera
+from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.facade import FacadeMaker
 from validation.scenes.real import Scene, load_fixture_scene, load_real_scene
 from validation.scenes.real_pairs import exact_correspondences, match_photographs
 from validation.scenes.two_views import make_two_views
-
-F64 = NDArray[np.float64]
 
 RIGHT_PX = 1.0
 NOISES_PX = (0.1, 0.25, 0.5, 1.0, 2.0)
@@ -132,11 +132,11 @@ def judge_pairs(pairs: Iterable[JudgedPair], seeds: int) -> tuple[dict[str, Coun
                 counter["refused"] += 1
                 continue
             middle = time.process_time()
-            certainty = judge_certainty(fit, pair.xy1, pair.xy2, rng=np.random.default_rng(seed))
+            degeneracy = assess_degeneracy(fit, pair.xy1, pair.xy2, rng=np.random.default_rng(seed))
             ratios.append((time.process_time() - middle) / max(middle - start, 1e-9))
             distances = symmetric_residuals(fit.F, pair.exact1, pair.exact2)
             right = np.sqrt(np.mean(distances**2) / 2.0) <= RIGHT_PX
-            sure = "sure" if certainty.determined else "unsure"
+            sure = "sure" if degeneracy.determined else "unsure"
             counter[f"{'right' if right else 'wrong'} and {sure}"] += 1
     return cells, ratios
 

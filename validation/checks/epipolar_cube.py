@@ -17,17 +17,16 @@ from pathlib import Path
 
 import numpy as np
 import plotly.graph_objects as go
-from numpy.typing import NDArray
 from plotly.colors import qualitative
 
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.precision import fundamental_bound
-from thesisrecon.geometry.camera import compose_camera
-from thesisrecon.geometry.multiview import epipoles, symmetric_residuals
+from thesisrecon.geometry.camera_matrix import compose_camera
+from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
 from thesisrecon.io.files import write_text
 from validation.checks.epipolar_catalogue import METHODS, THRESHOLD_PX, TOLD_SIGMAS, Method
 from validation.scenes.cube import CubeSequence, make_cube
 
-F64 = NDArray[np.float64]
 NOISES_PX = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
 OFF_FACE = 20
 """Common points that must lie off the face with the most of them."""

@@ -18,17 +18,16 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.epipolar.degeneracy import Configuration
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.precision import fundamental_bound
-from thesisrecon.geometry.multiview import symmetric_residuals
+from thesisrecon.geometry.two_view import symmetric_residuals
 from thesisrecon.io.files import write_text
 from validation.checks.epipolar_catalogue import DEFAULT, GOLD, METHODS, THRESHOLD_PX, TOLD_SIGMAS, Method
 from validation.references.libraries import PACKAGES, one_thread
 from validation.scenes.two_views import make_two_views
 
-F64 = NDArray[np.float64]
 SIZE = (1280.0, 960.0)
 WRONG, WRONG_NOISE_PX = 0.2, 1.0
 ALLOWED = 1.05

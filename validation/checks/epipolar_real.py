@@ -16,9 +16,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.epipolar.certainty import judge_certainty
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from validation.metrics.epipolar import precision_recall, rms_epipolar_distance, rms_sampson_distance
 from validation.metrics.record import Metric, markdown_table
 from validation.references.fundamental import OURS, SOLVERS, Estimate, estimate_with
@@ -32,7 +32,6 @@ from validation.scenes.real_pairs import (
     kusvod2_pairs,
 )
 
-F64 = NDArray[np.float64]
 Runs = dict[str, list[list[Estimate]]]
 THRESHOLD_PX = 1.0
 FAILED_PX = 5.0
@@ -126,7 +125,7 @@ def called_sure(estimate: Estimate, pair: RealPair, limit_px: float) -> bool:
     if estimate.fit is None or rms_epipolar_distance(estimate.F, pair.truth) <= limit_px:
         return False
     rng = np.random.default_rng(0)
-    return judge_certainty(estimate.fit, pair.xy1, pair.xy2, rng=rng).determined
+    return assess_degeneracy(estimate.fit, pair.xy1, pair.xy2, rng=rng).determined
 
 
 def check_cameras(

@@ -11,16 +11,14 @@ import argparse
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.epipolar.degeneracy import Configuration
+from thesisrecon.epipolar.configuration import Configuration
 from validation.metrics.epipolar import rms_epipolar_distance
 from validation.metrics.record import Metric, markdown_table
 from validation.references.fundamental import OURS, SOLVERS
 from validation.references.libraries import one_thread
 from validation.scenes.two_views import make_two_views
 
-F64 = NDArray[np.float64]
 SIZE, SIGMA_PX, THRESHOLD_PX = (1280.0, 960.0), 0.5, 1.0
 ACCURATE, POSELIB = "USAC_ACCURATE", "PoseLib"
 METHODS = (OURS, ACCURATE, POSELIB, "USAC_ACCURATE default", "USAC_MAGSAC", "FM_RANSAC", "COLMAP")

@@ -17,21 +17,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.config import ProjectiveReconstructor
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import random_transform
-from thesisrecon.optimize.projective_bundle import refine_projective_bundle
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.projective import Factorization, GatedIncremental
-from thesisrecon.projective.sturm_triggs import depths_from_fundamentals, factorize
-from thesisrecon.types import Reconstruction, Tracks, TwoView
+from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.projective.factorization import Factorization, depths_from_fundamentals, factorize
+from thesisrecon.projective.incremental import GatedIncremental
+from thesisrecon.records import Reconstruction, Tracks, TwoView
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.cloud import make_cloud
 from validation.scenes.dinosaur import pairs_from_tracks
 from validation.scenes.real import Scene, load_fixture_scene, load_real_scene
 from validation.scenes.rigs import Rig, noisy_tracks
-
-F64 = NDArray[np.float64]
 
 PLAIN, ITERATED, AFFINE, GROWN = (
     "Sturm-Triggs",

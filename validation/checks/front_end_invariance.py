@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.io.images import read_photographs
-from thesisrecon.pipeline import detect_features, match_views
-from thesisrecon.types import F64, Features, Image
+from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
+from thesisrecon.records import Features, Image
 from validation.checks.front_end_pairs import MAX_SIZE_PX, OURS, SIFT, front_ends
 from validation.metrics.record import Metric
 from validation.references.pictures import shrink, warp_affine
 from validation.scenes.real import load_real_scene
 
-U8 = NDArray[np.uint8]
 REPEATED_PX, RIGHT_PX = 1.5, 1.5
 PHOTOGRAPHS = (("fountain-P11", 5), ("Herz-Jesus-P8", 3))
 

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from thesisrecon import reconstruct
-from thesisrecon.geometry.camera import undistort
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.multiview import fundamental_from_cameras, sampson_residuals
-from thesisrecon.types import F64, Reconstruction, RunResult, TwoView
+from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
+from thesisrecon.records import Reconstruction, RunResult, TwoView
 from validation.checks.front_end_pairs import OURS, SIFT, THESIS, PreparedViews, front_ends
 from validation.metrics.record import Metric
 from validation.references.colmap_run import reconstruct_with_pycolmap
@@ -98,10 +99,10 @@ def disagreement(view: TwoView, model: Reconstruction) -> float:
 
 def _undistorted(xy: F64, model: Reconstruction, i: int) -> F64:
     assert model.K is not None
-    if model.radial is None:
+    if model.distortion is None:
         return xy
     normalized = dehomogenize(homogenize(xy) @ np.linalg.inv(model.K[i]).T)
-    return dehomogenize(homogenize(undistort(normalized, model.radial[i])) @ model.K[i].T)
+    return dehomogenize(homogenize(undistort(normalized, model.distortion[i])) @ model.K[i].T)
 
 
 def check_kermit(run: KermitRun) -> list[Metric]:

@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig, preset
-from thesisrecon.geometry.multiview import sampson_residuals
+from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.io.images import read_photographs
-from thesisrecon.pipeline import detect_features, match_views
-from thesisrecon.types import F64, Image, TwoView
+from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
+from thesisrecon.records import Image, TwoView
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
 from validation.references.sift_front_end import sift_front_end

@@ -22,8 +22,8 @@ from typing import Any
 from thesisrecon.config import PipelineConfig
 from thesisrecon.io.files import write_text
 from thesisrecon.io.images import list_images, read_photographs
-from thesisrecon.pipeline import detect_features, match_views
-from thesisrecon.workers import Workers
+from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
+from thesisrecon.runtime.executors import Workers
 from validation.checks.front_end_pairs import MAX_SIZE_PX
 from validation.harness.process import own_cores, run_process
 from validation.metrics.record import Metric

@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from thesisrecon.cli import run_command
+from thesisrecon.cli.main import run_command
 from thesisrecon.errors import MEND
 from validation.checks.kill_anywhere import COURTYARD, different, outputs
 

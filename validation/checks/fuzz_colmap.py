@@ -45,7 +45,7 @@ LARGEST_INPUT = 4096
 GUIDED = """
 import sys, warnings
 import atheris
-with atheris.instrument_imports(include=["thesisrecon.io", "thesisrecon.geometry.camera"]):
+with atheris.instrument_imports(include=["thesisrecon.io", "thesisrecon.geometry.camera_matrix"]):
     from validation.checks.fuzz_colmap import read_input
 warnings.simplefilter("error")
 atheris.Setup(sys.argv, read_input)

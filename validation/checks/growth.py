@@ -27,8 +27,8 @@ import numpy as np
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.io.files import write_text
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.types import RunResult
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import RunResult
 from validation.harness.process import own_cores, run_process
 from validation.scenes.crops import Crop, make_crops, make_separate_crops, shared_area
 from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene

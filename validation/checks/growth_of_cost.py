@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline import reconstruct
+from thesisrecon.pipeline.reconstruction import reconstruct
 from validation.checks.growth import exponent
 from validation.harness.process import own_cores, run_process
 from validation.scenes.many_views import walk, write_views

@@ -18,8 +18,9 @@ from functools import partial
 
 import numpy as np
 
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.types import F64, MetricResult, Tracks, TwoView
+from thesisrecon.records import MetricResult, Tracks, TwoView
 from validation.checks.subsets import Matched, solve
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.dinosaur import pairs_from_tracks
@@ -33,7 +34,7 @@ LEVEL = 1.96
 @dataclass(frozen=True)
 class Trial:
     """``said``: refused, doubted or trusted; ``worst`` focal error of the registered cameras (relative);
-    ``quiet`` of them are off by more than 3 % and than their intervals; the ``doubts`` or the refusal."""
+    ``quiet`` of them are off by more than 3 % and than their intervals; the ``failed_checks`` or the refusal."""
 
     number: int
     said: str
@@ -41,7 +42,7 @@ class Trial:
     worst: float
     median: float
     quiet: int
-    doubts: tuple[str, ...]
+    failed_checks: tuple[str, ...]
 
     @property
     def is_lie(self) -> bool:
@@ -71,7 +72,7 @@ def judge(number: int, result: MetricResult | None, failures: Sequence[str], mat
     quiet = int(((error > OFF) & (error > stated)).sum())
     said = "trusted" if result.trusted else "doubted"
     worst, median = float(error.max()), float(np.median(error))
-    return Trial(number, said, len(error), worst, median, quiet, tuple(result.doubts))
+    return Trial(number, said, len(error), worst, median, quiet, tuple(result.failed_checks))
 
 
 def verified_tracks(t: Tracks, pairs: Sequence[TwoView]) -> Tracks:

@@ -16,8 +16,8 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.types import F64
 from validation.checks.harsh import OURS, Trial, judge, line_of, print_head
 from validation.checks.subsets import Matched, match_scene, solve, take_views
 from validation.metrics.record import Metric, markdown_table

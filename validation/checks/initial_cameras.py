@@ -11,20 +11,18 @@ import argparse
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.epipolar import estimate_fundamental
-from thesisrecon.geometry.camera import compose_camera, project
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.geometry.camera_matrix import compose_camera, project
 from thesisrecon.geometry.homogeneous import cross_matrix, pixel_from_unit
-from thesisrecon.geometry.multiview import canonical_cameras, epipoles, unit_norm
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.two_view import canonical_cameras, epipoles, unit_norm
 from thesisrecon.projective.initial_pair import initial_cameras
-from thesisrecon.types import TwoView
+from thesisrecon.records import TwoView
 from validation.metrics.record import Metric, markdown_table
-
-F64 = NDArray[np.float64]
 
 SIZES = np.array([[1280, 960], [1280, 960]])
 FOCALS_PX = (800.0, 1600.0, 3200.0)

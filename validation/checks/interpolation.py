@@ -18,12 +18,13 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from thesisrecon.between import rectified_pair, relate
+from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
-from thesisrecon.geometry.camera import camera_from_centre, project
+from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.io.files import write_text
-from thesisrecon.types import Image
+from thesisrecon.records import Image
+from thesisrecon.view_interpolation import rectified_pair, relate
 from thesisrecon.views.interpolation import InterpolatedPair
 from validation.checks.tensor_views import (
     DIRECTIONS,
@@ -56,10 +57,6 @@ from validation.scenes.nine_views import (
     read_rgb,
 )
 from validation.scenes.real import load_real_scene
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 OVER_SGBM_DB, OVER_DISSOLVE_DB = 0.3, 5.0
 FRAME_SIZE, FRAME_S = (1000, 700), 1.0

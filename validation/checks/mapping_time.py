@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.assumptions import assumptions_of_views
 from thesisrecon.config import PipelineConfig
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.run import stream
-from thesisrecon.types import MetricResult, RunResult
+from thesisrecon.intrinsics import assumptions_of_views
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import MetricResult, RunResult
+from thesisrecon.runtime.run import stream
 from validation.metrics.record import Metric, markdown_table
 from validation.references.colmap_mapping import map_database, mapper_options
 from validation.references.colmap_matching import match_with_pycolmap

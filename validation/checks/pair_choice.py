@@ -18,9 +18,9 @@ import numpy as np
 
 from thesisrecon.config import ImageOptions, preset
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.types import Image, RunResult
-from thesisrecon.workers import Workers
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import Image, RunResult
+from thesisrecon.runtime.executors import Workers
 from validation.checks.growth import draw_crops
 from validation.metrics.record import Metric, summary_table
 from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.pipeline import reconstruct
+from thesisrecon.pipeline.reconstruction import reconstruct
 from validation.harness.process import own_cores, run_process
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.many_views import write_views

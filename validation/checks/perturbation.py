@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.config import ImageOptions, PipelineConfig, preset
-from thesisrecon.pipeline import reconstruct
-from thesisrecon.types import Features, Image, Matches, MetricResult, Tracks, TwoView
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import Features, Image, Matches, MetricResult, Tracks, TwoView
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import REAL_SCENES, Scene, load_fixture_scene, load_real_scene

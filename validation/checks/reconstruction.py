@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from thesisrecon.types import Reconstruction
+from thesisrecon.records import Reconstruction
 from validation.metrics.cameras import (
     CameraErrors,
     Reprojection,

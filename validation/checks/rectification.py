@@ -18,27 +18,23 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import thesisrecon
-from thesisrecon.dense.rectification import (
-    AnyRectification,
-    CommonOrientation,
-    EpipolarPair,
-    Hartley,
-    LeastDistortion,
-    LoopZhang,
-    PlanarRectification,
-    Polar,
-    RectificationQuality,
-    measure_quality,
-    pair_of_cameras,
-    pair_of_fundamental,
-    rectify,
-)
-from thesisrecon.dense.rectification.quality import jacobians
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.camera import project, undistort
+from thesisrecon.geometry.camera_matrix import project, undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate_linear
-from thesisrecon.types import F64, Reconstruction, TwoView
+from thesisrecon.records import Reconstruction, TwoView
+from thesisrecon.stereo.epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
+from thesisrecon.stereo.planar import CommonOrientation, PlanarRectification
+from thesisrecon.stereo.planar_methods import Hartley, LeastDistortion, LoopZhang
+from thesisrecon.stereo.polar import Polar
+from thesisrecon.stereo.rectification import (
+    AnyRectification,
+    RectificationQuality,
+    jacobians,
+    measure_quality,
+    rectify,
+)
 from validation.metrics.record import Metric, markdown_table
 from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
 from validation.scenes.real import data_root, load_real_scene
@@ -74,10 +70,10 @@ class Measured:
 def undistorted(model: Reconstruction, view: int, xy: F64) -> F64:
     """Pixels (N, 2) as a camera without lens distortion sees them."""
     assert model.K is not None
-    if model.radial is None:
+    if model.distortion is None:
         return xy
     inverse = np.linalg.inv(model.K[view])
-    places = undistort(dehomogenize(homogenize(xy) @ inverse.T), model.radial[view])
+    places = undistort(dehomogenize(homogenize(xy) @ inverse.T), model.distortion[view])
     return np.asarray(dehomogenize(homogenize(places) @ model.K[view].T))
 
 

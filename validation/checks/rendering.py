@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 
-from thesisrecon.geometry.camera import camera_from_centre
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.model import VolumetricFusion
-from thesisrecon.model.texture import TextureAtlas
-from thesisrecon.types import DepthMap, PinholeView, TexturedMesh
-from thesisrecon.views import Light, Shading, orbit, render, surface_points
+from thesisrecon.camera import Camera
+from thesisrecon.geometry.camera_matrix import camera_from_centre
+from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
+from thesisrecon.surface.fusion import VolumetricFusion
+from thesisrecon.surface.texture_atlas import TextureAtlas
+from thesisrecon.views.paths import orbit, surface_points
+from thesisrecon.views.render import Light, Shading, render
 from validation.metrics.record import Metric, markdown_table
 
 COURTYARD = Path(__file__).parent.parent.parent / "fixtures" / "courtyard"
@@ -60,10 +61,10 @@ def psnr_db(mesh: TexturedMesh, view: PinholeView) -> tuple[float, float]:
     return float(10.0 * np.log10(255.0**2 / (apart**2).mean())), float(seen.valid.mean())
 
 
-def camera_of(view: PinholeView) -> PinholeCamera:
+def camera_of(view: PinholeView) -> Camera:
     """Of the photograph's own size."""
     height, width = view.rgb.shape[:2]
-    return PinholeCamera.from_matrix(view.P, (width, height))
+    return Camera.from_matrix(view.P, (width, height))
 
 
 def least_seconds(work: Callable[[], object], repeats: int) -> tuple[float, float]:
@@ -77,7 +78,7 @@ def least_seconds(work: Callable[[], object], repeats: int) -> tuple[float, floa
     return min(processor[1:]), min(wall[1:])
 
 
-def times(mesh: TexturedMesh, camera: PinholeCamera, repeats: int) -> list[Metric]:
+def times(mesh: TexturedMesh, camera: Camera, repeats: int) -> list[Metric]:
     """A frame as photographed and under a lamp, on one thread and two."""
     lamp = Shading(lights=(Light(position=(0.0, 0.0, 0.0)),), specular=0.2)
     values: dict[str, dict[str, float | None]] = {"processor": {}, "wall": {}}

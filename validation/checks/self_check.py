@@ -14,23 +14,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import thesisrecon
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
 from thesisrecon.errors import StageFailure
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
 from thesisrecon.metric.adjustment import Adjustment
+from thesisrecon.metric.checks import self_check
 from thesisrecon.metric.model import MetricModel, retriangulate
-from thesisrecon.metric.prior_check import contradicted_focals
-from thesisrecon.metric.self_check import self_check
-from thesisrecon.metric.sharing_check import check_sharing
-from thesisrecon.types import Assumptions, IntrinsicInterval, RunResult, SelfCalibration
+from thesisrecon.metric.shared_camera import check_shared_cameras, contradicted_focals
+from thesisrecon.records import Assumptions, IntrinsicInterval, RunResult, SelfCalibration
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import load_fixture_scene, load_real_scene
 from validation.scenes.spoiled import SPOILINGS, centres, model_from_reconstruction
 
-F64 = NDArray[np.float64]
 OURS = "ours"
 SCENES = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
 LATE, ANGLE, ROUNDS = 7.0, np.radians(0.05), 3
@@ -81,8 +78,12 @@ def is_doubted(model: MetricModel, calibration: SelfCalibration, adjustment: Adj
         {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 0.0, "")}
         for g in model.cameras.group
     ]
-    doubts = self_check(model, calibration, said, sigmas=LATE)[1]
-    return bool(doubts or contradicted_focals(model, adjustment) or check_sharing(model, adjustment).doubts)
+    failed_checks = self_check(model, calibration, said, sigmas=LATE)[1]
+    return bool(
+        failed_checks
+        or contradicted_focals(model, adjustment)
+        or check_shared_cameras(model, adjustment).failed_checks
+    )
 
 
 def judge(

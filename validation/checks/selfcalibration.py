@@ -20,26 +20,22 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.assumptions import IntrinsicsAssumption, assumptions_of_views
+from thesisrecon.arrays import F64
 from thesisrecon.config import KINDS, SelfCalibrator
 from thesisrecon.errors import StageFailure
-from thesisrecon.metric import UpgradeAndBundle
-from thesisrecon.selfcalibration import (
-    HypothesesAndRefinement,
-    ModulusConstraint,
-    PollefeysQuadric,
-    Stratified,
-)
-from thesisrecon.types import Assumptions, Reconstruction
+from thesisrecon.intrinsics import IntrinsicsAssumption, assumptions_of_views
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.records import Assumptions, Reconstruction
+from thesisrecon.selfcalibration.hartley import PollefeysQuadric
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.stratified import Stratified
 from validation.checks.epipolar_cube import OFF_FACE
 from validation.metrics.focal_bound import focal_bound
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.cloud import make_cloud
 from validation.scenes.rigs import Rig, cube_rig, noisy_tracks, projective_from_truth, zoomed
-
-F64 = NDArray[np.float64]
 
 WITH_BUNDLE = "the whole, with the metric stage"
 BOUND = "the bound"
@@ -185,7 +181,7 @@ def focals_of(method: str, projective: Reconstruction, assumed: Assumptions) -> 
     rng = np.random.default_rng(0)
     if method == WITH_BUNDLE:
         calibration = HypothesesAndRefinement().calibrate(projective, assumed=assumed, rng=rng)
-        result = UpgradeAndBundle().refine(projective, calibration, assumed=assumed, rng=rng)
+        result = MetricRefinement().refine(projective, calibration, assumed=assumed, rng=rng)
         assert result.reconstruction.K is not None
         return result.reconstruction.K, result.trusted
     answer = VARIANTS[method].calibrate(projective, assumed=assumed, rng=rng)

@@ -18,19 +18,17 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, PairMatcher, SemiGlobal
+from thesisrecon.arrays import F32, U8
 from thesisrecon.io.files import write_text
-from thesisrecon.types import DisparityMap
+from thesisrecon.records import DisparityMap
+from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
+from thesisrecon.stereo.semi_global import CohesiveScanlines, PairMatcher, SemiGlobal
 from validation.metrics.record import Metric, markdown_table, summary_table
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 DEFAULT, THESIS, LETTER, SEMI_GLOBAL = "default", "thesis", "thesis, to the letter", "semi-global"
 OURS: dict[str, PairMatcher] = {

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from thesisrecon.stops import CODES
+from thesisrecon.runtime.signals import CODES
 from validation.checks.kill_anywhere import COURTYARD, Runs, different, outputs
 
 LIMIT_S, POLL_S = 2.0, 0.005

@@ -16,17 +16,15 @@ from pathlib import Path
 import numpy as np
 
 import thesisrecon
-from thesisrecon.assumptions import IntrinsicsAssumption, assume
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.selfcalibration import (
-    CheiralitySearch,
-    HartleyLinear,
-    ModulusConstraint,
-    ParallelLines,
-    PollefeysQuadric,
-    Stratified,
-)
-from thesisrecon.types import F64, Image, Reconstruction
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.records import Image, Reconstruction
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch
+from thesisrecon.selfcalibration.hartley import HartleyLinear, PollefeysQuadric
+from thesisrecon.selfcalibration.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.parallel_lines import ParallelLines
+from thesisrecon.selfcalibration.stratified import Stratified
 from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene
 
 PLANES: Mapping[str, CheiralitySearch | ModulusConstraint | ParallelLines] = {
@@ -66,7 +64,7 @@ def measure(
     for plane_name, plane in PLANES.items():
         for way_name, way in WAYS.items():
             for refined in (False, True):
-                variant = Stratified(plane, way, refined=refined).with_photographs(photographs)
+                variant = Stratified(plane, way, refined=refined).with_images(photographs)
                 start = time.perf_counter()
                 head = (plane_name, way_name, refined)
                 try:

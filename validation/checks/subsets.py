@@ -19,12 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.assumptions import IntrinsicsAssumption, assumptions_of_views
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline import ATTEMPTS, reconstruct
-from thesisrecon.run import stream
-from thesisrecon.types import B8, F64, I64, MetricResult, Tracks, TwoView
+from thesisrecon.intrinsics import IntrinsicsAssumption, assumptions_of_views
+from thesisrecon.pipeline.cameras import ATTEMPTS
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import MetricResult, Tracks, TwoView
+from thesisrecon.runtime.run import stream
 from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_scene, load_real_scene
 
 MODES = ("shared", "per-image")
@@ -61,7 +63,7 @@ class Trial:
     """One subset: its views, what came of it, and how long it took.
 
     ``median_pct`` and ``worst_pct`` are focal errors over the registered cameras, NaN where there is no
-    answer; ``doubts`` is empty where the answer is trusted; ``interval_pct`` is half of the median 95 %
+    answer; ``failed_checks`` is empty where the answer is trusted; ``interval_pct`` is half of the median 95 %
     interval of the focals; ``reasons`` as in :class:`Matched`.
     """
 
@@ -70,7 +72,7 @@ class Trial:
     registered: int
     median_pct: float
     worst_pct: float
-    doubts: tuple[str, ...]
+    failed_checks: tuple[str, ...]
     attempts: int
     seconds: float
     crash: str = ""
@@ -88,9 +90,9 @@ class Trial:
         if self.crash:
             return "crash"
         if self.right:
-            return "right, doubted" if self.doubts else "right"
-        if self.doubts:
-            told = "; ".join(self.doubts)
+            return "right, doubted" if self.failed_checks else "right"
+        if self.failed_checks:
+            told = "; ".join(self.failed_checks)
             named = not self.reasons or any(reason in told for reason in self.reasons)
             return "refused" if named else "refused, another reason"
         return "open" if self.median_pct <= self.interval_pct else "wrong"
@@ -195,7 +197,7 @@ def run_trial(
         return replace(nothing, seconds=seconds, crash=f"{type(error).__name__}: {error}")
     seconds = time.perf_counter() - start
     if result is None:
-        return replace(nothing, doubts=failures, attempts=attempts, seconds=seconds)
+        return replace(nothing, failed_checks=failures, attempts=attempts, seconds=seconds)
     model = result.reconstruction
     assert model.K is not None
     focal = np.sqrt(model.K[:, 0, 0] * model.K[:, 1, 1])[model.registered]
@@ -207,7 +209,7 @@ def run_trial(
         registered=len(focal),
         median_pct=float(np.median(known)) if len(known) else np.nan,
         worst_pct=float(known.max()) if len(known) else np.nan,
-        doubts=() if result.trusted else result.doubts or ("not trusted",),
+        failed_checks=() if result.trusted else result.failed_checks or ("not trusted",),
         attempts=attempts,
         seconds=seconds,
         interval_pct=196.0 * float(np.median([one.std / one.value for one in intervals])),
@@ -216,7 +218,7 @@ def run_trial(
 
 def describe(trial: Trial) -> str:
     """One line on a trial."""
-    verdict = f"{trial.outcome}: {trial.crash or '; '.join(trial.doubts) or 'trusted'}"
+    verdict = f"{trial.outcome}: {trial.crash or '; '.join(trial.failed_checks) or 'trusted'}"
     return (
         f"{trial.number}: views {trial.views}, {trial.registered} registered, focal {trial.median_pct:.2f} % "
         f"median {trial.worst_pct:.2f} % worst, {trial.attempts} attempts, {trial.seconds:.1f} s, {verdict}"
@@ -226,7 +228,7 @@ def describe(trial: Trial) -> str:
 def table_row(name: str, mode: str, trials: Sequence[Trial]) -> str:
     """One row of the table of :func:`main`."""
     errors = [trial.median_pct for trial in trials if np.isfinite(trial.median_pct)]
-    worst = [t.worst_pct for t in trials if not t.doubts and np.isfinite(t.worst_pct)]
+    worst = [t.worst_pct for t in trials if not t.failed_checks and np.isfinite(t.worst_pct)]
     return (
         f"| {name} | {mode} | {len(trials)} "
         f"| {' | '.join(str(sum(t.outcome == kind for t in trials)) for kind in OUTCOMES)} "

@@ -17,10 +17,12 @@ from pathlib import Path
 import numpy as np
 
 import thesisrecon
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig, preset
-from thesisrecon.geometry.camera import camera_from_centre, decompose_camera
-from thesisrecon.model.surfaces import BSplineSurface, DepthSurface, LinearSurface, normals, resampled
-from thesisrecon.types import F64, DepthMap
+from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera
+from thesisrecon.records import DepthMap
+from thesisrecon.surface.bspline import BSplineSurface
+from thesisrecon.surface.linear import DepthSurface, LinearSurface, normals, resampled
 from validation.metrics.depth import SAME, true_depth, true_from_maps
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import Scene, load_fixture_scene

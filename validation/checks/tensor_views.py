@@ -19,21 +19,20 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import plotly.graph_objects as go
-from numpy.typing import NDArray
 
-from thesisrecon.beyond import match_photographs
+from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.views.tensor import (
+from thesisrecon.view_synthesis import match_photographs
+from thesisrecon.views.trilinear import seed_of_two
+from thesisrecon.views.trilinear_synthesis import AGREE_PX, prepare_synthesis
+from thesisrecon.views.virtual_camera import (
     CalibratedPair,
     VirtualCamera,
     camera_at,
     guessed_intrinsics,
     pair_from_fundamental,
-    prepare_synthesis,
-    seed_of_two,
 )
-from thesisrecon.views.tensor.synthesis import AGREE_PX
 from validation.metrics.pictures import picture_metrics, psnr_db, ssim
 from validation.metrics.record import Metric, markdown_table
 from validation.metrics.timing import time_of_a_frame
@@ -42,10 +41,6 @@ from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_photo
 from validation.scenes.nine_views import dissolved
 from validation.scenes.raycast import Rays, World, trace
 from validation.scenes.real import load_real_scene
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 VIEWS = (6, 7)
 """Of the courtyard: 11 degrees and 1.3 m apart, the scene 3 to 9 m away."""

@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.camera import compose_camera
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.strata import Group, random_transform
@@ -31,7 +31,6 @@ from validation.references.triangulation import colmap_points, opencv_linear, op
 from validation.scenes.cloud import make_cloud
 from validation.scenes.rigs import Rig
 
-F64 = NDArray[np.float64]
 Method = Callable[[F64, F64], F64]
 
 POLYNOMIAL, OPTIMAL, LINEAR = "polynomial", "optimal", "linear"
@@ -68,7 +67,7 @@ class Errors:
 
 
 def beside(rng: np.random.Generator, views: int, points: int) -> Rig:
-    """Cameras on a cap about a cloud of points, each seeing all of it."""
+    """Cameras on a cap about a cloud of points, each with_images all of it."""
     rig = make_cloud(views, rng, points=points)
     return replace(rig, seen=np.ones_like(rig.seen))
 

@@ -9,21 +9,24 @@ from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.epipolar import TrifocalRansac, estimate_trifocal, refine_trifocal
+from thesisrecon.arrays import B8, F64
+from thesisrecon.epipolar.trifocal_estimation import estimate_trifocal, refine_trifocal
+from thesisrecon.epipolar.trifocal_ransac import TrifocalRansac
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera import calibration_matrix, camera_from_centre, project
+from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_centre, project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
-from thesisrecon.geometry.trifocal import tensor_from_cameras, transfer_lines, transfer_points
-from thesisrecon.geometry.trifocal_linear import estimate_tensor_linear
+from thesisrecon.geometry.three_view import (
+    estimate_tensor_linear,
+    tensor_from_cameras,
+    transfer_lines,
+    transfer_points,
+)
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import data_root
 
-F64 = NDArray[np.float64]
-B8 = NDArray[np.bool_]
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 WIDTH, HEIGHT = 1024, 768
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from thesisrecon.stops import killed_by
+from thesisrecon.runtime.signals import killed_by
 from validation.scenes.real import ROOT
 
 POLL_S = 0.02

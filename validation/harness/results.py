@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.io.files import write_text
-from thesisrecon.io.text import read_bytes
+from thesisrecon.io.files import read_bytes, write_text
 from validation.harness.canaries import read_refused
 from validation.harness.gates import Gate
 from validation.harness.records import Judgement, Outcome, Wishes, key_of

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from thesisrecon.io.run_directory import RUN_FILE
-from thesisrecon.run import FOLDERS
+from thesisrecon.runtime.run import FOLDERS
+from thesisrecon.runtime.run_folder import RUN_FILE
 from validation.harness.records import Outcome, Stage, Task, Wishes
 from validation.harness.worker import OUTCOMES
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.geometry.alignment import estimate_similarity
-from thesisrecon.geometry.camera import camera_centre, project_camera
-from thesisrecon.types import F64, Reconstruction
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
+from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.records import Reconstruction
 
 
 @dataclass(frozen=True)
@@ -94,8 +95,8 @@ def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:
     for i, R, t in zip(views, rotations, translations, strict=True):
         here = kept & (tracks.view_index == i)
         X = reconstruction.X[tracks.point_index[here]]
-        radial = 0.0 if reconstruction.radial is None else reconstruction.radial[i]
-        seen = project_camera(reconstruction.K[i], R, t, X[:, :3] / X[:, 3:], radial=radial)
+        distortion = 0.0 if reconstruction.distortion is None else reconstruction.distortion[i]
+        seen = project_camera(reconstruction.K[i], R, t, X[:, :3] / X[:, 3:], distortion=distortion)
         distances.append(np.linalg.norm(seen - tracks.xy[here], axis=1))
     d = np.concatenate([*distances, np.zeros(0)])
     if len(d) == 0:

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.alignment import Similarity, estimate_similarity
-from thesisrecon.types import B8, F32, F64, DepthMap, Reconstruction
+from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.geometry.similarity import Similarity, estimate_similarity
+from thesisrecon.records import DepthMap, Reconstruction
 from validation.scenes.real import Scene, load_fixture_depth
 
-U8 = NDArray[np.uint8]
 SAME = 0.01
 """Relative difference of depths up to which two views see the same place, and a depth is right."""
 NORMAL_MEDIAN = 0.6745

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.geometry.multiview import sampson_residuals, symmetric_residuals
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.two_view import sampson_residuals, symmetric_residuals
 
-F64 = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 NONE_PX = 99.0

@@ -7,12 +7,11 @@ counts as an observation. Dense, by finite differences: it judges the library an
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from thesisrecon.arrays import F64
 from validation.scenes.rigs import Rig
 
-F64 = NDArray[np.float64]
 _STEP = 1e-6
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.types import F64, MetricResult
+from thesisrecon.arrays import F64
+from thesisrecon.records import MetricResult
 
 NAMES = ("focal_px", "principal_x_px", "principal_y_px")
 LEVEL = 1.96

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.views import likeness
+from thesisrecon.arrays import U8
+from thesisrecon.views import image_similarity as likeness
 from validation.metrics.record import Metric
-
-U8 = NDArray[np.uint8]
 
 BORDER_PX = 5
 """How far the windows of the structural similarity reach."""

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.model import surface_from_depth
-from thesisrecon.model.mesh import face_areas
-from thesisrecon.types import F64, I64, DepthMap, TexturedMesh
+from thesisrecon.arrays import F64, I64
+from thesisrecon.records import DepthMap, TexturedMesh
+from thesisrecon.surface.linear import surface_from_depth
+from thesisrecon.surface.mesh import face_areas
 from validation.metrics.depth import true_depth
 from validation.references.open3d_meshes import Nearest
 from validation.scenes.real import Scene, load_fixture_depth, load_fixture_scene

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.types import F64
+from thesisrecon.arrays import F64
 from validation.references.libraries import NAMES, PACKAGES, NoReference, cv2, load, open3d, poselib, pycolmap
 
 BLOB = 32

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.optimize.metric_bundle import MetricCameras, Observations
-from thesisrecon.types import F64
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
 from validation.references.ceres_bundle import CeresOptions, bundle_adjuster
 from validation.references.colmap_model import colmap_model
 from validation.references.libraries import pycolmap

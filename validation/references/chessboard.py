@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.types import F64
 from validation.references.libraries import cv2
 
 HALF_WINDOW_PX = 5

@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.io.colmap import reconstruction_from_colmap
+from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.io.files import write_text
-from thesisrecon.types import F64, Reconstruction
+from thesisrecon.records import Reconstruction
 from validation.references.colmap_matching import DEFAULT_FOCAL_REL, forget_focal_priors
 from validation.references.libraries import pycolmap
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.optimize.metric_bundle import MetricCameras, Observations
-from thesisrecon.types import F64
+from thesisrecon.arrays import F64
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
 from validation.references.libraries import pycolmap
 
 

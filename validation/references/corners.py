@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.types import Image
+from thesisrecon.arrays import F64
+from thesisrecon.records import Image
 from validation.references.libraries import cv2
 from validation.references.sift import detect_sift, grey_of
-
-F64 = NDArray[np.float64]
 
 BLOCK, APERTURE, K = 3, 3, 0.04
 """Window, Sobel aperture and k as OpenCV's tutorial has them."""

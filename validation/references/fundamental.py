@@ -13,17 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.epipolar import (
-    ThesisRansac,
-    estimate_eight_point,
-    estimate_fundamental,
-    estimate_seven_point,
-)
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
+from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.errors import StageFailure
-from thesisrecon.types import FundamentalFit
+from thesisrecon.records import FundamentalFit
 from validation.references.libraries import cv2, poselib, pycolmap
 
-F64 = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Answer = tuple[Any, Any, FundamentalFit | None]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.geometry.alignment import Similarity
-from thesisrecon.types import F64
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.similarity import Similarity
 from validation.references.libraries import cv2, poselib, pycolmap
 
 
@@ -14,16 +14,18 @@ def opencv_homography(xy1: F64, xy2: F64) -> F64:
     return np.asarray(cv2.findHomography(xy1, xy2, 0)[0], dtype=np.float64)
 
 
-def opencv_projection(K: F64, R: F64, t: F64, X: F64, *, radial: F64) -> F64:
+def opencv_projection(K: F64, R: F64, t: F64, X: F64, *, distortion: F64) -> F64:
     """``cv2.projectPoints``: pixels (N, 2) of points (N, 3), ``radial`` (3,) of r^2, r^4 and r^6."""
     turn = cv2.Rodrigues(R)[0]
-    found = cv2.projectPoints(X, turn, t, K, np.array([radial[0], radial[1], 0.0, 0.0, radial[2]]))[0]
+    found = cv2.projectPoints(
+        X, turn, t, K, np.array([distortion[0], distortion[1], 0.0, 0.0, distortion[2]])
+    )[0]
     return np.asarray(found, dtype=np.float64)[:, 0]
 
 
-def opencv_undistortion(xy: F64, *, radial: F64) -> F64:
+def opencv_undistortion(xy: F64, *, distortion: F64) -> F64:
     """``cv2.undistortPoints`` of normalised points (N, 2)."""
-    terms = np.array([radial[0], radial[1], 0.0, 0.0, radial[2]])
+    terms = np.array([distortion[0], distortion[1], 0.0, 0.0, distortion[2]])
     return np.asarray(cv2.undistortPoints(xy[:, None], np.eye(3), terms), dtype=np.float64)[:, 0]
 
 

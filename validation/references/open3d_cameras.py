@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from thesisrecon.geometry.camera import decompose_camera
-from thesisrecon.types import F64, DepthMap
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.records import DepthMap
 
 
 def camera_of(P: F64, *, shift: float = 0.0) -> tuple[F64, F64]:

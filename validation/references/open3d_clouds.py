@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from thesisrecon.arrays import F64
 from validation.references.libraries import open3d as o3d
-
-F64 = NDArray[np.float64]
 
 SIZE = (900, 640)
 ITERATIONS = 60

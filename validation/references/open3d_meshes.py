@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.types import F64, I64, TexturedMesh
+from thesisrecon.arrays import F64, I64, U8
+from thesisrecon.camera import Camera
+from thesisrecon.records import TexturedMesh
 from validation.references.libraries import open3d as o3d
 from validation.references.open3d_cameras import camera_of
-
-U8 = NDArray[np.uint8]
 
 
 class Nearest:
@@ -30,7 +28,7 @@ class Nearest:
         return np.asarray(found.numpy(), dtype=np.float64)
 
 
-def render_open3d(mesh: TexturedMesh, camera: PinholeCamera) -> U8:
+def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
     """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit.
 
     Raises ``RuntimeError`` where the machine has no graphics that it can use.

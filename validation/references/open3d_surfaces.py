@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.types import DepthMap, PinholeView, TexturedMesh
+from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from validation.references.libraries import open3d as o3d
 from validation.references.open3d_cameras import camera_of, median_footprint
 

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.types import F64
+from thesisrecon.arrays import F64, U8
 from validation.references.libraries import cv2
 
-U8 = NDArray[np.uint8]
 Size = tuple[int, int]
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.dense.rectification import PlanarRectification
-from thesisrecon.geometry.camera import decompose_camera
-from thesisrecon.types import F64
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.stereo.planar import PlanarRectification
 from validation.references.libraries import cv2
 
 Size = tuple[int, int]

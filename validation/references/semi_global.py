@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F32, U8
 from validation.references.libraries import cv2
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 MODES = {"SGBM 3-way": "STEREO_SGBM_MODE_SGBM_3WAY", "SGBM HH": "STEREO_SGBM_MODE_HH"}
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from thesisrecon.types import F32, F64, I64, Image
+from thesisrecon.arrays import F32, F64, I64, U8
+from thesisrecon.records import Image
 from validation.references.libraries import cv2
 
-U8 = NDArray[np.uint8]
 ROWS = 512
 """Descriptors whose distances to all others are held at once."""
 

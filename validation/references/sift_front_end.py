@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.config import EstimateFundamental, PipelineConfig
-from thesisrecon.types import Features, Image, Matches
+from thesisrecon.records import Features, Image, Matches
 from validation.references.sift import SiftKeypoints, detect_sift, grey_of, match_sift
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.multiview import fundamental_from_cameras
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.two_view import fundamental_from_cameras
 from validation.references.libraries import cv2, pycolmap
-
-F64 = NDArray[np.float64]
 
 
 def opencv_linear(P: F64, xy: F64) -> F64:

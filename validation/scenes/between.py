@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.camera import camera_centre, decompose_camera
-from thesisrecon.geometry.multiview import estimate_homography, homography_residuals
+from thesisrecon.arrays import B8, F64, U8
+from thesisrecon.geometry.camera_matrix import camera_centre, decompose_camera
+from thesisrecon.geometry.two_view import estimate_homography, homography_residuals
 from thesisrecon.views.interpolation import InterpolatedPair
 from thesisrecon.views.warping import sample
 from validation.scenes.fixtures import Pose
-
-B8 = NDArray[np.bool_]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 
 def camera_between(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:

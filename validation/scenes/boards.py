@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from thesisrecon.geometry.camera import project_camera, undistort
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.types import F64, TexturedMesh
-from thesisrecon.views import render
+from thesisrecon.arrays import F64, U8
+from thesisrecon.camera import Camera
+from thesisrecon.geometry.camera_matrix import project_camera, undistort
+from thesisrecon.records import TexturedMesh
+from thesisrecon.views.render import render
 from validation.scenes.materials import Material
 from validation.scenes.photograph import Sensor, expose, integrate_pixels
 from validation.scenes.pose import look_at
 from validation.scenes.raycast import Rays, Surface, World, build_world, trace
 
-U8 = NDArray[np.uint8]
 SIZE = (640, 480)
 K = np.array([[612.4, 0.0, 327.3], [0.0, 612.4, 233.6], [0.0, 0.0, 1.0]])
 K1 = -0.12
@@ -47,12 +47,15 @@ class Board:
     X: F64
     R: F64
     t: F64
-    radial: float = 0.0
+    distortion: float = 0.0
 
     def projections(self) -> F64:
         """(V, N, 2) true pixels of the corners."""
         return np.array(
-            [project_camera(K, R, t, self.X, radial=self.radial) for R, t in zip(self.R, self.t, strict=True)]
+            [
+                project_camera(K, R, t, self.X, distortion=self.distortion)
+                for R, t in zip(self.R, self.t, strict=True)
+            ]
         )
 
 
@@ -129,7 +132,7 @@ def _rendered(board: Board) -> list[NDArray[np.float32]]:
     mesh = TexturedMesh(vertices, faces, uv=np.stack([u, v], axis=1)[faces], texture=texture)
     found = []
     for R, t in zip(board.R, board.t, strict=True):
-        camera = PinholeCamera(K, R, t, SIZE)
+        camera = Camera(K, R, t, SIZE)
         fine = render(mesh, camera.resized(PER_PIXEL), samples=1).color.astype(np.float32) / np.float32(255.0)
         found.append(integrate_pixels(fine, PER_PIXEL, SENSOR.blur_px))
     return found
@@ -139,7 +142,7 @@ def _through_a_lens(board: Board) -> list[NDArray[np.float32]]:
     """By the library's camera: the ray of each sample, distortion taken off, meets the board."""
     y, x = (np.indices((SIZE[1] * PER_PIXEL, SIZE[0] * PER_PIXEL)) + 0.5) / PER_PIXEL - 0.5
     bent = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
-    rays = np.column_stack([undistort(bent, board.radial), np.ones(len(bent))])
+    rays = np.column_stack([undistort(bent, board.distortion), np.ones(len(bent))])
     pattern = _pattern()
     found = []
     for R, t in zip(board.R, board.t, strict=True):

@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from validation.scenes.materials import (
     Material,
@@ -31,9 +30,6 @@ from validation.scenes.materials import (
 )
 from validation.scenes.procedural import fractal
 from validation.scenes.raycast import Surface, World, build_world
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 TEXEL = 0.005
 WALL_HEIGHT = 4.9

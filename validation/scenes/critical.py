@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.geometry.camera import compose_camera, project_camera
-from thesisrecon.optimize.projective_bundle import refine_projective_bundle
-from thesisrecon.types import Reconstruction, Tracks
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.pose import look_at
 
-F64 = NDArray[np.float64]
 SIZE = np.array([1536, 1024])
 HAND_TURN_DEG, HAND_SHIFT, WALL_RELIEF = 1.0, 0.01, 0.01
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from thesisrecon.types import Image
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from thesisrecon.arrays import F64, U8
+from thesisrecon.records import Image
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,8 @@ from math import cos, pi, sin
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.arrays import B8, F64
 from validation.scenes.pose import look_at
-
-F64 = NDArray[np.float64]
-B8 = NDArray[np.bool_]
 
 SIZE = (800, 600)
 POINTS_PER_FACE = 120

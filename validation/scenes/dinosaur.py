@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.epipolar import LocallyOptimisedRansac, PairVerification
-from thesisrecon.epipolar.planarity import homography_share
+from thesisrecon.arrays import F64, I64
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.verification import PairVerification, homography_inlier_ratio
 from thesisrecon.errors import StageFailure
-from thesisrecon.run import stream
-from thesisrecon.types import F64, I64, Tracks, TwoView
+from thesisrecon.records import Tracks, TwoView
+from thesisrecon.runtime.run import stream
 from validation.scenes.real import data_root
 
 SIZE = (720, 576)
@@ -66,7 +67,7 @@ def _verified(i: int, j: int, points: I64, xy: tuple[F64, F64], rng: np.random.G
         return None
     kept, needed = fit.inliers, PairVerification().min_inliers
     xy1, xy2 = xy[0][kept], xy[1][kept]
-    share = homography_share(fit.F, xy1, xy2, tolerance_px=max(2.0, 4.3 * fit.sigma_px), rng=rng)
+    share = homography_inlier_ratio(fit.F, xy1, xy2, tolerance_px=max(2.0, 4.3 * fit.sigma_px), rng=rng)
     enough = len(xy1) >= needed
     return TwoView(
         i, j, fit.F, fit.sigma_px, points[kept], points[kept], xy1, xy2,

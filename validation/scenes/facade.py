@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.geometry.camera import compose_camera, project
-from thesisrecon.geometry.multiview import fundamental_from_cameras
+from thesisrecon.arrays import B8, F64
+from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.geometry.two_view import fundamental_from_cameras
 
-F64 = NDArray[np.float64]
-B8 = NDArray[np.bool_]
 SIZE = np.array([1280.0, 960.0])
 K = np.array([[1200.0, 0.0, 639.5], [0.0, 1200.0, 479.5], [0.0, 0.0, 1.0]])
 DISTANCE = 10.0

@@ -13,20 +13,16 @@ from typing import Any
 import numba
 import numpy as np
 import PIL
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import features
 
+from thesisrecon.arrays import F64, U16
 from thesisrecon.io.files import write_atomically, write_text
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.cube import make_cube
 from validation.scenes.photograph import Sensor, encode_jpeg, expose, integrate_pixels
 from validation.scenes.pose import look_at
 from validation.scenes.raycast import Rays, World, trace
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-U16 = NDArray[np.uint16]
 
 SIZE = (1024, 768)
 FOCAL, PRINCIPAL = 908.6, (528.9, 367.8)

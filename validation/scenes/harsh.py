@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.types import I64, Tracks
+from thesisrecon.arrays import F64, I64
+from thesisrecon.records import Tracks
 from validation.scenes.pose import look_at
 
-F64 = NDArray[np.float64]
 SIZE = np.array([1536, 1024])
 UP = np.array([0.0, 0.0, 1.0])
 SEEN = 0.85

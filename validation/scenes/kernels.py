@@ -10,13 +10,9 @@ from math import atan2, log2, pi, sqrt
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F32, F64, I64
 from validation.scenes.procedural import compiled
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 PLANE, CYLINDER = 0, 1
 LEVELS = 4

@@ -12,17 +12,15 @@ from math import cos, pi, sin, tan
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from thesisrecon.arrays import U8
 from thesisrecon.io.files import write_atomically
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import Pose
 from validation.scenes.photograph import Sensor, expose, integrate_pixels
 from validation.scenes.pose import look_at
 from validation.scenes.raycast import Rays, World, trace
-
-U8 = NDArray[np.uint8]
 
 FOCAL_REL = 0.9
 """Focal length as a share of the long side."""

@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F32
 from validation.scenes.procedural import cells, courses, fractal, ivy
 
-F32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
 Box = tuple[float, float, float, float]
 

@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from thesisrecon.dense.matching import CohesiveScanlines
-from thesisrecon.types import DisparityMap
-from thesisrecon.views.tensor import CalibratedPair, TensorSynthesis, guessed_intrinsics, prepare_synthesis
-from thesisrecon.views.tensor.synthesis import AGREE_PX
+from thesisrecon.arrays import F32, U8
+from thesisrecon.records import DisparityMap
+from thesisrecon.stereo.semi_global import CohesiveScanlines
+from thesisrecon.views.trilinear_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
+from thesisrecon.views.virtual_camera import CalibratedPair, guessed_intrinsics
 from validation.scenes.real import data_root
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 ENDS = (2, 6)
 BETWEEN = (3, 4, 5)

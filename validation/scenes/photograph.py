@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
+from thesisrecon.arrays import F32, U8
 
 JPEG_QUALITY = 91
 

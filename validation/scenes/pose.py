@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from thesisrecon.arrays import F64
 
 
 def look_at(C: F64, target: F64, tan_half_roll: float) -> F64:

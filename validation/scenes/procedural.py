@@ -14,11 +14,9 @@ from typing import TypeVar, cast
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from thesisrecon.arrays import F32, F64
+
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 

@@ -13,14 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F32, F64, I64
 from validation.scenes.kernels import BLOCK, CYLINDER, LEVELS, PLANE, trace_rows
 from validation.scenes.materials import Material, smooth
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.io.files import read_json
-
-F64 = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[2]
 REAL_SCENES = {

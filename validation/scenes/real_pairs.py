@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from thesisrecon.geometry.camera import compose_camera
-from thesisrecon.geometry.multiview import fundamental_from_cameras, sampson_residuals
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.io.files import write_atomically
 from validation.references.sift import SiftKeypoints, detect_sift, match_sift
 from validation.scenes.real import Scene, data_root
 
-F64 = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 HAND_MADE_RATIO, CAMERA_RATIO = 0.85, 0.8

@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from thesisrecon.geometry.camera import compose_camera, project_camera
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.strata import random_transform
-from thesisrecon.optimize.projective_bundle import refine_projective_bundle
-from thesisrecon.types import Reconstruction, Tracks
+from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.cube import SIZE, make_cube
-
-F64 = NDArray[np.float64]
-B8 = NDArray[np.bool_]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -6,21 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.metric.model import MetricModel
-from thesisrecon.metric.start import camera_rows
-from thesisrecon.optimize.metric_bundle import MetricCameras
-from thesisrecon.types import I64, Assumptions, Reconstruction
-
-F64 = NDArray[np.float64]
+from thesisrecon.arrays import F64, I64
+from thesisrecon.metric.model import MetricModel, camera_rows
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.records import Assumptions, Reconstruction
 
 
 def model_from_reconstruction(found: Reconstruction, assumed: Assumptions) -> MetricModel:
     """The working model of a metric reconstruction."""
     assert found.K is not None
-    assert found.radial is not None
+    assert found.distortion is not None
     views = found.registered
     K = np.where(views[:, None, None], found.K, np.eye(3))
     Q = np.linalg.inv(K) @ found.P
@@ -29,7 +26,7 @@ def model_from_reconstruction(found: Reconstruction, assumed: Assumptions) -> Me
     for g in range(len(rows)):
         mine = np.flatnonzero((group == g) & views)
         v = int(mine[0]) if len(mine) else int(np.flatnonzero(views)[0])
-        rows[g] = [K[v, 0, 0], K[v, 1, 1] / K[v, 0, 0], K[v, 0, 1], *K[v, :2, 2], *found.radial[v]]
+        rows[g] = [K[v, 0, 0], K[v, 1, 1] / K[v, 0, 0], K[v, 0, 1], *K[v, :2, 2], *found.distortion[v]]
     cameras = MetricCameras(
         np.where(views[:, None, None], Q[:, :, :3], np.eye(3)), Q[:, :, 3], rows, group, shared
     )

@@ -7,14 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from thesisrecon.arrays import B8, F32, U8
 from validation.scenes.real import data_root
-
-B8 = NDArray[np.bool_]
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 STEREO_PAIRS = ("Tsukuba", "Teddy", "Cones", "Motorcycle")
 

@@ -12,8 +12,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.optimize.metric_bundle import MetricCameras, Observations
-from thesisrecon.types import F64, I64
+from thesisrecon.arrays import F64, I64
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
 
 Kind = Literal["street", "loop"]
 SIZE = (1000, 750)

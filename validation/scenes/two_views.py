@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.epipolar.degeneracy import Configuration
-from thesisrecon.geometry.camera import compose_camera, project
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.configuration import Configuration
+from thesisrecon.geometry.camera_matrix import compose_camera, project
 
-F64 = NDArray[np.float64]
 K = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 480.0], [0.0, 0.0, 1.0]])
 
 

@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from thesisrecon.arrays import F64, U8
 from thesisrecon.io.files import write_atomically
 from validation.scenes.real import Scene
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 FEATHER_PX = 24.0
 
 

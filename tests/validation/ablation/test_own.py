@@ -11,7 +11,7 @@ import pytest
 
 from tests.validation.ablation.toy import Darts
 from thesisrecon.errors import UsageError
-from thesisrecon.types import FundamentalFit
+from thesisrecon.records import FundamentalFit
 from validation.ablation import Study, ablate, analyse
 from validation.ablation.own import load_own
 from validation.ablation.plan import plan_study

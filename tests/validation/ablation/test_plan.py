@@ -10,9 +10,10 @@ import pytest
 
 from tests.validation.ablation.toy import Darts, Steps, area
 from thesisrecon.config import PRESETS, PipelineConfig, preset
-from thesisrecon.epipolar import LocallyOptimisedRansac, ThesisRansac
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.errors import UsageError
-from thesisrecon.features import HarrisCorners
+from thesisrecon.features.harris import HarrisCorners
 from validation.ablation import Measure, Study
 from validation.ablation.command import STUDIES, plan_words
 from validation.ablation.plan import plan_study, versions
@@ -94,7 +95,7 @@ def test_values_may_be_objects_tables_words_or_what_a_preset_has() -> None:
 
 
 def test_an_object_may_stand_deep_in_a_stage() -> None:
-    from thesisrecon.dense.matching import SemiGlobal
+    from thesisrecon.stereo.semi_global import SemiGlobal
 
     rows = plan_study(darts({"dense.pairs.matcher": [SemiGlobal(memory_mb=99.0)]})).rows
     assert rows[1].setting.config.dense.pairs.matcher == SemiGlobal(memory_mb=99.0)  # type: ignore[attr-defined]

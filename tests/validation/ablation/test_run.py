@@ -18,7 +18,7 @@ import pytest
 
 from tests.clusters import address
 from tests.validation.ablation.toy import Darts, Steps, area, marks
-from thesisrecon.errors import Unwritable, UsageError
+from thesisrecon.errors import OutputError, UsageError
 from validation.ablation import Study, ablate, analyse, read_rows
 from validation.ablation.run import State
 from validation.ablation.workers import crew_of
@@ -191,7 +191,7 @@ def test_a_killed_study_loses_no_more_than_the_rows_in_flight(tmp_path: Path) ->
 def test_a_row_on_a_full_disk_has_not_failed(executor: str, tmp_path: Path) -> None:
     log, out = tmp_path / "log", tmp_path / "out"
     crowded = study(log, scenes=["full"], seeds=1)
-    with pytest.raises(Unwritable, match=r"throws\.txt cannot be written: .* make room there"):
+    with pytest.raises(OutputError, match=r"throws\.txt cannot be written: .* make room there"):
         ablate(crowded, out, executor=executor, threads=1)
     assert len(read_rows(crowded, out)) == 0
     (tmp_path / "log.room").touch()

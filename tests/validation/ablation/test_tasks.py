@@ -14,7 +14,7 @@ import pytest
 import thesisrecon
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import UsageError
-from thesisrecon.selfcalibration import Stratified
+from thesisrecon.selfcalibration.stratified import Stratified
 from validation.ablation import Place, Study, ablate
 from validation.ablation.plan import plan_study
 from validation.ablation.tasks import TASKS, Reconstruction

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from thesisrecon.types import TexturedMesh
+from thesisrecon.records import TexturedMesh
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.metrics.record import Metric
 from validation.references.fundamental import estimate_with

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_stops import is_alive
+from tests.runtime.test_signals import is_alive
 from tests.validation.harness.test_harness import toy_wishes
 from tests.validation.harness.toy_stages import ToyStage
 from validation.checks.stop_anywhere import stopped

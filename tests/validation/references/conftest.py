@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.types import F64
+from thesisrecon.arrays import F64
 from validation.references.libraries import NoReference, load
 
 

@@ -9,10 +9,12 @@ import PIL.Image
 import pytest
 
 from tests.validation.references.conftest import Looked, skip_without
+from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
-from thesisrecon.optimize.metric_bundle import MetricCameras, Observations
-from thesisrecon.types import F64
+from thesisrecon.io.colmap import reconstruction_from_colmap
+from thesisrecon.io.colmap_files import read_colmap_model
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
 from validation.references.colmap_mapping import give_calibration
 from validation.references.colmap_matching import match_with_pycolmap
 from validation.references.colmap_model import cameras_from_colmap, colmap_model
@@ -73,9 +75,9 @@ def test_files_that_colmap_writes_mean_the_same_to_us(looked: Looked, tmp_path: 
     (model.write_text if text else model.write_binary)(tmp_path)
     read = reconstruction_from_colmap(read_colmap_model(tmp_path), names=["0.png", "1.png"])
     assert read.K is not None
-    assert read.radial is not None
+    assert read.distortion is not None
     np.testing.assert_allclose(read.K, looked.K, atol=1e-9)
-    np.testing.assert_allclose(read.radial[:, 0], K1, atol=1e-12)
+    np.testing.assert_allclose(read.distortion[:, 0], K1, atol=1e-12)
     np.testing.assert_allclose(np.linalg.inv(read.K) @ read.P, looked.P_normalised, atol=1e-9)
     xy = distorted(looked)
     for v in range(2):

@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.model.sphere import SHAPE, K, paint, photograph, ring_of
+from tests.surface.sphere import SHAPE, K, paint, photograph, ring_of
 from tests.validation.references.conftest import Looked, skip_without
-from thesisrecon.geometry.pinhole import PinholeCamera
+from thesisrecon.arrays import F64
+from thesisrecon.camera import Camera
 from thesisrecon.io.meshes import read_mesh, write_mesh
-from thesisrecon.model import SurfaceModel, VolumetricFusion
-from thesisrecon.types import F64, DepthMap, PinholeView, TexturedMesh
-from thesisrecon.views import render
+from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
+from thesisrecon.surface.fusion import VolumetricFusion
+from thesisrecon.surface.model import SurfaceModel
+from thesisrecon.views.render import render
 from validation.references import open3d_cameras, open3d_meshes, open3d_surfaces
 from validation.references.open3d_clouds import refine_by_icp
 
@@ -114,7 +116,7 @@ def test_a_glb_opens_in_trimesh_with_its_texture(model: TexturedMesh, tmp_path: 
     found = colors_at(points, vertices, np.asarray(loaded.faces), corners, texture)
     assert np.median(np.abs(found - paint(points))) < 6.0
     again = read_mesh(tmp_path / "model.glb")
-    camera = PinholeCamera.from_matrix(ring_of()[0].P, (SHAPE[1], SHAPE[0]))
+    camera = Camera.from_matrix(ring_of()[0].P, (SHAPE[1], SHAPE[0]))
     apart = render(again, camera).color.astype(float) - render(model, camera).color
     assert np.sqrt(np.mean(apart**2)) < 4.0
 
@@ -122,7 +124,7 @@ def test_a_glb_opens_in_trimesh_with_its_texture(model: TexturedMesh, tmp_path: 
 def test_its_own_pictures_agree_with_ours() -> None:
     maps = ring_of()
     mesh = open3d_surfaces.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
-    camera = PinholeCamera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).resized(2)
+    camera = Camera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).resized(2)
     try:
         theirs = open3d_meshes.render_open3d(mesh, camera)
     except RuntimeError as error:

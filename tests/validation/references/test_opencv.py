@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.validation.references.conftest import Looked, skip_without
-from thesisrecon.dense.rectification import PlanarRectification
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.types import Image
+from thesisrecon.records import Image
+from thesisrecon.stereo.planar import PlanarRectification
 from validation.references.corners import harris_corners, sift_corners
 from validation.references.pictures import shrink, warp_affine, warp_perspective
 from validation.references.rectification import opencv_calibrated

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.geometry.camera import compose_camera, project
+from thesisrecon.geometry.camera_matrix import compose_camera, project
 from validation.scenes.cube import SIZE, make_cube
 from validation.scenes.fixtures import write_cube
 from validation.scenes.real import ROOT

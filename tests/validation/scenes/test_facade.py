@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thesisrecon.geometry.multiview import estimate_homography, homography_residuals, sampson_residuals
+from thesisrecon.geometry.two_view import estimate_homography, homography_residuals, sampson_residuals
 from validation.scenes.facade import FacadeMaker
 
 

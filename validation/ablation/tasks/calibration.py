@@ -11,8 +11,8 @@ import numpy as np
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
+from thesisrecon.records import Reconstruction
 from thesisrecon.settings import unknown_word
-from thesisrecon.types import Reconstruction
 from validation.ablation.study import Measure, Place
 from validation.checks.selfcalibration import (
     MODES,

@@ -8,8 +8,8 @@ from functools import cache
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.errors import StageFailure, UsageError
@@ -19,7 +19,6 @@ from validation.checks.epipolar_catalogue import METHODS, THRESHOLD_PX, TOLD_SIG
 from validation.checks.epipolar_cube import CubePair, cube_pairs, measure_pair
 from validation.scenes.cube import make_cube
 
-F64 = NDArray[np.float64]
 BY_METHOD = {m.name: m for m in METHODS}
 OF_CONFIG = "epipolar of the configuration"
 

@@ -11,12 +11,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.images import read_photographs
-from thesisrecon.pipeline import detect_features, match_views
+from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
+from thesisrecon.records import Image
 from thesisrecon.settings import unknown_word
-from thesisrecon.types import F64, Image
 from validation.ablation.study import Measure, Place
 from validation.checks.front_end_pairs import MAX_SIZE_PX, Related
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance

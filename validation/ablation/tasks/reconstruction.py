@@ -13,10 +13,10 @@ import numpy as np
 import thesisrecon
 from thesisrecon.config import KINDS, PipelineConfig, tables_from_config
 from thesisrecon.errors import UsageError
-from thesisrecon.io.run_directory import code_key, key_of
-from thesisrecon.run import Until
+from thesisrecon.records import RunResult
+from thesisrecon.runtime.run import Until
+from thesisrecon.runtime.run_folder import code_key, key_of
 from thesisrecon.settings import unknown_word
-from thesisrecon.types import RunResult
 from validation.ablation.study import Measure, Place
 from validation.harness.records import Wishes
 from validation.harness.scenes import PHOTOGRAPHS, load_photographs, truth_of

@@ -19,7 +19,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from thesisrecon.io.demo import COUNT, demo_photographs
+from thesisrecon.io.lists import COUNT, demo_photographs
 from validation.checks.package.built import build, check_built, find_built
 from validation.checks.package.environments import (
     bare,

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from thesisrecon.io.demo import COUNT
+from thesisrecon.io.lists import COUNT
 from validation.checks.package.environments import bare, install, make_environment
 from validation.scenes.real import ROOT
 

@@ -9,14 +9,18 @@ from pathlib import Path
 from typing import assert_type
 
 import numpy as np
-from numpy.typing import NDArray
 
 import thesisrecon
+from thesisrecon.arrays import F64, U8
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.types import DisparityMap, RenderedView, RunResult, SelfCalibration, TexturedMesh, TwoView
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from thesisrecon.records import (
+    DisparityMap,
+    RenderedView,
+    RunResult,
+    SelfCalibration,
+    TexturedMesh,
+    TwoView,
+)
 
 
 def points_of_two(first: Path, second: Path) -> F64:
@@ -52,7 +56,7 @@ def pictures(left: U8, right: U8, mesh: TexturedMesh) -> list[U8]:
     assert_type(found, DisparityMap)
     between = thesisrecon.interpolate_view(left, right, 0.5, disparity=found)
     beside = thesisrecon.synthesize_view(left, right, np.eye(3), np.zeros(3))
-    camera = thesisrecon.PinholeCamera(np.diag([500.0, 500.0, 1.0]), np.eye(3), np.zeros(3), (640, 480))
+    camera = thesisrecon.Camera(np.diag([500.0, 500.0, 1.0]), np.eye(3), np.zeros(3), (640, 480))
     drawn = thesisrecon.render(mesh, camera)
     assert_type(drawn, RenderedView)
     return [assert_type(between, U8), assert_type(beside, U8), assert_type(drawn.color, U8)]

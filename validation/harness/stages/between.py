@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import PIL.Image
-from numpy.typing import NDArray
 
-from thesisrecon.between import rectified_pair
-from thesisrecon.types import F32, DisparityMap
-from thesisrecon.views.tensor import camera_at
+from thesisrecon.arrays import F32, U8
+from thesisrecon.records import DisparityMap
+from thesisrecon.view_interpolation import rectified_pair
+from thesisrecon.views.virtual_camera import camera_at
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric
@@ -31,7 +31,6 @@ from validation.scenes.nine_views import (
     synthesis_of_disparities,
 )
 
-U8 = NDArray[np.uint8]
 Measure = Callable[[U8, U8], float]
 OURS, TRUE, DISSOLVE = "ours", "true disparities", "cross-dissolve"
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import PIL.Image
 
-from thesisrecon.types import F64
+from thesisrecon.arrays import F64
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes
 from validation.metrics.record import Metric
 from validation.references.chessboard import board_corners, calibrate_from_corners
@@ -132,9 +132,9 @@ def _metrics(scene: str, way: str, board: Board, found: Mapping[str, F64] | None
         row(
             "distortion",
             "",
-            abs(float(found["k1"]) - board.radial),
+            abs(float(found["k1"]) - board.distortion),
             float(std[4]),
-            f"|k1 - true k1|; the true one is {board.radial:g}",
+            f"|k1 - true k1|; the true one is {board.distortion:g}",
         ),
     ]
 

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.optimize.metric_bundle import (
-    BundleOptions,
-    MetricCameras,
-    Observations,
-    refine_metric_bundle,
-)
-from thesisrecon.types import F64, Reconstruction
+from thesisrecon.arrays import F64
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
+from thesisrecon.records import Reconstruction
 from validation.checks.bundle import FOCAL_K1, LOSS_PX, WITH_CENTRE, model_as_bundle, perturbed_model
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs

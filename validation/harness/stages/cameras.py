@@ -13,11 +13,12 @@ import numpy as np
 import thesisrecon
 from thesisrecon.config import PipelineConfig, config_from_tables, preset
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.colmap import read_colmap_model, reconstruction_from_colmap
+from thesisrecon.io.colmap import reconstruction_from_colmap
+from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.io.files import read_json
-from thesisrecon.io.run_directory import MANIFEST_FILE, RunDirectory
-from thesisrecon.run import FOLDERS
-from thesisrecon.types import Reconstruction
+from thesisrecon.records import Reconstruction
+from thesisrecon.runtime.run import FOLDERS
+from thesisrecon.runtime.run_folder import MANIFEST_FILE, RunDirectory
 from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs, truth_of
 from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection

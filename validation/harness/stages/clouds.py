@@ -12,9 +12,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.geometry.alignment import Similarity, estimate_similarity
-from thesisrecon.geometry.camera import camera_centre
-from thesisrecon.types import F64, I64, Reconstruction
+from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.similarity import Similarity, estimate_similarity
+from thesisrecon.records import Reconstruction
 from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes, slug
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import COLMAP, COLMAP_PP, OURS, read_model

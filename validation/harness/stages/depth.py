@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 
+from thesisrecon.arrays import F32
 from thesisrecon.config import preset
-from thesisrecon.dense.multiview import MultiViewStereo, pinhole_view
 from thesisrecon.io.files import write_text
 from thesisrecon.io.images import read_photographs
-from thesisrecon.types import F32, DepthMap, Image, PinholeView, Reconstruction
+from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
+from thesisrecon.stereo.depth import MultiViewStereo
+from thesisrecon.stereo.neighbours import pinhole_view
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.harness.scenes import load_photographs
 from validation.harness.stages.cameras import OURS as OUR_CAMERAS

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 
-from thesisrecon.dense.matching import CohesiveScanlines, MaximumLikelihoodScanline, PairMatcher, SemiGlobal
-from thesisrecon.types import F32
+from thesisrecon.arrays import F32
+from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
+from thesisrecon.stereo.semi_global import CohesiveScanlines, PairMatcher, SemiGlobal
 from validation.checks.stereo import bad_pixels, picture
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.metrics.record import Metric

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from thesisrecon.arrays import F64
 from thesisrecon.config import preset
-from thesisrecon.features import HarrisCorners
-from thesisrecon.geometry.camera import compose_camera
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io.images import read_photographs
-from thesisrecon.types import F64, Image
+from thesisrecon.records import Image
 from validation.checks.front_end_pairs import RIGHT_PX, PreparedViews, front_ends
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.geometry.multiview import epipoles
-from thesisrecon.types import B8, F64
+from thesisrecon.arrays import B8, F64
+from thesisrecon.geometry.two_view import epipoles
 from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance

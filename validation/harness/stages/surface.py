@@ -10,12 +10,13 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from thesisrecon.arrays import F64
+from thesisrecon.camera import Camera
 from thesisrecon.config import preset
-from thesisrecon.geometry.alignment import Similarity
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.model import SurfaceModel
-from thesisrecon.types import F64, TexturedMesh
-from thesisrecon.views import render
+from thesisrecon.geometry.similarity import Similarity
+from thesisrecon.records import TexturedMesh
+from thesisrecon.surface.model import SurfaceModel
+from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.harness.scenes import load_photographs
 from validation.harness.stages.depth import (
@@ -155,7 +156,7 @@ def _row(scene: str, name: str, unit: str, values: Mapping[str, float | None], w
     return Metric(scene, name, unit, values, OURS, definition=words)
 
 
-def _camera(scene: str, wishes: Wishes) -> PinholeCamera:
+def _camera(scene: str, wishes: Wishes) -> Camera:
     """The true camera in the middle, at a size for a page."""
     truth = load_photographs(scene, wishes)
     assert truth.K is not None
@@ -164,11 +165,11 @@ def _camera(scene: str, wishes: Wishes) -> PinholeCamera:
     view = len(truth.C) // 2
     with PIL.Image.open(truth.image_paths[view]) as opened:
         size = opened.size
-    camera = PinholeCamera(truth.K[view], truth.R[view], -truth.R[view] @ truth.C[view], size)
+    camera = Camera(truth.K[view], truth.R[view], -truth.R[view] @ truth.C[view], size)
     return camera.resized(640.0 / max(size))
 
 
-def _drawn(mesh: TexturedMesh, off_pct: F64, camera: PinholeCamera) -> NDArray[np.uint8]:
+def _drawn(mesh: TexturedMesh, off_pct: F64, camera: Camera) -> NDArray[np.uint8]:
     """The surface coloured by how far each vertex is off."""
     colored = replace(mesh, colors=coloured(off_pct / RED_PCT))
     return render(colored, camera, background=(245, 247, 250)).color

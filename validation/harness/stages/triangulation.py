@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_midpoint, triangulate_optimal
-from thesisrecon.optimize.projective_bundle import refine_projective_bundle
-from thesisrecon.types import F64
+from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from validation.checks.triangulation import SCENES, cameras_of, frame_of, squared_distances
 from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
 from validation.metrics.record import Metric

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import PIL.Image
-from numpy.typing import NDArray
 
-from thesisrecon.geometry.pinhole import PinholeCamera
-from thesisrecon.model import SurfaceModel
-from thesisrecon.model.texture import BlendedViews, SingleView, TextureAtlas
-from thesisrecon.types import B8, DepthMap, PinholeView, RenderedView, TexturedMesh
-from thesisrecon.views import render
-from thesisrecon.views.likeness import exposed_alike, psnr_db, ssim, whole_pixels
+from thesisrecon.arrays import B8, U8
+from thesisrecon.camera import Camera
+from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMesh
+from thesisrecon.surface.color_correction import SingleView
+from thesisrecon.surface.model import SurfaceModel
+from thesisrecon.surface.texture_atlas import TextureAtlas
+from thesisrecon.surface.texture_blending import BlendedViews
+from thesisrecon.views.image_similarity import exposed_alike, psnr_db, ssim, whole_pixels
+from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.harness.scenes import load_photographs
 from validation.harness.stages.depth import COURTYARD, OURS, model_of, read_maps, views_of
@@ -24,7 +26,6 @@ from validation.metrics.record import Metric
 from validation.references.open3d_meshes import render_open3d
 from validation.references.open3d_surfaces import OpenTsdf
 
-U8 = NDArray[np.uint8]
 SINGLE = "ours (one photograph each)"
 TSDF, FINE, LEVELLED = "Open3D TSDF, 1.5 px", "Open3D TSDF, 1 px", "Open3D TSDF, 1 px, levelled"
 OWN_PICTURE = "Open3D TSDF, 1 px, its own picture"
@@ -85,7 +86,7 @@ class ViewsStage:
             others = [i for i in sorted(maps) if i != k]
             seen = [views[i] for i in others]
             mesh = _model(task.method, [maps[i] for i in others], seen, shared / f"surface-{k:04d}.npz")
-            camera = PinholeCamera.from_matrix(views[k].P, (views[k].rgb.shape[1], views[k].rgb.shape[0]))
+            camera = Camera.from_matrix(views[k].P, (views[k].rgb.shape[1], views[k].rgb.shape[0]))
             drawn = render(mesh, camera)
             _save(place / f"{k:04d}.png", drawn.color)
             _save(place / f"{k:04d}-covered.png", np.where(drawn.valid, 255, 0).astype(np.uint8))
@@ -153,7 +154,7 @@ def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list
     ]
 
 
-def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: PinholeCamera) -> None:
+def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: Camera) -> None:
     """Open3D's own picture, where the machine has graphics that it can use."""
     try:
         _save(path, render_open3d(mesh, camera))

@@ -1,0 +1,352 @@
+"""The command line on the project's own photographs: one whole run, killed once, and what it prints."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from thesisrecon.cli import main as cli
+from thesisrecon.cli.inspect import intrinsic_lines, time_taken
+from thesisrecon.cli.main import run_command
+from thesisrecon.io import lists as demo
+from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
+
+ROOT = Path(__file__).parents[2]
+COURTYARD = ROOT / "fixtures" / "courtyard"
+VIEWS = 6
+SMALL = ["--max-size", "640", "--threads", "2", "--until", "metric"]
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few neighbouring views of the courtyard, in a folder whose name has a space and a letter beyond
+    ASCII.
+    """
+    folder = tmp_path_factory.mktemp("cli") / "my phötographs"
+    folder.mkdir()
+    for path in sorted((COURTYARD / "images").iterdir())[:VIEWS]:
+        shutil.copy(path, folder)
+    return folder
+
+
+def command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-m", "thesisrecon", *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def killed_and_resumed(photographs: Path) -> tuple[Path, int]:
+    """The output of a run that was killed while it matched and then started again; and how many pairs were
+    kept.
+    """
+    out = photographs.parent / "out"
+    arguments = command("reconstruct", photographs, "-o", out, *SMALL)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 300
+    while len(list((out / "02-matches").glob("*.npz"))) < 2:
+        assert process.poll() is None, "the run ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    kept = len(list((out / "02-matches").glob("*.npz")))
+    assert not (out / "summary.json").exists()
+    run = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr == ""
+    assert f"{VIEWS} of {VIEWS} photographs registered" in run.stdout
+    return out, kept
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed: tuple[Path, int]) -> None:
+    out, kept = killed_and_resumed
+    assert kept >= 2
+    summary = read(out / "summary.json")
+    assert summary["registered"] == VIEWS
+    assert summary["trusted"]
+    truth = read(COURTYARD / "cameras.json")
+    focal = truth_focal(truth)
+    assert summary["cameras"][0]["focal_px"]["value"] == pytest.approx(focal, rel=0.02)
+    assert summary["points"] > 300
+
+
+def test_a_kill_and_the_number_of_threads_change_no_byte(
+    killed_and_resumed: tuple[Path, int], photographs: Path, tmp_path: Path
+) -> None:
+    out, _ = killed_and_resumed
+    # A process of its own: the command caps the threads of linear algebra before NumPy is imported.
+    arguments = command("reconstruct", photographs, "-o", tmp_path / "out", *SMALL, "--threads", "1")
+    subprocess.run(arguments, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, capture_output=True)
+    assert kept_bytes(tmp_path / "out") == kept_bytes(out)
+
+
+def kept_bytes(out: Path) -> dict[str, bytes]:
+    """Every result file of a run."""
+    files = [
+        *out.glob("0*/*.npz"),
+        *(out / "sparse" / "0").iterdir(),
+        out / "points.ply",
+        out / "cameras.json",
+    ]
+    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(files)}
+
+
+def test_the_preset_of_the_thesis_runs_to_the_end(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run_command(["reconstruct", str(photographs), "-o", str(out), "--preset", "thesis", *SMALL]) == 0
+    assert "photographs registered" in capsys.readouterr().out
+    summary = read(out / "summary.json")
+    assert summary["registered"] >= 4
+    assert summary["registered"] + len(summary["refused"]) == VIEWS
+
+
+def truth_focal(truth: Any) -> float:
+    """The true focal length (px) of the courtyard's one camera."""
+    cameras = truth["cameras"] if "cameras" in truth else truth["images"]
+    first = next(iter(cameras.values())) if isinstance(cameras, dict) else cameras[0]
+    return float(np.array(first["K"] if "K" in first else truth["K"])[0][0])
+
+
+def test_inspect_prints_what_was_found(
+    killed_and_resumed: tuple[Path, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["inspect", str(killed_and_resumed[0])]) == 0
+    printed = capsys.readouterr().out
+    assert f"{VIEWS} of {VIEWS} photographs registered" in printed
+    assert "camera 0: focal" in printed
+
+
+def test_an_early_end_prints_what_its_stage_found(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few, out = tmp_path / "few", tmp_path / "out"
+    few.mkdir()
+    for path in sorted(photographs.iterdir())[:2]:
+        shutil.copy(path, few)
+    wanted = {
+        "features": r"^\d{3,} corners in 2 photographs\n",
+        "matches": r"^1 of 1 pair of .*, \d\d+ verified",
+    }
+    for until, words in wanted.items():
+        arguments = ["reconstruct", str(few), "-o", str(out), "--until", until, "--max-size", "480"]
+        assert run_command(arguments) == 0
+        assert re.match(words, capsys.readouterr().out)
+        assert run_command(["inspect", str(out)]) == 0
+        assert re.match(words, capsys.readouterr().out)
+
+
+def test_a_finished_run_is_not_touched_by_another_config(
+    killed_and_resumed: tuple[Path, int], photographs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, _ = killed_and_resumed
+    before = (out / "summary.json").read_bytes()
+    arguments = ["reconstruct", str(photographs), "-o", str(out), "--max-size", "700"]
+    assert run_command(arguments) == 2
+    assert "images.max_size_px was 640 there and is 700 here" in capsys.readouterr().err
+    assert (out / "summary.json").read_bytes() == before
+
+
+def test_the_written_config_runs_again(
+    killed_and_resumed: tuple[Path, int], photographs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, _ = killed_and_resumed
+    arguments = ["reconstruct", str(photographs), "-o", str(out), "--config", str(out / "config.toml")]
+    assert run_command([*arguments, "--threads", "2", "--until", "metric"]) == 0
+    assert "registered" in capsys.readouterr().out
+    assert set(read(out / "summary.json")["resumed"]) >= {"features", "matches", "tracks", "metric"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["reconstruct"], "Missing"),
+        (["reconstruct", "nowhere", "-o", "out"], "there is no folder nowhere"),
+        (["reconstruct", ".", "-o", "out", "--preset", "best"], "--preset"),
+        (["reconstruct", ".", "-o", "out", "--cameras", "two"], "--cameras"),
+        (["reconstruct", ".", "-o", "out", "--no-such-option"], "--no-such-option"),
+        (["reconstruct", ".", "-o", "out", "--seed", "many"], "--seed"),
+        (["reconstruct", ".", "-o", "out", "--set", "features.kin=x"], "did you mean features.kind"),
+        (["reconstruct", ".", "-o", "out", "--config", "nowhere.toml"], "nowhere.toml cannot be read"),
+        (["reconstruct", ".", "-o", "out", "--until", "surface"], "unknown stage"),
+        (["reconstruct", ".", "-o", "out", "--executor", "dask://x"], "given as dask://HOST:PORT"),
+        (["reconstruct", ".", "-o", "out", "--max-size", "5"], "at least 64"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "window:0"], "a window of 0 gives no pairs"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "window"], "takes a whole number"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "window:--5"], "takes a whole number"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "most"], "all, overlap, window:N, or a file"),
+        (["reconstruct", ".", "-o", "out", "--set", "pairs.kind=some"], "unknown kind of pairs"),
+        (["inspect", "nowhere"], "no summary"),
+        (["reconstruct", ".", "-o", ""], "the folder has no name"),
+        (["reconstruct", "", "-o", "out"], "the folder has no name"),
+        (["demo", "-o", " "], "the folder has no name"),
+        (["rebuild"], "rebuild"),
+    ],
+)
+def test_a_wrong_command_gets_one_sentence_and_exit_2(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_command(arguments) == 2
+    printed = capsys.readouterr()
+    assert words in printed.err
+    assert printed.err.count("\n") == 1
+    assert "Traceback" not in printed.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_focal_length_is_given_as_the_readme_says(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = "--set intrinsics.focal_px=1200 --set intrinsics.focal_std_rel=0.05"
+    assert f"`{words}`" in (ROOT / "README.md").read_text(encoding="utf-8")
+    asked: list[Any] = []
+
+    def listen(*_: Any, config: Any, **__: Any) -> None:
+        asked.append(config.intrinsics)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", listen)
+    arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out"), *words.split()]
+    assert run_command(arguments) == 130
+    assert (asked[0].focal_px, asked[0].focal_std_rel) == (1200.0, 0.05)
+
+
+def test_the_last_line_tells_the_time_of_this_run() -> None:
+    whole = {"seconds": {"total": 40.0}, "elapsed_seconds": 41.5, "resumed": []}
+    assert time_taken(whole) == "41.5 s"
+    again = {**whole, "elapsed_seconds": 1.5, "resumed": ["features"]}
+    assert time_taken(again) == "1.5 s (40.0 s with what was kept of an earlier run)"
+
+
+def test_every_camera_has_a_line_with_what_was_estimated_of_it() -> None:
+    def view(camera: int, focal: float, **more: float) -> dict[str, Any]:
+        values = {"focal_px": focal, "principal_x_px": 5.0, "principal_y_px": 4.0, **more}
+        return {"camera": camera} | {
+            name: {"value": value, "std": 0.0 if value == 1.0 else 0.5, "source": "x"}
+            for name, value in values.items()
+        }
+
+    square, other = view(0, 900.0, aspect=1.0), view(1, 800.0, aspect=1.2, skew_px=2.0)
+    lines = intrinsic_lines([square, square, other, {"camera": 0, "registered": False}])
+    assert len(lines) == 2
+    assert lines[0].startswith("camera 0: focal 900.0 +- 0.5 px")
+    assert "aspect" not in lines[0]
+    assert lines[1].endswith("aspect 1.20000 +- 0.50000, skew 2.00 +- 0.50 px")
+
+
+def test_ctrl_c_says_how_to_go_on(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", interrupt)
+    assert run_command(["reconstruct", str(photographs), "-o", str(tmp_path / "out")]) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_an_error_in_the_program_is_a_sentence_too(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise IndexError("index 3 is out of bounds")
+
+    monkeypatch.delenv(cli.DEBUG_VARIABLE, raising=False)
+    monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", fail)
+    arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out")]
+    assert run_command(arguments) == 1
+    assert "IndexError: index 3" in capsys.readouterr().err
+    monkeypatch.setenv(cli.DEBUG_VARIABLE, "1")
+    with pytest.raises(IndexError):
+        run_command(arguments)
+
+
+def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["--version"]) == 0
+    assert run_command([]) == 0
+    assert run_command(["reconstruct", "--help"]) == 0
+    printed = capsys.readouterr().out
+    options = ["--preset", "--cameras", "--config", "--set", "--seed", "--threads", "--max-size", "--until"]
+    for option in [*options, "--executor", "--overwrite"]:
+        assert option in printed
+
+
+def test_the_demo_without_its_photographs_says_where_they_were_looked_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo, "files", lambda _: tmp_path / "thesisrecon")
+    assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
+    assert str(tmp_path / "thesisrecon" / "courtyard") in capsys.readouterr().err
+
+
+def test_kernels_that_can_be_kept_nowhere_are_told_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise RuntimeError("cannot cache function 'f': no locator available for file 'g'")
+
+    monkeypatch.setattr(cli, "_run", refuse)
+    assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
+    assert "NUMBA_CACHE_DIR" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wish", "kind"),
+    [("all", AllPairs()), ("overlap", OverlapEstimate()), ("window:3", SequenceWindow(3))],
+)
+def test_the_pairs_of_the_command_are_those_of_the_settings(wish: str, kind: object) -> None:
+    assert cli._config(None, None, cli._option_tables(None, None, wish), []).pairs == kind
+
+
+def test_a_list_of_pairs_is_read_matched_and_told(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = sorted(path.name for path in photographs.iterdir())
+    wish, out = tmp_path / "pairs.txt", tmp_path / "out"
+    wish.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
+    given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
+    assert run_command([*given, "--pairs", str(wish)]) == 0
+    assert "of 2 pairs of photographs accepted (15 are possible)" in capsys.readouterr().out
+    pairs = json.loads((out / "summary.json").read_text(encoding="utf-8"))["pairs"]
+    assert (pairs["matched"], pairs["possible"], pairs["chosen_by"]) == (2, 15, "the listed pairs")
+    assert "2 of 15 pairs were tried: the listed pairs." in (out / "report.html").read_text(encoding="utf-8")
+    for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is none"), ("", "leaves no pair")):
+        wish.write_text(line, encoding="utf-8")
+        assert run_command([*given, "--pairs", str(wish), "--overwrite"]) == 2
+        assert words in capsys.readouterr().err
+    # The run that was there is whole.
+    assert json.loads((out / "run.json").read_text(encoding="utf-8"))["settings"]["pairs"]["listed"][0] == [
+        names[1],
+        names[0],
+    ]
+    assert (out / "report.html").is_file()
+
+
+def test_a_list_of_pairs_that_was_mended_needs_no_overwriting(photographs: Path, tmp_path: Path) -> None:
+    names = sorted(path.name for path in photographs.iterdir())
+    wish, out = tmp_path / "pairs.txt", tmp_path / "out"
+    given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
+    for line, code in ((f"{names[0]} nope.jpg", 2), (f"{names[0]} {names[1]}", 0)):
+        wish.write_text(line, encoding="utf-8")
+        assert run_command([*given, "--pairs", str(wish)]) == code

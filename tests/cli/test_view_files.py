@@ -1,0 +1,216 @@
+"""``thesisrecon views`` on a small run made by hand: the painted sphere and the cameras around it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from tests.surface.sphere import SHAPE, photograph, ring_of
+from thesisrecon.cli.main import run_command
+from thesisrecon.cli.view_files import ViewWishes, write_views
+from thesisrecon.errors import UsageError
+from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.io.files import write_json
+from thesisrecon.io.meshes import write_mesh
+from thesisrecon.records import Image, Reconstruction, TexturedMesh, Tracks
+from thesisrecon.report.summary import cameras_table
+from thesisrecon.surface.fusion import VolumetricFusion
+from thesisrecon.surface.texture_atlas import TextureAtlas
+
+SIZE = SHAPE[::-1]
+COUNT = 8
+
+
+def write_cameras(out: Path) -> None:
+    """``cameras.json`` by the writer of runs."""
+    P = np.array([depth_map.P for depth_map in ring_of(COUNT)])
+    K = np.array([decompose_camera(p)[0] for p in P])
+    none = np.zeros(0, dtype=np.int64)
+    reconstruction = Reconstruction(
+        stratum="metric",
+        P=P,
+        X=np.zeros((0, 4)),
+        registered=np.arange(COUNT) != 3,
+        valid=np.zeros(0, dtype=bool),
+        inlier=np.zeros(0, dtype=bool),
+        tracks=Tracks(none, none, np.zeros((0, 2)), COUNT, 0),
+        sizes=np.tile(SIZE, (COUNT, 1)),
+        sigma_px=0.1,
+        reasons=("",) * COUNT,
+        K=K,
+        distortion=np.zeros((COUNT, 3)),
+    )
+    images = tuple(Image(f"{k}.jpg", np.zeros((*SHAPE, 3), np.uint8), SIZE) for k in range(COUNT))
+    write_json(out / "cameras.json", cameras_table(reconstruction, images))
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TexturedMesh]:
+    """A folder as a run leaves it, and the model in it."""
+    out = tmp_path_factory.mktemp("views") / "a rün"
+    maps = ring_of(COUNT)
+    mesh = TextureAtlas().texture(VolumetricFusion(voxel_px=3.0).fuse(maps), [photograph(m) for m in maps])
+    write_mesh(out / "model.glb", mesh)
+    write_cameras(out)
+    write_json(out / "run.json", {})
+    return out, mesh
+
+
+@pytest.fixture
+def run(sphere: tuple[Path, TexturedMesh], tmp_path: Path) -> Path:
+    """A copy of the run for one test."""
+    return Path(shutil.copytree(sphere[0], tmp_path / sphere[0].name))
+
+
+def pixels(path: Path) -> np.ndarray:
+    with PIL.Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def difference_from_photograph(frame: Path, view: int) -> float:
+    """Median difference of colours from photograph ``view`` on the sphere, well inside it."""
+    truth = photograph(ring_of(COUNT)[view]).rgb.astype(int)
+    y, x = np.indices(SHAPE)
+    inside = np.hypot(x - 79.5, y - 59.5) < 25
+    return float(np.median(np.abs(pixels(frame) - truth)[inside]))
+
+
+def test_interpolation_begins_and_ends_as_the_photographs(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["views", str(run), "--path", "interpolate", "--frames", "5", "--threads", "2"]) == 0
+    folder = run / "views" / "interpolate"
+    said = capsys.readouterr()
+    assert said.out == f"5 pictures of 160 x 120 px and interpolate.webp are in {folder}\n"
+    assert said.err == ""
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == [*(f"frame-000{k}.png" for k in range(1, 6)), "frames.json", "interpolate.webp"]
+    assert difference_from_photograph(folder / "frame-0001.png", 0) < 6
+    assert difference_from_photograph(folder / "frame-0005.png", COUNT - 1) < 6
+    with PIL.Image.open(folder / "interpolate.webp") as film:
+        assert film.n_frames == 5
+    told = json.loads((folder / "frames.json").read_text(encoding="utf-8"))
+    cameras = json.loads((run / "cameras.json").read_text(encoding="utf-8"))["cameras"]
+    assert len(cameras) == COUNT - 1
+    np.testing.assert_allclose(told["frames"][0]["centre"], cameras[0]["centre"], atol=1e-9)
+    np.testing.assert_allclose(told["frames"][-1]["R"], cameras[-1]["R"], atol=1e-9)
+
+
+def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(
+    run: Path, tmp_path: Path
+) -> None:
+    wanted = ["views", str(run), "--path", "orbit", "--frames", "6", "--size", "120x80"]
+    wanted += ["--background", "#102030"]
+    for threads in ("1", "2"):
+        assert run_command([*wanted, "-o", str(tmp_path / threads), "--threads", threads]) == 0
+    one, two = tmp_path / "1", tmp_path / "2"
+    assert {p.name: p.read_bytes() for p in one.iterdir()} == {p.name: p.read_bytes() for p in two.iterdir()}
+    frames = [pixels(one / f"frame-000{k}.png") for k in range(1, 7)]
+    for frame in frames:
+        assert frame.shape == (80, 120, 3)
+        assert (frame[0, 0] == [16, 32, 48]).all()
+        drawn = (frame != [16, 32, 48]).any(axis=2)
+        assert 0.1 < drawn.mean() < 0.9
+        y, x = np.nonzero(drawn)
+        assert abs(x.mean() - 59.5) < 3
+        assert abs(y.mean() - 39.5) < 3
+    assert np.abs(frames[0] - frames[3]).mean() > 4
+
+
+def test_light_changes_the_colours_and_a_bare_model_is_lit(run: Path, tmp_path: Path) -> None:
+    mean = {}
+    for light in ("none", "camera", "sun"):
+        folder = tmp_path / light
+        assert run_command(["views", str(run), "--frames", "1", "--light", light, "-o", str(folder)]) == 0
+        mean[light] = pixels(folder / "frame-0001.png")
+    assert np.abs(mean["none"] - mean["camera"]).mean() > 1
+    assert np.abs(mean["sun"] - mean["camera"]).mean() > 1
+    cube = TexturedMesh(
+        np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)]) * 0.7,
+        np.array([[0, 1, 2], [3, 2, 1], [4, 6, 5], [7, 5, 6], [0, 4, 1], [5, 1, 4]]),
+    )
+    write_mesh(run / "model.glb", cube)
+    assert run_command(["views", str(run), "--frames", "2", "-o", str(tmp_path / "cube")]) == 0
+    shown = pixels(tmp_path / "cube" / "frame-0001.png")[..., 0]
+    assert len(np.unique(shown)) > 5
+
+
+def test_a_shorter_command_leaves_none_of_the_frames_before(run: Path) -> None:
+    small = ["views", str(run), "--size", "40x30", "-o", str(run / "film"), "--frames"]
+    assert run_command([*small, "4"]) == 0
+    assert run_command([*small, "2", "--path", "interpolate"]) == 0
+    names = sorted(path.name for path in (run / "film").iterdir())
+    assert names == ["frame-0001.png", "frame-0002.png", "frames.json", "interpolate.webp"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--frames", "0"], "--frames takes a whole number of at least 1; got 0"),
+        (["--frames", "many"], "--frames"),
+        (["--size", "large"], "--size takes WIDTHxHEIGHT in pixels, as 1000x700; got 'large'"),
+        (["--size", "100x0"], "sides of 1 to 8192 pixels; got 100x0"),
+        (["--size", "100x9000"], "sides of 1 to 8192 pixels"),
+        (["--size", "-5x7"], "--size takes WIDTHxHEIGHT"),
+        (["--path", "spiral"], "--path"),
+        (["--light", "moon"], "--light"),
+        (["--background", "mauvish"], "--background takes a colour as white or #20304f; got 'mauvish'"),
+        (["-o", ""], "the folder has no name"),
+    ],
+)
+def test_wrong_wishes_get_one_sentence(
+    options: list[str], words: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["views", str(run), *options]) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert not (run / "views").exists()
+
+
+def test_what_is_missing_is_named(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def told(out: Path) -> str:
+        assert run_command(["views", str(out)]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        return said
+
+    assert "holds no run; make one with thesisrecon reconstruct" in told(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    assert "holds no run" in told(tmp_path / "empty")
+    (run / "cameras.json").rename(run / "other.json")
+    assert "there is no cameras.json" in told(run)
+    (run / "model.glb").write_bytes(b"glTF")
+    assert "model.glb cannot be read" in told(run)
+    (run / "model.glb").unlink()
+    assert "has no model yet (model.glb)" in (said := told(run))
+    assert "without --until" in said
+    reason = "there is no model: no depths were found; none of 4 views agrees with another."
+    (run / "summary.json").write_text(json.dumps({"warnings": ["something else", reason]}))
+    assert f"found its cameras and no surface: {reason}" in told(run)
+
+
+def test_a_folder_of_photographs_is_not_written_over(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photographs = run / "photographs"
+    photographs.mkdir()
+    (photographs / "frame-0001.png").write_bytes(b"dear")
+    assert run_command(["views", str(run), "-o", str(photographs)]) == 2
+    assert "holds 'frame-0001.png', which is not of this command" in capsys.readouterr().err
+    assert (photographs / "frame-0001.png").read_bytes() == b"dear"
+    assert run_command(["views", str(run), "-o", str(photographs / "frame-0001.png")]) == 2
+    assert "cannot be used" in capsys.readouterr().err
+
+
+def test_progress_is_told_to_its_end(run: Path) -> None:
+    heard: list[tuple[str, int, int]] = []
+    wishes = ViewWishes(frames=3, size=(40, 30))
+    written = write_views(run, run / "film", wishes, threads=2, progress=lambda *step: heard.append(step))
+    assert heard == [("views", k, 4) for k in range(1, 5)]
+    assert [path.is_file() for path in (*written.frames, written.animation)] == [True] * 4
+    with pytest.raises(UsageError, match="unknown path"):
+        ViewWishes(path="spiral")

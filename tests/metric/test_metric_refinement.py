@@ -1,0 +1,142 @@
+"""The metric stage on scenes with truth: exactness, freed lens, postponed cameras, honesty."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.metric.resection import resect_calibrated
+from thesisrecon.records import MetricResult, Reconstruction
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+
+
+def run(
+    scene: TrueScene,
+    *,
+    shared: bool = True,
+    reconstruction: Reconstruction | None = None,
+    variant: MetricRefinement | None = None,
+    wish: IntrinsicsAssumption | None = None,
+) -> MetricResult:
+    start = projective_reconstruction(scene) if reconstruction is None else reconstruction
+    assumed = assume(start, wish or IntrinsicsAssumption(cameras="shared" if shared else "per-image"))
+    rng = np.random.default_rng(0)
+    calibration = HypothesesAndRefinement().calibrate(start, assumed=assumed, rng=rng)
+    return (variant or MetricRefinement()).refine(start, calibration, assumed=assumed, rng=rng)
+
+
+def centre_error(result: MetricResult, scene: TrueScene) -> float:
+    """Mean camera-centre error after similarity alignment, in units of the cameras' mutual distance."""
+    views = result.reconstruction.registered
+    C = camera_centre(result.reconstruction.P[views])
+    C = C[:, :3] / C[:, 3:]
+    moved = estimate_similarity(C, scene.centres[views]).apply(C)
+    spread = np.linalg.norm(scene.centres - scene.centres.mean(axis=0), axis=1).mean()
+    return float(np.linalg.norm(moved - scene.centres[views], axis=1).mean() / spread)
+
+
+def test_noise_free_scene_comes_back_with_its_lens() -> None:
+    scene = make_scene(principal_shift=(9.0, -6.0), k1=0.03, points=400)
+    result = run(scene)
+    assert result.trusted
+    r = result.reconstruction
+    assert r.stratum == "metric"
+    assert r.K is not None
+    assert r.distortion is not None
+    # The prior of the principal point and of k1 pulls a little, hence not to rounding.
+    np.testing.assert_allclose(r.K[:, 0, 0], 1500.0, rtol=1e-3)
+    np.testing.assert_allclose(r.K[:, :2, 2] - scene.K[:, :2, 2], 0.0, atol=1.0)
+    np.testing.assert_allclose(r.distortion[:, 0], 0.03, atol=1e-3)
+    assert centre_error(result, scene) < 1e-3
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_noisy_scene_is_right_within_its_own_intervals(shared: bool) -> None:
+    scene = make_scene(sigma_px=0.5, points=500, zoom=0.0 if shared else 0.3, seed=3)
+    result = run(scene, shared=shared)
+    assert result.trusted, result.failed_checks
+    for view, intervals in enumerate(result.intrinsics):
+        focal = intervals["focal_px"]
+        assert 0 < focal.std < 0.05 * focal.value
+        assert abs(focal.value - scene.K[view, 0, 0]) < 4 * focal.std
+    assert result.reconstruction.sigma_px == pytest.approx(0.5, rel=0.3)
+    assert centre_error(result, scene) < 0.01
+
+
+def test_a_postponed_camera_joins_by_calibrated_resection() -> None:
+    scene = make_scene(sigma_px=0.3, points=400, seed=4)
+    start = projective_reconstruction(scene)
+    registered = np.ones(8, dtype=bool)
+    registered[5] = False
+    inlier = start.inlier & registered[scene.tracks.view_index]
+    reasons = tuple("waits" if v == 5 else "" for v in range(8))
+    start = replace(start, registered=registered, inlier=inlier, reasons=reasons)
+    result = run(scene, reconstruction=start)
+    assert result.reconstruction.registered.all()
+    assert result.reconstruction.reasons == ("",) * 8
+    assert centre_error(result, scene) < 0.01
+
+
+def test_a_wrong_camera_of_the_projective_stage_is_caught_and_resected() -> None:
+    scene = make_scene(sigma_px=0.3, points=400, seed=5)
+    start = projective_reconstruction(scene)
+    P = start.P.copy()
+    P[6] = P[6] @ (np.eye(4) + 0.5 * np.random.default_rng(1).normal(size=(4, 4)))
+    result = run(scene, reconstruction=replace(start, P=P))
+    assert result.reconstruction.registered.all()
+    assert centre_error(result, scene) < 0.01
+
+
+def test_a_view_without_points_keeps_its_reason() -> None:
+    scene = make_scene(points=300, seed=6)
+    t = scene.tracks
+    keep = t.view_index != 7
+    tracks = replace(t, view_index=t.view_index[keep], point_index=t.point_index[keep], xy=t.xy[keep])
+    lonely = replace(scene, tracks=tracks)
+    start = projective_reconstruction(lonely)
+    registered = np.arange(8) != 7
+    reasons = ("",) * 7 + ("too little overlap with the others",)
+    start = replace(
+        start, registered=registered, reasons=reasons, P=np.where(registered[:, None, None], start.P, 0.0)
+    )
+    result = run(lonely, reconstruction=start)
+    assert not result.reconstruction.registered[7]
+    assert result.reconstruction.reasons[7]
+    assert result.intrinsics[7] == {}
+
+
+def test_fixed_principal_point_is_said_to_be_assumed() -> None:
+    scene = make_scene(sigma_px=0.3, seed=7)
+    result = run(scene, wish=IntrinsicsAssumption(principal_point="known", k1="known"))
+    interval = result.intrinsics[0]["principal_x_px"]
+    assert interval.value == pytest.approx((1536 - 1) / 2)
+    assert interval.source == "assumed"
+
+
+def test_calibrated_resection_survives_half_wrong_points() -> None:
+    scene = make_scene()
+    rng = np.random.default_rng(0)
+    Y = scene.X @ scene.R[0].T + scene.t[0]
+    xy = Y[:, :2] / Y[:, 2:]
+    wrong = np.arange(len(xy)) % 2 == 0
+    xy[wrong] += rng.uniform(0.1, 0.4, (int(wrong.sum()), 2))
+    found = resect_calibrated(scene.X, xy, threshold=1e-3, rng=rng)
+    assert found is not None
+    np.testing.assert_allclose(found[0], scene.R[0], atol=1e-6)
+    np.testing.assert_allclose(found[1], scene.t[0], atol=1e-5)
+    assert not found[2][wrong].any()
+    assert found[2][~wrong].all()
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    scene = make_scene(sigma_px=0.5, seed=8)
+    first, second = run(scene), run(scene)
+    assert first.reconstruction.P.tobytes() == second.reconstruction.P.tobytes()
+    assert first.reconstruction.X.tobytes() == second.reconstruction.X.tobytes()

@@ -1,0 +1,135 @@
+"""Covariances against Monte Carlo, and the two ways to them against each other."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.numerics.bundle_scenes import make_block, project_block
+from thesisrecon.numerics import covariance as bundle_covariance
+from thesisrecon.numerics import reduced_solvers as kernels
+from thesisrecon.numerics.covariance import gauge_directions, robust_sigma
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics.metric_cameras import IntrinsicsPrior, MetricCameras
+from thesisrecon.numerics.observations import Observations
+
+FREE = np.array([True, False, False, True, True, True])
+
+
+def _own_focals(block, populations):
+    """Focals of their own, the rest common; with ``populations`` views 1 to 5 are of one kind, 0 is held."""
+    c = block.cameras
+    rows = np.tile(c.intrinsics[0], (6, 1))
+    rows[:, 0] = [1200.0, 1150.0, 1240.0, 1180.0, 1210.0, 1260.0]
+    shared = np.zeros((6, 6), dtype=np.int64)
+    shared[:, 0] = np.arange(6)
+    cameras = MetricCameras(c.R, c.t, rows, np.arange(6), shared)
+    if not populations:
+        return cameras, None
+    std = np.full((6, 6), np.inf)
+    std[0, 0] = 0.0
+    spread = np.array([0.03, *[np.inf] * 5])
+    return cameras, IntrinsicsPrior(rows, std, np.array([-1, 1, 1, 1, 1, 1]), spread)
+
+
+@pytest.mark.parametrize("populations", [False, True])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_the_banded_way_gives_the_covariances_of_the_dense_one(monkeypatch, populations, fixed):
+    block = make_block(k1=0.02, points=60)
+    cameras, prior = _own_focals(block, populations)
+    xy = project_block(cameras, block.X, block.view, block.point)
+    xy += 0.3 * np.random.default_rng(0).normal(size=xy.shape)
+    held = np.arange(6) < 2 if fixed else None
+
+    def fit():
+        return refine_metric_bundle(
+            cameras,
+            block.X,
+            Observations(block.view, block.point, xy),
+            free=FREE,
+            prior=prior,
+            options=BundleOptions(covariance=True, fixed_views=held),
+        )
+
+    dense = fit()
+    monkeypatch.setattr(bundle_covariance, "DENSE", 0)
+    banded = fit()
+    scale = np.abs(dense.intrinsics_covariance).max(axis=0) + 1e-30
+    assert (np.abs(banded.intrinsics_covariance - dense.intrinsics_covariance) / scale).max() < 1e-3
+    scale = np.abs(dense.pose_covariance).max(axis=(1, 2), keepdims=True) + 1e-30
+    assert (np.abs(banded.pose_covariance - dense.pose_covariance) / scale).max() < 1e-3
+    assert bool(dense.intrinsics_covariance[0, 0, 0] > 0.0) is not populations
+
+
+def test_entries_of_the_inverse_inside_the_band():
+    rng = np.random.default_rng(3)
+    L = np.tril(rng.normal(size=(20, 20))) * (np.abs(np.subtract.outer(range(20), range(20))) < 5)
+    L[np.diag_indices(20)] = rng.uniform(1.0, 2.0, 20)
+    inverse = np.linalg.inv(L @ L.T)
+    packed, out = np.zeros((20, 5)), np.zeros((20, 5))
+    for j in range(20):
+        packed[j, : min(5, 20 - j)] = L[j : j + 5, j]
+    kernels.invert_band(packed, out)
+    for j in range(20):
+        np.testing.assert_allclose(out[j, : min(5, 20 - j)], inverse[j : j + 5, j], rtol=1e-9, atol=1e-12)
+
+
+def test_noise_is_found_beside_outliers_and_points_that_fit_anything():
+    rng = np.random.default_rng(0)
+    residual, leverage = 0.3 * rng.normal(size=(5000, 2)), np.zeros((5000, 2))
+    assert robust_sigma(residual, leverage, 0) == pytest.approx(0.3, rel=0.02)
+    residual[:100] *= 100.0
+    assert robust_sigma(residual, leverage, 0) == pytest.approx(0.3, rel=0.04)
+    # A coordinate keeps the share of its variance that neither its point nor the cameras took.
+    leverage[:] = 0.5
+    assert robust_sigma(np.sqrt(0.25) * residual, leverage, 2500) == pytest.approx(0.3, rel=0.04)
+    leverage[2500:], residual[2500:] = 1.0, 0.0
+    assert robust_sigma(np.sqrt(0.25) * residual, leverage, 2500) == pytest.approx(0.3, rel=0.05)
+    assert robust_sigma(residual, np.ones_like(leverage), 0) == 0.0
+    assert robust_sigma(np.zeros((0, 2)), np.zeros((0, 2)), 0) == 0.0
+
+
+@pytest.mark.parametrize("populations", [False, True])
+def test_errors_are_as_large_as_the_covariances_say(populations):
+    block = make_block(k1=0.02, points=60)
+    cameras, prior = _own_focals(block, populations)
+    exact, sigma, trials = project_block(cameras, block.X, block.view, block.point), 0.4, 120
+    rng = np.random.default_rng(11)
+    # The inner gauge is that of the frame used inside: centred and scaled by medians.
+    origin = np.median(block.X, axis=0)
+    scale = 1.0 / np.median(np.linalg.norm(block.X - origin, axis=1))
+    c = block.cameras
+    N = gauge_directions(c.R, scale * (c.t + c.R @ origin))
+    z_intrinsics, z_poses, sigmas = [], [], []
+    for _ in range(trials):
+        true = cameras.intrinsics.copy()
+        xy = exact
+        if prior is not None:
+            # The truth of a population is drawn from it anew, as its prior has it.
+            true[1:, 0] = 1200.0 * np.exp(0.03 * rng.normal(size=5))
+            moved = MetricCameras(c.R, c.t, true, np.arange(6))
+            xy = project_block(moved, block.X, block.view, block.point)
+        fit = refine_metric_bundle(
+            MetricCameras(c.R, c.t, true, np.arange(6), cameras.shared),
+            block.X,
+            Observations(block.view, block.point, xy + sigma * rng.normal(size=exact.shape)),
+            free=FREE,
+            prior=prior,
+            options=BundleOptions(
+                sigma_px=sigma, loss="squared", loss_px=1.0, max_iterations=15, covariance=True
+            ),
+        )
+        error = fit.cameras.intrinsics - true
+        std = np.sqrt(fit.intrinsics_covariance[:, range(6), range(6)])
+        free = std > 0.0
+        z_intrinsics.append((error[free] / std[free]) ** 2)
+        turn = Rotation.from_matrix(fit.cameras.R @ np.swapaxes(c.R, 1, 2))
+        shift = fit.cameras.t - np.einsum("vab,vb->va", turn.as_matrix(), c.t + c.R @ origin)
+        shift += fit.cameras.R @ origin
+        delta = np.concatenate([turn.as_rotvec(), scale * shift], axis=1).ravel()
+        delta -= N @ (N.T @ delta)
+        units = np.array([1.0, 1.0, 1.0, scale, scale, scale])
+        z_poses.append(delta**2 / (np.diagonal(fit.pose_covariance, axis1=1, axis2=2) * units**2).ravel())
+        sigmas.append(fit.sigma_px)
+    assert np.sqrt(np.mean(z_intrinsics)) == pytest.approx(1.0, abs=0.08)
+    assert np.sqrt(np.mean(z_poses)) == pytest.approx(1.0, abs=0.08)
+    assert np.mean(sigmas) == pytest.approx(sigma, rel=0.01)

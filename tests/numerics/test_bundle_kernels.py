@@ -1,0 +1,344 @@
+"""Compiled kernels against plain NumPy and finite differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.numerics.bundle_scenes import make_block, perturbed, project_block
+from thesisrecon.numerics import schur
+from thesisrecon.numerics.elimination import Sums, sum_leverages
+from thesisrecon.numerics.levenberg_marquardt import LOSS_CODES, LOSSES, floored_diagonal
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics.metric_cameras import (
+    MetricCameras,
+    MetricModel,
+    linearize_metric,
+    metric_cost,
+    move_poses,
+)
+from thesisrecon.numerics.observations import Jacobians, Observations, Seen, Weighing, sort_observations
+from thesisrecon.numerics.projective_cameras import (
+    UnitState,
+    linearize_projective,
+    projective_cost,
+    tangent_reflectors,
+    tangent_step,
+)
+from thesisrecon.numerics.reduced_solvers import (
+    BandedCholesky,
+    ConjugateGradients,
+    DenseCholesky,
+    ReducedSystem,
+    add_diagonal,
+    choose_solver,
+    fill_band,
+    multiply,
+)
+from thesisrecon.numerics.schur import BundleSystem, CameraPrior, lay_out
+
+
+def _linearized_metric(block, xy, loss="squared", delta=1.0, sigma=1.0):
+    c, n = block.cameras, len(xy)
+    width = c.intrinsics.shape[1]
+    J = Jacobians.empty(n, 6, width)
+    model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen, weighing = Seen(block.view, block.point, xy), Weighing(sigma, LOSS_CODES[loss], delta)
+    own = np.zeros(0, dtype=np.int64)
+    cost = linearize_metric(model, seen, weighing, own, np.arange(width), J)
+    assert metric_cost(model, seen, weighing) == pytest.approx(cost, rel=1e-12)
+    return cost, J
+
+
+def _moved(cameras, pose, intrinsics):
+    turn = Rotation.from_rotvec(pose[:, :3]).as_matrix()
+    q = cameras.intrinsics + intrinsics
+    q[:, 0] = cameras.intrinsics[:, 0] * np.exp(intrinsics[:, 0])
+    t = np.einsum("vab,vb->va", turn, cameras.t) + pose[:, 3:]
+    return MetricCameras(turn @ cameras.R, t, q, cameras.group)
+
+
+@pytest.mark.parametrize("lens", [(), (-0.03, 0.02)])
+def test_metric_jacobians_match_finite_differences(lens):
+    block = make_block(k1=0.05, lens=lens, groups=2)
+    _, J = _linearized_metric(block, block.xy + 3.0)
+    V, G, h = len(block.cameras.R), 2, 1e-6
+
+    def difference(pose, intrinsics, X):
+        ends = [
+            project_block(
+                _moved(block.cameras, s * h * pose, s * h * intrinsics),
+                block.X + s * h * X,
+                block.view,
+                block.point,
+            )
+            for s in (1.0, -1.0)
+        ]
+        return (ends[0] - ends[1]) / (2.0 * h)
+
+    C = 6 + len(lens)
+    none = np.zeros((V, 6)), np.zeros((G, C)), np.zeros_like(block.X)
+    for c in range(6):
+        unit = np.eye(6)[c]
+        np.testing.assert_allclose(J.A[:, :, c], difference(none[0] + unit, *none[1:]), rtol=2e-5, atol=2e-4)
+    for c in range(C):
+        unit = np.eye(C)[c]
+        np.testing.assert_allclose(
+            J.E[:, :, c], difference(none[0], none[1] + unit, none[2]), rtol=2e-5, atol=2e-4
+        )
+    for c in range(3):
+        np.testing.assert_allclose(
+            J.B[:, :, c], difference(none[0], none[1], none[2] + np.eye(3)[c]), rtol=2e-5, atol=2e-4
+        )
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-5, 1e-3, 1.0, 3.0])
+def test_poses_move_by_the_exponential_map(size):
+    rng = np.random.default_rng(3)
+    R, t = Rotation.random(9, random_state=rng).as_matrix(), rng.normal(size=(9, 3))
+    step = size * rng.normal(size=(9, 6))
+    R_out, t_out = np.empty_like(R), np.empty_like(t)
+    move_poses(R, t, step, R_out, t_out)
+    turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+    np.testing.assert_allclose(R_out, turn @ R, atol=1e-15)
+    np.testing.assert_allclose(t_out, np.einsum("vab,vb->va", turn, t) + step[:, 3:], atol=2e-15)
+
+
+def test_projective_jacobians_match_finite_differences():
+    rng = np.random.default_rng(4)
+    P = rng.normal(size=(3, 12))
+    X = rng.normal(size=(7, 4))
+    P /= np.linalg.norm(P, axis=1, keepdims=True)
+    X /= np.linalg.norm(X, axis=1, keepdims=True)
+    view, point = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(7)))
+    xy = rng.normal(size=(21, 2))
+    J, state = Jacobians.empty(21, 11, 0), UnitState.at(P, X)
+    seen, weighing = Seen(view, point, xy), Weighing(1.0, 0, 1.0)
+    cost = linearize_projective(state, seen, weighing, J)
+    assert projective_cost(state, seen, weighing) == pytest.approx(cost, rel=1e-12)
+    z = np.einsum("kab,kb->ka", P.reshape(3, 3, 4)[view], X[point])
+    np.testing.assert_allclose(J.residual, z[:, :2] / z[:, 2:] - xy, rtol=1e-12)
+    assert cost == pytest.approx(0.5 * np.sum(J.residual**2))
+
+    def residual(sP, sX):
+        moved_P, moved_X = np.empty_like(P), np.empty_like(X)
+        tangent_step(P, state.vP, state.bP, sP, moved_P)
+        tangent_step(X, state.vX, state.bX, sX, moved_X)
+        u = np.einsum("kab,kb->ka", moved_P.reshape(3, 3, 4)[view], moved_X[point])
+        return u[:, :2] / u[:, 2:]
+
+    h = 1e-7
+    for c in range(11):
+        step = h * np.tile(np.eye(11)[c], (3, 1))
+        slope = (residual(step, np.zeros((7, 3))) - residual(-step, np.zeros((7, 3)))) / (2 * h)
+        np.testing.assert_allclose(J.A[:, :, c], slope, rtol=1e-4, atol=1e-5 * np.abs(J.A).max())
+    for c in range(3):
+        step = h * np.tile(np.eye(3)[c], (7, 1))
+        slope = (residual(np.zeros((3, 11)), step) - residual(np.zeros((3, 11)), -step)) / (2 * h)
+        np.testing.assert_allclose(J.B[:, :, c], slope, rtol=1e-4, atol=1e-5 * np.abs(J.B).max())
+
+
+@pytest.mark.parametrize("loss", sorted(LOSSES))
+def test_losses_of_the_kernels_are_those_of_numpy(loss):
+    block = make_block()
+    noise = np.random.default_rng(0).normal(size=block.xy.shape) * 2.0
+    cost, J = _linearized_metric(block, block.xy - noise, loss, 1.5, 2.0)
+    s = np.sum((noise / 2.0) ** 2, axis=1)
+    rho, weight = LOSSES[loss](s, 1.5)
+    assert cost == pytest.approx(0.5 * rho.sum())
+    np.testing.assert_allclose(J.residual, np.sqrt(weight)[:, None] * noise / 2.0, rtol=1e-9, atol=1e-9)
+
+
+def _full_jacobian(J, layout):
+    """All columns of one problem side by side: blocks of the views, border, points."""
+    o, places, C = layout.observations, layout.places, layout.width
+    edge = C * len(places.pair)
+    full = np.zeros((2 * len(o.xy), layout.size + 3 * (len(o.start) - 1)))
+    for k in range(len(o.xy)):
+        rows, v, j = slice(2 * k, 2 * k + 2), places.block[o.view_index[k]], o.point_index[k]
+        if v >= 0:
+            full[rows, C * v : C * v + C] = J.A[k]
+        for f, column in enumerate(places.common[o.view_index[k]]):
+            if column >= 0:
+                full[rows, edge + column] += J.E[k, :, f]
+        full[rows, layout.size + 3 * j : layout.size + 3 * j + 3] = J.B[k]
+    return full
+
+
+@pytest.mark.parametrize("solver", ["chosen", "banded", "conjugate"])
+@pytest.mark.parametrize("twice", [False, True])
+def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
+    block = make_block(views=6, points=30, groups=2)
+    rng = np.random.default_rng(2)
+    view = block.view.copy()
+    if twice:
+        view[1] = view[0]
+    o = sort_observations(view, block.point, block.xy + rng.normal(size=block.xy.shape), 6, 30)
+    c = block.cameras
+    # View 0 is held fixed; the focals are the views' own, the rest belongs to two groups, of which one has no
+    # third coefficient.
+    own, common = np.array([0]), np.arange(1, 6)
+    columns = np.arange(5) + 5 * c.group[:, None]
+    columns[c.group == 1, 4] = -1
+    layout = lay_out(o, np.arange(6) - 1, width=7, common=columns, border=9)
+    assert isinstance(layout.solver, DenseCholesky)
+    if solver == "banded":
+        layout = replace(layout, solver=BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
+    if solver == "conjugate":
+        layout = replace(layout, solver=ConjugateGradients(1e-13))
+    J = layout.jacobians()
+    model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen = Seen(o.view_index, o.point_index, o.xy)
+    cost = linearize_metric(model, seen, Weighing(1.0, 0, 1.0), own, common, J)
+    gradient = np.zeros(layout.size)
+    gradient[[6, 40]] = [3.0, -3.0]
+    prior = CameraPrior(np.array([6, 40]), np.array([40, -1]), np.array([2e4, 5e3]), gradient)
+    system = BundleSystem(cost, layout, J, prior)
+    step, gain = system.solve(1e-3)
+
+    full, r, D = _full_jacobian(J, layout), J.residual.ravel(), layout.size
+    H, g = full.T @ full, full.T @ r
+    H[6, 6] += 2e4
+    H[40, 40] += 2.5e4
+    H[6, 40] -= 2e4
+    H[40, 6] -= 2e4
+    g[:D] += gradient
+    damped = H + 1e-3 * np.diag(floored_diagonal(np.diag(H)))
+    expected = np.linalg.solve(damped, -g)
+    np.testing.assert_allclose(step.cameras, expected[:D], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(step.points.ravel(), expected[D:], rtol=1e-5, atol=1e-8)
+    assert gain == pytest.approx(-g @ expected - 0.5 * expected @ H @ expected, rel=1e-5)
+
+
+def test_chunks_and_threads_do_not_change_a_byte(monkeypatch):
+    block = make_block(views=6, points=200, groups=1)
+    monkeypatch.setattr(schur, "CHUNK", 100)
+    cameras, X = perturbed(block)
+    fits = [
+        refine_metric_bundle(
+            cameras,
+            X,
+            Observations(block.view, block.point, block.xy),
+            free=np.array([True, False, False, True, True, False]),
+            options=BundleOptions(threads=threads),
+        )
+        for threads in (1, 3)
+    ]
+    assert fits[0].X.tobytes() == fits[1].X.tobytes()
+    assert fits[0].cameras.R.tobytes() == fits[1].cameras.R.tobytes()
+    monkeypatch.setattr(schur, "CHUNK", 10**6)
+    whole = refine_metric_bundle(
+        cameras,
+        X,
+        Observations(block.view, block.point, block.xy),
+        free=np.array([True, False, False, True, True, False]),
+    )
+    np.testing.assert_allclose(whole.X, fits[0].X, atol=1e-6)
+
+
+def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
+    rng = np.random.default_rng(5)
+    row, column = np.array([0, 0, 1, 2, 2, 3]), np.array([0, 2, 1, 2, 3, 3])
+    blocks = rng.normal(size=(6, 2, 2))
+    blocks[row == column] += np.swapaxes(blocks[row == column], 1, 2)
+    border, corner = rng.normal(size=(4, 2, 3)), rng.normal(size=(3, 3))
+    corner += corner.T
+    dense = np.zeros((11, 11))
+    for i in range(6):
+        dense[2 * row[i] : 2 * row[i] + 2, 2 * column[i] : 2 * column[i] + 2] = blocks[i]
+    dense[:8, 8:], dense[8:, 8:] = border.reshape(8, 3), corner
+    full = np.triu(dense) + np.triu(dense, 1).T
+    system = ReducedSystem(row, column, Sums(blocks, border, corner, *np.zeros((3, 11))))
+    np.testing.assert_array_equal(np.triu(system.dense()), np.triu(dense))
+    more, pair = np.arange(11.0), np.full((4, 4), -1)
+    pair[row, column] = np.arange(6)
+    add_diagonal(blocks, pair, corner, more)
+    full += np.diag(more)
+    np.testing.assert_array_equal(np.triu(system.dense()), np.triu(full))
+    x = rng.normal(size=11)
+    np.testing.assert_allclose(multiply(system, x), full @ x, rtol=1e-12)
+    place = np.array([1, 3, 0, 2])
+    band = np.zeros((8, 6))
+    fill_band(blocks, row, column, place, band)
+    order = (2 * np.argsort(place)[:, None] + np.arange(2)).ravel()
+    moved = full[np.ix_(order, order)]
+    for i in range(8):
+        for j in range(i, min(8, i + 6)):
+            assert band[i, j - i] == moved[j, i]
+
+
+@pytest.mark.parametrize(
+    "solver", [DenseCholesky(), BandedCholesky(np.arange(3), 2), ConjugateGradients()], ids=lambda s: type(s)
+)
+@pytest.mark.parametrize("spoiled", ["views", "corner", "rhs"])
+@pytest.mark.parametrize("value", [-1.0, 0.0, np.nan])
+def test_every_solver_tells_a_system_that_is_not_positive(solver, spoiled, value):
+    row, column = np.array([0, 0, 1, 1, 2]), np.array([0, 1, 1, 2, 2])
+    blocks, border, corner = np.zeros((5, 2, 2)), np.full((3, 2, 1), 0.1), np.eye(1)
+    blocks[row == column] = np.eye(2)
+    sums = Sums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
+    system = ReducedSystem(row, column, sums)
+    np.testing.assert_allclose(multiply(system, solver.solve(system)), 1.0, atol=1e-2)
+    what = {"views": blocks, "corner": corner, "rhs": sums.rhs}[spoiled]
+    what *= value
+    if spoiled != "rhs" or np.isnan(value):
+        assert solver.solve(system) is None
+
+
+def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
+    def chosen(n, pairs):
+        i, j = (np.array(a) for a in zip(*sorted(pairs), strict=True))
+        return choose_solver(i, j, n, 6, 4)
+
+    near = {(i, j) for i in range(400) for j in range(i, min(i + 8, 400))}
+    ring = near | {(j, i + 400) for i in range(-8, 0) for j in range(i + 8)}
+    rng = np.random.default_rng(0)
+    wild = {tuple(sorted(rng.integers(0, 2000, 2))) for _ in range(20000)} | {(i, i) for i in range(2000)}
+    every = {(i, j) for i in range(150) for j in range(i, 150)}
+    assert chosen(400, near).reach == 7
+    assert isinstance(chosen(400, ring), BandedCholesky)
+    assert isinstance(chosen(2000, wild), ConjugateGradients)
+    assert isinstance(chosen(150, every), DenseCholesky)
+
+
+def test_tangent_steps_keep_unit_norm_and_side():
+    rng = np.random.default_rng(8)
+    p = rng.normal(size=(20, 4))
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    v, beta, out = np.empty_like(p), np.empty(20), np.empty_like(p)
+    tangent_reflectors(p, v, beta)
+    tangent_step(p, v, beta, 3.0 * rng.normal(size=(20, 3)), out)
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1.0, rtol=1e-12)
+    assert (np.sum(p * out, axis=1) > 0.0).all()
+
+
+@pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
+def test_bending_losses_keep_the_gradient_and_bend_the_curvature(loss):
+    block = make_block()
+    c, n = block.cameras, len(block.xy)
+    xy = block.xy + np.random.default_rng(1).normal(size=block.xy.shape)
+    model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen, own, common = Seen(block.view, block.point, xy), np.array([0, 3]), np.array([4, 5])
+    plain, bent = Jacobians.empty(n, 8, 2), Jacobians.empty(n, 8, 2)
+    for J, least in ((plain, 1.0), (bent, 0.2)):
+        linearize_metric(model, seen, Weighing(1.0, LOSS_CODES[loss], 1.1, least), own, common, J)
+    for a, b in ((plain.A, bent.A), (plain.E, bent.E), (plain.B, bent.B)):
+        gradient = np.einsum("kic,ki->kc", a, plain.residual)
+        np.testing.assert_allclose(np.einsum("kic,ki->kc", b, bent.residual), gradient, rtol=1e-9, atol=1e-9)
+    # Curvature of rho along the residual e over that of plain reweighting, by differences of its slope in s.
+    e = project_block(c, block.X, block.view, block.point) - xy
+    s, rho = np.sum(e**2, axis=1), LOSSES[loss]
+    slope = (rho(s * 1.00001, 1.1)[1] - rho(s * 0.99999, 1.1)[1]) / (2e-5 * s)
+    expected = np.maximum(1.0 + 2.0 * s * slope / rho(s, 1.1)[1], 0.2)
+    along = np.einsum("kic,ki->kc", plain.A, e)[:, 4] ** 2, np.einsum("kic,ki->kc", bent.A, e)[:, 4] ** 2
+    np.testing.assert_allclose(along[1] / along[0], expected, rtol=2e-3, atol=2e-3)
+
+
+def test_leverages_are_the_diagonal_of_the_projection_onto_the_points():
+    rng = np.random.default_rng(0)
+    start, B, leverage = np.array([0, 3, 3, 7]), rng.normal(size=(7, 2, 3)), np.empty((7, 2))
+    sum_leverages(start, B, leverage)
+    for s, e in ((0, 3), (3, 7)):
+        J = B[s:e].reshape(-1, 3)
+        np.testing.assert_allclose(leverage[s:e].ravel(), np.diag(J @ np.linalg.pinv(J)), rtol=1e-9)

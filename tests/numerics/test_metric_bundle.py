@@ -1,0 +1,392 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.numerics.bundle_scenes import make_block, perturbed, project_block
+from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.numerics import schur
+from thesisrecon.numerics.intrinsic_values import number_values
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics.metric_cameras import IntrinsicsPrior, MetricCameras
+from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics.reduced_solvers import BandedCholesky, ConjugateGradients
+
+FOCAL = np.array([True, False, False, False, False, False])
+FOCAL_CENTRE_RADIAL = np.array([True, False, False, True, True, True])
+
+
+def _seen(block, xy=None):
+    return Observations(block.view, block.point, block.xy if xy is None else xy)
+
+
+def _refine(cameras, X, seen, *, free, prior=None, **options):
+    return refine_metric_bundle(cameras, X, seen, free=free, prior=prior, options=BundleOptions(**options))
+
+
+@pytest.mark.parametrize("groups", [1, 6])
+def test_exact_observations_give_the_true_calibration_and_shape(groups):
+    block = make_block(k1=0.03, groups=groups)
+    cameras, X = perturbed(block)
+    result = _refine(cameras, X, _seen(block), free=FOCAL_CENTRE_RADIAL, max_iterations=100)
+    assert np.abs(result.residual_px).max() < 1e-3
+    np.testing.assert_allclose(result.cameras.intrinsics, block.cameras.intrinsics, rtol=1e-3, atol=2e-3)
+    aligned = estimate_similarity(result.X, block.X).apply(result.X)
+    np.testing.assert_allclose(aligned, block.X, atol=2e-3)
+    seen = project_block(result.cameras, result.X, block.view, block.point)
+    np.testing.assert_allclose(seen - block.xy, result.residual_px, atol=1e-6)
+
+
+def test_pixels_that_are_neither_square_nor_upright_are_those_of_the_model():
+    block = make_block(k1=0.03)
+    c = block.cameras
+    rows = c.intrinsics.copy()
+    rows[:, 1:3] = 1.2, 5.0
+    cameras = MetricCameras(c.R, c.t, rows, c.group)
+    xy = project_block(cameras, block.X, block.view, block.point)
+    there = _refine(cameras, block.X, _seen(block, xy), free=FOCAL, max_iterations=0)
+    np.testing.assert_allclose(there.residual_px, 0.0, atol=1e-9)
+    start = MetricCameras(c.R, c.t, rows * [1.05, 1.03, 1.0, 1.0, 1.0, 1.0], c.group)
+    free = np.array([True, True, True, False, False, True])
+    result = _refine(start, block.X, _seen(block, xy), free=free, max_iterations=100)
+    np.testing.assert_allclose(result.cameras.intrinsics, rows, rtol=1e-3, atol=2e-3)
+
+
+def test_a_lens_of_three_coefficients_comes_back():
+    block = make_block(k1=0.03, lens=(-0.04, 0.05), points=150)
+    cameras, X = perturbed(block)
+    free = np.array([True, False, False, True, True, True, True, True])
+    result = _refine(cameras, X, _seen(block), free=free, max_iterations=200, covariance=True)
+    assert np.abs(result.residual_px).max() < 1e-3
+    np.testing.assert_allclose(result.cameras.intrinsics, block.cameras.intrinsics, rtol=5e-3, atol=2e-3)
+    assert result.intrinsics_covariance.shape == (1, 8, 8)
+    assert (np.diag(result.intrinsics_covariance[0])[3:] > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    "solver", [BandedCholesky(np.arange(6), 5), ConjugateGradients()], ids=["band", "cg"]
+)
+@pytest.mark.parametrize("groups", [1, 6])
+def test_every_solver_leads_to_the_same_optimum(monkeypatch, solver, groups):
+    block = make_block(k1=0.03, groups=groups, points=150)
+    cameras, X = perturbed(block)
+    seen = _seen(block, block.xy + 0.3 * np.random.default_rng(0).normal(size=block.xy.shape))
+    dense = _refine(cameras, X, seen, free=FOCAL_CENTRE_RADIAL, max_iterations=100)
+    monkeypatch.setattr(schur, "choose_solver", lambda *_: solver)
+    other = _refine(cameras, X, seen, free=FOCAL_CENTRE_RADIAL, max_iterations=100)
+    assert other.converged
+    assert other.cost == pytest.approx(dense.cost, rel=1e-6)
+    np.testing.assert_allclose(other.cameras.intrinsics[:, 0], dense.cameras.intrinsics[:, 0], rtol=1e-3)
+
+
+def test_cost_does_not_depend_on_the_frame():
+    block = make_block()
+    cameras, X = perturbed(block)
+    xy = block.xy + 0.5 * np.random.default_rng(0).normal(size=block.xy.shape)
+    first = _refine(cameras, X, _seen(block, xy), free=FOCAL, max_iterations=60)
+    s, shift, Q = 250.0, np.array([1e4, -3e3, 8e3]), block.cameras.R[2]
+    moved = MetricCameras(
+        cameras.R @ Q.T, s * cameras.t - cameras.R @ Q.T @ shift, cameras.intrinsics, cameras.group
+    )
+    second = _refine(moved, s * X @ Q.T + shift, _seen(block, xy), free=FOCAL, max_iterations=60)
+    assert second.initial_cost == pytest.approx(first.initial_cost, rel=1e-6)
+    assert second.cost == pytest.approx(first.cost, rel=1e-5)
+    np.testing.assert_allclose(second.cameras.intrinsics, first.cameras.intrinsics, rtol=1e-4)
+
+
+def _noisy_fits(block, count, sigma, **options):
+    rng = np.random.default_rng(11)
+    for _ in range(count):
+        xy = block.xy + sigma * rng.normal(size=block.xy.shape)
+        yield _refine(
+            block.cameras, block.X, _seen(block, xy), free=FOCAL_CENTRE_RADIAL, loss_px=100.0,
+            sigma_px=sigma, max_iterations=10, covariance=True, **options,
+        )  # fmt: skip
+
+
+def test_covariance_and_sigma_agree_with_monte_carlo():
+    block = make_block(points=60)
+    fits = list(_noisy_fits(block, 150, 0.4))
+    q = np.array([fit.cameras.intrinsics[0] for fit in fits])[:, FOCAL_CENTRE_RADIAL]
+    predicted = np.array([np.diag(fit.intrinsics_covariance[0]) for fit in fits])[:, FOCAL_CENTRE_RADIAL]
+    ratio = q.std(axis=0) / np.sqrt(predicted.mean(axis=0))
+    # A standard deviation from 150 samples is itself known to 6 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.25)
+    assert np.mean([fit.sigma_px for fit in fits]) == pytest.approx(0.4, rel=0.05)
+
+
+def test_views_without_observations_do_not_change_the_covariance():
+    block = make_block(views=5, points=40)
+    c = block.cameras
+    extra = MetricCameras(
+        np.concatenate([c.R, np.eye(3)[None]]),
+        np.concatenate([c.t, np.ones((1, 3))]),
+        c.intrinsics,
+        np.zeros(6, int),
+    )
+    xy = block.xy + 0.2 * np.random.default_rng(3).normal(size=block.xy.shape)
+    fits = [_refine(start, block.X, _seen(block, xy), free=FOCAL, covariance=True) for start in (c, extra)]
+    np.testing.assert_allclose(fits[1].intrinsics_covariance, fits[0].intrinsics_covariance, rtol=1e-9)
+    np.testing.assert_allclose(fits[1].pose_covariance[:5], fits[0].pose_covariance, rtol=1e-9)
+    assert not fits[1].pose_covariance[5].any()
+
+
+def test_intrinsics_covariance_is_that_of_the_dense_normal_matrix_in_another_gauge():
+    block = make_block(views=4, points=25)
+    xy = block.xy + 0.2 * np.random.default_rng(3).normal(size=block.xy.shape)
+    fit = _refine(block.cameras, block.X, _seen(block, xy), free=FOCAL, loss_px=100.0, covariance=True)
+    c, h = fit.cameras, 1e-6
+    n_pose, n_points = 6 * 3, 3 * len(fit.X)
+
+    def project(x):
+        # The first camera stays, and so does one coordinate of the second one's position (the scale).
+        pose = np.zeros((4, 6))
+        pose[1:] = x[:n_pose].reshape(3, 6)
+        turn = Rotation.from_rotvec(pose[:, :3]).as_matrix()
+        q = c.intrinsics.copy()
+        q[0, 0] *= np.exp(x[-1])
+        t = np.einsum("vab,vb->va", turn, c.t) + pose[:, 3:]
+        moved = MetricCameras(turn @ c.R, t, q, c.group)
+        return project_block(moved, fit.X + x[n_pose:-1].reshape(-1, 3), block.view, block.point).ravel()
+
+    size = n_pose + n_points + 1
+    J = np.column_stack([(project(h * e) - project(-h * e)) / (2 * h) for e in np.eye(size)])
+    J = np.delete(J, 3, axis=1)
+    expected = fit.sigma_px**2 * np.linalg.inv(J.T @ J)[-1, -1] * c.intrinsics[0, 0] ** 2
+    assert fit.intrinsics_covariance[0, 0, 0] == pytest.approx(expected, rel=1e-3)
+    assert np.count_nonzero(fit.intrinsics_covariance) == 1
+    assert fit.pose_covariance.shape == (4, 6, 6)
+    assert (np.linalg.eigvalsh(fit.pose_covariance) > -1e-12).all()
+
+
+def test_a_tight_prior_holds_and_a_loose_one_yields():
+    block = make_block()
+    mean = block.cameras.intrinsics.copy()
+    mean[:, 0] *= 1.1
+
+    def focal(std_rel):
+        std = np.full((1, 6), np.inf)
+        std[0, 0] = std_rel
+        return _refine(
+            block.cameras, block.X, _seen(block), free=FOCAL, max_iterations=50,
+            prior=IntrinsicsPrior(mean, std), sigma_px=0.3,
+        ).cameras.intrinsics[0, 0]  # fmt: skip
+
+    assert focal(1e-7) == pytest.approx(mean[0, 0], rel=1e-3)
+    assert focal(1.0) == pytest.approx(1200.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "soft_l1"])
+def test_outliers_hardly_move_the_focal_under_a_robust_loss(loss):
+    block = make_block(points=150)
+    rng = np.random.default_rng(9)
+    xy = block.xy + 0.2 * rng.normal(size=block.xy.shape)
+    wrong = rng.choice(len(xy), 20, replace=False)
+    xy[wrong] += rng.uniform(15.0, 40.0, size=(20, 2))
+    result = _refine(
+        block.cameras,
+        block.X,
+        _seen(block, xy),
+        free=FOCAL,
+        loss=loss,
+        loss_px=0.5,
+        max_iterations=60,
+    )
+    assert result.cameras.intrinsics[0, 0] == pytest.approx(1200.0, rel=5e-3)
+    assert result.sigma_px < 0.35
+
+
+def test_fixed_and_unseen_parts_come_back_untouched():
+    block = make_block()
+    cameras, X = perturbed(block)
+    X = np.concatenate([X, [[9.0, 9.0, 9.0]]])
+    fixed = np.array([True, False, False, False, False, True])
+    result = _refine(
+        cameras,
+        X,
+        _seen(block),
+        free=np.zeros(6, bool),
+        fixed_views=fixed,
+        covariance=True,
+    )
+    np.testing.assert_array_equal(result.cameras.R[fixed], cameras.R[fixed])
+    np.testing.assert_array_equal(result.cameras.t[fixed], cameras.t[fixed])
+    np.testing.assert_array_equal(result.cameras.intrinsics, cameras.intrinsics)
+    np.testing.assert_array_equal(result.X[-1], X[-1])
+    assert result.cost < result.initial_cost
+    assert not result.pose_covariance[fixed].any()
+
+
+def test_degenerate_and_wrong_input_is_guarded():
+    block = make_block()
+    c = block.cameras
+    empty = np.zeros(0, dtype=np.int64)
+    nothing = _refine(c, block.X, Observations(empty, empty, np.zeros((0, 2))), free=FOCAL, covariance=True)
+    assert nothing.cost == 0.0
+    # All cameras at one place: depths are free, nothing may raise.
+    same = MetricCameras(c.R, np.zeros_like(c.t), c.intrinsics, c.group)
+    far = np.tile([0.0, 0.0, 5.0], (len(block.X), 1))
+    turned = _refine(same, far + 0.1 * block.X, _seen(block), free=FOCAL, covariance=True)
+    assert turned.cost <= turned.initial_cost
+    assert np.isfinite(turned.X).all()
+    with pytest.raises(ValueError, match="6 intrinsics"):
+        _refine(c, block.X, _seen(block), free=np.ones(3, bool))
+    negative = MetricCameras(c.R, c.t, -c.intrinsics, c.group)
+    with pytest.raises(ValueError, match="positive"):
+        _refine(negative, block.X, _seen(block), free=FOCAL)
+
+
+@pytest.mark.parametrize("field", ["sigma_px", "threads", "loss_px"])
+def test_options_that_mean_nothing_are_refused(field):
+    with pytest.raises(ValueError, match=r"positive|needs a thread"):
+        BundleOptions(**{field: 0})
+
+
+def test_wrong_calls_are_refused():
+    block = make_block(views=4, points=20)
+    c, q = block.cameras, block.cameras.intrinsics
+    seen, known = _seen(block), np.ones_like(q)
+
+    def refused(match, cameras=c, observations=seen, prior=None, **options):
+        with pytest.raises(ValueError, match=match):
+            _refine(cameras, block.X, observations, free=FOCAL, prior=prior, **options)
+
+    refused("metric bundle needs", MetricCameras(c.R, c.t[:2], q, c.group))
+    refused("shared has a number", MetricCameras(c.R, c.t, q, c.group, np.zeros(6, dtype=np.int64)))
+    refused("groups must lie", MetricCameras(c.R, c.t, q, c.group + 1))
+    refused("observations need", observations=Observations(block.view, block.point[1:], block.xy))
+    refused("fixed_views is one flag", fixed_views=np.zeros(3, bool))
+    refused("prior of shape", prior=IntrinsicsPrior(q, -known))
+    refused("population needs its spread", prior=IntrinsicsPrior(q, known, np.zeros(1, int)))
+    refused("above 0", prior=IntrinsicsPrior(q, known, np.zeros(1, int), np.zeros(6)))
+
+
+def _varied(block, focals, *, seed=4, sigma=0.0):
+    """The block with a focal of its own for each view, principal point and k1 common to all."""
+    c = block.cameras
+    rows = np.tile(c.intrinsics[0], (len(c.R), 1))
+    rows[:, 0] = focals
+    shared = np.zeros(rows.shape, dtype=np.int64)
+    shared[:, 0] = np.arange(len(rows))
+    cameras = MetricCameras(c.R, c.t, rows, np.arange(len(rows)), shared)
+    xy = project_block(cameras, block.X, block.view, block.point)
+    return cameras, xy + sigma * np.random.default_rng(seed).normal(size=xy.shape)
+
+
+def test_focals_of_their_own_beside_a_common_principal_point_and_distortion():
+    block = make_block(k1=0.02, points=120)
+    focals = np.array([900.0, 1100.0, 1500.0, 1250.0, 1000.0, 1300.0])
+    cameras, xy = _varied(block, focals)
+    start = cameras.intrinsics.copy()
+    start[:, 0] *= 1.0 + 0.03 * np.cos(np.arange(6))
+    start[:, 3:5] += [6.0, -5.0]
+    moved = MetricCameras(cameras.R, cameras.t, start, cameras.group, cameras.shared)
+    fit = _refine(moved, block.X, _seen(block, xy), free=FOCAL_CENTRE_RADIAL, max_iterations=100)
+    np.testing.assert_allclose(fit.cameras.intrinsics, cameras.intrinsics, rtol=1e-3, atol=2e-3)
+    assert (fit.cameras.intrinsics[:, 3:] == fit.cameras.intrinsics[0, 3:]).all()
+    assert len(np.unique(fit.cameras.intrinsics[:, 0])) == 6
+
+
+def test_all_shared_by_the_table_is_one_row_for_all():
+    block = make_block(k1=0.02)
+    cameras, X = perturbed(block)
+    xy = block.xy + 0.3 * np.random.default_rng(0).normal(size=block.xy.shape)
+    rows = np.tile(cameras.intrinsics, (6, 1))
+    tied = MetricCameras(cameras.R, cameras.t, rows, np.arange(6), np.zeros((6, 6), dtype=np.int64))
+    fits = [
+        _refine(c, X, _seen(block, xy), free=FOCAL_CENTRE_RADIAL, max_iterations=60, covariance=True)
+        for c in (cameras, tied)
+    ]
+    assert fits[1].cost == pytest.approx(fits[0].cost, rel=1e-6)
+    np.testing.assert_allclose(fits[1].cameras.intrinsics[3], fits[0].cameras.intrinsics[0], rtol=1e-4)
+    np.testing.assert_allclose(
+        fits[1].intrinsics_covariance[3], fits[0].intrinsics_covariance[0], rtol=2e-2, atol=1e-7
+    )
+
+
+def test_a_std_of_zero_holds_one_camera_at_its_mean_while_others_move():
+    block = make_block(groups=6)
+    mean = block.cameras.intrinsics.copy()
+    std = np.full_like(mean, np.inf)
+    std[2, 0], mean[2, 0] = 0.0, 1234.0
+    fit = _refine(
+        block.cameras, block.X, _seen(block), free=FOCAL, prior=IntrinsicsPrior(mean, std), covariance=True
+    )
+    assert fit.cameras.intrinsics[2, 0] == pytest.approx(1234.0, rel=1e-12)
+    assert not fit.intrinsics_covariance[2].any()
+    others = np.delete(np.arange(6), 2)
+    assert (fit.intrinsics_covariance[others, 0, 0] > 0.0).all()
+    assert (np.abs(fit.cameras.intrinsics[others, 0] - 1200.0) > 1e-3).all()
+
+
+def test_a_camera_without_a_determined_focal_borrows_from_its_population():
+    block = make_block(points=150)
+    focals = 1200.0 * np.exp(0.02 * np.array([-1.0, 0.5, 1.0, -0.5, 0.3, 0.8]))
+    cameras, xy = _varied(block, focals, sigma=0.3)
+    # View 5 keeps three points: a pose, but hardly a focal of its own.
+    kept = (block.view != 5) | (np.cumsum(block.view == 5) <= 3)
+    seen = Observations(block.view[kept], block.point[kept], xy[kept])
+    start = cameras.intrinsics.copy()
+    start[5, 0] = 3000.0
+    start = MetricCameras(cameras.R, cameras.t, start, cameras.group, cameras.shared)
+    spread = np.array([0.02, *[np.inf] * 5])
+    nothing = np.full_like(cameras.intrinsics, np.inf)
+    prior = IntrinsicsPrior(cameras.intrinsics, nothing, np.zeros(6, dtype=np.int64), spread)
+    fit = _refine(
+        start, block.X, seen, free=FOCAL, prior=prior, sigma_px=0.3, max_iterations=100, covariance=True
+    )
+    f = fit.cameras.intrinsics[:, 0]
+    np.testing.assert_allclose(f[:5], focals[:5], rtol=0.01)
+    common = np.exp(np.log(f[:5]).mean())
+    std = np.sqrt(fit.intrinsics_covariance[:, 0, 0]) / f
+    assert abs(np.log(f[5] / common)) < 0.03
+    # It is as uncertain as a member drawn at random: spread, and the mean known from five others.
+    assert std[5] == pytest.approx(0.02 * np.sqrt(1.0 + 1.0 / 5.0), rel=0.15)
+    assert (std[:5] < 0.01).all()
+
+
+def test_the_population_is_the_quadratic_form_of_deviations_from_its_mean():
+    block = make_block()
+    cameras, _ = _varied(block, np.array([1000.0, 1100.0, 1200.0, 1300.0, 1400.0, 1500.0]))
+    std = np.full_like(cameras.intrinsics, np.inf)
+    std[1, 0], std[4, 0] = 0.0, 0.1
+    population = np.array([0, 0, 0, 0, 7, -1])
+    spread = np.array([0.05, np.inf, np.inf, np.inf, np.inf, np.inf])
+    prior = IntrinsicsPrior(cameras.intrinsics, std, population, spread)
+    values, x, table = number_values(cameras, np.ones(6, bool), FOCAL, prior)
+    np.testing.assert_allclose(table, cameras.intrinsics, rtol=1e-14)
+    assert (values.seen, values.size) == (5, 6)
+    log_f = np.log(cameras.intrinsics[:4, 0])
+    x[-1] = log_f.mean()
+    expected = np.sum((log_f - log_f.mean()) ** 2) / 0.05**2 / 2.0
+    assert values.links.cost(x) == pytest.approx(expected)
+    # Free values at the rows of 0, 2, 3 once the mean is marginalised: (I - 11'/4) / tau^2 of four members.
+    Q = values.links.information(values.size)
+    marginal = Q[:5, :5] - np.outer(Q[:5, 5], Q[5, :5]) / Q[5, 5]
+    np.testing.assert_allclose(marginal[:3, :3], (np.eye(3) - 0.25) / 0.05**2, atol=1e-9)
+    np.testing.assert_allclose(marginal[3:, 3:], np.diag([100.0, 0.0]), atol=1e-9)
+    step = 1e-6 * np.eye(6)
+    slope = [(values.links.cost(x + h) - values.links.cost(x - h)) / 2e-6 for h in step]
+    np.testing.assert_allclose(values.links.gradient(x), slope, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("shared", "distinct"), [(None, [0, 1, 2, 3, 4, 5]), ([0, 0, 1, 2, 2, 3], [0, 2, 3, 5])]
+)
+def test_a_population_counts_a_value_that_cameras_share_once(shared, distinct):
+    cameras, _ = _varied(make_block(), np.array([1000.0, 1100.0, 1200.0, 1300.0, 1400.0, 1500.0]))
+    table = None
+    if shared is not None:
+        table = np.tile(np.arange(6)[:, None], (1, 6))
+        table[:, 0] = shared
+        first = np.array([distinct[value] for value in shared])
+        cameras.intrinsics[:, 0] = cameras.intrinsics[first, 0]
+    cameras = MetricCameras(cameras.R, cameras.t, cameras.intrinsics, cameras.group, table)
+    nothing = np.full_like(cameras.intrinsics, np.inf)
+    prior = IntrinsicsPrior(
+        cameras.intrinsics, nothing, np.zeros(6, np.int64), np.array([0.05, *[np.inf] * 5])
+    )
+    values, x, _ = number_values(cameras, np.ones(6, bool), FOCAL, prior)
+    log_f = np.log(cameras.intrinsics[distinct, 0])
+    assert values.size == len(distinct) + 1
+    x[-1] = log_f.mean()
+    assert values.links.cost(x) == pytest.approx(np.sum((log_f - log_f.mean()) ** 2) / 0.05**2 / 2.0)

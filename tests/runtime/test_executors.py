@@ -1,0 +1,312 @@
+"""Whoever does the work, the answers are the same bytes; whoever is lost, the run goes on."""
+
+from __future__ import annotations
+
+import builtins
+import concurrent.futures as futures
+import hashlib
+import logging
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests import fake_stages as fakes
+from tests.clusters import address
+from tests.fake_stages import fake_config, photographs
+from thesisrecon.cli.main import run_command
+from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.errors import UsageError, WorkersLost
+from thesisrecon.io.files import read_json
+from thesisrecon.pipeline import state as preparing
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.pipeline.state import PreparedViews, batches_of_pairs
+from thesisrecon.runtime import dask_cluster as cluster
+from thesisrecon.runtime import executors as workers
+from thesisrecon.runtime.executors import Workers
+
+COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
+NO_RESULT = ("seconds", "elapsed_seconds", "peak_memory_mb", "threads", "executor", "resumed")
+"""What a summary says of how it came about."""
+
+
+def results(out: Path) -> dict[str, Any]:
+    """Every result file of a run by its hash, and its summary without times."""
+    files = [
+        *out.glob("0*/*.npz"),
+        *(out / "sparse").rglob("*.bin"),
+        *out.glob("*.ply"),
+        out / "cameras.json",
+    ]
+    found: dict[str, Any] = {
+        str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)
+    }
+    model = out / "model.glb"
+    found["model"] = hashlib.sha256(model.read_bytes()).hexdigest() if model.exists() else ""
+    summary = read_json(out / "summary.json")
+    return found | {"summary": {name: v for name, v in summary.items() if name not in NO_RESULT}}
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path]:
+    """Four photographs of the courtyard, and their run with one worker."""
+    place = tmp_path_factory.mktemp("serial")
+    images = sorted(COURTYARD.iterdir())[4:8]
+    small_job(images, place / "out", threads=1)
+    return images, place / "out"
+
+
+def small_job(images: list[Path], out: Path, **options: Any) -> None:
+    config = replace(PipelineConfig(), images=ImageOptions(max_size_px=400))
+    reconstruct(images, out, config=config, until="metric", **options)
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes", "dask", "shuffled"])
+def test_the_sparse_job_has_the_same_bytes_whoever_does_it(
+    kind: str, serial: tuple[list[Path], Path], tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    images, out = serial
+    if kind == "shuffled":
+        images = [images[k] for k in np.random.default_rng(3).permutation(len(images))]
+        assert images != serial[0]
+    executor = {"processes": "processes", "dask": ""}.get(kind, "local")
+    if kind == "dask":
+        executor = address(request.getfixturevalue("dask_cluster"))
+    small_job(images, tmp_path, threads=2, executor=executor)
+    assert results(tmp_path) == results(out)
+    assert read_json(tmp_path / "summary.json")["executor"] == executor
+
+
+def test_surfaces_have_the_same_bytes_on_a_cluster_and_in_an_executor_of_ones_own(
+    dask_cluster: Any, tmp_path: Path
+) -> None:
+    """Through all that fans out, with fake stages."""
+    given: dict[str, Any] = {"config": fake_config(), "threads": 2}
+    reconstruct(photographs(4), tmp_path / "a", **given)
+    reconstruct(photographs(4), tmp_path / "b", executor=address(dask_cluster), **given)
+    with futures.ThreadPoolExecutor(2) as pool:
+        reconstruct(photographs(4), tmp_path / "c", executor=pool, **given)
+        assert pool.submit(int).result() == 0, "an executor of the caller's is not shut down"
+    assert results(tmp_path / "a")["model"]
+    assert results(tmp_path / "a") == results(tmp_path / "b") == results(tmp_path / "c")
+    assert read_json(tmp_path / "c" / "summary.json")["executor"] == "ThreadPoolExecutor"
+
+
+@dataclass(frozen=True)
+class DeadlyMatcher(fakes.FakeMatcher):
+    """Kills the process it works in, once: when it comes to a pair and the file is not there."""
+
+    told: str = ""
+    fatal: tuple[int, int] = (1, 2)
+
+    def match(self, view1: Any, view2: Any, *, pair: Any, estimate_fundamental: Any, rng: Any) -> Any:
+        if tuple(pair) == self.fatal:
+            try:
+                os.close(os.open(self.told, os.O_CREAT | os.O_EXCL))
+            except FileExistsError:
+                pass
+            else:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return super().match(view1, view2, pair=pair, estimate_fundamental=estimate_fundamental, rng=rng)
+
+
+def deadly(tmp_path: Path) -> PipelineConfig:
+    return fake_config(matching=DeadlyMatcher(told=str(tmp_path / "killed")))
+
+
+def undisturbed(tmp_path: Path) -> dict[str, Any]:
+    (tmp_path / "killed").touch()
+    reconstruct(photographs(4), tmp_path / "whole", config=deadly(tmp_path), until="metric", threads=1)
+    (tmp_path / "killed").unlink()
+    return results(tmp_path / "whole")
+
+
+def test_a_worker_of_a_cluster_that_is_killed_loses_nothing(dask_cluster: Any, tmp_path: Path) -> None:
+    whole = undisturbed(tmp_path)
+    executor, config = address(dask_cluster), deadly(tmp_path)
+    reconstruct(photographs(4), tmp_path / "out", config=config, until="metric", executor=executor)
+    assert (tmp_path / "killed").exists()
+    assert results(tmp_path / "out") == whole
+
+
+def test_a_worker_process_that_is_killed_is_told_and_the_run_goes_on(tmp_path: Path) -> None:
+    whole, config = undisturbed(tmp_path), deadly(tmp_path)
+    given: dict[str, Any] = {"config": config, "until": "metric", "threads": 2, "executor": "processes"}
+    with pytest.raises(
+        WorkersLost, match=r"ended unexpectedly .* \(in the stage matches\).* goes on from there"
+    ):
+        reconstruct(photographs(4), tmp_path / "out", **given)
+    reconstruct(photographs(4), tmp_path / "out", **given)
+    assert results(tmp_path / "out") == whole
+
+
+@pytest.fixture
+def lonely() -> Iterator[tuple[str, Any]]:
+    """A scheduler and its worker in this process, to be closed in the middle."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp://",
+        host="127.0.0.1",
+        dashboard_address=":0",
+        worker_dashboard_address=None,
+        silence_logs=logging.ERROR,
+    ) as running:
+        yield address(running), running
+
+
+def test_a_scheduler_that_dies_in_the_middle_is_told_and_the_run_goes_on(
+    lonely: tuple[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    executor, running = lonely
+    monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
+    monkeypatch.setattr(workers, "PATIENCE_S", 0.5)
+
+    def close_at_matches(stage: str, done: int, _: int) -> None:
+        if stage == "matches" and done == 2:
+            running.close()
+
+    config = fake_config(matching=SlowMatcher())
+    with pytest.raises(WorkersLost, match=r"scheduler at 127\.0\.0\.1:\d+ is gone \(in the stage matches\)"):
+        reconstruct(
+            photographs(4),
+            tmp_path,
+            config=config,
+            until="metric",
+            executor=executor,
+            progress=close_at_matches,
+        )
+    assert len(list((tmp_path / "02-matches").glob("*.npz"))) >= 2
+    result = reconstruct(photographs(4), tmp_path, config=config, until="metric")
+    assert result.metric is not None
+
+
+@dataclass(frozen=True)
+class SlowMatcher(fakes.FakeMatcher):
+    def match(self, *views: Any, **given: Any) -> Any:
+        time.sleep(0.2)
+        return super().match(*views, **given)
+
+
+@pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])
+def test_an_address_that_is_none_is_refused_before_anything_is_made(port: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"dask://HOST:PORT, for instance .* got 'dask://there"):
+        reconstruct(photographs(2), tmp_path / "out", config=fake_config(), executor=f"dask://there:{port}")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    found = builtins.__import__
+
+    def without(name: str, *given: Any, **more: Any) -> Any:
+        if name.split(".")[0] == "distributed":
+            raise ImportError(name)
+        return found(name, *given, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(UsageError, match=r"not installed; install thesisrecon\[distributed\]"):
+        reconstruct(photographs(2), tmp_path / "out", config=fake_config(), executor="dask://localhost:8786")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scheduler_that_does_not_answer_is_told_on_the_command_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = ["reconstruct", str(COURTYARD), "-o", str(tmp_path / "out")]
+    assert run_command([*command, "--executor", f"dask://127.0.0.1:{port}"]) == 2
+    said = capsys.readouterr().err
+    assert f"no Dask scheduler answers at 127.0.0.1:{port}" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_worker_with_other_code_is_refused() -> None:
+    with pytest.raises(UsageError, match="another version of thesisrecon"):
+        workers._answer("another", b"")
+
+
+def test_a_task_that_a_worker_cannot_load_is_named() -> None:
+    missing = b"cno_such_module\nfunction\n."
+    with pytest.raises(UsageError, match="cannot load its task: No module named 'no_such_module'"):
+        workers._answer(workers.package_key(), missing)
+
+
+def test_what_is_no_executor_is_refused() -> None:
+    with pytest.raises(UsageError, match="or a concurrent"):
+        Workers(1, 3)  # type: ignore[arg-type]
+
+
+def test_an_executor_is_given_few_tasks_at_a_time() -> None:
+    """Large sets must not lie in memory as tasks."""
+    asked, done = 0, 0
+
+    def tasks() -> Iterator[tuple[int]]:
+        nonlocal asked
+        for n in range(50):
+            asked += 1
+            assert asked - done <= 2 * workers.AHEAD + 2
+            yield (n,)
+
+    def finished(_: int, __: Any) -> None:
+        nonlocal done
+        done += 1
+
+    with futures.ThreadPoolExecutor(2) as pool:
+        Workers(2, pool).run(abs, tasks(), finished)
+    assert done == 50
+
+
+def test_workers_may_become_fewer_in_the_middle() -> None:
+    there, done = iter([4]), list[int]()
+    with futures.ThreadPoolExecutor(1) as pool:
+        remote = workers._Remote(pool, lambda: next(there, 1))
+        workers._hand_out(remote, (abs, False), [(n,) for n in range(20)], lambda n, _: done.append(n))
+    assert sorted(done) == list(range(20))
+
+
+def test_what_is_prepared_stays_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    class Counting(fakes.FakeMatcher):
+        def prepare(self, image: Any, features: Any) -> Any:
+            del image
+            made.append(features)
+            return np.zeros(100)
+
+    monkeypatch.setattr(preparing, "KEPT_BYTES", 4 * 800)
+    views = PreparedViews(Counting(), {i: (None, i) for i in range(6)})  # type: ignore[misc]
+    assert [len(view) for view in views] == [100] * 6
+    assert [views[5] is views[5], made] == [True, [0, 1, 2, 3, 4, 5]]
+    assert len(views[0]) == 100
+    assert made[-1] == 0
+    assert len(views.part([4, 5])) == 2
+    with pytest.raises(IndexError):
+        views.part([4, 5])[0]
+
+
+@pytest.mark.parametrize(("pairs", "workers_there"), [(91, 2), (7, 4), (3000, 2)])
+def test_batches_hold_every_pair_once_and_few_views(pairs: int, workers_there: int) -> None:
+    views = next(n for n in range(100) if n * (n - 1) // 2 >= pairs)
+    every = [(i, j) for i in range(views) for j in range(i + 1, views)][:pairs]
+    numbers = list(range(0, pairs, 2))
+    dealt = batches_of_pairs(every, numbers, workers_there)
+    assert sorted(n for batch in dealt for n in batch) == numbers
+    assert len(dealt) >= min(len(numbers), 8 * workers_there)
+    assert min(len(batch) for batch in dealt[:-1]) == max(len(batch) for batch in dealt)
+    for batch in dealt:
+        assert len(batch) <= preparing.LARGEST_BATCH
+        assert len({view for n in batch for view in every[n]}) <= 6 * len(batch) ** 0.5

@@ -1,0 +1,251 @@
+"""The run directory: records survive, damage is noticed, another run's folder is left alone."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thesisrecon.errors import UsageError
+from thesisrecon.io.files import read_json, write_atomically
+from thesisrecon.records import (
+    Features,
+    IntrinsicInterval,
+    MetricResult,
+    Reconstruction,
+    Seeds,
+    StageReport,
+    Tracks,
+)
+from thesisrecon.runtime.record_files import ChangedRecord, bytes_from_record
+from thesisrecon.runtime.run_folder import RunDirectory, StageFolder, code_key, key_of
+
+
+def some_features(value: float = 1.0) -> Features:
+    seeds = Seeds(
+        np.full((2, 2), value), np.ones(2, np.float32), np.zeros(2, np.float32), np.eye(2, dtype=np.float32)
+    )
+    return Features(np.arange(6.0).reshape(3, 2), np.ones(3, np.float32), np.zeros(3, np.float32), seeds)
+
+
+def some_metric() -> MetricResult:
+    tracks = Tracks(np.zeros(1, np.int64), np.zeros(1, np.int64), np.ones((1, 2)), 2, 1)
+    reconstruction = Reconstruction(
+        stratum="metric",
+        P=np.ones((2, 3, 4)),
+        X=np.ones((1, 4)),
+        registered=np.array([True, False]),
+        valid=np.array([True]),
+        inlier=np.array([True]),
+        tracks=tracks,
+        sizes=np.array([[4, 3], [4, 3]]),
+        sigma_px=0.5,
+        reasons=("", "ünsüitable"),
+    )
+    intervals = ({"focal_px": IntrinsicInterval(100.0, 1.0, "data")}, {})
+    return MetricResult(reconstruction, intervals, {"checked": 1.0}, False, ("a doubt",))
+
+
+def test_records_survive_the_disk(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path / "01")
+    folder.save("a", "key", some_features())
+    folder.save("b", "key", some_metric())
+    features, metric = folder.load("a", "key"), folder.load("b", "key")
+    np.testing.assert_array_equal(features.seeds.patches, np.eye(2, dtype=np.float32))
+    assert features.seeds.patches.dtype == np.float32
+    assert metric.reconstruction.reasons == ("", "ünsüitable")
+    assert metric.reconstruction.K is None
+    assert metric.intrinsics[0]["focal_px"] == IntrinsicInterval(100.0, 1.0, "data")
+    assert metric.failed_checks == ("a doubt",)
+    assert metric.reconstruction.registered.dtype == np.bool_
+
+
+def test_equal_records_give_equal_bytes() -> None:
+    assert bytes_from_record(some_metric(), "k") == bytes_from_record(some_metric(), "k")
+    assert bytes_from_record(some_features(1.0), "k") != bytes_from_record(some_features(2.0), "k")
+
+
+def test_another_key_and_absence_mean_compute_and_damage_is_told(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path)
+    assert folder.load("a", "key") is None
+    folder.save("a", "key", some_features())
+    assert folder.load("a", "other") is None
+    good = (tmp_path / "a.npz").read_bytes()
+    for bad in (b"", b"text", good[: len(good) // 2], good[:300] + b"\0" * 40 + good[340:]):
+        (tmp_path / "a.npz").write_bytes(bad)
+        with pytest.raises(ChangedRecord, match=r"a\.npz: "):
+            folder.load("a", "key")
+
+
+def test_a_pickle_is_never_loaded(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", description=np.array([{"key": "key"}], dtype=object))
+    with pytest.raises(ChangedRecord, match="allow_pickle"):
+        StageFolder(tmp_path).load("a", "key")
+
+
+def test_the_manifest_ends_a_stage_and_sweeps_what_is_no_longer_part_of_it(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path)
+    folder.save("old", "1", some_features())
+    folder.save("new", "2", some_features())
+    report = StageReport("features", 1.5, {"images": 1}, {"x": 0.5}, ("a warning",))
+    folder.finish(report, {"kind": "k"}, {"new": "2"})
+    assert not (tmp_path / "old.npz").exists()
+    assert folder.finished({"new": "2"}) == report
+    assert folder.finished({"new": "3"}) is None
+    (tmp_path / "manifest.json").write_text("{")
+    assert folder.finished({"new": "2"}) is None
+
+
+def test_keys_tell_values_types_and_arrays_apart() -> None:
+    keys = [key_of(1), key_of("1"), key_of(1, 1), key_of(np.arange(3)), key_of(np.arange(3.0)), key_of(None)]
+    assert len(set(keys)) == len(keys)
+    assert key_of({"a": 1, "b": 2}) == key_of({"b": 2, "a": 1})
+    with pytest.raises(TypeError, match="plain values"):
+        key_of(object())
+
+
+def test_stages_have_different_code() -> None:
+    assert code_key("thesisrecon.features.harris") != code_key("thesisrecon.matching.strength")
+
+
+IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "photographs": {"a.jpg": "1", "b.jpg": "2"}}
+
+
+def test_the_same_run_is_resumed_and_another_is_refused_with_what_differs(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "new" / "out")
+    with directory.claimed(IDENTITY, overwrite=False):
+        directory.adopt(IDENTITY, overwrite=False)
+        directory.stage("01").save("a", "key", some_features())
+    with directory.claimed(IDENTITY, overwrite=False):
+        directory.adopt(IDENTITY, overwrite=False)
+    changed = [
+        ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 there and is 6 here"),
+        ({**IDENTITY, "seed": 1}, "seed was 0 there and is 1"),
+        ({**IDENTITY, "photographs": {"a.jpg": "1"}}, "without 'b.jpg'"),
+        ({**IDENTITY, "photographs": {"a.jpg": "1", "b.jpg": "3"}}, "a changed 'b.jpg'"),
+        (
+            {**IDENTITY, "photographs": {"a.jpg": "1", "b.jpg": "2", "c.jpg": "4", "d.jpg": "5"}},
+            "new 'c.jpg' and 1 more",
+        ),
+    ]
+    for identity, words in changed:
+        with pytest.raises(UsageError, match=words), directory.claimed(identity, overwrite=False):
+            pass
+    assert read_json(directory.path / "run.json") == IDENTITY
+    assert directory.stage("01").load("a", "key") is not None
+    with directory.claimed(changed[0][0], overwrite=True):
+        assert directory.stage("01").load("a", "key") is not None
+
+
+def test_settings_are_judged_before_the_photographs_are_known(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path)
+    with directory.claimed(IDENTITY, overwrite=False):
+        directory.adopt(IDENTITY, overwrite=False)
+    wishes = {name: value for name, value in IDENTITY.items() if name != "photographs"}
+    with directory.claimed(wishes, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
+        directory.adopt({**IDENTITY, "photographs": {"a.jpg": "1"}}, overwrite=False)
+    with (
+        pytest.raises(UsageError, match="seed was 0"),
+        directory.claimed({**wishes, "seed": 2}, overwrite=False),
+    ):
+        pass
+
+
+def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "out")
+    results = ["summary.json", "sparse/0/cameras.bin", "absent.txt"]
+
+    def adopt(seed: int) -> None:
+        identity = {**IDENTITY, "seed": seed}
+        with directory.claimed(identity, overwrite=True):
+            directory.adopt(identity, overwrite=True, results=results)
+
+    adopt(0)
+    write_atomically(directory.path / "summary.json", b"{}")
+    write_atomically(directory.path / "sparse" / "0" / "cameras.bin", b"")
+    write_atomically(directory.path / "sparse" / "note.txt", b"of the user")
+    adopt(0)
+    assert (directory.path / "sparse" / "0" / "cameras.bin").exists()
+    adopt(1)
+    assert not (directory.path / "summary.json").exists()
+    assert not (directory.path / "sparse" / "0").exists()
+    assert (directory.path / "sparse" / "note.txt").exists()
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("dear")
+    with (
+        pytest.raises(UsageError, match=r"holds 'letter\.txt', which is of no run"),
+        RunDirectory(tmp_path).claimed(IDENTITY, overwrite=True),
+    ):
+        pass
+    assert not (tmp_path / "run.json").exists()
+
+
+def test_two_runs_cannot_share_a_folder(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "out")
+    with (
+        directory.claimed(IDENTITY, overwrite=False),
+        pytest.raises(UsageError, match="another run is writing"),
+        directory.claimed(IDENTITY, overwrite=False),
+    ):
+        pass
+    with directory.claimed(IDENTITY, overwrite=False):
+        pass
+
+
+def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(UsageError, match="cannot be written"),
+        RunDirectory(tmp_path / "file" / "out").claimed(IDENTITY, overwrite=False),
+    ):
+        pass
+
+
+def test_what_one_run_kept_another_takes_by_its_key(tmp_path: Path) -> None:
+    one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01-features") for name in "ab")
+    one.save("00000", "key", some_features(2.0))
+    assert two.load("00007", "other") is None
+    found = two.load("00007", "key")
+    assert bytes_from_record(found, "") == bytes_from_record(some_features(2.0), "")
+    # Taken once, it is there whatever becomes of the others.
+    (tmp_path / "shared" / "01-features" / "key.npz").unlink()
+    one.path.joinpath("00000.npz").unlink()
+    assert two.load("00007", "key") is not None
+    assert not list(tmp_path.rglob("*.partial"))
+    # What is replaced in one run stays as it was in the others.
+    two.save("00007", "new", some_features(3.0))
+    one.save("00000", "key", some_features(2.0))
+    assert two.load("00007", "new") is not None
+
+
+def test_what_is_damaged_in_one_place_is_taken_from_the_other(tmp_path: Path) -> None:
+    one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01") for name in "ab")
+    one.save("0", "key", some_features())
+    own, kept = tmp_path / "b" / "01" / "0.npz", tmp_path / "shared" / "01" / "key.npz"
+    write_atomically(own, b"damaged")
+    assert two.load("0", "key") is not None
+    assert own.read_bytes() == kept.read_bytes()
+    write_atomically(kept, b"damaged")
+    assert two.load("0", "key") is not None
+    write_atomically(own, b"damaged")
+    with pytest.raises(ChangedRecord):
+        two.load("0", "key")
+
+
+def test_code_of_the_caller_counts_by_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = []
+    for name, text in (("callers_one", "x = 1"), ("callers_two", "x = 1"), ("callers_one", "x = 2")):
+        (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        importlib.import_module(name)
+        code_key.cache_clear()
+        keys.append(code_key(name))
+    assert len(set(keys)) == 3
+    assert code_key("typed_into_a_prompt") == code_key("typed_into_a_prompt")

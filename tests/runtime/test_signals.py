@@ -1,0 +1,185 @@
+"""Programs that are told to stop: at once, with a sentence and its exit code, whatever they are at."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.fake_stages import fake_config, photographs
+from thesisrecon.cli.main import run_command
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.runtime.executors import ProcessPool
+from thesisrecon.runtime.signals import CODES, advised
+from validation.checks.kill_anywhere import different, outputs
+from validation.checks.stop_anywhere import Stop, stopped, table
+
+ROOT = Path(__file__).parents[2]
+COURTYARD = ROOT / "fixtures" / "courtyard" / "images"
+ENDLESS = 'hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)'
+"""Compiled code that lets go of the interpreter and does not end."""
+PROGRAM = """
+import hashlib, sys, time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from thesisrecon.stops import advised, obey_signals
+from thesisrecon.workers import ProcessPool
+if __name__ == "__main__":
+    obey_signals("toy")
+    with advised("it goes on\\nlater"):
+        {work}
+"""
+IGNORING = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+LOADING = """
+import runpy, sys, time
+from pathlib import Path
+ready, name, slow = sys.argv[1:]
+class Slow:
+    def find_spec(self, wanted, *_):
+        if wanted == slow:
+            Path(ready).touch()
+            time.sleep(600)
+sys.meta_path.insert(0, Slow())
+runpy.run_module(name, run_name="__main__", alter_sys=True)
+"""
+"""A command, one of whose modules is never loaded."""
+AT_WORK = {
+    "in compiled code": "Path(sys.argv[1]).touch(); " + ENDLESS,
+    "at the end of a pool of threads": f"""
+        with ThreadPoolExecutor(2) as pool:
+            for _ in range(5):
+                pool.submit(lambda: {ENDLESS})
+            Path(sys.argv[1]).touch()""",
+    "in processes": """
+        pool = ProcessPool(2)
+        tasks = [pool.submit(time.sleep, 600) for _ in range(5)]
+        while not tasks[1].running():
+            time.sleep(0.01)
+        Path(sys.argv[1]).touch()
+        tasks[0].result()""",
+    "while it starts processes": """
+        Path(sys.argv[1]).touch()
+        while True:
+            ProcessPool(2).submit(time.sleep, 600)""",
+}
+
+
+def program(folder: Path, work: str) -> list[str]:
+    file = folder / "toy.py"
+    file.write_text(PROGRAM.format(work=work))
+    return [sys.executable, str(file), str(folder / "ready")]
+
+
+def is_alive(number: int) -> bool:
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("what", AT_WORK)
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
+def test_a_program_is_ended_whatever_it_is_at(what: str, asked: signal.Signals, tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ready = tmp_path / "ready"
+    stop = stopped(program(tmp_path, AT_WORK[what]), ready.exists, asked, environment=environment)
+    word = "interrupted" if asked == signal.SIGINT else "told to end"
+    assert (stop.code, stop.said, stop.left) == (CODES[asked], f"toy: {word}; it goes on later\n", 0)
+
+
+@pytest.mark.parametrize(("name", "slow"), [("thesisrecon", "cli"), ("validation", "command")])
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_is_ended_while_it_is_loaded(
+    name: str, slow: str, asked: signal.Signals, tmp_path: Path
+) -> None:
+    ready = tmp_path / "ready"
+    program = [sys.executable, "-c", LOADING, str(ready), name, f"{name}.{slow}"]
+    stop = stopped(program, ready.exists, asked, environment={**os.environ, "PYTHONPATH": str(ROOT)})
+    word = "interrupted" if asked == signal.SIGINT else "told to end"
+    assert stop.code == CODES[asked]
+    assert stop.said == f"{name}: {word}; give the same command again\n"
+
+
+def test_what_a_program_was_started_to_ignore_it_ignores(tmp_path: Path) -> None:
+    ready = tmp_path / "ready"
+    work = "Path(sys.argv[1]).touch(); time.sleep(0.5)"
+    process = subprocess.Popen(
+        [sys.executable, "-c", IGNORING, *program(tmp_path, work)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    while not ready.exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    assert process.wait() == 0
+
+
+def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    images, out = tmp_path / "images", tmp_path / "out"
+    images.mkdir()
+    for path in sorted(COURTYARD.iterdir())[:4]:
+        (images / path.name).symlink_to(path)
+    arguments = ["reconstruct", str(images), "--max-size", "200", "--until", "matches", "--threads", "2"]
+    stop = stopped(
+        [sys.executable, "-m", "thesisrecon", *arguments, "-o", str(out), "--executor", "processes"],
+        lambda: any(out.glob("01-features/*.npz")),
+        signal.SIGINT,
+        environment={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert (stop.code, stop.left) == (130, 0)
+    advice = f"the same command goes on where it stopped (what was done is kept in {out})"
+    assert stop.said == f"thesisrecon: interrupted; {advice}\n"
+    assert run_command([*arguments, "-o", str(out)]) == 0
+    assert run_command([*arguments, "-o", str(tmp_path / "whole")]) == 0
+    assert different(outputs(out), outputs(tmp_path / "whole")) == ()
+
+
+def test_a_pool_is_abandoned_at_once() -> None:
+    pool = ProcessPool(1)
+    number = pool.submit(os.getpid).result()
+    pool.submit(time.sleep, 600)
+    assert is_alive(number)
+    pool.abandon()
+    assert not is_alive(number)
+
+
+def test_an_interrupt_carries_what_is_advised() -> None:
+    with pytest.raises(KeyboardInterrupt, match="go on"), advised("begin again"), advised("go on"):
+        raise KeyboardInterrupt
+
+
+def test_a_callers_own_program_is_interrupted_as_any_other(tmp_path: Path) -> None:
+    """The library leaves signals alone: Ctrl-C is an exception there, and the run goes on afterwards."""
+
+    def interrupt(stage: str, done: int, _: int) -> None:
+        if (stage, done) == ("matches", 2):
+            raise KeyboardInterrupt
+
+    config = fake_config()
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(photographs(4), tmp_path / "out", config=config, progress=interrupt, until="metric")
+    reconstruct(photographs(4), tmp_path / "out", config=config, until="metric")
+    reconstruct(photographs(4), tmp_path / "whole", config=config, until="metric")
+    assert different(outputs(tmp_path / "out"), outputs(tmp_path / "whole")) == ()
+
+
+def test_the_check_names_what_is_wrong() -> None:
+    said = "thesisrecon: interrupted; the same command goes on\n"
+    well = Stop("5 % (0.4 s)", 0.1, 130, said, 0, 3)
+    bad = Stop("15 % (1.2 s)", 2.5, 1, "Traceback\nKeyboardInterrupt\n", 2, 4, ("points.ply",))
+    assert well.wrong(signal.SIGINT) == ""
+    assert well.wrong(signal.SIGTERM) == "exit code 130"
+    assert table([well, bad], signal.SIGINT).splitlines()[2:] == [
+        "| 5 % (0.4 s) | 0.10 | 130 | 3 | nothing |",
+        "| 15 % (1.2 s) | 2.50 | 1 | 4 | took 2.5 s; exit code 1; not one sentence; 2 processes left; "
+        "differs: points.ply |",
+    ]

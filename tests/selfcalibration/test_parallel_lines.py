@@ -1,0 +1,226 @@
+"""The plane at infinity from vanishing points: given ones, and those of segments found in photographs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.selfcalibration.stratified_scenes import (
+    CENTRED,
+    NOTHING_BUT_CONSTANT,
+    assume,
+    make_scene,
+    setup,
+    true_plane,
+)
+from tests.synthetic import TrueScene, projective_reconstruction
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.images import read_photographs
+from thesisrecon.records import Tracks
+from thesisrecon.selfcalibration.line_segments import LineSegments, fit_segments
+from thesisrecon.selfcalibration.parallel_lines import (
+    ParallelLines,
+    VanishingPoints,
+    find_directions,
+    propose_points,
+    refine_plane,
+    segment_set,
+    triangulate_directions,
+)
+from thesisrecon.selfcalibration.stratified import Stratified, projective_scene
+from validation.scenes.real import load_fixture_scene
+
+TURN = np.array([[0.8, 0.36, 0.48], [-0.6, 0.48, 0.64], [0.0, -0.8, 0.6]])
+"""Three directions at right angles, none of them along an axis."""
+
+
+def vanishing_points(scene: TrueScene, directions: np.ndarray, views: list[int]) -> VanishingPoints:
+    """Exact vanishing points of directions (D, 3) in the named views."""
+    M = scene.K @ scene.R
+    xyh = np.concatenate([directions @ M[v].T for v in views])
+    return VanishingPoints(
+        np.repeat(views, len(directions)), np.tile(np.arange(len(directions)), len(views)), xyh
+    )
+
+
+def drawn_segments(scene: TrueScene, *, sigma_px: float, stray: int, seed: int) -> list[np.ndarray]:
+    """Segments of 40 lines along each of three directions seen by every camera, and ``stray`` of none."""
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-1.5, 1.5, (120, 3))
+    Y = X + np.repeat(TURN, 40, axis=0) * rng.uniform(0.5, 1.0, (120, 1))
+    found = []
+    for P in scene.P:
+        ends = [np.column_stack([Z, np.ones(len(Z))]) @ P.T for Z in (X, Y)]
+        true = np.concatenate([e[:, :2] / e[:, 2:] for e in ends], axis=1)
+        place = rng.uniform(0.0, 1000.0, (stray, 2))
+        wild = np.concatenate([place, place + rng.normal(0.0, 60.0, (stray, 2))], axis=1)
+        found.append(np.concatenate([true + rng.normal(0.0, sigma_px, true.shape), wild]))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("views", [[0, 1], [2, 5, 7]])
+def test_three_given_directions_fix_the_plane(seed: int, views: list[int]) -> None:
+    scene = make_scene(seed=seed)
+    found, plane, _ = setup(scene, seed=seed)
+    way = ParallelLines(vanishing_points(scene, TURN, views))
+    located = way.locate(found, np.random.default_rng(0))
+    np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
+
+
+def test_more_directions_and_points_at_infinity_do_no_harm() -> None:
+    scene = make_scene(seed=1)
+    R0 = scene.R[0]
+    level = np.array([R0[0], R0[1], R0[2], [0.3, -0.2, 0.9]])
+    given = vanishing_points(scene, level, [0, 3, 6])
+    assert abs(given.xyh[0, 2]) < 1e-12
+    found, plane, _ = setup(scene, seed=1)
+    located = ParallelLines(given).locate(found, np.random.default_rng(0))
+    np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
+
+
+def test_directions_at_right_angles_give_the_calibration_too() -> None:
+    """With three views nothing but right angles and zero skew settles K of one camera."""
+    scene = make_scene(seed=2, views=3, principal_shift=(50.0, -30.0), seen_share=1.0)
+    way = ParallelLines(vanishing_points(scene, TURN, [0, 1]), right_angles=True)
+    answer = Stratified(way, refined=False).calibrate(
+        projective_reconstruction(scene, seed=2), assumed=assume(scene, NOTHING_BUT_CONSTANT),
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-3)
+
+
+def test_directions_in_one_plane_are_refused() -> None:
+    scene = make_scene(seed=3)
+    found, _, _ = setup(scene, seed=3)
+    flat = np.array([TURN[0], TURN[1], TURN[0] + TURN[1]])
+    with pytest.raises(StageFailure, match="lie in one plane"):
+        ParallelLines(vanishing_points(scene, flat, [0, 1])).locate(found, np.random.default_rng(0))
+
+
+def test_two_directions_are_refused_with_their_number() -> None:
+    scene = make_scene(seed=3)
+    found, _, _ = setup(scene, seed=3)
+    given = vanishing_points(scene, TURN, [0, 1])
+    one_view = replace(given, view=np.where(given.direction == 2, 0, given.view))
+    one_view = VanishingPoints(*(part[:5] for part in (one_view.view, one_view.direction, one_view.xyh)))
+    with pytest.raises(StageFailure, match=r"three directions.*2 have"):
+        ParallelLines(one_view).locate(found, np.random.default_rng(0))
+
+
+def test_triangulated_points_are_seen_where_they_were() -> None:
+    scene = make_scene(seed=4)
+    v = np.einsum("vij,dj->dvi", scene.K @ scene.R, TURN)
+    v /= np.linalg.norm(v, axis=2, keepdims=True)
+    X = triangulate_directions(np.tile(scene.P / 1500.0, (3, 1, 1, 1)), v)
+    np.testing.assert_allclose(np.abs(np.sum(X[:, :3] * TURN, axis=1)), 1.0, atol=1e-9)
+    np.testing.assert_allclose(X[:, 3], 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize(("sigma", "stray", "limit"), [(0.0, 0, 1e-8), (0.3, 60, 0.01)])
+def test_directions_are_found_among_strays(sigma: float, stray: int, limit: float) -> None:
+    scene = make_scene(seed=5, views=6)
+    found, plane, _ = setup(scene, seed=5)
+    frame = found.frame
+    segments = segment_set(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
+    rng = np.random.default_rng(1)
+    proposals = [
+        propose_points(segments.subset(segments.camera == k), keep=5, samples=300, tolerance_px=1.5, rng=rng)
+        for k in range(6)
+    ]
+    X, direction = find_directions(frame, segments, proposals, keep=3, tolerance_px=1.5)
+    truth = np.tile(np.concatenate([np.repeat([0, 1, 2], 40), np.full(stray, -1)]), 6)
+    for d in range(3):
+        mine = truth[direction == d]
+        # A segment that runs towards two of the directions goes to the stronger one.
+        right = np.bincount(mine[mine >= 0], minlength=3).max()
+        assert right > max(0.7 * 240, 0.85 * len(mine))
+    v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)
+    start = np.linalg.svd(X)[2][-1]
+    refined, _, noise = refine_plane(frame, segments, direction, start[:3] / start[3], v)
+    np.testing.assert_allclose(refined, plane, atol=limit)
+    assert noise == pytest.approx(sigma, rel=0.5, abs=0.01)
+
+
+def test_the_detector_finds_the_sides_of_a_turned_square() -> None:
+    y, x = np.mgrid[0:200, 0:240].astype(np.float64)
+    angle, half, centre = np.radians(17.0), 60.0, (118.3, 97.6)
+    a = (x - centre[0]) * np.cos(angle) + (y - centre[1]) * np.sin(angle)
+    b = -(x - centre[0]) * np.sin(angle) + (y - centre[1]) * np.cos(angle)
+    outside = np.maximum(np.abs(a), np.abs(b)) - half
+    gray = (60.0 + 120.0 * np.clip(0.5 - outside, 0.0, 1.0)).astype(np.float32)
+    segments = LineSegments().detect(gray)
+    assert len(segments) == 4
+    for x1, y1, x2, y2 in segments:
+        assert np.hypot(x2 - x1, y2 - y1) > 100.0
+        for px, py in ((x1, y1), (x2, y2)):
+            u = (px - centre[0]) * np.cos(angle) + (py - centre[1]) * np.sin(angle)
+            w = -(px - centre[0]) * np.sin(angle) + (py - centre[1]) * np.cos(angle)
+            assert max(abs(u), abs(w)) == pytest.approx(half, abs=0.15)
+
+
+def test_a_flat_image_has_no_segments_and_noise_has_few() -> None:
+    assert LineSegments().detect(np.full((50, 60), 90.0, dtype=np.float32)).shape == (0, 4)
+    noise = np.random.default_rng(0).normal(128.0, 5.0, (300, 400)).astype(np.float32)
+    assert len(LineSegments().detect(noise)) < 10
+
+
+def test_fitted_segments_run_through_their_points() -> None:
+    t = np.linspace(0.0, 30.0, 31)
+    lines = np.column_stack([5 + 0.6 * t, 7 + 0.8 * t]), np.column_stack([t, np.full(31, 3.0)])
+    xy = np.concatenate([*lines, [[1.0, 2.0]]])
+    segments, rms = fit_segments(xy, np.repeat([4, 9, 11], [31, 31, 1]))
+    assert segments.shape == (2, 4)
+    np.testing.assert_allclose(rms, 0.0, atol=1e-6)
+    np.testing.assert_allclose(segments[0], [5.0, 7.0, 23.0, 31.0], atol=1e-9)
+
+
+def courtyard(views: list[int]) -> tuple[TrueScene, list[Path]]:
+    """The true cameras of the courtyard with points strewn over the yard."""
+    told = load_fixture_scene()
+    assert told.K is not None
+    assert told.R is not None
+    assert told.C is not None
+    X = np.random.default_rng(0).uniform([-3.0, -2.5, 0.2], [3.0, -0.2, 3.0], (200, 3))
+    t = -np.einsum("vij,vj->vi", told.R, told.C)[views]
+    K, R = told.K[views], told.R[views]
+    seen = np.einsum("vij,nj->vni", K @ R, X) + (K @ t[..., None])[:, None, :, 0]
+    point, view = np.indices((len(X), len(views))).reshape(2, -1)
+    xy = (seen[..., :2] / seen[..., 2:])[view, point]
+    tracks = Tracks(view, point, xy, len(views), len(X))
+    sizes = np.tile([1024, 768], (len(views), 1))
+    return TrueScene(K, R, t, X, 0.0, tracks, sizes), [told.image_paths[v] for v in views]
+
+
+def test_parallel_lines_are_found_in_photographs() -> None:
+    scene, paths = courtyard([0, 3, 6, 9, 12])
+    photographs = read_photographs(paths, max_size_px=1600).images
+    given, assumed = projective_reconstruction(scene), assume(scene, CENTRED)
+    variant = Stratified(ParallelLines(), refined=False).with_images(photographs)
+    found = projective_scene(given, assumed)
+    located = variant.plane.locate(found, np.random.default_rng(0))
+    plane = true_plane(scene, found)
+    assert np.linalg.norm(located.planes[0] - plane) < 0.02 * (1.0 + np.linalg.norm(plane))
+    answer = variant.calibrate(given, assumed=assumed, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[0, 0, 0], rtol=0.03)
+
+
+def test_a_wall_of_nothing_is_refused_with_its_directions() -> None:
+    scene, paths = courtyard([0, 6, 12])
+    photographs = read_photographs(paths, max_size_px=1600).images
+    flat = [replace(image, rgb=np.full_like(image.rgb, 90)) for image in photographs]
+    with pytest.raises(StageFailure, match="0 directions"):
+        Stratified(ParallelLines()).with_images(flat).calibrate(
+            projective_reconstruction(scene), assumed=assume(scene), rng=np.random.default_rng(0)
+        )
+
+
+def test_photographs_must_be_there() -> None:
+    scene = make_scene()
+    with pytest.raises(ValueError, match="a photograph for each of the 8 views"):
+        Stratified(ParallelLines()).calibrate(
+            projective_reconstruction(scene), assumed=assume(scene), rng=np.random.default_rng(0)
+        )

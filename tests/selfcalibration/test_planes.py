@@ -1,0 +1,178 @@
+"""The ways to the plane at infinity on exact and noisy scenes, and what they refuse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.selfcalibration.stratified_scenes import (
+    CENTRED_ZOOM,
+    NOTHING_BUT_CONSTANT,
+    assume,
+    make_scene,
+    setup,
+)
+from tests.synthetic import projective_reconstruction
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch, PlaneRegion, local_minima
+from thesisrecon.selfcalibration.hartley import HartleyLinear, PollefeysQuadric
+from thesisrecon.selfcalibration.modulus import (
+    ModulusConstraint,
+    modulus_coefficients,
+    modulus_quartic,
+    modulus_residuals,
+    pairs_of_constant_cameras,
+)
+from thesisrecon.selfcalibration.refinement import descend
+from thesisrecon.selfcalibration.stratified import Stratified
+
+PAIRS = [
+    (plane, way)
+    for plane in (CheiralitySearch(), ModulusConstraint())
+    for way in (HartleyLinear(), PollefeysQuadric())
+]
+
+
+def test_the_coefficients_are_those_of_the_characteristic_polynomial() -> None:
+    rng = np.random.default_rng(0)
+    A, a, p = rng.normal(size=(3, 3, 3)), rng.normal(size=(3, 3)), rng.normal(size=3)
+    pairs = np.array([[0, 1], [1, 2], [2, 0]])
+    c = modulus_coefficients(A, a, pairs)
+    H = A - a[:, :, None] * p
+    for m, (i, j) in enumerate(pairs):
+        for x in (-1.3, 0.2, 0.7, 2.0):
+            value = sum((c[m, k, :3] @ p + c[m, k, 3]) * x**k for k in range(4))
+            assert value == pytest.approx(np.linalg.det(x * H[i] - H[j]), rel=1e-10, abs=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_true_plane_satisfies_the_quartics_whatever_the_constant_calibration(seed: int) -> None:
+    scene = make_scene(seed=seed, principal_shift=(80.0, -60.0))
+    found, plane, _ = setup(scene, NOTHING_BUT_CONSTANT, seed=seed)
+    pairs = pairs_of_constant_cameras(found.knowledge.first)
+    assert len(pairs) == 28
+    c = modulus_coefficients(found.frame.A, found.frame.a, pairs)
+    assert np.abs(modulus_quartic(c, plane[None])).max() < 1e-9
+    r, t = modulus_residuals(c, plane[None])
+    assert np.abs(r).max() < 1e-9
+    R = scene.R
+    angles = np.trace(R[pairs[:, 0]] @ R[pairs[:, 1]].swapaxes(1, 2), axis1=1, axis2=2)
+    np.testing.assert_allclose(t[0], angles, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_cheirality_bounds_hold_the_true_plane(seed: int) -> None:
+    found, plane, _ = setup(make_scene(seed=seed, sigma_px=0.0), seed=seed)
+    region = PlaneRegion.of(found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0))
+    assert region.share_outside(plane[None])[0] == 0.0
+    inside = [
+        part.contains((np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0))[None, :3]
+                      / (np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0))[3])[0]
+        for part in region.polytopes
+    ]  # fmt: skip
+    assert sum(inside) == 1
+
+
+def test_samples_of_the_bounds_are_inside_them() -> None:
+    found, _, _ = setup(make_scene(seed=2))
+    region = PlaneRegion.of(found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0))
+    for part in region.polytopes:
+        v = part.sample(100, np.random.default_rng(1))
+        assert part.contains(v).all()
+        assert (np.ptp(v, axis=0) > 0.1 * np.ptp(part.box, axis=1)).all()
+        back = part.reference_planes(v)
+        assert region.share_outside(back).max() == 0.0
+
+
+@pytest.mark.parametrize(("plane", "way"), PAIRS, ids=lambda v: type(v).__name__)
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_cameras_give_the_exact_answer_in_closed_form(plane, way, seed: int) -> None:
+    scene = make_scene(seed=seed)
+    answer = Stratified(plane, way, refined=False).calibrate(
+        projective_reconstruction(scene, seed=seed), assumed=assume(scene), rng=np.random.default_rng(seed)
+    )
+    np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=1e-8)
+    assert answer.identifiable
+    assert type(plane).__name__ in answer.candidates[0].method
+
+
+def test_an_unknown_constant_calibration_comes_out_whole() -> None:
+    scene = make_scene(seed=4, principal_shift=(70.0, -50.0))
+    answer = Stratified(ModulusConstraint(), refined=False).calibrate(
+        projective_reconstruction(scene, seed=4),
+        assumed=assume(scene, NOTHING_BUT_CONSTANT),
+        rng=np.random.default_rng(4),
+    )
+    np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_three_views_of_a_constant_camera_suffice(seed: int) -> None:
+    scene = make_scene(views=3, seed=seed, seen_share=1.0)
+    found, plane, _ = setup(scene, seed=seed)
+    candidates = ModulusConstraint().locate(found, np.random.default_rng(0))
+    nearest = np.linalg.norm(candidates.planes - plane, axis=1).min()
+    assert nearest < 1e-6
+    answer = Stratified(ModulusConstraint(), kept=21).calibrate(
+        projective_reconstruction(scene, seed=seed), assumed=assume(scene), rng=np.random.default_rng(0)
+    )
+    assert answer.K[0, 0, 0] == pytest.approx(1500.0, rel=1e-6)
+
+
+def test_zooming_cameras_are_found_by_the_search_and_refused_by_the_modulus_constraint() -> None:
+    scene = make_scene(seed=6, zoom=0.3)
+    given, assumed = projective_reconstruction(scene, seed=6), assume(scene, CENTRED_ZOOM)
+    answer = Stratified(refined=False).calibrate(given, assumed=assumed, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[:, 0, 0], rtol=1e-8)
+    with pytest.raises(StageFailure, match="three photographs of one camera"):
+        Stratified(ModulusConstraint()).calibrate(given, assumed=assumed, rng=np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("plane", "way"), PAIRS, ids=lambda v: type(v).__name__)
+def test_noise_moves_the_focal_by_little(plane: object, way: object) -> None:
+    scene = make_scene(seed=7)
+    given = projective_reconstruction(scene, seed=7)
+    unit = np.linalg.inv(pixel_from_unit(scene.sizes))
+    P = unit @ given.P
+    size = np.linalg.norm(P, axis=(1, 2), keepdims=True)
+    P += 1e-4 * size * np.random.default_rng(0).normal(size=P.shape)
+    noisy = replace(given, P=np.linalg.inv(unit) @ P)
+    answer = Stratified(plane, way).calibrate(noisy, assumed=assume(scene), rng=np.random.default_rng(0))
+    np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=0.01)
+
+
+def test_the_modulus_descent_lowers_every_start() -> None:
+    found, plane, _ = setup(make_scene(seed=8))
+    c = modulus_coefficients(found.frame.A, found.frame.a, pairs_of_constant_cameras(found.knowledge.first))
+    starts = plane + 0.02 * np.random.default_rng(0).normal(size=(10, 3))
+    ends, cost = descend(lambda p: modulus_residuals(c, p)[0], starts, iterations=60, loss_scale=0.05)
+    assert cost.max() < 1e-20
+    np.testing.assert_allclose(ends, np.tile(plane, (10, 1)), atol=1e-9)
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    scene = make_scene(seed=9)
+    given, assumed = projective_reconstruction(scene, seed=9), assume(scene)
+    for plane in (CheiralitySearch(), ModulusConstraint()):
+        first, second = (
+            Stratified(plane).calibrate(given, assumed=assumed, rng=np.random.default_rng(3))
+            for _ in range(2)
+        )
+        assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()
+
+
+def test_local_minima_are_no_worse_than_any_of_their_neighbours() -> None:
+    score = np.random.default_rng(0).uniform(size=(5, 5, 5))
+    score[2, 2, :] = np.inf
+    expected = []
+    for cell in np.ndindex(score.shape):
+        near = [np.add(cell, step) for step in np.vstack([np.eye(3, dtype=int), -np.eye(3, dtype=int)])]
+        inside = [tuple(n) for n in near if (n >= 0).all() and (n < 5).all()]
+        if np.isfinite(score[cell]) and all(score[cell] <= score[n] for n in inside):
+            expected.append(cell)
+    expected.sort(key=lambda cell: score[cell])
+    found = local_minima(score)
+    assert [tuple(np.array(np.unravel_index(k, score.shape)).tolist()) for k in found] == expected

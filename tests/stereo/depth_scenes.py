@@ -1,0 +1,122 @@
+"""A wall with a board in front of it, photographed from an arc: everything about it is known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from tests.textures import texture
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import (
+    camera_from_centre,
+    decompose_camera,
+    distort,
+    project,
+    undistort,
+)
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.records import Image, Reconstruction, Tracks
+
+SIZE = (240, 180)
+FOCAL = 260.0
+RADIAL = np.array([-0.08, 0.02, 0.0])
+
+
+@dataclass(frozen=True)
+class Walled:
+    """Photographs, their reconstruction, and true depth (H, W) of every view without distortion."""
+
+    images: tuple[Image, ...]
+    reconstruction: Reconstruction
+    depth: tuple[F64, ...]
+
+
+def calibration() -> F64:
+    return np.array([[FOCAL, 0.0, 121.0], [0.0, FOCAL, 88.0], [0.0, 0.0, 1.0]])
+
+
+def on_arc(angles_deg: tuple[float, ...], *, distance: float = 6.0) -> F64:
+    """Cameras (V, 3, 4) about a point on the wall."""
+    cameras = []
+    for k, angle in enumerate(np.radians(angles_deg)):
+        centre = distance * np.array([np.sin(angle), 0.06 * (-1) ** k, -np.cos(angle)])
+        z = -centre / np.linalg.norm(centre)
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        cameras.append(camera_from_centre(calibration(), np.array([x, np.cross(z, x), z]), centre))
+    return np.array(cameras)
+
+
+def make_walled(P: F64, *, distortion: F64 | None = None, plain: bool = False, seed: int = 0) -> Walled:
+    """Photographs by cameras P (V, 3, 4) through a lens; a ``plain`` wall and board have no texture."""
+    textures = [
+        np.full((900, 900), 90.0 + 60.0 * k) if plain else texture(900, 900, seed + k) for k in (0, 1)
+    ]
+    lens = np.zeros(3) if distortion is None else distortion
+    x, y = np.meshgrid(np.arange(float(SIZE[0])), np.arange(float(SIZE[1])))
+    xy = np.stack([x, y], axis=-1).reshape(-1, 2)
+    images, depths = [], []
+    for view, camera in enumerate(P):
+        depths.append(_trace(camera, xy, textures)[0].reshape(x.shape))
+        K = decompose_camera(camera)[0]
+        straight = undistort((xy - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T, lens) @ K[:2, :2].T + K[:2, 2]
+        gray = _trace(camera, straight, textures)[1].reshape(x.shape)
+        rgb = np.repeat(np.clip(np.rint(gray), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        images.append(Image(f"{view}.png", rgb, SIZE))
+    return Walled(tuple(images), _reconstruction(P, lens, depths, seed), tuple(depths))
+
+
+def _trace(P: F64, xy: F64, textures: list[F64]) -> tuple[F64, F64]:
+    """Depth and grey level (N,): a board |X|, |Y| < 0.7 at Z = -0.8 before a leaning wall Z = 0.2 X."""
+    M = np.linalg.inv(P[:, :3])
+    centre, rays = -M @ P[:, 3], homogenize(xy) @ M.T
+    board = (-0.8 - centre[2]) / rays[:, 2]
+    wall = (0.2 * centre[0] - centre[2]) / (rays[:, 2] - 0.2 * rays[:, 0])
+    hit = centre + board[:, None] * rays
+    near = (np.abs(hit[:, :2]) < 0.7).all(axis=1)
+    depth = np.where(near, board, wall)
+    X = centre + depth[:, None] * rays
+    places = 450.0 + 70.0 * X[:, :2].T[::-1]
+    levels = [map_coordinates(t, places, order=3, mode="reflect") for t in textures]
+    return depth, np.where(near, levels[1], levels[0])
+
+
+def _reconstruction(P: F64, lens: F64, depths: list[F64], seed: int) -> Reconstruction:
+    """Points on the surface seen in view 0, observed by every view that sees them."""
+    rng = np.random.default_rng(seed)
+    pixel = np.stack([rng.integers(4, SIZE[0] - 4, 400), rng.integers(4, SIZE[1] - 4, 400)], axis=1)
+    M = np.linalg.inv(P[0, :, :3])
+    X = M @ (homogenize(pixel.astype(np.float64)).T * depths[0][pixel[:, 1], pixel[:, 0]] - P[0, :, 3:])
+    X = X.T
+    K = calibration()
+    view, point, seen_at = [], [], []
+    for v, camera in enumerate(P):
+        xy = project(camera, X)
+        z = X @ camera[2, :3] + camera[2, 3]
+        at = np.clip(np.rint(xy), 0, np.array(SIZE) - 1).astype(np.int64)
+        good = np.all((xy > 0) & (xy < np.array(SIZE) - 1), axis=1) & (z > 0)
+        good &= np.abs(depths[v][at[:, 1], at[:, 0]] / z - 1.0) < 0.02
+        k = np.flatnonzero(good)
+        view.append(np.full(len(k), v))
+        point.append(k)
+        normalized = (xy[k] - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+        seen_at.append(distort(normalized, lens) @ K[:2, :2].T + K[:2, 2])
+    views, points = np.concatenate(view), np.concatenate(point)
+    order = np.lexsort((views, points))
+    tracks = Tracks(views[order], points[order], np.concatenate(seen_at)[order], len(P), len(X))
+    return Reconstruction(
+        stratum="metric",
+        P=P,
+        X=homogenize(X),
+        registered=np.ones(len(P), dtype=bool),
+        valid=np.ones(len(X), dtype=bool),
+        inlier=np.ones(len(views), dtype=bool),
+        tracks=tracks,
+        sizes=np.tile(np.array(SIZE), (len(P), 1)),
+        sigma_px=0.1,
+        reasons=("",) * len(P),
+        K=np.tile(K, (len(P), 1, 1)),
+        distortion=np.tile(lens, (len(P), 1)),
+    )

@@ -1,0 +1,179 @@
+"""Scenes of rectangles that are hard to match, with exact depth: fences, tunnels, blank walls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from tests.stereo.depth_scenes import Walled
+from tests.textures import texture
+from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera, project
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.records import Image, Reconstruction, Tracks
+
+PER_UNIT = 60.0
+"""Texels a unit of length."""
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A corner and two edges; its grey levels, or one for all of it."""
+
+    corner: tuple[float, float, float]
+    along: tuple[float, float, float]
+    up: tuple[float, float, float]
+    levels: F64 | float
+
+
+@cache
+def textured(seed: int) -> F64:
+    """Grey levels that go on by reflection."""
+    return texture(300, 300, seed)
+
+
+def fence(seed: int = 0) -> list[Rectangle]:
+    """Slats of 0.25, as far apart as they are wide, at depth 4 before a wall at 6: occlusions everywhere."""
+    places = [0.5 * k - 4.0 for k in range(16)]
+    slats = [
+        Rectangle((x, -3.0, 4.0), (0.25, 0, 0), (0, 6.0, 0), textured(seed + k))
+        for k, x in enumerate(places, 1)
+    ]
+    return [Rectangle((-6.0, -5.0, 6.0), (12.0, 0, 0), (0, 10.0, 0), textured(seed)), *slats]
+
+
+def tunnel(seed: int = 0) -> list[Rectangle]:
+    """Four walls along the way and one at its end."""
+    z = (0.0, 0.0, 14.0)
+    sides = [((-1.5, -1.2, -1.0), (0, 2.4, 0)), ((1.5, -1.2, -1.0), (0, 2.4, 0))]
+    sides += [((-1.5, -1.2, -1.0), (3.0, 0, 0)), ((-1.5, 1.2, -1.0), (3.0, 0, 0))]
+    walls = [Rectangle(corner, z, up, textured(seed + k)) for k, (corner, up) in enumerate(sides)]
+    return [*walls, Rectangle((-1.5, -1.2, 13.0), (3.0, 0, 0), (0, 2.4, 0), textured(seed + 9))]
+
+
+def blank_wall(rim: float = 1.2, seed: int = 0) -> list[Rectangle]:
+    """A blank square with a textured rim of that width, leaning away, at depth 5 in its middle."""
+    wall = leaning(4.0, 5.0, textured(seed))
+    return [wall, leaning(4.0 - rim, 5.0 - 1e-6, 140.0)]
+
+
+def leaning(half: float, depth: float, levels: F64 | float) -> Rectangle:
+    """A square about the optical axis that leans away to the right."""
+    slope = 0.3
+    corner = (-half, -half, depth - slope * half)
+    return Rectangle(corner, (2 * half, 0, 2 * slope * half), (0, 2 * half, 0), levels)
+
+
+def looking_ahead(
+    places: Sequence[Sequence[float]], *, focal: float = 200.0, size: tuple[int, int] = (200, 150)
+) -> F64:
+    """Cameras (V, 3, 4) at places, all looking along z."""
+    K = np.array([[focal, 0.0, (size[0] - 1) / 2], [0.0, focal, (size[1] - 1) / 2], [0.0, 0.0, 1.0]])
+    return np.array([camera_from_centre(K, np.eye(3), np.array(place, dtype=float)) for place in places])
+
+
+def photograph_scene(
+    P: F64,
+    rectangles: Sequence[Rectangle],
+    *,
+    sizes: Sequence[tuple[int, int]] | None = None,
+    noise: float = 1.0,
+    points: int = 400,
+    seed: int = 0,
+) -> Walled:
+    """What cameras P (V, 3, 4) see, with noise of so many grey levels, and so many exact sparse points."""
+    rng = np.random.default_rng(seed)
+    wanted = [(200, 150)] * len(P) if sizes is None else list(sizes)
+    images, depths = [], []
+    for view, (camera, size) in enumerate(zip(P, wanted, strict=True)):
+        depth, gray = trace(camera, rectangles, size)
+        gray = gray + noise * rng.normal(size=gray.shape)
+        rgb = np.repeat(np.clip(np.rint(gray), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        images.append(Image(f"{view}.png", rgb, size))
+        depths.append(depth)
+    reconstruction = sparse(P, depths, rectangles, points, rng)
+    return Walled(tuple(images), reconstruction, tuple(depths))
+
+
+def trace(P: F64, rectangles: Sequence[Rectangle], size: tuple[int, int]) -> tuple[F64, F64]:
+    """Depth (inf where nothing is) and grey level (H, W)."""
+    x, y = np.meshgrid(np.arange(float(size[0])), np.arange(float(size[1])))
+    M = np.linalg.inv(P[:, :3])
+    centre, rays = -M @ P[:, 3], homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ M.T
+    best, level = np.full(len(rays), np.inf), np.full(len(rays), 90.0)
+    for r in rectangles:
+        along, up = np.array(r.along, dtype=float), np.array(r.up, dtype=float)
+        A = np.linalg.inv(np.stack([along, up, np.cross(along, up)], axis=1))
+        start, step = A @ (centre - np.array(r.corner)), rays @ A.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -start[2] / step[:, 2]
+            u, v = start[:2, None] + t * step[:, :2].T
+        hit = (t > 1e-6) & (t < best) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        best[hit] = t[hit]
+        if isinstance(r.levels, float):
+            level[hit] = r.levels
+        else:
+            places = PER_UNIT * np.stack([v[hit] * np.linalg.norm(up), u[hit] * np.linalg.norm(along)])
+            level[hit] = map_coordinates(r.levels, places, order=1, mode="reflect")
+    return best.reshape(x.shape), level.reshape(x.shape)
+
+
+def sparse(
+    P: F64, depths: Sequence[F64], rectangles: Sequence[Rectangle], points: int, rng: np.random.Generator
+) -> Reconstruction:
+    """Exact points on textured surfaces, from every view in turn, observed by all that see them."""
+    blank = [r for r in rectangles if isinstance(r.levels, float)]
+    found: list[F64] = []
+    for camera, depth in zip(P, depths, strict=True):
+        height, width = depth.shape
+        at = np.stack([rng.integers(2, width - 2, points), rng.integers(2, height - 2, points)], axis=1)
+        z = depth[at[:, 1], at[:, 0]]
+        M = np.linalg.inv(camera[:, :3])
+        at, z = at[np.isfinite(z)], z[np.isfinite(z)]
+        X = (M @ (homogenize(at.astype(float)).T * z - camera[:, 3:])).T
+        for r in blank:
+            away = X - np.array(r.corner)
+            u, v = (away @ np.array(edge) / np.dot(edge, edge) for edge in (r.along, r.up))
+            away_from_it = (u < 0) | (u > 1) | (v < 0) | (v > 1)
+            X = X[away_from_it]
+        found.append(X)
+    X = np.concatenate(found)
+    view, point, seen_at = [], [], []
+    for k, (camera, depth) in enumerate(zip(P, depths, strict=True)):
+        z = X @ camera[2, :3] + camera[2, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = project(camera, X)
+        limit = np.array(depth.shape[::-1]) - 1.0
+        inside = (z > 0) & np.all((xy >= 0) & (xy <= limit), axis=1)
+        at = np.where(inside[:, None], np.rint(xy), 0).astype(np.int64)
+        n = np.flatnonzero(inside & (np.abs(depth[at[:, 1], at[:, 0]] / np.where(z > 0, z, 1) - 1) < 0.02))
+        view.append(np.full(len(n), k))
+        point.append(n)
+        seen_at.append(xy[n])
+    sizes = np.array([d.shape[::-1] for d in depths])
+    seen = (np.concatenate(part) for part in (view, point, seen_at))
+    return with_points(P, sizes, X, *seen)
+
+
+def with_points(P: F64, sizes: I64, X: F64, view: I64, point: I64, xy: F64) -> Reconstruction:
+    """A metric reconstruction of points X (N, 3) with observations (K,)."""
+    order = np.lexsort((view, point))
+    tracks = Tracks(view[order], point[order], xy[order], len(P), len(X))
+    return Reconstruction(
+        stratum="metric",
+        P=P,
+        X=homogenize(X),
+        registered=np.ones(len(P), dtype=bool),
+        valid=np.ones(len(X), dtype=bool),
+        inlier=np.ones(len(view), dtype=bool),
+        tracks=tracks,
+        sizes=sizes,
+        sigma_px=0.1,
+        reasons=("",) * len(P),
+        K=np.stack([decompose_camera(p)[0] for p in P]),
+        distortion=np.zeros((len(P), 3)),
+    )

@@ -1,0 +1,143 @@
+"""Depth maps of whole scenes against truth, and what hopeless ones give."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
+from thesisrecon.stereo.depth import MultiViewStereo
+from thesisrecon.stereo.depth_fusion import SequenceLinking
+
+STEREO = MultiViewStereo()
+SMALL = replace(STEREO, max_side=160, match_side=160)
+
+
+@pytest.fixture(scope="module")
+def walled():
+    return make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)), distortion=RADIAL)
+
+
+def at_size(depth, shape):
+    """Depths between pixels as the inverse depths interpolate them."""
+    rows, columns = ((np.arange(n) + 0.5) * m / n - 0.5 for n, m in zip(shape, depth.shape, strict=True))
+    places = np.meshgrid(rows, columns, indexing="ij")
+    return 1.0 / map_coordinates(1.0 / depth, places, order=1, mode="nearest")
+
+
+def errors(walled, maps):
+    """Relative errors of known pixels, and the share of all that is known."""
+    apart = [maps[i].depth / at_size(walled.depth[i], maps[i].depth.shape) - 1.0 for i in maps]
+    known = np.concatenate([a[np.isfinite(a)] for a in apart])
+    return np.abs(known), len(known) / sum(a.size for a in apart)
+
+
+@pytest.mark.parametrize("linker", [STEREO.linker, SequenceLinking()], ids=lambda v: type(v).__name__)
+def test_depth_is_that_of_the_scene_and_its_deviation_tells_the_error(walled, linker):
+    stereo = MultiViewStereo(linker=linker)
+    maps = stereo.map_all(walled.images, walled.reconstruction)
+    error, known = errors(walled, maps)
+    assert np.median(error) < 0.002
+    assert np.mean(error < 0.01) > 0.95
+    assert known > 0.75
+    for i, found in maps.items():
+        z = (found.depth - walled.depth[i]) / found.std
+        assert 0.05 < np.nanmedian(np.abs(z)) < 2.0
+        assert (found.views[np.isfinite(found.depth)] >= 1).all()
+        assert (found.views[np.isnan(found.depth)] == 0).all()
+        assert np.array_equal(np.isnan(found.depth), np.isnan(found.std))
+
+
+def test_the_same_bytes_whatever_the_number_of_threads_and_one_by_one(walled):
+    reconstruction = replace(walled.reconstruction, registered=np.array([True, True, True, False]))
+    stereo = replace(STEREO, max_side=120, match_side=90)
+    together = stereo.map_all(walled.images, reconstruction, threads=2)
+    scene = stereo.prepare(walled.images, reconstruction)
+    raw = {i: stereo.depth_map(scene, i) for i in sorted(scene.views, reverse=True)}
+    for i in scene.views:
+        one = stereo.confirm(scene, raw, i)
+        for field in ("depth", "std", "views", "P"):
+            assert getattr(one, field).tobytes() == getattr(together[i], field).tobytes()
+
+
+@pytest.mark.parametrize("linker", [STEREO.linker, SequenceLinking(length=1)], ids=lambda v: type(v).__name__)
+def test_the_surroundings_of_a_view_are_enough_for_its_map(linker):
+    """What is sent to a worker elsewhere: a part of the scene, and the same bytes come back."""
+    walled = make_walled(on_arc(tuple(np.linspace(-15.0, 15.0, 5))))
+    choice = replace(STEREO.choice, most=1)
+    stereo = replace(STEREO, linker=linker, choice=choice, least_partners=2, max_side=80, match_side=64)
+    scene = stereo.prepare(walled.images, walled.reconstruction)
+    raw = {i: stereo.depth_map(scene, i) for i in scene.views}
+    for i in (0, 2):
+        near = stereo.surroundings(scene, i)
+        assert i in near
+        assert len(near) < len(scene.views)
+        part = scene.part(near)
+        assert set(part.views) == set(part.matched) == near
+        assert len(part.points.X) < len(scene.points.X) or part.points.seen[sorted(near)].any(axis=0).all()
+        partly = {j: raw[j] for j in near}
+        for whole, alone in (
+            (raw[i], stereo.depth_map(part, i)),
+            (stereo.confirm(scene, raw, i), stereo.confirm(part, partly, i)),
+        ):
+            assert np.isfinite(whole.depth).any()
+            assert whole.depth.tobytes() == alone.depth.tobytes()
+            assert whole.std.tobytes() == alone.std.tobytes()
+
+
+def test_pairs_are_matched_smaller_and_depths_are_as_exact(walled):
+    stereo = replace(STEREO, match_side=160)
+    scene = stereo.prepare(walled.images, walled.reconstruction)
+    assert scene.matched[1].seen.shape == (120, 160)
+    error, known = errors(walled, {1: stereo.depth_map(scene, 1)})
+    assert np.median(error) < 0.002
+    assert np.mean(error < 0.01) > 0.93
+    assert known > 0.75
+
+
+def known_share(maps):
+    return float(np.mean([np.isfinite(found.depth).mean() for found in maps.values()]))
+
+
+def test_one_baseline_gives_depth_though_nothing_is_seen_by_a_third_view():
+    walled = make_walled(on_arc((-5.0, 5.0)))
+    error, known = errors(walled, SMALL.map_all(walled.images, walled.reconstruction))
+    assert known > 0.5
+    assert np.median(error) < 0.003
+
+
+def test_no_baseline_gives_no_depth():
+    walled = make_walled(on_arc((0.0, 0.0)))
+    still = replace(walled.reconstruction, P=np.stack([walled.reconstruction.P[0]] * 2))
+    maps = SMALL.map_all(walled.images, still)
+    assert known_share(maps) == 0.0
+    assert all((found.views == 0).all() for found in maps.values())
+
+
+def test_a_wall_without_texture_is_unknown():
+    plain = make_walled(on_arc((-5.0, 5.0)), plain=True)
+    assert known_share(SMALL.map_all(plain.images, plain.reconstruction)) < 0.3
+
+
+def test_forward_motion_is_right_where_it_is_known():
+    P = np.concatenate([on_arc((0.0,), distance=d) for d in (6.0, 5.3, 4.6)])
+    walled = make_walled(P)
+    error, known = errors(walled, SMALL.map_all(walled.images, walled.reconstruction))
+    assert known > 0.1
+    assert np.median(error) < 0.01
+
+
+def test_views_without_a_camera_are_left_out_and_asking_for_them_is_wrong(walled):
+    reconstruction = replace(walled.reconstruction, registered=np.array([True, True, False, False]))
+    scene = STEREO.prepare(walled.images, reconstruction)
+    assert sorted(scene.views) == [0, 1]
+    assert scene.neighbours == {0: (1,), 1: (0,)}
+    with pytest.raises(ValueError, match="no camera"):
+        STEREO.depth_map(scene, 2)
+    with pytest.raises(ValueError, match="as many photographs"):
+        STEREO.prepare(walled.images[:2], reconstruction)
+    with pytest.raises(ValueError, match="metric"):
+        STEREO.prepare(walled.images, replace(reconstruction, stratum="projective"))

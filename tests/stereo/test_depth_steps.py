@@ -1,0 +1,263 @@
+"""Undistorted views, neighbours, correspondences through rectified frames, consistency: each by itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import camera_centre, project
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.records import DepthMap, DisparityMap
+from thesisrecon.stereo.consistency import Completion, Consistency, piece_sizes, transfer
+from thesisrecon.stereo.correspondence import PairMatching, brightness_gain, sample_disparity
+from thesisrecon.stereo.depth_fusion import follow, inverse_depth_of
+from thesisrecon.stereo.neighbours import (
+    NeighbourChoice,
+    pinhole_view,
+    ray_angles_deg,
+    shared_projections,
+    sparse_points,
+)
+from thesisrecon.stereo.plane_refinement import PlaneRefinement
+from thesisrecon.stereo.rectification import rectify_cameras
+
+
+@pytest.fixture(scope="module")
+def walled():
+    return make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)), distortion=RADIAL)
+
+
+def views_of(walled, **options):
+    return {
+        i: pinhole_view(image, walled.reconstruction, i, **options) for i, image in enumerate(walled.images)
+    }
+
+
+def test_an_undistorted_view_is_what_a_lens_without_distortion_shows(walled):
+    straight = make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)))
+    for i, view in views_of(walled).items():
+        assert (view.rgb[~view.seen] == 0).all()
+        assert 0.8 < view.seen.mean() <= 1.0
+        apart = view.rgb.astype(float) - straight.images[i].rgb
+        assert np.median(np.abs(apart[view.seen])) < 2.0
+        plain = pinhole_view(straight.images[i], straight.reconstruction, i)
+        assert (plain.rgb == straight.images[i].rgb).all()
+
+
+def test_a_smaller_view_has_the_camera_of_its_pixels(walled):
+    view, small = views_of(walled)[1], views_of(walled, max_side=120)[1]
+    assert small.seen.shape == (SIZE[1] // 2, SIZE[0] // 2)
+    X = sparse_points(walled.reconstruction).X
+    np.testing.assert_allclose(project(small.P, X), (project(view.P, X) + 0.5) / 2.0 - 0.5, atol=1e-9)
+    assert np.linalg.norm(small.P[2, :3]) == pytest.approx(1.0)
+
+
+def test_views_are_refused_with_a_sentence(walled):
+    image, reconstruction = walled.images[0], walled.reconstruction
+    with pytest.raises(ValueError, match="metric"):
+        pinhole_view(image, replace(reconstruction, K=None), 0)
+    with pytest.raises(ValueError, match="px; got"):
+        pinhole_view(image, replace(reconstruction, sizes=reconstruction.sizes + 1), 0)
+    with pytest.raises(ValueError, match="max_side"):
+        pinhole_view(image, reconstruction, 0, max_side=1)
+    with pytest.raises(StageFailure, match="no camera"):
+        pinhole_view(image, replace(reconstruction, registered=np.zeros(4, dtype=bool)), 0)
+
+
+def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):
+    views, points = views_of(walled), sparse_points(walled.reconstruction)
+    choice = NeighbourChoice(most=2)
+    assert set(choice.choose(points, views, 1)) == {0, 2}
+    assert set(choice.choose(points, views, 2)) == {1, 3}
+    S = np.diag([1e3, 1e3, 1e3, 1.0])
+    larger = {i: replace(view, P=1e3 * view.P @ np.linalg.inv(S)) for i, view in views.items()}
+    assert choice.choose(replace(points, X=1e3 * points.X), larger, 1) == choice.choose(points, views, 1)
+
+
+def test_a_view_at_the_same_place_or_with_few_points_is_no_neighbour(walled):
+    views, points = views_of(walled), sparse_points(walled.reconstruction)
+    same = {0: views[0], 1: replace(views[1], P=views[0].P)}
+    assert NeighbourChoice().choose(points, same, 0) == []
+    few = replace(points, seen=points.seen & (np.arange(points.seen.shape[1]) < 5))
+    assert NeighbourChoice().choose(few, views, 0) == []
+    centres = [camera_centre(view.P) for view in views.values()]
+    angles = ray_angles_deg(np.zeros((1, 3)), *(c[:3] / c[3] for c in centres[:2]))
+    assert angles == pytest.approx(11.3, abs=0.1)
+
+
+@dataclass(frozen=True)
+class TrueDisparity:
+    """Stands in for a matcher: the disparities that the true depth of the reference has in the frame."""
+
+    walled: object
+    pair: tuple[int, int]
+    method: str
+
+    def frame(self):
+        a, b = (self.walled.reconstruction.P[i] for i in self.pair)
+        return rectify_cameras(a, b, SIZE, SIZE, method=self.method)
+
+    def found(self):
+        frame = self.frame()
+        width, height = frame.size
+        x, y = np.meshgrid(np.arange(float(width)), np.arange(float(height)))
+        place = np.stack([x, y], axis=-1).reshape(-1, 2)
+        xy = frame.original_from_rectified(0, place)
+        i, j = self.pair
+        P = self.walled.reconstruction.P
+        # A wall at depth 6 of the reference everywhere: its depth is known between pixels too.
+        X = (homogenize(np.nan_to_num(xy)) * 6.0 - P[i, :, 3]) @ np.linalg.inv(P[i, :, :3]).T
+        right = frame.rectified_from_original(1, project(P[j], X), within=False)
+        d = np.where(np.isfinite(xy).all(axis=1), x.ravel() - right[:, 0], np.nan)
+        d = d.reshape(height, width).astype(np.float32)
+        return DisparityMap(d, np.isfinite(d).astype(np.float32), 0.1)
+
+
+@pytest.mark.parametrize("method", ["metric", "polar"])
+def test_exact_disparities_give_exact_depth(method):
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    true = TrueDisparity(walled, (0, 1), method)
+    pair = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE))
+    rho, std = inverse_depth_of(walled.reconstruction.P[0], walled.reconstruction.P[1], pair)
+    known = np.isfinite(rho)
+    assert known.mean() > 0.6
+    assert np.nanmedian(np.abs(6.0 * rho - 1.0)) < 1e-5
+    assert np.nanquantile(np.abs(6.0 * rho - 1.0), 0.99) < 2e-4
+    # 0.2 px of about f B / z = 54 px per unit of relative inverse depth.
+    assert np.nanmedian(6.0 * std) == pytest.approx(0.2 / 54.0 / np.sqrt(2.0), rel=0.5)
+
+
+def test_pixels_of_larger_photographs_are_told_where_their_places_are():
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    true = TrueDisparity(walled, (0, 1), "metric")
+    larger = (2 * SIZE[0], 2 * SIZE[1])
+    own = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE))
+    told = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (larger, larger))
+    assert told.sigma.shape == (2 * SIZE[1], 2 * SIZE[0])
+    # The middle of four pixels is the pixel of the smaller photograph.
+    four = np.mean([told.xy[a::2, b::2] for a in (0, 1) for b in (0, 1)], axis=0)
+    apart = np.abs((four + 0.5) / 2.0 - 0.5 - own.xy)
+    assert np.nanmedian(apart) < 1e-3
+    assert np.nanquantile(apart, 0.99) < 0.02
+    assert np.nanmedian(told.sigma[::2, ::2] / own.sigma) == pytest.approx(2.0, rel=0.01)
+
+
+def test_disparities_are_interpolated_on_a_surface_and_not_across_its_edge():
+    d = np.tile(np.array([1.0, 1.5, 2.0, 9.0, 9.5, np.nan], np.float32), (3, 1))
+    found = DisparityMap(d, np.ones_like(d), 0.1)
+    places = np.array(
+        [[0.5, 1.0], [1.25, 0.5], [2.4, 1.0], [2.6, 1.0], [4.4, 1.0], [4.6, 1.0], [np.nan, 0.0]]
+    )
+    values, sure = sample_disparity(found, places)
+    np.testing.assert_allclose(values, [1.25, 1.625, 2.0, 9.0, 9.5, np.nan, np.nan])
+    assert (sure == np.isfinite(values)).all()
+
+
+def test_brightness_is_made_alike(walled):
+    views, points = views_of(walled), sparse_points(walled.reconstruction)
+    darker = replace(views[1], rgb=np.rint(views[1].rgb * np.array([0.8, 0.7, 0.9])).astype(np.uint8))
+    xy = shared_projections(points, views[0], views[1])
+    gain = brightness_gain(views[0], darker, *xy) / brightness_gain(views[0], views[1], *xy)
+    np.testing.assert_allclose(gain, 1.0 / np.array([0.8, 0.7, 0.9]), rtol=0.02)
+    assert (brightness_gain(views[0], darker, xy[0][:3], xy[1][:3]) == 1.0).all()
+
+
+def test_links_of_a_chain_lead_from_view_to_view():
+    walled = make_walled(on_arc((-8.0, 0.0, 8.0)))
+    P = walled.reconstruction.P
+    steps = []
+    for i, j in ((0, 1), (1, 2)):
+        true = TrueDisparity(walled, (i, j), "metric")
+        steps.append(PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE)))
+    linked = follow(*steps)
+    known = linked.known
+    assert known.mean() > 0.3
+    first = steps[0].xy[known].astype(float)
+    # The stand-in has a plane at depth 6 of either reference: from i to j by the one, on to k by the other.
+    X = (homogenize(first) * 6.0 - P[1, :, 3]) @ np.linalg.inv(P[1, :, :3]).T
+    apart = np.linalg.norm(project(P[2], X) - linked.xy[known], axis=1)
+    assert np.median(apart) < 1e-3
+    assert np.quantile(apart, 0.98) < 0.05
+    assert (linked.sigma[known] >= steps[0].sigma[known]).all()
+
+
+def true_maps(walled):
+    return [
+        DepthMap(i, walled.reconstruction.P[i], d.astype(np.float32), np.full(d.shape, 5e-3, np.float32),
+                 np.ones(d.shape, np.uint8))
+        for i, d in enumerate(walled.depth)
+    ]  # fmt: skip
+
+
+def test_what_a_view_lacks_is_taken_from_others_where_the_photographs_agree():
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    maps, views = true_maps(walled), views_of(walled)
+    depth, other = maps[0].depth.copy(), maps[1].depth.copy()
+    lacks, wrong = np.s_[60:100, 60:110], np.s_[130:160, 100:150]
+    depth[lacks], depth[wrong] = np.nan, np.nan
+    # The other view is wrong there: what the photographs say counts, with the planes around the gap.
+    other[120:] *= 0.8
+    own, offering = replace(maps[0], depth=depth), replace(maps[1], depth=other)
+    found = Completion().complete(own, [offering], views, refinement=PlaneRefinement())
+    kept = np.isfinite(depth)
+    assert (found.depth[kept] == depth[kept]).all()
+    error = np.abs(found.depth[lacks] / maps[0].depth[lacks] - 1.0)
+    assert np.isfinite(error).mean() > 0.7
+    error = error[np.isfinite(error)]
+    assert np.median(error) < 0.004
+    assert np.mean(error < 0.02) > 0.95
+    error = found.depth[wrong] / maps[0].depth[wrong] - 1.0
+    assert np.mean(np.abs(error[np.isfinite(error)]) < 0.02) > 0.95
+    assert np.isfinite(found.std[np.isfinite(found.depth)]).all()
+    assert (found.views[lacks][np.isfinite(found.depth[lacks])] == 1).all()
+    nothing = replace(offering, depth=np.full_like(other, np.nan))
+    assert Completion().complete(own, [nothing], views, refinement=PlaneRefinement()) is own
+
+
+def test_what_other_views_see_through_and_small_pieces_go():
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    maps = true_maps(walled)
+    depth = maps[0].depth.copy()
+    depth[80:100, 20:40] *= 0.6
+    depth[100, 200:203] = np.nan
+    depth[101, 199:203] = np.nan
+    found = Consistency().confirm(replace(maps[0], depth=depth), [maps[1]])
+    assert np.isnan(found.depth[80:100, 20:40]).all()
+    assert np.isfinite(found.depth).mean() > 0.7
+    assert (found.views == np.isfinite(found.depth)).all()
+    alone = Consistency().confirm(maps[0], [])
+    assert np.isnan(alone.depth).all()
+    lonely = np.full((50, 60), np.nan, dtype=np.float32)
+    lonely[:20], lonely[30:32, 5:8] = 2.0, 3.0
+    sizes = piece_sizes(lonely, 0.02)
+    assert (sizes[:20] == 1200).all()
+    assert (sizes[30:32, 5:8] == 6).all()
+    assert sizes[25, 5] == 0
+
+
+def test_what_nobody_confirms_stays_if_it_continues_what_is_confirmed():
+    walled = make_walled(on_arc((-6.0, 6.0)))
+    maps = true_maps(walled)
+    other = maps[1].depth.copy()
+    other[20:26, 60:200] = np.nan
+    depth = maps[0].depth.copy()
+    depth[22:25, 100:103] *= 0.98
+    found = Consistency().confirm(replace(maps[0], depth=depth), [replace(maps[1], depth=other)])
+    assert np.isnan(found.depth[22:25, 100:103]).all()
+    strip = np.isfinite(found.depth[20:26, 110:180])
+    assert strip.mean() > 0.95
+    other[20:60, 60:200] = np.nan
+    found = Consistency().confirm(maps[0], [replace(maps[1], depth=other)])
+    assert np.isnan(found.depth[35:45, 110:180]).all()
+
+
+def test_a_pixel_goes_to_another_view_and_back():
+    P = on_arc((-6.0, 6.0))
+    to, back = transfer(P[0], P[1]), transfer(P[1], P[0])
+    q = to @ np.array([6.0 * 100.0, 6.0 * 80.0, 6.0, 1.0])
+    there = np.append(q, 1.0)
+    np.testing.assert_allclose(back @ there, [600.0, 480.0, 6.0], atol=1e-9)

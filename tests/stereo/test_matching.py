@@ -1,0 +1,231 @@
+"""Every variant on pairs whose disparity is known, and on pairs that have none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from tests.textures import texture
+from thesisrecon.stereo.cost import CensusAndColour, estimate_noise, prepare_pair, row_strips
+from thesisrecon.stereo.paths import PathPenalties
+from thesisrecon.stereo.postprocessing import Finish
+from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
+from thesisrecon.stereo.semi_global import CohesiveScanlines, SemiGlobal, match_rectified
+
+VARIANTS = [CohesiveScanlines(), SemiGlobal(), MaximumLikelihoodScanline()]
+HEIGHT, WIDTH = 120, 180
+names = pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: type(v).__name__)
+
+
+def pair_with_truth(seed: int = 0):
+    """A slanted wall behind a square: left and right image, left disparities, which pixels both see."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    wall, square = texture(HEIGHT, 2 * WIDTH, seed), texture(HEIGHT, 2 * WIDTH, seed + 1)
+    # Of the middle frame u a surface of disparity d is seen at u + d / 2 left and at u - d / 2 right.
+    slope, offset, near = 0.03, 3.0, 14.0
+
+    def seen(sign):
+        u = (x - sign * offset / 2.0) / (1.0 + sign * slope / 2.0)
+        image = map_coordinates(wall, [y, u + WIDTH / 2.0], order=3)
+        v = x - sign * near / 2.0
+        front = (np.abs(y - 60.0) < 30.0) & (np.abs(v - 90.0) < 35.0)
+        image[front] = map_coordinates(square, [y, v + WIDTH / 2.0], order=3)[front]
+        return image + rng.normal(0.0, 1.0, image.shape), front, offset + slope * u
+
+    left, front_l, back = seen(1.0)
+    right, front_r, _ = seen(-1.0)
+    truth = np.where(front_l, near, back)
+    partner = np.rint(x - truth).astype(int)
+    inside = partner >= 0
+    covered = front_r[y.astype(int), np.maximum(partner, 0)] & ~front_l
+    return left.astype(np.float32), right.astype(np.float32), truth, inside & ~covered
+
+
+@names
+def test_disparities_of_a_scene_are_found(variant):
+    left, right, truth, both = pair_with_truth()
+    found = variant.match(left, right, disparity_range=(0, 24))
+    error = np.abs(found.disparity - truth)
+    known = np.isfinite(found.disparity)
+    assert known[both].mean() > 0.93
+    assert np.mean(error[known & both] > 1.0) < 0.02
+    assert np.median(error[known & both]) < (0.3 if variant == VARIANTS[2] else 0.12)
+    assert np.mean(np.abs(found.filled() - truth)[both] > 1.0) < 0.03
+    assert ((found.confidence >= 0.0) & (found.confidence <= 1.0)).all()
+    assert (found.confidence[~known] == 0.0).all()
+    assert found.disparity.dtype == found.confidence.dtype == np.float32
+    assert np.median(error[known & both]) < 1.5 * found.sigma_px < 0.6
+
+
+@names
+def test_hidden_pixels_are_unknown(variant):
+    left, right, _, both = pair_with_truth()
+    found = variant.match(left, right, disparity_range=(0, 24))
+    hidden = ~both
+    hidden[:, :20] = False
+    assert hidden.sum() > 300
+    assert np.isfinite(found.disparity[hidden]).mean() < 0.5
+
+
+@names
+def test_a_range_may_span_zero(variant):
+    left, right, truth, both = pair_with_truth()
+    shifted = np.full_like(right, np.nan)
+    shifted[:, 10:] = right[:, :-10]
+    found = variant.match(left, shifted, disparity_range=(-12, 12))
+    known = np.isfinite(found.disparity) & both
+    assert known.mean() > 0.7
+    assert np.mean(np.abs(found.disparity - (truth - 10.0))[known] > 1.0) < 0.03
+
+
+@names
+def test_pixels_that_are_none_have_no_disparity(variant):
+    left, right, truth, both = pair_with_truth()
+    left[:20], left[100:, 90:] = np.nan, np.nan
+    found = variant.match(left, right, disparity_range=(0, 24))
+    assert np.isnan(found.disparity[np.isnan(left)]).all()
+    known = np.isfinite(found.disparity) & both
+    assert known.mean() > 0.5
+    assert np.mean(np.abs(found.disparity - truth)[known] > 1.0) < 0.03
+
+
+@names
+def test_the_number_of_threads_changes_no_byte(variant):
+    left, right, _, _ = pair_with_truth()
+    if not isinstance(variant, MaximumLikelihoodScanline):
+        variant = replace(variant, memory_mb=0.6)
+    one = variant.match(left, right, disparity_range=(0, 24))
+    three = replace(variant, threads=3).match(left, right, disparity_range=(0, 24))
+    assert one.disparity.tobytes() == three.disparity.tobytes()
+    assert one.confidence.tobytes() == three.confidence.tobytes()
+
+
+@pytest.mark.parametrize("variant", VARIANTS[:2], ids=lambda v: type(v).__name__)
+def test_strips_change_little(variant):
+    left, right, _, _ = pair_with_truth()
+    whole = variant.match(left, right, disparity_range=(0, 24))
+    strips = replace(variant, memory_mb=1.2).match(left, right, disparity_range=(0, 24))
+    known = np.isfinite(whole.disparity) & np.isfinite(strips.disparity)
+    assert (np.isfinite(whole.disparity) == np.isfinite(strips.disparity)).mean() > 0.99
+    assert np.mean(np.abs(whole.disparity - strips.disparity)[known] > 0.5) < 0.002
+
+
+@names
+@pytest.mark.parametrize("kind", ["uniform", "noise", "shade"])
+def test_walls_without_features_are_not_invented(variant, kind):
+    rng = np.random.default_rng(1)
+    level = np.full((HEIGHT, WIDTH), 120.0)
+    if kind == "shade":
+        level += np.linspace(-40.0, 40.0, WIDTH)
+    sigma = 0.0 if kind == "uniform" else 2.0
+    left, right = (level + sigma * rng.normal(size=level.shape) for _ in range(2))
+    found = variant.match(left, right, disparity_range=(0, 30))
+    known = np.isfinite(found.disparity)
+    if isinstance(variant, MaximumLikelihoodScanline):
+        # It has a disparity for everything that is not hidden, but says how little it is worth.
+        assert np.median(found.confidence) < 0.5
+    else:
+        assert known.mean() < 0.02
+        assert np.quantile(found.confidence, 0.99) < 0.1
+
+
+@names
+def test_unrelated_images_are_mostly_unknown_or_unlikely(variant):
+    left, right = texture(HEIGHT, WIDTH, 5), texture(HEIGHT, WIDTH, 6)
+    found = variant.match(left, right, disparity_range=(0, 30))
+    assert np.isfinite(found.disparity).mean() < 0.3
+
+
+@names
+def test_odd_images_do_no_harm(variant):
+    for left in (np.full((20, 30), np.nan), np.zeros((1, 1)), np.zeros((2, 40)), np.zeros((40, 2, 3))):
+        found = variant.match(left, left, disparity_range=(0, 8))
+        assert found.disparity.shape == left.shape[:2]
+        assert np.isnan(found.disparity).all() or isinstance(variant, MaximumLikelihoodScanline)
+    left, right, _, _ = pair_with_truth()
+    assert np.isnan(variant.match(left, right, disparity_range=(500, 520)).disparity).all()
+    assert variant.match(left, right, disparity_range=(4, 4)).disparity.shape == left.shape
+
+
+@names
+def test_wrong_calls_are_refused(variant):
+    image = np.zeros((10, 12))
+    with pytest.raises(ValueError, match="one shape"):
+        variant.match(image, np.zeros((10, 13)), disparity_range=(0, 4))
+    with pytest.raises(ValueError, match="must be \\(H, W\\)"):
+        variant.match(np.zeros(5), np.zeros(5), disparity_range=(0, 4))
+    with pytest.raises(ValueError, match="first <= last"):
+        variant.match(image, image, disparity_range=(4, 0))
+
+
+def test_the_front_door():
+    left, right, truth, both = pair_with_truth()
+    color = [np.repeat(np.clip(image, 0, 255)[..., None], 3, axis=2) for image in (left, right)]
+    found = match_rectified(*[image.astype(np.uint8) for image in color], max_disparity_px=23.2)
+    known = np.isfinite(found.disparity) & both
+    assert known.mean() > 0.8
+    assert np.mean(np.abs(found.disparity - truth)[known] > 1.0) < 0.02
+    thesis = match_rectified(left, right, max_disparity_px=24, config=MaximumLikelihoodScanline())
+    assert set(np.unique(thesis.disparity[np.isfinite(thesis.disparity)] % 1.0)) == {0.0}
+    for wrong in (-1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="max_disparity_px"):
+            match_rectified(left, right, max_disparity_px=wrong)
+
+
+@pytest.mark.parametrize(
+    ("make", "rule"),
+    [
+        (lambda: CensusAndColour(census_share=1.2), "census_share"),
+        (lambda: CensusAndColour(truncation=0.0), "truncation"),
+        (lambda: PathPenalties(step=2.0), "penalties must obey"),
+        (lambda: PathPenalties(edge=0.0), "edge"),
+        (lambda: Finish(radius=-1), "must not be negative"),
+        (lambda: Finish(least_confidence=1.0), "least_confidence"),
+        (lambda: MaximumLikelihoodScanline(detection=1.0), "detection"),
+        (lambda: MaximumLikelihoodScanline(radius=9), "radius"),
+        (lambda: MaximumLikelihoodScanline(cohesion="both"), "cohesion"),
+    ],
+)
+def test_parameters_are_checked(make, rule):
+    with pytest.raises(ValueError, match=rule):
+        make()
+
+
+def test_the_cost_of_a_hidden_pixel_is_that_of_the_paper():
+    # ln(0.99 / 0.01 * 256 / sqrt(2 pi 4)), equation (9) with one grey level as measurement.
+    assert MaximumLikelihoodScanline().hidden_cost(1, 4.0) == pytest.approx(8.528, abs=1e-3)
+
+
+def test_cohesion_takes_the_solution_with_fewer_discontinuities():
+    left, right, _, _ = pair_with_truth()
+    left, right = np.rint(left / 16.0) * 16.0, np.rint(right / 16.0) * 16.0
+    breaks = []
+    for cohesion in ("none", "along", "along and across"):
+        variant = MaximumLikelihoodScanline(radius=0, cohesion=cohesion)
+        found = variant.match(left, right, disparity_range=(0, 24)).disparity
+        d = np.nan_to_num(found, nan=-99.0)
+        breaks.append((int((np.diff(d, axis=1) != 0).sum()), int((np.diff(d, axis=0) != 0).sum())))
+    assert breaks[1][0] < breaks[0][0]
+    assert breaks[2][1] < breaks[1][1]
+
+
+def test_the_noise_of_an_image_is_found_beside_its_texture():
+    rng = np.random.default_rng(2)
+    clean = texture(200, 300, 3)
+    for sigma in (0.0, 2.0, 5.0):
+        noisy = np.clip(clean + sigma * rng.normal(size=clean.shape), 0, 255)
+        side, _ = prepare_pair(noisy, noisy)
+        assert estimate_noise(side) == pytest.approx(sigma, abs=1.2)
+
+
+def test_strips_cover_every_row_once_and_fit():
+    for height, per_row, memory in ((100, 10, 1e6), (500, 1000, 2e5), (333, 7, 1.0)):
+        strips = row_strips(height, per_row, memory)
+        assert [s[0] for s in strips] == [0, *[s[1] for s in strips[:-1]]]
+        assert strips[-1][1] == height
+        assert all(0 <= top <= first and last <= bottom <= height for first, last, top, bottom in strips)
+    assert all((s[3] - s[2]) * 1000 <= 2e5 for s in row_strips(500, 1000, 2e5))

@@ -1,0 +1,278 @@
+"""Compiled loops against their plain twins."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tests.stereo import matching_twins as twins
+from thesisrecon.stereo.cost_kernels import (
+    census,
+    cost_volume,
+    count_ones,
+    sampled_bounds,
+    split_bytes,
+    split_channels,
+    support_masks,
+)
+from thesisrecon.stereo.paths import jump_penalties, scratch_size, sum_paths, turn_back, turn_rows
+from thesisrecon.stereo.postprocessing import (
+    best_disparities,
+    check_left_right,
+    fill_pinholes,
+    rate,
+    remove_peaks,
+    smooth_alike,
+    squared_gradient,
+)
+from thesisrecon.stereo.scanline import FORBIDDEN, NOTHING, solve_row
+
+
+def random_side(rng, height=13, width=21, channels=3):
+    values = rng.integers(0, 200, (channels, height, width)).astype(np.int16)
+    valid = np.where(rng.random((height, width)) < 0.9, 255, 0).astype(np.uint8)
+    bits = np.empty((height, width), np.int32)
+    census(values.sum(axis=0, dtype=np.int16), bits)
+    low, high = np.empty_like(values), np.empty_like(values)
+    sampled_bounds(values, low, high)
+    return bits, values, low, high, valid
+
+
+def test_channels_are_quarter_levels_and_pixels_that_are_none_are_told():
+    image = np.array([[[0.0, 255.0], [10.1, np.nan]], [[300.0, -4.0], [np.inf, 1.0]]], np.float32)
+    channels, grey = np.empty((2, 2, 2), np.int16), np.empty((2, 2), np.int16)
+    valid = np.empty((2, 2), np.uint8)
+    split_channels(image, channels, grey, valid)
+    assert valid.tolist() == [[255, 0], [255, 0]]
+    assert channels[0].tolist() == [[0, 40], [1020, 0]]
+    assert channels[1].tolist() == [[1020, 0], [0, 4]]
+    assert (grey == channels.sum(axis=0)).all()
+
+
+def test_bytes_are_split_as_numbers_are():
+    image = np.random.default_rng(9).integers(0, 256, (7, 9, 3)).astype(np.uint8)
+    found = []
+    for values in (image, image.astype(np.float32)):
+        channels, grey = np.empty((3, 7, 9), np.int16), np.empty((7, 9), np.int16)
+        if values.dtype == np.uint8:
+            split_bytes(values, channels, grey)
+        else:
+            split_channels(values, channels, grey, np.empty((7, 9), np.uint8))
+        found.append((channels, grey))
+    assert (found[0][0] == found[1][0]).all()
+    assert (found[0][1] == found[1][1]).all()
+
+
+def test_ones_are_counted():
+    words = np.random.default_rng(0).integers(0, 2**31 - 1, 100).astype(np.int32)
+    expected = [int(word).bit_count() for word in words]
+    assert [count_ones(word) for word in words] == expected
+    assert twins.ones(words).tolist() == expected
+
+
+def test_census_and_bounds():
+    bits, channels, low, high, _ = random_side(np.random.default_rng(1))
+    assert (bits == twins.census(channels.sum(axis=0))).all()
+    for ours, theirs in zip((low, high), twins.bounds(channels), strict=True):
+        assert (ours == theirs).all()
+
+
+@pytest.mark.parametrize("insensitive", [0, 1])
+@pytest.mark.parametrize(("first", "n"), [(0, 6), (-4, 9), (15, 12), (30, 3), (-40, 3)])
+def test_costs_of_pixels(first, n, insensitive):
+    rng = np.random.default_rng(2)
+    left, right = random_side(rng), random_side(rng)
+    weights = np.array([400, 9, 300, insensitive], np.int16)
+    volume = np.empty((13, n, 21), np.uint8)
+    none = np.empty((4, 0, 13, 21), np.uint8)
+    cost_volume(left, right, none, first, weights, np.uint8(33), volume)
+    assert (volume == twins.costs(left, right, first, n, weights, 33)).all()
+
+
+def test_costs_over_supports():
+    rng = np.random.default_rng(3)
+    left, right = random_side(rng), random_side(rng)
+    left[1][:] //= 8
+    masks = np.empty((4, 2, 13, 21), np.uint8)
+    support_masks(left[1], left[4], np.int16(12), masks)
+    arms = twins.arm_lengths(left[1], left[4], 12)
+    assert ((masks > 0).sum(axis=1) == arms).all()
+    assert set(np.unique(arms)) == {0, 1, 2}
+    weights = np.array([400, 9, 300, 0], np.int16)
+    volume = np.empty((13, 7, 21), np.uint8)
+    cost_volume(left, right, masks, -2, weights, np.uint8(33), volume)
+    pixels = twins.costs(left, right, -2, 7, weights, 33)
+    assert np.abs(volume - twins.mean_over_support(pixels, arms)).max() <= 1
+    assert np.mean(volume == twins.mean_over_support(pixels, arms)) > 0.99
+
+
+@pytest.mark.parametrize("shape", [(9, 5, 7), (24, 3, 64), (17, 2, 130)])
+def test_rows_turn_and_turn_back(shape):
+    rows, n, width = shape
+    source = np.random.default_rng(4).integers(0, 256, shape).astype(np.uint8)
+    turned = np.zeros(((width + 7) // 8 * 8, n, (rows + 7) // 8 * 8), np.uint8)
+    turn_rows(source, turned)
+    assert (turned[:width, :, :rows] == source.transpose(2, 1, 0)).all()
+    back = np.empty_like(source)
+    turn_back(turned, back)
+    assert (back == source).all()
+
+
+@pytest.mark.parametrize("pairs", [2, 4])
+@pytest.mark.parametrize("shape", [(11, 6, 14), (200, 1, 9), (1, 5, 8), (6, 4, 1)])
+def test_sums_of_paths(shape, pairs):
+    rng = np.random.default_rng(5)
+    height, _, width = shape
+    costs = rng.integers(0, 49, shape).astype(np.uint8)
+    grey = rng.integers(0, 3000, (height, width)).astype(np.int16)
+    jumps = np.empty((4, height, width), np.uint8)
+    jump_penalties(grey, np.float32(70.0), np.float32(30.0), np.float32(200.0), jumps)
+
+    def penalty(y, x, v, u):
+        apart = abs(int(grey[y, x]) - int(grey[v, u]))
+        return int(max(30.0, 70.0 * 200.0 / (200.0 + apart)))
+
+    total = np.empty((pairs, *shape), np.uint8)
+    scratch = np.empty((2, scratch_size(*shape)), np.uint8)
+    sum_paths(costs, jumps, np.uint8(20), total, scratch)
+    directions = [(0, 1), (1, 0), (1, 1), (1, -1)]
+    for k in range(pairs):
+        dy, dx = directions[k]
+        there = twins.path_sum(costs, penalty, 20, (dy, dx))
+        assert (total[k] == there + twins.path_sum(costs, penalty, 20, (-dy, -dx))).all()
+
+
+def test_best_disparities_of_both_sides():
+    rng = np.random.default_rng(6)
+    sums = rng.integers(0, 250, (2, 5, 7, 15)).astype(np.uint8)
+    left, right, confidence = (np.empty((3, 15), np.float32) for _ in range(3))
+    best_disparities(sums, 1, -2, (left, right, confidence), 40.0)
+    total = sums.sum(axis=0, dtype=int)[1:4]
+    best = total.argmin(axis=1)
+    assert (np.abs(left - (best - 2)) <= 0.5).all()
+    for y, x in np.ndindex(3, 15):
+        mine = total[y, :, x]
+        rivals = [value for q, value in enumerate(mine) if abs(q - best[y, x]) > 1]
+        margin = min(rivals) - mine.min()
+        assert confidence[y, x] == pytest.approx(margin / (margin + 40.0))
+        seen = {q: total[y, q, x + q - 2] for q in range(7) if 0 <= x + q - 2 < 15}
+        assert right[y, x] == min(seen, key=lambda q: (seen[q], q)) - 2
+
+
+def test_the_sub_pixel_place_is_where_two_lines_meet():
+    sums = np.zeros((2, 1, 4, 1), np.uint8)
+    sums[0, 0, :, 0] = [90, 40, 20, 50]
+    out = tuple(np.empty((1, 1), np.float32) for _ in range(3))
+    best_disparities(sums, 0, 0, out, 1.0)
+    # Slope 30: 40 = v + 30 (x - 1), 50 = v + 30 (3 - x).
+    assert out[0][0, 0] == pytest.approx(2.0 - 1.0 / 6.0)
+
+
+def test_sides_that_contradict_each_other():
+    left = np.array([[2.0, 1.0, 1.0, 1.2, np.nan, 3.0]], np.float32)
+    right = np.array([[1.0, 1.0, 3.0, 1.0, 1.0, np.nan]], np.float32)
+    confidence = np.ones((1, 6), np.float32)
+    limits = np.array([1.0, 0.1], np.float32)
+    check_left_right(left, right, confidence, limits)
+    np.testing.assert_array_equal(left, np.array([[np.nan, 1, 1, np.nan, np.nan, 3]], np.float32))
+    confidence[0, 1] = 0.05
+    check_left_right(left, right, confidence, limits)
+    assert np.isnan(left[0, 1])
+    assert left[0, 2] == 1.0
+
+
+def test_peaks_go_and_surfaces_stay_where_there_is_texture():
+    disparity = np.zeros((9, 12), np.float32)
+    disparity[2:4, 2:4] = 5.0
+    disparity[:, 8:] += np.arange(1, 5, dtype=np.float32)
+    before = disparity.copy()
+    remove_peaks(disparity, np.ones((9, 12), bool), np.float32(1.0), 5)
+    gone = np.isnan(disparity)
+    assert gone.sum() == 4
+    assert gone[2:4, 2:4].all()
+    assert (disparity[~gone] == before[~gone]).all()
+    remove_peaks(disparity, np.zeros((9, 12), bool), np.float32(1.0), 5)
+    assert np.isnan(disparity).all()
+
+
+def test_confidence_falls_with_texture_and_where_it_was_filled_in():
+    confidence = np.full((1, 4), 0.8, np.float32)
+    confirmed = np.array([[1.0, np.nan, np.nan, 2.0]], np.float32)
+    disparity = np.array([[1.0, 1.0, np.nan, 2.0]], np.float32)
+    rate(confidence, confirmed, disparity, np.array([[4.0, 4.0, 4.0, 0.5]], np.float32))
+    assert confidence[0].tolist() == pytest.approx([0.6, 0.3, 0.0, 0.04])
+
+
+def test_pinholes_take_the_median_and_large_holes_stay():
+    disparity = np.arange(30, dtype=np.float32).reshape(5, 6)
+    disparity[2, 2] = np.nan
+    disparity[:, 5] = np.nan
+    out = np.empty_like(disparity)
+    fill_pinholes(disparity, 5, out)
+    assert out[2, 2] == np.nanmedian(disparity[1:4, 1:4])
+    assert np.isnan(out[:, 5]).all()
+    known = ~np.isnan(disparity)
+    assert (out[known] == disparity[known]).all()
+
+
+def test_smoothing_averages_what_is_alike():
+    rng = np.random.default_rng(7)
+    disparity = np.where(np.arange(11) < 5, 3.0, 9.0) + rng.uniform(-0.4, 0.4, (8, 11))
+    disparity[3, 3] = np.nan
+    values, out = disparity.astype(np.float32), np.empty((8, 11), np.float32)
+    smooth_alike(values, np.float32(1.0), 2, out)
+    for y, x in np.ndindex(8, 11):
+        window = values[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
+        if np.isnan(values[y, x]):
+            assert np.isnan(out[y, x])
+        else:
+            alike = window[np.abs(window - values[y, x]) <= 1.0]
+            assert out[y, x] == pytest.approx(alike.mean(), rel=1e-5)
+
+
+def test_squared_gradients_over_windows():
+    channels = np.random.default_rng(8).integers(0, 1000, (2, 9, 12)).astype(np.int16)
+    out = np.empty((9, 12), np.float32)
+    squared_gradient(channels, 2, out)
+    squares = np.zeros((9, 12))
+    squares[:, 1:-1] = ((channels[:, :, 2:].astype(float) - channels[:, :, :-2]) ** 2).mean(axis=0)
+    padded = np.pad(squares, 2)
+    for y, x in np.ndindex(9, 12):
+        assert out[y, x] == pytest.approx(padded[y : y + 5, x : x + 5].sum() / 25.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("first", "n"), [(0, 5), (-3, 6), (2, 4)])
+def test_rows_of_greatest_likelihood(first, n, seed):
+    rng = np.random.default_rng(seed)
+    width = 12
+    costs = rng.integers(0, 30, (n, width)).astype(np.int32)
+    costs[rng.random(costs.shape) < 0.1] = FORBIDDEN
+    for q in range(n):
+        x = np.arange(width)
+        costs[q, (x - first - q < 0) | (x - first - q >= width)] = FORBIDDEN
+    above = tuple(
+        np.where(rng.random(width) < 0.3, NOTHING, rng.integers(first, first + n, width)).astype(np.int32)
+        for _ in range(2)
+    )
+    left, right = np.empty(width, np.int32), np.empty(width, np.int32)
+    for prices in ((11, 5, 1, 1), (11, 11, 1, 0), (11, 5, 0, 0), (40, 5, 1, 1)):
+        solve_row(costs, first, prices, above, left, right)
+        found = price_of(costs, first, prices, above, left, right)
+        assert found == twins.most_likely_row(costs, first, prices, above)
+
+
+def price_of(costs, first, prices, above, left, right):
+    """Cost and discontinuities of a correspondence; it must be ordered and unique."""
+    width = costs.shape[1]
+    pairs = [(x, x - int(left[x])) for x in range(width) if left[x] != NOTHING]
+    assert all(right[j] == x - j for x, j in pairs)
+    assert (right != NOTHING).sum() == len(pairs)
+    assert all(b[0] > a[0] and b[1] > a[1] for a, b in itertools.pairwise(pairs))
+    # No other match is left: what the program says of these alone is their price.
+    fixed = np.full_like(costs, FORBIDDEN)
+    for x, j in pairs:
+        fixed[x - j - first, x] = costs[x - j - first, x]
+    return twins.most_likely_row(fixed, first, prices, above)

@@ -1,0 +1,124 @@
+"""The search for slanted windows: its compiled loops against plain NumPy, and what it finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from tests.stereo.depth_twins import Setting, squares
+from tests.textures import texture
+from thesisrecon.stereo.plane_kernels import UNKNOWN, begin_planes, pack_squares, rate_planes, sweep_planes
+
+SHAPE = (13, 17)
+PLANE = np.array([1.0, 6e-3, -4e-3])
+"""Inverse depth at (0, 0) and its gradient."""
+
+
+def arguments(setting, others):
+    """What the compiled loops take of a setting."""
+    words, layout, start = [], [], 0
+    for other in others:
+        word = np.empty(other.shape, np.uint32)
+        pack_squares(other, word)
+        words.append(word.ravel())
+        layout.append((start, *other.shape[::-1]))
+        start += other.size
+    packed = np.concatenate(words)
+    gray, H, e = setting.gray, setting.H, setting.e
+    return gray, packed, np.array(layout), H, e, setting.offsets, setting.likeness
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A plane in three views; the third shows something else, and corners of two are unknown."""
+    gray = texture(60, 70, 3)
+    H = np.eye(3) + np.array([0.0, 1e-3, -1e-3])[:, None, None] * np.ones((3, 3)) * [[1], [1], [1e-2]]
+    e = np.array([[5.0, 1.0, 0.01], [-4.0, 2.0, -0.01], [1.0, -6.0, 0.0]])
+    y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(float)
+    others = []
+    for k, shape in enumerate(((22, 30), (20, 27), (25, 24))):
+        v, u = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
+        # Pixels of the other view come from (x, y) by the inverse of the plane's homography.
+        G = H[k] + np.outer(e[k], [PLANE[1], PLANE[2], PLANE[0]])
+        q = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(G).T
+        at = [20.0 + q[..., 1] / q[..., 2], 20.0 + q[..., 0] / q[..., 2]]
+        others.append(map_coordinates(gray if k < 2 else gray[::-1], at, order=1).astype(np.float32))
+    one = map_coordinates(gray, [20.0 + y, 20.0 + x], order=1).astype(np.float32)
+    one[:3, :2], others[0][:4, :5] = np.nan, np.nan
+    sample = np.stack(np.meshgrid(np.arange(-4, 5, 2), np.arange(-4, 5, 2))).reshape(2, -1)
+    likeness = np.exp(-np.arange(256.0) / 15.0).astype(np.float32)
+    setting = Setting(one, others, H, e, sample.astype(np.float32), likeness)
+    return setting, arguments(setting, others), (x, y)
+
+
+def planes_about(places, spread, seed=0):
+    """The plane of the scene, disturbed by ``spread`` px at pixels at random, unknown at some."""
+    rng = np.random.default_rng(seed)
+    x, y = places
+    planes = np.stack([PLANE[0] + x * PLANE[1] + y * PLANE[2], x * 0 + PLANE[1], x * 0 + PLANE[2]], axis=-1)
+    planes[..., 0] += spread / 5.0 * rng.normal(size=x.shape)
+    planes[rng.random(x.shape) < 0.2] = np.nan
+    return planes.astype(np.float32)
+
+
+def test_squares_are_the_four_levels_of_an_interpolation(scene):
+    gray = scene[0].gray.copy()
+    gray[5, 7] = 300.0
+    packed = np.empty(SHAPE, np.uint32)
+    pack_squares(gray, packed)
+    wanted = squares(gray)
+    for k in range(4):
+        assert ((packed >> (8 * k)) & 255 == wanted[..., k]).all()
+    assert (packed[:3, :2] == 0).all()
+    assert (packed[-1] == 0).all()
+    assert (packed[3:-1, :-1] > 0).all()
+
+
+@pytest.mark.parametrize("spread", [0.3, 20.0])
+def test_costs_equal_weighted_correlations(scene, spread):
+    setting, given, places = scene
+    planes = planes_about(places, spread)
+    cost = np.empty(SHAPE, np.float32)
+    begin_planes(*given, planes, cost)
+    np.testing.assert_allclose(cost, setting.begin(planes), atol=2e-4)
+    least, slope = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
+    support = np.empty(SHAPE, np.uint8)
+    rate_planes(*given, planes, 0.4, least, support, slope)
+    wanted = setting.rate(planes, 0.4)
+    np.testing.assert_allclose(least, wanted[0], atol=2e-4)
+    assert (support == wanted[1]).all()
+    np.testing.assert_allclose(slope, wanted[2], rtol=1e-5, atol=1e-9)
+    assert len(np.unique(support)) >= 3
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_a_pass_equals_that_of_plain_numpy(scene, backward):
+    setting, given, places = scene
+    planes = planes_about(places, 0.5)
+    cost = np.empty(SHAPE, np.float32)
+    begin_planes(*given, planes, cost)
+    wanted, wanted_cost = planes.copy(), cost.copy()
+    setting.sweep(wanted, wanted_cost, step_px=0.4, settled=0.02, backward=backward)
+    sweep_planes(*given, 0.4, 0.02, backward, planes, cost)
+    # Sums in single precision may turn a choice between planes of one cost.
+    assert np.mean(np.isclose(cost, wanted_cost, atol=5e-4)) > 0.97
+    same = np.isclose(planes, wanted, atol=1e-4, equal_nan=True).all(axis=-1)
+    assert same.mean() > 0.95
+
+
+def test_passes_find_the_plane_and_fill_what_has_none(scene):
+    _, given, (x, y) = scene
+    planes = planes_about((x, y), 0.5, seed=2)
+    cost = np.empty(SHAPE, np.float32)
+    begin_planes(*given, planes, cost)
+    before = cost.copy()
+    for k in range(4):
+        sweep_planes(*given, 0.5 * 0.5**k, 0.0, k % 2 == 1, planes, cost)
+    assert (cost <= before).all()
+    off = 5.0 * np.abs(planes[..., 0] - (PLANE[0] + x * PLANE[1] + y * PLANE[2]))
+    seen = np.isfinite(given[0])
+    assert np.isfinite(planes[seen]).mean() > 0.98
+    assert np.nanmedian(off[seen]) < 0.05
+    assert np.mean(off[seen] < 0.5) > 0.8
+    assert (cost[~seen] == UNKNOWN).all()

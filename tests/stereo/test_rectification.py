@@ -1,0 +1,281 @@
+"""Rows are epipolar lines, maps are inverse, nearer is farther left on the right, bad pairs are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from tests.geometry.properties import holds_for_every
+from tests.stereo.rectification_scenes import MOTIONS, PLANAR, SIZE, make_pair
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import camera_from_centre, project
+from thesisrecon.stereo.epipolar_pair import pair_of_cameras, pair_of_fundamental
+from thesisrecon.stereo.planar import CommonOrientation, FrameLimits, PlanarRectification
+from thesisrecon.stereo.planar_methods import Hartley, LeastDistortion, LoopZhang
+from thesisrecon.stereo.polar import Polar, PolarRectification
+from thesisrecon.stereo.rectification import (
+    LeastDistorted,
+    disparity_range,
+    jacobians,
+    measure_quality,
+    rectify_cameras,
+    rectify_pair,
+)
+
+PLANAR_METHODS = (Hartley(), LoopZhang(), LeastDistortion(), CommonOrientation())
+CASES = [(method, motion) for method in PLANAR_METHODS for motion in PLANAR]
+CASES += [(Polar(), motion) for motion in MOTIONS]
+
+
+def named(value):
+    return value if isinstance(value, str) else type(value).__name__
+
+
+def both_pairs(scene):
+    """The pair of F, and that of the cameras."""
+    return (
+        pair_of_fundamental(scene.F, scene.xy1, scene.xy2, *scene.sizes),
+        pair_of_cameras(*scene.P, *scene.sizes, xy1=scene.xy1, xy2=scene.xy2),
+    )
+
+
+@pytest.mark.parametrize(("method", "motion"), CASES, ids=named)
+def test_exact_matches_share_their_row_and_nearer_ones_are_farther_left_on_the_right(method, motion):
+    scene = make_pair(motion, np.random.default_rng(0))
+    for pair in both_pairs(scene):
+        if pair.cameras is None and isinstance(method, CommonOrientation):
+            continue
+        rectified = method.rectify(pair)
+        left = rectified.rectified_from_original(0, scene.xy1)
+        right = rectified.rectified_from_original(1, scene.xy2)
+        seen = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
+        assert seen.mean() > 0.97
+        assert np.abs(left - right)[seen, 1].max() < 1e-8
+        # A point ten percent farther on the ray of view 0 has a smaller disparity.
+        beyond = rectified.rectified_from_original(1, project(scene.P[1], 1.1 * scene.X), within=False)
+        assert (beyond[seen, 0] > right[seen, 0]).all()
+
+
+@pytest.mark.parametrize(("method", "motion"), CASES, ids=named)
+def test_no_pixel_shrinks_by_more_than_is_stated_and_none_is_mirrored(method, motion):
+    scene = make_pair(motion, np.random.default_rng(1))
+    pair = both_pairs(scene)[1]
+    rectified = method.rectify(pair)
+    quality = measure_quality(rectified, pair)
+    assert quality.least_scale >= 1.0 / method.limits.most_shrink - 1e-2
+    assert quality.growth <= method.limits.most_growth
+    for side in (0, 1):
+        inside = np.isfinite(rectified.rectified_from_original(side, pair.regions[side])).all(axis=1)
+        J = jacobians(rectified, side, pair.regions[side][inside])
+        told = np.isfinite(J).all(axis=(1, 2))
+        assert (np.linalg.det(J[told]) > 0.0).all()
+        assert told.mean() > 0.95
+
+
+@holds_for_every(st.sampled_from(CASES), examples=60)
+def test_the_maps_are_inverse_to_each_other(rng, case):
+    method, motion = case
+    scene = make_pair(motion, rng)
+    rectified = method.rectify(both_pairs(scene)[1])
+    width, height = rectified.size
+    places = rng.uniform([-0.4, -0.4], [width - 0.6, height - 0.6], (200, 2))
+    for side in (0, 1):
+        xy = rectified.original_from_rectified(side, places)
+        shown = np.isfinite(xy).all(axis=1) & (np.abs(xy) < 2000.0).all(axis=1)
+        assert np.abs(rectified.rectified_from_original(side, xy[shown]) - places[shown]).max() < 1e-9
+        pixels = rng.uniform([0.0, 0.0], np.array(scene.sizes[side]) - 1.0, (200, 2))
+        there = rectified.rectified_from_original(side, pixels)
+        there = there[np.isfinite(there).all(axis=1)]
+        kept = pixels[np.isfinite(rectified.rectified_from_original(side, pixels)).all(axis=1)]
+        assert np.abs(rectified.original_from_rectified(side, there) - kept).max(initial=0.0) < 1e-9
+
+
+@pytest.mark.parametrize(("method", "motion"), [(LoopZhang(), "toed in"), (Polar(), "forward")], ids=named)
+def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
+    rectified = method.rectify(both_pairs(make_pair(motion, np.random.default_rng(2)))[0])
+    rows = range(37, 42)
+    x, y = np.meshgrid(np.arange(float(rectified.size[0])), np.array(rows, dtype=np.float64))
+    expected = rectified.original_from_rectified(1, np.column_stack([x.ravel(), y.ravel()]))
+    np.testing.assert_allclose(rectified.lookup(1, rows).reshape(-1, 2), expected, atol=1e-10)
+    outside = np.array([[-1.0, 3.0], [3.0, -1.0], [rectified.size[0], 3.0], [3.0, rectified.size[1]]])
+    assert np.isnan(rectified.original_from_rectified(0, outside)).all()
+
+
+def test_a_parallel_pair_stays_as_it_is():
+    scene = make_pair("parallel", np.random.default_rng(3))
+    for method in (LoopZhang(), LeastDistortion(), CommonOrientation()):
+        rectified = method.rectify(both_pairs(scene)[1])
+        for H in (rectified.H1, rectified.H2):
+            expected = np.eye(3)
+            expected[:2, 2] = (H / H[2, 2])[:2, 2]
+            if isinstance(method, LeastDistortion):
+                # The disparities of any scene slope a little; a shear takes part of that.
+                assert np.abs(H / H[2, 2] - expected).max() < 0.1
+            else:
+                np.testing.assert_allclose(H / H[2, 2], expected, atol=1e-6)
+
+
+def test_disparities_of_a_common_orientation_are_inverse_depths():
+    scene = make_pair("toed in", np.random.default_rng(4))
+    pair = both_pairs(scene)[1]
+    rectified = CommonOrientation().rectify(pair)
+    d = (
+        rectified.rectified_from_original(0, scene.xy1)[:, 0]
+        - rectified.rectified_from_original(1, scene.xy2)[:, 0]
+    )
+    # The third coordinate of the new orientation is that of H1 M1 over its scale.
+    M = rectified.H1 @ scene.P[0, :, :3]
+    z = scene.X @ M[2] / np.linalg.norm(M[2])
+    inverse, seen = 1.0 / z, np.isfinite(d)
+    slope, offset = np.polyfit(inverse[seen], d[seen], 1)
+    assert slope > 0.0
+    np.testing.assert_allclose(d[seen], slope * inverse[seen] + offset, atol=1e-8)
+
+
+def test_hartley_leaves_the_second_photograph_rigid_about_its_centre_and_makes_the_first_like_it():
+    scene = make_pair("beside", np.random.default_rng(5))
+    pair = both_pairs(scene)[0]
+    hartley = Hartley().rectify(pair)
+    centre = (np.array(scene.sizes[1]) - 1.0) / 2.0
+    J = jacobians(hartley, 1, centre[None])[0]
+    s = np.linalg.svd(J, compute_uv=False)
+    assert s[0] / s[1] == pytest.approx(1.0, abs=1e-5)
+    spread = {
+        type(m).__name__: np.ptp(measure_quality(m.rectify(pair), pair).disparities)
+        for m in PLANAR_METHODS[:3]
+    }
+    assert spread["Hartley"] == min(spread.values())
+
+
+def test_loop_and_zhang_keep_angles_and_ratios_and_the_least_distorted_is_not_beaten():
+    for motion in ("beside", "toed in", "rolled", "behind"):
+        pair = both_pairs(make_pair(motion, np.random.default_rng(6), noise_px=0.1))[0]
+        found = {type(m).__name__: measure_quality(m.rectify(pair), pair) for m in PLANAR_METHODS[:3]}
+        assert np.abs(np.array(found["LoopZhang"].orthogonality_deg) - 90.0).max() < 5.0
+        assert np.abs(np.array(found["LoopZhang"].aspect) - 1.0).max() < 0.1
+        least = min(quality.distortion for quality in found.values())
+        # The crop, which the measure heeds, depends on the result.
+        assert found["LeastDistortion"].distortion < least + 0.01
+
+
+def test_noise_of_matches_is_the_noise_of_rows():
+    scene = make_pair("beside", np.random.default_rng(7), noise_px=0.2)
+    pair = both_pairs(scene)[1]
+    for method in (*PLANAR_METHODS, Polar()):
+        quality = measure_quality(method.rectify(pair), pair)
+        assert 0.2 < quality.rms_dy_px / np.sqrt(2.0) / quality.greatest_scale + 0.1 < 0.35
+
+
+@pytest.mark.parametrize("motion", ["forward", "diagonal", "half forward"])
+def test_epipoles_inside_are_for_polar_frames_alone(motion):
+    scene = make_pair(motion, np.random.default_rng(8))
+    pair = both_pairs(scene)[1]
+    for method in PLANAR_METHODS:
+        with pytest.raises(StageFailure, match="polar"):
+            method.rectify(pair)
+    for best in (
+        rectify_pair(scene.F, scene.xy1, scene.xy2, *scene.sizes),
+        rectify_cameras(*scene.P, *scene.sizes, xy1=scene.xy1, xy2=scene.xy2),
+        rectify_cameras(*scene.P, *scene.sizes),
+    ):
+        assert isinstance(best, PolarRectification)
+        assert min(measure_quality(best, pair).kept) > 0.5
+
+
+def test_the_best_is_planar_for_neighbours_and_polar_where_planar_frames_stretch():
+    scene = make_pair("beside", np.random.default_rng(9))
+    best = rectify_pair(scene.F, scene.xy1, scene.xy2, *scene.sizes)
+    assert isinstance(best, PlanarRectification)
+    with pytest.raises(ValueError, match="one of"):
+        rectify_pair(scene.F, scene.xy1, scene.xy2, *scene.sizes, method="none")
+    wide = make_pair("toed in", np.random.default_rng(9))
+    turned = replace(LeastDistorted((LeastDistortion(), Polar())), bending=-1.0)
+    assert isinstance(turned.rectify(both_pairs(wide)[0]), PolarRectification)
+
+
+def test_matches_bound_the_disparities_and_a_few_wrong_ones_do_not():
+    scene = make_pair("beside", np.random.default_rng(10))
+    rectified = rectify_cameras(*scene.P, *scene.sizes, method="metric")
+    low, high = disparity_range(rectified, scene.xy1, scene.xy2)
+    left = rectified.rectified_from_original(0, scene.xy1)
+    d = left[:, 0] - rectified.rectified_from_original(1, scene.xy2)[:, 0]
+    assert low < d.min()
+    assert d.max() < high
+    shifted = left.copy()
+    shifted[:2, 0] -= 300.0
+    wrong = np.where(
+        np.arange(len(left))[:, None] < 2,
+        rectified.original_from_rectified(0, shifted, within=False),
+        scene.xy1,
+    )
+    again = disparity_range(rectified, wrong, scene.xy2)
+    assert abs(again[0] - low) + abs(again[1] - high) < 0.2 * (high - low)
+    with pytest.raises(StageFailure, match="disparities"):
+        disparity_range(rectified, scene.xy1[:0], scene.xy2[:0])
+
+
+def test_pairs_without_depth_are_refused_with_a_reason():
+    rng = np.random.default_rng(11)
+    scene = make_pair("beside", rng)
+    H = np.array([[1.0, 0.02, 5.0], [-0.02, 1.0, 3.0], [1e-5, 2e-5, 1.0]])
+    turned = np.column_stack([scene.xy1, np.ones(len(scene.xy1))]) @ H.T
+    turned = turned[:, :2] / turned[:, 2:] + 0.1 * rng.normal(size=scene.xy1.shape)
+    with pytest.raises(StageFailure, match="no parallax"):
+        rectify_pair(scene.F, scene.xy1, turned, SIZE, SIZE)
+    same = scene.P.copy()
+    same[1] = same[1, :, :3] @ np.column_stack([np.eye(3), np.zeros(3)])
+    with pytest.raises(StageFailure, match="one centre"):
+        rectify_cameras(*same, SIZE, SIZE)
+    near = scene.P.copy()
+    near[1, :, 3] *= 1e-5
+    x2 = project(near[1], scene.X) + 0.05 * rng.normal(size=scene.xy1.shape)
+    with pytest.raises(StageFailure, match="no parallax"):
+        rectify_cameras(*near, SIZE, SIZE, xy1=scene.xy1, xy2=x2)
+
+
+def test_contradictions_and_too_little_are_refused_with_a_reason():
+    scene = make_pair("forward", np.random.default_rng(12))
+    # Half of the points moved to the other side of the epipole, where their lines run on.
+    e = np.linalg.svd(scene.F.T)[2][2]
+    other = scene.xy2.copy()
+    other[::2] = 2.0 * e[:2] / e[2] - other[::2]
+    with pytest.raises(StageFailure, match="opposite halves"):
+        rectify_pair(scene.F, scene.xy1, other, *scene.sizes)
+    with pytest.raises(StageFailure, match="too few"):
+        rectify_pair(scene.F, scene.xy1[:5], scene.xy2[:5], *scene.sizes)
+    with pytest.raises(StageFailure, match="rank 1"):
+        rectify_pair(np.outer([1.0, 2.0, 3.0], [3.0, 1.0, 2.0]), scene.xy1, scene.xy2, *scene.sizes)
+    away = scene.P.copy()
+    away[1] = camera_from_centre(scene.P[0, :, :3], np.diag([-1.0, 1.0, -1.0]), np.array([1.5, 0.0, -5.0]))
+    with pytest.raises(StageFailure, match="in front of both"):
+        rectify_cameras(*away, SIZE, SIZE)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"F": np.zeros((3, 3))},
+        {"F": np.eye(2)},
+        {"F": np.full((3, 3), np.nan)},
+        {"xy1": np.zeros((4, 2))},
+        {"xy1": np.full((300, 2), np.inf)},
+        {"size1": (1, 480)},
+        {"size2": (640.5, 480)},
+        {"size2": (640, 480, 3)},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_wrong_calls_are_value_errors(change):
+    scene = make_pair("beside", np.random.default_rng(14))
+    call = {"F": scene.F, "xy1": scene.xy1, "xy2": scene.xy2, "size1": SIZE, "size2": SIZE} | change
+    with pytest.raises(ValueError, match=r"rectif|matches|photograph"):
+        rectify_pair(**call)
+    with pytest.raises(ValueError, match="most_shrink"):
+        FrameLimits(most_shrink=0.5)
+    with pytest.raises(ValueError, match="most_shear"):
+        LeastDistortion(most_shear=0.0)
+    with pytest.raises(ValueError, match="side"):
+        rectify_cameras(*scene.P, SIZE, SIZE).rectified_from_original(2, scene.xy1)

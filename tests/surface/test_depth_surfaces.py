@@ -1,0 +1,269 @@
+"""Surfaces of single depth maps: linear and fitted, against shapes that are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import binary_erosion
+
+from tests.surface.sphere import looking_at_origin, sphere_map
+from thesisrecon.arrays import B8, F64
+from thesisrecon.geometry.camera_matrix import camera_from_centre
+from thesisrecon.records import DepthMap
+from thesisrecon.surface.bspline import BSplineSurface
+from thesisrecon.surface.linear import (
+    DepthSurface,
+    LinearSurface,
+    normals,
+    resampled,
+    sampled_mesh,
+    surface_from_depth,
+)
+from thesisrecon.surface.mesh import parts_of
+
+BOTH = pytest.mark.parametrize("surface", [LinearSurface(), BSplineSurface()], ids=["linear", "b-spline"])
+SHAPE = (60, 80)
+P = camera_from_centre(
+    np.diag([75.0, 75.0, 1.0]) + np.outer([39.5, 29.5, 0.0], [0, 0, 1.0]), np.eye(3), np.zeros(3)
+)
+
+
+def map_of(rho: F64, deviation: float, *, known: B8 | None = None) -> DepthMap:
+    """Depths of inverse depths with a deviation."""
+    depth = np.where(True if known is None else known, 1.0 / rho, np.nan)
+    std = (deviation / rho**2).astype(np.float32)
+    return DepthMap(0, P, depth.astype(np.float32), std, np.ones(rho.shape, dtype=np.uint8))
+
+
+def pixels(shape: tuple[int, int] = SHAPE) -> F64:
+    y, x = np.indices(shape)
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
+
+
+def polynomial(*c: float) -> Callable[[F64], tuple[F64, F64]]:
+    """Inverse depth c0 + c1 u + c2 v + c3 u^2 + c4 u v + c5 v^2 of u, v in long sides, and its gradient."""
+
+    def shape(xy: F64) -> tuple[F64, F64]:
+        u, v = xy.T / 80.0 - 0.5
+        a = (*c, *(0.0,) * (6 - len(c)))
+        rho = a[0] + a[1] * u + a[2] * v + a[3] * u**2 + a[4] * u * v + a[5] * v**2
+        gradient = np.stack([a[1] + 2 * a[3] * u + a[4] * v, a[2] + a[4] * u + 2 * a[5] * v], axis=1)
+        return rho, gradient / 80.0
+
+    return shape
+
+
+@BOTH
+@settings(max_examples=6, deadline=None)
+@given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.integers(0, 2**31))
+def test_planes_are_exact_everywhere_with_their_normals(
+    surface: DepthSurface, a: float, b: float, seed: int
+) -> None:
+    plane = polynomial(0.2, a, b)
+    fit = surface.fit(map_of(plane(pixels())[0].reshape(SHAPE), 1e-4))
+    xy = np.random.default_rng(seed).uniform(0.0, [79.0, 59.0], (200, 2))
+    rho, gradient = plane(xy)
+    found = fit.evaluate(xy)
+    np.testing.assert_allclose(found.inverse_depth, rho, rtol=1e-6)  # depths are float32
+    np.testing.assert_allclose(found.gradient, gradient, atol=2e-7)
+    # a . (x, y, 1) = 1 / z is the plane (K' a) . X = 1, and its normal looks back at the camera.
+    level = np.append(gradient[0], rho[0] - gradient[0] @ xy[0])
+    normal = -P[:, :3].T @ level
+    np.testing.assert_allclose(
+        normals(fit, xy), np.tile(normal / np.linalg.norm(normal), (200, 1)), atol=2e-3
+    )
+    assert normal[2] < 0.0
+
+
+def test_quadrics_and_their_derivatives_are_reproduced() -> None:
+    quadric = polynomial(0.2, 0.03, -0.02, 0.05, 0.04, -0.06)
+    fit = BSplineSurface().fit(map_of(quadric(pixels())[0].reshape(SHAPE), 1e-5))
+    xy = np.random.default_rng(0).uniform(0.0, [79.0, 59.0], (300, 2))
+    rho, gradient = quadric(xy)
+    found = fit.evaluate(xy)
+    assert np.abs(found.inverse_depth / rho - 1.0).max() < 1e-4
+    assert (
+        np.linalg.norm(found.gradient - gradient, axis=1).max()
+        < 0.03 * np.linalg.norm(gradient, axis=1).max()
+    )
+
+
+@BOTH
+def test_the_gradient_is_the_derivative_of_the_surface(surface: DepthSurface) -> None:
+    fit = surface.fit(sphere_map(0, looking_at_origin(0.3, 0.2, 3.5), noise=0.01))
+    xy = np.random.default_rng(1).uniform([60.0, 40.0], [100.0, 80.0], (200, 2))
+    h = 1e-5
+    slope = [
+        (fit.evaluate(xy + step).inverse_depth - fit.evaluate(xy - step).inverse_depth) / (2 * h)
+        for step in (np.array([h, 0.0]), np.array([0.0, h]))
+    ]
+    inner = np.abs(xy % 1.0 - 0.5).max(axis=1) < 0.49
+    inner &= np.abs(xy.sum(axis=1) % 1.0 - 0.5) < 0.49  # off the diagonals
+    inner &= np.abs((xy[:, 0] - xy[:, 1]) % 1.0 - 0.5) < 0.49
+    np.testing.assert_allclose(fit.evaluate(xy).gradient[inner], np.stack(slope, axis=1)[inner], atol=1e-7)
+
+
+@BOTH
+def test_nothing_is_said_beyond_the_depths(surface: DepthSurface) -> None:
+    plane = polynomial(0.2, 0.05)
+    hole = np.ones(SHAPE, dtype=bool)
+    hole[20:40, 30:50] = False
+    hole[:, 70:] = False
+    fit = surface.fit(map_of(plane(pixels())[0].reshape(SHAPE), 1e-4, known=hole))
+    found = np.isfinite(resampled(fit).depth)
+    np.testing.assert_array_equal(found, hole)
+    outside = np.array([[-3.0, 5.0], [90.0, 5.0], [5.0, 70.0], [35.0, 30.0], [75.0, 10.0], [np.nan, 1.0]])
+    assert np.isnan(fit.evaluate(outside).inverse_depth).all()
+    nothing = surface.fit(map_of(np.full(SHAPE, 0.2), 1e-4, known=np.zeros(SHAPE, dtype=bool)))
+    assert np.isnan(nothing.evaluate(pixels()).inverse_depth).all()
+    assert len(sampled_mesh(nothing).faces) == 0
+
+
+def errors(surface: DepthSurface, noisy: DepthMap, clean: DepthMap) -> F64:
+    """Relative errors of depths off the outline of the sphere, where it slopes away."""
+    inner = binary_erosion(np.isfinite(clean.depth), iterations=5)
+    return np.asarray(resampled(surface.fit(noisy)).depth / clean.depth - 1.0)[inner]
+
+
+def test_noise_is_averaged_where_the_surface_is_smooth() -> None:
+    camera = looking_at_origin(0.3, 0.2, 3.5)
+    clean, noisy = sphere_map(0, camera), sphere_map(0, camera, noise=0.01)
+    linear, fitted = (errors(s, noisy, clean) for s in (LinearSurface(), BSplineSurface()))
+    rms = [float(np.sqrt(np.mean(e**2))) for e in (linear, fitted)]
+    assert rms[1] < rms[0] / 3.5
+    assert abs(fitted.mean()) < 0.05 * rms[0]
+
+
+def test_deviations_that_are_told_too_large_or_small_change_little() -> None:
+    camera = looking_at_origin(0.3, 0.2, 3.5)
+    clean, noisy = sphere_map(0, camera), sphere_map(0, camera, noise=0.01)
+    rms = []
+    for factor in (0.3, 1.0, 3.0):
+        told = replace(noisy, std=np.float32(factor) * noisy.std)
+        rms.append(float(np.sqrt(np.mean(errors(BSplineSurface(), told, clean) ** 2))))
+    assert max(rms) < 1.3 * min(rms)
+
+
+@pytest.mark.parametrize("size", [0.03, 1.0], ids=["near", "gross"])
+def test_a_fifth_of_wrong_depths_is_outvoted(size: float) -> None:
+    camera = looking_at_origin(0.3, 0.2, 3.5)
+    clean, noisy = sphere_map(0, camera), sphere_map(0, camera, noise=0.004)
+    rng = np.random.default_rng(2)
+    wrong = rng.random(noisy.depth.shape) < 0.2
+    spoilt = noisy.depth + np.where(wrong, rng.uniform(-size, size, wrong.shape), 0.0).astype(np.float32)
+    fitted = errors(BSplineSurface(), replace(noisy, depth=spoilt), clean)
+    without = errors(BSplineSurface(), noisy, clean)
+    assert np.sqrt(np.nanmean(fitted**2)) < 2.0 * np.sqrt(np.mean(without**2))
+    assert np.isfinite(fitted).mean() > 0.999
+    linear = errors(LinearSurface(), replace(noisy, depth=spoilt), clean)
+    assert np.sqrt(np.mean(linear**2)) > 5.0 * np.sqrt(np.nanmean(fitted**2))
+
+
+@pytest.mark.parametrize("slant", [0.0, 0.02])
+def test_an_edge_is_not_smeared(slant: float) -> None:
+    """Half the picture is nearer: pixels next to the edge are as exact as others."""
+    near, far = polynomial(0.5, slant, 0.01), polynomial(0.2, -slant, 0.02)
+    y, x = np.indices(SHAPE)
+    front = x < 33 + (y // 7) % 4
+    truth = np.where(front, near(pixels())[0].reshape(SHAPE), far(pixels())[0].reshape(SHAPE))
+    noise = 5e-4
+    rho = truth + noise * np.random.default_rng(0).normal(size=SHAPE)
+    fit = BSplineSurface().fit(map_of(rho, noise))
+    error = 1.0 / resampled(fit).depth - truth
+    assert np.abs(error).max() < 2.5 * noise
+    assert np.sqrt(np.mean(error**2)) < noise / 3.0
+    mesh = sampled_mesh(fit)
+    assert len(np.unique(parts_of(mesh.faces, len(mesh.vertices)))) == 2
+
+
+def test_a_cut_may_end_within_the_surface() -> None:
+    """A step that fades out: apart where it is large, one surface where it ends, exact on both sides."""
+    y, x = np.indices(SHAPE)
+    step = np.clip((45.0 - y) / 45.0, 0.0, 1.0) * 0.1
+    truth = 0.2 + 0.5 * step * np.where(x < 40, 1.0, -1.0)
+    noise = 2e-4
+    rho = truth + noise * np.random.default_rng(0).normal(size=SHAPE)
+    fit = BSplineSurface().fit(map_of(rho, noise))
+    error = np.abs(1.0 / resampled(fit).depth - truth)
+    near_the_end = (np.abs(y - 42) < 8) & (np.abs(x - 39.5) < 8)
+    assert error[~near_the_end].max() < 5.0 * noise
+    mesh = sampled_mesh(fit)
+    assert len(np.unique(parts_of(mesh.faces, len(mesh.vertices)))) == 1
+
+
+def test_small_pieces_become_the_surface_about_them_or_nothing() -> None:
+    rho = np.full(SHAPE, 0.2)
+    known = np.zeros(SHAPE, dtype=bool)
+    known[:, :60] = True
+    known[10:13, 70:73] = True  # alone
+    rho[30:33, 30:33] = 0.5  # before the wall
+    found = resampled(BSplineSurface().fit(map_of(rho, 1e-4, known=known))).depth
+    np.testing.assert_allclose(found[:, :60], 5.0, rtol=1e-4)
+    assert np.isnan(found[:, 60:]).all()
+
+
+@BOTH
+def test_any_resolution(surface: DepthSurface) -> None:
+    fit = surface.fit(sphere_map(0, looking_at_origin(0.3, 0.2, 3.5)))
+    meshes = {scale: sampled_mesh(fit, scale) for scale in (0.5, 1.0, 2.0)}
+    faces = {scale: len(mesh.faces) for scale, mesh in meshes.items()}
+    assert faces[0.5] == pytest.approx(faces[1.0] / 4, rel=0.15)
+    assert faces[2.0] == pytest.approx(4 * faces[1.0], rel=0.15)
+    for mesh in meshes.values():
+        radius = np.linalg.norm(mesh.vertices, axis=1)
+        assert np.median(np.abs(radius - 1.0)) < 1e-3
+        assert np.quantile(np.abs(radius - 1.0), 0.8) < 0.01  # the outline slopes away
+    with pytest.raises(ValueError, match="positive"):
+        resampled(fit, 0.0)
+
+
+def test_the_linear_surface_is_the_triangulated_map() -> None:
+    depth_map = sphere_map(0, looking_at_origin(0.3, 0.2, 3.5), noise=0.02)
+    fit = LinearSurface().fit(depth_map)
+    assert resampled(fit) is depth_map
+    y, x = np.indices(depth_map.depth.shape)
+    at_pixels = fit.evaluate(np.stack([x.ravel(), y.ravel()], axis=1).astype(float)).inverse_depth
+    np.testing.assert_allclose(1.0 / at_pixels, depth_map.depth.ravel(), rtol=1e-6)
+    mesh, plain = sampled_mesh(fit), surface_from_depth(depth_map)
+    np.testing.assert_array_equal(mesh.faces, plain.faces)
+    # The middle of a triangle of the mesh lies on the surface.
+    middle = plain.vertices[plain.faces[::37]].mean(axis=1) @ depth_map.P[:, :3].T + depth_map.P[:, 3]
+    rho = fit.evaluate(middle[:, :2] / middle[:, 2:]).inverse_depth
+    np.testing.assert_allclose(rho, 1.0 / middle[:, 2], rtol=1e-6)
+
+
+def test_normals_of_a_noisy_sphere() -> None:
+    camera = looking_at_origin(0.3, 0.2, 3.5)
+    noisy = sphere_map(0, camera, noise=0.003)
+    xy = np.random.default_rng(0).uniform([55.0, 35.0], [105.0, 85.0], (500, 2))
+    off = []
+    for surface in (LinearSurface(), BSplineSurface()):
+        fit = surface.fit(noisy)
+        ray = np.column_stack([xy, np.ones(len(xy))]) / fit.evaluate(xy).inverse_depth[:, None]
+        X = np.linalg.solve(camera[:, :3], (ray - camera[:, 3]).T).T
+        true = X / np.linalg.norm(X, axis=1, keepdims=True)
+        off.append(np.degrees(np.arccos(np.clip(np.sum(true * normals(fit, xy), axis=1), -1.0, 1.0))))
+    assert np.nanmedian(off[1]) < 2.0
+    assert np.nanmedian(off[0]) > 5.0 * np.nanmedian(off[1])
+
+
+def test_the_same_map_gives_the_same_bytes() -> None:
+    noisy = sphere_map(0, looking_at_origin(0.3, 0.2, 3.5), noise=0.01)
+    one, two = (BSplineSurface().fit(noisy).coefficients for _ in range(2))
+    assert one.tobytes() == two.tobytes()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"knot_px": 1}, {"rounds": 0}, {"window": 0}, {"grazing_deg": 0.0}, {"grazing_deg": 90.0}]
+)
+def test_wrong_parameters_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="needed"):
+        BSplineSurface(**wrong)  # type: ignore[arg-type]
+    if "grazing_deg" in wrong:
+        with pytest.raises(ValueError, match="needed"):
+            LinearSurface(**wrong)

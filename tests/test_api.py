@@ -1,0 +1,143 @@
+"""The front doors of single stages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+import thesisrecon
+from tests import fake_stages as fakes
+from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.errors import StageFailure
+from thesisrecon.intrinsics import IntrinsicsAssumption
+from thesisrecon.records import Image, Reconstruction, TexturedMesh, Tracks
+from thesisrecon.report.summary import original_from_working, point_colours
+
+COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
+
+
+def small_reconstruction() -> Reconstruction:
+    """Two points seen by two views of which the second is of another size."""
+    view, point = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
+    xy = np.array([[1.0, 2.0], [3.2, 0.4], [0.0, 0.0], [90.0, 90.0]])
+    return Reconstruction(
+        stratum="projective",
+        P=np.stack([fakes.scene_camera(0), fakes.scene_camera(1)]),
+        X=fakes.scene_points()[:3],
+        registered=np.array([True, True]),
+        valid=np.array([True, True, False]),
+        inlier=np.array([True, True, True, False]),
+        tracks=Tracks(view, point, xy, 2, 3),
+        sizes=np.array([[96, 80], [48, 40]]),
+        sigma_px=1.0,
+        reasons=("", ""),
+    )
+
+
+def test_two_photographs_give_verified_matches_and_f() -> None:
+    paths = sorted(COURTYARD.iterdir())[:2]
+    config = PipelineConfig(images=ImageOptions(max_size_px=640))
+    pair = thesisrecon.match_pair(paths[0], paths[1], config=config)
+    assert pair.accepted
+    assert len(pair.xy1) >= 60
+    ends = [np.column_stack([xy, np.ones(len(xy))]) for xy in (pair.xy1, pair.xy2)]
+    lines = ends[0] @ pair.F.T
+    distance = np.abs(np.sum(ends[1] * lines, axis=1)) / np.hypot(lines[:, 0], lines[:, 1])
+    assert np.median(distance) < 0.5
+    again = thesisrecon.match_pair(str(paths[0]), str(paths[1]), config=config)
+    np.testing.assert_array_equal(again.xy2, pair.xy2)
+
+
+def test_photographs_that_cannot_be_read_or_matched_are_failures(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_text("no picture")
+    noise = [np.random.default_rng(k).integers(0, 256, (200, 200, 3), dtype=np.uint8) for k in range(2)]
+    with pytest.raises(StageFailure, match=r"a\.jpg is not an image"):
+        thesisrecon.match_pair(tmp_path / "a.jpg", noise[0])
+    with pytest.raises(StageFailure, match="do not match"):
+        thesisrecon.match_pair(*noise)
+
+
+def test_self_calibration_groups_views_by_size_and_takes_a_prior() -> None:
+    heard = []
+
+    class Listening(fakes.FakeCalibrator):
+        def calibrate(self, reconstruction, *, assumed, rng):  # type: ignore[no-untyped-def]
+            heard.append(assumed)
+            return super().calibrate(reconstruction, assumed=assumed, rng=rng)
+
+    config = fakes.fake_config(selfcalibration=Listening())
+    thesisrecon.self_calibrate(small_reconstruction(), config=config)
+    wish = IntrinsicsAssumption(focal_px=50.0, focal_std_rel=0.1, cameras="per-image")
+    thesisrecon.self_calibrate(small_reconstruction(), config=replace(config, intrinsics=wish))
+    assert heard[0].group.tolist() == [0, 1]
+    assert not heard[0].focal_known.any()
+    assert heard[1].focal_known.all()
+    assert heard[1].mean[:, 0].tolist() == [50.0, 50.0]
+
+
+def test_only_a_projective_reconstruction_is_calibrated() -> None:
+    metric = replace(small_reconstruction(), stratum="metric")
+    with pytest.raises(ValueError, match="takes a projective reconstruction; got metric"):
+        thesisrecon.self_calibrate(metric)
+
+
+def test_triangulate_and_estimate_fundamental_are_front_doors() -> None:
+    X, P = fakes.scene_points(), np.stack([fakes.scene_camera(0), fakes.scene_camera(2)])
+    xy = np.stack([(X @ camera.T)[:, :2] / (X @ camera.T)[:, 2:] for camera in P])
+    found = thesisrecon.triangulate(P, xy)
+    np.testing.assert_allclose(found[:, :3] / found[:, 3:], X[:, :3], atol=1e-6)
+    fit = thesisrecon.estimate_fundamental(xy[0], xy[1])
+    assert fit.inliers.sum() >= 25
+    with pytest.raises(AttributeError, match="no attribute 'reconstrukt'"):
+        _ = thesisrecon.reconstrukt  # type: ignore[attr-defined]
+    assert set(thesisrecon.__all__) == set(dir(thesisrecon))
+
+
+def test_points_take_the_mean_colour_of_where_they_are_seen() -> None:
+    images = []
+    for width, height in ((96, 80), (48, 40)):
+        rgb = np.zeros((height, width, 3), np.uint8)
+        rgb[..., 0], rgb[..., 1] = np.arange(width)[None, :], np.arange(height)[:, None]
+        images.append(Image("x", rgb, (width, height)))
+    colours = point_colours(small_reconstruction(), tuple(images))
+    assert colours.tolist() == [[2, 1, 0], [0, 0, 0], [128, 128, 128]]
+
+
+def test_pixels_go_back_to_the_original_as_they_came() -> None:
+    scale = 0.4
+    original = np.array([123.0, 45.0])
+    working = (original + 0.5) * scale - 0.5
+    np.testing.assert_allclose(original_from_working(scale) @ [*working, 1.0], [*original, 1.0])
+
+
+def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    wall = np.asarray(
+        PIL.Image.fromarray(rng.integers(0, 256, (20, 40), dtype=np.uint8)).resize((160, 80)), dtype=np.uint8
+    )
+    left, right = (np.repeat(wall[:, a:b, None], 3, axis=2) for a, b in ((0, 150), (6, 156)))
+    found = thesisrecon.match_rectified(left, right, max_disparity_px=12)
+    inner = found.disparity[8:-8, 20:-8]
+    assert np.isfinite(inner).mean() > 0.9
+    assert np.nanmedian(np.abs(inner - 6.0)) < 0.2
+    for name, image in (("left", left), ("right", right)):
+        PIL.Image.fromarray(image).save(tmp_path / f"{name}.png")
+    again = thesisrecon.match_rectified(tmp_path / "left.png", tmp_path / "right.png", max_disparity_px=12)
+    np.testing.assert_array_equal(again.disparity, found.disparity)
+    with pytest.raises(StageFailure, match="nothing"):
+        thesisrecon.match_rectified(tmp_path / "nothing.png", right, max_disparity_px=12)
+    with pytest.raises(ValueError, match="one shape"):
+        thesisrecon.match_rectified(left, right[:-2], max_disparity_px=12)
+
+
+def test_a_model_is_rendered_through_the_front_door() -> None:
+    triangle = np.array([[-1.0, -1.0, 2.0], [-1.0, 1.0, 2.0], [1.0, 0.0, 2.0]])
+    mesh = TexturedMesh(triangle, np.array([[0, 1, 2]]))
+    K = np.array([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])
+    seen = thesisrecon.render(mesh, thesisrecon.Camera(K, np.eye(3), np.zeros(3), (32, 24)))
+    assert seen.valid[12, 12]
+    assert seen.depth[12, 12] == pytest.approx(2.0)

@@ -1,0 +1,286 @@
+"""Views between photographs: the front door, what is refused, and the command."""
+
+from __future__ import annotations
+
+import json
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+
+import thesisrecon
+from tests.textures import texture
+from thesisrecon import view_interpolation as between
+from thesisrecon.cli.main import run_command
+from thesisrecon.cli.view_files import METHODS, BetweenWishes, write_between
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.records import Image
+from thesisrecon.views.interpolation import pair_of_rectified, unsure
+
+COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
+SHIFT = 6
+
+
+@pytest.fixture(scope="module")
+def wall() -> tuple[np.ndarray, np.ndarray]:
+    """A textured wall from two places, ``SHIFT`` px apart."""
+    rgb = np.stack([texture(90, 170, seed) for seed in (0, 1, 2)], axis=-1).astype(np.uint8)
+    return rgb[:, :160], np.ascontiguousarray(rgb[:, SHIFT : 160 + SHIFT])
+
+
+def photograph(seed: int, size: tuple[int, int] = (40, 30)) -> Image:
+    rgb = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    return Image(f"{seed}.jpg", rgb, size)
+
+
+def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities(
+    wall: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    left, right = wall
+    expected = np.roll(left, -SHIFT // 2, axis=1)[:, 10:-20].astype(int)
+    d = np.full(left.shape[:2], SHIFT, dtype=np.float32)
+    for known in (None, d, (d, d), (unsure(d), unsure(d))):
+        view = thesisrecon.interpolate_view(left, right, 0.5, disparity=known)
+        assert view.dtype == np.uint8
+        assert view.shape == left.shape
+        assert np.abs(view[:, 10:-20] - expected).mean() < 2.0
+    for name, image in (("left", left), ("right", right)):
+        PIL.Image.fromarray(image).save(tmp_path / f"{name}.png")
+    again = thesisrecon.interpolate_view(tmp_path / "left.png", tmp_path / "right.png", 0.5, disparity=d)
+    np.testing.assert_array_equal(again, thesisrecon.interpolate_view(left, right, 0.5, disparity=d))
+    np.testing.assert_array_equal(thesisrecon.interpolate_view(left, right, 1, disparity=d), right)
+    grey = thesisrecon.interpolate_view(left[..., 0], right[..., 0], 0.5, disparity=d)
+    assert grey.shape == left.shape
+
+
+def test_wrong_calls_of_the_front_door_are_refused(wall: tuple[np.ndarray, np.ndarray]) -> None:
+    left, right = wall
+    with pytest.raises(ValueError, match="from 0"):
+        thesisrecon.interpolate_view(left, right, 1.5)
+    with pytest.raises(ValueError, match="one size"):
+        thesisrecon.interpolate_view(left, right[:-3], 0.5)
+    with pytest.raises(ValueError, match="uint8"):
+        thesisrecon.interpolate_view(left.astype(float), right, 0.5)
+    with pytest.raises(ValueError, match="shape of the photographs"):
+        thesisrecon.interpolate_view(left, right, 0.5, disparity=np.zeros((3, 4), np.float32))
+    d = np.zeros(left.shape[:2], np.float32)
+    odd: Any
+    for odd in ([d, d], d[..., None]):
+        with pytest.raises(ValueError, match=r"\(H, W\), or a tuple"):
+            thesisrecon.interpolate_view(left, right, 0.5, disparity=odd)
+    with pytest.raises(UsageError, match="no photograph"):
+        thesisrecon.interpolate_view(Path("nowhere.png"), right, 0.5)
+
+
+def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    a, b = photograph(0), photograph(1)
+    with pytest.raises(UsageError, match=r"0\.jpg and 0\.jpg are the same photograph"):
+        between.relate(a, Image("0.jpg", a.rgb.copy(), a.size))
+    with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
+        between.relate(a, photograph(2, (40, 20)))
+    with pytest.raises(UsageError, match="same photograph"):
+        between.interpolation_film([a, b, a], 3)
+    with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
+        between.interpolation_film([a, b, photograph(2, (40, 20))], 3)
+    # Forward motion: both epipoles at (21, 14).
+    e, rng = np.array([21.0, 14.0]), np.random.default_rng(0)
+    xy = rng.uniform((0.0, 0.0), (40.0, 30.0), (100, 2))
+    ahead = e + rng.uniform(1.05, 1.3, (100, 1)) * (xy - e)
+    pair = SimpleNamespace(F=cross_matrix(np.append(e, 1.0)), xy1=xy, xy2=ahead)
+    monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
+    with pytest.raises(
+        StageFailure, match=r"moved towards what they show, or away; .*\(21, 14\) px of the first"
+    ):
+        between.relate(a, b)
+    # A photograph and a copy of it, saved anew: this F is as good as any.
+    pair.xy2 = xy + rng.normal(0.0, 0.01, xy.shape)
+    with pytest.raises(StageFailure, match="no parallax"):
+        between.relate(a, b)
+
+
+def test_what_cannot_be_rectified_is_told_without_the_library_s_other_ways(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Dense:
+        failure = StageFailure("too distorted", "a number", "rectify in polar coordinates")
+
+        def match_two_views(self, *_: Any, **__: Any) -> None:
+            raise self.failure
+
+    F = cross_matrix(np.array([1.0, 0.0, 0.0]))
+    pair = SimpleNamespace(F=F, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+    monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
+    config: Any = SimpleNamespace(dense=Dense())
+    with pytest.raises(
+        StageFailure, match=r"too distorted; a number; take them from places beside each other"
+    ):
+        between.relate(photograph(0), photograph(1), config=config)
+    Dense.failure = StageFailure("no parallax")
+    with pytest.raises(StageFailure, match="no parallax"):
+        between.relate(photograph(0), photograph(1), config=config)
+
+
+@pytest.fixture
+def still(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """Photographs of one place: every pixel stays, and what is related is noted."""
+    related: list[tuple[str, str]] = []
+
+    def relate(first: Image, second: Image, **_: Any) -> Any:
+        related.append((first.name, second.name))
+        nothing = unsure(np.zeros(first.rgb.shape[:2], np.float32))
+        return pair_of_rectified(first.rgb, second.rgb, (nothing, nothing))
+
+    monkeypatch.setattr(between, "relate", relate)
+    return related
+
+
+def even(name: str, level: int) -> Image:
+    return Image(name, np.full((24, 32, 3), level, dtype=np.uint8), (32, 24))
+
+
+def test_a_film_of_two_goes_from_one_to_the_other(still: list[tuple[str, str]]) -> None:
+    film = between.interpolation_film([even("a", 100), even("b", 200)], 5)
+    assert film.captions[1] == "75 % a, 25 % b"
+    assert film.places[4] == {"shares": [0.0, 1.0]}
+    levels = [float(film.draw(k, 1).mean()) for k in range(5)]
+    assert levels[0] == 100.0
+    assert levels[4] == 200.0
+    # Exposures are mixed by their ratio, in which neither photograph is the darker one's.
+    assert levels == sorted(levels)
+    assert film.told["violating_monotonicity"] == [0.0]
+    assert "0.0 % of these violate monotonicity" in film.notes[0]
+    assert still == [("a", "b")]
+    assert between.interpolation_film([even("a", 100), even("b", 200)], 1).captions == ("50 % a, 50 % b",)
+    for photographs, frames in (([even("a", 1)], 3), ([even("a", 1), even("b", 2)], 0)):
+        with pytest.raises(ValueError, match="2 or 3"):
+            between.interpolation_film(photographs, frames)
+
+
+def test_a_film_of_three_crosses_the_triangle(still: list[tuple[str, str]]) -> None:
+    film = between.interpolation_film([even("a", 100), even("b", 200), even("c", 50)], 5)
+    assert [place["shares"] for place in film.places] == [
+        [1.0, 0.0, 0.0],
+        [0.75, 0.25, 0.0],
+        [0.5, 0.5, 0.0],
+        [0.25, 0.25, 0.5],
+        [0.0, 0.0, 1.0],
+    ]
+    assert still == [("a", "b"), ("the view between", "c")]
+    levels = [float(film.draw(k, 1).mean()) for k in range(5)]
+    assert levels[0] == 100.0
+    assert levels[4] == 50.0
+    assert levels[1] < levels[2] > levels[3] > levels[4]
+    assert len(film.notes) == 2
+
+
+def test_a_place_in_the_triangle_is_reached_by_interpolating_twice(still: list[tuple[str, str]]) -> None:
+    three = [even("a", 100), even("b", 100), even("c", 100)]
+    for weights, expected in (
+        ((0.2, 0.3, 0.5), [("a", "b"), ("the view between", "c")]),
+        ((0.4, 0.6, 0.0), [("a", "b")]),
+        ((0.5, 0.0, 0.5), [("the view between", "c")]),
+        ((0.0, 0.0, 1.0), []),
+        ((0.0, 0.0, 1.0 - 1e-7), []),
+    ):
+        still.clear()
+        np.testing.assert_array_equal(between.interpolate_three(three, weights), 100)
+        assert still == expected
+    for weights in ((0.5, 0.6, 0.0), (-0.1, 0.6, 0.5)):
+        with pytest.raises(ValueError, match="sum to 1"):
+            between.interpolate_three(three, weights)
+
+
+def test_the_command_writes_frames_an_animation_and_a_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photographs = [str(COURTYARD / f"000{k}.jpg") for k in (6, 7)]
+    out = tmp_path / "früm one to other"
+    options = ["--frames", "3", "--max-size", "512", "--threads", "2", "-o", str(out)]
+    assert run_command(["views", *photographs, *options]) == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines()[0] == f"3 pictures of 512 x 384 px and interpolation.webp are in {out}"
+    names = ["frame-0001.png", "frame-0002.png", "frame-0003.png", "frames.json", "interpolation.webp"]
+    assert sorted(path.name for path in out.iterdir()) == [*names, "strip.html"]
+    told = json.loads((out / "frames.json").read_text(encoding="utf-8"))
+    assert told["photographs"] == ["0006.jpg", "0007.jpg"]
+    assert told["frames"][1] == {"name": "frame-0002.png", "shares": [0.5, 0.5]}
+    assert 0.0 < told["violating_monotonicity"][0] < 0.3
+    assert told["known"][0] > 0.3
+    with PIL.Image.open(out / "interpolation.webp") as film:
+        assert film.n_frames == 3
+    page = (out / "strip.html").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg;base64,") == 4
+    assert "http" not in page.replace("http-equiv", "")
+    assert "violate monotonicity" in page
+    frames = []
+    for k in range(3):
+        with PIL.Image.open(out / names[k]) as picture:
+            frames.append(np.asarray(picture).astype(float))
+    # Halfway there is no ghost of either end: mixtures of two photographs are dull.
+    contrast = [np.abs(np.diff(frame, axis=1)).mean() for frame in frames]
+    assert contrast[1] > 0.8 * min(contrast[0], contrast[2])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words", "code"),
+    [
+        (["0004.jpg", "0004.jpg"], "is given twice", 2),
+        (["0004.jpg", "copy.jpg"], "0004.jpg and copy.jpg are the same photograph", 2),
+        (["0004.jpg", "nowhere.jpg"], "there is no photograph", 2),
+        (["0004.jpg", "text.jpg"], "text.jpg is not an image", 3),
+        (["0004.jpg", "small.jpg"], "one size; 0004.jpg is 1024 x 768 and small.jpg is 512 x 384 px", 2),
+        (["0004.jpg", "noise.png", "--max-size", "256"], "do not match", 3),
+        (["0004.jpg"], "got one file", 2),
+        (["0004.jpg", "folder"], "is a folder", 2),
+        (["0000.jpg", "0001.jpg", "0002.jpg", "0003.jpg"], "2 or 3 photographs; got 4", 2),
+        (["0004.jpg", "0005.jpg", "--path", "orbit"], "--path is of a run", 2),
+        (["0004.jpg", "0005.jpg", "--frames", "0"], "--frames takes a whole number of at least 1", 2),
+        (["0004.jpg", "0005.jpg", "--max-size", "9"], "--max-size takes at least 64 px", 2),
+        (["0004.jpg", "0005.jpg", "--method", "guessing"], "--method", 2),
+        (["folder", "--method", "interpolation"], "--method is of views between photographs", 2),
+    ],
+)
+def test_bad_input_of_the_command_gets_one_sentence(
+    arguments: list[str], words: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "copy.jpg").write_bytes((COURTYARD / "0004.jpg").read_bytes())
+    (tmp_path / "text.jpg").write_text("no picture", encoding="utf-8")
+    (tmp_path / "folder").mkdir()
+    with PIL.Image.open(COURTYARD / "0005.jpg") as picture:
+        picture.resize((512, 384)).save(tmp_path / "small.jpg")
+    noise = np.random.default_rng(0).integers(0, 256, (768, 1024, 3), dtype=np.uint8)
+    PIL.Image.fromarray(noise).save(tmp_path / "noise.png")
+    placed = [
+        str((COURTYARD if (COURTYARD / word).is_file() else tmp_path) / word)
+        if "." in word or word == "folder"
+        else word
+        for word in arguments
+    ]
+    out = tmp_path / "out"
+    assert run_command(["views", *placed, "-o", str(out)]) == code
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert not out.exists()
+
+
+def test_wishes_name_what_is_wrong(tmp_path: Path) -> None:
+    photographs = (COURTYARD / "0004.jpg", COURTYARD / "0005.jpg")
+    with pytest.raises(UsageError, match="unknown method"):
+        BetweenWishes(photographs, method="guessing")
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(UsageError, match="not of this command"):
+        write_between(tmp_path, BetweenWishes(photographs))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_its_film(method: str) -> None:
+    module, name = METHODS[method]
+    assert callable(getattr(import_module(module), name))

@@ -1,0 +1,126 @@
+"""Views without a model from two photographs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+import thesisrecon
+from thesisrecon.cli.view_files import BetweenWishes, write_between
+from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.intrinsics import IntrinsicsAssumption
+from thesisrecon.view_synthesis import match_photographs, tensor_film, tensor_views
+from thesisrecon.views.virtual_camera import VirtualCamera
+from validation.scenes.real import load_fixture_scene
+
+SCENE = load_fixture_scene()
+SMALL = PipelineConfig(images=ImageOptions(max_size_px=512))
+
+
+@pytest.fixture(scope="module")
+def found():
+    return match_photographs(SCENE.image_paths[6], SCENE.image_paths[7], config=SMALL)
+
+
+def _photograph(k):
+    with PIL.Image.open(SCENE.image_paths[k]) as image:
+        return np.asarray(image.resize((512, 384), PIL.Image.Resampling.BOX))
+
+
+def _psnr(a, b):
+    return 10.0 * np.log10(255.0**2 / np.mean((a.astype(np.float64) - b) ** 2))
+
+
+def test_calibrated_photographs_show_a_third_one(found):
+    views = tensor_views(found, K=SCENE.K[6], config=SMALL)
+    R, C = SCENE.R, SCENE.C
+    baseline = np.linalg.norm(C[7] - C[6])
+    np.testing.assert_allclose(views.pair.t, R[7] @ (C[6] - C[7]) / baseline, atol=0.01)
+    np.testing.assert_allclose(views.pair.K1[0], [454.3, 0.0, 264.2], atol=0.06)
+    camera = VirtualCamera(R[8] @ R[7].T, R[8] @ (C[7] - C[8]) / baseline, views.pair.K2, views.sizes[1])
+    picture, truth = views.render(camera), _photograph(8)
+    gain = truth[100:300, 130:400].mean() / picture[100:300, 130:400].mean()
+    inner = (slice(60, -60), slice(80, -80))
+    assert _psnr(gain * picture[inner], truth[inner]) > _psnr(_photograph(7)[inner], truth[inner]) + 3.0
+
+
+def test_at_their_own_places_the_photographs_are_seen_again(found):
+    guessed = tensor_views(found, config=SMALL)
+    np.testing.assert_allclose(guessed.pair.K1[0], [512.0, 0.0, 255.5])
+    first, second = (guessed.render(camera) for camera in guessed.along(2))
+    assert np.mean(second != found.images[1].rgb) < 1e-3
+    # Rounding leaves a corner to its neighbours.
+    assert np.mean(first != found.images[0].rgb) < 1e-3
+
+
+def test_what_is_told_of_the_focal_length_is_taken(found):
+    told = replace(SMALL, intrinsics=IntrinsicsAssumption(focal="known", focal_px=900.0))
+    assert tensor_views(found, config=told).pair.K1[0, 0] == 450.0
+
+
+def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
+    with pytest.raises(ValueError, match="det -1"):
+        thesisrecon.synthesize_view("no.jpg", "file.jpg", -np.eye(3), np.zeros(3))
+    with pytest.raises(ValueError, match="three finite"):
+        thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), [0.0, 1.0])
+    with pytest.raises(ValueError, match="K is"):
+        thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3), K=np.eye(4))
+    with pytest.raises(UsageError, match=r"there is no photograph no\.jpg"):
+        thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3))
+
+
+def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
+    motion = np.eye(3), np.array([0.1, 0.0, 0.0])
+    picture = thesisrecon.synthesize_view(SCENE.image_paths[6], SCENE.image_paths[7], *motion, config=SMALL)
+    assert picture.shape == (384, 512, 3)
+    assert picture.dtype == np.uint8
+    views = tensor_views(found, config=SMALL)
+    np.testing.assert_array_equal(
+        picture, views.render(VirtualCamera(*motion, views.pair.K2, views.sizes[1]), threads=2)
+    )
+
+
+def test_cameras_in_one_place_show_no_parallax():
+    """As of one camera with another principal point."""
+    picture = _photograph(6)
+    with pytest.raises(StageFailure, match="show no parallax: the camera only turned"):
+        match_photographs(picture[:, :-32].copy(), picture[:, 32:].copy(), config=SMALL)
+
+
+def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
+    paths = tuple(SCENE.image_paths[6:8])
+    made = write_between(tmp_path / "film", BetweenWishes(paths, "tensor", frames=5, max_size_px=320))
+    told = json.loads((tmp_path / "film" / "frames.json").read_text(encoding="utf-8"))
+    assert [frame["baselines"] for frame in told["frames"]] == [-0.5, 0.0, 0.5, 1.0, 1.5]
+    assert told["photographs"] == ["0006.jpg", "0007.jpg"]
+    assert made.size == (320, 240)
+    pictures = []
+    for path in made.frames:
+        with PIL.Image.open(path) as image:
+            pictures.append(np.asarray(image))
+    with PIL.Image.open(SCENE.image_paths[7]) as image:
+        second = np.asarray(image.resize((320, 240), PIL.Image.Resampling.BOX))
+    likeness = [_psnr(picture, second) for picture in pictures]
+    assert np.argmax(likeness) == 3
+    page = (tmp_path / "film" / "strip.html").read_text(encoding="utf-8")
+    assert "0.50 baselines before 0006.jpg" in page
+    assert "0.50 baselines beyond 0007.jpg" in page
+
+
+def test_films_are_of_two_different_photographs(found):
+    first, second = found.images
+    with pytest.raises(UsageError, match="2 photographs; got 3"):
+        tensor_film((first, second, first), 5)
+    with pytest.raises(UsageError, match="the same photograph"):
+        tensor_film((first, first), 5)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="there is no photograph"):
+        match_photographs(tmp_path / "none.png", tmp_path / "none.png")

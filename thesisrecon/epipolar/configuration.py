@@ -1,0 +1,379 @@
+"""Whether a homography is that of a camera that turned: K R K^-1 with square pixels (HZ 13.2, 19.6).
+
+Section 5.5: is F determined at all, and what else would explain the matches: evidence, then a name.
+
+Matches of one plane, and of a camera that only turned, are explained by a homography and leave the epipoles
+free; of a camera that moved without turning F is [e]x with two degrees of freedom in place of seven. Every
+test is against the noise: a simpler model is believed unless its residuals are larger than the noise allows,
+or more of the matches that it leaves agree with F than chance would have of the wrong ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import scipy
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.epipolar.degeneracy import (
+    chance_of_agreement,
+    find_dominant_plane,
+    log10_false_alarms,
+    multiplicity_weights,
+    plane_covariance,
+)
+from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
+from thesisrecon.epipolar.plane_kernels import geometries_of_plane, refine_plane
+from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
+from thesisrecon.epipolar.search import sampson_distances
+from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
+from thesisrecon.geometry.two_view import homography_distances
+from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
+from thesisrecon.numerics.noise import noise_scale, trimmed_noise_scale
+
+FOCALS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+"""Tried focal lengths, in spreads of the points: fields of view of 150 to 10 degrees."""
+REFINED = 3
+CONSTRAINTS = 2
+"""A homography has 8 degrees of freedom; a rotation, a focal length and a principal point 6."""
+ITERATIONS = 50
+
+
+def turned_camera(parameters: F64) -> F64:
+    """K R K^-1 (3, 3) of log f, principal point and rotation vector (6,)."""
+    f, (x, y) = float(np.exp(np.clip(parameters[0], -20.0, 20.0))), parameters[1:3]
+    K = np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
+    back = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, f]]) / f
+    H: F64 = K @ scipy.spatial.transform.Rotation.from_rotvec(parameters[3:]).as_matrix() @ back
+    return H
+
+
+def turning_ratio(H: F64, xy1: F64, xy2: F64, *, risk: float) -> float:
+    """Increase of the squared residuals from H to the best K R K^-1, over the limit that noise keeps to.
+
+    ``H`` (3, 3) is the least-squares homography of matches (N > 4, 2) in coordinates about one centre for
+    both images and of unit spread. An F-test with 2 and 2 N - 8 degrees of freedom: at most 1 for a camera of
+    square pixels that only turned, except with the probability ``risk``.
+    """
+
+    def residuals(parameters: F64) -> F64:
+        return homography_distances(turned_camera(parameters), xy1, xy2).ravel()
+
+    starts = [_start(H, f) for f in FOCALS]
+    costs = [float(np.sum(residuals(start) ** 2)) for start in starts]
+    rss = float(np.sum(homography_distances(H, xy1, xy2) ** 2))
+    degrees = 2 * len(xy1) - 8
+    limit = (
+        CONSTRAINTS * float(scipy.special.fdtri(CONSTRAINTS, degrees, 1.0 - risk)) * max(rss, 1e-24) / degrees
+    )
+    ratio = np.inf
+    for k in np.argsort(costs, kind="stable")[:REFINED]:
+        if np.isfinite(costs[k]):
+            found = minimize_residuals(residuals, starts[k], max_iterations=ITERATIONS, tolerance=1e-8)
+            ratio = min(ratio, (2.0 * found.cost - rss) / limit)
+        if ratio <= 1.0:
+            break
+    return ratio
+
+
+def _start(H: F64, f: float) -> F64:
+    """The rotation nearest to K^-1 H K for a focal length and the principal point at the centre."""
+    A = H * np.array([[1.0, 1.0, 1.0 / f], [1.0, 1.0, 1.0 / f], [f, f, 1.0]])
+    A = A * np.sign(np.linalg.det(A))
+    U, _, Vt = np.linalg.svd(A)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return np.array([np.log(f), 0.0, 0.0, *scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()])
+
+
+MINIMUM = 12
+NEAR = 11.0
+NEAR_MEAN, CHI2_MEDIAN = 0.97743, 1.386294
+"""Squared distances from a homography, in sigma^2, are chi-square(2) with this median; of those below 11
+either half, the one across epipolar lines and the parallax along them, has this mean."""
+TRIMMINGS = 3
+STANDARD_ERRORS = 4.0
+"""The F of a plane may choose the epipole toward which the noise is least: 1.5 errors, give or take 1."""
+FAR = 16.0
+"""A match stands off a homography beyond this squared distance: noise does so once in 3000."""
+LARGEST_CHANCE = -3.0
+"""log10 of the false alarms that matches off the simpler model may be."""
+BAND = 2.5
+FLEXIBLE = 2.0
+"""An F of a plane is fitted to wrong matches too, and moves toward them: they agree so much more often."""
+EPIPOLE, BEYOND_TRANSLATION = 2, 5
+"""Degrees of freedom that F has beyond a homography, and beyond [e]x."""
+RISK, ALLOWANCE = 2e-3, 0.4
+"""Chance to take a pure translation for more than that, were all residuals normal; what is allowed beyond it
+where a wrong match or more is expected in the band, for F to bend to."""
+TURN_RISK = 1e-3
+"""Chance to take a rotation for a plane, by its eigenvalues (on either side) and as a camera's."""
+TRANSLATED = 3.3
+"""Matches within so many sigma of a translation are compared with F; more would be cut by what noise does."""
+CORRECTIONS, EXACT = 10, 1e-12
+
+
+class Configuration(Enum):
+    """What the matches of a pair show."""
+
+    GENERAL = "general"
+    PLANE = "plane"
+    ROTATION = "pure rotation"
+    TRANSLATION = "pure translation"
+
+
+@dataclass(frozen=True)
+class Degeneracy:
+    """The name and the evidence that it rests on.
+
+    Attributes
+    ----------
+    kind : what was found.
+    sigma_px : standard deviation of one coordinate, from the residuals of the general F.
+    homography_errors : excess of the squared parallax of the matches within 3.3 sigma of the best homography
+        over their squared distances from F, as a logarithm in its standard errors; above 4 they show relief.
+    off_homography : share of the inliers more than 4 sigma off it.
+    off_homography_chance : log10 of how often chance has as many of the wrong matches agree with F; below -3
+        they show relief.
+    turning_errors : |trace H - trace H^-1| (det H = 1), 0 for a rotation, in its standard errors.
+    turning_camera_ratio : increase of the squared residuals from the homography to that of a camera of square
+        pixels that turned, over its limit; at most 1 for a rotation, NaN where the eigenvalues told already.
+    turn_deg : the angle of that rotation, NaN where the eigenvalues are not those of one.
+    translation_ratio : increase of the squared residuals from F to [e]x, over its limit; at most 1 where F is
+        that of a translation, inf where more matches leave [e]x than chance would have.
+    """
+
+    kind: Configuration
+    sigma_px: float
+    homography_errors: float
+    off_homography: float
+    off_homography_chance: float
+    turning_errors: float
+    turning_camera_ratio: float
+    turn_deg: float
+    translation_ratio: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.kind.value}: noise {self.sigma_px:.2g} px, homography off by "
+            f"{self.homography_errors:.1f} standard errors with {100.0 * self.off_homography:.0f} % of the "
+            f"matches beyond it (10^{self.off_homography_chance:.0f} by chance), rotation "
+            f"off by {self.turning_errors:.1f}, translation at {self.translation_ratio:.2g} of its limit"
+        )
+
+
+def classify_configuration(
+    F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None, seed: int = 0
+) -> Degeneracy:
+    """Name what the matches (N, 2) px that agree with F (3, 3) show.
+
+    ``inliers`` (N,), at least 12, are those that agree, all of them where None. Given the wrong ones too it
+    is known how many could agree by chance: an F fitted to a plane gathers wrong matches at will. Both images
+    are taken to share their intrinsics (else a rotation is named a plane, a translation general) and to have
+    square pixels, which tell a plane from a rotation where its eigenvalues happen to be those of one. GENERAL
+    where relief and baseline stand out of the noise. ``seed`` draws the planes that are tried. Raises as
+    :func:`~thesisrecon.epipolar.frame.check_matches`, and ``ValueError`` for an F below rank 2 and for flags
+    of another shape.
+    """
+    xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
+    inliers = np.ones(len(xy1), dtype=bool) if inliers is None else inliers
+    if inliers.shape != (len(xy1),):
+        raise ValueError(f"classify_configuration got {inliers.shape} inlier flags for {len(xy1)} matches")
+    check_matches(xy1[inliers], xy2[inliers], needed=MINIMUM)
+    # One centre for both images: F of a translation is skew in it, H of a rotation keeps its eigenvalues.
+    own = PairFrame.of(xy1[inliers], xy2[inliers])
+    centre = 0.5 * (own.centroid1 + own.centroid2)
+    frame = PairFrame(centre, centre, own.scale)
+    points, f = frame.points(xy1, xy2), check_start(F, frame)
+    refine(f, points[inliers], SAMPSON, np.inf, _scale(f, points[inliers]) * 3.0, 15)
+    sigma = _scale(f, points[inliers])
+    agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
+    chance = chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
+    case = _Case(f, points, agree, multiplicity_weights(xy1, xy2), sigma, chance)
+    return _classify(case, frame.scale, seed)
+
+
+@dataclass(frozen=True)
+class _Case:
+    """``points`` (N, 4), F and sigma in one frame, which ``agree``, ``weights``, the ``chance`` to agree."""
+
+    f: F64
+    points: F64
+    agree: B8
+    weights: F64
+    sigma: float
+    chance: float
+
+    def false_alarms(self, off: B8, free: int) -> float:
+        """How often, log10, as many of the matches ``off`` a simpler model agree with a better one."""
+        agreeing, tried = self.weights[off & self.agree].sum(), self.weights[off].sum()
+        # What F can still choose beside the model, it chooses to agree with wrong matches.
+        chance = FLEXIBLE * self.chance if free == EPIPOLE else self.chance
+        return log10_false_alarms(float(agreeing), float(tried), chance=chance, free=free)
+
+
+def _scale(f: F64, points: F64) -> float:
+    r = np.asarray(sampson_distances(f, points))
+    return max(trimmed_noise_scale(r, noise_scale(r)), 1e-12)
+
+
+def _classify(case: _Case, scale: float, seed: int) -> Degeneracy:
+    sigma = case.sigma
+    errors, off, chance, turning, angle, camera = np.inf, 1.0, -np.inf, np.inf, np.nan, np.nan
+    plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
+    if plane is not None:
+        squared = plane.squared * case.sigma**2
+        noise = _plane_noise(squared[case.agree])
+        near, far = squared < NEAR * noise**2, squared > FAR * noise**2
+        errors = _excess_errors(case, near, float(squared[near].sum()))
+        off, chance = float(np.mean(far[case.agree])), case.false_alarms(far, EPIPOLE)
+        # Least squares of all of them, for which the covariance holds.
+        refine_plane(plane.h, case.points[near], 1e6 * noise, 4)
+        turning, angle = _turning(plane.h.reshape(3, 3), plane_covariance(plane.h, case.points[near], noise))
+    ratio = _translation_ratio(case)
+    kind = Configuration.GENERAL
+    if plane is not None and errors < STANDARD_ERRORS and chance > LARGEST_CHANCE:
+        # F has fitted itself to the noise of a plane; the homography could not.
+        sigma = noise
+        turned = turning < _turn_limit(int(near.sum())) and np.isfinite(angle)
+        if turned:
+            xy1, xy2 = case.points[near, :2], case.points[near, 2:]
+            camera = turning_ratio(plane.h.reshape(3, 3), xy1, xy2, risk=TURN_RISK)
+            turned = camera <= 1.0
+        kind = Configuration.ROTATION if turned else Configuration.PLANE
+    elif ratio <= 1.0:
+        kind = Configuration.TRANSLATION
+    return Degeneracy(kind, sigma / scale, errors, off, chance, turning, camera, angle, ratio)
+
+
+def _plane_noise(squared: F64) -> float:
+    """Standard deviation of one coordinate from squared distances (N,) to a homography, some off it."""
+    variance = float(np.median(squared)) / CHI2_MEDIAN
+    for _ in range(TRIMMINGS):
+        near = squared[squared < NEAR * variance]
+        if len(near) < MINIMUM:
+            break
+        variance = float(near.sum()) / (2.0 * NEAR_MEAN * (len(near) - 4))
+    return float(np.sqrt(max(variance, 1e-24)))
+
+
+def _excess_errors(case: _Case, near: B8, rss_plane: float) -> float:
+    """By how many standard errors the squared parallax of the matches near the plane is more than noise.
+
+    A homography has 8 parameters for 2 K residuals, F takes 7 of the K across the lines: K - 1 are left along
+    them, and of the same variance if they are noise. The F of just these matches is compared.
+    """
+    k = int(near.sum())
+    if k < MINIMUM - 4:
+        return float("inf")
+    across = _least_squares(case.f, case.points[near])
+    ratio = max(rss_plane - across, 1e-24) / (k - 1) * (k - 7) / max(across, 1e-24)
+    return float(np.log(ratio) / np.sqrt(2.0 / (k - 1) + 2.0 / (k - 7)))
+
+
+def _turning(H: F64, covariance: F64) -> tuple[float, float]:
+    """|trace H - trace H^-1| in standard errors and the angle, deg: H of a rotation has eigenvalues
+    1, exp(+-i angle) whatever the camera (HZ 13.2; Hartley 1994)."""
+    determinant = float(np.cbrt(np.linalg.det(H)))
+    if not abs(determinant) > 1e-4 * float(np.linalg.norm(H)):
+        return np.inf, np.nan
+    # Of unit determinant; what the covariance has along H itself is 0, and traces do not see it.
+    M, back = H / determinant, np.linalg.inv(H / determinant)
+    covariance = covariance / determinant**2
+    t, t_back = float(np.trace(M)), float(np.trace(back))
+    # d trace M = <I, dM>, d trace M^-1 = -<M^-2', dM>, for dM that keeps the determinant.
+    project = back.T / 3.0
+    slope: F64 = (np.eye(3) - project * t).ravel()
+    difference: F64 = slope - (project * t_back - (back @ back).T).ravel()
+    gap = float(np.sqrt(max(float(difference @ covariance @ difference), 1e-300)))
+    mean, error = 0.5 * (t + t_back), float(np.sqrt(max(float(slope @ covariance @ slope), 1e-300)))
+    still = bool(np.linalg.norm(M - np.eye(3)) ** 2 < 16.0 * np.trace(covariance) + 1e-18)
+    turned = -1.0 <= mean < 3.0 - 3.0 * error
+    angle = (
+        float(np.degrees(np.arccos(np.clip(0.5 * (mean - 1.0), -1.0, 1.0)))) if turned or still else np.nan
+    )
+    return abs(t - t_back) / gap, angle
+
+
+def _turn_limit(n: int) -> float:
+    """Standard errors that the turning of a rotation keeps to: Student's, since the noise is estimated."""
+    return float(scipy.special.stdtrit(n - 7, 1.0 - TURN_RISK))
+
+
+def _translation_ratio(case: _Case) -> float:
+    """(RSS of [e]x - RSS of F) over the limit that noise keeps to, an F-test with 5 and n - 7 degrees."""
+    mine = case.points[case.agree]
+    f = _fit_translation(mine, case.sigma)
+    simple = np.asarray(sampson_distances(f, case.points))
+    off = simple > np.sqrt(FAR) * case.sigma
+    if case.false_alarms(off, BEYOND_TRANSLATION) < LARGEST_CHANCE:
+        return float("inf")
+    near = case.points[simple < TRANSLATED * case.sigma]
+    degrees = len(near) - 7
+    if degrees < MINIMUM - 7:
+        return float("inf")
+    # The same matches for both models, chosen by neither's favour: F would keep what it fits best.
+    _refine_translation(f, near, np.inf)
+    rss_simple = float(np.sum(np.asarray(sampson_distances(f, near)) ** 2))
+    rss = min(rss_simple, *(_least_squares(start, near) for start in (case.f, f)))
+    limit = (
+        BEYOND_TRANSLATION
+        * float(scipy.special.fdtri(BEYOND_TRANSLATION, degrees, 1.0 - RISK))
+        * max(rss / degrees, 1e-24)
+    )
+    strays = case.chance * float(case.weights[~case.agree].sum())
+    return (rss_simple - rss) / (limit * (1.0 + ALLOWANCE * min(strays, 1.0)))
+
+
+def _least_squares(f: F64, points: F64) -> float:
+    f = f.copy()
+    refine(f, points, SAMPSON, np.inf, UNBOUNDED, CORRECTIONS)
+    return float(np.sum(np.asarray(sampson_distances(f, points)) ** 2))
+
+
+def _fit_translation(points: F64, sigma: float) -> F64:
+    """[e]x (9,) of most points: from pairs of them, then from all within a shrinking gate."""
+    rng = np.random.default_rng(len(points))
+    identity = np.eye(3).ravel() / np.sqrt(3.0)
+    some = points[rng.permutation(len(points))[:200]]
+    pairs = rng.integers(0, len(some), (100, 2))
+    weights = np.ones((1, len(some)))
+    F, _, found = geometries_of_plane(identity, some, weights, pairs, 4.0 * BAND * sigma)
+    f: F64 = F[int(np.argmax(found[:, 0]))].copy()
+    for gate in (4.0, 2.0, 1.5):
+        _refine_translation(f, points, gate * 4.0 * sigma)
+    return f
+
+
+def _refine_translation(f: F64, points: F64, gate: float) -> None:
+    """Least squares of the Sampson distances of [e]x (9,) within the gate (in place), by Gauss-Newton."""
+    e = np.array([f[7], f[2], f[3]])
+    if not np.linalg.norm(e) > EXACT:
+        return
+    e /= np.linalg.norm(e)
+    kept = points[np.asarray(sampson_distances(f, points)) < gate]
+    if len(kept) < 5:
+        return
+    x1, x2 = homogenize(kept[:, :2]), homogenize(kept[:, 2:])
+    normal = np.cross(x1, x2)
+    for _ in range(CORRECTIONS):
+        # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two rows.
+        l2, l1 = np.cross(e, x1)[:, :2], np.cross(x2, e)[:, :2]
+        g = np.sum(l1**2, axis=1) + np.sum(l2**2, axis=1) + EXACT**2
+        value = normal @ e
+        size = 1.0 / np.sqrt(g)
+        # d g / d e = 2 (l1 . dl1 + l2 . dl2)
+        dg = np.zeros((len(kept), 3))
+        dg[:, 0] = l2[:, 1] * -x1[:, 2] + l1[:, 1] * x2[:, 2]
+        dg[:, 1] = l2[:, 0] * x1[:, 2] - l1[:, 0] * x2[:, 2]
+        dg[:, 2] = -l2[:, 0] * x1[:, 1] + l2[:, 1] * x1[:, 0] + l1[:, 0] * x2[:, 1] - l1[:, 1] * x2[:, 0]
+        J = normal * size[:, None] - (value * size**3)[:, None] * dg
+        basis = np.linalg.svd(e[None])[2][1:].T
+        Jb = J @ basis
+        step = basis @ np.linalg.lstsq(Jb, -(value * size), rcond=None)[0]
+        e = e + step
+        e /= np.linalg.norm(e)
+        if step @ step < 1e-20:
+            break
+    f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()

@@ -1,1 +1,0 @@
-"""Sections 5.3: the compiled refinement over matrices of rank 2."""

@@ -1,0 +1,226 @@
+"""Compiled loops of the z-buffer; each has a plain twin in the tests.
+
+Which face of a mesh each pixel of a camera sees: a z-buffer, exact in perspective.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import F32, F64, I64, U8
+from thesisrecon.camera import Camera
+
+SLACK = 1e-7
+"""Pixels by which a triangle reaches beyond its edges, so that no rounding opens a crack between two."""
+
+
+@njit(cache=True, nogil=True)
+def _inverse(p: F64, inverse: F64) -> bool:
+    """Inverse (3, 3) of the matrix whose columns are the rows of p (3, 3); False where it is singular."""
+    for i in range(3):
+        a, b = p[(i + 1) % 3], p[(i + 2) % 3]
+        inverse[i, 0] = a[1] * b[2] - a[2] * b[1]
+        inverse[i, 1] = a[2] * b[0] - a[0] * b[2]
+        inverse[i, 2] = a[0] * b[1] - a[1] * b[0]
+    determinant = p[0, 0] * inverse[0, 0] + p[0, 1] * inverse[0, 1] + p[0, 2] * inverse[0, 2]
+    size = 0.0
+    for i in range(3):
+        size = max(size, abs(p[0, i] * inverse[0, i]))
+    if abs(determinant) <= 1e-14 * size:
+        return False
+    for i in range(3):
+        for k in range(3):
+            inverse[i, k] /= determinant
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int]:
+    """First and last + 1 pixel of row y in which all barycentric coordinates and the depth are positive."""
+    low, high = 0.0, width - 1.0
+    slope_sum, constant_sum = 0.0, 0.0
+    for i in range(4):
+        if i < 3:
+            slope, constant = inverse[i, 0], inverse[i, 1] * y + inverse[i, 2]
+            slope_sum += slope
+            constant_sum += constant
+        else:
+            slope, constant = -slope_sum, 1.0 / near - constant_sum
+        if slope > 0.0:
+            low = max(low, -constant / slope - SLACK)
+        elif slope < 0.0:
+            high = min(high, -constant / slope + SLACK)
+        elif constant < 0.0:
+            return 0, 0
+    if not low <= high:
+        return 0, 0
+    return int(np.ceil(low)), int(np.floor(high)) + 1
+
+
+@njit(cache=True, nogil=True)
+def rasterize_rows(
+    corners: F64, near: float, rows: tuple[int, int], depth: F32, face: I64, weights: F32
+) -> None:
+    """Draw triangles into rows [first, last) of a z-buffer.
+
+    ``corners`` (M, 3, 3): of each face its three image points K (R X + t), whose last entry is their depth.
+    With these as the columns of M, the barycentric coordinates of the point seen at (x, y), each over its
+    depth, are M^-1 (x, y, 1): linear in the pixel, right in perspective, and without clipping at the near
+    plane (Olano and Greer 1997). ``depth`` (H, W) inf where nothing is, ``face`` (H, W) int64, ``weights``
+    (H, W, 2) the coordinates of corners 1 and 2; of equal depths the first face stays.
+    """
+    width = depth.shape[1]
+    inverse = np.empty((3, 3))
+    for m in range(corners.shape[0]):
+        p = corners[m]
+        first, last = rows
+        if p[0, 2] <= near and p[1, 2] <= near and p[2, 2] <= near:
+            continue
+        if p[0, 2] > near and p[1, 2] > near and p[2, 2] > near:
+            y0, y1, y2 = p[0, 1] / p[0, 2], p[1, 1] / p[1, 2], p[2, 1] / p[2, 2]
+            top, bottom = min(y0, y1, y2), max(y0, y1, y2)
+            if bottom < first - SLACK or top > last:
+                continue
+            x0, x1, x2 = p[0, 0] / p[0, 2], p[1, 0] / p[1, 2], p[2, 0] / p[2, 2]
+            if max(x0, x1, x2) < -SLACK or min(x0, x1, x2) > width:
+                continue
+            first = max(first, int(np.ceil(top - SLACK)))
+            last = min(last, int(np.floor(bottom + SLACK)) + 1)
+            if first >= last:
+                continue
+        if not _inverse(p, inverse):
+            continue
+        for y in range(first, last):
+            start, stop = _row_span(inverse, near, float(y), width)
+            for x in range(start, stop):
+                w1 = inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]
+                w2 = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
+                over_depth = w1 + w2 + inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]
+                if over_depth <= 0.0:
+                    continue
+                z = np.float32(1.0 / over_depth)
+                if z < depth[y, x]:
+                    depth[y, x] = z
+                    face[y, x] = m
+                    weights[y, x, 0] = np.float32(w1 / over_depth)
+                    weights[y, x, 1] = np.float32(w2 / over_depth)
+
+
+@njit(cache=True, nogil=True)
+def interpolate_corners(face: I64, weights: F32, values: F32, out: F32) -> None:
+    """Values (M, 3, C) of the corners of faces at each pixel (H, W, C); pixels without a face stay."""
+    for y in range(face.shape[0]):
+        for x in range(face.shape[1]):
+            m = face[y, x]
+            if m < 0:
+                continue
+            b, c = weights[y, x, 0], weights[y, x, 1]
+            a = np.float32(1.0) - b - c
+            for k in range(values.shape[2]):
+                out[y, x, k] = a * values[m, 0, k] + b * values[m, 1, k] + c * values[m, 2, k]
+
+
+@njit(cache=True, nogil=True)
+def interpolate_vertices(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> None:
+    """Values (N, C) of the vertices of ``faces`` (M, 3) at each pixel (H, W, C); pixels without a face
+    stay."""
+    for y in range(face.shape[0]):
+        for x in range(face.shape[1]):
+            m = face[y, x]
+            if m < 0:
+                continue
+            i, j, l = faces[m, 0], faces[m, 1], faces[m, 2]
+            b, c = weights[y, x, 0], weights[y, x, 1]
+            a = np.float32(1.0) - b - c
+            for k in range(values.shape[1]):
+                out[y, x, k] = a * values[i, k] + b * values[j, k] + c * values[l, k]
+
+
+@njit(cache=True, nogil=True)
+def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
+    """Bilinear texels (H, W, 3) at uv (H, W, 2) where ``drawn`` >= 0; beyond the border its own texel."""
+    height, width = texture.shape[:2]
+    for y in range(uv.shape[0]):
+        for x in range(uv.shape[1]):
+            if drawn[y, x] < 0:
+                continue
+            u = min(max(uv[y, x, 0], np.float32(0.0)), np.float32(width - 1))
+            v = min(max(uv[y, x, 1], np.float32(0.0)), np.float32(height - 1))
+            left, top = int(u), int(v)
+            right, below = min(left + 1, width - 1), min(top + 1, height - 1)
+            s, t = u - np.float32(left), v - np.float32(top)
+            for k in range(3):
+                # Differences of whole numbers without a sign would wrap around.
+                a, b = np.float32(texture[top, left, k]), np.float32(texture[top, right, k])
+                c, d = np.float32(texture[below, left, k]), np.float32(texture[below, right, k])
+                upper, lower = a + s * (b - a), c + s * (d - c)
+                out[y, x, k] = upper + t * (lower - upper)
+
+
+NEAR = 1e-6
+"""Nearest depth that is drawn, in units of the distance from the camera to the farthest vertex."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """What a camera sees of a mesh before it has colours: ``depth`` (H, W) float32, inf where nothing is;
+    ``face`` (H, W) int64, -1 where none; ``weights`` (H, W, 2) float32, the barycentric coordinates of the
+    face's corners 1 and 2."""
+
+    depth: F32
+    face: I64
+    weights: F32
+
+    def interpolate(self, values: F64 | F32) -> F32:
+        """Values (M, 3, C) of the corners of all faces, at every pixel (H, W, C); 0 where no face is."""
+        out = np.zeros((*self.face.shape, values.shape[2]), dtype=np.float32)
+        interpolate_corners(self.face, self.weights, np.ascontiguousarray(values, dtype=np.float32), out)
+        return out
+
+    def interpolate_vertices(self, faces: I64, values: F32) -> F32:
+        """Values (N, C) of the vertices of the faces (M, 3), at every pixel (H, W, C); 0 where no face is."""
+        out = np.zeros((*self.face.shape, values.shape[1]), dtype=np.float32)
+        interpolate_vertices(self.face, self.weights, faces, values, out)
+        return out
+
+    def rows(self, first: int, last: int) -> Raster:
+        """Rows [first, last) alone."""
+        return Raster(self.depth[first:last], self.face[first:last], self.weights[first:last])
+
+
+def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) -> Raster:
+    """Which face is seen at the centre of each pixel.
+
+    ``vertices`` (N, 3), ``faces`` (M, 3); both sides of a face are seen. ``threads`` draw strips of rows: the
+    result is the same whatever their number.
+    """
+    width, height = camera.size
+    seen = (vertices @ camera.R.T + camera.t) @ (camera.K / camera.K[2, 2]).T
+    corners = np.ascontiguousarray(seen[faces])
+    near = NEAR * max(float(np.abs(seen[:, 2]).max(initial=0.0)), 1e-300)
+    depth = np.full((height, width), np.inf, dtype=np.float32)
+    face = np.full((height, width), -1, dtype=np.int64)
+    weights = np.zeros((height, width, 2), dtype=np.float32)
+
+    def draw(rows: tuple[int, int]) -> None:
+        rasterize_rows(corners, near, rows, depth, face, weights)
+
+    in_strips(draw, height, threads)
+    return Raster(depth, face, weights)
+
+
+def in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
+    """Call ``work`` with the first and last + 1 row of as many strips as there are threads, one in each."""
+    edges = np.linspace(0, height, max(threads, 1) + 1).round().astype(int)
+    strips = [(int(a), int(b)) for a, b in pairwise(edges)]
+    if len(strips) == 1:
+        work(strips[0])
+        return
+    with ThreadPoolExecutor(len(strips)) as pool:
+        list(pool.map(work, strips))

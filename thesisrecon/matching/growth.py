@@ -1,0 +1,441 @@
+"""Growth: local affine maps from known matches, and the search around the places they predict.
+
+The default matching: seeds without a radius, then growth along the epipolar lines, then sub-pixel
+alignment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy
+from numba import njit
+
+from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.matching.alignment import aligned_matches, strongest_distinct
+from thesisrecon.matching.prepared import (
+    SAMPLES,
+    SIDE,
+    FundamentalEstimator,
+    PreparedView,
+    dot,
+    empty_matches,
+    level_of,
+    map_determinant,
+    matches_at,
+    normalize_window,
+    one_to_one,
+    prepare_view,
+    sample_window,
+)
+from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
+from thesisrecon.records import Features, Image, Matches
+
+# Two corners of an image closer than this, in pixels of their scale, may be one scene point.
+APART = 3.0
+# Rounds of least squares of a local map: the first with all neighbours alike, the others re-weighted.
+ROUNDS = 3
+# How much the prior holds a local map, as a share of what its neighbours' weights say along one direction.
+PRIOR_SHARE = 0.05
+
+
+@njit(cache=True, nogil=True)
+def fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
+    """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its ``neighbours`` (N, K) among
+    matches.
+
+    Weighted least squares, weights 1 / (d^2 + d_mean^2), rounds of Cauchy re-weighting against neighbours on
+    another surface, held to ``prior`` (M, 2, 2), the mean of the neighbours' own maps, where they are in
+    line. Returns the map (N, 2, 2), the place in image 2 (N, 2) and its uncertainty (N,) px.
+    """
+    count, k = neighbours.shape
+    affine = np.empty((count, 2, 2))
+    place = np.empty((count, 2))
+    spread = np.empty(count)
+    offset = np.empty((k, 2))
+    rest = np.empty((k, 2))
+    distance2 = np.empty(k)
+    residual2 = np.empty(k)
+    for n in range(count):
+        mean2 = 0.0
+        a0 = np.zeros((2, 2))
+        for m in range(k):
+            i = neighbours[n, m]
+            dx, dy = xy1[i, 0] - xy[n, 0], xy1[i, 1] - xy[n, 1]
+            offset[m, 0], offset[m, 1] = dx, dy
+            distance2[m] = dx * dx + dy * dy
+            residual2[m] = 0.0
+            mean2 += distance2[m] / k
+            a0 += prior[i] / k
+        mean2 = mean2 + 1e-9
+        for m in range(k):
+            i, dx, dy = neighbours[n, m], offset[m, 0], offset[m, 1]
+            rest[m, 0] = xy2[i, 0] - (a0[0, 0] * dx + a0[0, 1] * dy)
+            rest[m, 1] = xy2[i, 1] - (a0[1, 0] * dx + a0[1, 1] * dy)
+        scale2 = np.inf
+        a, z = a0, np.zeros((3, 2))
+        for _ in range(ROUNDS):
+            z = _solve_correction(offset, rest, (distance2, mean2), (residual2, scale2))
+            a = a0 + z[:2].T
+            for m in range(k):
+                i, dx, dy = neighbours[n, m], offset[m, 0], offset[m, 1]
+                ex = xy2[i, 0] - (a[0, 0] * dx + a[0, 1] * dy + z[2, 0])
+                ey = xy2[i, 1] - (a[1, 0] * dx + a[1, 1] * dy + z[2, 1])
+                residual2[m] = ex * ex + ey * ey
+            scale2 = np.median(residual2)
+        affine[n] = a
+        place[n] = z[2]
+        spread[n] = np.sqrt(scale2)
+    return affine, place, spread
+
+
+@njit(cache=True, nogil=True)
+def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: tuple[F64, float]) -> F64:
+    """(3, 2) correction of the prior map, transposed, over the translation, by weighted least squares."""
+    distance2, mean2 = near
+    residual2, scale2 = misfit
+    s = np.zeros((3, 3))
+    r = np.zeros((3, 2))
+    total = 0.0
+    for m in range(len(offset)):
+        w = 1.0 / (distance2[m] + mean2)
+        w /= 1.0 + residual2[m] / (scale2 + 1e-9)
+        total += w
+        dx, dy = offset[m, 0], offset[m, 1]
+        s[0, 0] += w * dx * dx
+        s[0, 1] += w * dx * dy
+        s[1, 1] += w * dy * dy
+        s[0, 2] += w * dx
+        s[1, 2] += w * dy
+        s[2, 2] += w
+        for side in range(2):
+            e = rest[m, side]
+            r[0, side] += w * dx * e
+            r[1, side] += w * dy * e
+            r[2, side] += w * e
+    ridge = PRIOR_SHARE * total * mean2
+    s[0, 0] += ridge
+    s[1, 1] += ridge
+    s[1, 0], s[2, 0], s[2, 1] = s[0, 1], s[0, 2], s[1, 2]
+    correction = np.empty((3, 2))
+    correction[:] = np.linalg.solve(s, r)
+    return correction
+
+
+@njit(cache=True, nogil=True)
+def grow_corners(
+    view1: tuple[F32, I64, float],
+    corners1: tuple[F64, F32],
+    predicted: tuple[F64, F64, F64],
+    corners2: tuple[F64, F32, F32],
+    grid2: tuple[float, I64, I64, I64],
+    gate: tuple[F64, float, float],
+) -> tuple[I64, F32, F32]:
+    """The corner of image 2 that looks most like each corner of image 1, near its predicted place and
+    epipolar line.
+
+    ``view1`` = pixels, levels, base; ``corners1`` = xy (N, 2), scale (N,); ``predicted`` = affine (N, 2, 2),
+    place (N, 2), radius (N,) px; ``corners2`` = xy, scale, patches (C, 225); ``grid2`` = cell size, shape
+    (2,), start, order of the corners of image 2 in cells; ``gate`` = F, half width of the epipolar band px,
+    least correlation. Returns the corner of image 2 (-1: none), the correlation, and that of the best rival
+    that lies elsewhere (-1: none).
+    """
+    xy1, scale1 = corners1
+    affine, place, radius = predicted
+    xy2, scale2, patches2 = corners2
+    F, band, least = gate
+    count = len(xy1)
+    index = np.full(count, -1, np.int64)
+    score = np.zeros(count, np.float32)
+    competing_model = np.full(count, -1.0, np.float32)
+    near, seen = np.empty(len(xy2), np.int64), np.empty(len(xy2), np.float32)
+    window = np.empty((2, SAMPLES), np.float32)
+    ready = np.zeros(2, np.bool_)
+    sizes = np.array([1.0, 2.0]) * float(np.min(scale2))
+    for n in range(count):
+        determinant = map_determinant(affine[n])
+        if determinant == 0.0:
+            continue
+        found = _corners_in_band(xy1[n], (place[n], radius[n]), (F, band), xy2, grid2, near)
+        if found == 0:
+            continue
+        _warp_windows(view1, (xy1[n], scale1[n]), (affine[n], determinant), sizes, (window, ready))
+        best, top = -1, least
+        for t in range(found):
+            c = near[t]
+            size = 0 if scale2[c] < 1.5 * sizes[0] else 1
+            seen[t] = np.float32(-1.0)
+            if ready[size]:
+                seen[t] = dot(window[size], patches2[c])
+                if seen[t] > top:
+                    best, top = c, float(seen[t])
+        if best >= 0:
+            index[n], score[n] = best, top
+            competing_model[n] = _best_elsewhere(xy2, best, APART * scale2[best], near[:found], seen)
+    return index, score, competing_model
+
+
+@njit(cache=True, nogil=True)
+def _corners_in_band(
+    xy1: F64,
+    search: tuple[F64, float],
+    epipolar: tuple[F64, float],
+    xy2: F64,
+    grid2: tuple[float, I64, I64, I64],
+    near: I64,
+) -> int:
+    """How many corners of image 2 lie within the radius of the place and within the band of the epipolar
+    line; their numbers go to ``near``."""
+    place, radius = search
+    F, band = epipolar
+    cell, shape, start, order = grid2
+    l0 = F[0, 0] * xy1[0] + F[0, 1] * xy1[1] + F[0, 2]
+    l1 = F[1, 0] * xy1[0] + F[1, 1] * xy1[1] + F[1, 2]
+    l2 = F[2, 0] * xy1[0] + F[2, 1] * xy1[1] + F[2, 2]
+    length = np.sqrt(l0 * l0 + l1 * l1) + 1e-300
+    if abs(l0 * place[0] + l1 * place[1] + l2) > (radius + band) * length:
+        return 0
+    first_x = max(int((place[0] - radius) / cell), 0)
+    last_x = min(int((place[0] + radius) / cell), shape[1] - 1)
+    first_y = max(int((place[1] - radius) / cell), 0)
+    last_y = min(int((place[1] + radius) / cell), shape[0] - 1)
+    if last_x < first_x:
+        return 0
+    found = 0
+    for cy in range(first_y, last_y + 1):
+        row = cy * shape[1]
+        for at in range(start[row + first_x], start[row + last_x + 1]):
+            c = order[at]
+            dx, dy = xy2[c, 0] - place[0], xy2[c, 1] - place[1]
+            if dx * dx + dy * dy > radius * radius:
+                continue
+            if abs(l0 * xy2[c, 0] + l1 * xy2[c, 1] + l2) > band * length:
+                continue
+            near[found] = c
+            found += 1
+    return found
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _warp_windows(
+    view1: tuple[F32, I64, float],
+    corner: tuple[F64, float],
+    local: tuple[F64, float],
+    sizes: F64,
+    out: tuple[F32, B8],
+) -> None:
+    """The window of a corner of image 1 as image 2 shows it, for each of the ``sizes`` of corners there; not
+    ready where the corner would have another size, or the window leaves the image or is blank."""
+    pixels, levels, base = view1
+    xy, scale = corner
+    a, determinant = local
+    window, ready = out
+    m = np.sqrt(determinant)
+    inverse = np.empty((2, 2))
+    inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
+    inverse[1, 0], inverse[1, 1] = -a[1, 0] / determinant, a[0, 0] / determinant
+    for t in range(len(sizes)):
+        ready[t] = False
+        ratio = scale * m / sizes[t]
+        if ratio > 0.6 and ratio < 1.7:
+            k = level_of(sizes[t] / m, base, len(levels))
+            step = inverse * sizes[t]
+            if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy, step, SIDE, window[t]):
+                ready[t] = normalize_window(window[t]) > 0.0
+
+
+@njit(cache=True, nogil=True)
+def _best_elsewhere(xy2: F64, best: int, apart: float, near: I64, seen: F32) -> float:
+    """Largest of the correlations ``seen`` of corners ``near`` that lie ``apart`` from the best; -1: none."""
+    competing_model = np.float32(-1.0)
+    for t in range(len(near)):
+        dx, dy = xy2[near[t], 0] - xy2[best, 0], xy2[near[t], 1] - xy2[best, 1]
+        if dx * dx + dy * dy > apart**2:
+            competing_model = max(competing_model, seen[t])
+    return float(competing_model)
+
+
+Found = tuple[I64, I64, SeedMatches]
+"""Corners of image 1, corners of image 2, and the matches with their places, maps and correlations."""
+
+
+@dataclass(frozen=True)
+class SeedsAndGrowth:
+    """Seeds give F, F and the seeds' local affine maps tell each corner where to look, alignment does the
+    rest.
+
+    Parameters
+    ----------
+    ratio : distance of a seed to its match as a share of the distance to the best rival, at most.
+    least_support : strength of match (of at most 10) that a seed needs in the filtered trial.
+    least_seeds : verified seeds under which a pair counts as not overlapping.
+    band_rel : half width of the epipolar band, share of the long side.
+    radius_rel : largest search radius around the predicted place, share of the long side.
+    least_correlation : of a grown match at its corner; ``aligned_correlation`` after alignment.
+    grown_ratio : as ``ratio``, for a grown match and the rivals in its part of the epipolar band.
+    neighbours : matches that define a local affine map.
+    affine_std : prior standard deviation of an affine coefficient in the alignment.
+    orientation : seeds by their upright patches, by those turned to their gradient, or "auto": the turned
+        ones too where the upright ones do not relate the pair well.
+    support : whether F is sought among the seeds whose neighbours move as they do ("always"), among all
+        ("never"), or in both ways and the better kept ("auto").
+    growth : corners are sought where the seeds tell, else only those that a seed stands on are matched.
+    coarse_first : the corners of the coarser size grow before all of them, and give a better F to these.
+    rematch : guided rematching: all corners are sought once more with the F and the maps of the matches that
+        grew.
+    align : places in image 2 are moved to sub-pixel by least-squares matching, else stay at the corners.
+    """
+
+    ratio: float = 0.8
+    least_support: float = 2.0
+    least_seeds: int = 12
+    band_rel: float = 0.002
+    radius_rel: float = 0.025
+    least_correlation: float = 0.7
+    aligned_correlation: float = 0.8
+    grown_ratio: float = 0.8
+    neighbours: int = 10
+    affine_std: float = 0.02
+    orientation: Literal["auto", "upright", "turned"] = "auto"
+    support: Literal["auto", "always", "never"] = "auto"
+    growth: bool = True
+    coarse_first: bool = True
+    rematch: bool = True
+    align: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("least_seeds", "neighbours"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
+        for name in ("ratio", "grown_ratio", "band_rel", "radius_rel"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}")
+        if not self.affine_std >= 0.0:
+            raise ValueError(f"affine_std must be at least 0; got {self.affine_std}")
+
+    def prepare(self, image: Image, features: Features) -> PreparedView:
+        """What is computed once for a photograph."""
+        return prepare_view(image, features)
+
+    def match(
+        self,
+        view1: PreparedView,
+        view2: PreparedView,
+        *,
+        pair: tuple[int, int],
+        estimate_fundamental: FundamentalEstimator,
+        rng: np.random.Generator,
+    ) -> Matches:
+        """Corner matches of two photographs, one-to-one, aligned to sub-pixel; empty if none.
+
+        Raises :class:`UsageError` for features without seeds.
+        """
+        if view1.features.seeds is None or view2.features.seeds is None:
+            raise UsageError(
+                "matching by seeds and growth needs features with seeds; set "
+                "features.kind=multi-scale-corners, or matching.kind=strength-of-match"
+            )
+        start = self._verified_seeds(view1, view2, estimate_fundamental, rng)
+        if start is None:
+            return empty_matches(pair)
+        if self.growth:
+            one, two, found = self._grow_in_rounds(view1, view2, start, estimate_fundamental, rng)
+        else:
+            one, two, found = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
+        matches = Matches(*pair, one, two, found.xy1, found.xy2, found.score, found.affine)
+        if not self.align:
+            return matches_at(matches, strongest_distinct(matches))
+        return aligned_matches(
+            view1,
+            view2,
+            matches,
+            affine_std=self.affine_std,
+            least_correlation=self.aligned_correlation,
+        )
+
+    def _verified_seeds(
+        self,
+        view1: PreparedView,
+        view2: PreparedView,
+        estimate: FundamentalEstimator,
+        rng: np.random.Generator,
+    ) -> tuple[SeedMatches, F64] | None:
+        seeds1, seeds2 = view1.features.seeds, view2.features.seeds
+        assert seeds1 is not None
+        assert seeds2 is not None
+        best: tuple[SeedMatches, F64] | None = None
+        for turned in {"auto": (False, True), "upright": (False,), "turned": (True,)}[self.orientation]:
+            seeds = match_seeds(seeds1, seeds2, turned=turned, ratio=self.ratio)
+            for trial in self._trials(seeds):
+                try:
+                    fit = estimate(trial.xy1, trial.xy2, rng)
+                except StageFailure:
+                    continue
+                if fit.inliers.sum() >= self.least_seeds and (
+                    best is None or fit.inliers.sum() > len(best[0])
+                ):
+                    best = trial.at(fit.inliers), fit.F
+            if best is not None and len(best[0]) >= max(50, 0.5 * len(seeds)):
+                break
+        return best
+
+    def _trials(self, seeds: SeedMatches) -> tuple[SeedMatches, ...]:
+        """The sets of seeds among which F is sought; none where there are too few."""
+        if self.support == "never":
+            return (seeds,) if len(seeds) >= self.least_seeds else ()
+        supported = neighbour_support(seeds) >= self.least_support
+        if supported.sum() < self.least_seeds:
+            return ()
+        return (seeds.at(supported), seeds) if self.support == "auto" else (seeds.at(supported),)
+
+    def _grow_in_rounds(
+        self,
+        view1: PreparedView,
+        view2: PreparedView,
+        start: tuple[SeedMatches, F64],
+        estimate: FundamentalEstimator,
+        rng: np.random.Generator,
+    ) -> Found:
+        """The corners of the coarser size, then all, then all once more, each led by those before it."""
+        known, F = start
+        scale = view1.features.scale
+        everything = np.arange(len(scale))
+        rounds = [np.flatnonzero(scale > scale.min())] if self.coarse_first else []
+        rounds += [everything] * (1 + self.rematch)
+        for chosen in rounds[:-1]:
+            one, _, grown = self._grow(view1, view2, chosen, known, F)
+            if len(one) < 8:
+                continue
+            try:
+                fit = estimate(grown.xy1, grown.xy2, rng)
+            except StageFailure:
+                continue
+            F, known = fit.F, grown.at(fit.inliers)
+        return self._grow(view1, view2, everything, known, F)
+
+    def _grow(
+        self, view1: PreparedView, view2: PreparedView, chosen: I64, known: SeedMatches, F: F64
+    ) -> Found:
+        xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
+        # Asked for a list of ranks, the tree answers with a row a corner even where that is one neighbour.
+        ranks = np.arange(1, min(self.neighbours, len(known)) + 1)
+        near = scipy.spatial.cKDTree(known.xy1).query(xy1, ranks)[1]
+        affine, place, spread = fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
+        long_side = view2.long_side
+        radius = np.clip(3.0 * spread, 0.004 * long_side, self.radius_rel * long_side)
+        corners2 = (view2.features.xy, view2.features.scale, view2.patches)
+        index, score, competing_model = grow_corners(
+            view1.pyramid,
+            (xy1, scale1),
+            (affine, place, radius),
+            corners2,
+            view2.cells,
+            (F, self.band_rel * long_side, self.least_correlation),
+        )
+        index[1.0 - score > self.grown_ratio**2 * (1.0 - competing_model)] = -1
+        rows = one_to_one(index, score)
+        one, two = chosen[rows], index[rows]
+        return one, two, SeedMatches(xy1[rows], view2.features.xy[two], affine[rows], score[rows])

@@ -1,0 +1,1 @@
+"""Optimisation and robust statistics."""

@@ -1,0 +1,239 @@
+"""How far parts of the scene contradict each other after bundle adjustment, against what noise lets expect.
+
+The covariance of a bundle adjustment is right for independent noise of one size and a right camera model.
+Matches of photographs err together, their noise has heavy tails, and lenses have more coefficients than a
+model. What remains visible of that is that the points of one part of the scene want other cameras than those
+of the next: their gradients, summed by parts, are larger than independent noise would make them (the sandwich
+covariance of Huber 1967 and White 1980, its terms summed by clusters; Liang and Zeger 1986).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.numerics import metric_cameras as kernels
+from thesisrecon.numerics.covariance import gauge_directions, invert_in_inner_gauge
+from thesisrecon.numerics.intrinsic_values import IntrinsicValues, number_values
+from thesisrecon.numerics.levenberg_marquardt import LOSS_CODES
+from thesisrecon.numerics.metric_cameras import POSE_DOF, IntrinsicsPrior, MetricCameras, MetricModel
+from thesisrecon.numerics.observations import Jacobians, Observations, Seen, Weighing, scene_frame
+
+# Unknowns of poses that take part in the judgement beside all of the intrinsics.
+POSES_JUDGED = 30
+
+
+@dataclass(frozen=True)
+class BlockScatter:
+    """Variances of the intrinsics after a bundle adjustment and how far the data contradict them.
+
+    ``model`` (G, C) as the information matrix has it for noise of the given sigma, the focal's relative;
+    ``tied`` (C,) the same were one camera behind all photographs, 0 for what does not move;
+    ``ratio`` (G, C) by how much the scatter between blocks of points exceeds it, NaN for what does not move;
+    ``contradiction`` how much larger the scatter between blocks is, over all unknowns, than that between
+    single points lets expect: 1 where the noise of different points is independent, whatever its
+    distribution. ``blocks`` how many blocks speak.
+    """
+
+    model: F64
+    tied: F64
+    ratio: F64
+    contradiction: float
+    blocks: int
+
+    @property
+    def typical_ratio(self) -> float:
+        """The median of the ratios, 1 where there is none."""
+        known = self.ratio[np.isfinite(self.ratio)]
+        return float(np.median(known)) if len(known) else 1.0
+
+
+def point_blocks(X: F64, used: B8, *, most: int = 32, least_points: int = 12) -> I64:
+    """(N,) number of the block of neighbours in space that a point belongs to, -1 where it is not ``used``.
+
+    Median splits along the longest axis, robust against far points; at most ``most`` blocks (a power of two)
+    of at least ``least_points`` points.
+    """
+    block = np.where(used, 0, -1)
+    count = 1
+    while 2 * count <= most and np.count_nonzero(used) >= 2 * count * least_points:
+        for b in range(count):
+            rows = np.flatnonzero(block == b)
+            spread = np.subtract(*np.percentile(X[rows], [90, 10], axis=0))
+            axis = int(np.argmax(spread))
+            order = rows[np.argsort(X[rows, axis], kind="stable")]
+            block[order[len(order) // 2 :]] = count + b
+        count *= 2
+    return np.asarray(block, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Weighted residuals (2K,) at the optimal points, their sparse Jacobian on the cameras (2K, D), what the
+    elimination of the points takes from it (3N, D), and which point each residual is of."""
+
+    residual: F64
+    J: scipy.sparse.csr_matrix
+    taken: scipy.sparse.csr_matrix
+    point: I64
+
+
+def block_scatter(
+    cameras: MetricCameras,
+    X: F64,
+    observations: Observations,
+    *,
+    free: B8,
+    prior: IntrinsicsPrior,
+    noise: tuple[float, float],
+) -> BlockScatter:
+    """Scatter of the blocks' pulls on the intrinsics at the end of a bundle adjustment.
+
+    With S_b the information of block b on the cameras (its points eliminated), g_b its gradient and C the
+    covariance, the pull of a block on value a is c_a' g_b, and without any correlation between blocks sum
+    (c_a' g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a: the ratio of the two is 1. Huber's loss
+    weighs as if its weight were its slope; the ratio of their means corrects the covariance for it.
+
+    Arguments are those of :func:`refine_metric_bundle`; ``noise`` its sigma and the turn of Huber's loss, px.
+    The matrix of all cameras is dense here: meant for a few hundred of them.
+    """
+    o, group = observations, np.asarray(cameras.group)
+    seen = np.bincount(o.view_index, minlength=len(group)) > 0
+    used = np.bincount(group[seen], minlength=len(cameras.intrinsics)) > 0
+    values = number_values(cameras, used, np.asarray(free, dtype=bool), prior)[0]
+    views, first = np.flatnonzero(seen), POSE_DOF * int(seen.sum())
+    frame = _centred(cameras, X, o)
+    found = _linearise(*frame, o, (values, np.where(seen, np.cumsum(seen) - 1, -1)), noise)
+    S = (found.J.T @ found.J).toarray() - (found.taken.T @ found.taken).toarray()
+    S[first:, first:] += values.links.information(values.size)
+    C = _covariance(S, frame[0], views)
+    poses = np.arange(0, first, max(first // POSES_JUDGED, 1))
+    chosen = np.concatenate([poses, np.arange(first, len(C))])
+    block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
+    curvature = _loss_correction(found.residual.reshape(-1, 2), noise[1] / noise[0])
+    ratio = curvature * _block_ratio(found, C[chosen], C, block)
+    alone = curvature * _point_ratio(found, C[chosen])
+    judged = np.isfinite(ratio) & (alone > 0.0)
+    number = values.number
+    place = np.maximum(number, 0)
+    return BlockScatter(
+        np.where(number >= 0, np.diag(C)[first + place], 0.0),
+        _tied_variances(S, values, frame[0], views),
+        np.where(number >= 0, ratio[len(poses) + place], np.nan),
+        float(np.mean(ratio[judged]) / np.mean(alone[judged])) if judged.any() else np.nan,
+        int(block.max()) + 1,
+    )
+
+
+def _centred(cameras: MetricCameras, X: F64, o: Observations) -> tuple[MetricCameras, F64]:
+    """The same scene in the middle of the frame and of size 1, for the numbers' sake."""
+    origin, scale = scene_frame(X[np.unique(o.point_index)])
+    t = scale * (cameras.t + cameras.R @ origin)
+    return replace(cameras, t=t), scale * (X - origin)
+
+
+def _linearise(
+    cameras: MetricCameras,
+    X: F64,
+    o: Observations,
+    columns: tuple[IntrinsicValues, I64],
+    noise: tuple[float, float],
+) -> _Linearised:
+    values, place = columns
+    K, width, (sigma, loss) = len(o.xy), cameras.intrinsics.shape[1], noise
+    model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
+    seen, weighing = (
+        Seen(o.view_index, o.point_index, o.xy),
+        Weighing(sigma, LOSS_CODES["huber"], loss / sigma),
+    )
+    weighted, none = Jacobians.empty(K, POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
+    kernels.linearize_metric(model, seen, weighing, np.arange(width), none, weighted)
+    first = POSE_DOF * (int(place.max()) + 1)
+    number = values.number[cameras.group[o.view_index]]
+    column = np.concatenate(
+        [POSE_DOF * place[o.view_index][:, None] + np.arange(POSE_DOF), first + np.maximum(number, 0)], axis=1
+    )
+    weighted.A[:, :, POSE_DOF:] *= (number >= 0)[:, None]
+    J = _sparse(weighted.A, column, first + values.size)
+    B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
+    E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
+    return _Linearised(
+        residual - E @ (E.T @ residual), J, scipy.sparse.csr_matrix(E.T @ J), np.repeat(o.point_index, 2)
+    )
+
+
+def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:
+    """Rows (2K, width) with values (K, 2, n) in the columns (K, n)."""
+    K, _, n = values.shape
+    rows = np.repeat(np.arange(2 * K), n)
+    return scipy.sparse.csr_matrix(
+        (values.ravel(), (rows, np.repeat(column, 2, axis=0).ravel())), (2 * K, width)
+    )
+
+
+def _orthonormal(B: F64, point: I64, n: int) -> F64:
+    """B (K, 2, 3) times the inverse root of its points' information: their columns become orthonormal."""
+    outer = np.einsum("kra,krb->kab", B, B).reshape(-1, 9)
+    V = np.stack([np.bincount(point, c, minlength=n) for c in outer.T], axis=1).reshape(n, 3, 3)
+    w, U = np.linalg.eigh(V)
+    root = np.where(w > 1e-12 * w[:, 2:], 1.0 / np.sqrt(np.maximum(w, 1e-300)), 0.0)
+    return np.asarray(B @ (U * root[:, None])[point])
+
+
+def _covariance(S: F64, cameras: MetricCameras, views: I64) -> F64:
+    """The inverse of S without the freedoms of the frame."""
+    poses = gauge_directions(cameras.R[views], cameras.t[views])
+    N = np.zeros((len(S), poses.shape[1]))
+    N[: len(poses)] = poses
+    return invert_in_inner_gauge(S, N)
+
+
+def _tied_variances(S: F64, values: IntrinsicValues, cameras: MetricCameras, views: I64) -> F64:
+    """(C,) variances of the intrinsics were all cameras one."""
+    first = len(S) - values.size
+    column = values.column[: values.seen]
+    T = np.zeros((len(S), first + values.number.shape[1]))
+    T[np.arange(first), np.arange(first)] = 1.0
+    T[first + np.arange(values.seen), first + column] = 1.0
+    moves = np.concatenate([np.ones(first, dtype=bool), np.isin(np.arange(values.number.shape[1]), column)])
+    C = _covariance(T[:, moves].T @ S @ T[:, moves], cameras, views)
+    tied = np.zeros(T.shape[1])
+    tied[moves] = np.diag(C)
+    return tied[first:]
+
+
+def _block_ratio(found: _Linearised, rows: F64, C: F64, block: I64) -> F64:
+    """Squared pulls of the blocks on some unknowns (``rows`` of C) over what independent noise gives them
+    after the fit, the diagonal of sum C (S_b - S_b C S_b) C; NaN where that is nothing."""
+    squares, expected = np.zeros(len(rows)), np.zeros(len(rows))
+    of_residual, of_point = block[found.point], np.repeat(block, 3)
+    for b in range(int(block.max()) + 1):
+        here = np.flatnonzero(of_residual == b)
+        J, taken = found.J[here], found.taken[np.flatnonzero(of_point == b)]
+        half = (J.T @ (J @ rows.T) - taken.T @ (taken @ rows.T)).T
+        expected += np.sum(half * rows, axis=1) - np.sum((half @ C) * half, axis=1)
+        squares += (rows @ (J.T @ found.residual[here])) ** 2
+    return np.where(expected > 0.0, squares / np.maximum(expected, 1e-300), np.nan)
+
+
+def _point_ratio(found: _Linearised, rows: F64) -> F64:
+    """The same with every point a block of its own, whose part in the fit is nothing."""
+    squares = np.zeros(len(rows))
+    for n, c in enumerate(rows):
+        squares[n] = np.sum(np.bincount(found.point, (found.J @ c) * found.residual) ** 2)
+    # Not the variance: priors and populations have a part in that, and no points that pull.
+    expected = np.sum((found.J @ rows.T) ** 2, axis=0) - np.sum((found.taken @ rows.T) ** 2, axis=0)
+    return np.asarray(squares / np.maximum(expected, 1e-300))
+
+
+def _loss_correction(weighted: F64, delta: float) -> float:
+    """(mean weight / mean slope)^2 of Huber's loss from residuals multiplied by the root of their weight."""
+    squared = np.sum(weighted**2, axis=1)
+    # Outside, |w r|^2 = delta |r|, hence the weight delta / |r| = delta^2 / |w r|^2.
+    outside = squared > delta**2
+    weight = np.where(outside, delta**2 / np.maximum(squared, 1e-300), 1.0)
+    slope = np.where(outside, 0.5 * weight, 1.0)
+    return float(weight.mean() / slope.mean()) ** 2

@@ -1,0 +1,341 @@
+"""Elimination of the points from the normal equations, and their steps once the cameras' are known.
+
+A residual's Jacobian has three parts: ``A`` (K, 2, C), columns of its view's own block; ``E`` (K, 2, F),
+columns that views have in common, F may be 0; and ``B`` (K, 2, 3) of its point. The reduced system is kept in
+three parts accordingly: C x C blocks for pairs of views that see a point together, a border between views and
+common columns, and a corner. Residuals and Jacobians come multiplied by sqrt(rho').
+
+With V = sum B'B + damping = L L' of one point, B~ = B L^-T and Q_kl = delta_kl I - B~_k B~_l' (2 x 2), the
+reduced system is S_kl = A_k' Q_kl A_l: rank-two updates instead of the rank-three ones of W V^-1 W'.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.numerics.observations import Jacobians
+
+
+class Places(NamedTuple):
+    """Where observations, sorted by point, go.
+
+    ``start`` (N + 1,) the first of each point; ``view_index`` (K,); ``block`` (V,) number of the view's
+    block, -1 for one held fixed; ``pair`` (b, b) number of the block of two views, upper triangle;
+    ``common`` (V, F) columns of the border, -1 for one that does not move."""
+
+    start: I64
+    view_index: I64
+    block: I64
+    pair: I64
+    common: I64
+
+
+class Sums(NamedTuple):
+    """The reduced system: ``blocks`` (n, C, C), ``border`` (b, C, e), ``corner`` (e, e), ``rhs`` (D,) with
+    D = b C + e; and, before elimination, ``diagonal`` (D,) of J'J and ``gradient`` (D,)."""
+
+    blocks: F64
+    border: F64
+    corner: F64
+    rhs: F64
+    diagonal: F64
+    gradient: F64
+
+
+class PointSums(NamedTuple):
+    """Of each point: ``inverse`` (N, 3, 3) of its damped J'J, zeros where the data do not hold it;
+    ``gradient`` (N, 3) and ``diagonal`` (N, 3) of J'J."""
+
+    inverse: F64
+    gradient: F64
+    diagonal: F64
+
+
+class _Left(NamedTuple):
+    """What the steps of their points leave: ``Bt`` (k, 2, 3) = B~ and ``residual`` (k, 2) of the observations
+    from ``first`` on, ``g`` (n, 3) = L^-1 h of the points."""
+
+    first: int
+    Bt: F64
+    residual: F64
+    g: F64
+
+
+@njit(cache=True, nogil=True)
+def eliminate_points(
+    first: int, last: int, damping: float, J: Jacobians, places: Places, sums: Sums, points: PointSums
+) -> None:
+    """Add the points first..last, eliminated, to ``sums``; fill their ``points``.
+
+    The diagonal of a point's J'J is multiplied by 1 + damping; a point whose block is not positive stays
+    where it is.
+    """
+    k = places.start[first]
+    n = places.start[last] - k
+    left = _Left(k, np.empty((n, 2, 3)), np.empty((n, 2)), np.empty((last - first, 3)))
+    sum_points(first, last, damping, J, places, points, left)
+    add_views(first, last, J, places, sums, left)
+    if len(sums.corner) > 0:
+        add_common(first, last, J, places, sums, left)
+
+
+# A call costs more than a point, for all the arrays that go with it: the loops over the points are inside.
+
+
+@njit(cache=True, nogil=True)
+def sum_points(
+    first: int, last: int, damping: float, J: Jacobians, places: Places, points: PointSums, left: _Left
+) -> None:
+    """J'J and J'r of each point, its inverse, B~ and the residuals that its own step leaves."""
+    M, more = np.empty((3, 3)), 1.0 + damping
+    for j in range(first, last):
+        v00 = v01 = v02 = v11 = v12 = v22 = h0 = h1 = h2 = 0.0
+        s, e = places.start[j], places.start[j + 1]
+        for k in range(s, e):
+            for i in range(2):
+                b0, b1, b2, r = J.B[k, i, 0], J.B[k, i, 1], J.B[k, i, 2], J.residual[k, i]
+                v00, v01, v02 = v00 + b0 * b0, v01 + b0 * b1, v02 + b0 * b2
+                v11, v12, v22 = v11 + b1 * b1, v12 + b1 * b2, v22 + b2 * b2
+                h0, h1, h2 = h0 + b0 * r, h1 + b1 * r, h2 + b2 * r
+        h, d, g = points.gradient[j], points.diagonal[j], left.g[j - first]
+        h[0], h[1], h[2] = h0, h1, h2
+        d[0], d[1], d[2] = v00, v11, v22
+        inverse_root(v00 * more, v01, v02, v11 * more, v12, v22 * more, M)
+        for a in range(3):
+            for b in range(3):
+                points.inverse[j, a, b] = M[0, a] * M[0, b] + M[1, a] * M[1, b] + M[2, a] * M[2, b]
+        m00, m10, m11, m20, m21, m22 = M[0, 0], M[1, 0], M[1, 1], M[2, 0], M[2, 1], M[2, 2]
+        g0, g1, g2 = m00 * h0, m10 * h0 + m11 * h1, m20 * h0 + m21 * h1 + m22 * h2
+        g[0], g[1], g[2] = g0, g1, g2
+        for k in range(s, e):
+            for i in range(2):
+                b0, b1, b2 = J.B[k, i, 0], J.B[k, i, 1], J.B[k, i, 2]
+                t0, t1, t2 = m00 * b0, m10 * b0 + m11 * b1, m20 * b0 + m21 * b1 + m22 * b2
+                t = left.Bt[k - left.first, i]
+                t[0], t[1], t[2] = t0, t1, t2
+                left.residual[k - left.first, i] = J.residual[k, i] - t0 * g0 - t1 * g1 - t2 * g2
+
+
+@njit(cache=True, nogil=True)
+def inverse_root(v00: float, v01: float, v02: float, v11: float, v12: float, v22: float, M: F64) -> bool:
+    """M = L^-1 of a symmetric 3 x 3 matrix L L'; zeros (and False) where a pivot is not positive."""
+    M[:] = 0.0
+    if not v00 > 0.0:
+        return False
+    l00 = np.sqrt(v00)
+    l10, l20 = v01 / l00, v02 / l00
+    p1 = v11 - l10 * l10
+    if not p1 > 0.0:
+        return False
+    l11 = np.sqrt(p1)
+    l21 = (v12 - l20 * l10) / l11
+    p2 = v22 - l20 * l20 - l21 * l21
+    if not p2 > 0.0:
+        return False
+    M[0, 0], M[1, 1], M[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / np.sqrt(p2)
+    M[1, 0] = -l10 * M[0, 0] * M[1, 1]
+    M[2, 1] = -l21 * M[1, 1] * M[2, 2]
+    M[2, 0] = -(l20 * M[0, 0] + l21 * M[1, 0]) * M[2, 2]
+    return True
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def add_views(first: int, last: int, J: Jacobians, places: Places, sums: Sums, left: _Left) -> None:
+    """The blocks of all pairs of views that see a point, and the views' part of the right-hand side."""
+    C = J.A.shape[2]
+    for j in range(first, last):
+        for k in range(places.start[j], places.start[j + 1]):
+            v = places.block[places.view_index[k]]
+            if v < 0:
+                continue
+            r0, r1 = J.residual[k, 0], J.residual[k, 1]
+            t0, t1 = left.residual[k - left.first, 0], left.residual[k - left.first, 1]
+            for a in range(C):
+                a0, a1 = J.A[k, 0, a], J.A[k, 1, a]
+                sums.gradient[v * C + a] += a0 * r0 + a1 * r1
+                sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
+                sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
+            b = left.Bt[k - left.first]
+            for m in range(k, places.start[j + 1]):
+                w = places.block[places.view_index[m]]
+                if w < 0:
+                    continue
+                c = left.Bt[m - left.first]
+                same = 1.0 if m == k else 0.0
+                q00 = same - b[0, 0] * c[0, 0] - b[0, 1] * c[0, 1] - b[0, 2] * c[0, 2]
+                q01 = -b[0, 0] * c[1, 0] - b[0, 1] * c[1, 1] - b[0, 2] * c[1, 2]
+                q10 = -b[1, 0] * c[0, 0] - b[1, 1] * c[0, 1] - b[1, 2] * c[0, 2]
+                q11 = same - b[1, 0] * c[1, 0] - b[1, 1] * c[1, 1] - b[1, 2] * c[1, 2]
+                S = sums.blocks[places.pair[v, w]]
+                add_block(S, J.A[k], J.A[m], q00, q01, q10, q11)
+                if v == w and m > k:
+                    add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
+
+
+@njit(cache=True, nogil=True, inline="always", fastmath={"contract"}, forceinline=True)
+def add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float, q11: float) -> None:
+    """S (C, C) += left' Q right for left, right (2, C)."""
+    C = S.shape[0]
+    for a in range(C):
+        p0 = left[0, a] * q00 + left[1, a] * q10
+        p1 = left[0, a] * q01 + left[1, a] * q11
+        for b in range(C):
+            S[a, b] += p0 * right[0, b] + p1 * right[1, b]
+
+
+@njit(cache=True, nogil=True)
+def add_common(first: int, last: int, J: Jacobians, places: Places, sums: Sums, left: _Left) -> None:
+    """Border, corner and right-hand side of the columns that views have in common.
+
+    Those of one point side by side are E (2m, n). With p = B~' E the point's own step leaves T = E - B~ p of
+    them, and E' T = E'E - p'p.
+    """
+    most, C = 1, J.A.shape[2]
+    for j in range(first, last):
+        most = max(most, places.start[j + 1] - places.start[j])
+    wide = min(len(sums.corner), most * places.common.shape[1])
+    E, T, p = np.empty((most, 2, wide)), np.empty((2, wide)), np.empty((3, wide))
+    column, slot = np.empty(wide, np.int64), np.full(len(sums.corner), -1)
+    edge = C * sums.border.shape[0]
+    ends = (sums.corner, sums.rhs[edge:], sums.diagonal[edge:], sums.gradient[edge:])
+    for j in range(first, last):
+        s, e = places.start[j], places.start[j + 1]
+        n = gather_common(s, e, J.E, places.view_index, places.common, E, column, slot)
+        p[:, :n] = 0.0
+        for i in range(e - s):
+            for x in range(2):
+                b = left.Bt[s + i - left.first, x]
+                for c in range(n):
+                    p[0, c] += b[0] * E[i, x, c]
+                    p[1, c] += b[1] * E[i, x, c]
+                    p[2, c] += b[2] * E[i, x, c]
+        for i in range(e - s):
+            v = places.block[places.view_index[s + i]]
+            if v < 0:
+                continue
+            for x in range(2):
+                b = left.Bt[s + i - left.first, x]
+                for c in range(n):
+                    T[x, c] = E[i, x, c] - b[0] * p[0, c] - b[1] * p[1, c] - b[2] * p[2, c]
+            for a in range(C):
+                a0, a1 = J.A[s + i, 0, a], J.A[s + i, 1, a]
+                for c in range(n):
+                    sums.border[v, a, column[c]] += a0 * T[0, c] + a1 * T[1, c]
+        add_corner(column[:n], E[: e - s], p, left.g[j - first], J.residual[s:e], ends)
+
+
+@njit(cache=True, nogil=True)
+def gather_common(
+    s: int, e: int, J_E: F64, view_index: I64, common: I64, E: F64, column: I64, slot: I64
+) -> int:
+    """The common columns of observations s..e side by side in E (m, 2, n), their ``column`` in the border;
+    returns n. ``slot`` (columns of the border,) is -1 all over, before and after."""
+    F, n = common.shape[1], 0
+    for k in range(s, e):
+        for f in range(F):
+            c = common[view_index[k], f]
+            if c >= 0 and slot[c] < 0:
+                slot[c] = n
+                column[n] = c
+                n += 1
+    for k in range(s, e):
+        for c in range(n):
+            E[k - s, 0, c] = E[k - s, 1, c] = 0.0
+        for f in range(F):
+            c = common[view_index[k], f]
+            if c >= 0:
+                E[k - s, 0, slot[c]] += J_E[k, 0, f]
+                E[k - s, 1, slot[c]] += J_E[k, 1, f]
+    for c in range(n):
+        slot[column[c]] = -1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[F64, F64, F64, F64]) -> None:
+    """What the common columns of one point add to (corner, rhs, diagonal, gradient) of the border."""
+    corner, rhs, diagonal, gradient = ends
+    n = len(column)
+    for c in range(n):
+        r = squared = 0.0
+        for i in range(len(E)):
+            r += E[i, 0, c] * residual[i, 0] + E[i, 1, c] * residual[i, 1]
+            squared += E[i, 0, c] * E[i, 0, c] + E[i, 1, c] * E[i, 1, c]
+        gradient[column[c]] += r
+        rhs[column[c]] -= r - p[0, c] * g[0] - p[1, c] * g[1] - p[2, c] * g[2]
+        diagonal[column[c]] += squared
+        for d in range(c, n):
+            total = -p[0, c] * p[0, d] - p[1, c] * p[1, d] - p[2, c] * p[2, d]
+            for i in range(len(E)):
+                total += E[i, 0, c] * E[i, 0, d] + E[i, 1, c] * E[i, 1, d]
+            corner[column[c], column[d]] += total
+            if d > c:
+                corner[column[d], column[c]] += total
+
+
+@njit(cache=True, nogil=True)
+def substitute_points(
+    first: int, last: int, camera_step: F64, J: Jacobians, places: Places, points: PointSums, step: F64
+) -> None:
+    """Steps of the points first..last (N, 3) for a step of the cameras (D,): -V^-1 (h + B' J step)."""
+    C, F = J.A.shape[2], places.common.shape[1]
+    border = len(places.pair) * C
+    for j in range(first, last):
+        h = points.gradient[j]
+        t0, t1, t2 = h[0], h[1], h[2]
+        for k in range(places.start[j], places.start[j + 1]):
+            e0 = e1 = 0.0
+            view = places.view_index[k]
+            v = places.block[view] * C
+            if v >= 0:
+                for c in range(C):
+                    e0 += J.A[k, 0, c] * camera_step[v + c]
+                    e1 += J.A[k, 1, c] * camera_step[v + c]
+            for f in range(F):
+                column = places.common[view, f]
+                if column >= 0:
+                    e0 += J.E[k, 0, f] * camera_step[border + column]
+                    e1 += J.E[k, 1, f] * camera_step[border + column]
+            t0 += J.B[k, 0, 0] * e0 + J.B[k, 1, 0] * e1
+            t1 += J.B[k, 0, 1] * e0 + J.B[k, 1, 1] * e1
+            t2 += J.B[k, 0, 2] * e0 + J.B[k, 1, 2] * e1
+        V = points.inverse[j]
+        for a in range(3):
+            step[j, a] = -(V[a, 0] * t0 + V[a, 1] * t1 + V[a, 2] * t2)
+
+
+@njit(cache=True, nogil=True)
+def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
+    """Share of the variance of each coordinate (K, 2) that its point's own three freedoms take, B V^-1 B'."""
+    M = np.empty((3, 3))
+    for j in range(len(start) - 1):
+        v00 = v01 = v02 = v11 = v12 = v22 = 0.0
+        for k in range(start[j], start[j + 1]):
+            for i in range(2):
+                b0, b1, b2 = B[k, i, 0], B[k, i, 1], B[k, i, 2]
+                v00, v01, v02 = v00 + b0 * b0, v01 + b0 * b1, v02 + b0 * b2
+                v11, v12, v22 = v11 + b1 * b1, v12 + b1 * b2, v22 + b2 * b2
+        held = inverse_root(v00, v01, v02, v11, v12, v22, M)
+        for k in range(start[j], start[j + 1]):
+            for i in range(2):
+                b0, b1, b2 = B[k, i, 0], B[k, i, 1], B[k, i, 2]
+                t0, t1 = M[0, 0] * b0, M[1, 0] * b0 + M[1, 1] * b1
+                t2 = M[2, 0] * b0 + M[2, 1] * b1 + M[2, 2] * b2
+                leverage[k, i] = t0 * t0 + t1 * t1 + t2 * t2 if held else 1.0
+
+
+@njit(cache=True, nogil=True)
+def mark_pairs(start: I64, view: I64, block: I64, seen: NDArray[np.bool_]) -> None:
+    """Mark in ``seen`` (b, b), upper triangle, the blocks of views that see a point together."""
+    for j in range(len(start) - 1):
+        for k in range(start[j], start[j + 1]):
+            v = block[view[k]]
+            if v >= 0:
+                for m in range(k, start[j + 1]):
+                    if block[view[m]] >= 0:
+                        seen[v, block[view[m]]] = True

@@ -1,0 +1,333 @@
+"""Metric bundle adjustment: poses, points and intrinsics that views share or have on their own, with
+priors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.numerics.covariance import (
+    SIMILARITY_DOF,
+    CovarianceInput,
+    bundle_covariances,
+    robust_sigma,
+)
+from thesisrecon.numerics.elimination import sum_leverages
+from thesisrecon.numerics.intrinsic_values import (
+    IntrinsicColumns,
+    IntrinsicValues,
+    number_values,
+    place_intrinsics,
+)
+from thesisrecon.numerics.levenberg_marquardt import LossName, Solution, loss_code, run_levenberg_marquardt
+from thesisrecon.numerics.metric_cameras import (
+    POSE_DOF,
+    IntrinsicsPrior,
+    MetricCameras,
+    MetricModel,
+    check_cameras,
+    check_prior,
+    linearize_metric,
+    metric_cost,
+    move_poses,
+    project_metric,
+)
+from thesisrecon.numerics.observations import (
+    Jacobians,
+    Observations,
+    Seen,
+    SortedObservations,
+    Weighing,
+    scene_frame,
+    sort_observations,
+)
+from thesisrecon.numerics.schur import (
+    BundleLayout,
+    BundleStep,
+    BundleSystem,
+    CameraPrior,
+    hold_flipping,
+    lay_out,
+)
+
+# Where a robust loss bends, this share of the curvature along a residual is kept once the gain of a step has
+# fallen below CLOSE of the cost. Reweighting goes safely towards the minimum, but near it Newton is faster.
+LEAST, CLOSE = 0.3, 1e-3
+BENDING = ("huber", "soft_l1", "cauchy")
+
+
+@dataclass(frozen=True)
+class BundleOptions:
+    """How a metric bundle is weighed and when it ends.
+
+    Parameters
+    ----------
+    sigma_px : standard deviation of one image coordinate, the weight of the data against the priors.
+    loss, loss_px : the robust loss and where it turns, px.
+    max_iterations : linear systems at the most.
+    fixed_views : (V,) True for poses that must not move; None: all move.
+    covariance : whether to compute the covariances (one more linear system).
+    noise_floor_px : the covariances take the noise to be at least this, whatever the residuals say.
+    threads : how many may work on it; the answer does not depend on them.
+    """
+
+    sigma_px: float = 1.0
+    loss: LossName = "huber"
+    loss_px: float = 1.0
+    max_iterations: int = 20
+    fixed_views: B8 | None = field(default=None, compare=False)
+    covariance: bool = False
+    noise_floor_px: float = 0.0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        loss_code(self.loss, self.loss_px)
+        if not self.sigma_px > 0.0:
+            raise ValueError(f"sigma_px must be positive; got {self.sigma_px}")
+        if self.threads < 1 or self.max_iterations < 0:
+            raise ValueError(
+                f"a bundle needs a thread and iterations >= 0; got {self.threads}, {self.max_iterations}"
+            )
+
+
+@dataclass(frozen=True)
+class MetricBundleResult:
+    """Refined cameras and points with their uncertainty.
+
+    ``residual_px`` (K, 2) projection minus observation in the caller's order; ``cost``, ``initial_cost`` 1/2
+    sum rho in units of the given sigma, priors included; ``sigma_px`` the standard deviation of one image
+    coordinate estimated from the residuals. With ``covariance``: ``intrinsics_covariance`` (G, C, C), zero
+    for entries that do not move, and ``pose_covariance`` (V, 6, 6) of (rotation vector in rad, translation)
+    of x -> exp(w) x + d in each camera's frame, with respect to the centre of all poses (the inner gauge: no
+    camera is taken as exact).
+    """
+
+    cameras: MetricCameras
+    X: F64
+    residual_px: F64
+    cost: float
+    initial_cost: float
+    iterations: int
+    converged: bool
+    intrinsics_covariance: F64
+    pose_covariance: F64 | None
+    sigma_px: float
+
+
+@dataclass(frozen=True)
+class _State:
+    model: MetricModel
+    values: F64
+
+
+@dataclass(frozen=True)
+class _MetricProblem:
+    """Reprojection in units of sigma plus the priors; the columns of a view are its pose and the intrinsics
+    that no other shares, the rest of the unknowns are common columns."""
+
+    layout: BundleLayout
+    columns: IntrinsicColumns
+    free_views: B8
+    values: IntrinsicValues
+    weighing: Weighing
+    jacobians: Jacobians
+
+    def linearize(self, state: _State) -> BundleSystem:
+        J, c = self.jacobians, self.columns
+
+        def work(which: slice, seen: Seen) -> float:
+            part = J.part(which.start, which.stop)
+            return float(linearize_metric(state.model, seen, self.weighing, c.own, c.common, part))
+
+        cost = sum(self.layout.over_observations(work)) + self.values.links.cost(state.values)
+        if c.pinned.any():
+            J.A[:] = np.where(c.pinned[self.layout.observations.view_index][:, None], 0.0, J.A)
+        return BundleSystem(cost, self.layout, J, self._prior(state))
+
+    def _prior(self, state: _State) -> CameraPrior | None:
+        links, place = self.values.links, self.columns.place
+        if not len(links.first):
+            return None
+        gradient = np.zeros(self.layout.size)
+        gradient[place] = links.gradient(state.values)
+        return CameraPrior(
+            self.columns.of(links.first), self.columns.of(links.second), links.weight, gradient
+        )
+
+    def retract(self, state: _State, step: BundleStep) -> _State:
+        m, layout = state.model, self.layout
+        n_own = layout.size - layout.border
+        poses = np.zeros((len(m.t), POSE_DOF))
+        poses[self.free_views] = step.cameras[:n_own].reshape(-1, layout.width)[
+            layout.places.block[self.free_views], :POSE_DOF
+        ]
+        R, t = np.empty_like(m.R), np.empty_like(m.t)
+        move_poses(m.R, m.t, poses, R, t)
+        values = self.values.step(state.values, step.cameras[self.columns.place])
+        X = m.X + step.points
+        before, after = np.column_stack([m.R[:, 2], m.t[:, 2]]), np.column_stack([R[:, 2], t[:, 2]])
+        hold_flipping(layout, before, after, m.X, X)
+        return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
+
+    def residual(self, state: _State) -> F64:
+        """Residuals (K, 2) in px."""
+        K = len(self.layout.observations.xy)
+        residual, depth = np.empty((K, 2)), np.empty(K)
+
+        def work(which: slice, seen: Seen) -> None:
+            project_metric(state.model, seen, residual[which], depth[which])
+
+        self.layout.over_observations(work)
+        return residual
+
+    def sigma(self, state: _State, residual: F64) -> float:
+        """The noise of one coordinate, px, from the residuals at the minimum."""
+        leverage = np.empty_like(residual)
+        self.linearize(state)
+        sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
+        held = not self.free_views[self.layout.observations.view_index].all()
+        poses = POSE_DOF * int(self.free_views.sum())
+        return robust_sigma(residual, leverage, poses + self.values.size - (0 if held else SIMILARITY_DOF))
+
+    def cost(self, state: _State) -> float:
+        def work(_: slice, seen: Seen) -> float:
+            return float(metric_cost(state.model, seen, self.weighing))
+
+        return sum(self.layout.over_observations(work)) + self.values.links.cost(state.values)
+
+
+def refine_metric_bundle(
+    cameras: MetricCameras,
+    X: F64,
+    observations: Observations,
+    *,
+    free: B8,
+    prior: IntrinsicsPrior | None = None,
+    options: BundleOptions | None = None,
+) -> MetricBundleResult:
+    """Minimise sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 over poses, points and
+    intrinsics q.
+
+    Sparse Levenberg-Marquardt; the focal is stepped as log f, the seven freedoms of the frame are left to the
+    damping, and the frame is centred and scaled inside so that they are well conditioned.
+
+    Parameters
+    ----------
+    cameras : where to start, and which intrinsics are shared. X : (N, 3) points.
+    observations : K of them, in any order.
+    free : (C,) which of the intrinsics move at all. prior : what is known of them, which
+    may hold single ones; nothing by default.
+
+    Views and points without observations come back untouched. The cost never rises; singular systems end the
+    iterations instead of raising. Raises ``ValueError`` for wrong shapes, values that are not finite or
+    focals that are not positive.
+    """
+    options = options or BundleOptions()
+    X = np.array(X, dtype=np.float64)
+    check_cameras(cameras, X, free)
+    if prior is not None:
+        check_prior(prior, cameras.intrinsics.shape)
+    o = sort_observations(
+        observations.view_index, observations.point_index, observations.xy, len(cameras.R), len(X)
+    )
+    seen_points = np.diff(o.start) > 0
+    origin, scale = scene_frame(X[seen_points])
+    problem, values, table = _metric_problem(cameras, o, np.asarray(free, dtype=bool), prior, options)
+    start = MetricModel(
+        np.array(cameras.R, dtype=np.float64),
+        scale * (cameras.t + cameras.R @ origin),
+        problem.values.write(table, values),
+        np.ascontiguousarray(cameras.group, dtype=np.int64),
+        np.ascontiguousarray(scale * (X - origin)),
+    )
+    solution = _minimize(problem, _State(start, values), options)
+    refined = _refined(cameras, problem.free_views, solution.state.model, origin, scale)
+    residual = problem.residual(solution.state)
+    sigma = problem.sigma(solution.state, residual)
+    intrinsics_covariance, pose_covariance = np.zeros((*table.shape, table.shape[1])), None
+    if options.covariance:
+        noise = max(sigma or options.sigma_px, options.noise_floor_px)
+        intrinsics_covariance, pose_covariance = _covariances(problem, solution.state, noise, scale)
+    return MetricBundleResult(
+        refined,
+        np.where(seen_points[:, None], solution.state.model.X / scale + origin, X),
+        o.unsort(residual),
+        solution.cost,
+        solution.initial_cost,
+        solution.iterations,
+        solution.converged,
+        intrinsics_covariance,
+        pose_covariance,
+        sigma,
+    )
+
+
+def _refined(cameras: MetricCameras, moved: B8, end: MetricModel, origin: F64, scale: float) -> MetricCameras:
+    """The cameras at the end in the caller's frame; those that did not move as they were."""
+    return replace(
+        cameras,
+        R=np.where(moved[:, None, None], end.R, cameras.R),
+        t=np.where(moved[:, None], end.t / scale - end.R @ origin, cameras.t),
+        intrinsics=end.intrinsics,
+    )
+
+
+def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Solution[_State]:
+    """Down to the minimum, by reweighting first and nearly Newton's steps at the end."""
+    if options.loss not in BENDING:
+        return run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations)
+    far = run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations, tolerance=CLOSE)
+    left = options.max_iterations - far.iterations
+    if left < 1:
+        return far
+    near = replace(problem, weighing=problem.weighing._replace(least=LEAST))
+    end = run_levenberg_marquardt(near, far.state, max_iterations=left)
+    return replace(end, initial_cost=far.initial_cost, iterations=far.iterations + end.iterations)
+
+
+def _metric_problem(
+    cameras: MetricCameras,
+    o: SortedObservations,
+    free: B8,
+    prior: IntrinsicsPrior | None,
+    options: BundleOptions,
+) -> tuple[_MetricProblem, F64, F64]:
+    """The problem, where its intrinsic values start, and the table of intrinsics they are put into."""
+    group = np.asarray(cameras.group, dtype=np.int64)
+    seen = np.bincount(o.view_index, minlength=len(group)) > 0
+    used = np.bincount(group[seen], minlength=len(cameras.intrinsics)) > 0
+    values, start, table = number_values(cameras, used, free, prior)
+    fixed = np.zeros(len(group), bool) if options.fixed_views is None else np.asarray(options.fixed_views)
+    if fixed.shape != group.shape:
+        raise ValueError(f"fixed_views is one flag for each of {len(group)} views; got shape {fixed.shape}")
+    free_views = seen & ~fixed.astype(bool)
+    columns = place_intrinsics(values, group, np.flatnonzero(free), seen, free_views)
+    layout = lay_out(
+        o,
+        columns.block,
+        width=POSE_DOF + len(columns.own),
+        common=columns.border,
+        border=columns.n_border,
+        threads=options.threads,
+    )
+    weighing = Weighing(
+        options.sigma_px, loss_code(options.loss, options.loss_px), options.loss_px / options.sigma_px
+    )
+    problem = _MetricProblem(layout, columns, free_views, values, weighing, layout.jacobians())
+    return problem, start, table
+
+
+def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
+    """Covariances of intrinsics (G, C, C) and poses (V, 6, 6) for the noise found, t in the caller's unit."""
+    w = problem.weighing
+    problem = replace(problem, weighing=Weighing(sigma_px, w.code, w.delta))
+    reduced, _, _ = problem.linearize(state).reduce(1e-10)
+    layout, m = problem.layout, state.model
+    held = not problem.free_views[layout.observations.view_index].all()
+    block = np.where(problem.free_views, layout.places.block, -1)
+    found = CovarianceInput(reduced, block, m.R, m.t, held)
+    number = problem.columns.of(problem.values.number)
+    return bundle_covariances(found, number, m.intrinsics[:, 0], scale)

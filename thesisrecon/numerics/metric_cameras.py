@@ -1,0 +1,270 @@
+"""Calibrated cameras with radial distortion: projection, cost and Jacobians.
+
+Calibrated cameras as bundle adjustment sees them, and what is known of their intrinsics beforehand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.numerics.observations import Jacobians, Seen, Weighing
+from thesisrecon.numerics.small_solvers import away_from_zero, loss_curvature, loss_value, loss_weight
+
+
+class MetricModel(NamedTuple):
+    """``R`` (V, 3, 3), ``t`` (V, 3), ``intrinsics`` (G, 6) or (G, 8) with k2 and k3, ``group`` (V,) the row
+    of each view, ``X`` (N, 3)."""
+
+    R: F64
+    t: F64
+    intrinsics: F64
+    group: I64
+    X: F64
+
+
+@njit(cache=True, nogil=True, inline="always")
+def in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
+    """R x + t."""
+    return (
+        r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0],
+        r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1],
+        r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2],
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
+    """Pixel of a point in the camera's frame, w away from 0; q a row of intrinsics."""
+    a, b = x0 / w, x1 / w
+    r2 = a * a + b * b
+    d = 1.0 + q[5] * r2
+    if len(q) > 6:
+        d += (q[6] + q[7] * r2) * r2 * r2
+    return q[0] * a * d + q[2] * b * d + q[3], q[0] * q[1] * b * d + q[4]
+
+
+@njit(cache=True, nogil=True)
+def project_metric(model: MetricModel, seen: Seen, residual: F64, depth: F64) -> None:
+    """Fill residual (K, 2) px, projection minus observation, and depth (K,)."""
+    for k in range(len(seen.xy)):
+        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+        x0, x1, x2 = in_camera(model.R[v], model.t[v], x)
+        px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
+        depth[k] = x2
+        residual[k, 0] = px - seen.xy[k, 0]
+        residual[k, 1] = py - seen.xy[k, 1]
+
+
+@njit(cache=True, nogil=True)
+def metric_cost(model: MetricModel, seen: Seen, weighing: Weighing) -> float:
+    """1/2 sum rho of the residuals."""
+    cost = 0.0
+    for k in range(len(seen.xy)):
+        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+        x0, x1, x2 = in_camera(model.R[v], model.t[v], x)
+        px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
+        e0, e1 = (px - seen.xy[k, 0]) / weighing.sigma, (py - seen.xy[k, 1]) / weighing.sigma
+        cost += loss_value(weighing.code, e0 * e0 + e1 * e1, weighing.delta)
+    return 0.5 * cost
+
+
+@njit(cache=True, nogil=True)
+def move_poses(R: F64, t: F64, step: F64, R_out: F64, t_out: F64) -> None:
+    """Poses R (V, 3, 3), t (V, 3) followed by x -> exp(w) x + d for the steps (w, d) (V, 6)."""
+    for v in range(len(t)):
+        w = step[v, :3]
+        angle = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+        # Rodrigues: exp(w) = I + a [w]x + b [w]x^2, with their series where the quotients lose digits.
+        a, b = 1.0 - angle * angle / 6.0, 0.5 - angle * angle / 24.0
+        if angle > 1e-4:
+            a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+        for c in range(4):
+            x = R[v, :, c] if c < 3 else t[v]
+            y = R_out[v, :, c] if c < 3 else t_out[v]
+            u0, u1, u2 = w[1] * x[2] - w[2] * x[1], w[2] * x[0] - w[0] * x[2], w[0] * x[1] - w[1] * x[0]
+            y[0] = x[0] + a * u0 + b * (w[1] * u2 - w[2] * u1)
+            y[1] = x[1] + a * u1 + b * (w[2] * u0 - w[0] * u2)
+            y[2] = x[2] + a * u2 + b * (w[0] * u1 - w[1] * u0)
+        for c in range(3):
+            t_out[v, c] += step[v, 3 + c]
+
+
+@njit(cache=True, nogil=True)
+def linearize_metric(
+    model: MetricModel, seen: Seen, weighing: Weighing, own: I64, common: I64, J: Jacobians
+) -> float:
+    """Fill J with weighted residuals in units of sigma and the Jacobians; returns the cost.
+
+    A pose moves by x -> exp(w) x + d in the camera's frame: columns (w, d) of A, behind them the intrinsics
+    that ``own`` lists of (log f, aspect, skew, cx, cy, k1, k2, k3); those that ``common`` lists make E.
+    """
+    cost = 0.0
+    D = np.empty((2, 10))
+    for k in range(len(seen.xy)):
+        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+        r, q = model.R[v], model.intrinsics[model.group[v]]
+        x0, x1, x2 = in_camera(r, model.t[v], x)
+        w = away_from_zero(x2)
+        px, py = image_of(q, x0, x1, w)
+        e0, e1 = (px - seen.xy[k, 0]) / weighing.sigma, (py - seen.xy[k, 1]) / weighing.sigma
+        s = e0 * e0 + e1 * e1
+        cost += loss_value(weighing.code, s, weighing.delta)
+        root = np.sqrt(loss_weight(weighing.code, s, weighing.delta))
+        a, b = x0 / w, x1 / w
+        fill_columns(q, a, b, root / weighing.sigma, D)
+        kept = max(loss_curvature(weighing.code, s, weighing.delta), weighing.least)
+        if kept < 1.0:
+            # (I - (1 - sqrt(kept)) e e' / s) J with the residual over sqrt(kept): the gradient is the same.
+            kept = np.sqrt(kept)
+            root /= kept
+            for c in range(10):
+                along = (1.0 - kept) * (e0 * D[0, c] + e1 * D[1, c]) / s
+                D[0, c], D[1, c] = D[0, c] - along * e0, D[1, c] - along * e1
+        J.residual[k, 0], J.residual[k, 1] = root * e0, root * e1
+        for c in range(len(own)):
+            J.A[k, 0, 6 + c], J.A[k, 1, 6 + c] = D[0, own[c]], D[1, own[c]]
+        for c in range(len(common)):
+            J.E[k, 0, c], J.E[k, 1, c] = D[0, common[c]], D[1, common[c]]
+        j00, j01, j02 = D[0, 8] / w, D[0, 9] / w, -(D[0, 8] * a + D[0, 9] * b) / w
+        j10, j11, j12 = D[1, 8] / w, D[1, 9] / w, -(D[1, 8] * a + D[1, 9] * b) / w
+        A = J.A[k]
+        A[0, 0], A[0, 1], A[0, 2] = j02 * x1 - j01 * w, j00 * w - j02 * x0, j01 * x0 - j00 * x1
+        A[1, 0], A[1, 1], A[1, 2] = j12 * x1 - j11 * w, j10 * w - j12 * x0, j11 * x0 - j10 * x1
+        A[0, 3], A[0, 4], A[0, 5] = j00, j01, j02
+        A[1, 3], A[1, 4], A[1, 5] = j10, j11, j12
+        for c in range(3):
+            J.B[k, 0, c] = j00 * r[0, c] + j01 * r[1, c] + j02 * r[2, c]
+            J.B[k, 1, c] = j10 * r[0, c] + j11 * r[1, c] + j12 * r[2, c]
+    return 0.5 * cost
+
+
+@njit(cache=True, nogil=True)
+def fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
+    """Fill D (2, 10): derivatives of the pixel by the eight intrinsics and by the normalised point (a, b),
+    times root."""
+    f, g, skew = root * q[0], root * q[0] * q[1], root * q[2]
+    r2 = a * a + b * b
+    # d is the distortion, slope its derivative over r^2.
+    d, slope = 1.0 + q[5] * r2, q[5]
+    if len(q) > 6:
+        d += (q[6] + q[7] * r2) * r2 * r2
+        slope += (2.0 * q[6] + 3.0 * q[7] * r2) * r2
+    D[0, 0], D[1, 0] = f * a * d, g * b * d
+    D[0, 1], D[1, 1] = 0.0, f * b * d
+    D[0, 2], D[1, 2] = root * b * d, 0.0
+    D[0, 3], D[1, 3] = root, 0.0
+    D[0, 4], D[1, 4] = 0.0, root
+    D[0, 5], D[1, 5] = (f * a + skew * b) * r2, g * b * r2
+    D[0, 6], D[1, 6] = D[0, 5] * r2, D[1, 5] * r2
+    D[0, 7], D[1, 7] = D[0, 6] * r2, D[1, 6] * r2
+    m00, m01, m11 = d + 2.0 * slope * a * a, 2.0 * slope * a * b, d + 2.0 * slope * b * b
+    D[0, 8], D[0, 9] = f * m00 + skew * m01, f * m01 + skew * m11
+    D[1, 8], D[1, 9] = g * m01, g * m11
+
+
+POSE_DOF = 6
+# Columns of a table of intrinsics: with k1 alone, and with k2 and k3.
+INTRINSIC_DOFS = (6, 8)
+FOCAL = 0
+
+
+@dataclass(frozen=True)
+class MetricCameras:
+    """Calibrated cameras whose views share what they are said to share.
+
+    ``R`` (V, 3, 3) world-to-camera, ``t`` (V, 3); ``intrinsics`` (G, C) rows [focal_px, aspect fy/fx,
+    skew_px, cx_px, cy_px, k1] (C = 6), with k2 and k3 after them where the lens needs these (C = 8);
+    ``group`` (V,) the row of each view. A normalised point (x, y) is seen at (x, y) (1 + k1 r^2 + k2 r^4 + k3
+    r^6), then at K = [[f, skew, cx], [0, aspect f, cy], [0, 0, 1]]. ``shared`` (G, C): rows with equal
+    numbers in a column hold one and the same value there; None: every row has values of its own.
+    """
+
+    R: F64
+    t: F64
+    intrinsics: F64
+    group: I64
+    shared: I64 | None = None
+
+    @property
+    def K(self) -> F64:
+        """(V, 3, 3) calibration matrices."""
+        f, aspect, skew, cx, cy = self.intrinsics[self.group].T[:5]
+        zero, one = np.zeros_like(f), np.ones_like(f)
+        rows = [f, skew, cx, zero, aspect * f, cy, zero, zero, one]
+        return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+    @property
+    def P(self) -> F64:
+        """(V, 3, 4) cameras before distortion, K [R t]."""
+        return np.asarray(self.K @ np.concatenate([self.R, self.t[:, :, None]], axis=2))
+
+
+@dataclass(frozen=True)
+class IntrinsicsPrior:
+    """What is known of the intrinsics: ``mean``, ``std`` (G, C), one row for each row of ``intrinsics``.
+
+    Units are those of the intrinsics (px; aspect and k1 pure numbers), but the focal's std is relative: the
+    prior acts on log f. std 0: the value is the mean and does not move. std inf: nothing is known. Rows that
+    share a value have one prior for it: the tightest of theirs.
+
+    ``population`` (G,): rows of equal number are cameras of one kind, whose values scatter about a common
+    mean that is not known, with standard deviation ``spread`` (C,), or (G, C) where each kind has its own
+    (that of its first row counts; relative for the focal; inf = no such assumption): a camera whose own
+    photographs do not determine a value borrows it from the others. -1: of no kind.
+    """
+
+    mean: F64
+    std: F64
+    population: I64 | None = None
+    spread: F64 | None = None
+
+
+def check_cameras(cameras: MetricCameras, X: F64, free: B8) -> None:
+    """Refuse wrong shapes and values with ``ValueError``."""
+    n_views, n_rows, width = len(cameras.R), len(cameras.intrinsics), cameras.intrinsics.shape[-1]
+    shapes = (cameras.R.shape, cameras.t.shape, cameras.intrinsics.shape, cameras.group.shape, X.shape[1:])
+    if width not in INTRINSIC_DOFS or shapes != (
+        (n_views, 3, 3), (n_views, 3), (n_rows, width), (n_views,), (3,)
+    ):  # fmt: skip
+        raise ValueError(
+            f"a metric bundle needs R (V, 3, 3), t (V, 3), intrinsics (G, 6 or 8), group (V,); got {shapes}"
+        )
+    if np.shape(free) != (width,):
+        raise ValueError(f"free is one flag for each of the {width} intrinsics; got shape {np.shape(free)}")
+    if cameras.shared is not None and np.shape(cameras.shared) != cameras.intrinsics.shape:
+        raise ValueError(
+            f"shared has a number for each of the intrinsics; got shape {np.shape(cameras.shared)}"
+        )
+    finite = (np.isfinite(a).all() for a in (cameras.R, cameras.t, cameras.intrinsics, X))
+    if not all(finite) or not (cameras.intrinsics[:, FOCAL] > 0.0).all():
+        raise ValueError("cameras and points must be finite and focals positive")
+    if n_views and (cameras.group.min() < 0 or cameras.group.max() >= n_rows):
+        raise ValueError(f"groups must lie in 0..{n_rows - 1}")
+
+
+def check_prior(prior: IntrinsicsPrior, shape: tuple[int, ...]) -> None:
+    """Refuse wrong shapes and values with ``ValueError``."""
+    known = np.isfinite(prior.std) if np.shape(prior.std) == shape else np.ones(shape, dtype=bool)
+    if not (
+        np.shape(prior.mean) == np.shape(prior.std) == shape
+        and (prior.std >= 0.0).all()
+        and np.isfinite(prior.mean[known]).all()
+        and (prior.mean[known[:, FOCAL], FOCAL] > 0.0).all()
+    ):
+        raise ValueError(
+            f"a prior of shape {shape} needs stds >= 0 and, where they are finite, means and positive focals"
+        )
+    if (prior.population is None) != (prior.spread is None):
+        raise ValueError("a population needs its spread, and a spread its population")
+    if prior.population is not None and prior.spread is not None:
+        shapes = (np.shape(prior.population), np.shape(prior.spread))
+        if shapes not in ((shape[:1], shape[1:]), (shape[:1], shape)) or not (prior.spread > 0.0).all():
+            raise ValueError(
+                f"population is (G,) and spread (C,) or (G, C) above 0; got {shapes}, {prior.spread}"
+            )

@@ -1,0 +1,76 @@
+"""Section 5.4, Algorithm 2: the loop of random sampling consensus; what is sampled is the caller's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.random import Generator
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.numerics.noise import draw_sample
+
+Model = TypeVar("Model")
+
+
+class SampledProblem(Protocol[Model]):
+    """What is estimated: models through a minimal sample, and how far the data are from a model."""
+
+    @property
+    def sample_size(self) -> int:
+        """Data in a minimal sample."""
+
+    def solve(self, sample: I64) -> list[Model]:
+        """Models through the data of these indices (sample_size,), possibly none."""
+
+    def residuals(self, model: Model) -> F64:
+        """Distance of every datum from the model; (N,)."""
+
+
+@dataclass(frozen=True)
+class Consensus(Generic[Model]):
+    """The model with the most data within the threshold, which they are (N,), and the samples drawn."""
+
+    model: Model
+    inliers: B8
+    samples: int
+
+
+@dataclass(frozen=True)
+class SampleConsensus:
+    """Algorithm 2: draw ``max_samples`` samples, or stop once the share of inliers is above ``enough_share``.
+
+    The model with the most data within ``threshold`` wins; of two with as many, the one whose inliers have
+    the lower standard deviation (Fischler and Bolles, 1981). Trying every sample instead would take
+    n! / (s! (n - s)!) of them, s being its size (the thesis' text has n! / s!).
+    """
+
+    threshold: float
+    max_samples: int = 1000
+    enough_share: float = 1.0
+
+    def search(self, problem: SampledProblem[Model], n: int, rng: Generator) -> Consensus[Model] | None:
+        """The best model of ``n`` data, or None where no sample gave one.
+
+        Raises ``ValueError`` for fewer data than a sample has.
+        """
+        if n < problem.sample_size:
+            raise ValueError(f"sampling needs at least {problem.sample_size} data; got {n}")
+        best: Consensus[Model] | None = None
+        best_rank = (-1, 0.0)
+        sample = np.empty(problem.sample_size, dtype=np.int64)
+        for drawn in range(1, self.max_samples + 1):
+            draw_sample(rng.random(problem.sample_size), n, sample)
+            for model in problem.solve(sample):
+                rank, inliers = self._rank(problem.residuals(model))
+                if rank > best_rank:
+                    best, best_rank = Consensus(model, inliers, drawn), rank
+            if best is not None and best_rank[0] > self.enough_share * n:
+                break
+        return None if best is None else Consensus(best.model, best.inliers, drawn)
+
+    def _rank(self, residuals: F64) -> tuple[tuple[int, float], B8]:
+        inliers = np.abs(residuals) < self.threshold
+        spread = float(np.sqrt(np.mean(residuals[inliers] ** 2))) if inliers.any() else 0.0
+        return (int(inliers.sum()), -spread), inliers

@@ -1,0 +1,296 @@
+"""The reduced system in the forms that its solvers want: dense, banded, and as a product with a vector.
+
+Solvers of the reduced camera system, and the choice between them by size and sparsity.
+
+Dense Cholesky serves up to some hundred views. Beyond, views see points with their neighbours only: where an
+order of the views keeps these near the diagonal (corridors, loops, streets) a banded Cholesky factor is exact
+at a cost linear in the views; where none does, conjugate gradients work on the blocks as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import scipy
+from numba import njit
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.numerics.elimination import Sums
+from thesisrecon.numerics.levenberg_marquardt import solve_positive
+
+
+@njit(cache=True, nogil=True)
+def fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
+    """Blocks (n, C, C) of views row[i] <= column[i] into the upper triangle of S (D, D)."""
+    C = blocks.shape[1]
+    for i in range(len(blocks)):
+        r, c = row[i] * C, column[i] * C
+        for a in range(C):
+            for b in range(C):
+                S[r + a, c + b] = blocks[i, a, b]
+
+
+@njit(cache=True, nogil=True)
+def add_diagonal(blocks: F64, pair: I64, corner: F64, values: F64) -> None:
+    """Add values (D,) to the diagonal of the reduced matrix; ``pair`` (b, b) numbers the blocks of views."""
+    C, b = blocks.shape[1], len(pair)
+    for v in range(b):
+        for a in range(C):
+            blocks[pair[v, v], a, a] += values[v * C + a]
+    for c in range(len(corner)):
+        corner[c, c] += values[b * C + c]
+
+
+@njit(cache=True, nogil=True)
+def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None:
+    """Blocks into the lower band of LAPACK, band[j, i - j] = S[i, j], views in the order ``place`` (b,).
+
+    ``band`` (D, width + 1) is row-major, hence the column-major array that LAPACK wants, transposed.
+    """
+    C = blocks.shape[1]
+    for i in range(len(blocks)):
+        r, c = place[row[i]] * C, place[column[i]] * C
+        for a in range(C):
+            for b in range(C):
+                high, low = max(r + a, c + b), min(r + a, c + b)
+                band[low, high - low] = blocks[i, a, b]
+
+
+@njit(cache=True, nogil=True)
+def multiply_blocks(blocks: F64, row: I64, column: I64, x: F64, y: F64) -> None:
+    """y (b, C) = S x for the symmetric S of which ``blocks`` are the upper triangle; x (b, C)."""
+    C = blocks.shape[1]
+    y[:] = 0.0
+    for i in range(len(blocks)):
+        r, c, S = row[i], column[i], blocks[i]
+        for a in range(C):
+            total = 0.0
+            for b in range(C):
+                total += S[a, b] * x[c, b]
+            y[r, a] += total
+        if r != c:
+            for a in range(C):
+                left = x[r, a]
+                for b in range(C):
+                    y[c, b] += S[a, b] * left
+
+
+@njit(cache=True, nogil=True)
+def invert_band(L: F64, Z: F64) -> None:
+    """The entries inside the band of (L L')^-1, by the recursion of Takahashi (1973) from the last column on.
+
+    L and Z (D, width) hold column j from the diagonal down: L[j, i - j].
+    """
+    D, width = L.shape
+    for j in range(D - 1, -1, -1):
+        last = min(D - 1, j + width - 1)
+        pivot = 1.0 / L[j, 0]
+        for i in range(last, j, -1):
+            total = 0.0
+            for k in range(j + 1, i + 1):
+                total += L[j, k - j] * Z[k, i - k]
+            for k in range(i + 1, last + 1):
+                total += L[j, k - j] * Z[i, k - i]
+            Z[j, i - j] = -pivot * total
+        total = 0.0
+        for k in range(j + 1, last + 1):
+            total += L[j, k - j] * Z[j, k - j]
+        Z[j, 0] = pivot * (pivot - total)
+
+
+# What an operation costs beside one of a dense Cholesky factorisation: narrow bands keep the processor less
+# busy, and the blocks of a product with a vector come from memory.
+BAND_COST, PRODUCT_COST = 2.0, 8.0
+TYPICAL_PRODUCTS = 150
+SMALL = 600
+
+
+@dataclass(frozen=True)
+class ReducedSystem:
+    """A symmetric positive system in blocks: ``row`` <= ``column`` (n,) the views of each of ``sums.blocks``;
+    ``sums.border`` and ``sums.corner`` what they have in common; ``sums.rhs`` the right-hand side."""
+
+    row: I64
+    column: I64
+    sums: Sums
+
+    def dense(self) -> F64:
+        """The matrix (D, D), upper triangle."""
+        edge, D = self.sums.border.shape[0] * self.sums.border.shape[1], len(self.sums.rhs)
+        S = np.zeros((D, D))
+        fill_dense(self.sums.blocks, self.row, self.column, S)
+        S[:edge, edge:] = self.sums.border.reshape(edge, D - edge)
+        S[edge:, edge:] = self.sums.corner
+        return S
+
+
+class ReducedSolver(Protocol):
+    """Solves a reduced system; None where it is not positive."""
+
+    def solve(self, system: ReducedSystem) -> F64 | None:
+        """x (D,)."""
+
+
+@dataclass(frozen=True)
+class DenseCholesky:
+    """The whole matrix by LAPACK: D^3 / 3 operations."""
+
+    def solve(self, system: ReducedSystem) -> F64 | None:
+        """x (D,) or None."""
+        # Row-major upper is column-major lower: LAPACK reads the transpose without a copy.
+        return solve_positive(system.dense().T, system.sums.rhs)
+
+
+@dataclass(frozen=True)
+class BandedFactor:
+    """A reduced system taken apart.
+
+    LAPACK's lower banded ``factor`` (width, b C) of the views' part, views in the order ``place`` (b,);
+    ``border`` (b, C, e); ``moved`` (b C, e) = views^-1 border; ``complement`` (e, e) = corner - border'
+    moved."""
+
+    place: I64
+    factor: F64
+    border: F64
+    moved: F64
+    complement: F64
+
+    def solve_views(self, right: F64) -> F64:
+        """views^-1 right for right (b C, m)."""
+        b, C, _ = self.border.shape
+        ordered = right.reshape(b, C, -1)[np.argsort(self.place)].reshape(b * C, -1)
+        solved, _ = scipy.linalg.lapack.dpbtrs(self.factor, ordered, lower=1)
+        return np.asarray(solved.reshape(b, C, -1)[self.place].reshape(b * C, -1))
+
+    def solve(self, right: F64) -> F64 | None:
+        """S^-1 right for right (D, m); None where the complement is not positive."""
+        edge, flat = len(self.moved), self.border.reshape(len(self.moved), -1)
+        views = self.solve_views(right[:edge])
+        tail = solve_positive(self.complement, right[edge:] - flat.T @ views)
+        if tail is None or not np.isfinite(views).all():
+            return None
+        return np.concatenate([views - self.moved @ tail, tail])
+
+    def inverse_blocks(self) -> F64:
+        """(b, C + e, C + e): of S^-1 the rows and columns of each view and of the border."""
+        b, C, e = self.border.shape
+        band = np.zeros(self.factor.T.shape)
+        invert_band(np.ascontiguousarray(self.factor.T), band)
+        corner, moved = np.linalg.inv(self.complement), self.moved.reshape(b, C, e)
+        blocks = np.zeros((b, C + e, C + e))
+        first = self.place[:, None] * C + np.arange(C)
+        for a in range(C):
+            for c in range(a, C):
+                blocks[:, c, a] = blocks[:, a, c] = band[first[:, a], c - a]
+        blocks[:, :C, :C] += np.einsum("bae,ef,bcf->bac", moved, corner, moved)
+        blocks[:, :C, C:] = -moved @ corner
+        blocks[:, C:, :C] = np.swapaxes(blocks[:, :C, C:], 1, 2)
+        blocks[:, C:, C:] = corner
+        return blocks
+
+
+@dataclass(frozen=True)
+class BandedCholesky:
+    """The views in the order ``place`` (b,), neighbours at most ``reach`` places apart, by LAPACK's banded
+    factorisation; the border by its Schur complement."""
+
+    place: I64
+    reach: int
+
+    def solve(self, system: ReducedSystem) -> F64 | None:
+        """x (D,) or None."""
+        factored = self.factor(system)
+        found = None if factored is None else factored.solve(system.sums.rhs[:, None])
+        return None if found is None else found[:, 0]
+
+    def factor(self, system: ReducedSystem) -> BandedFactor | None:
+        """The system taken apart; None where it is not positive."""
+        s, (b, C, e) = system.sums, system.sums.border.shape
+        band = np.zeros((b * C, (self.reach + 1) * C))
+        fill_band(s.blocks, system.row, system.column, self.place, band)
+        if not np.isfinite(band).all():
+            return None
+        factor, info = scipy.linalg.lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
+        if info != 0:
+            return None
+        flat = s.border.reshape(b * C, e)
+        views = BandedFactor(self.place, factor, s.border, flat, s.corner)
+        moved = views.solve_views(flat) if e else flat
+        return BandedFactor(self.place, factor, s.border, moved, s.corner - flat.T @ moved)
+
+
+@dataclass(frozen=True)
+class ConjugateGradients:
+    """Preconditioned by the inverses of the views' blocks and of the corner (block Jacobi), from zero, until
+    the residual in that norm has fallen by ``tolerance``."""
+
+    tolerance: float = 1e-3
+    max_products: int = 1000
+
+    def solve(self, system: ReducedSystem) -> F64 | None:
+        """x (D,) or None."""
+        s, (b, C, _) = system.sums, system.sums.border.shape
+        own = s.blocks[system.row == system.column]
+        try:
+            # Inverses of what is not positive exist, but say nothing of descent: Cholesky refuses them.
+            np.linalg.cholesky(own), np.linalg.cholesky(s.corner)
+            inverse, corner = np.linalg.inv(own), np.linalg.inv(s.corner)
+        except np.linalg.LinAlgError:
+            return None
+
+        def precondition(r: F64) -> F64:
+            views = np.einsum("bij,bj->bi", inverse, r[: b * C].reshape(b, C))
+            return np.concatenate([views.ravel(), corner @ r[b * C :]])
+
+        x, r = np.zeros_like(s.rhs), s.rhs.copy()
+        z = precondition(r)
+        p, energy = z, float(r @ z)
+        if not energy >= 0.0:
+            return None
+        enough = self.tolerance**2 * energy
+        for _ in range(self.max_products):
+            if not energy > enough:
+                break
+            product = multiply(system, p)
+            curvature = float(p @ product)
+            if not curvature > 0.0:
+                return None
+            x, r = x + energy / curvature * p, r - energy / curvature * product
+            z = precondition(r)
+            before, energy = energy, float(r @ z)
+            p = z + energy / before * p
+        return x if np.isfinite(x).all() else None
+
+
+def multiply(system: ReducedSystem, x: F64) -> F64:
+    """S x (D,)."""
+    s, (b, C, e) = system.sums, system.sums.border.shape
+    border, y = s.border.reshape(b * C, e), np.empty((b, C))
+    multiply_blocks(s.blocks, system.row, system.column, x[: b * C].reshape(b, C), y)
+    return np.concatenate([y.ravel() + border @ x[b * C :], border.T @ x[: b * C] + s.corner @ x[b * C :]])
+
+
+def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) -> ReducedSolver:
+    """The solver with the least work for this pattern of blocks; dense for all small systems."""
+    D = float(n_views * width + border)
+    if D <= SMALL:
+        return DenseCholesky()
+    banded = order_views(row, column, n_views)
+    band, products = float((banded.reach + 1) * width), 4.0 * (len(row) * width**2 + D * border)
+    work: list[tuple[float, ReducedSolver]] = [
+        (D**3 / 3.0, DenseCholesky()),
+        (BAND_COST * D * band * (band + 4.0 * (border + 1)), banded),
+        (PRODUCT_COST * TYPICAL_PRODUCTS * products, ConjugateGradients()),
+    ]
+    return min(work, key=lambda choice: choice[0])[1]
+
+
+def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:
+    """The order of the views in which neighbours stand close (reverse Cuthill-McKee)."""
+    graph = scipy.sparse.coo_array((np.ones(len(row)), (row, column)), shape=(n_views, n_views)).tocsr()
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    place = np.empty(n_views, dtype=np.int64)
+    place[order] = np.arange(n_views)
+    return BandedCholesky(place, int(np.abs(place[row] - place[column]).max(initial=0)))

@@ -1,0 +1,227 @@
+"""The sparse linear system of bundle adjustment: points are eliminated, cameras are solved together.
+
+[[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then
+b = -V^-1 (h + W' a). The reduced matrix holds a block for every pair of views that see a point together, and
+a border for what views have in common. Points are eliminated in chunks whose number depends on the problem
+alone, added up in their order: the same bytes whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.numerics.elimination import (
+    Places,
+    PointSums,
+    Sums,
+    eliminate_points,
+    mark_pairs,
+    substitute_points,
+)
+from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
+from thesisrecon.numerics.observations import Jacobians, Seen, SortedObservations
+from thesisrecon.numerics.point_kernels import revert_cheirality_violations
+from thesisrecon.numerics.reduced_solvers import ReducedSolver, ReducedSystem, add_diagonal, choose_solver
+
+Result = TypeVar("Result")
+
+CHUNK = 16384
+# Every chunk has sums of its own: few chunks where these are large.
+MOST_CHUNKS, CHUNK_BYTES = 16, 128e6
+
+
+@dataclass(frozen=True)
+class BundleLayout:
+    """Where everything of one problem stands.
+
+    The unknowns of the cameras are ``width`` columns for each of b views' blocks, then ``border`` columns
+    that views have in common. ``row``, ``column`` (n,) name the views of each block of the reduced matrix;
+    ``chunks`` are ranges of points (first, last); ``threads`` may work on them.
+    """
+
+    observations: SortedObservations
+    places: Places
+    width: int
+    border: int
+    row: I64
+    column: I64
+    chunks: tuple[tuple[int, int], ...]
+    solver: ReducedSolver
+    threads: int
+
+    @property
+    def size(self) -> int:
+        """Unknowns of the cameras, D."""
+        return len(self.places.pair) * self.width + self.border
+
+    def over_chunks(self, work: Callable[[int, int], Result]) -> list[Result]:
+        """work(first, last) for every range of points, in their order."""
+        if self.threads == 1 or len(self.chunks) == 1:
+            return [work(*chunk) for chunk in self.chunks]
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(lambda chunk: work(*chunk), self.chunks))
+
+    def over_observations(self, work: Callable[[slice, Seen], Result]) -> list[Result]:
+        """work(which, they) for the observations of every range of points, in their order."""
+        start, o = self.observations.start, self.observations
+        seen = Seen(o.view_index, o.point_index, o.xy)
+
+        def run(first: int, last: int) -> Result:
+            return work(slice(start[first], start[last]), seen.part(start[first], start[last]))
+
+        return self.over_chunks(run)
+
+    def jacobians(self) -> Jacobians:
+        """Buffers of one linearisation."""
+        return Jacobians.empty(len(self.observations.xy), self.width, self.places.common.shape[1])
+
+    def sums(self) -> Sums:
+        """A reduced system of zeros."""
+        C, b, e, D = self.width, len(self.places.pair), self.border, self.size
+        shapes = [(len(self.row), C, C), (b, C, e), (e, e), (D,), (D,), (D,)]
+        return Sums(*(np.zeros(shape) for shape in shapes))
+
+
+def lay_out(
+    observations: SortedObservations,
+    block: I64,
+    *,
+    width: int,
+    common: I64,
+    border: int,
+    threads: int = 1,
+) -> BundleLayout:
+    """Find the pairs of views that share points, cut the points into chunks and choose a solver.
+
+    ``block`` (V,) is the number of a view's block, -1 for one that does not move; ``common`` (V, F) its
+    columns of the border, -1 for none.
+    """
+    o, n = observations, int(block.max(initial=-1)) + 1
+    marked = np.eye(n, dtype=bool)
+    mark_pairs(o.start, o.view_index, block, marked)
+    row, column = (a.astype(np.int64) for a in np.nonzero(marked))
+    pair = np.full((n, n), -1, dtype=np.int64)
+    pair[row, column] = np.arange(len(row))
+    solver = choose_solver(row, column, n, width, border)
+    bytes_each = 8.0 * (len(row) * width**2 + n * width * border + border**2)
+    most = max(1, min(MOST_CHUNKS, int(CHUNK_BYTES / max(bytes_each, 1.0))))
+    count = int(np.clip(len(o.xy) // CHUNK, 1, most))
+    bounds = np.searchsorted(o.start, np.linspace(0, len(o.xy), count + 1)[1:-1])
+    ends = [0, *bounds.tolist(), len(o.start) - 1]
+    chunks = tuple(itertools.pairwise(ends))
+    places = Places(o.start, o.view_index, block, pair, np.ascontiguousarray(common))
+    return BundleLayout(o, places, width, border, row, column, chunks, solver, threads)
+
+
+@dataclass(frozen=True)
+class CameraPrior:
+    """Gaussian terms between camera columns: ``weight`` (L,) on the differences of columns ``first`` and
+    ``second`` (L,), -1 for a number instead; the second always one of the border. ``gradient`` (D,)."""
+
+    first: I64
+    second: I64
+    weight: F64
+    gradient: F64
+
+
+@dataclass(frozen=True)
+class BundleStep:
+    """Steps of the camera columns (D,) and of the points (N, 3)."""
+
+    cameras: F64
+    points: F64
+
+
+@dataclass(frozen=True)
+class BundleSystem:
+    """A bundle problem linearised at one state; the Jacobian buffers belong to the latest one."""
+
+    cost: float
+    layout: BundleLayout
+    jacobians: Jacobians
+    prior: CameraPrior | None = None
+
+    def reduce(self, damping: float) -> tuple[ReducedSystem, PointSums, F64]:
+        """The damped reduced system, what back substitution needs, and the damping of each column (D,)."""
+        N, layout = len(self.layout.observations.start) - 1, self.layout
+        points = PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
+
+        def eliminate(first: int, last: int) -> Sums:
+            sums = layout.sums()
+            eliminate_points(first, last, damping, self.jacobians, layout.places, sums, points)
+            return sums
+
+        total, *rest = layout.over_chunks(eliminate)
+        for part in rest:
+            for into, values in zip(total, part, strict=True):
+                into += values
+        if self.prior is not None:
+            _add_prior(layout, total, self.prior)
+        damped = damping * floored_diagonal(total.diagonal)
+        # A column nothing acts upon stays: any positive pivot does.
+        _add_diagonal(layout, total, np.where(total.diagonal == 0.0, 1.0, damped))
+        system = ReducedSystem(layout.row, layout.column, total)
+        return system, points, damped
+
+    def solve(self, damping: float) -> tuple[BundleStep, float] | None:
+        """The damped step and its promised gain, or None where the reduced matrix is not positive."""
+        reduced, points, damped = self.reduce(damping)
+        cameras = self.layout.solver.solve(reduced)
+        if cameras is None:
+            return None
+        moves = np.zeros_like(points.gradient)
+
+        def substitute(first: int, last: int) -> None:
+            substitute_points(first, last, cameras, self.jacobians, self.layout.places, points, moves)
+
+        self.layout.over_chunks(substitute)
+        if not np.isfinite(moves).all():
+            return None
+        stiff = float(damped @ cameras**2) + damping * float(np.vdot(points.diagonal, moves**2))
+        slope = float(reduced.sums.gradient @ cameras) + float(np.vdot(points.gradient, moves))
+        return BundleStep(cameras, moves), 0.5 * (stiff - slope)
+
+
+def _add_prior(layout: BundleLayout, total: Sums, prior: CameraPrior) -> None:
+    """The prior's information and gradient."""
+    first, second, w, edge = prior.first, prior.second, prior.weight, layout.size - layout.border
+    total.rhs[:] -= prior.gradient
+    total.gradient[:] += prior.gradient
+    both = second >= 0
+    weight = np.bincount(first, w, minlength=layout.size).astype(np.float64)
+    weight += np.bincount(second[both], w[both], minlength=layout.size)
+    total.diagonal[:] += weight
+    _add_diagonal(layout, total, weight)
+    first, second, w = first[both], second[both] - edge, w[both]
+    inside = first >= edge
+    np.add.at(total.corner, (first[inside] - edge, second[inside]), -w[inside])
+    np.add.at(total.corner, (second[inside], first[inside] - edge), -w[inside])
+    flat = total.border.reshape(edge, layout.border)
+    np.add.at(flat, (first[~inside], second[~inside]), -w[~inside])
+
+
+def _add_diagonal(layout: BundleLayout, total: Sums, values: F64) -> None:
+    """values (D,) on the diagonal of the reduced matrix."""
+    add_diagonal(total.blocks, layout.places.pair, total.corner, values)
+
+
+def hold_flipping(layout: BundleLayout, before: F64, after: F64, X_before: F64, X_after: F64) -> None:
+    """Put back the points whose step takes them through the focal plane of a view that sees them.
+
+    ``before``, ``after`` (V, 4) third rows of the cameras; X (N, 4), or (N, 3) with a fourth coordinate 1.
+    """
+    start, view = layout.observations.start, layout.observations.view_index
+
+    def work(first: int, last: int) -> None:
+        revert_cheirality_violations(
+            start[first : last + 1], view, before, after, X_before[first:last], X_after[first:last]
+        )
+
+    layout.over_chunks(work)

@@ -1,0 +1,289 @@
+"""Refinement of one kind of unknown with the rest held: points, one projective camera, one calibrated
+pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.numerics.levenberg_marquardt import (
+    DenseSystem,
+    invert_information,
+    loss_code,
+    run_levenberg_marquardt,
+)
+from thesisrecon.numerics.metric_cameras import (
+    MetricModel,
+    linearize_metric,
+    metric_cost,
+    move_poses,
+    project_metric,
+)
+from thesisrecon.numerics.observations import (
+    Jacobians,
+    Seen,
+    Weighing,
+    pixel_conditioning,
+    sort_observations,
+    whitening_transform,
+)
+from thesisrecon.numerics.point_kernels import refine_each_point
+from thesisrecon.numerics.projective_cameras import (
+    UnitState,
+    linearize_projective,
+    project_projective,
+    projective_cost,
+    tangent_reflectors,
+    tangent_step,
+)
+
+
+@dataclass(frozen=True)
+class CameraRefinement:
+    """A refined camera ``P`` (3, 4), at the norm and sign of its start.
+
+    ``covariance`` (12, 12) of P's row-major entries in the caller's frame for noise of 1 px in each image
+    coordinate: multiply by sigma^2. It has no part along P itself (the scale); directions that the points do
+    not determine have huge variances. ``residual_px`` (M, 2) projection minus observation; ``cost`` px^2.
+    """
+
+    P: F64
+    covariance: F64
+    residual_px: F64
+    cost: float
+    iterations: int
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """A refined calibrated camera: ``R`` (3, 3), ``t`` (3,), ``intrinsics`` (6,).
+
+    ``covariance`` (6 + F, 6 + F) for noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x +
+    d in the camera's frame, then the F free intrinsics, the focal as log f. ``residual_px`` (M, 2); ``cost``
+    px^2.
+    """
+
+    R: F64
+    t: F64
+    intrinsics: F64
+    covariance: F64
+    residual_px: F64
+    cost: float
+    iterations: int
+
+
+def refine_points(
+    P: F64,
+    X: F64,
+    view_index: I64,
+    point_index: I64,
+    xy: F64,
+    *,
+    loss_px: float = 1.0,
+    iterations: int = 5,
+) -> F64:
+    """Minimise each point's own sum of rho(|x - P X|^2), cameras held, rho = Huber's loss at ``loss_px``.
+
+    P (V, 3, 4) cameras; X (N, 4) homogeneous starts; view_index, point_index (K,), xy (K, 2) px -> (N, 4)
+    with the norms and signs of the starts. Damped Gauss-Newton in the tangent space of the whitened unit
+    4-vector; no point's cost rises and none crosses the focal plane of a view that sees it. Points that are
+    all zero or not finite, and points with fewer than two observations, come back untouched. Raises
+    ``ValueError`` for wrong shapes.
+    """
+    P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
+    if P.ndim != 3 or P.shape[1:] != (3, 4) or X.ndim != 2 or X.shape[1] != 4:
+        raise ValueError(f"refine_points needs (V, 3, 4) cameras and (N, 4) points; got {P.shape}, {X.shape}")
+    o = sort_observations(view_index, point_index, xy, len(P), len(X))
+    code = loss_code("huber", loss_px)
+    norms = np.linalg.norm(X, axis=1)
+    used = np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2)
+    if not used.any():
+        return X
+    T, M = pixel_conditioning(o.xy), whitening_transform(X[used])
+    # The scale of a camera does not change its projections, but it must not push depths below rounding.
+    cameras = T @ P @ np.linalg.inv(M)
+    sizes = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
+    cameras = np.ascontiguousarray(cameras / np.where(sizes > 0.0, sizes, 1.0))
+    moved = np.where(used[:, None], X, 0.0) @ M.T
+    moved[used] /= np.linalg.norm(moved[used], axis=1, keepdims=True)
+    xy_conditioned = o.xy * T[0, 0] + T[:2, 2]
+    refine_each_point(
+        cameras, moved, o.start, o.view_index, xy_conditioned, code, loss_px * float(T[0, 0]), iterations
+    )
+    back = moved @ np.linalg.inv(M).T
+    lengths = np.linalg.norm(back, axis=1, keepdims=True)
+    back *= norms[:, None] / np.where(lengths > 0.0, lengths, 1.0)
+    return np.where(used[:, None] & np.isfinite(back).all(axis=1, keepdims=True), back, X)
+
+
+@dataclass(frozen=True)
+class _CameraProblem:
+    """One unit camera (1, 12) against whitened unit points, conditioned pixels."""
+
+    X: F64
+    seen: Seen
+    weighing: Weighing
+
+    def linearize(self, state: F64) -> DenseSystem:
+        J = Jacobians.empty(len(self.X), 11, 0)
+        cost = linearize_projective(UnitState.at(state, self.X), self.seen, self.weighing, J)
+        return _dense_system(cost, J)
+
+    def retract(self, state: F64, step: F64) -> F64:
+        s, moved = UnitState.at(state, self.X), np.empty_like(state)
+        tangent_step(state, s.vP, s.bP, step[None], moved)
+        return moved
+
+    def residual(self, state: F64) -> F64:
+        residual, depth = np.empty((len(self.X), 2)), np.empty(len(self.X))
+        project_projective(state.reshape(1, 3, 4), self.X, self.seen, residual, depth)
+        return residual
+
+    def cost(self, state: F64) -> float:
+        return float(projective_cost(UnitState.at(state, self.X), self.seen, self.weighing))
+
+
+def _seen_by_one(xy: F64) -> Seen:
+    """Every point once, by the only view."""
+    return Seen(np.zeros(len(xy), dtype=np.int64), np.arange(len(xy)), np.ascontiguousarray(xy))
+
+
+def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
+    """Normal equations of the camera's columns."""
+    A, r = J.A.reshape(-1, J.A.shape[2]), J.residual.ravel()
+    return DenseSystem(cost, A.T @ A, A.T @ r)
+
+
+def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> CameraRefinement:
+    """Minimise sum rho(|x - P X|^2) over one camera's 11 freedoms, points held (resection, section 6.4).
+
+    P (3, 4) start; X (M, 4) homogeneous points; xy (M, 2) px; rho = Huber's loss at ``loss_px``. Conditioned
+    and whitened inside. Too few points or points on one plane do not raise: their covariance says so. Raises
+    ``ValueError`` for wrong shapes or zero or infinite values.
+    """
+    P, X, xy = (np.array(a, dtype=np.float64) for a in (P, X, xy))
+    if P.shape != (3, 4) or X.ndim != 2 or X.shape[1] != 4 or xy.shape != (len(X), 2) or len(X) == 0:
+        raise ValueError(
+            f"refine_camera needs (3, 4), (M, 4) and (M, 2); got {P.shape}, {X.shape}, {xy.shape}"
+        )
+    norms, size = np.linalg.norm(X, axis=1), float(np.linalg.norm(P))
+    finite = np.isfinite(norms).all() and np.isfinite(size) and np.isfinite(xy).all()
+    if not finite or not (norms > 0.0).all() or not size > 0.0:
+        raise ValueError("refine_camera needs finite points and a finite camera that are not zero")
+    T, M = pixel_conditioning(xy), whitening_transform(X)
+    points = X @ M.T
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    start = (T @ P @ np.linalg.inv(M)).reshape(1, 12)
+    scale = float(T[0, 0])
+    weighing = Weighing(1.0, loss_code("huber", loss_px), loss_px * scale)
+    problem = _CameraProblem(points, _seen_by_one(xy * scale + T[:2, 2]), weighing)
+    solution = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations)
+    # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
+    back = np.kron(np.linalg.inv(T), M.T)
+    raw = back @ solution.state[0]
+    back *= size / np.linalg.norm(raw)
+    raw *= size / np.linalg.norm(raw)
+    # The norm is held at that of the start, so the part of an error along P is only a change of scale.
+    back -= np.outer(raw, raw @ back) / size**2
+    covariance = back @ _camera_covariance(problem, solution.state) @ back.T * scale**2
+    return CameraRefinement(
+        raw.reshape(3, 4),
+        covariance,
+        problem.residual(solution.state) / scale,
+        solution.cost / scale**2,
+        solution.iterations,
+    )
+
+
+def _camera_covariance(problem: _CameraProblem, state: F64) -> F64:
+    """(12, 12) covariance of the unit camera for unit noise in conditioned pixels."""
+    v, beta = np.empty_like(state), np.empty(1)
+    tangent_reflectors(state, v, beta)
+    basis = (np.eye(12) - beta[0] * np.outer(v[0], v[0]))[:, 1:]
+    return np.asarray(basis @ invert_information(problem.linearize(state).hessian) @ basis.T)
+
+
+@dataclass(frozen=True)
+class _PoseProblem:
+    """One calibrated camera against points held still; a state's model has one view and one row."""
+
+    seen: Seen
+    free: I64
+    weighing: Weighing
+
+    def linearize(self, state: MetricModel) -> DenseSystem:
+        J = Jacobians.empty(len(state.X), 6 + len(self.free), 0)
+        cost = linearize_metric(state, self.seen, self.weighing, self.free, self.free[:0], J)
+        return _dense_system(cost, J)
+
+    def retract(self, state: MetricModel, step: F64) -> MetricModel:
+        R, t = np.empty_like(state.R), np.empty_like(state.t)
+        move_poses(state.R, state.t, step[None, :6], R, t)
+        moves = np.zeros(state.intrinsics.shape[1])
+        moves[self.free] = step[6:]
+        intrinsics = state.intrinsics + moves
+        intrinsics[0, 0] = state.intrinsics[0, 0] * np.exp(np.clip(moves[0], -3.0, 3.0))
+        return state._replace(R=R, t=t, intrinsics=intrinsics)
+
+    def residual(self, state: MetricModel) -> F64:
+        residual, depth = np.empty_like(self.seen.xy), np.empty(len(self.seen.xy))
+        project_metric(state, self.seen, residual, depth)
+        return residual
+
+    def cost(self, state: MetricModel) -> float:
+        return float(metric_cost(state, self.seen, self.weighing))
+
+
+def refine_pose(
+    R: F64,
+    t: F64,
+    intrinsics: F64,
+    X: F64,
+    xy: F64,
+    *,
+    free: B8 | None = None,
+    loss_px: float = 1.0,
+    iterations: int = 20,
+) -> PoseRefinement:
+    """Minimise sum rho(|x - project(X)|^2) over one pose and the free intrinsics, points held.
+
+    R (3, 3) world-to-camera, t (3,), intrinsics (6,) or (8,) as in ``MetricCameras``; X (M,
+    3); xy (M, 2) px; free (6,) or (8,) which intrinsics move (none by default); rho =
+    Huber's loss at ``loss_px``. Raises ``ValueError`` for wrong shapes, values that are not finite or a focal
+    that is not positive.
+    """
+    R, t, q, X, xy = (np.array(a, dtype=np.float64) for a in (R, t, intrinsics, X, xy))
+    shapes = R.shape, t.shape, q.shape, X.shape
+    if shapes != ((3, 3), (3,), (8 if q.shape == (8,) else 6,), (len(xy), 3)) or len(X) == 0:
+        raise ValueError(f"refine_pose got R {R.shape}, t {t.shape}, intrinsics {q.shape}, X {X.shape}")
+    if xy.shape != (len(X), 2) or not all(np.isfinite(a).all() for a in (R, t, q, X, xy)) or not q[0] > 0.0:
+        raise ValueError(
+            f"refine_pose needs finite (M, 2) pixels and a positive focal; got {xy.shape}, {q[0]}"
+        )
+    columns = np.flatnonzero(np.zeros(len(q), bool) if free is None else free)
+    # Centred and scaled points: the pose's freedoms are of one size and well separated.
+    origin = X.mean(axis=0)
+    size = float(np.linalg.norm(X - origin, axis=1).mean())
+    scale = 1.0 / size if size > 0.0 else 1.0
+    weighing = Weighing(1.0, loss_code("huber", loss_px), loss_px)
+    problem = _PoseProblem(_seen_by_one(xy), columns, weighing)
+    moved = scale * (t + R @ origin)
+    group = np.zeros(1, dtype=np.int64)
+    start = MetricModel(R[None], moved[None], q[None], group, np.ascontiguousarray(scale * (X - origin)))
+    solution = run_levenberg_marquardt(problem, start, max_iterations=iterations)
+    end = solution.state
+    units = np.ones(6 + len(columns))
+    units[3:6] = 1.0 / scale
+    covariance = invert_information(problem.linearize(end).hessian) * units * units[:, None]
+    return PoseRefinement(
+        end.R[0],
+        end.t[0] / scale - end.R[0] @ origin,
+        end.intrinsics[0],
+        covariance,
+        problem.residual(end),
+        solution.cost,
+        solution.iterations,
+    )

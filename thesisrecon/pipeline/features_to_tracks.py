@@ -1,0 +1,195 @@
+"""Corners, matches and tracks: 4.2.1, 4.2.2 and chapter 5."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure, counted
+from thesisrecon.pipeline.state import PreparedViews, Work, batches_of_pairs, near_in_pairs
+from thesisrecon.records import Features, Image, PairChoice, TwoView
+from thesisrecon.runtime.run import Batch, stream
+
+MIN_CORNERS = 16
+
+# ---------------------------------------------------------------- 4.2.1: features
+
+
+def find_features(work: Work) -> None:
+    run, images = work.run, work.result.images
+    variant = run.variant_key("features")
+    keys = {
+        f"{i:05d}": run.key("features", variant, photograph.digest)
+        for i, photograph in enumerate(work.photographs.photographs)
+    }
+    features = run.kept_all(
+        "features", keys, _detect_all, lambda missing: (([i], (work.config, [images[i]])) for i in missing)
+    )
+    work.result = replace(work.result, features=tuple(features))
+    counts = [len(f.xy) for f in features]
+    poor = [
+        f"{image.name} has only {counted(n, 'corner')}"
+        for image, n in zip(images, counts, strict=True)
+        if n < MIN_CORNERS
+    ]
+    run.finish(
+        "features",
+        counts={"images": len(images), "corners": sum(counts), "fewest_in_one_image": min(counts)},
+        warnings=poor,
+    )
+
+
+def _detect_all(config: PipelineConfig, images: Sequence[Image]) -> list[Features]:
+    return [detect_features(config, image) for image in images]
+
+
+def detect_features(config: PipelineConfig, image: Image) -> Features:
+    return config.features.detect(image)
+
+
+# ---------------------------------------------------------------- 4.2.2 and chapter 5: pairs of views
+
+
+def choose_pairs(work: Work) -> None:
+    run, images, features = work.run, work.result.images, work.result.features
+    names = [image.name for image in images]
+    key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
+    run.progress("pairs", 0, 1)
+    choice: PairChoice = run.kept(
+        "pairs",
+        "choice",
+        key,
+        lambda: work.config.pairs.select(
+            names, features, map_all=run.workers.map_all, rng=stream(run.seed, "pairs")
+        ),
+    )
+    work.result = replace(work.result, pair_choice=choice)
+    possible = len(images) * (len(images) - 1) // 2
+    counts = {"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
+    run.finish("pairs", counts=counts)
+    run.progress("pairs", 1, 1)
+
+
+def match_pairs(work: Work) -> None:
+    run, result = work.run, work.result
+    assert result.pair_choice is not None
+    pairs = [(int(i), int(j)) for i, j in result.pair_choice.pairs]
+    variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
+    features = list(run.logs["features"].keys.values())
+    keys = {
+        f"{i:05d}-{j:05d}": run.key("matches", variants, features[i], features[j], run.seed, i, j)
+        for i, j in pairs
+    }
+
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        views = _prepared(work)
+        if run.workers.in_process:
+            dealt = [[n] for n in near_in_pairs(pairs, missing)]
+        else:
+            dealt = batches_of_pairs(pairs, missing, run.workers.parallel())
+        for numbers in dealt:
+            some = [pairs[n] for n in numbers]
+            given = views if run.workers.in_process else views.part({view for pair in some for view in pair})
+            yield numbers, (work.config, given, some, run.seed)
+
+    two_views: list[TwoView] = run.kept_all("matches", keys, _match_all, batches)
+    work.result = replace(result, pairs=tuple(two_views))
+    accepted = [pair for pair in two_views if pair.accepted]
+    counts = {"pairs": len(pairs), "accepted": len(accepted), "verified": sum(p.inliers for p in accepted)}
+    counts["undetermined"] = sum(pair.undetermined for pair in accepted)
+    metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
+    run.finish("matches", counts=counts, metrics=metrics, warnings=_open_pairs(accepted))
+
+
+def _open_pairs(accepted: Sequence[TwoView]) -> list[str]:
+    """A sentence where the geometry of most pairs is open: what follows rests on few."""
+    undetermined = [pair for pair in accepted if pair.undetermined]
+    if 2 * len(undetermined) <= len(accepted):
+        return []
+    kinds = Counter(pair.configuration for pair in undetermined)
+    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    return [
+        f"{len(undetermined)} of {len(accepted)} accepted pairs leave their epipolar geometry undetermined "
+        f"({told})"
+    ]
+
+
+def _prepared(work: Work) -> PreparedViews:
+    """What matching needs of each view, made only when something must be computed from it."""
+    if work.prepared is None:
+        given = zip(work.result.images, work.result.features, strict=True)
+        work.prepared = PreparedViews(work.config.matching, dict(enumerate(given)))
+    return work.prepared
+
+
+def _match_all(
+    config: PipelineConfig, views: Sequence[Any], pairs: Sequence[tuple[int, int]], seed: int
+) -> list[TwoView]:
+    return [match_views(config, views[i], views[j], (i, j), seed) for i, j in pairs]
+
+
+def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
+    """Match, estimate F, verify; a pair that cannot give an F is a refused pair, not an end of the run."""
+    rng = stream(seed, "matches", *pair)
+    candidates = 0
+    try:
+        matches = config.matching.match(
+            view1, view2, pair=pair, estimate_fundamental=config.epipolar.estimate, rng=rng
+        )
+        candidates = len(matches.xy1)
+        fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
+        return config.verification.verify(matches, fit, rng)
+    except StageFailure as failure:
+        return _refused_pair(pair, candidates, str(failure))
+
+
+def _refused_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:
+    nothing = np.zeros(0, dtype=np.int64)
+    return TwoView(
+        i=pair[0],
+        j=pair[1],
+        F=np.zeros((3, 3)),
+        sigma_px=float("nan"),
+        index1=nothing,
+        index2=nothing,
+        xy1=np.zeros((0, 2)),
+        xy2=np.zeros((0, 2)),
+        affine=np.zeros((0, 2, 2)),
+        candidates=candidates,
+        homography_inlier_ratio=float("nan"),
+        accepted=False,
+        reason=reason,
+    )
+
+
+def build_tracks(work: Work) -> None:
+    run, result = work.run, work.result
+    accepted = [pair for pair in result.pairs if pair.accepted]
+    if not accepted:
+        best = max(result.pairs, key=lambda pair: pair.inliers)
+        raise StageFailure(
+            "no two photographs could be matched",
+            f"the best of {counted(len(result.pairs), 'pair')} has "
+            f"{counted(best.inliers, 'verified match')}: {best.reason}",
+            "take photographs with more overlap of a scene with texture, all of the same scene",
+        )
+    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
+    tracks = run.kept(
+        "tracks",
+        "tracks",
+        key,
+        lambda: work.config.tracks.build(_prepared(work), result.pairs, stream(run.seed, "tracks")),
+    )
+    work.result = replace(result, tracks=tracks)
+    seen = np.bincount(tracks.point_index, minlength=tracks.n_points)
+    counts = {
+        "points": tracks.n_points,
+        "observations": len(tracks.xy),
+        "seen_3_times": int((seen >= 3).sum()),
+    }
+    run.finish("tracks", counts=counts)

@@ -1,0 +1,1 @@
+"""Run folder, workers and signals."""

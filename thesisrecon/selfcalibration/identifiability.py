@@ -1,0 +1,308 @@
+"""Whether the photographs determine the calibration at all, with the evidence, before anything rests on it.
+
+Two questions with two answers. Which critical motion do the cameras come nearest to
+(:mod:`~thesisrecon.selfcalibration.critical_motions`)? And is the answer determined under what is assumed of
+the intrinsics? The second is read off the information that the photographs hold about the focal lengths once
+poses and points are free, since what a critical motion leaves open may be settled by an assumption: a
+turntable leaves the scale along its axis and with it the shape of the pixels, and pixels that are known to
+be square settle both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
+from thesisrecon.numerics.metric_cameras import IntrinsicsPrior, MetricCameras
+from thesisrecon.numerics.noise import noise_from_distances
+from thesisrecon.numerics.observations import Observations
+from thesisrecon.records import Assumptions, IdentifiabilityReport, Reconstruction, Upgrade
+from thesisrecon.selfcalibration.critical_motions import (
+    LEAST_MOVE,
+    MAX_FOCAL_STD,
+    MIN_SIGNIFICANCE,
+    MOST_NOISE,
+    UpgradedCameras,
+    measure_motion,
+    motion_sentences,
+    nearest_critical_motion,
+    shifts_without_an_answer,
+)
+from thesisrecon.selfcalibration.frame import build_frame
+
+NOISE_FLOOR_PX = 0.05
+"""Corners are not found better than this, however well a few of them agree."""
+NOISE_FLOOR_REL = 3e-5
+"""The same in long sides, below which no ratio of noises means anything."""
+MOST_OBSERVATIONS = 12000
+ROUNDS = 12
+NEEDED_EQUATIONS = 8
+FREE_STD = 1e3
+FREE = np.array([True, True, False, True, True, False])
+
+
+def check_identifiability(
+    reconstruction: Reconstruction, upgrade: Upgrade, assumed: Assumptions
+) -> IdentifiabilityReport:
+    """The verdict on an answer of self-calibration.
+
+    A metric bundle adjustment of part of the observations gives cameras, and the covariance of their focal
+    lengths under ``assumed``; the same with nothing known of aspect and principal point tells what rests on
+    knowing these. ``evidence`` holds the measures of
+    :data:`~thesisrecon.selfcalibration.critical_motions.TOLERANCES`, ``focal_long_sides`` (median, adjusted),
+    ``focal_std_rel`` (worst view),
+    ``focal_std_rel_median``, ``focal_std_rel_free`` (median, aspect and principal point free),
+    ``principal_point_std_free`` (long sides), ``turn_significance``, ``spare_equations`` of the counting
+    argument, and ``noise_px``.
+    """
+    problem = _core_problem(reconstruction, upgrade, assumed)
+    spare = spare_equations(assumed, reconstruction.registered)
+    if problem is None:
+        return verdict_without_an_answer(reconstruction, assumed)
+    fit = problem.adjust(rounds=ROUNDS)
+    free = problem.with_nothing_known(fit).adjust(rounds=0)
+    return _verdict(problem, fit, free, spare)
+
+
+def verdict_without_an_answer(reconstruction: Reconstruction, assumed: Assumptions) -> IdentifiabilityReport:
+    """The verdict where self-calibration found nothing: what the projective cameras alone tell."""
+    frame = build_frame(reconstruction, assumed.group)
+    evidence = shifts_without_an_answer(frame.A, frame.a)
+    motion, nearness = nearest_critical_motion(evidence)
+    motion = motion if nearness < 1.0 else ""
+    evidence |= {
+        "nearness": nearness,
+        "spare_equations": float(spare_equations(assumed, reconstruction.registered)),
+    }
+    given = _given_focal_std(assumed.std[reconstruction.registered, 0])
+    sentences = motion_sentences(motion, evidence, identifiable=False, focal_std=given)
+    return IdentifiabilityReport(False, motion, nearness < 1.0, evidence, sentences)
+
+
+def spare_equations(assumed: Assumptions, registered: B8) -> int:
+    """How many equations the counting argument has beyond the 8 it needs: m n_known + (m - 1) n_constant - 8.
+
+    Written for any pattern of sharing: five intrinsics of each of m views less the number of values that are
+    not known (a standard deviation counts as knowing). Negative: too few views for what is assumed.
+    """
+    unknown = 0
+    for column in range(5):
+        open_ = registered & ~np.isfinite(assumed.std[:, column])
+        unknown += len(np.unique(assumed.shared[open_, column]))
+    return 5 * int(registered.sum()) - unknown - NEEDED_EQUATIONS
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The registered ``views``, each with a row of intrinsics of its own; ``share`` of the observations that
+    is taken; ``longest`` (V,) side in px; ``projective_px`` the noise that the projective cameras leave in
+    the same observations."""
+
+    cameras: MetricCameras
+    X: F64
+    observations: Observations
+    prior: IntrinsicsPrior
+    sigma_px: float
+    share: float
+    longest: F64
+    views: I64
+    projective_px: float
+
+    def adjust(self, *, rounds: int) -> MetricBundleResult:
+        """Focal, aspect and principal point as far as the prior lets them, with their covariance."""
+        return refine_metric_bundle(
+            self.cameras, self.X, self.observations, free=FREE, prior=self.prior,
+            options=BundleOptions(
+                sigma_px=self.sigma_px, loss_px=2.0 * self.sigma_px, max_iterations=rounds, covariance=True,
+                noise_floor_px=NOISE_FLOOR_PX,
+            ),
+        )  # fmt: skip
+
+    def with_nothing_known(self, fit: MetricBundleResult) -> _Problem:
+        """At the answer of ``fit``, one aspect and principal point for each focal, and nothing known of them.
+
+        Wide deviations in place of none keep the system regular where nothing is determined.
+        """
+        std = np.full_like(self.prior.std, FREE_STD)
+        std[:, 3:5] *= self.longest.max()
+        shared = np.array(fit.cameras.shared)
+        shared[:, 1:5] = shared[:, :1]
+        # Values of one number are one value: those of the first of its views.
+        first = np.unique(shared[:, 0], return_index=True)[1][np.unique(shared[:, 0], return_inverse=True)[1]]
+        intrinsics = np.column_stack([fit.cameras.intrinsics[:, 0], fit.cameras.intrinsics[first, 1:]])
+        return replace(
+            self,
+            cameras=replace(fit.cameras, shared=shared, intrinsics=intrinsics),
+            X=fit.X,
+            prior=IntrinsicsPrior(intrinsics, std),
+            sigma_px=max(fit.sigma_px, 1e-6),
+        )
+
+
+def _core_problem(reconstruction: Reconstruction, upgrade: Upgrade, assumed: Assumptions) -> _Problem | None:
+    """The upgraded cameras and points with some of their observations; None where hardly any is usable."""
+    views = np.flatnonzero(reconstruction.registered)
+    cameras, X, usable = _upgraded(reconstruction, upgrade, views)
+    index = _usable_observations(reconstruction, cameras, X, usable)
+    t, total = reconstruction.tracks, len(index)
+    index = index[_thinned(t.point_index[index], np.bincount(t.point_index[index], minlength=t.n_points))]
+    seen = np.isin(views, t.view_index[index])
+    if len(index) < 4 * len(views) + 20 or seen.sum() < 3:
+        return None
+    views = views[seen]
+    points, point = np.unique(t.point_index[index], return_inverse=True)
+    mean, std = assumed.mean[views].copy(), assumed.std[views].copy()
+    mean[:, 0] = np.where(np.isfinite(mean[:, 0]), mean[:, 0], upgrade.K[views, 0, 0])
+    intrinsics = np.column_stack([upgrade.K[views, 0, 0], mean[:, 1:5], np.zeros(len(views))])
+    own = np.arange(len(views), dtype=np.int64)
+    return _Problem(
+        MetricCameras(cameras.R[seen], cameras.t[seen], intrinsics, own, assumed.shared[views]), X[points],
+        Observations(np.searchsorted(views, t.view_index[index]), point.astype(np.int64), t.xy[index]),
+        IntrinsicsPrior(mean, std), max(reconstruction.sigma_px, 1e-3), len(index) / max(total, 1),
+        reconstruction.sizes[views].max(axis=1).astype(np.float64), views,
+        _projective_noise(reconstruction, index),
+    )  # fmt: skip
+
+
+def _projective_noise(reconstruction: Reconstruction, index: I64) -> float:
+    """Noise (px) of one coordinate of the observations ``index`` about the projective cameras and points.
+
+    Measured, and corrected for the 3 N + 11 V - 15 freedoms that fitted it: what the stage that made the
+    cameras worked with is never below a floor, and says little of photographs whose noise is.
+    """
+    t = reconstruction.tracks
+    view, point = t.view_index[index], t.point_index[index]
+    x = np.einsum("kij,kj->ki", reconstruction.P[view], reconstruction.X[point])
+    noise = noise_from_distances(np.linalg.norm(x[:, :2] / x[:, 2:] - t.xy[index], axis=1))
+    left = 2 * len(index) - 3 * len(np.unique(point)) - 11 * len(np.unique(view)) + 15
+    return noise * float(np.sqrt(2.0 * len(index) / max(left, 1)))
+
+
+def _usable_observations(reconstruction: Reconstruction, cameras: MetricCameras, X: F64, usable: B8) -> I64:
+    """Observations, explained so far, of finite points in front of their cameras, at least two a point and
+    ten a view."""
+    t, views = reconstruction.tracks, np.flatnonzero(reconstruction.registered)
+    index = np.flatnonzero(
+        reconstruction.inlier & reconstruction.registered[t.view_index] & usable[t.point_index]
+    )
+    place = np.searchsorted(views, t.view_index[index])
+    depth = np.einsum("kj,kj->k", cameras.R[place, 2], X[t.point_index[index]]) + cameras.t[place, 2]
+    index = index[depth > 1e-6]
+    index = index[np.bincount(t.view_index[index], minlength=t.n_views)[t.view_index[index]] >= 10]
+    seen = np.bincount(t.point_index[index], minlength=t.n_points)
+    return np.asarray(index[seen[t.point_index[index]] >= 2], dtype=np.int64)
+
+
+def _thinned(point: I64, seen: I64) -> I64:
+    """Places of about ``MOST_OBSERVATIONS`` observations, of points drawn evenly over how often they were
+    seen."""
+    if len(point) <= MOST_OBSERVATIONS:
+        return np.arange(len(point))
+    numbers = np.unique(point)
+    step = len(point) / MOST_OBSERVATIONS
+    order = numbers[np.argsort(-seen[numbers], kind="stable")]
+    # Every other of all, not those seen most often alone: these may lie in one corner of the scene.
+    wanted = order[np.unique(np.arange(0, len(order), step).astype(np.int64))]
+    chosen = np.zeros(int(point.max()) + 1, dtype=bool)
+    chosen[wanted] = True
+    return np.flatnonzero(chosen[point])
+
+
+def _upgraded(reconstruction: Reconstruction, upgrade: Upgrade, views: I64) -> tuple[MetricCameras, F64, B8]:
+    """Poses of the registered views and points (N, 3) after the upgrade, and which of the points are
+    finite."""
+    P = reconstruction.P[views] @ np.linalg.inv(upgrade.metric_from_projective)
+    Q = np.linalg.inv(upgrade.K[views]) @ P
+    Q *= np.where(np.linalg.det(Q[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
+    U, S, Vt = np.linalg.svd(Q[:, :, :3])
+    Xm = reconstruction.X @ upgrade.metric_from_projective.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        X = Xm[:, :3] / Xm[:, 3:]
+    usable = reconstruction.valid & np.isfinite(X).all(axis=1)
+    X = np.where(usable[:, None], X, 0.0)
+    spread = float(np.median(np.linalg.norm(X[usable] - np.median(X[usable], axis=0), axis=1)))
+    # A point far behind the others says nothing and spoils every scale.
+    usable &= np.linalg.norm(X - np.median(X[usable], axis=0), axis=1) < 100.0 * spread
+    t = Q[:, :, 3] / S.mean(axis=1)[:, None]
+    empty = MetricCameras(U @ Vt, t / spread, np.zeros((0, 6)), np.zeros(0, dtype=np.int64))
+    return empty, X / spread, usable
+
+
+def _verdict(
+    problem: _Problem, fit: MetricBundleResult, free: MetricBundleResult, spare: int
+) -> IdentifiabilityReport:
+    cameras, views = fit.cameras, problem.views
+    focal = cameras.intrinsics[cameras.group, 0]
+    metric = UpgradedCameras(
+        focal / problem.longest, cameras.R, -np.einsum("vba,vb->va", cameras.R, cameras.t), fit.X
+    )
+    evidence = measure_motion(metric)
+    motion, nearness = nearest_critical_motion(evidence)
+    evidence["nearness"] = nearness
+    std = _focal_std(fit, problem)
+    own = _focal_std(free, problem)
+    centre = np.sqrt(
+        np.diagonal(free.intrinsics_covariance, axis1=1, axis2=2)[cameras.group, 3:5].max(axis=1)
+    )
+    evidence |= {
+        "focal_long_sides": float(np.median(metric.focal)),
+        "focal_std_rel": float(std.max()),
+        "focal_std_rel_median": float(np.median(std)),
+        "focal_std_rel_free": float(np.median(own)),
+        "principal_point_std_free": float(np.median(centre / problem.longest) * np.sqrt(problem.share)),
+        "turn_significance": turn_significance(cameras.R, fit.pose_covariance)
+        / float(np.sqrt(problem.share)),
+        "spare_equations": float(spare),
+        "noise_px": fit.sigma_px,
+        "noise_over_projective": fit.sigma_px
+        / max(problem.projective_px, NOISE_FLOOR_REL * float(np.median(problem.longest))),
+    }
+    undetermined = views[std >= MAX_FOCAL_STD]
+    # A prior that fixes the focal does so whatever the cameras did.
+    turned = (
+        evidence["turn_significance"] >= MIN_SIGNIFICANCE
+        and evidence["image_shift_beyond_roll"] >= LEAST_MOVE
+    )
+    settled = bool((problem.prior.std[:, 0] < MAX_FOCAL_STD).all())
+    identifiable = (
+        len(views) - len(undetermined) >= max(3, (len(views) + 1) // 2)
+        and spare >= 0
+        and (turned or settled)
+        and evidence["noise_over_projective"] < MOST_NOISE
+    )
+    given = _given_focal_std(problem.prior.std[:, 0])
+    sentences = motion_sentences(motion, evidence, identifiable=identifiable, focal_std=given)
+    return IdentifiabilityReport(
+        identifiable, motion, nearness < 1.0, evidence, sentences, tuple(int(v) for v in undetermined)
+    )
+
+
+def _given_focal_std(std: F64) -> float:
+    """The largest of the deviations of focal lengths beforehand, inf without any view."""
+    return float(std.max(initial=0.0)) if len(std) else float("inf")
+
+
+def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:
+    """(V,) relative standard deviations that all observations would give."""
+    group = fit.cameras.group
+    variance = np.maximum(fit.intrinsics_covariance[group, 0, 0], 0.0)
+    std = np.sqrt(variance) / fit.cameras.intrinsics[group, 0] * np.sqrt(problem.share)
+    return np.asarray(np.where(np.isfinite(std), std, np.inf), dtype=np.float64)
+
+
+def turn_significance(R: F64, covariance: F64 | None) -> float:
+    """By how many of its standard deviations the tilt of the optical axes against each other stands out
+    (rms).
+
+    Without such tilts, in a pure translation or with a camera that only rolled, nothing tells the focal
+    length. ``covariance`` (V, 6, 6) of the poses.
+    """
+    if covariance is None:
+        return 0.0
+    mean = R[:, 2].mean(axis=0)
+    tilt = (R @ (mean / max(float(np.linalg.norm(mean)), 1e-12)))[:, :2]
+    variance = float(np.mean(np.diagonal(covariance, axis1=1, axis2=2)[:, :2]))
+    return float(np.sqrt(np.mean(tilt**2) / max(variance, 1e-300))) if np.isfinite(variance) else 0.0

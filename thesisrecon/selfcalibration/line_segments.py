@@ -1,0 +1,123 @@
+"""Straight line segments of a photograph, for vanishing points.
+
+Burns, Hanson and Riseman, "Extracting straight lines", PAMI 8(4), 1986: neighbouring pixels whose gradients
+point alike support one line. Two overlapping partitions of the directions are made, and each pixel votes for
+the longer of its two regions. The line itself is fitted to the edge points of its region, which are located
+to a fraction of a pixel on a parabola along the gradient (Devernay, INRIA RR-2724, 1995).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from thesisrecon.arrays import B8, F32, F64, I64
+
+_BINS = 8
+_ANY_NEIGHBOUR = np.ones((3, 3), dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class LineSegments:
+    """Detector of straight segments.
+
+    ``sigma_px`` of the smoothing; ``min_gradient`` in grey levels a pixel; ``min_length`` of a segment as a
+    share of the long side; ``max_rms_px`` of its edge points about the line.
+    """
+
+    sigma_px: float = 1.0
+    min_gradient: float = 3.0
+    min_length: float = 0.02
+    max_rms_px: float = 0.5
+
+    def detect(self, gray: F32) -> F64:
+        """Segments (S, 4) = (x1, y1, x2, y2) px of a grey image (H, W), the longest first."""
+        gx, gy = (scipy.ndimage.gaussian_filter(gray, self.sigma_px, order=o) for o in ((0, 1), (1, 0)))
+        size = np.hypot(gx, gy)
+        region = support_regions(np.arctan2(gy, gx), size > self.min_gradient)
+        xy, of = edge_points(gx, gy, size, region)
+        segments, rms = fit_segments(xy, of)
+        length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
+        good = (length >= self.min_length * max(gray.shape)) & (rms <= self.max_rms_px)
+        order = np.argsort(-length[good], kind="stable")
+        return np.asarray(segments[good][order])
+
+
+def support_regions(angle: F32, strong: B8) -> I64:
+    """Line-support region (H, W) of each strong pixel, from 1; 0 where there is none.
+
+    Regions are connected pixels whose gradient angles lie in one of eight bins. They are made for two
+    partitions half a bin apart; a pixel votes for the larger of its two regions, and the regions are kept
+    that have more than half of their pixels' votes.
+    """
+    turn = 2.0 * np.pi / _BINS
+    both = [
+        _label_bins(np.floor(angle / turn + shift).astype(np.int64) % _BINS, strong) for shift in (0.0, 0.5)
+    ]
+    offset = int(both[0].max())
+    both[1] = np.where(both[1] > 0, both[1] + offset, 0)
+    sizes = np.bincount(np.concatenate([part.ravel() for part in both]))
+    first = sizes[both[0]] >= sizes[both[1]]
+    vote = np.where(first, both[0], both[1])
+    votes = np.bincount(vote.ravel(), minlength=len(sizes))
+    kept = 2 * votes > sizes
+    kept[0] = False
+    return np.where(kept[vote], vote, 0)
+
+
+def _label_bins(bins: I64, strong: B8) -> I64:
+    labels = np.zeros(bins.shape, dtype=np.int64)
+    count = 0
+    for b in range(_BINS):
+        mine, n = scipy.ndimage.label(strong & (bins == b), structure=_ANY_NEIGHBOUR)
+        labels += np.where(mine > 0, mine + count, 0)
+        count += int(n)
+    return labels
+
+
+def edge_points(gx: F32, gy: F32, size: F32, region: I64) -> tuple[F64, I64]:
+    """Points (E, 2) px where the gradient of a region's pixels is largest across the edge, with their region.
+
+    The maximum along the nearest of the eight directions to the gradient, on a parabola through three pixels.
+    """
+    h, w = region.shape
+    y, x = np.nonzero(region)
+    inside = (x > 0) & (y > 0) & (x < w - 1) & (y < h - 1)
+    x, y = x[inside], y[inside]
+    eighth = np.round(np.arctan2(gy[y, x], gx[y, x]) / (np.pi / 4.0)) * (np.pi / 4.0)
+    dx, dy = np.rint(np.cos(eighth)).astype(np.int64), np.rint(np.sin(eighth)).astype(np.int64)
+    before, here, after = size[y - dy, x - dx], size[y, x], size[y + dy, x + dx]
+    peak = (here >= before) & (here > after)
+    x, y, dx, dy = x[peak], y[peak], dx[peak], dy[peak]
+    left, middle, right = (part[peak].astype(np.float64) for part in (before, here, after))
+    shift = 0.5 * (left - right) / np.minimum(left - 2.0 * middle + right, -1e-12)
+    return np.column_stack([x + shift * dx, y + shift * dy]), region[y, x]
+
+
+def fit_segments(xy: F64, region: I64) -> tuple[F64, F64]:
+    """Total least squares lines through the points (E, 2) of each region, cut at its ends.
+
+    Returns segments (S, 4) and the RMS distance (S,) of their points; regions of fewer than five have none.
+    """
+    n = np.bincount(region)
+    regions = np.flatnonzero(n >= 5)
+    place = np.full(len(n), -1)
+    place[regions] = np.arange(len(regions))
+    keep = place[region] >= 0
+    xy, of, n = xy[keep], place[region[keep]], n[regions].astype(np.float64)
+    mean = np.column_stack([np.bincount(of, xy[:, k], minlength=len(regions)) for k in (0, 1)]) / n[:, None]
+    d = xy - mean[of]
+    xx, xy_, yy = (
+        np.bincount(of, d[:, a] * d[:, b], minlength=len(regions)) / n for a, b in ((0, 0), (0, 1), (1, 1))
+    )
+    angle = 0.5 * np.arctan2(2.0 * xy_, xx - yy)
+    along = np.column_stack([np.cos(angle), np.sin(angle)])
+    least = 0.5 * (xx + yy - np.hypot(xx - yy, 2.0 * xy_))
+    position = np.sum(d * along[of], axis=1)
+    low, high = np.zeros(len(regions)), np.zeros(len(regions))
+    np.minimum.at(low, of, position)
+    np.maximum.at(high, of, position)
+    ends = [mean + t[:, None] * along for t in (low, high)]
+    return np.column_stack(ends), np.sqrt(np.maximum(least, 0.0))

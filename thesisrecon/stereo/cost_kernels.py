@@ -1,0 +1,343 @@
+"""Compiled matching costs: an image row against the row of the other, all disparities, columns innermost.
+
+The column runs in the inner loop everywhere, so that each operation works on whole rows whatever the number
+of disparities. Functions that take rows get them as slices: with no index arithmetic in them the compiler
+uses vector instructions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import F32, I16, I32, U8, U16
+
+LEVELS = 4
+"""Steps of a grey level: channels are whole numbers of quarter levels, for rectified images are resampled."""
+REACH = 2
+"""Of the census window: 5 x 5 pixels, 24 comparisons."""
+ARM = 2
+"""Pixels to each side in the support of a pixel."""
+WEIGHT_SHIFT = 8
+"""Weights are given in 1 / 256."""
+
+
+@njit(cache=True, nogil=True)
+def count_ones(word: np.int32) -> np.uint32:
+    """Number of ones, added up in pairs, fours and bytes: the compiler knows this form as one instruction."""
+    x = np.uint32(word)
+    x = np.uint32(x - np.uint32(np.uint32(x >> np.uint32(1)) & np.uint32(0x55555555)))
+    twos = np.uint32(np.uint32(x >> np.uint32(2)) & np.uint32(0x33333333))
+    x = np.uint32(np.uint32(x & np.uint32(0x33333333)) + twos)
+    x = np.uint32(np.uint32(x + np.uint32(x >> np.uint32(4))) & np.uint32(0x0F0F0F0F))
+    return np.uint32(np.uint32(x * np.uint32(0x01010101)) >> np.uint32(24))
+
+
+@njit(cache=True, nogil=True)
+def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
+    """(H, W, K) grey levels, NaN = no pixel, as ``channels`` (K, H, W) of quarter levels, their sum ``grey``
+    (H, W), and ``valid`` (H, W) 0 or 255."""
+    height, width, n = image.shape
+    top = np.float32(255.0 * LEVELS)
+    for y in range(height):
+        for x in range(width):
+            valid[y, x] = 255
+            total = np.int16(0)
+            for k in range(n):
+                level = image[y, x, k] * np.float32(LEVELS)
+                if not np.isfinite(level):
+                    valid[y, x] = 0
+                    level = np.float32(0.0)
+                whole = np.int16(min(max(level, np.float32(0.0)), top) + np.float32(0.5))
+                channels[k, y, x] = whole
+                total = np.int16(total + whole)
+            grey[y, x] = total
+
+
+@njit(cache=True, nogil=True)
+def split_bytes(image: U8, channels: I16, grey: I16) -> None:
+    """The same of an image of bytes, of which every pixel is one."""
+    height, width, n = image.shape
+    for y in range(height):
+        total = grey[y]
+        total[:] = 0
+        for k in range(n):
+            channel = channels[k, y]
+            for x in range(width):
+                whole = np.int16(np.int16(image[y, x, k]) * np.int16(LEVELS))
+                channel[x] = whole
+                total[x] = np.int16(total[x] + whole)
+
+
+@njit(cache=True, nogil=True)
+def _compare(centre: I16, other: I16, bits: I32) -> None:
+    for x in range(len(centre)):
+        bits[x] = np.int32(bits[x] << 1) | np.int32(other[x] < centre[x])
+
+
+@njit(cache=True, nogil=True)
+def census(grey: I16, bits: I32) -> None:
+    """Census transform (Zabih and Woodfill 1994) of (H, W): which pixels of the window are darker than its
+    centre, a bit each. Beyond the border the outermost pixel is repeated."""
+    height, width = grey.shape
+    padded = np.empty((2 * REACH + 1, width + 2 * REACH), np.int16)
+    bits[:] = 0
+    for y in range(height):
+        for dy in range(-REACH, REACH + 1):
+            row = padded[dy + REACH]
+            source = grey[min(max(y + dy, 0), height - 1)]
+            row[REACH : REACH + width] = source
+            row[:REACH] = source[0]
+            row[REACH + width :] = source[width - 1]
+        for dy in range(2 * REACH + 1):
+            for dx in range(2 * REACH + 1):
+                if dx != REACH or dy != REACH:
+                    _compare(grey[y], padded[dy, dx : dx + width], bits[y])
+
+
+@njit(cache=True, nogil=True)
+def sampled_bounds(channels: I16, low: I16, high: I16) -> None:
+    """Least and greatest value within half a pixel left and right, linearly interpolated, (K, H, W)
+    (Birchfield and Tomasi 1998)."""
+    n, height, width = channels.shape
+    for k in range(n):
+        for y in range(height):
+            row, below, above = channels[k, y], low[k, y], high[k, y]
+            for x in range(width):
+                here = row[x]
+                before = np.int16(np.int16(here + row[max(x - 1, 0)]) >> 1)
+                after = np.int16(np.int16(here + row[min(x + 1, width - 1)]) >> 1)
+                below[x] = min(here, min(before, after))
+                above[x] = max(here, max(before, after))
+
+
+@njit(cache=True, nogil=True)
+def _add_difference(a: I16, a_low: I16, a_high: I16, b: I16, b_low: I16, b_high: I16, total: I16) -> None:
+    """Add the sampling-insensitive difference of one channel: 0 where one lies within the other's bounds."""
+    for x in range(len(total)):
+        one, other = np.int16(a[x] - b_high[x]), np.int16(b_low[x] - a[x])
+        one = other if other > one else one
+        two, other = np.int16(b[x] - a_high[x]), np.int16(a_low[x] - b[x])
+        two = other if other > two else two
+        one = two if two < one else one
+        one = np.int16(0) if one < 0 else one
+        total[x] = np.int16(total[x] + one)
+
+
+@njit(cache=True, nogil=True)
+def _add_plain_difference(a: I16, b: I16, total: I16) -> None:
+    for x in range(len(total)):
+        apart = np.int16(a[x] - b[x])
+        apart = np.int16(-apart) if apart < 0 else apart
+        total[x] = np.int16(total[x] + apart)
+
+
+@njit(cache=True, nogil=True)
+def _hamming(a: I32, b: I32, out: I16) -> None:
+    for x in range(len(out)):
+        out[x] = np.int16(count_ones(np.int32(a[x] ^ b[x])))
+
+
+@njit(cache=True, nogil=True)
+def _join(bits: I16, colour: I16, known: U8, weights: I16, outside: np.uint8, out: U8) -> None:
+    """Weighted sum of both costs."""
+    of_bit, of_level, cap = weights[0], weights[1], weights[2]
+    for x in range(len(out)):
+        level = colour[x]
+        level = cap if level > cap else level
+        cost = np.int16(np.int16(bits[x] * of_bit) + np.int16(level * of_level)) >> WEIGHT_SHIFT
+        inside = known[x]
+        out[x] = np.uint8(cost) if inside != 0 else outside
+
+
+@njit(cache=True, nogil=True)
+def _both(a: U8, b: U8, out: U8) -> None:
+    for x in range(len(out)):
+        out[x] = a[x] & b[x]
+
+
+@njit(cache=True, nogil=True)
+def row_costs(
+    y: int,
+    left: tuple[I32, I16, I16, I16, U8],
+    right: tuple[I32, I16, I16, I16, U8],
+    first: int,
+    weights: I16,
+    outside: np.uint8,
+    out: U8,
+) -> None:
+    """Costs (D, W) of the pixels of row y of the left image at the disparities first, first + 1, ...
+
+    Each side is (census (H, W), channels, low, high (K, H, W), valid (H, W)). ``weights``: of a bit, of a
+    quarter level, the cap of the levels (sum over channels), whether the difference is insensitive to
+    sampling. ``outside`` is the cost where one of the pixels is none.
+    """
+    bits_l, a, a_low, a_high, valid_l = left
+    bits_r, b, b_low, b_high, valid_r = right
+    width = bits_l.shape[1]
+    total, differing = np.empty(width, np.int16), np.empty(width, np.int16)
+    known = np.empty(width, np.uint8)
+    for q in range(len(out)):
+        d = first + q
+        lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
+        out[q, : min(lo, width)] = outside
+        out[q, max(hi, 0) :] = outside
+        if hi <= lo:
+            continue
+        n = hi - lo
+        total[:n] = 0
+        for k in range(len(a) if weights[1] != 0 else 0):
+            if weights[3] == 0:
+                _add_plain_difference(a[k, y, lo:hi], b[k, y, lo - d : hi - d], total[:n])
+            else:
+                _add_difference(
+                    a[k, y, lo:hi],
+                    a_low[k, y, lo:hi],
+                    a_high[k, y, lo:hi],
+                    b[k, y, lo - d : hi - d],
+                    b_low[k, y, lo - d : hi - d],
+                    b_high[k, y, lo - d : hi - d],
+                    total[:n],
+                )
+        _hamming(bits_l[y, lo:hi], bits_r[y, lo - d : hi - d], differing[:n])
+        _both(valid_l[y, lo:hi], valid_r[y, lo - d : hi - d], known[:n])
+        _join(differing[:n], total[:n], known[:n], weights, outside, out[q, lo:hi])
+
+
+@njit(cache=True, nogil=True)
+def _alike(a: I16, b: I16, tolerance: np.int16, mask: U8) -> None:
+    for x in range(len(mask)):
+        apart = np.int16(a[x] - b[x])
+        apart = np.int16(-apart) if apart < 0 else apart
+        before = mask[x]
+        mask[x] = before if apart <= tolerance else np.uint8(0)
+
+
+@njit(cache=True, nogil=True)
+def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> None:
+    """The arms of a pixel's support (Zhang, Lu and Lafruit 2009): ``masks`` (4, ARM, H, W) is 255 where the
+    pixel s + 1 to the left, right, above, below and all before it differ from this one by no more than
+    ``tolerance`` in every channel, else 0."""
+    height, width = valid.shape
+    masks[:] = 0
+    for arm in range(4):
+        for s in range(masks.shape[1]):
+            dx = (s + 1) * (-1 if arm == 0 else 1 if arm == 1 else 0)
+            dy = (s + 1) * (-1 if arm == 2 else 1 if arm == 3 else 0)
+            lo, hi = min(max(-dx, 0), width), max(min(width, width - dx), 0)
+            if hi <= lo:
+                continue
+            for y in range(max(-dy, 0), min(height, height - dy)):
+                mask = masks[arm, s, y, lo:hi]
+                if s == 0:
+                    mask[:] = valid[y + dy, lo + dx : hi + dx]
+                else:
+                    _both(masks[arm, s - 1, y, lo:hi], valid[y + dy, lo + dx : hi + dx], mask)
+                for k in range(len(channels)):
+                    _alike(channels[k, y, lo:hi], channels[k, y + dy, lo + dx : hi + dx], tolerance, mask)
+
+
+@njit(cache=True, nogil=True)
+def _sum_five_bytes(values: tuple[U8, U8, U8, U8, U8], masks: tuple[U8, U8, U8, U8], out: U16) -> None:
+    far_l, left, here, right, far_r = values
+    mask_l, mask_far_l, mask_r, mask_far_r = masks
+    for x in range(len(out)):
+        total = np.uint16(here[x]) + np.uint16(left[x] & mask_l[x]) + np.uint16(far_l[x] & mask_far_l[x])
+        total += np.uint16(right[x] & mask_r[x]) + np.uint16(far_r[x] & mask_far_r[x])
+        out[x] = np.uint16(total)
+
+
+@njit(cache=True, nogil=True)
+def _sum_five(
+    values: tuple[U16, U16, U16, U16, U16], masks: tuple[U16, U16, U16, U16], share: F32, out: U8
+) -> None:
+    far_a, above, here, below, far_b = values
+    mask_a, mask_far_a, mask_b, mask_far_b = masks
+    for x in range(len(out)):
+        total = np.uint16(here[x] + np.uint16(above[x] & mask_a[x]))
+        total = np.uint16(total + np.uint16(far_a[x] & mask_far_a[x]))
+        total = np.uint16(total + np.uint16(below[x] & mask_b[x]))
+        total = np.uint16(total + np.uint16(far_b[x] & mask_far_b[x]))
+        out[x] = np.uint8(np.int32(np.float32(total) * share[x] + np.float32(0.5)))
+
+
+@njit(cache=True, nogil=True)
+def _sum_along_row(padded: U8, masks: U8, y: int, out: U16) -> None:
+    """Sums (W,) of the costs over the horizontal arms of every pixel of row y; ``padded`` (W + 2 ARM,)."""
+    n = len(out)
+    _sum_five_bytes(
+        (padded[:n], padded[1 : n + 1], padded[2 : n + 2], padded[3 : n + 3], padded[4 : n + 4]),
+        (masks[0, 0, y], masks[0, 1, y], masks[1, 0, y], masks[1, 1, y]),
+        out,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _mean_along_column(ring: U16, y: int, masks: U16, share: F32, out: U8) -> None:
+    """Means (W,) over the vertical arms; ``ring`` (2 ARM + 1, W) holds row y at y modulo its length."""
+    n = len(ring)
+    _sum_five(
+        (ring[(y - 2) % n], ring[(y - 1) % n], ring[y % n], ring[(y + 1) % n], ring[(y + 2) % n]),
+        (masks[0], masks[1], masks[2], masks[3]),
+        share,
+        out,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _widen_mask(mask: U8, out: U16) -> None:
+    for x in range(len(out)):
+        out[x] = np.uint16(np.uint16(mask[x]) * np.uint16(257))
+
+
+@njit(cache=True, nogil=True)
+def _shares(counts: U16, y: int, masks: U16, share: F32) -> None:
+    """1 / number of pixels in the support of every pixel of row y."""
+    n = len(counts)
+    far_a, above, here = counts[(y - 2) % n], counts[(y - 1) % n], counts[y % n]
+    below, far_b = counts[(y + 1) % n], counts[(y + 2) % n]
+    mask_a, mask_far_a, mask_b, mask_far_b = masks[0], masks[1], masks[2], masks[3]
+    for x in range(len(share)):
+        total = np.int32(here[x]) + np.int32(above[x] & mask_a[x]) + np.int32(far_a[x] & mask_far_a[x])
+        total += np.int32(below[x] & mask_b[x]) + np.int32(far_b[x] & mask_far_b[x])
+        share[x] = np.float32(1.0) / np.float32(total)
+
+
+@njit(cache=True, nogil=True)
+def cost_volume(
+    left: tuple[I32, I16, I16, I16, U8],
+    right: tuple[I32, I16, I16, I16, U8],
+    masks: U8,
+    first: int,
+    weights: I16,
+    outside: np.uint8,
+    volume: U8,
+) -> None:
+    """Mean costs over every pixel's support, ``volume`` (H, D, W); the rows of ``left, right, masks`` are
+    those of the volume. Without masks (of length 0) the support is the pixel.
+
+    Horizontal sums of the 2 ARM + 1 rows about the present one wait in a ring, so nothing but the volume is
+    as large as the volume.
+    """
+    height, n, width = volume.shape
+    if masks.shape[1] == 0:
+        for y in range(height):
+            row_costs(y, left, right, first, weights, outside, volume[y])
+        return
+    span = 2 * ARM + 1
+    ring, counts = np.zeros((n, span, width), np.uint16), np.zeros((span, width), np.uint16)
+    costs, ones = np.zeros((n, width + 2 * ARM), np.uint8), np.ones(width + 2 * ARM, np.uint8)
+    share, wide = np.empty(width, np.float32), np.empty((2 * ARM, width), np.uint16)
+    summed = 0
+    for y in range(height):
+        while summed < min(y + ARM + 1, height):
+            row_costs(summed, left, right, first, weights, outside, costs[:, ARM : ARM + width])
+            _sum_along_row(ones, masks, summed, counts[summed % span])
+            for q in range(n):
+                _sum_along_row(costs[q], masks, summed, ring[q, summed % span])
+            summed += 1
+        for k in range(2 * ARM):
+            _widen_mask(masks[2 + k // ARM, k % ARM, y], wide[k])
+        _shares(counts, y, wide, share)
+        for q in range(n):
+            _mean_along_column(ring[q], y, wide, share, volume[y, q])

@@ -1,0 +1,220 @@
+"""Compiled loops over the pixels of depth maps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import F32, F64, U8
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> None:
+    """Inverse depth (H, W) of pixels x that are seen at ``xy`` (H, W, 2) in the other view, with deviation.
+
+    There a pixel of inverse depth rho is at H (x, y, 1) + rho e; the answer is the rho whose place is
+    nearest. NaN where the place is not known or behind either camera.
+    """
+    height, width = rho.shape
+    for v in range(height):
+        for u in range(width):
+            rho[v, u], std[v, u] = np.nan, np.nan
+            x, y = np.float64(xy[v, u, 0]), np.float64(xy[v, u, 1])
+            if not (np.isfinite(x) and np.isfinite(sigma[v, u])):
+                continue
+            hx = H[0, 0] * u + H[0, 1] * v + H[0, 2]
+            hy = H[1, 0] * u + H[1, 1] * v + H[1, 2]
+            hz = H[2, 0] * u + H[2, 1] * v + H[2, 2]
+            ax, ay = e[0] - x * e[2], e[1] - y * e[2]
+            bx, by = x * hz - hx, y * hz - hy
+            square = ax * ax + ay * ay
+            value = (ax * bx + ay * by) / square
+            w = hz + value * e[2]
+            if value > 0.0 and w > 0.0 and square > 0.0:
+                rho[v, u] = value
+                std[v, u] = sigma[v, u] * w / np.sqrt(square)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fuse_inverse_depths(
+    rho: F32, std: F32, gate: float, out: F32, out_std: F32, support: U8, rivals: U8
+) -> None:
+    """One inverse depth (H, W) of several (K, H, W): the mean, weighted by the inverse variances, of those
+    that agree within ``gate`` deviations with the one that most agree with (the more certain among equals).
+
+    ``support`` is how many agree, ``rivals`` how many are known and do not.
+    """
+    count, height, width = rho.shape
+    for v in range(height):
+        for u in range(width):
+            known, best, most, weight_of_best = 0, -1, 0, 0.0
+            for k in range(count):
+                if not np.isfinite(rho[k, v, u]):
+                    continue
+                known += 1
+                n, weight = 0, 0.0
+                for m in range(count):
+                    if _agree(rho[k, v, u], std[k, v, u], rho[m, v, u], std[m, v, u], gate):
+                        n += 1
+                        weight += 1.0 / np.float64(std[m, v, u]) ** 2
+                if n > most or (n == most and weight > weight_of_best):
+                    best, most, weight_of_best = k, n, weight
+            support[v, u], rivals[v, u] = most, known - most
+            if best < 0:
+                out[v, u], out_std[v, u] = np.nan, np.nan
+                continue
+            total, weights = 0.0, 0.0
+            for m in range(count):
+                if _agree(rho[best, v, u], std[best, v, u], rho[m, v, u], std[m, v, u], gate):
+                    w = 1.0 / np.float64(std[m, v, u]) ** 2
+                    total += w * rho[m, v, u]
+                    weights += w
+            mean, scatter = total / weights, 0.0
+            for m in range(count):
+                if _agree(rho[best, v, u], std[best, v, u], rho[m, v, u], std[m, v, u], gate):
+                    scatter += ((rho[m, v, u] - mean) / std[m, v, u]) ** 2
+            # What the estimates differ by beyond their deviations is deviation too.
+            spread = scatter / (most - 1) if most > 1 else 1.0
+            out[v, u], out_std[v, u] = mean, np.sqrt(max(spread, 1.0) / weights)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _agree(a: float, sa: float, b: float, sb: float, gate: float) -> bool:
+    # A comparison with NaN is false.
+    return (a - b) * (a - b) <= gate * gate * (sa * sa + sb * sb)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive: U8, support: U8) -> None:
+    """One step of the 1-D Kalman filter of every pixel (H, W), in place.
+
+    A measurement beyond ``gate`` deviations of the innovation, or none, ends the chain of its pixel
+    (``alive`` 0); the first one starts it.
+    """
+    height, width = rho.shape
+    for v in range(height):
+        for u in range(width):
+            if not alive[v, u]:
+                continue
+            z, s = np.float64(new[v, u]), np.float64(new_std[v, u])
+            if not np.isfinite(z):
+                alive[v, u] = 0
+            elif not np.isfinite(rho[v, u]):
+                rho[v, u], std[v, u], support[v, u] = z, s, 1
+            elif _agree(rho[v, u], std[v, u], z, s, gate):
+                variance = np.float64(std[v, u]) ** 2
+                gain = variance / (variance + s * s)
+                rho[v, u] += gain * (z - rho[v, u])
+                std[v, u] = np.sqrt((1.0 - gain) * variance)
+                support[v, u] += 1
+            else:
+                alive[v, u] = 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_agreement(
+    depth: F32,
+    std: F32,
+    to: F64,
+    other: F32,
+    other_std: F32,
+    back: F64,
+    limits: F64,
+    agree: U8,
+    contradict: U8,
+) -> None:
+    """Add 1 to ``agree`` (H, W) where the depth map ``other`` confirms ``depth``, to ``contradict`` where it
+    sees through it.
+
+    ``to`` and ``back`` (3, 4) take z (x, y, 1), 1 of one view to z' (x', y', 1) of the other and back. With
+    ``limits`` (pixels, relative depth, deviations): confirmed is what comes back within the pixels from a
+    depth that differs by less than the relative bound plus the deviations of both; seen through what is
+    nearer than what the other view sees there by more.
+    """
+    height, width = depth.shape
+    rows, columns = other.shape
+    for v in range(height):
+        for u in range(width):
+            z = np.float64(depth[v, u])
+            if not np.isfinite(z):
+                continue
+            w = z * (to[2, 0] * u + to[2, 1] * v + to[2, 2]) + to[2, 3]
+            x = (z * (to[0, 0] * u + to[0, 1] * v + to[0, 2]) + to[0, 3]) / w
+            y = (z * (to[1, 0] * u + to[1, 1] * v + to[1, 2]) + to[1, 3]) / w
+            if not (w > 0.0 and -0.5 < x < columns - 0.5 and -0.5 < y < rows - 0.5):
+                continue
+            q, p = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+            found = np.float64(other[q, p])
+            if not np.isfinite(found):
+                continue
+            bound = limits[1] * w + limits[2] * np.sqrt(
+                (np.float64(std[v, u]) * w / z) ** 2 + np.float64(other_std[q, p]) ** 2
+            )
+            if found > w + bound:
+                contradict[v, u] += 1
+            elif found >= w - bound:
+                # The nearest pixel's depth, taken along the very ray of the pixel.
+                b = found * (back[2, 0] * x + back[2, 1] * y + back[2, 2]) + back[2, 3]
+                dx = (found * (back[0, 0] * x + back[0, 1] * y + back[0, 2]) + back[0, 3]) / b - u
+                dy = (found * (back[1, 0] * x + back[1, 1] * y + back[1, 2]) + back[1, 3]) / b - v
+                if b > 0.0 and dx * dx + dy * dy <= limits[0] * limits[0]:
+                    agree[v, u] += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def splat_depths(depth: F32, to: F64, out: F32) -> None:
+    """Depths (H, W) of one view at the nearest pixels of another, the nearer of several there; ``out``
+    (H', W') is updated, NaN where nothing is known. ``to`` (3, 4) see :func:`count_agreement`."""
+    rows, columns = out.shape
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = np.float64(depth[v, u])
+            if not np.isfinite(z):
+                continue
+            w = z * (to[2, 0] * u + to[2, 1] * v + to[2, 2]) + to[2, 3]
+            x = (z * (to[0, 0] * u + to[0, 1] * v + to[0, 2]) + to[0, 3]) / w
+            y = (z * (to[1, 0] * u + to[1, 1] * v + to[1, 2]) + to[1, 3]) / w
+            if w > 0.0 and -0.5 < x < columns - 0.5 and -0.5 < y < rows - 0.5:
+                q, p = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+                # A comparison with NaN is false.
+                if not out[q, p] <= w:
+                    out[q, p] = w
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def continue_surface(rho: F32, std: F32, sure: U8, radius: int, alike: float, gate: float, joins: U8) -> None:
+    """``joins`` (H, W): whether the inverse depth of a pixel that is not sure continues the surface about it.
+
+    The surface is the plane that fits the sure pixels within ``radius``, those that differ by at most the
+    share ``alike``; they must be a quarter of the window and not all to one side, and the plane must pass
+    within ``gate`` deviations.
+    """
+    height, width = rho.shape
+    least = (2 * radius + 1) ** 2 // 4
+    for v in range(height):
+        for u in range(width):
+            joins[v, u] = 0
+            here = np.float64(rho[v, u])
+            if sure[v, u] or not np.isfinite(here):
+                continue
+            sxx, sxy, syy, sxd, syd, sx, sy, sd, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
+            for b in range(max(v - radius, 0), min(v + radius + 1, height)):
+                for a in range(max(u - radius, 0), min(u + radius + 1, width)):
+                    d = np.float64(rho[b, a]) - here
+                    if sure[b, a] and abs(d) <= alike * here:
+                        x, y = a - u, b - v
+                        sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
+                        sxd, syd = sxd + x * d, syd + y * d
+                        sx, sy, sd, n = sx + x, sy + y, sd + d, n + 1
+            if n < least:
+                continue
+            mx, my = sx / n, sy / n
+            sxx, sxy, syy = sxx - sx * mx, sxy - sx * my, syy - sy * my
+            sxd, syd = sxd - sx * sd / n, syd - sy * sd / n
+            det = sxx * syy - sxy * sxy
+            # Farther from their middle than they spread, the plane would be extrapolated.
+            if det <= 1e-3 * sxx * syy or mx * mx + my * my > 0.5 * (sxx + syy) / n:
+                continue
+            gx, gy = (syy * sxd - sxy * syd) / det, (sxx * syd - sxy * sxd) / det
+            if abs(sd / n - gx * mx - gy * my) <= gate * std[v, u]:
+                joins[v, u] = 1

@@ -1,0 +1,450 @@
+"""The pencil of epipolar lines of a pair: what every way of rectifying shares.
+
+Epipolar planes are numbered by an angle phi, the plane p = (cos phi, sin phi) being seen as the line L p in
+either view (3, 2 matrices L, two lines through the epipole). Every pixel lies on one half-plane bounded by
+the baseline, so phi runs over the whole circle: half epipolar lines (Pollefeys, Koch and Van Gool, ICCV
+1999), without an exception for epipoles at infinity. Places are z = (x - centre) / unit, the unit about one
+focal length.
+
+What a pair of views gives to every way of rectifying it, and the refusal of pairs that cannot be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thesisrecon.arrays import F64
+from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
+from thesisrecon.geometry.homogeneous import require_finite
+from thesisrecon.geometry.homographies import infinite_homography
+from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.two_view import (
+    canonical_cameras,
+    fundamental_from_cameras,
+    require_parallax,
+    rotation_planes,
+)
+
+FOCAL_PER_SIDE = 1.2
+"""The unit of length in an image over its long side: the focal length of a usual lens."""
+_J = np.array([[0.0, -1.0], [1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class EpipolarPencil:
+    """``lines`` (2, 3, 2): L of each view in places z, oriented such that matches share their phi.
+
+    ``centres`` (2, 2) px and ``units`` (2,) px make z of pixels; ``sizes`` (2, 2) width, height of the
+    photographs. ``turned`` says that rows run against phi and columns against the half-lines: with it larger
+    disparities are nearer.
+    """
+
+    lines: F64
+    centres: F64
+    units: F64
+    sizes: tuple[tuple[int, int], tuple[int, int]]
+    turned: bool = False
+
+    def places(self, side: int, xy: F64) -> F64:
+        """z (..., 2) of pixels (..., 2)."""
+        return np.asarray((xy - self.centres[side]) / self.units[side])
+
+    def pixels(self, side: int, z: F64) -> F64:
+        """Pixels (..., 2) of z (..., 2)."""
+        return np.asarray(z * self.units[side] + self.centres[side])
+
+    def epipole(self, side: int) -> F64:
+        """(3,) homogeneous, in places; the third entry is 0 at infinity."""
+        return np.asarray(np.cross(self.lines[side, :, 0], self.lines[side, :, 1]))
+
+    def planes(self, side: int, xy: F64) -> F64:
+        """p (..., 2), any positive length, of the half-planes that hold pixels (..., 2)."""
+        z = self.places(side, xy)
+        L = self.lines[side]
+        q = z @ L[:2] + L[2]
+        return np.stack([q[..., 1], -q[..., 0]], axis=-1)
+
+    def angles(self, side: int, xy: F64, *, about: float = 0.0) -> F64:
+        """phi (...) of pixels (..., 2), within pi of ``about``."""
+        p = self.planes(side, xy)
+        c, s = np.cos(about), np.sin(about)
+        return np.asarray(about + np.arctan2(c * p[..., 1] - s * p[..., 0], c * p[..., 0] + s * p[..., 1]))
+
+    def half_lines(self, side: int, phi: F64) -> HalfLines:
+        """The half epipolar lines phi (N,) of a view."""
+        l = plane_of(phi) @ self.lines[side].T
+        norm = np.linalg.norm(l[:, :2], axis=1)
+        n, offset = l[:, :2] / norm[:, None], l[:, 2] / norm
+        d = np.stack([-n[:, 1], n[:, 0]], axis=1)
+        e = self.epipole(side)
+        away = np.hypot(e[0], e[1])
+        e = e / max(away, abs(e[2]))
+        return HalfLines(-offset[:, None] * n, d, offset, e)
+
+    def swept(self, side: int, phi: F64, z: F64) -> F64:
+        """How far lines phi (N,) move across their points z (N, 2) per radian, in places."""
+        p = plane_of(phi)
+        l, moving = p @ self.lines[side].T, p @ (self.lines[side] @ _J).T
+        return np.asarray(
+            np.abs(np.sum(moving[:, :2] * z, axis=1) + moving[:, 2]) / np.linalg.norm(l[:, :2], axis=1)
+        )
+
+
+@dataclass(frozen=True)
+class HalfLines:
+    """Half-lines as ``foot`` (N, 2), the point nearest to the image centre, and unit ``direction`` (N, 2).
+
+    Along the direction d(z - e) grows, or falls where the epipole's third coordinate is negative;
+    ``epipole`` (3,) has a largest entry of about 1, ``distance`` (N,) is signed, of the centre.
+    """
+
+    foot: F64
+    direction: F64
+    distance: F64
+    epipole: F64
+
+    @property
+    def sagitta(self) -> F64:
+        """(N,) by how much the circle about the epipole through the centre is off each foot.
+
+        D (1 - cos alpha) with the epipole's distance D and the angle alpha it sees foot and centre under:
+        columns of equal distance from the epipole, without cancellation where that is far away, and 0 at
+        infinity.
+        """
+        e = self.epipole
+        D_w = float(np.hypot(e[0], e[1]))
+        if D_w == 0.0:
+            return np.zeros(len(self.foot))
+        sign = -1.0 if e[2] < 0.0 else 1.0
+        cosine = -(self.direction @ e[:2]) / D_w
+        near = np.maximum(1.0 + cosine, 1.0)
+        flat = self.distance**2 * abs(e[2]) / D_w / near
+        with np.errstate(divide="ignore", invalid="ignore"):
+            steep = np.where(cosine < 0.0, D_w / abs(e[2]) * (1.0 - cosine), 0.0) if e[2] else 0.0 * cosine
+        return np.asarray(sign * np.where(cosine < 0.0, steep, flat))
+
+    @property
+    def start(self) -> F64:
+        """(N,) position along the direction where the half-line begins or ends; infinite for an epipole at
+        infinity."""
+        e = self.epipole
+        if e[2] == 0.0:
+            return np.full(len(self.foot), -np.inf)
+        return np.asarray(self.direction @ (e[:2] / e[2]))
+
+    def on_half(self, t: F64) -> F64:
+        """Whether positions ``t`` (N, ...) along the directions lie on the half-lines, not beyond."""
+        first = self.start.reshape(-1, *([1] * (t.ndim - 1)))
+        return np.asarray(t < first if self.epipole[2] < 0.0 else t > first)
+
+    def chord(self, low: F64, high: F64) -> tuple[F64, F64]:
+        """The positions (N,), (N,) between which the half-lines are within the box ``low`` to ``high`` (2,);
+        the first is not below the second where they miss it."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, two = (low - self.foot) / self.direction, (high - self.foot) / self.direction
+        inside = (self.foot >= low) & (self.foot <= high)
+        parallel = self.direction == 0.0
+        enter = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(one, two)).max(axis=1)
+        leave = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(one, two)).min(axis=1)
+        if self.epipole[2] < 0.0:
+            return enter, np.minimum(leave, self.start)
+        return np.maximum(enter, self.start), leave
+
+
+def plane_of(phi: F64) -> F64:
+    """(cos phi, sin phi), (N, 2)."""
+    return np.stack([np.cos(phi), np.sin(phi)], axis=-1)
+
+
+def pencil_of_fundamental(
+    F: F64, sizes: tuple[tuple[int, int], tuple[int, int]]
+) -> tuple[EpipolarPencil, float]:
+    """The pencil of F (3, 3), of either orientation, and the ratio of the singular values of F in places."""
+    units = FOCAL_PER_SIDE * np.array([max(size) for size in sizes], dtype=np.float64)
+    centres = (np.array(sizes, dtype=np.float64) - 1.0) / 2.0
+    T = [
+        np.array([[u, 0.0, c[0]], [0.0, u, c[1]], [0.0, 0.0, 1.0]])
+        for u, c in zip(units, centres, strict=True)
+    ]
+    U, s, Vt = np.linalg.svd(T[1].T @ F @ T[0])
+    ratio = float(s[1] / s[0]) if s[0] > 0.0 else 0.0
+    # F z1 = U S V'z1, and V'z1 = J p with p the plane of z1.
+    lines = np.stack([Vt[:2].T, (U[:, :2] * s[:2]) @ _J / max(s[0], 1e-300)])
+    return EpipolarPencil(lines, centres, units, sizes), ratio
+
+
+def orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> tuple[EpipolarPencil, float]:
+    """The pencil with the second view's sign such that matches share their half-planes, and how many do."""
+    p1, p2 = pencil.planes(0, xy1), pencil.planes(1, xy2)
+    with np.errstate(invalid="ignore"):
+        same = np.sum(p1 * p2, axis=1) > 0.0
+    share = float(np.mean(same))
+    if share >= 0.5:
+        return pencil, share
+    lines = pencil.lines.copy()
+    lines[1] *= -1.0
+    return replace(pencil, lines=lines), 1.0 - share
+
+
+Size = tuple[int, int]
+
+LEAST_MATCHES = 8
+SAME_HALF = 0.8
+"""Share of matches that must lie on the same half of their epipolar lines: wrong ones do by chance."""
+SAMPLES = 16
+"""Places along either side of a photograph at which distortion is measured."""
+
+
+@dataclass(frozen=True)
+class EpipolarPair:
+    """A pair ready for rectification.
+
+    ``pencil`` oriented, and turned such that larger disparities are nearer; ``xy1``, ``xy2`` (N, 2) px
+    matches, perhaps none; ``arc`` the half-planes, in increasing phi, that both photographs see; ``regions``
+    two (M, 2) px samples of what either photograph shows of them, first the corners of that polygon;
+    ``cameras`` (2, 3, 4) where they are known.
+    """
+
+    pencil: EpipolarPencil
+    xy1: F64
+    xy2: F64
+    arc: tuple[float, float]
+    regions: tuple[F64, F64]
+    cameras: F64 | None = None
+
+    @property
+    def sizes(self) -> tuple[Size, Size]:
+        """(width, height) of the photographs."""
+        return self.pencil.sizes
+
+    @property
+    def matches(self) -> tuple[F64, F64]:
+        """Matches of either side."""
+        return self.xy1, self.xy2
+
+
+def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
+    """The pair of F (3, 3) and its inliers (N, 2) px.
+
+    Which disparities are nearer follows from cameras with a usual focal length (quasi-Euclidean frame), with
+    every point in front. Raises ``ValueError`` for wrong shapes, numbers that are not finite and sizes below
+    2 px; ``StageFailure`` for fewer than 8 matches, an F of rank 1, matches that a homography explains and
+    matches on opposite halves of their epipolar lines.
+    """
+    sizes = _checked_sizes(size1, size2)
+    xy1, xy2 = _checked_matches(xy1, xy2)
+    F = np.asarray(F, dtype=np.float64)
+    if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
+        raise ValueError(f"rectification needs a finite F (3, 3) that is not zero; got shape {F.shape}")
+    if len(xy1) < LEAST_MATCHES:
+        raise StageFailure(
+            "the pair has too few matches to rectify it",
+            f"{counted(len(xy1), 'match')}, needed at least {LEAST_MATCHES}",
+            "match the photographs anew, or rectify from cameras",
+        )
+    pencil, ratio = pencil_of_fundamental(F, sizes)
+    if not ratio > 1e-9:
+        raise StageFailure(
+            "the fundamental matrix has rank 1 and no epipolar lines",
+            f"its second singular value is {ratio:.1g} of the first",
+            "estimate it from more matches",
+        )
+    require_parallax(F, xy1, xy2, advice=", or rectify from cameras if the scene is a plane")
+    return _complete(pencil, xy1, xy2, None)
+
+
+def pair_of_cameras(
+    P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
+) -> EpipolarPair:
+    """The pair of two metric cameras (3, 4), P = K [R t] with points in front where P[2] X > 0.
+
+    Matches (N, 2) px are of use for the range of disparities but need not be given. Raises ``ValueError`` as
+    :func:`pair_of_fundamental`; ``StageFailure`` where the centres coincide or the matches do not move but
+    by the noise, and where nothing is in front of both cameras.
+    """
+    sizes = _checked_sizes(size1, size2)
+    none = np.empty((0, 2))
+    xy1, xy2 = _checked_matches(none if xy1 is None else xy1, none if xy2 is None else xy2)
+    P = np.stack([np.asarray(P1, dtype=np.float64), np.asarray(P2, dtype=np.float64)])
+    if P.shape != (2, 3, 4):
+        raise ValueError(f"rectification needs two cameras (3, 4); got {P.shape[1:]}")
+    require_finite("rectification", P)
+    det = np.linalg.det(P[:, :, :3])
+    if not (np.abs(det) > 1e-14 * np.linalg.norm(P[:, :, :3], axis=(1, 2)) ** 3).all():
+        raise ValueError("rectification needs finite cameras; the left part of one is singular")
+    P = P * np.sign(det)[:, None, None]
+    F = _fundamental(P)
+    if len(xy1) >= LEAST_MATCHES:
+        require_parallax(F, xy1, xy2, at_infinity=infinite_homography(P[0], P[1]))
+    return _complete(pencil_of_fundamental(F, sizes)[0], xy1, xy2, P)
+
+
+def _fundamental(P: F64) -> F64:
+    centres = np.stack([camera_centre(camera) for camera in P])
+    places = centres[:, :3] / centres[:, 3:]
+    apart = float(np.linalg.norm(places[1] - places[0]))
+    if not apart > 1e-12 * (1.0 + float(np.abs(places).max())):
+        raise StageFailure(
+            "the cameras have one centre and no epipolar lines",
+            f"their centres are {apart:.1g} apart",
+            "take photographs from different places, or other views",
+        )
+    return fundamental_from_cameras(P[0], P[1])
+
+
+def _checked_sizes(size1: Size, size2: Size) -> tuple[Size, Size]:
+    sizes = []
+    for size in (size1, size2):
+        if len(size) != 2 or not all(float(side).is_integer() and side >= 2 for side in size):
+            raise ValueError(f"a photograph to rectify is at least 2 x 2 px; got {tuple(size)}")
+        sizes.append((int(size[0]), int(size[1])))
+    return sizes[0], sizes[1]
+
+
+def _checked_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
+    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
+    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
+        raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
+    require_finite("rectification, for its matches,", xy1, xy2)
+    return xy1, xy2
+
+
+def _complete(pencil: EpipolarPencil, xy1: F64, xy2: F64, P: F64 | None) -> EpipolarPair:
+    """Orientation, direction of disparities, and what both photographs see."""
+    seen1, seen2, P_z = (xy1, xy2, None) if P is None else _virtual_matches(pencil, P)
+    pencil, share = orient(pencil, seen1, seen2)
+    if share < SAME_HALF:
+        raise StageFailure(
+            "matches lie on opposite halves of their epipolar lines, which no scene shows",
+            f"only {100.0 * share:.0f} % of {len(seen1)} agree on the halves",
+            "the fundamental matrix or the matches are wrong; estimate them anew",
+        )
+    P_z = _quasi_euclidean(pencil, xy1, xy2) if P_z is None else P_z
+    pencil = replace(pencil, turned=not _farther_is_along(pencil, P_z, seen1, seen2))
+    arc = _common_arc(pencil, xy1)
+    regions = (_region(pencil, 0, arc), _region(pencil, 1, arc))
+    return EpipolarPair(pencil, xy1, xy2, arc, regions, P)
+
+
+def _places_from_pixels(pencil: EpipolarPencil, side: int) -> F64:
+    s, c = 1.0 / pencil.units[side], pencil.centres[side]
+    return np.array([[s, 0.0, -s * c[0]], [0.0, s, -s * c[1]], [0.0, 0.0, 1.0]])
+
+
+def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[F64, F64, F64]:
+    """Pixels of points at many depths in front of both cameras, and the cameras in places."""
+    (width, height), centres = pencil.sizes[0], np.stack([camera_centre(camera) for camera in P])
+    C = centres[:, :3] / centres[:, 3:]
+    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 7), np.linspace(0, height - 1, 7)), -1).reshape(
+        -1, 2
+    )
+    rays = np.linalg.solve(P[0, :, :3], np.column_stack([grid, np.ones(len(grid))]).T).T
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    steps = np.linalg.norm(C[1] - C[0]) * np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0, 256.0])
+    X = (C[0] + steps[:, None, None] * rays).reshape(-1, 3)
+    X = X[np.column_stack([X, np.ones(len(X))]) @ P[1, 2] > 0.0]
+    if len(X) == 0:
+        raise StageFailure(
+            "nothing is in front of both cameras", "they look away from each other", "choose another pair"
+        )
+    z = np.stack([_places_from_pixels(pencil, side) @ P[side] for side in (0, 1)])
+    return project(P[0], X), project(P[1], X), z
+
+
+def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
+    """Two cameras (2, 3, 4) in places with the pencil's F: of four candidates the one with most in front."""
+    z = np.stack([pencil.places(0, xy1), pencil.places(1, xy2)])
+    L1, L2 = pencil.lines
+    F = L2 @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ L1.T
+    best, most = np.empty((2, 3, 4)), -1
+    for plane in rotation_planes(F):
+        for scale in (1.0, -1.0):
+            P = np.stack(canonical_cameras(F, plane=plane, scale=scale))
+            X = triangulate_linear(P, z)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                front = int(np.sum((depth(X, P[0]) > 0.0) & (depth(X, P[1]) > 0.0)))
+            if front > most:
+                best, most = P, front
+    return best
+
+
+def _farther_is_along(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> bool:
+    """Whether points that recede along their rays of view 1 move along the half-lines of view 2."""
+    z = np.stack([pencil.places(0, xy1), pencil.places(1, xy2)])
+    X = triangulate_linear(P, z)
+    centre = camera_centre(P[0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        point, C = X[:, :3] / X[:, 3:], centre[:3] / centre[3]
+        moved = project(P[1], C + 1.001 * (point - C)) - project(P[1], point)
+        direction = pencil.half_lines(1, pencil.angles(1, xy2)).direction
+        steps = np.sum(moved * direction, axis=1)
+    return bool(np.nansum(np.sign(steps)) >= 0.0)
+
+
+def _common_arc(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
+    """The interval of phi that both photographs see."""
+    arcs = [_arc(pencil, side) for side in (0, 1)]
+    if arcs[0] is None and arcs[1] is None:
+        return _full_circle(pencil, xy1)
+    if arcs[0] is None or arcs[1] is None:
+        one = arcs[0] if arcs[0] is not None else arcs[1]
+        assert one is not None
+        return one
+    (a, b), (c, d) = arcs[0], arcs[1]
+    turn = 2.0 * np.pi * np.round((0.5 * (a + b) - 0.5 * (c + d)) / (2.0 * np.pi))
+    low, high = max(a, c + turn), min(b, d + turn)
+    if not high > low:
+        raise StageFailure(
+            "the photographs share no epipolar line",
+            "no half-plane through the baseline is seen in both",
+            "the fundamental matrix is wrong, or the views do not overlap; choose another pair",
+        )
+    return low, high
+
+
+def _arc(pencil: EpipolarPencil, side: int) -> tuple[float, float] | None:
+    """The interval of phi that a photograph sees, None for all of the circle (the epipole is inside)."""
+    width, height = pencil.sizes[side]
+    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
+    e = pencil.epipole(side)
+    if abs(e[2]) > 1e-12 * np.hypot(e[0], e[1]):
+        inside = pencil.pixels(side, e[:2] / e[2])
+        if (inside >= 0.0).all() and (inside <= corners[2]).all():
+            return None
+    # Half-lines away from an epipole outside sweep a convex photograph within half a turn.
+    about = float(pencil.angles(side, pencil.centres[side][None])[0])
+    phi = pencil.angles(side, corners, about=about)
+    return float(phi.min()), float(phi.max())
+
+
+def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
+    """All half-planes, beginning in the widest gap between matches."""
+    phi = np.sort(pencil.angles(0, xy1))
+    if len(phi) == 0:
+        return -np.pi, np.pi
+    gaps = np.diff(phi, append=phi[0] + 2.0 * np.pi)
+    k = int(np.argmax(gaps))
+    start = float(phi[k] + 0.5 * gaps[k])
+    return start, start + 2.0 * np.pi
+
+
+def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
+    """Samples of the part of a photograph within the arc: the corners of that polygon, then a grid."""
+    width, height = pencil.sizes[side]
+    x, y = np.linspace(0.0, width - 1.0, SAMPLES), np.linspace(0.0, height - 1.0, SAMPLES)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    middle, half = 0.5 * (arc[0] + arc[1]), 0.5 * (arc[1] - arc[0])
+    # The corners that bound the arc are of it, rounding or not.
+    inside = np.abs(pencil.angles(side, grid, about=middle) - middle) <= half + 1e-9
+    low, high = (
+        pencil.places(side, np.array(corner)) for corner in ((0.0, 0.0), (width - 1.0, height - 1.0))
+    )
+    rim = pencil.half_lines(side, np.array(arc))
+    enter, leave = rim.chord(low, high)
+    met = leave >= enter
+    ends = [pencil.pixels(side, rim.foot + t[:, None] * rim.direction)[met] for t in (enter, leave)]
+    corners = grid[[0, SAMPLES - 1, -SAMPLES, -1]][inside[[0, SAMPLES - 1, -SAMPLES, -1]]]
+    return np.concatenate([*ends, corners, grid[inside]])

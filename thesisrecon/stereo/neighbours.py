@@ -1,0 +1,197 @@
+"""Which other views the depth of a view is worked out with.
+
+Photographs without their lens distortion, at the size that depth is worked out at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import camera_centre, distort, project
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.records import Image, PinholeView, Reconstruction
+from thesisrecon.stereo.resampling import warp_image
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """The points of a metric reconstruction: ``X`` (N, 3) and ``seen`` (V, N), which view observes which."""
+
+    X: F64
+    seen: B8
+
+
+def sparse_points(reconstruction: Reconstruction) -> SparsePoints:
+    """The valid points with their inlying observations; ``ValueError`` where not metric."""
+    if reconstruction.stratum != "metric":
+        raise ValueError(f"depth needs a metric reconstruction; got {reconstruction.stratum}")
+    tracks = reconstruction.tracks
+    seen = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
+    good = reconstruction.inlier
+    seen[tracks.view_index[good], tracks.point_index[good]] = True
+    seen &= reconstruction.registered[:, None]
+    valid = reconstruction.valid
+    return SparsePoints(reconstruction.X[valid, :3] / reconstruction.X[valid, 3:], seen[:, valid])
+
+
+def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> tuple[F64, F64]:
+    """Projections (N, 2), (N, 2) px into both views of the points that one of them observes and both hold.
+
+    More of the scene than what both observe: the range of depths is to be that of all that is seen.
+    """
+    X = points.X[points.seen[a.view] | points.seen[b.view]]
+    keep = np.ones(len(X), dtype=bool)
+    places = []
+    for view in (a, b):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = project(view.P, X)
+        size = np.array([view.seen.shape[1], view.seen.shape[0]])
+        keep &= (X @ view.P[2, :3] + view.P[2, 3] > 0.0) & np.all((xy >= 0.0) & (xy <= size - 1.0), axis=1)
+        places.append(xy)
+    return places[0][keep], places[1][keep]
+
+
+@dataclass(frozen=True)
+class NeighbourChoice:
+    """At most ``most`` neighbours, the one that adds most first.
+
+    A point counts by the angle between its rays: most at ``best_deg``, less for smaller angles, whose depth
+    is less certain (falling off with ``below_deg``), and for larger ones, across which surfaces change their
+    looks (``above_deg``). What earlier neighbours serve counts less, and so does a view whose baseline runs
+    in a direction that has been chosen already: what is hidden from one side is seen from the other. A view
+    with fewer than ``least_points`` common points of at least ``least_deg`` is none.
+    """
+
+    most: int = 4
+    best_deg: float = 10.0
+    below_deg: float = 3.0
+    above_deg: float = 10.0
+    least_deg: float = 1.0
+    least_points: int = 12
+
+    def choose(self, points: SparsePoints, views: dict[int, PinholeView], view: int) -> list[int]:
+        """Numbers of the neighbours of ``view`` among ``views``, perhaps none."""
+        centre = _centre(views[view].P)
+        worth: dict[int, F64] = {}
+        direction: dict[int, F64] = {}
+        for other in sorted(views):
+            weight = self._weights(points, centre, views, view, other)
+            if weight is not None:
+                worth[other] = weight
+                baseline = _centre(views[other].P) - centre
+                direction[other] = baseline / np.linalg.norm(baseline)
+        served = np.zeros(len(points.X))
+        chosen: list[int] = []
+        while worth and len(chosen) < self.most:
+            gains = {
+                j: float(np.sum(np.sqrt(served + w) - np.sqrt(served)))
+                * 0.7 ** sum(direction[j] @ direction[c] > 0.5 for c in chosen)
+                for j, w in worth.items()
+            }
+            best = max(gains, key=lambda j: (gains[j], -j))
+            served += worth.pop(best)
+            chosen.append(best)
+        return chosen
+
+    def _weights(
+        self, points: SparsePoints, centre: F64, views: dict[int, PinholeView], view: int, other: int
+    ) -> F64 | None:
+        """What the points are worth (N,) with ``other``, None where it is no neighbour."""
+        common = points.seen[view] & points.seen[other]
+        if other == view or int(common.sum()) < self.least_points:
+            return None
+        angle = ray_angles_deg(points.X[common], centre, _centre(views[other].P))
+        if int(np.sum(angle >= self.least_deg)) < self.least_points:
+            return None
+        off = angle - self.best_deg
+        width = np.where(off < 0.0, self.below_deg, self.above_deg)
+        weights = np.zeros(len(points.X))
+        weights[common] = np.where(angle >= self.least_deg, np.exp(-0.5 * (off / width) ** 2), 0.0)
+        return weights
+
+
+def ray_angles_deg(X: F64, first: F64, second: F64) -> F64:
+    """Angles (N,) between the rays of points (N, 3) to two centres (3,), in degrees."""
+    a, b = X - first, X - second
+    return np.asarray(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))))
+
+
+def _centre(P: F64) -> F64:
+    centre = camera_centre(P)
+    return np.asarray(centre[:3] / centre[3])
+
+
+def pinhole_view(
+    image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
+) -> PinholeView:
+    """Photograph ``view`` as a camera without distortion would have taken it.
+
+    Parameters
+    ----------
+    image : the photograph at the size that the reconstruction's pixels are of.
+    reconstruction : metric, with ``K`` and the coefficients of the lens in ``radial`` (None: no distortion).
+    max_side : px; a photograph whose longer side is greater is made smaller (cubic, no aliasing).
+
+    Returns
+    -------
+    The frame is the photograph's; pixels the lens does not reach are not ``seen`` and black. ``P`` is in this
+    frame's pixels and scaled such that the third coordinate is the depth.
+
+    Raises
+    ------
+    ValueError
+        Where the reconstruction is not metric, or the photograph is of another size.
+    StageFailure
+        Where the view has no camera.
+    """
+    K = reconstruction.K
+    if reconstruction.stratum != "metric" or K is None:
+        raise ValueError("undistorted views need a metric reconstruction with K")
+    if tuple(reconstruction.sizes[view]) != image.size:
+        raise ValueError(f"view {view} is {tuple(reconstruction.sizes[view])} px; got {image.size}")
+    if max_side < 2:
+        raise ValueError(f"max_side is at least 2 px; got {max_side}")
+    if not reconstruction.registered[view]:
+        raise StageFailure(f"view {view} has no camera", reconstruction.reasons[view], "")
+    shrink = min(1.0, max_side / max(image.size))
+    size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
+    S = _resizing(image.size, size)
+    distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
+    P = S @ _depth_scaled(reconstruction.P[view])
+    if not distortion.any() and size == image.size:
+        return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
+    pixels = warp_image(_Lens(K[view], distortion, S, size), image.rgb.astype(np.float32), 0)
+    seen = np.asarray(np.isfinite(pixels).all(axis=2))
+    rgb = np.clip(np.rint(np.where(seen[:, :, None], pixels, 0.0)), 0.0, 255.0).astype(np.uint8)
+    return PinholeView(view, P, rgb, seen)
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """Where the pixels of a frame of ``size`` without distortion are in the photograph."""
+
+    K: F64
+    distortion: F64
+    S: F64
+    size: tuple[int, int]
+
+    def lookup(self, side: int, rows: range) -> F64:  # noqa: ARG002 - there is but one photograph
+        """(len(rows), width, 2) px in the photograph."""
+        x, y = np.meshgrid(np.arange(float(self.size[0])), np.arange(float(rows.start), float(rows.stop)))
+        rays = homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ np.linalg.inv(self.S @ self.K).T
+        xy = distort(dehomogenize(rays), self.distortion) @ self.K[:2, :2].T + self.K[:2, 2]
+        return np.asarray(xy.reshape(*x.shape, 2))
+
+
+def _resizing(size: tuple[int, int], wanted: tuple[int, int]) -> F64:
+    """(3, 3): (x + 0.5) s - 0.5 along either side."""
+    sx, sy = wanted[0] / size[0], wanted[1] / size[1]
+    return np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
+
+
+def _depth_scaled(P: F64) -> F64:
+    return np.asarray(P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))

@@ -1,0 +1,404 @@
+"""Compiled search for the plane of every pixel that makes the photographs agree."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import F32, F64, I64, U8, U32
+
+UNKNOWN = 4.0
+"""Cost of a pixel without a plane; that of the worst plane is 2."""
+HIDDEN = 0.5
+"""By how much a neighbour's cost may exceed the least one and still count."""
+TEXTURE = 4.0
+"""Variance in squared grey levels that counts as noise: below it a window says nothing."""
+HELD = 0.7
+"""Share of a window's weight that a neighbour has to hold."""
+SAME_PLANE = 0.1
+"""Planes that differ by less, in steps of the search over the whole window, are one."""
+SUMS = {"reassoc", "contract", "arcp", "nsz"}
+"""What the compiler may do to sums over a window, so that samples are done several at once; NaN stays NaN."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pack_squares(gray: F32, squares: U32) -> None:
+    """``squares`` (H, W): the grey levels of a pixel, its right, lower and lower right neighbours as bytes,
+    the lowest first, so that an interpolation takes one load; 0 where one is unknown or outside."""
+    height, width = gray.shape
+    for v in range(height):
+        for u in range(width):
+            squares[v, u] = 0
+            if v + 1 == height or u + 1 == width:
+                continue
+            word, known = np.uint32(0), True
+            for k in range(4):
+                level = gray[v + k // 2, u + k % 2]
+                known &= np.isfinite(level)
+                word |= np.uint32(min(max(level + np.float32(0.5), 1.0), 255.0)) << np.uint32(8 * k)
+            if known:
+                squares[v, u] = word
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit_planes(rho: F32, radius: int, alike: float, gx: F32, gy: F32) -> None:
+    """Gradient (H, W) of the inverse depth about every known pixel, from the known ones within ``radius``
+    that differ from it by at most the share ``alike``; 0 where they are too few, NaN where unknown."""
+    height, width = rho.shape
+    for v in range(height):
+        for u in range(width):
+            gx[v, u], gy[v, u] = np.nan, np.nan
+            here = np.float64(rho[v, u])
+            if not np.isfinite(here):
+                continue
+            sxx, sxy, syy, sxd, syd, sx, sy, sd, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
+            for b in range(max(v - radius, 0), min(v + radius + 1, height)):
+                for a in range(max(u - radius, 0), min(u + radius + 1, width)):
+                    d = np.float64(rho[b, a]) - here
+                    if abs(d) <= alike * here:
+                        x, y = a - u, b - v
+                        sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
+                        sxd, syd = sxd + x * d, syd + y * d
+                        sx, sy, sd, n = sx + x, sy + y, sd + d, n + 1
+            gx[v, u], gy[v, u] = 0.0, 0.0
+            if n >= 6:
+                sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+                sxd, syd = sxd - sx * sd / n, syd - sy * sd / n
+                det = sxx * syy - sxy * sxy
+                if det > 1e-3 * sxx * syy:
+                    gx[v, u] = (syy * sxd - sxy * syd) / det
+                    gy[v, u] = (sxx * syd - sxy * sxd) / det
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def window_samples(gray: F32, u: int, v: int, offsets: F32, likeness: F32, samples: F32) -> float:
+    """Fill ``samples`` (2, S) of the window about a pixel: weights that sum to 1, the more alike the centre
+    the more, and weighted grey levels less their mean; returns the weighted variance of the levels.
+
+    What is outside or has no pixel weighs 0. ``offsets`` (2, S) whole px, among them (0, 0), ``likeness``
+    (256,) the weight by grey difference.
+    """
+    height, width = gray.shape
+    centre = gray[v, u]
+    total, mean, square = 0.0, 0.0, 0.0
+    for k in range(offsets.shape[1]):
+        a, b = u + int(offsets[0, k]), v + int(offsets[1, k])
+        samples[0, k], samples[1, k] = 0.0, 0.0
+        if 0 <= a < width and 0 <= b < height:
+            level = gray[b, a] - centre
+            if abs(level) < 256.0:
+                weight = likeness[int(abs(level))]
+                samples[0, k], samples[1, k] = weight, weight * level
+                total, mean, square = total + weight, mean + weight * level, square + weight * level * level
+    mean /= total
+    for k in range(offsets.shape[1]):
+        samples[1, k] = (samples[1, k] - samples[0, k] * mean) / total
+        samples[0, k] /= total
+    return square / total - mean * mean
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _carry(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, way: F64) -> bool:
+    """Fill ``way`` (8,): the step (dx, dy) from pixel ``at`` is carried by the plane to view k's
+    (way[0] + dx way[1] + dy way[2], way[3] + dx way[4] + dy way[5]) / (1 + dx way[6] + dy way[7]).
+
+    False where that is behind the camera. (x, y, 1) of inverse depth rho is at H (x, y, 1) + rho e.
+    """
+    u, v = at
+    z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2] + plane[0] * e[k, 2]
+    if not z > 0.0:
+        return False
+    s = 1.0 / z
+    for row in range(2):
+        way[3 * row] = s * (H[k, row, 0] * u + H[k, row, 1] * v + H[k, row, 2] + plane[0] * e[k, row])
+        way[3 * row + 1] = s * (H[k, row, 0] + plane[1] * e[k, row])
+        way[3 * row + 2] = s * (H[k, row, 1] + plane[2] * e[k, row])
+    way[6], way[7] = s * (H[k, 2, 0] + plane[1] * e[k, 2]), s * (H[k, 2, 1] + plane[2] * e[k, 2])
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS, inline="always", forceinline=True)
+def _cost_inside(
+    squares: U32, start: int, width: int, way: F64, offsets: F32, samples: F32, variance: float
+) -> float:
+    """1 - weighted NCC of a window with its image in another view that holds all of it, -1 where a pixel of
+    it is unknown. That view's ``squares`` begin at ``start``."""
+    x0, x1, x2 = np.float32(way[0]), np.float32(way[1]), np.float32(way[2])
+    y0, y1, y2 = np.float32(way[3]), np.float32(way[4]), np.float32(way[5])
+    z1, z2, one, byte = np.float32(way[6]), np.float32(way[7]), np.float32(1.0), np.uint32(255)
+    sb, sbb, sab, unknown = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.int32(0)
+    for k in range(offsets.shape[1]):
+        dx, dy = offsets[0, k], offsets[1, k]
+        scale = one / (one + dx * z1 + dy * z2)
+        x, y = (x0 + dx * x1 + dy * x2) * scale, (y0 + dx * y1 + dy * y2) * scale
+        i, j = np.int32(x), np.int32(y)
+        fx, fy = x - np.float32(i), y - np.float32(j)
+        # One unsigned place (no wrap-around to test) and one load: several samples are done at once.
+        square = squares[np.uint32(np.int32(start) + j * np.int32(width) + i)]
+        if square == 0:
+            unknown += np.int32(1)
+        a = np.float32(np.int32(square & byte))
+        b = np.float32(np.int32((square >> np.uint32(8)) & byte))
+        c = np.float32(np.int32((square >> np.uint32(16)) & byte))
+        d = np.float32(np.int32(square >> np.uint32(24)))
+        top, bottom = a + fx * (b - a), c + fx * (d - c)
+        level = top + fy * (bottom - top)
+        sb += samples[0, k] * level
+        sbb += samples[0, k] * level * level
+        sab += samples[1, k] * level
+    if unknown > 0:
+        return -1.0
+    cost: float = _cost_of(variance, float(sbb - sb * sb), float(sab))
+    return cost
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _cost_of(variance: float, other_variance: float, covariance: float) -> float:
+    spread = (max(variance, 0.0) + TEXTURE) * (max(other_variance, 0.0) + TEXTURE)
+    return float(max(1.0 - covariance / np.sqrt(spread), 0.0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cost_at_border(
+    squares: U32, start: int, size: tuple[int, int], way: F64, offsets: F32, samples: F32
+) -> float:
+    """The same of the part of a window that the other view holds, -1 where that is too little."""
+    width, height = size
+    held, sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(offsets.shape[1]):
+        dx, dy, w = offsets[0, k], offsets[1, k], np.float64(samples[0, k])
+        z = 1.0 + dx * way[6] + dy * way[7]
+        if not z > 0.0:
+            return -1.0
+        x, y = (way[0] + dx * way[1] + dy * way[2]) / z, (way[3] + dx * way[4] + dy * way[5]) / z
+        if not (w > 0.0 and 0.0 <= x < width - 1 and 0.0 <= y < height - 1):
+            continue
+        i, j = int(x), int(y)
+        square = np.int64(squares[start + j * width + i])
+        if square == 0:
+            continue
+        fx, fy = x - i, y - j
+        top = (square & 255) + fx * (((square >> 8) & 255) - (square & 255))
+        bottom = ((square >> 16) & 255) + fx * ((square >> 24) - ((square >> 16) & 255))
+        a, b = samples[1, k] / w, top + fy * (bottom - top)
+        held += w
+        sa, sb = sa + w * a, sb + w * b
+        saa, sbb, sab = saa + w * a * a, sbb + w * b * b, sab + w * a * b
+    if held < HELD:
+        return -1.0
+    sa, sb = sa / held, sb / held
+    return _cost_of(saa / held - sa * sa, sbb / held - sb * sb, sab / held - sa * sb)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
+def view_cost(
+    squares: U32, layout: I64, k: int, way: F64, offsets: F32, samples: F32, variance: float
+) -> float:
+    """1 - weighted NCC of a window with its image in view ``k``, -1 where that is not held.
+
+    ``squares`` of all views (:func:`pack_squares`) row by row; ``layout`` (K, 3) where a view's begin, its
+    width and height; ``way`` (8,) see :func:`_carry`; ``offsets`` (2, S) px, ``samples`` and ``variance`` see
+    :func:`window_samples`.
+    """
+    start, width, height = layout[k, 0], layout[k, 1], layout[k, 2]
+    # Samples begin in a corner of the window and end in the opposite one.
+    reach = -offsets[0, 0]
+    sx, sy = reach * (abs(way[1]) + abs(way[2])), reach * (abs(way[4]) + abs(way[5]))
+    sz = 1.0 - reach * (abs(way[6]) + abs(way[7]))
+    inside = sz > 0.5 and sx <= way[0] and sy <= way[3]
+    if inside and way[0] + sx < sz * (width - 1.01) and way[3] + sy < sz * (height - 1.01):
+        cost: float = _cost_inside(squares, start, width, way, offsets, samples, variance)
+        if cost >= 0.0:
+            return cost
+    return _cost_at_border(squares, start, (width, height), way, offsets, samples)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
+def plane_cost(
+    squares: U32,
+    layout: I64,
+    H: F64,
+    e: F64,
+    at: tuple[int, int],
+    plane: F64,
+    offsets: F32,
+    samples: F32,
+    variance: float,
+    way: F64,
+) -> float:
+    """Mean of the least two costs, the second at most ``HIDDEN`` above the first: a neighbour from which the
+    pixel is hidden has no say. ``way`` (8,) is scratch."""
+    if not plane[0] > 0.0:
+        return UNKNOWN
+    least, second = UNKNOWN, UNKNOWN
+    for k in range(layout.shape[0]):
+        if not _carry(H, e, k, at, plane, way):
+            continue
+        cost = view_cost(squares, layout, k, way, offsets, samples, variance)
+        if cost >= 0.0:
+            if cost < least:
+                least, second = cost, least
+            elif cost < second:
+                second = cost
+    # A single neighbour, or one beside those that are hidden: the worse for it, whatever the others show.
+    return least + 0.5 * min(second - least, HIDDEN) if least < UNKNOWN else UNKNOWN
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def motion_px(H: F64, e: F64, k: int, at: tuple[int, int], rho: float) -> float:
+    """Pixels that the place in view ``k`` moves per unit of inverse depth."""
+    u, v = at
+    z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2] + rho * e[k, 2]
+    x = (H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2] + rho * e[k, 0]) / z
+    y = (H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2] + rho * e[k, 1]) / z
+    dx, dy = (e[k, 0] - x * e[k, 2]) / z, (e[k, 1] - y * e[k, 2]) / z
+    return float(np.sqrt(dx * dx + dy * dy))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _step(H: F64, e: F64, at: tuple[int, int], rho: float, px: float) -> float:
+    """The step of inverse depth that moves the place in any view by at most ``px``."""
+    most = 0.0
+    for k in range(H.shape[0]):
+        most = max(most, motion_px(H, e, k, at, rho))
+    return px / most
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _continued(planes: F32, a: int, b: int, u: int, v: int, trial: F64) -> bool:
+    """Fill ``trial`` with the plane of pixel (a, b) seen from (u, v); False where there is none."""
+    if not (0 <= a < planes.shape[1] and 0 <= b < planes.shape[0]) or not np.isfinite(planes[b, a, 0]):
+        return False
+    trial[0] = planes[b, a, 0] + (u - a) * planes[b, a, 1] + (v - b) * planes[b, a, 2]
+    trial[1], trial[2] = planes[b, a, 1], planes[b, a, 2]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS)
+def sweep_planes(
+    gray: F32,
+    squares: U32,
+    layout: I64,
+    H: F64,
+    e: F64,
+    offsets: F32,
+    likeness: F32,
+    step_px: float,
+    settled: float,
+    backward: bool,
+    planes: F32,
+    cost: F32,
+) -> None:
+    """One pass over ``planes`` (H, W, 3), inverse depth and its gradient, and their ``cost``, in place.
+
+    Every pixel tries the planes of the two neighbours that the pass has been at, continued to it unless they
+    are its own, and its own moved by ``step_px`` in the image (as a whole, and tilted by as much at the rim
+    of the window), unless its cost is at most ``settled``.
+    ``offsets`` (2, S) px are the samples of the window, ``likeness`` (256,) their weight by grey difference;
+    ``squares`` and ``layout`` those of the neighbours, see :func:`view_cost`.
+    """
+    height, width = gray.shape
+    samples, way = np.empty((2, offsets.shape[1]), np.float32), np.empty(8)
+    plane, trial = np.empty(3), np.empty(3)
+    reach = -float(offsets[0, 0])
+    back = -1 if backward else 1
+    for row in range(height):
+        v = height - 1 - row if backward else row
+        for column in range(width):
+            u = width - 1 - column if backward else column
+            if not np.isfinite(gray[v, u]) or cost[v, u] <= settled:
+                continue
+            variance = window_samples(gray, u, v, offsets, likeness, samples)
+            for d in range(3):
+                plane[d] = planes[v, u, d]
+            least = float(cost[v, u])
+            move = _step(H, e, (u, v), plane[0], step_px) if least < UNKNOWN else 0.0
+            for k in range(8):
+                if k < 2:
+                    if not _continued(planes, u - back * (1 - k), v - back * k, u, v, trial):
+                        continue
+                    tilt = abs(trial[1] - plane[1]) + abs(trial[2] - plane[2])
+                    if abs(trial[0] - plane[0]) + reach * tilt <= SAME_PLANE * move:
+                        continue
+                else:
+                    if least == UNKNOWN:
+                        break
+                    if k == 2:
+                        move = _step(H, e, (u, v), plane[0], step_px)
+                    by = move if k % 2 == 0 else -move
+                    for d in range(3):
+                        trial[d] = plane[d]
+                    trial[k // 2 - 1] += by if k < 4 else by / reach
+                tried = plane_cost(squares, layout, H, e, (u, v), trial, offsets, samples, variance, way)
+                if tried < least:
+                    least = tried
+                    for d in range(3):
+                        plane[d] = trial[d]
+            for d in range(3):
+                planes[v, u, d] = plane[d]
+            cost[v, u] = least
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS)
+def rate_planes(
+    gray: F32,
+    squares: U32,
+    layout: I64,
+    H: F64,
+    e: F64,
+    offsets: F32,
+    likeness: F32,
+    planes: F32,
+    accepted: float,
+    least: F32,
+    support: U8,
+    slope: F32,
+) -> None:
+    """``least`` cost (H, W) of planes in a neighbour, in how many it is at most ``accepted`` (``support``),
+    and ``slope``, the root of the sum of the squared pixels per unit of inverse depth over these."""
+    height, width = gray.shape
+    samples, way, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
+    for v in range(height):
+        for u in range(width):
+            least[v, u], support[v, u], slope[v, u] = UNKNOWN, 0, 0.0
+            if not (np.isfinite(gray[v, u]) and planes[v, u, 0] > 0.0):
+                continue
+            variance = window_samples(gray, u, v, offsets, likeness, samples)
+            for d in range(3):
+                plane[d] = planes[v, u, d]
+            total = 0.0
+            for k in range(layout.shape[0]):
+                if not _carry(H, e, k, (u, v), plane, way):
+                    continue
+                one = view_cost(squares, layout, k, way, offsets, samples, variance)
+                if 0.0 <= one < least[v, u]:
+                    least[v, u] = one
+                if 0.0 <= one <= accepted:
+                    support[v, u] += 1
+                    total += motion_px(H, e, k, (u, v), plane[0]) ** 2
+            slope[v, u] = np.sqrt(total)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS)
+def begin_planes(
+    gray: F32,
+    squares: U32,
+    layout: I64,
+    H: F64,
+    e: F64,
+    offsets: F32,
+    likeness: F32,
+    planes: F32,
+    cost: F32,
+) -> None:
+    """``cost`` (H, W) of the planes that a search begins with, ``UNKNOWN`` where there is none."""
+    height, width = gray.shape
+    samples, way, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
+    for v in range(height):
+        for u in range(width):
+            cost[v, u] = UNKNOWN
+            if np.isfinite(gray[v, u]) and planes[v, u, 0] > 0.0:
+                variance = window_samples(gray, u, v, offsets, likeness, samples)
+                for d in range(3):
+                    plane[d] = planes[v, u, d]
+                cost[v, u] = plane_cost(squares, layout, H, e, (u, v), plane, offsets, samples, variance, way)

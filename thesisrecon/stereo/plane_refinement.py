@@ -1,0 +1,191 @@
+"""Slanted windows: every pixel's inverse depth and its gradient made to agree with the neighbours' pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F32, F64, I64, U8, U32
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.records import PinholeView
+from thesisrecon.stereo.depth_fusion import InverseDepth
+from thesisrecon.stereo.depth_kernels import continue_surface
+from thesisrecon.stereo.plane_kernels import (
+    UNKNOWN,
+    begin_planes,
+    fit_planes,
+    pack_squares,
+    rate_planes,
+    sweep_planes,
+)
+
+ALIKE = 0.03
+"""Share of the inverse depth up to which pixels near each other may be one surface."""
+
+
+@dataclass(frozen=True)
+class PlaneRefinement:
+    """Planes are handed from pixel to pixel where they explain the photographs better, and tuned.
+
+    Rectified matching compares upright windows and takes steps between neighbouring disparities for unlikely:
+    ground that is seen at a slant is lost to it. A plane of space is linear in the inverse depth of a view,
+    so a pixel keeps that and its gradient; its window is carried to the neighbours by the homography of the
+    plane and compared by normalised correlation, samples unlike the centre counting less (Bleyer, Rhemann
+    and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al., ECCV 2016). Nothing is drawn at random:
+    what the matching found is the beginning, and ``sweeps`` passes, there and back, spread and tune it with
+    steps that halve from ``first_step_px``; planes of cost (1 - correlation) up to ``settled`` are left.
+
+    A pixel is kept with two neighbours of cost up to ``accepted``, with one of up to half of it, or if two of
+    the matches that it began with agree. The window is ``radius`` px wide to either side, sampled every
+    ``spacing``; a grey difference of ``likeness`` levels weighs 1/e. ``sigma_px`` is the deviation of a place
+    in the neighbours; the plane counts for what the matching found too within ``gate`` deviations.
+    """
+
+    sweeps: int = 4
+    first_step_px: float = 0.5
+    radius: int = 4
+    spacing: int = 2
+    likeness: float = 15.0
+    accepted: float = 0.4
+    doubtful: float = 0.6
+    settled: float = 0.1
+    gate: float = 3.0
+    sigma_px: float = 0.4
+
+    def refine(
+        self, reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth
+    ) -> InverseDepth:
+        """The inverse depths of ``reference`` with those of more pixels, from its neighbours ``others``."""
+        if not others or not np.isfinite(found.value).any():
+            return found
+        setting = _Setting.of(reference, others, self._offsets(), self.likeness)
+        planes = self._planes(found.value)
+        cost = setting.begin(planes)
+        self._sweep(setting, planes, cost, self.sweeps)
+        return self._kept(found, setting, planes)
+
+    def search(
+        self,
+        reference: PinholeView,
+        others: Sequence[PinholeView],
+        rho: F32,
+        *,
+        wanted: B8,
+        sweeps: int,
+    ) -> tuple[F32, F32, U8]:
+        """Inverse depth, deviation and support (H, W) of the pixels that are ``wanted``, begun with ``rho``
+        (H, W); NaN where no plane is accepted. Planes of other pixels stay as they are."""
+        setting = _Setting.of(reference, others, self._offsets(), self.likeness)
+        planes = self._planes(rho)
+        begun = np.where(wanted[..., None], planes, np.float32(np.nan))
+        # Nothing is tried where a plane costs nothing.
+        cost = np.where(wanted, setting.begin(begun), np.float32(0.0))
+        self._sweep(setting, planes, cost, sweeps)
+        planes[~wanted] = np.nan
+        least, support, slope = setting.rate(planes, self.accepted)
+        seen = self._seen(least, support)
+        with np.errstate(divide="ignore"):
+            std = (self.sigma_px / slope).astype(np.float32)
+        unknown = np.float32(np.nan)
+        return np.where(seen, planes[..., 0], unknown), np.where(seen, std, unknown), support * seen
+
+    def _planes(self, rho: F32) -> F32:
+        """(H, W, 3) inverse depths and their gradients."""
+        gradients = np.empty((2, *rho.shape), dtype=np.float32)
+        fit_planes(rho, self.radius, ALIKE, gradients[0], gradients[1])
+        return np.stack([rho, gradients[0], gradients[1]], axis=-1)
+
+    def _sweep(self, setting: _Setting, planes: F32, cost: F32, sweeps: int) -> None:
+        for k in range(sweeps):
+            step = self.first_step_px * 0.5**k
+            views, window = setting.views, (setting.offsets, setting.likeness)
+            sweep_planes(*views, *window, step, self.settled, k % 2 == 1, planes, cost)
+
+    def _seen(self, least: F32, support: U8) -> B8:
+        """(H, W) planes that two neighbours accept, or one without doubt."""
+        return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * self.accepted)))
+
+    def _kept(self, found: InverseDepth, setting: _Setting, planes: F32) -> InverseDepth:
+        rho = planes[..., 0]
+        least, support, slope = setting.rate(planes, self.accepted)
+        seen = self._seen(least, support)
+        joining, std = self._joining(setting, planes, seen, least)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            std = np.where(joining, std, self.sigma_px / slope).astype(np.float32)
+            near = np.abs(rho - found.value) <= self.gate * np.hypot(found.std, std)
+        seen |= joining
+        matched = ~seen & (found.views >= 2)
+        # Where windows say nothing (no texture) the matching has the word.
+        with np.errstate(invalid="ignore"):
+            both = seen & near & (found.views >= 2)
+        value = np.where(seen, rho, np.where(matched, found.value, np.nan)).astype(np.float32)
+        std = np.where(seen, std, np.where(matched, found.std, np.nan)).astype(np.float32)
+        views = np.where(both, np.maximum(support, found.views), np.where(seen, support, found.views))
+        views = np.where(joining, np.maximum(views, 1), views)
+        return InverseDepth(value, std, np.where(np.isfinite(value), views, 0).astype(np.uint8), found.rivals)
+
+    def _joining(self, setting: _Setting, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
+        """(H, W) pixels of doubtful planes that continue the surface of those that are seen, and the
+        deviation of their inverse depths."""
+        doubtful = ~seen & (least <= self.doubtful)
+        slope = setting.rate(np.where(doubtful[..., None], planes, np.float32(np.nan)), self.doubtful)[2]
+        with np.errstate(divide="ignore"):
+            std = (self.sigma_px / slope).astype(np.float32)
+        joins = np.zeros(seen.shape, dtype=np.uint8)
+        rho = np.where(seen | doubtful, planes[..., 0], np.float32(np.nan))
+        continue_surface(rho, std, seen.astype(np.uint8), self.radius + 1, ALIKE, self.gate, joins)
+        return joins > 0, std
+
+    def _offsets(self) -> F32:
+        """(2, S) samples of the window, the centre among them."""
+        one = self.spacing * np.arange(-(self.radius // self.spacing), self.radius // self.spacing + 1)
+        return np.stack(np.meshgrid(one, one)).reshape(2, -1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """The grey levels of a view and its neighbours (row by row), and how pixels go from one to the others."""
+
+    views: tuple[F32, U32, I64, F64, F64]
+    offsets: F32
+    likeness: F32
+
+    @classmethod
+    def of(
+        cls, reference: PinholeView, others: Sequence[PinholeView], offsets: F32, likeness: float
+    ) -> _Setting:
+        gray = [_gray(view) for view in (reference, *others)]
+        layout = np.array([(0, *one.shape[::-1]) for one in gray[1:]], dtype=np.int64)
+        layout[1:, 0] = np.cumsum([one.size for one in gray[1:]])[:-1]
+        squares = [np.empty(one.shape, dtype=np.uint32) for one in gray[1:]]
+        for one, words in zip(gray[1:], squares, strict=True):
+            pack_squares(one, words)
+        M = np.linalg.inv(reference.P[:, :3])
+        centre = camera_centre(reference.P)
+        H = np.stack([other.P[:, :3] @ M for other in others])
+        e = np.stack([other.P @ (centre / centre[3]) for other in others])
+        table = np.exp(-np.arange(256.0) / likeness).astype(np.float32)
+        packed = np.concatenate([words.ravel() for words in squares])
+        return cls((gray[0], packed, layout, H, e), offsets, table)
+
+    def begin(self, planes: F32) -> F32:
+        """Cost (H, W) of planes (H, W, 3)."""
+        cost = np.empty(planes.shape[:2], dtype=np.float32)
+        begin_planes(*self.views, self.offsets, self.likeness, planes, cost)
+        return cost
+
+    def rate(self, planes: F32, accepted: float) -> tuple[F32, U8, F32]:
+        """Least cost, support and slope (H, W) of planes (H, W, 3)."""
+        shape = planes.shape[:2]
+        least, slope = np.full(shape, UNKNOWN, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+        support = np.zeros(shape, dtype=np.uint8)
+        rate_planes(*self.views, self.offsets, self.likeness, planes, accepted, least, support, slope)
+        return least, support, slope
+
+
+def _gray(view: PinholeView) -> F32:
+    """(H, W) grey levels, NaN where the photograph has no pixel."""
+    gray = view.rgb.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    return np.where(view.seen, gray, np.float32(np.nan)).astype(np.float32)

@@ -1,0 +1,163 @@
+"""Compiled resampling of an image at given places; its NumPy twin stands in the tests.
+
+Resampling a photograph into a rectified frame, strip by strip.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import F32, F64
+from thesisrecon.geometry.raster import cubic_weights
+
+MOST_TAPS = 24
+"""Taps along an axis: images that shrink more than sixfold are undersampled from there on."""
+NOT_SHRUNK = 1.1
+"""Distances of neighbours up to this are taken for 1: what aliases is next to nothing."""
+
+
+@njit(cache=True, nogil=True)
+def _cubic(x: float) -> float:
+    """Keys' cubic convolution kernel, a = -1/2: third-order accurate, 0 beyond 2."""
+    x = abs(x)
+    if x < 1.0:
+        return (1.5 * x - 2.5) * x * x + 1.0
+    if x < 2.0:
+        return ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0
+    return 0.0
+
+
+@njit(cache=True, nogil=True)
+def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
+    """Weights of the pixels around ``at``, the kernel ``spread`` times as wide; the first, how many."""
+    reach = min(2.0 * spread, 0.5 * MOST_TAPS - 1.0)
+    first = int(np.ceil(at - reach))
+    count = int(np.floor(at + reach)) - first + 1
+    total = 0.0
+    for k in range(count):
+        weights[k] = _cubic((first + k - at) / spread)
+        total += weights[k]
+    for k in range(count):
+        weights[k] /= total
+    return first, count
+
+
+@njit(cache=True, nogil=True)
+def _spread(xy: F64, i: int, j: int, axis: int) -> float:
+    """How far neighbours of ``xy[i, j]`` are apart along an axis of the image, at least 1."""
+    i1 = i + 1 if i + 1 < xy.shape[0] else i - 1
+    j1 = j + 1 if j + 1 < xy.shape[1] else j - 1
+    across = xy[i, j1, axis] - xy[i, j, axis] if j1 >= 0 else 0.0
+    down = xy[i1, j, axis] - xy[i, j, axis] if i1 >= 0 else 0.0
+    squared = across * across + down * down
+    # The comparison is false for NaN, too: at the rim of the lookup.
+    return np.sqrt(squared) if squared > NOT_SHRUNK * NOT_SHRUNK else 1.0
+
+
+@njit(cache=True, nogil=True)
+def sample_image(image: F32, xy: F64, out: F32) -> None:
+    """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C); NaN outside.
+
+    ``xy`` holds the places of neighbouring pixels, and may have a row more than ``out``: where neighbours lie
+    farther apart than a pixel the kernel is widened along each axis of the image by as much, so that nothing
+    finer than what ``out`` can show passes. NaN where xy is NaN, beyond the centres of the border pixels, or
+    where one of the four pixels around is NaN; others that are NaN are left out.
+    """
+    height, width, channels = image.shape
+    wx, wy = np.empty(MOST_TAPS), np.empty(MOST_TAPS)
+    total = np.empty(channels)
+    for i in range(out.shape[0]):
+        for j in range(xy.shape[1]):
+            out[i, j] = np.nan
+            x, y = xy[i, j, 0], xy[i, j, 1]
+            # Rounding of the lookup must not cut off the border pixels.
+            if not (x > -1e-6 and y > -1e-6 and x < width - 1 + 1e-6 and y < height - 1 + 1e-6):
+                continue
+            x0, y0 = min(max(int(x), 0), width - 1), min(max(int(y), 0), height - 1)
+            x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
+            if np.isnan(image[y0, x0, 0] + image[y0, x1, 0] + image[y1, x0, 0] + image[y1, x1, 0]):
+                continue
+            spread_x, spread_y = _spread(xy, i, j, 0), _spread(xy, i, j, 1)
+            inner = x0 >= 1 and x0 + 2 < width and y0 >= 1 and y0 + 2 < height
+            if inner and spread_x == 1.0 and spread_y == 1.0:
+                cubic_weights(x - x0, wx)
+                cubic_weights(y - y0, wy)
+                for c in range(channels):
+                    value = 0.0
+                    for k in range(4):
+                        row = image[y0 - 1 + k]
+                        value += wy[k] * (
+                            wx[0] * row[x0 - 1, c]
+                            + wx[1] * row[x0, c]
+                            + wx[2] * row[x0 + 1, c]
+                            + wx[3] * row[x0 + 2, c]
+                        )
+                    total[c] = value
+                if not np.isnan(total[0]):
+                    for c in range(channels):
+                        out[i, j, c] = total[c]
+                    continue
+            left, n_x = _taps(x, spread_x, wx)
+            top, n_y = _taps(y, spread_y, wy)
+            weight = 0.0
+            total[:] = 0.0
+            for k in range(n_y):
+                v = min(max(top + k, 0), height - 1)
+                for l in range(n_x):
+                    u = min(max(left + l, 0), width - 1)
+                    if np.isnan(image[v, u, 0]):
+                        continue
+                    w = wy[k] * wx[l]
+                    weight += w
+                    for c in range(channels):
+                        total[c] += w * image[v, u, c]
+            for c in range(channels):
+                out[i, j, c] = total[c] / weight
+
+
+STRIP_ROWS = 64
+"""Rows whose lookup is held in memory at a time."""
+
+
+class Lookup(Protocol):
+    """Where the pixels of a rectified frame come from."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the frame, common to both sides."""
+
+    def lookup(self, side: int, rows: range) -> F64:
+        """(len(rows), width, 2) px in the photograph of ``side``."""
+
+
+def warp_image(source: Lookup, image: F32, side: int) -> F32:
+    """``image`` (H, W) or (H, W, C) in the frame of ``source``: float32, NaN outside.
+
+    Cubic convolution; where the photograph shrinks the kernel is widened by as much. Beside the image itself
+    the memory is that of ``STRIP_ROWS`` rows. ``ValueError`` for images of another shape or side.
+    """
+    if image.ndim not in (2, 3) or image.size == 0:
+        raise ValueError(f"an image to warp is (H, W) or (H, W, C); got shape {image.shape}")
+    pixels = np.ascontiguousarray(image, dtype=np.float32)
+    pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    width, height = source.size
+    out = np.empty((height, width, pixels.shape[2]), np.float32)
+    for first in range(0, height, STRIP_ROWS):
+        last = min(first + STRIP_ROWS, height)
+        # One row more where there is one: distances of neighbours tell how the photograph shrinks.
+        start = first - 1 if last == height and last - first == 1 and first > 0 else first
+        places = source.lookup(side, range(start, min(last + 1, height)))
+        strip = out[start:last] if start == first else np.empty((last - start, *out.shape[1:]), np.float32)
+        sample_image(pixels, places, strip)
+        out[first:last] = strip[first - start :]
+    return out[:, :, 0] if image.ndim == 2 else out
+
+
+def require_side(side: int) -> int:
+    """0 or 1, else ``ValueError``."""
+    if side not in (0, 1):
+        raise ValueError(f"a side of a rectified pair is 0 or 1; got {side}")
+    return side

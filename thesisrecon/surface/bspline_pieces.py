@@ -1,0 +1,305 @@
+"""Compiled parts of the fit of B-splines: pieces of surface, their coefficients, sums and values.
+
+A piece is what hangs together of the pixels of one cell between knots. Cells are numbered row by row, pieces
+cell by cell. Node (a, b) is the a-th row and b-th column of coefficients; cell (p, q) has the nodes (p + i,
+q + j), i, j = 0 .. 3.
+
+Pixels that hang together: what of a depth map is fitted by which coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy
+from numba import njit
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.numerics.noise import MAD_FACTOR
+from thesisrecon.records import DepthMap
+from thesisrecon.surface.linear import one_surface, steepest_slope
+
+
+@njit(cache=True, nogil=True)
+def root_of(parent: I64, k: int) -> int:
+    """The root of k in a forest, whose paths it halves."""
+    while parent[k] != k:
+        parent[k] = parent[parent[k]]
+        k = parent[k]
+    return k
+
+
+@njit(cache=True, nogil=True)
+def join(parent: I64, a: int, b: int) -> None:
+    """Make one tree of those of a and b, under the smaller root."""
+    a, b = root_of(parent, a), root_of(parent, b)
+    if a < b:
+        parent[b] = a
+    elif b < a:
+        parent[a] = b
+
+
+@njit(cache=True, nogil=True)
+def label_pieces(known: B8, right: B8, down: B8, cell: int, piece: I64, first: I64) -> int:
+    """Number the pieces: ``piece`` (H, W), -1 where not ``known``; ``first`` (cells + 1,) that of each cell.
+
+    ``right`` (H, W - 1) and ``down`` (H - 1, W) say which neighbours are of one surface. Returns how many.
+    """
+    height, width = known.shape
+    rows, columns = (height + cell - 1) // cell, (width + cell - 1) // cell
+    parent = np.empty(cell * cell, dtype=np.int64)
+    number = np.empty(cell * cell, dtype=np.int64)
+    count = 0
+    for p in range(rows):
+        for q in range(columns):
+            first[p * columns + q] = count
+            y1, x1 = min((p + 1) * cell, height), min((q + 1) * cell, width)
+            for k in range(cell * cell):
+                parent[k] = k
+                number[k] = -1
+            for y in range(p * cell, y1):
+                for x in range(q * cell, x1):
+                    k = (y - p * cell) * cell + x - q * cell
+                    if x + 1 < x1 and right[y, x]:
+                        join(parent, k, k + 1)
+                    if y + 1 < y1 and down[y, x]:
+                        join(parent, k, k + cell)
+            for y in range(p * cell, y1):
+                for x in range(q * cell, x1):
+                    piece[y, x] = -1
+                    if not known[y, x]:
+                        continue
+                    root = root_of(parent, (y - p * cell) * cell + x - q * cell)
+                    if number[root] < 0:
+                        number[root] = count
+                        count += 1
+                    piece[y, x] = number[root]
+    first[rows * columns] = count
+    return count
+
+
+@njit(cache=True, nogil=True)
+def number_coefficients(first: I64, columns: int, start: I64, linked: I64, coefficient: I64) -> int:
+    """A coefficient for every node and every set of pieces that hang together within its sixteen cells.
+
+    ``linked[start[k]:start[k + 1]]`` are the pieces that go on from piece k in other cells. ``coefficient``
+    (pieces, 16) gets the numbers at node (i, j) of its cell in place 4 i + j. Returns how many there are.
+    """
+    rows = (len(first) - 1) // columns
+    parent = np.arange(len(coefficient))
+    own = np.full(len(coefficient), -1, dtype=np.int64)
+    count = 0
+    for a in range(rows + 3):
+        for b in range(columns + 3):
+            p0, p1 = max(a - 3, 0), min(a, rows - 1)
+            q0, q1 = max(b - 3, 0), min(b, columns - 1)
+            for p in range(p0, p1 + 1):
+                begin, end = first[p * columns + q0], first[p * columns + q1 + 1]
+                for k in range(begin, end):
+                    parent[k] = k
+                    own[k] = -1
+            for p in range(p0, p1 + 1):
+                for k in range(first[p * columns + q0], first[p * columns + q1 + 1]):
+                    for n in range(start[k], start[k + 1]):
+                        other = linked[n]
+                        if other > k and _within(first, columns, other, p0, p1, q0, q1):
+                            join(parent, k, other)
+            for p in range(p0, p1 + 1):
+                for q in range(q0, q1 + 1):
+                    for k in range(first[p * columns + q], first[p * columns + q + 1]):
+                        root = root_of(parent, k)
+                        if own[root] < 0:
+                            own[root] = count
+                            count += 1
+                        coefficient[k, 4 * (a - p) + b - q] = own[root]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _within(first: I64, columns: int, k: int, p0: int, p1: int, q0: int, q1: int) -> bool:
+    """Whether piece k lies in a cell of rows p0 .. p1 and columns q0 .. q1."""
+    found = False
+    for p in range(p0, p1 + 1):
+        found = found or first[p * columns + q0] <= k < first[p * columns + q1 + 1]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def sum_squares(
+    piece: I64, value: F64, weight: F64, basis: F64, cell: int, matrix: F64, right_side: F64
+) -> None:
+    """Add the normal equations of all pixels to those of their pieces.
+
+    ``value``, ``weight`` (H, W); ``basis`` (cell, 4) of the pixels of a cell along either axis; ``matrix``
+    (pieces, 16, 16) gets its upper half, ``right_side`` (pieces, 16).
+    """
+    height, width = piece.shape
+    b = np.empty(16)
+    for y in range(height):
+        for x in range(width):
+            k = piece[y, x]
+            w = weight[y, x]
+            if k < 0 or w <= 0.0:
+                continue
+            for i in range(4):
+                for j in range(4):
+                    b[4 * i + j] = basis[y % cell, i] * basis[x % cell, j]
+            for m in range(16):
+                wb = w * b[m]
+                right_side[k, m] += wb * value[y, x]
+                for n in range(m, 16):
+                    matrix[k, m, n] += wb * b[n]
+
+
+@njit(cache=True, nogil=True)
+def evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int, value: F64) -> None:
+    """``value`` (H, W) of the surface at the pixels, NaN where they are of no piece."""
+    height, width = piece.shape
+    for y in range(height):
+        for x in range(width):
+            k = piece[y, x]
+            total = np.nan
+            if k >= 0:
+                total = 0.0
+                for i in range(4):
+                    for j in range(4):
+                        total += basis[y % cell, i] * basis[x % cell, j] * c[coefficient[k, 4 * i + j]]
+            value[y, x] = total
+
+
+STEP = 5.0
+"""Deviations by which a difference stands out that is a step."""
+
+
+@dataclass(frozen=True)
+class Domain:
+    """What of a depth map a surface stands in front of: ``held`` (H, W), and ``speaks``, whose depths count;
+    ``right`` (H, W - 1), ``down`` (H - 1, W): whether neighbours are of one surface."""
+
+    held: B8
+    speaks: B8
+    right: B8
+    down: B8
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """``piece`` (H, W), the number of the piece that each pixel is of, -1 for none; ``coefficient`` (N, 16),
+    the coefficients of each piece; ``cell`` (N,), where it lies among the cells (``shape``); ``count`` of
+    coefficients."""
+
+    piece: I64
+    coefficient: I64
+    cell: I64
+    shape: tuple[int, int]
+    count: int
+
+
+def domain_of(depth_map: DepthMap, *, grazing_deg: float, least: int, reach: float) -> Domain:
+    """Depths joined to surfaces, cut where they break.
+
+    Connected pixels fewer than ``least`` are no surface: their depths do not speak. Within ``reach`` px of
+    one they get its depth, beyond there is nothing.
+    """
+    depth, std = depth_map.depth.astype(np.float64), depth_map.std.astype(np.float64)
+    slope = steepest_slope(depth_map.P, grazing_deg)
+    known = np.isfinite(depth) & (depth > 0.0) & (std > 0.0) & np.isfinite(std)
+    depth = np.where(known, depth, np.nan)
+    joined = [
+        _alike(depth, std, np.full(depth.shape, slope), axis) & ~_steps(1.0 / depth, std / depth**2, axis)
+        for axis in (0, 1)
+    ]
+    speaks = known & (_sizes(joined, known) >= least)
+    if not speaks.any():
+        return Domain(speaks, speaks, joined[1], joined[0])
+    away, (y, x) = scipy.ndimage.distance_transform_edt(~speaks, return_indices=True)
+    held = known & (away <= reach)
+    for axis in (0, 1):
+        # The depth of a pixel that does not speak is lent by the nearest that does.
+        lent = _alike(depth[y, x], std[y, x], slope * (1.0 + 2.0 * away), axis)
+        joined[axis] = np.where(_both(speaks, axis), joined[axis], lent) & _both(held, axis)
+    # What was lent a depth must hang together with depths that speak.
+    held &= _sizes(joined, speaks) >= least
+    joined = [one & _both(held, axis) for axis, one in enumerate(joined)]
+    return Domain(held, speaks & held, joined[1], joined[0])
+
+
+def _pairs(values: Any, axis: int) -> tuple[Any, Any]:
+    """Values (H, W) of neighbours along an axis."""
+    return (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
+
+
+def _both(mask: B8, axis: int) -> B8:
+    first, second = _pairs(mask, axis)
+    return np.asarray(first & second)
+
+
+def _alike(depth: F64, std: F64, slope: F64, axis: int) -> B8:
+    """Whether depths are near enough to the next along an axis for one surface."""
+    with np.errstate(invalid="ignore"):
+        return one_surface(*_pairs(depth, axis), *_pairs(std, axis), np.maximum(*_pairs(slope, axis)))
+
+
+def _steps(rho: F64, deviation: F64, axis: int) -> B8:
+    """Whether inverse depth jumps from a pixel to the next: by another difference than before and after.
+
+    On a plane differences are equal. Those that stand out on both sides by ``STEP`` deviations, of noise as
+    it is told or, if that is more, as most differences show it, are steps.
+    """
+    rho, deviation = np.moveaxis(rho, axis, 0), np.moveaxis(deviation, axis, 0)
+    step = np.diff(rho, axis=0)
+    padded = np.pad(step, ((1, 1), (0, 0)), constant_values=np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.fmin(np.abs(step - padded[:-2]), np.abs(step - padded[2:]))
+        off /= np.sqrt(3.0) * np.hypot(deviation[:-1], deviation[1:])
+        told = off[np.isfinite(off)]
+        usual = max(1.0, MAD_FACTOR * float(np.median(told))) if len(told) else 1.0
+        return np.asarray(np.moveaxis(off > STEP * usual, 0, axis))
+
+
+def _sizes(joined: Sequence[B8], counted: B8) -> I64:
+    """(H, W) number of pixels, of those that are ``counted``, that each hangs together with."""
+    shape = counted.shape
+    number = np.arange(counted.size).reshape(shape)
+    start, stop = (
+        np.concatenate([_pairs(number, axis)[end][joined[axis]] for axis in (0, 1)]) for end in (0, 1)
+    )
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(start), dtype=np.int8), (start, stop)), shape=(number.size, number.size)
+    )
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    return np.asarray(np.bincount(label, counted.ravel())[label].reshape(shape), dtype=np.int64)
+
+
+def pieces_of(domain: Domain, cell: int) -> Pieces:
+    """The pieces of a domain in cells of ``cell`` px, and the coefficients of each.
+
+    A node of the spline has a coefficient for every part of the surface that hangs together within the
+    sixteen cells that it reaches: both sides of a cut have their own, and it is smooth round the end.
+    """
+    height, width = domain.held.shape
+    shape = (-(-height // cell), -(-width // cell))
+    piece = np.empty((height, width), dtype=np.int64)
+    first = np.empty(shape[0] * shape[1] + 1, dtype=np.int64)
+    count = label_pieces(domain.held, domain.right, domain.down, cell, piece, first)
+    start, linked = _links(piece, domain, count)
+    coefficient = np.empty((count, 16), dtype=np.int64)
+    total = number_coefficients(first, shape[1], start, linked, coefficient)
+    cells = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    return Pieces(piece, coefficient, cells, shape, total)
+
+
+def _links(piece: I64, domain: Domain, count: int) -> tuple[I64, I64]:
+    """Which pieces go on in which others: starts (count + 1,) and numbers."""
+    pairs = [
+        np.stack([piece[:, :-1][domain.right], piece[:, 1:][domain.right]]),
+        np.stack([piece[:-1][domain.down], piece[1:][domain.down]]),
+    ]
+    pair = np.concatenate(pairs, axis=1)
+    pair = np.concatenate([pair, pair[::-1]], axis=1)
+    code = np.unique(pair[0] * count + pair[1])
+    start = np.searchsorted(code, np.arange(count + 1) * count)
+    return start.astype(np.int64), (code % max(count, 1)).astype(np.int64)

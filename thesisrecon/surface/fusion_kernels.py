@@ -1,0 +1,284 @@
+"""Compiled loops of the fusion; each has a plain twin in the tests."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import F32, F64, I64, U8
+
+SIDE = 8
+"""Voxels a side of a block."""
+
+BEYOND = 0.1
+"""Weight of a depth half a pixel and more beyond the last that is known."""
+
+
+class Surface(NamedTuple):
+    """What one depth map tells: ``depth`` and its deviation ``std`` (H, W), ``lean`` (H, W) how far a ray
+    comes off the surface for a unit of depth, and ``slope``, the largest relative step in depth from one
+    pixel to the next on one surface."""
+
+    depth: F32
+    std: F32
+    lean: F32
+    slope: float
+
+
+class Distances(NamedTuple):
+    """Of the voxels of blocks (B, 8, 8, 8): the weighted mean distance to the surface, and its weight."""
+
+    value: F32
+    weight: F32
+
+
+@njit(cache=True, nogil=True)
+def touched_blocks(
+    depth: F32, lean: F32, rays: F64, centre: F64, reach: float, edge: float, marked: U8
+) -> None:
+    """Mark the blocks (X, Y, Z) that the surface may pass: those on a ray before and behind its point as
+    long as the ray is within ``reach`` of the surface.
+
+    ``lean`` (H, W) is how far a ray comes off the surface for a unit of depth. ``rays`` (3, 3) takes
+    (x, y, 1) to the point at depth 1 less ``centre`` (3,), which counts from the grid's origin; ``edge`` is
+    the side of a block. Points outside of the grid mark nothing.
+    """
+    for y in range(depth.shape[0]):
+        for x in range(depth.shape[1]):
+            z = depth[y, x]
+            if not z > 0.0:
+                continue
+            along = reach / lean[y, x]
+            steps = int(np.ceil(2.0 * along / (0.5 * edge))) + 1
+            dx = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
+            dy = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
+            dz = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
+            for s in range(steps):
+                r = z + along * (2.0 * s / (steps - 1) - 1.0)
+                i = int(np.floor((centre[0] + r * dx) / edge))
+                j = int(np.floor((centre[1] + r * dy) / edge))
+                k = int(np.floor((centre[2] + r * dz) / edge))
+                if 0 <= i < marked.shape[0] and 0 <= j < marked.shape[1] and 0 <= k < marked.shape[2]:
+                    marked[i, j, k] = 1
+
+
+@njit(cache=True, nogil=True)
+def integrate_view(
+    blocks: I64, voxel: float, P: F64, surface: Surface, truncation: float, sums: Distances
+) -> None:
+    """Add one depth map to the signed distances of blocks (Curless and Levoy 1996).
+
+    ``blocks`` (B, 3) grid places; ``P`` (3, 4) = K [R t] of the map, the centre of the first voxel the
+    origin. ``sums`` are updated, in units of ``truncation`` and cut at 1. What lies more than ``truncation``
+    behind a surface is not seen. A view weighs by lean^4 / (s^2 + (truncation / 8)^2), s the deviation
+    across the surface: the surface is taken to be plane as far as the ray is near it, and the error of that
+    grows with 1 / lean^2.
+    """
+    depth, std, lean, slope = surface
+    value, weight = sums
+    height, width = depth.shape
+    base = (truncation / 8.0) ** 2
+    for b in range(blocks.shape[0]):
+        for i in range(SIDE):
+            X = (blocks[b, 0] * SIDE + i) * voxel
+            for j in range(SIDE):
+                Y = (blocks[b, 1] * SIDE + j) * voxel
+                for k in range(SIDE):
+                    Z = (blocks[b, 2] * SIDE + k) * voxel
+                    z = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
+                    if z <= 0.0:
+                        continue
+                    u = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) / z
+                    v = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) / z
+                    if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+                        continue
+                    seen, place, trust = _depth_at(depth, std, slope, u, v)
+                    spread, leaning = std[place], lean[place]
+                    distance = leaning * (seen - z)
+                    if not distance > -truncation:
+                        continue
+                    own = trust / (leaning * leaning * spread * spread + base)
+                    if distance > truncation:
+                        distance = truncation
+                    else:
+                        own *= leaning**4
+                    total = weight[b, i, j, k] + own
+                    mean = value[b, i, j, k]
+                    value[b, i, j, k] = np.float32(mean + own / total * (distance / truncation - mean))
+                    weight[b, i, j, k] = np.float32(total)
+
+
+@njit(cache=True, nogil=True)
+def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[float, tuple[int, int], float]:
+    """Depth at (u, v), the row and column that it is of, and how far that can be trusted.
+
+    Bilinear in 1 / z where the four pixels are one surface, else that of the nearest pixel. Where that has
+    none, the next of the four is taken to go on: a net ends half a voxel before what is known does. NaN where
+    all four have none.
+    """
+    x, y = min(int(u), depth.shape[1] - 2), min(int(v), depth.shape[0] - 2)
+    x, y = max(x, 0), max(y, 0)
+    x1, y1 = min(x + 1, depth.shape[1] - 1), min(y + 1, depth.shape[0] - 1)
+    a, b, c, d = depth[y, x], depth[y, x1], depth[y1, x], depth[y1, x1]
+    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    s, t = u - x, v - y
+    row, column = (y1 if t > 0.5 else y), (x1 if s > 0.5 else x)
+    # Comparisons with NaN are false, so that any unknown pixel ends here too.
+    whole = a == a and b == b and c == c and d == d
+    if whole and high - low <= max(3.0 * std[row, column], slope * low):
+        upper = (1.0 - s) / a + s / b
+        lower = (1.0 - s) / c + s / d
+        return 1.0 / ((1.0 - t) * upper + t * lower), (row, column), 1.0
+    if depth[row, column] == depth[row, column]:
+        return depth[row, column], (row, column), 1.0
+    other_row, other_column = y + y1 - row, x + x1 - column
+    if depth[row, other_column] == depth[row, other_column]:
+        column = other_column
+    elif depth[other_row, column] == depth[other_row, column]:
+        row = other_row
+    else:
+        row, column = other_row, other_column
+    return depth[row, column], (row, column), BEYOND
+
+
+@njit(cache=True, nogil=True)
+def _find(place: I64, i: int, j: int, k: int) -> int:
+    """Number of the block at grid voxel (i, j, k), -1 where there is none."""
+    if i < 0 or j < 0 or k < 0:
+        return -1
+    bi, bj, bk = i // SIDE, j // SIDE, k // SIDE
+    if bi >= place.shape[0] or bj >= place.shape[1] or bk >= place.shape[2]:
+        return -1
+    return int(place[bi, bj, bk])
+
+
+@njit(cache=True, nogil=True)
+def place_vertices(blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64) -> int:
+    """One vertex in each cell of eight voxels that the surface passes (surface nets, Gibson 1998).
+
+    It is the mean of where the cell's edges are crossed, in voxels. ``place`` (X, Y, Z) block numbers or -1;
+    ``vertex`` (B, 8, 8, 8) gets the number of the cell at each voxel or -1, ``points`` (N, 3) as many of
+    the vertices as it holds. Returns how many there are.
+    """
+    count = 0
+    corner = np.empty(8)
+    for b in range(blocks.shape[0]):
+        for i in range(SIDE):
+            for j in range(SIDE):
+                for k in range(SIDE):
+                    vertex[b, i, j, k] = -1
+                    x, y, z = blocks[b, 0] * SIDE + i, blocks[b, 1] * SIDE + j, blocks[b, 2] * SIDE + k
+                    inside, known = 0, True
+                    for c in range(8):
+                        X, Y, Z = x + (c & 1), y + ((c >> 1) & 1), z + (c >> 2)
+                        n = _find(place, X, Y, Z)
+                        if n < 0 or not weight[n, X % SIDE, Y % SIDE, Z % SIDE] > 0.0:
+                            known = False
+                            break
+                        corner[c] = value[n, X % SIDE, Y % SIDE, Z % SIDE]
+                        inside += corner[c] < 0.0
+                    if not known or inside == 0 or inside == 8:
+                        continue
+                    if count < points.shape[0]:
+                        _mean_crossing(corner, points[count])
+                        points[count, 0] += x
+                        points[count, 1] += y
+                        points[count, 2] += z
+                    vertex[b, i, j, k] = count
+                    count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _mean_crossing(corner: F64, point: F64) -> None:
+    """Mean of the zeros on the twelve edges of a cell with values ``corner`` (8,) at x + 2 y + 4 z."""
+    point[:] = 0.0
+    crossed = 0
+    for c in range(8):
+        for axis in range(3):
+            bit = 1 << axis
+            if c & bit:
+                continue
+            a, b = corner[c], corner[c | bit]
+            if (a < 0.0) == (b < 0.0):
+                continue
+            for d in range(3):
+                point[d] += (a / (a - b)) if d == axis else ((c >> d) & 1)
+            crossed += 1
+    for d in range(3):
+        point[d] /= crossed
+
+
+@njit(cache=True, nogil=True)
+def join_vertices(
+    blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64, faces: I64
+) -> int:
+    """Two triangles across each edge between voxels that the surface crosses, anticlockwise from outside.
+
+    ``faces`` (M, 3) gets as many as it holds; returns how many there are. Of the two diagonals the shorter is
+    taken.
+    """
+    count = 0
+    step = np.zeros(3, np.int64)
+    ring = np.empty(4, np.int64)
+    for b in range(blocks.shape[0]):
+        for i in range(SIDE):
+            for j in range(SIDE):
+                for k in range(SIDE):
+                    if not weight[b, i, j, k] > 0.0:
+                        continue
+                    start = value[b, i, j, k]
+                    x, y, z = blocks[b, 0] * SIDE + i, blocks[b, 1] * SIDE + j, blocks[b, 2] * SIDE + k
+                    for axis in range(3):
+                        step[:] = 0
+                        step[axis] = 1
+                        X, Y, Z = x + step[0], y + step[1], z + step[2]
+                        n = _find(place, X, Y, Z)
+                        if n < 0 or not weight[n, X % SIDE, Y % SIDE, Z % SIDE] > 0.0:
+                            continue
+                        stop = value[n, X % SIDE, Y % SIDE, Z % SIDE]
+                        if (start < 0.0) == (stop < 0.0):
+                            continue
+                        if not _ring(place, vertex, (x, y, z), axis, ring):
+                            continue
+                        if stop < 0.0:
+                            ring[1], ring[3] = ring[3], ring[1]
+                        first = _squared(points, ring[0], ring[2]) <= _squared(points, ring[1], ring[3])
+                        if count + 2 <= faces.shape[0]:
+                            for t in range(3):
+                                faces[count, t] = ring[t] if first else ring[(t + 1) % 4]
+                            for t in range(3):
+                                faces[count + 1, t] = ring[(t + 2) % 4] if first else ring[(t + 3) % 4]
+                        count += 2
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _squared(points: F64, a: int, b: int) -> float:
+    total = 0.0
+    if max(a, b) < points.shape[0]:
+        for d in range(3):
+            total += (points[a, d] - points[b, d]) ** 2
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _ring(place: I64, vertex: I64, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
+    """The vertices of the four cells about the edge from voxel ``at`` along ``axis``, anticlockwise seen
+    from its end; False where one of them has none."""
+    second, third = (axis + 1) % 3, (axis + 2) % 3
+    for t in range(4):
+        back_second = 1 if t == 0 or t == 3 else 0
+        back_third = 1 if t < 2 else 0
+        X = at[0] - (back_second if second == 0 else 0) - (back_third if third == 0 else 0)
+        Y = at[1] - (back_second if second == 1 else 0) - (back_third if third == 1 else 0)
+        Z = at[2] - (back_second if second == 2 else 0) - (back_third if third == 2 else 0)
+        n = _find(place, X, Y, Z)
+        if n < 0:
+            return False
+        ring[t] = vertex[n, X % SIDE, Y % SIDE, Z % SIDE]
+        if ring[t] < 0:
+            return False
+    return True

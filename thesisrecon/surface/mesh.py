@@ -1,0 +1,166 @@
+"""Upkeep of triangle meshes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.records import TexturedMesh
+
+
+def without_unused_vertices(mesh: TexturedMesh) -> TexturedMesh:
+    """The same surface with only the vertices that its faces name, in their order."""
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces] = True
+    number = np.cumsum(used) - 1
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return replace(mesh, vertices=mesh.vertices[used], faces=number[mesh.faces], colors=colors)
+
+
+def with_faces(mesh: TexturedMesh, keep: B8) -> TexturedMesh:
+    """The surface of the faces that ``keep`` (M,) marks."""
+    uv = None if mesh.uv is None else mesh.uv[keep]
+    untextured = None if mesh.untextured is None else mesh.untextured[keep]
+    return without_unused_vertices(replace(mesh, faces=mesh.faces[keep], uv=uv, untextured=untextured))
+
+
+def face_areas(vertices: F64, faces: I64) -> F64:
+    """(M,) areas of triangles."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+
+
+def vertex_normals(mesh: TexturedMesh) -> F64:
+    """Unit normals (N, 3) of the vertices: the mean over their faces by area."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    total = np.zeros_like(mesh.vertices)
+    for k in range(3):
+        for d in range(3):
+            total[:, d] += np.bincount(mesh.faces[:, k], normal[:, d], len(total))
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
+
+
+def parts_of(faces: I64, vertices: int) -> I64:
+    """(M,) number of the connected part that each face belongs to; faces connect by common vertices."""
+    if not len(faces):
+        return np.zeros(0, dtype=np.int64)
+    row, column = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(row), dtype=np.int8), (row, column)), shape=(vertices, vertices)
+    )
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    return np.asarray(label[faces[:, 0]], dtype=np.int64)
+
+
+def face_neighbours(faces: I64) -> I64:
+    """(M, 3) number of the face across the side from corner k to corner k + 1, -1 where there is none.
+
+    Where more than two faces meet in a side, each has one of the others.
+    """
+    start, stop = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    low, high = np.minimum(start, stop), np.maximum(start, stop)
+    order = np.lexsort((np.arange(len(low)), high, low))
+    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
+    neighbour = np.full(len(order), -1, dtype=np.int64)
+    first, second = order[:-1][same], order[1:][same]
+    neighbour[second] = first // 3
+    neighbour[first] = second // 3
+    return neighbour.reshape(-1, 3)
+
+
+def keep_large_parts(mesh: TexturedMesh, least_share: float = 0.002) -> TexturedMesh:
+    """Without connected parts of less than ``least_share`` of the whole area: crumbs of wrong depths."""
+    if not len(mesh.faces):
+        return mesh
+    part = parts_of(mesh.faces, len(mesh.vertices))
+    area = np.bincount(part, face_areas(mesh.vertices, mesh.faces))
+    return with_faces(mesh, area[part] >= least_share * area.sum())
+
+
+def coarser(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
+    """The same surface with at most ``max_faces`` triangles; a mesh that has no more is returned as it is.
+
+    Vertices that are connected within one cell of a cubic grid become one (Rossignac and Borrel 1993; two
+    sheets that only pass the same cell stay apart), placed where the squared distances to the planes of
+    their faces are least (Lindstrom 2000), so that edges and corners survive. Cells grow until the faces
+    are few enough. Faces keep their orientation; those that lose a corner or repeat another are dropped.
+    Colours of vertices are averaged; a texture does not survive.
+
+    Raises ``ValueError`` where ``max_faces`` is less than one.
+    """
+    if max_faces < 1:
+        raise ValueError(f"max_faces must be at least 1; got {max_faces}")
+    if len(mesh.faces) <= max_faces:
+        return mesh
+    mesh = without_unused_vertices(replace(mesh, uv=None, texture=None, untextured=None))
+    extent = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
+    cell = max(float(np.sqrt(face_areas(mesh.vertices, mesh.faces).sum() / max_faces)), 1e-9 * extent)
+    while True:
+        cluster = _clusters(mesh, cell)
+        faces = _distinct_faces(cluster[mesh.faces])
+        if len(faces) <= max_faces:
+            break
+        cell *= max(1.02, float(np.sqrt(len(faces) / max_faces)))
+    vertices = _cluster_places(mesh, cluster, cell)
+    colors = None if mesh.colors is None else np.rint(_means(cluster, mesh.colors)).astype(np.uint8)
+    return without_unused_vertices(replace(mesh, vertices=vertices, faces=faces, colors=colors))
+
+
+def _clusters(mesh: TexturedMesh, cell: float) -> I64:
+    """(N,) number of the cluster of each vertex, dense: those that edges connect within a cell."""
+    place = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
+    start, stop = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
+    within = (place[start] == place[stop]).all(axis=1)
+    start, stop = start[within], stop[within]
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(start), dtype=np.int8), (start, stop)), shape=(len(place), len(place))
+    )
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def _distinct_faces(faces: I64) -> I64:
+    """Faces (M', 3) with three different corners, each cycle of corners once, in their first order.
+
+    Two faces on the same corners that look to opposite sides are the sides of a sheet: both stay.
+    """
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    first = np.argmin(faces, axis=1)
+    turned = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
+    return faces[np.sort(np.unique(turned, axis=0, return_index=True)[1])]
+
+
+def _cluster_places(mesh: TexturedMesh, cluster: I64, cell: float) -> F64:
+    """(C, 3) the point of each cluster that is nearest to the planes of its faces.
+
+    Directions in which the planes say little keep the mean of the vertices; a point that would leave it by
+    more than a cell is that mean.
+    """
+    mean = _means(cluster, mesh.vertices)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    planes = np.zeros((len(mean), 3, 3))
+    pull = np.zeros((len(mean), 3))
+    for corner in range(3):
+        which = cluster[mesh.faces[:, corner]]
+        away = (normal * (a - mean[which])).sum(axis=1)
+        for i in range(3):
+            pull[:, i] += np.bincount(which, normal[:, i] * away, len(mean))
+            for j in range(3):
+                planes[:, i, j] += np.bincount(which, normal[:, i] * normal[:, j], len(mean))
+    values, vectors = np.linalg.eigh(planes)
+    told = values > np.maximum(1e-2 * values[:, 2:], np.finfo(float).tiny)
+    along = np.einsum("nij,ni->nj", vectors, pull) * told / np.where(told, values, 1.0)
+    step = np.einsum("nij,nj->ni", vectors, along)
+    return mean + np.where(np.linalg.norm(step, axis=1, keepdims=True) <= cell, step, 0.0)
+
+
+def _means(cluster: I64, values: F64 | NDArray[np.uint8]) -> F64:
+    """(C, 3) means of ``values`` (N, 3) over each cluster."""
+    size = np.bincount(cluster)
+    return np.stack([np.bincount(cluster, values[:, d]) / size for d in range(3)], axis=1)

@@ -1,0 +1,215 @@
+"""The texture of a mesh: pieces in the outline of photographs, packed into one picture, without seams.
+
+Each chart (connected faces that one photograph shows best) has the outline and the resolution that it has in
+that photograph. What is painted there is either what all photographs agree on
+(:class:`~thesisrecon.surface.texture_blending.BlendedViews`) or that photograph alone
+(:class:`~thesisrecon.surface.color_correction.SingleView`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.raster import resample, smooth
+from thesisrecon.records import PinholeView, TexturedMesh
+from thesisrecon.surface.color_correction import SingleView
+from thesisrecon.surface.mesh import face_neighbours
+from thesisrecon.surface.texture_blending import BlendedViews
+from thesisrecon.surface.texture_views import (
+    Charts,
+    camera_of,
+    charts_of,
+    choose_views,
+    face_quality,
+    project,
+)
+
+MARGIN = 2
+"""Pixels around each piece, so that what is drawn smaller does not mix pieces at once."""
+
+SWATCH = 3
+"""Texels a side for a face that no photograph sees."""
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """The faces of an atlas before packing: ``xy`` (M, 3, 2) corners in the photograph of the face, ``label``
+    (M,) its place among the views or -1, ``chart`` (M,)."""
+
+    xy: F64
+    label: I64
+    chart: I64
+
+
+LEAST_SCALE = 0.05
+"""Photographs reduced to less show nothing; the pieces' margins remain."""
+
+
+@dataclass(frozen=True)
+class TextureAtlas:
+    """Texture at the resolution of the view that shows each part of the surface largest.
+
+    ``max_texels``: photographs are reduced until the atlas has no more. ``smooth_rounds``, ``least_faces``:
+    see :func:`choose_views`. ``painter`` puts the colours on it.
+    """
+
+    max_texels: int = 4096 * 4096
+    smooth_rounds: int = 40
+    least_faces: int = 30
+    painter: BlendedViews | SingleView = field(default_factory=BlendedViews)
+
+    def __post_init__(self) -> None:
+        if self.max_texels < 1:
+            raise ValueError(f"max_texels >= 1 is needed; got {self.max_texels}")
+
+    def texture(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
+        """The mesh with ``uv``, ``texture`` and ``untextured``.
+
+        Faces that no view sees whole get the colour of their surroundings. Raises :class:`StageFailure` where
+        no face is seen at all, and where the atlas is too large with photographs of ``LEAST_SCALE``.
+        """
+        neighbours = face_neighbours(mesh.faces)
+        quality = face_quality(mesh, views, threads=threads)
+        label = choose_views(quality, neighbours, rounds=self.smooth_rounds, least_faces=self.least_faces)
+        if not (label >= 0).any():
+            raise StageFailure("the surface has no texture", "no photograph sees any of it")
+        chart = charts_of(label, neighbours)
+        scale = 1.0
+        while True:
+            smaller = [_reduced(view, scale) for view in views]
+            pieces = Pieces(_corners(mesh, smaller, label), label, chart)
+            rectangles = _rectangles(pieces, smaller)
+            offsets, size = pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
+            if size[0] * size[1] <= self.max_texels:
+                break
+            if scale <= LEAST_SCALE:
+                texels = size[0] * size[1]
+                raise StageFailure(
+                    "the texture is too large",
+                    f"{len(rectangles)} pieces take {texels} texels, allowed are {self.max_texels}",
+                    "allow more texels, or fewer pieces (least_faces)",
+                )
+            scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), LEAST_SCALE)
+        uv = pieces.xy + (offsets - rectangles[:, :2])[chart][:, None, :]
+        cut_out = _fill(smaller, pieces, rectangles, offsets, size)
+        texture = self.painter.paint(mesh, smaller, Charts(label, chart, uv, cut_out), threads=threads)
+        uv, texture = _swatches(mesh, label, uv, texture)
+        return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
+
+
+def _reduced(view: PinholeView, scale: float) -> PinholeView:
+    """The view with ``scale`` <= 1 times as many pixels a side."""
+    if scale >= 1.0:
+        return view
+    height, width = (max(1, round(scale * n)) for n in view.rgb.shape[:2])
+    S = np.diag([width / view.rgb.shape[1], height / view.rgb.shape[0], 1.0])
+    S[:2, 2] = (np.diag(S)[:2] - 1.0) / 2.0
+    blur = 0.5 * np.sqrt(max(1.0 / scale**2 - 1.0, 1e-6))
+    planes = [resample(smooth(view.rgb[..., k].astype(np.float32), blur), width, height) for k in range(3)]
+    seen = resample(view.seen.astype(np.float32), width, height) > 0.999
+    rgb = np.clip(np.rint(np.stack(planes, axis=-1)), 0, 255).astype(np.uint8)
+    return PinholeView(view.view, S @ view.P, rgb, seen)
+
+
+def _corners(mesh: TexturedMesh, views: Sequence[PinholeView], label: I64) -> F64:
+    """(M, 3, 2) pixels of the corners of each face in its view, 0 where it has none."""
+    xy = np.zeros((len(mesh.faces), 3, 2))
+    for v, view in enumerate(views):
+        mine = label == v
+        xy[mine] = project(camera_of(view), mesh.vertices)[0][mesh.faces[mine]]
+    return xy
+
+
+def _rectangles(pieces: Pieces, views: Sequence[PinholeView]) -> I64:
+    """(C, 4) left, top, right, bottom of each chart in its photograph, the last two exclusive."""
+    charts = int(pieces.chart.max()) + 1
+    low = np.full((charts, 2), np.iinfo(np.int64).max)
+    high = np.full((charts, 2), -1)
+    view = np.zeros(charts, dtype=np.int64)
+    seen = pieces.label >= 0
+    view[pieces.chart[seen]] = pieces.label[seen]
+    np.minimum.at(low, pieces.chart[seen], np.floor(pieces.xy[seen].min(axis=1)).astype(np.int64))
+    np.maximum.at(high, pieces.chart[seen], np.ceil(pieces.xy[seen].max(axis=1)).astype(np.int64) + 1)
+    sizes = np.array([[v.rgb.shape[1], v.rgb.shape[0]] for v in views])[view]
+    low = np.where(high < 0, 0, np.maximum(low - MARGIN, 0))
+    high = np.where(high < 0, 0, np.minimum(high + MARGIN, sizes))
+    return np.concatenate([low, high], axis=1)
+
+
+def pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
+    """Places (C, 2) of rectangles of ``sizes`` (C, 2) without overlap; (width, height) of what holds them.
+
+    On shelves, the highest first, in a width of about the square root of their area.
+    """
+    width = max(
+        int(np.ceil(1.05 * np.sqrt(float(sizes.prod(axis=1).sum())))), int(sizes[:, 0].max(initial=1))
+    )
+    places = np.zeros_like(sizes)
+    x, y, shelf, widest = 0, 0, 0, 1
+    for c in np.lexsort((np.arange(len(sizes)), -sizes[:, 0], -sizes[:, 1])):
+        w, h = sizes[c]
+        if x + w > width:
+            x, y, shelf = 0, y + shelf, 0
+        places[c] = x, y
+        x, shelf, widest = x + w, max(shelf, h), max(widest, x + w)
+    return places, (int(widest), int(max(y + shelf, 1)))
+
+
+def _fill(
+    views: Sequence[PinholeView], pieces: Pieces, rectangles: I64, offsets: I64, size: tuple[int, int]
+) -> np.ndarray:
+    """(H, W, 3) uint8: every chart's rectangle of its photograph at its place."""
+    texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
+    first = np.unique(pieces.chart, return_index=True)[1]
+    for c, v in enumerate(pieces.label[first]):
+        if v >= 0:
+            left, top, right, bottom = rectangles[c]
+            x, y = offsets[c]
+            texture[y : y + bottom - top, x : x + right - left] = views[v].rgb[top:bottom, left:right]
+    return texture
+
+
+def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> tuple[F64, np.ndarray]:
+    """Faces that no photograph sees, each with a patch of one colour below the atlas: that of the seen faces
+    nearest along the surface."""
+    unseen = np.flatnonzero(label < 0)
+    if not len(unseen):
+        return uv, texture
+    columns = max(texture.shape[1] // SWATCH, 1)
+    rows = -(-len(unseen) // columns)
+    color = _surroundings(mesh, label, uv, texture)[unseen]
+    strip = np.full((rows * SWATCH, texture.shape[1], 3), 128, dtype=np.uint8)
+    row, column = np.divmod(np.arange(len(unseen)), columns)
+    for dy in range(SWATCH):
+        for dx in range(min(SWATCH, texture.shape[1])):
+            strip[row * SWATCH + dy, column * SWATCH + dx] = color
+    uv = uv.copy()
+    middle = np.stack([column * SWATCH + SWATCH // 2, texture.shape[0] + row * SWATCH + SWATCH // 2], axis=1)
+    uv[unseen] = middle[:, None, :]
+    return uv, np.concatenate([texture, strip])
+
+
+def _surroundings(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> np.ndarray:
+    """(M, 3) uint8: the colour of seen faces, carried from face to face to those that are not."""
+    neighbours = face_neighbours(mesh.faces)
+    x, y = np.clip(np.rint(uv.mean(axis=1)).astype(np.int64), 0, np.array(texture.shape[1::-1]) - 1).T
+    color = np.where(label[:, None] >= 0, texture[y, x], 0).astype(np.float64)
+    known = label >= 0
+    while not known.all():
+        open_ = np.flatnonzero(~known)
+        around = neighbours[open_]
+        told = (around >= 0) & known[around]
+        reached = told.any(axis=1)
+        if not reached.any():
+            color[~known] = color[known].mean(axis=0)
+            break
+        weights = told[reached].astype(np.float64)
+        mean = (color[around[reached]] * weights[..., None]).sum(axis=1) / weights.sum(axis=1)[:, None]
+        color[open_[reached]] = mean
+        known[open_[reached]] = True
+    return np.rint(color).astype(np.uint8)

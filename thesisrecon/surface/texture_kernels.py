@@ -1,0 +1,205 @@
+"""Compiled loops of the texture; each has a plain twin in the tests."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import B8, F32, F64, I64, U8
+
+
+class SeenSurface(NamedTuple):
+    """A view of a surface: ``P`` (3, 4) = K [R t]; ``depth`` (H, W) nearest surface, inf where none;
+    ``clear`` (H, W) 0..1 trust in each pixel; ``slack``, the part of its depth by which a point may lie
+    behind what is seen; ``rgb`` (H, W, 3), and ``gain`` (3,) by which its colours are multiplied."""
+
+    P: F64
+    depth: F32
+    clear: F32
+    slack: float
+    rgb: U8
+    gain: F32
+
+
+@njit(cache=True, nogil=True)
+def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> None:
+    """One round: ``out`` (M, V) is ``keep`` of ``share`` and the rest from the mean of ``spread`` over the
+    faces across the sides, 0 for views that do not see a face."""
+    for m in range(share.shape[0]):
+        count = 0
+        for k in range(3):
+            count += neighbours[m, k] >= 0
+        part = np.float32((1.0 - keep) / max(count, 1))
+        for v in range(share.shape[1]):
+            out[m, v] = 0.0
+            if share[m, v] > 0.0:
+                total = np.float32(0.0)
+                for k in range(3):
+                    if neighbours[m, k] >= 0:
+                        total += spread[neighbours[m, k], v]
+                out[m, v] = np.float32(keep) * share[m, v] + part * total
+
+
+@njit(cache=True, nogil=True)
+def observe_points(points: F64, normals: F64, view: SeenSurface, weight: F32, color: F32) -> None:
+    """What one view shows at points (N, 3) with outer normals (N, 3).
+
+    A point is seen where it lies at most ``view.slack`` of its depth behind the farthest of the four pixels
+    around it. ``weight`` (N,) gets the pixels a unit of area covers, times the trust in them, 0 where the
+    point is not seen from outside; ``color`` (N, 3) its bilinear colour times the gain.
+    """
+    P, depth, clear, slack, rgb, gain = view
+    height, width = depth.shape
+    M = np.ascontiguousarray(P[:, :3])
+    # (u, v, 1) z = M X + p: pixels per area are det M times the distance to the tangent plane over z^3.
+    centre = -np.linalg.solve(M, np.ascontiguousarray(P[:, 3]))
+    scale = abs(np.linalg.det(M))
+    for n in range(points.shape[0]):
+        weight[n] = 0.0
+        X, Y, Z = points[n]
+        towards = (
+            normals[n, 0] * (centre[0] - X)
+            + normals[n, 1] * (centre[1] - Y)
+            + normals[n, 2] * (centre[2] - Z)
+        )
+        z = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
+        if not (z > 0.0 and towards > 0.0):
+            continue
+        u = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) / z
+        v = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) / z
+        if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+            continue
+        x, y = int(u), int(v)
+        right, below = min(x + 1, width - 1), min(y + 1, height - 1)
+        farthest = max(max(depth[y, x], depth[y, right]), max(depth[below, x], depth[below, right]))
+        if z * (1.0 - slack) > farthest:
+            continue
+        s, t = u - x, v - y
+        upper = clear[y, x] + s * (clear[y, right] - clear[y, x])
+        lower = clear[below, x] + s * (clear[below, right] - clear[below, x])
+        weight[n] = np.float32((upper + t * (lower - upper)) * scale * towards / (z * z * z))
+        for k in range(3):
+            a, b = np.float32(rgb[y, x, k]), np.float32(rgb[y, right, k])
+            c, d = np.float32(rgb[below, x, k]), np.float32(rgb[below, right, k])
+            top, bottom = a + s * (b - a), c + s * (d - c)
+            color[n, k] = np.float32((top + t * (bottom - top)) * gain[k])
+
+
+@njit(cache=True, nogil=True)
+def _weighted_median(values: F32, weights: F64, order: I64) -> float:
+    """Lower weighted median of values (V,) with weights (V,) that are not all 0; ``order`` is scratch."""
+    count, total = 0, 0.0
+    for v in range(len(values)):
+        if weights[v] > 0.0:
+            k = count
+            while k > 0 and values[order[k - 1]] > values[v]:
+                order[k] = order[k - 1]
+                k -= 1
+            order[k] = v
+            count += 1
+            total += weights[v]
+    below = 0.0
+    for k in range(count):
+        below += weights[order[k]]
+        if below >= 0.5 * total:
+            return float(values[order[k]])
+    return float(values[order[count - 1]])
+
+
+@njit(cache=True, nogil=True)
+def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F32) -> None:
+    """One colour for each of N points from V views that show it.
+
+    ``weight`` (V, N) 0 where a view does not, ``color`` (V, N, 3). Weights relative to the largest are raised
+    to ``power``, and fall by 1 / (1 + (d / scatter)^2)^2 with the distance d of a view's colour from the
+    median of all (root mean square over the channels, weights to the first power). ``out`` (N, 3); points
+    that no view shows stay.
+    """
+    views = weight.shape[0]
+    relative = np.empty(views)
+    order = np.empty(views, np.int64)
+    middle = np.empty(3)
+    for n in range(weight.shape[1]):
+        best = np.float32(0.0)
+        for v in range(views):
+            best = max(best, weight[v, n])
+        if best <= 0.0:
+            continue
+        for v in range(views):
+            relative[v] = weight[v, n] / best
+        for k in range(3):
+            middle[k] = _weighted_median(color[:, n, k], relative, order)
+        total = 0.0
+        mean = np.zeros(3)
+        for v in range(views):
+            if relative[v] <= 0.0:
+                continue
+            apart = 0.0
+            for k in range(3):
+                apart += (color[v, n, k] - middle[k]) ** 2
+            trust = 1.0 / (1.0 + apart / (3.0 * scatter * scatter))
+            w = relative[v] ** power * trust * trust
+            total += w
+            for k in range(3):
+                mean[k] += w * color[v, n, k]
+        for k in range(3):
+            out[n, k] = np.float32(mean[k] / total)
+
+
+@njit(cache=True, nogil=True)
+def grow_colors(texture: U8, drawn: B8) -> None:
+    """Texels (H, W, 3) at the rim of what is ``drawn`` (H, W) take the mean of those of their eight
+    neighbours that are, and count as drawn."""
+    height, width = drawn.shape
+    before = drawn.copy()
+    total = np.zeros(3)
+    for y in range(height):
+        for x in range(width):
+            if before[y, x]:
+                continue
+            total[:] = 0.0
+            count = 0
+            for j in range(max(y - 1, 0), min(y + 2, height)):
+                for i in range(max(x - 1, 0), min(x + 2, width)):
+                    if before[j, i]:
+                        count += 1
+                        for k in range(3):
+                            total[k] += texture[j, i, k]
+            if count:
+                drawn[y, x] = True
+                for k in range(3):
+                    texture[y, x, k] = int(total[k] / count + 0.5)
+
+
+@njit(cache=True, nogil=True)
+def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
+    """Texels beside a face that have none continue it: the rim of a piece, a texel wide.
+
+    ``corners`` (M, 3, 3) texels of the corners, their last entry 1; ``face`` (H, W) -1 where none;
+    ``weights`` (H, W, 2) barycentric coordinates of corners 1 and 2, which beyond the face may go to
+    ``farthest``. The neighbours before, after, above and below are asked in this order.
+    """
+    height, width = face.shape
+    before = face.copy()
+    for y in range(height):
+        for x in range(width):
+            if before[y, x] >= 0:
+                continue
+            for side in range(4):
+                j = y + (side == 3) - (side == 2)
+                i = x + (side == 1) - (side == 0)
+                if not (0 <= j < height and 0 <= i < width) or before[j, i] < 0:
+                    continue
+                c = corners[before[j, i]]
+                ax, ay = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1]
+                bx, by = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1]
+                area = ax * by - ay * bx
+                dx, dy = x - c[0, 0], y - c[0, 1]
+                p, q = dx * by - dy * bx, ax * dy - ay * dx
+                if max(abs(p), abs(q)) <= farthest * abs(area) and area != 0.0:
+                    face[y, x] = before[j, i]
+                    weights[y, x, 0] = np.float32(p / area)
+                    weights[y, x, 1] = np.float32(q / area)
+                    break

@@ -1,0 +1,258 @@
+"""Compiled loops of interpolation; each has a plain twin in the tests."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import B8, F32, F64
+
+ONE_SURFACE_PX = 1.0
+"""Neighbouring disparities that differ by more belong to different surfaces."""
+
+
+REACH, SPARSE = 12, 3
+"""How far about a guessed pixel its disparity is looked for, and how many pixels are skipped in between."""
+WINDOW = 2 * REACH // SPARSE + 1
+NEAR = 2
+"""How far about a guessed pixel others must agree with it."""
+
+
+@njit(cache=True, nogil=True)
+def mark_crossings(disparity: F32, slack: float, crossing: B8) -> None:
+    """Mark pixels (H, W) whose partner x - d lies on the wrong side of that of another pixel of their row, by
+    more than ``slack`` px; NaN takes no part."""
+    height, width = disparity.shape
+    least = np.empty(width + 1)
+    for y in range(height):
+        least[width] = np.inf
+        for x in range(width - 1, -1, -1):
+            d = disparity[y, x]
+            least[x] = least[x + 1] if np.isnan(d) else min(least[x + 1], x - d)
+        most = -np.inf
+        for x in range(width):
+            d = disparity[y, x]
+            crossing[y, x] = not np.isnan(d) and (most > x - d + slack or least[x + 1] < x - d - slack)
+            if not np.isnan(d):
+                most = max(most, x - d)
+
+
+@njit(cache=True, nogil=True)
+def fill_empty_rows(disparity: F32) -> None:
+    """Give rows (H, W) that are NaN throughout the nearest other row, the upper one of two; in place."""
+    height = disparity.shape[0]
+    known = np.empty(height, np.bool_)
+    for y in range(height):
+        known[y] = not np.isnan(disparity[y]).all()
+    for y in range(height):
+        if known[y]:
+            continue
+        for k in range(1, height):
+            if y - k >= 0 and known[y - k]:
+                disparity[y] = disparity[y - k]
+                break
+            if y + k < height and known[y + k]:
+                disparity[y] = disparity[y + k]
+                break
+
+
+@njit(cache=True, nogil=True)
+def take_back(
+    maps: tuple[F32, F32], H: F64, rows: tuple[int, int], places: F64, disparity: F32, sure: F32
+) -> None:
+    """Disparity and confidence of the pixels of a photograph, rows [first, last), from its rectified frame.
+
+    ``maps``: disparities (H, W) without holes and confidences (H, W), 0 where unknown; ``H`` (3, 3) takes
+    pixels to their frame. ``places`` (h, w, 2) px in the frame, NaN beyond the line sent to infinity;
+    ``disparity`` (h, w) bilinear where the four pixels around are of one surface, else the nearest one's;
+    beyond the frame that of its border, with confidence 0.
+    """
+    field, confidence = maps
+    height, width = field.shape
+    for y in range(rows[0], rows[1]):
+        for x in range(disparity.shape[1]):
+            w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+            if not w > 0.0:
+                places[y, x] = np.nan
+                disparity[y, x] = np.nan
+                sure[y, x] = 0.0
+                continue
+            px = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w
+            py = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w
+            places[y, x, 0], places[y, x, 1] = px, py
+            inside = px > -0.5 and py > -0.5 and px < width - 0.5 and py < height - 0.5
+            u, v = min(max(px, 0.0), width - 1.0), min(max(py, 0.0), height - 1.0)
+            x0, y0 = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
+            x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
+            a, b, c, d = field[y0, x0], field[y0, x1], field[y1, x0], field[y1, x1]
+            near_y, near_x = int(np.rint(v)), int(np.rint(u))
+            if max(max(a, b), max(c, d)) - min(min(a, b), min(c, d)) <= ONE_SURFACE_PX:
+                top, bottom = a + (u - x0) * (b - a), c + (u - x0) * (d - c)
+                disparity[y, x] = top + (v - y0) * (bottom - top)
+            else:
+                disparity[y, x] = field[near_y, near_x]
+            sure[y, x] = confidence[near_y, near_x] if inside else 0.0
+
+
+@njit(cache=True, nogil=True)
+def settle_guesses(
+    levels: F32, disparity: F32, sure: F32, rows: tuple[int, int], limits: tuple[float, float], out: F32
+) -> None:
+    """Make the guessed disparities of a photograph follow its colours, rows [first, last).
+
+    Those whose confidence ``sure`` (h, w) is 0 become the weighted median of ``disparity`` (h, w) over every
+    ``SPARSE``-th pixel of every such row within ``REACH``. Weights fall with the difference of ``levels``
+    (h, w, 3), to 1 / e at ``limits[0]`` in sum over the channels; guesses weigh ``limits[1]`` of known ones.
+    """
+    height, width = disparity.shape
+    values, weights = np.empty(WINDOW * WINDOW, np.float32), np.empty(WINDOW * WINDOW)
+    for y in range(rows[0], rows[1]):
+        for x in range(width):
+            out[y, x] = disparity[y, x]
+            if sure[y, x] > 0.0 or np.isnan(disparity[y, x]):
+                continue
+            n, total = 0, 0.0
+            least, most = disparity[y, x], disparity[y, x]
+            for v in range(max(y - REACH, y % SPARSE), min(y + REACH + 1, height), SPARSE):
+                for u in range(max(x - REACH, x % SPARSE), min(x + REACH + 1, width), SPARSE):
+                    d = disparity[v, u]
+                    if np.isnan(d):
+                        continue
+                    apart = 0.0
+                    for c in range(levels.shape[2]):
+                        apart += abs(levels[y, x, c] - levels[v, u, c])
+                    weight = np.exp(-apart / limits[0])
+                    if sure[v, u] <= 0.0:
+                        weight *= limits[1]
+                    values[n], weights[n] = d, weight
+                    least, most = min(least, d), max(most, d)
+                    total += weight
+                    n += 1
+            # On one surface there is nothing to choose.
+            if most - least > ONE_SURFACE_PX:
+                out[y, x] = _weighted_median(values[:n], weights[:n], 0.5 * total)
+
+
+@njit(cache=True, nogil=True)
+def smooth_guesses(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
+    """Guessed disparities (h, w), whose confidence ``sure`` is 0, become the median of those within ``NEAR``
+    pixels, rows [first, last): a pixel alone is a speck in every view between."""
+    height, width = disparity.shape
+    values = np.empty((2 * NEAR + 1) ** 2, np.float32)
+    for y in range(rows[0], rows[1]):
+        for x in range(width):
+            out[y, x] = disparity[y, x]
+            if sure[y, x] > 0.0 or np.isnan(disparity[y, x]):
+                continue
+            n = 0
+            for v in range(max(y - NEAR, 0), min(y + NEAR + 1, height)):
+                for u in range(max(x - NEAR, 0), min(x + NEAR + 1, width)):
+                    if not np.isnan(disparity[v, u]):
+                        values[n] = disparity[v, u]
+                        n += 1
+            if values[:n].max() - values[:n].min() > ONE_SURFACE_PX:
+                out[y, x] = np.sort(values[:n])[n // 2]
+
+
+@njit(cache=True, nogil=True)
+def _weighted_median(values: F32, weights: F64, half: float) -> float:
+    """The least of ``values`` (N,) up to which the weights sum to ``half``."""
+    order, total = np.argsort(values), 0.0
+    for k in order:
+        total += weights[k]
+        if total >= half:
+            return float(values[k])
+    return float(values[order[-1]])
+
+
+@njit(cache=True, nogil=True)
+def place_between(
+    places: F64, disparity: F32, share: float, G: F64, rows: tuple[int, int], target: F64
+) -> None:
+    """Where pixels lie in a view between: ``places`` (h, w, 2) moved left by ``share`` of their disparity
+    (h, w), then by the homography ``G`` (3, 3), into rows of ``target`` (h, w, 2); NaN beyond infinity."""
+    for y in range(rows[0], rows[1]):
+        for x in range(disparity.shape[1]):
+            u, v = places[y, x, 0] - share * disparity[y, x], places[y, x, 1]
+            w = G[2, 0] * u + G[2, 1] * v + G[2, 2]
+            if w > 0.0:
+                target[y, x, 0] = (G[0, 0] * u + G[0, 1] * v + G[0, 2]) / w
+                target[y, x, 1] = (G[1, 0] * u + G[1, 1] * v + G[1, 2]) / w
+            else:
+                target[y, x] = np.nan
+
+
+@njit(cache=True, nogil=True)
+def _at(values: F32, source: F32, y: int, x: int) -> float:
+    """The value (h, w) of the pixel nearest to the source (H, W, 2) of a pixel."""
+    v = min(max(int(np.rint(source[y, x, 1])), 0), values.shape[0] - 1)
+    u = min(max(int(np.rint(source[y, x, 0])), 0), values.shape[1] - 1)
+    return float(values[v, u])
+
+
+@njit(cache=True, nogil=True)
+def blend(
+    colors: tuple[F32, F32],
+    fronts: tuple[F32, F32],
+    sources: tuple[F32, F32],
+    weights: tuple[F32, F32],
+    limits: tuple[float, float, float],
+    out: tuple[F32, F32],
+) -> None:
+    """One picture of two.
+
+    ``colors`` (H, W, 3) and nearness ``fronts`` (H, W) of both, NaN where nothing is; ``weights`` (h, w) of
+    the pixels of either photograph, those at or below ``limits[1]`` being guesses; ``sources`` (H, W, 2)
+    which pixel is seen. Where both are within ``limits[0]`` of each other's nearness their mean, weighted
+    further by 1 - s and s, s = ``limits[2]``; else what is no guess, of two that are none the nearer one, of
+    two that are the farther one. ``out``: colours and nearness, NaN where neither has any.
+    """
+    alike, guess, s = limits
+    rgb, near = out
+    for y in range(near.shape[0]):
+        for x in range(near.shape[1]):
+            n0, n1 = fronts[0][y, x], fronts[1][y, x]
+            if np.isnan(n0) and np.isnan(n1):
+                rgb[y, x] = np.nan
+                near[y, x] = np.nan
+                continue
+            w0 = 0.0 if np.isnan(n0) else _at(weights[0], sources[0], y, x)
+            w1 = 0.0 if np.isnan(n1) else _at(weights[1], sources[1], y, x)
+            if w0 > 0.0 and w1 > 0.0 and abs(n0 - n1) > alike:
+                sure0, sure1 = w0 > guess, w1 > guess
+                first = n0 > n1 if sure0 and sure1 else (n0 < n1 if sure0 == sure1 else sure0)
+                w0, w1 = (w0, 0.0) if first else (0.0, w1)
+            if w0 > 0.0 and w1 > 0.0:
+                w0, w1 = (1.0 - s) * w0, s * w1
+            t = w1 / (w0 + w1)
+            for c in range(rgb.shape[2]):
+                if t == 0.0:
+                    rgb[y, x, c] = colors[0][y, x, c]
+                elif t == 1.0:
+                    rgb[y, x, c] = colors[1][y, x, c]
+                else:
+                    rgb[y, x, c] = (1.0 - t) * colors[0][y, x, c] + t * colors[1][y, x, c]
+            near[y, x] = n0 if w0 >= w1 else n1
+
+
+@njit(cache=True, nogil=True)
+def weigh(disparity: F32, sure: F32, floors: tuple[float, float, float], out: F32) -> None:
+    """Weights (h, w) of the pixels of a photograph in the mean of two.
+
+    Those of confidence 0 have ``floors[0]``, others their confidence but at least ``floors[1]``, times
+    ``floors[2]`` beside a cut: pixels at the rim of a surface are a mixture of two.
+    """
+    height, width = disparity.shape
+    for y in range(height):
+        for x in range(width):
+            if sure[y, x] <= 0.0:
+                out[y, x] = floors[0]
+                continue
+            weight = max(float(sure[y, x]), floors[1])
+            d = disparity[y, x]
+            for k in range(4):
+                v, u = y + (k == 0) - (k == 1), x + (k == 2) - (k == 3)
+                if 0 <= v < height and 0 <= u < width and abs(disparity[v, u] - d) > ONE_SURFACE_PX:
+                    weight *= floors[2]
+                    break
+            out[y, x] = weight
