@@ -1,4 +1,0 @@
-"""The package as somebody gets it: built, installed into an empty environment, and used from an empty folder.
-
-``python -m validation.checks.package`` says each step.
-"""

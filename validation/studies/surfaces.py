@@ -1,0 +1,161 @@
+"""Linear and fitted surfaces of depth maps: ``python -m validation.studies.surfaces [-o OUT]``.
+
+Surfaces that are known, with noise and with a fifth of wrong depths; then the depth maps of the courtyard,
+their depths and normals against the truth. Everything before the depth maps is that of the photographs alone
+and kept in OUT; ``--variant thesis`` takes the maps that the thesis' own way gives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import thesisrecon
+from thesisrecon.arrays import F64
+from thesisrecon.config import PipelineConfig, preset
+from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera
+from thesisrecon.records import DepthMap
+from thesisrecon.surface.bspline import BSplineSurface
+from thesisrecon.surface.linear import DepthSurface, LinearSurface, normals, resampled
+from validation.metrics.depth import SAME, true_depth, true_from_maps
+from validation.metrics.record import Metric, markdown_table
+from validation.scenes.real import Scene, load_fixture_scene
+
+SURFACES: Mapping[str, DepthSurface] = {"linear": LinearSurface(), "b-spline": BSplineSurface()}
+SMOOTH_DEG = 3.0
+"""Where the normals to either side of a true pixel differ by more there is an edge, and no normal."""
+NOISE = 5e-4
+"""Of inverse depths of about 0.2."""
+
+
+def known_surfaces() -> dict[str, F64]:
+    """Inverse depths (240, 320) by name."""
+    y, x = np.indices((240, 320))
+    u, v = x / 320.0 - 0.5, y / 240.0 - 0.5
+
+    def waves(period_px: float) -> F64:
+        return np.asarray(
+            0.2 + 5e-5 * period_px * np.sin(2 * np.pi * x / period_px) * np.cos(2 * np.pi * y / period_px)
+        )
+
+    return {
+        "plane": 0.2 + 0.05 * u - 0.03 * v,
+        "roof": 0.2 - 0.1 * np.abs(u),
+        "quadric": 0.2 + 0.03 * u + 0.1 * u * u - 0.08 * v * v,
+        "waves of 40 px": waves(40.0),
+        "waves of 16 px": waves(16.0),
+        "step": np.where(x < 150, 0.3, 0.2),
+    }
+
+
+def check_known(name: str, rho: F64, wrong: float) -> Metric:
+    """RMS error of inverse depths in deviations of their noise, a share of them ``wrong``."""
+    K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
+    rng = np.random.default_rng(0)
+    noisy = rho + NOISE * rng.normal(size=rho.shape)
+    noisy += np.where(rng.random(rho.shape) < wrong, rng.uniform(-0.1, 0.1, rho.shape), 0.0)
+    P, std = camera_from_centre(K, np.eye(3), np.zeros(3)), NOISE / noisy**2
+    views = np.ones(rho.shape, dtype=np.uint8)
+    given = DepthMap(0, P, (1.0 / noisy).astype(np.float32), std.astype(np.float32), views)
+    off = {
+        word: 1.0 / resampled(surface.fit(given)).depth.astype(np.float64) - rho
+        for word, surface in SURFACES.items()
+    }
+    rms = {word: float(np.sqrt(np.nanmean(e**2))) / NOISE for word, e in off.items()}
+    what = f"RMS error, {wrong:.0%} wrong" if wrong else "RMS error"
+    return Metric("known surfaces", f"{name}: {what}", "deviations", rms, "b-spline")
+
+
+def true_normals(scene: Scene, view: int, depth: F64, stride: int) -> F64:
+    """(h, w, 3) unit normals in the camera of a true map, towards the camera, NaN at edges."""
+    assert scene.K is not None
+    K = scene.K[view]
+    y, x = np.indices(depth.shape) * stride
+    rho = 1.0 / depth
+
+    def from_steps(gx: F64, gy: F64) -> F64:
+        normal = -np.stack([gx, gy, rho - gx * x - gy * y], axis=-1) @ K
+        return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
+    ahead, behind = np.full((2, 2, *depth.shape), np.nan)
+    ahead[0][:, :-1] = behind[0][:, 1:] = np.diff(rho, axis=1) / stride
+    ahead[1][:-1] = behind[1][1:] = np.diff(rho, axis=0) / stride
+    turn = np.sum(from_steps(*ahead) * from_steps(*behind), axis=-1)
+    mean = from_steps(*(0.5 * (ahead + behind)))
+    return np.where((turn > np.cos(np.radians(SMOOTH_DEG)))[..., None], mean, np.nan)
+
+
+def check_map(found: DepthMap, scene: Scene, scale: float) -> dict[str, dict[str, float]]:
+    """What each surface of one map is worth at the places of the truth, which lie between its pixels."""
+    depth, stride, seen = true_depth(scene, found.view)
+    true = true_normals(scene, found.view, depth, stride)
+    shrink = found.depth.shape[1] / (stride * depth.shape[1])
+    y, x = (np.indices(depth.shape) * stride + 0.5) * shrink - 0.5
+    xy = np.stack([x, y], axis=-1).reshape(-1, 2)
+    R = decompose_camera(found.P)[1]
+    told = {}
+    for word, surface in SURFACES.items():
+        start = time.process_time()
+        fit = surface.fit(found)
+        seconds = time.process_time() - start
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.abs(scale / fit.evaluate(xy).inverse_depth.reshape(depth.shape) / depth - 1.0)
+            cosine = np.sum((normals(fit, xy) @ R.T).reshape(true.shape) * true, axis=-1)
+        known = seen & np.isfinite(error)
+        angle = np.degrees(np.arccos(np.clip(cosine[seen & np.isfinite(cosine)], -1.0, 1.0)))
+        told[word] = {
+            "known, of what two views see (%)": 100.0 * known.sum() / seen.sum(),
+            "depth error, median (%)": 100.0 * float(np.median(error[known])),
+            "within 1 %, of the known (%)": 100.0 * float(np.mean(error[known] < SAME)),
+            "normals, median error (deg)": float(np.median(angle)),
+            "normals within 10 deg (%)": 100.0 * float(np.mean(angle < 10.0)),
+            "processor seconds a view": seconds,
+        }
+    return told
+
+
+def check_courtyard(out: Path, variant: str, views: Sequence[int] | None) -> list[Metric]:
+    """The mean over the views of the courtyard."""
+    scene = load_fixture_scene("courtyard")
+    dense = replace(preset(variant).dense, max_side=640)  # type: ignore[type-var]
+    config = replace(PipelineConfig(), dense=dense)
+    run = thesisrecon.reconstruct(list(scene.image_paths), out / variant, config=config, until="dense")
+    scale = true_from_maps({m.view: m for m in run.depth_maps}, scene).scale
+    told = [check_map(m, scene, scale) for m in run.depth_maps if views is None or m.view in views]
+    return [
+        Metric(
+            f"courtyard, {variant} maps",
+            what,
+            "",
+            {word: float(np.mean([one[word][what] for one in told])) for word in SURFACES},
+            "b-spline",
+        )
+        for what in told[0]["linear"]
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--out", type=Path, help="where the run on the courtyard is kept")
+    parser.add_argument("--variant", nargs="*", default=["default"], choices=("default", "thesis"))
+    parser.add_argument("--views", nargs="*", type=int, help="of the courtyard; all without it")
+    options = parser.parse_args(arguments)
+    metrics = [
+        check_known(name, rho, wrong) for name, rho in known_surfaces().items() for wrong in (0.0, 0.2)
+    ]
+    print(markdown_table(metrics), flush=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        for variant in options.variant:
+            print(markdown_table(check_courtyard(options.out or Path(temporary), variant, options.views)))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

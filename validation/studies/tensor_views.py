@@ -1,0 +1,314 @@
+"""Views by the trilinear tensor beside the truth: ``python -m validation.studies.tensor_views``.
+
+The courtyard is rendered anew at places along the baseline of two of its views and off it, with guessed and
+with true intrinsics; photograph 5 of fountain-P11 is made from 4 and 6; the views in between of Cones from
+its views 2 and 6, beside the same warp with OpenCV's semi-global matching. ``-o`` takes a folder for the
+pictures and the plot. The exit code is 1 where a target is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import plotly.graph_objects as go
+
+from thesisrecon.arrays import F32, U8
+from thesisrecon.config import PipelineConfig
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.view_synthesis import match_photographs
+from thesisrecon.views.trilinear import seed_of_two
+from thesisrecon.views.trilinear_synthesis import AGREE_PX, prepare_synthesis
+from thesisrecon.views.virtual_camera import (
+    CalibratedPair,
+    VirtualCamera,
+    camera_at,
+    guessed_intrinsics,
+    pair_from_fundamental,
+)
+from validation.metrics.pictures import picture_metrics, psnr_db, ssim
+from validation.metrics.record import Metric, markdown_table
+from validation.metrics.timing import time_of_a_frame
+from validation.scenes.courtyard import build_courtyard
+from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_photograph
+from validation.scenes.nine_views import dissolved
+from validation.scenes.raycast import Rays, World, trace
+from validation.scenes.real import load_real_scene
+
+VIEWS = (6, 7)
+"""Of the courtyard: 11 degrees and 1.3 m apart, the scene 3 to 9 m away."""
+ALONG = (-1.0, -0.5, -0.25, 0.25, 0.5, 0.75, 1.25, 1.5, 2.0)
+OFF = (0.1, 0.25, 0.5, 1.0)
+DIRECTIONS = {"up": (0.0, -1.0, 0.0), "ahead": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0)}
+FRAME_SIZE, FRAME_S = (1000, 700), 1.0
+BORDER_PX = 50
+"""Columns of views beyond the baseline that no photograph shows, or whose picture ends before."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A virtual camera of the courtyard: ``s`` baselines along it, ``off`` baselines from it."""
+
+    s: float
+    off: float = 0.0
+    direction: str = "along"
+
+    @property
+    def distance(self) -> float:
+        """From the nearest place between the photographs, in baselines."""
+        return float(np.hypot(max(-self.s, self.s - 1.0, 0.0), self.off))
+
+    def of(self, pair: CalibratedPair) -> VirtualCamera:
+        """The camera as the pair takes it."""
+        camera = camera_at(pair, self.s, sizes=(SIZE, SIZE))
+        if self.direction == "along":
+            return camera
+        step = self.off * np.array(DIRECTIONS[self.direction])
+        return replace(camera, translation=camera.translation - step)
+
+
+def places_of_courtyard() -> Iterator[Place]:
+    """Along the baseline, and off its middle in three directions."""
+    yield from (Place(s) for s in ALONG)
+    yield from (Place(0.5, off, direction) for direction in DIRECTIONS for off in OFF)
+
+
+@dataclass(frozen=True)
+class CourtyardTruth:
+    """The ``world`` and two of its cameras, ``photographs`` of equal exposure and the true ``places``."""
+
+    world: World
+    poses: tuple[Pose, Pose]
+    photographs: tuple[U8, U8]
+    places: tuple[F32, F32]
+
+    @property
+    def pair(self) -> CalibratedPair:
+        """The true cameras, in baselines."""
+        one, two = self.poses
+        return CalibratedPair(
+            one.K, two.K, two.R @ one.R.T, two.R @ (one.C - two.C) / np.linalg.norm(two.C - one.C)
+        )
+
+    def pose(self, camera: VirtualCamera) -> Pose:
+        """Where a virtual camera of the true pair stands in the world."""
+        two = self.poses[1]
+        step = camera.rotation.T @ camera.translation * np.linalg.norm(two.C - self.poses[0].C)
+        return Pose(camera.K, camera.rotation @ two.R, two.C - two.R.T @ step)
+
+
+def photograph(world: World, pose: Pose) -> U8:
+    """As the fixtures are made, with the exposure of the pose and no white balance."""
+    with PIL.Image.open(io.BytesIO(render_photograph(world, pose, 0)[0])) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+@cache
+def courtyard() -> CourtyardTruth:
+    """Rendered, with the true correspondence from the traced depth."""
+    world = build_courtyard()
+    one, two = (replace(courtyard_poses()[k], exposure=1.0) for k in VIEWS)
+    places = []
+    for here, there in ((one, two), (two, one)):
+        depth = trace(world, Rays(here.K, here.R, here.C), SIZE, shade=False)[1]
+        y, x = np.indices(depth.shape)
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(here.K).T
+        X = rays * np.where(depth > 0.0, depth, np.nan)[..., None] @ here.R + here.C
+        places.append(dehomogenize((X - there.C) @ (there.K @ there.R).T).astype(np.float32))
+    pictures = photograph(world, one), photograph(world, two)
+    return CourtyardTruth(world, (one, two), pictures, (places[0], places[1]))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A picture at one ``place`` by one ``method``: ``psnr`` dB, ``ssim``, and how far its pixels are from
+    where they belong, median and 90 % (px)."""
+
+    place: Place
+    method: str
+    psnr: float
+    ssim: float
+    off_px: tuple[float, float]
+
+
+def measure_courtyard(out: Path | None) -> list[Measured]:
+    """All places by true cameras and correspondence, and by F and matches with true and guessed K."""
+    truth = courtyard()
+    found = match_photographs(*truth.photographs, config=PipelineConfig())
+    dense = found.dense.places(0, SIZE), found.dense.places(1, SIZE)
+    K, guess = truth.poses[0].K, guessed_intrinsics(SIZE)
+    matches = found.pair.xy1, found.pair.xy2
+    pairs = {
+        "all true": truth.pair,
+        "true K": pair_from_fundamental(found.pair.F, *matches, K1=K, K2=K),
+        "guessed K": pair_from_fundamental(found.pair.F, *matches, K1=guess, K2=guess),
+    }
+    ready = {
+        name: prepare_synthesis(
+            pair,
+            truth.photographs,
+            truth.places if name == "all true" else dense,
+            gain=found.dense.gain if name != "all true" else np.ones(3),
+            agree_px=np.inf if name == "all true" else AGREE_PX,
+        )
+        for name, pair in pairs.items()
+    }
+    rows = []
+    for place in places_of_courtyard():
+        wanted = photograph(truth.world, truth.pose(place.of(truth.pair)))
+        shown = []
+        for name, views in ready.items():
+            picture = views.render(place.of(views.pair), threads=2)
+            off = _displaced(truth, place, views.pair)
+            rows.append(Measured(place, name, psnr_db(picture, wanted), ssim(picture, wanted), off))
+            shown.append(picture)
+        if out is not None:
+            name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
+            save_beside(out / name, [wanted, *shown])
+    return rows
+
+
+def _displaced(truth: CourtyardTruth, place: Place, pair: CalibratedPair) -> tuple[float, float]:
+    """How far the exact matches of view 1 come to lie from where the true camera has them (px)."""
+    y, x = np.indices(truth.places[0].shape[:2])[:, ::8, ::8].reshape(2, -1).astype(np.float64)
+    matches = truth.places[0][::8, ::8].reshape(-1, 2).astype(np.float64)
+    both = []
+    for cameras in (truth.pair, pair):
+        camera = place.of(cameras)
+        tensor = seed_of_two(cameras).moved(camera.rotation, camera.translation, K=camera.K)
+        both.append(tensor.transfer(np.stack([x, y], axis=1), matches)[0])
+    inside = np.all((both[0] > 0.0) & (both[0] < np.array(SIZE)), axis=1)
+    apart = np.linalg.norm(both[1] - both[0], axis=1)[inside]
+    apart = apart[np.isfinite(apart)]
+    return float(np.median(apart)), float(np.quantile(apart, 0.9))
+
+
+def linear_range(rows: list[Measured], method: str) -> tuple[float, float]:
+    """Up to which distance beyond the baseline's ends the median displacement grows in proportion, within
+    10 %, and its slope, px a baseline: from the places along the baseline."""
+    ends = sorted((r.place.distance, r.off_px[0]) for r in rows if r.method == method and r.place.s > 1.0)
+    slope = ends[0][1] / ends[0][0]
+    reach = 0.0
+    for distance, off in ends:
+        if abs(off / distance - slope) > 0.1 * slope:
+            break
+        reach = distance
+    return reach, slope
+
+
+def draw(rows: list[Measured]) -> go.Figure:
+    """PSNR and displacement as functions of the distance from the baseline."""
+    figure = go.Figure()
+    for method in dict.fromkeys(row.method for row in rows):
+        for direction in ("along", *DIRECTIONS):
+            chosen = [r for r in rows if r.method == method and r.place.direction == direction]
+            figure.add_scatter(
+                x=[r.place.s - 1.0 if direction == "along" else r.place.off for r in chosen],
+                y=[r.psnr for r in chosen],
+                name=f"{method}, {direction}",
+                mode="lines+markers",
+                customdata=[r.off_px for r in chosen],
+                hovertemplate="%{x} baselines: %{y:.1f} dB, displaced by %{customdata[0]:.2f} px",
+            )
+    figure.update_layout(
+        xaxis_title="baselines beyond the second photograph, or off the middle", yaxis_title="PSNR, dB"
+    )
+    return figure
+
+
+def save_beside(path: Path, pictures: list[U8]) -> None:
+    """Pictures in a row, at half their size."""
+    PIL.Image.fromarray(np.concatenate(pictures, axis=1)[::2, ::2]).save(path)
+
+
+def courtyard_table(rows: list[Measured]) -> str:
+    """Every place, a column for each method: PSNR, SSIM, median displacement."""
+    methods = list(dict.fromkeys(row.method for row in rows))
+    lines = [f"| place | {' | '.join(methods)} |", f"| --- |{' --- |' * len(methods)}"]
+    for place in dict.fromkeys(row.place for row in rows):
+        cells = [f"{r.psnr:.1f} dB, {r.ssim:.3f}, {r.off_px[0]:.2f} px" for r in rows if r.place == place]
+        where = f"s = {place.s:g}" if place.direction == "along" else f"{place.off:g} {place.direction}"
+        lines.append(f"| {where} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def measure_fountain(out: Path | None) -> list[Metric]:
+    """Photograph 5 from 4 and 6, by its true place."""
+    scene = load_real_scene("fountain-P11")
+    if scene is None or scene.K is None or scene.R is None or scene.C is None:
+        return []
+    (K1, K, K2), (R1, R, R2), (C1, C, C2) = scene.K[4:7], scene.R[4:7], scene.C[4:7]
+    found = match_photographs(scene.image_paths[4], scene.image_paths[6])
+    images = found.images
+    size = images[0].size
+    dense = found.dense.places(0, size), found.dense.places(1, size)
+    with PIL.Image.open(scene.image_paths[5]) as image:
+        wanted = np.asarray(image.convert("RGB"))
+    baseline = float(np.linalg.norm(C1 - C2))
+    guess = guessed_intrinsics(size)
+    matches = found.pair.xy1, found.pair.xy2
+    pairs = {
+        "true cameras": CalibratedPair(K1, K2, R2 @ R1.T, R2 @ (C1 - C2) / baseline),
+        "F, true K": pair_from_fundamental(found.pair.F, *matches, K1=K1, K2=K2),
+        "F, guessed K": pair_from_fundamental(found.pair.F, *matches, K1=guess, K2=guess),
+    }
+    pictures: dict[str, U8] = {}
+    for name, pair in pairs.items():
+        views = prepare_synthesis(pair, (images[0].rgb, images[1].rgb), dense, gain=found.dense.gain)
+        own = guess if "guessed" in name else K
+        camera = VirtualCamera(R @ R2.T, R @ (C2 - C) / baseline, own, size)
+        pictures[name] = views.render(camera, threads=2)
+    pictures["cross-dissolve"] = dissolved(images[0].rgb, images[1].rgb, 0.5)
+    if out is not None:
+        save_beside(out / "fountain-5.jpg", [wanted, *pictures.values()])
+    return picture_metrics("fountain-P11, 5 from 4 and 6", pictures, wanted)
+
+
+def measure_time(repeats: int) -> Metric:
+    """A frame of 1000 x 700 px from photographs as large, once the correspondence is known."""
+    truth = courtyard()
+    width, height = FRAME_SIZE
+    images = tuple(picture[:height, :width] for picture in truth.photographs)
+    places = tuple(part[:height, :width] for part in truth.places)
+    views = prepare_synthesis(truth.pair, (images[0], images[1]), (places[0], places[1]))
+    camera = replace(camera_at(truth.pair, 0.4, sizes=(FRAME_SIZE, FRAME_SIZE)))
+    draw_frame = partial(views.render, camera, threads=2)
+    return time_of_a_frame("courtyard, 1000 x 700", draw_frame, repeats=repeats, target_s=FRAME_S)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("parts", nargs="*", default=["fountain", "courtyard", "time"])
+    parser.add_argument("-o", "--out", type=Path)
+    parser.add_argument("--repeats", type=int, default=5)
+    wishes = parser.parse_args(arguments)
+    if wishes.out is not None:
+        wishes.out.mkdir(parents=True, exist_ok=True)
+    rows: list[Metric] = []
+    if "fountain" in wishes.parts:
+        rows += measure_fountain(wishes.out)
+    if "time" in wishes.parts:
+        rows.append(measure_time(wishes.repeats))
+    if "courtyard" in wishes.parts:
+        measured = measure_courtyard(wishes.out)
+        print(courtyard_table(measured), end="\n\n")
+        for method in ("true K", "guessed K"):
+            reach, slope = linear_range(measured, method)
+            print(f"{method}: {slope:.2f} px a baseline beyond, linear to {reach:g} baselines", end="\n\n")
+        if wishes.out is not None:
+            draw(measured).write_html(wishes.out / "tensor-views.html", include_plotlyjs=True)
+    for scene in dict.fromkeys(row.scene for row in rows):
+        print(f"### {scene}\n\n{markdown_table([r for r in rows if r.scene == scene])}", end="\n\n")
+    return int(any(row.verdict == "missed" for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
