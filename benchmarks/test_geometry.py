@@ -10,7 +10,7 @@ from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_optimal
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from validation.checks.bundle import FOCAL_K1
+from validation.studies.bundle import FOCAL_K1
 from validation.references.ceres_bundle import CeresOptions, bundle_adjuster
 from validation.references.colmap_model import colmap_model
 from validation.references.fundamental import SOLVERS

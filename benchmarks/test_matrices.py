@@ -16,7 +16,7 @@ from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.geometry.two_view import estimate_homography
-from validation.checks.triangulation import beside, cameras_of
+from validation.studies.triangulation import beside, cameras_of
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point
 from validation.references.geometry import (
     colmap_similarity,

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.conftest import Bench
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
-from validation.checks.rendering import courtyard
+from validation.studies.rendering import courtyard
 from validation.references.open3d_surfaces import OpenTsdf
 
 STEP = 2

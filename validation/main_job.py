@@ -22,7 +22,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.io.files import write_text
-from validation.checks.reconstruction import COLMAP, COLMAP_PP, OURS, THESIS, Outcome, check_reconstruction
+from validation.studies.reconstruction import COLMAP, COLMAP_PP, OURS, THESIS, Outcome, check_reconstruction
 from validation.harness.process import Process, own_cores, run_process
 from validation.metrics.cameras import TrueCameras
 from validation.metrics.record import Metric, markdown_table, summary_table

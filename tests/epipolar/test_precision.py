@@ -22,7 +22,7 @@ from thesisrecon.epipolar.precision import (
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
 from thesisrecon.records import FundamentalFit
-from validation.checks.epipolar import DEFAULT, GOLD, check_precision
+from validation.studies.epipolar import DEFAULT, GOLD, check_precision
 from validation.scenes.two_views import make_two_views
 
 

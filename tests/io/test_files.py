@@ -19,7 +19,7 @@ from thesisrecon.io.colmap_files import write_colmap_model
 from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints
 from thesisrecon.io.exports import write_point_cloud
 from thesisrecon.io.files import is_partial, link, read_json, write_atomically, write_json, write_text
-from validation.checks.full_disk import disk_ends, remount, small_disk
+from validation.studies.full_disk import disk_ends, remount, small_disk
 
 MANY = np.zeros((20_000, 3))
 

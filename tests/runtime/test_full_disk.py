@@ -14,8 +14,8 @@ from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.errors import OutputError
 from thesisrecon.pipeline.reconstruction import reconstruct
-from validation.checks.full_disk import Refusal, SmallRuns, disk_ends, filled, refused_at, table
-from validation.checks.kill_anywhere import different, outputs
+from validation.studies.full_disk import Refusal, SmallRuns, disk_ends, filled, refused_at, table
+from validation.studies.kill_anywhere import different, outputs
 
 
 def run(out: Path, **options: Any) -> None:

@@ -16,8 +16,8 @@ from thesisrecon.cli.main import run_command
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime.executors import ProcessPool
 from thesisrecon.runtime.signals import CODES, advised
-from validation.checks.kill_anywhere import different, outputs
-from validation.checks.stop_anywhere import Stop, stopped, table
+from validation.studies.kill_anywhere import different, outputs
+from validation.studies.stop_anywhere import Stop, stopped, table
 
 ROOT = Path(__file__).parents[2]
 COURTYARD = ROOT / "fixtures" / "courtyard" / "images"

@@ -10,7 +10,7 @@ pytest.importorskip("pycolmap")
 from tests.numerics.bundle_scenes import make_block
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.records import Reconstruction, Tracks
-from validation.checks.bundle import (
+from validation.studies.bundle import (
     FOCAL_K1,
     Case,
     check_covariance,

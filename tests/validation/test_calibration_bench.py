@@ -10,10 +10,10 @@ import pytest
 from tests.validation.test_cameras import _reconstruction, _truth
 from thesisrecon.config import PipelineConfig
 from thesisrecon.records import Reconstruction
-from validation.checks.calibration_bench import Rows
-from validation.checks.calibration_parts import keep_observations, one_camera
-from validation.checks.calibration_real import _change_pct, _pooled, _told
-from validation.checks.reconstruction import COLMAP, OURS
+from validation.studies.calibration_bench import Rows
+from validation.studies.calibration_parts import keep_observations, one_camera
+from validation.studies.calibration_real import _change_pct, _pooled, _told
+from validation.studies.reconstruction import COLMAP, OURS
 from validation.metrics.intervals import IntervalScores, holding_std
 from validation.metrics.record import Metric
 from validation.scenes.real import Scene

@@ -10,8 +10,8 @@ import pytest
 from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import MetricResult
-from validation.checks import growth_of_cost, parallel, perturbation
-from validation.checks.growth_of_cost import Cost, Meter
+from validation.studies import growth_of_cost, parallel, perturbation
+from validation.studies.growth_of_cost import Cost, Meter
 from validation.scenes.many_views import walk
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from validation.checks.dinosaur import Comparison, compare, to_metrics
+from validation.studies.dinosaur import Comparison, compare, to_metrics
 from validation.scenes.dinosaur import load_dinosaur
 
 pytestmark = pytest.mark.real

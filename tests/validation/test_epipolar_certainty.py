@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from thesisrecon.epipolar.configuration import Configuration
-from validation.checks.epipolar_certainty import (
+from validation.studies.epipolar_certainty import (
     certainty_metrics,
     certainty_table,
     check_degeneracy,

@@ -7,7 +7,7 @@ import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.geometry.two_view import symmetric_residuals
-from validation.checks.epipolar_real import called_sure, check_cameras, least
+from validation.studies.epipolar_real import called_sure, check_cameras, least
 from validation.metrics.epipolar import (
     NONE_PX,
     precision_recall,

@@ -12,8 +12,8 @@ pytest.importorskip("poselib")
 pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
-from validation.checks import epipolar_cube, epipolar_methods
-from validation.checks.epipolar_catalogue import (
+from validation.studies import epipolar_cube, epipolar_methods
+from validation.studies.epipolar_catalogue import (
     DEFAULT,
     GOLD,
     GOLD_FROM_DEFAULT,
@@ -23,8 +23,8 @@ from validation.checks.epipolar_catalogue import (
     RAW,
     Method,
 )
-from validation.checks.epipolar_cube import BOUND, CubeRow, cube_pairs, run_cube
-from validation.checks.epipolar_methods import (
+from validation.studies.epipolar_cube import BOUND, CubeRow, cube_pairs, run_cube
+from validation.studies.epipolar_methods import (
     Result,
     Setting,
     make_trial,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from validation.checks.factorization import (
+from validation.studies.factorization import (
     AFFINE,
     GROWN,
     ITERATED,

@@ -8,7 +8,7 @@ import pytest
 
 from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.io.colmap_model import MODEL_NUMBERS, inconsistency
-from validation.checks import fuzz_colmap
+from validation.studies import fuzz_colmap
 
 
 def test_good_inputs_are_models(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from validation.checks.growth import Growth, exponent, recall_of, table
-from validation.checks.pair_choice import Choice, to_metrics
+from validation.studies.growth import Growth, exponent, recall_of, table
+from validation.studies.pair_choice import Choice, to_metrics
 
 ROW = Growth(
     "all-pairs", 10, 45, 45, 2, 1.0, 0.0, 9.0, 10.0, None, ((0, 1, True), (0, 2, False), (1, 2, True))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from thesisrecon.records import IntrinsicInterval, MetricResult, Reconstruction, Tracks
-from validation.checks.calibration_coverage import run_trial
-from validation.checks.calibration_parts import named, without
-from validation.checks.subsets import Matched
+from validation.studies.calibration_coverage import run_trial
+from validation.studies.calibration_parts import named, without
+from validation.studies.subsets import Matched
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
 
 K = np.array([[1000.0, 0.0, 500.0], [0.0, 1002.001, 300.0], [0.0, 0.0, 1.0]])

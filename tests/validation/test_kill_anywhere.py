@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from validation.checks.kill_anywhere import TORN, Kill, different, outputs, table
+from validation.studies.kill_anywhere import TORN, Kill, different, outputs, table
 
 
 def write(folder: Path, seconds: float, focal: float) -> None:

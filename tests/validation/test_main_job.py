@@ -14,7 +14,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import colmap_from_reconstruction
 from thesisrecon.io.colmap_files import write_colmap_model
 from validation import main_job
-from validation.checks.reconstruction import COLMAP, OURS
+from validation.studies.reconstruction import COLMAP, OURS
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric

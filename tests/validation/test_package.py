@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from thesisrecon.io.lists import COUNT, demo_photographs
-from validation.checks.package.built import NEEDED, wheel_faults
-from validation.checks.package.environments import dependencies, lowest_versions
-from validation.checks.package.quiet import Watched, trespasses, watch
-from validation.checks.package.suite import Part, counted, quick_parts, run_part, suite_faults
+from validation.studies.package.built import NEEDED, wheel_faults
+from validation.studies.package.environments import dependencies, lowest_versions
+from validation.studies.package.quiet import Watched, trespasses, watch
+from validation.studies.package.suite import Part, counted, quick_parts, run_part, suite_faults
 from validation.scenes.real import ROOT
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from thesisrecon.records import PairChoice
-from validation.checks.pair_choice import Choice, choose, to_metrics
+from validation.studies.pair_choice import Choice, choose, to_metrics
 
 
 class FirstPairOnly:

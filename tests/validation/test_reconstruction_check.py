@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from tests.validation.test_cameras import V, _reconstruction, _truth
-from validation.checks.reconstruction import COLMAP, OURS, Outcome, check_reconstruction
+from validation.studies.reconstruction import COLMAP, OURS, Outcome, check_reconstruction
 from validation.metrics.record import Metric, markdown_table
 
 

@@ -9,7 +9,7 @@ pytest.importorskip("cv2")
 
 from tests.stereo.rectification_scenes import make_pair
 from thesisrecon.stereo.epipolar_pair import pair_of_cameras, pair_of_fundamental
-from validation.checks.rectification import BEST_F, METHODS, RealPair, check_scene, measure, seen_by_other
+from validation.studies.rectification import BEST_F, METHODS, RealPair, check_scene, measure, seen_by_other
 from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thesisrecon.geometry.camera_matrix import project
-from validation.checks.selfcalibration import (
+from validation.studies.selfcalibration import (
     BOUND,
     WITH_BUNDLE,
     Cell,

@@ -8,7 +8,7 @@ import pytest
 from tests.textures import texture
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import CohesiveScanlines
-from validation.checks.stereo import DEFAULT, THESIS, bad_pixels, check_pair
+from validation.studies.stereo import DEFAULT, THESIS, bad_pixels, check_pair
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
 
 LIMITS_PCT = {

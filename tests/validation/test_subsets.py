@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.synthetic import make_scene, true_pairs
-from validation.checks.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
+from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
 
 
 def matched_scene() -> Matched:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thesisrecon.views.virtual_camera import CalibratedPair
-from validation.checks.tensor_views import Measured, Place, draw, linear_range
+from validation.studies.tensor_views import Measured, Place, draw, linear_range
 
 
 def test_places_are_as_far_from_the_baseline_as_they_say():

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("cv2")
 pytest.importorskip("pycolmap")
 
-from validation.checks.triangulation import (
+from validation.studies.triangulation import (
     FRAMES,
     GEOMETRIES,
     OPENCV,

@@ -17,7 +17,7 @@ from tests.validation.ablation.toy import Darts, marks
 from validation.ablation import Measure, Study, ablate, analyse, write_analysis
 from validation.ablation.progress import duration, words_of
 from validation.ablation.run import State
-from validation.checks.stop_anywhere import stopped
+from validation.studies.stop_anywhere import stopped
 from validation.command import main
 from validation.scenes.real import ROOT
 

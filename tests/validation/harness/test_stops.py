@@ -15,7 +15,7 @@ import pytest
 from tests.runtime.test_signals import is_alive
 from tests.validation.harness.test_harness import toy_wishes
 from tests.validation.harness.toy_stages import ToyStage
-from validation.checks.stop_anywhere import stopped
+from validation.studies.stop_anywhere import stopped
 from validation.harness.records import Wishes
 from validation.harness.schedule import run_tasks
 from validation.scenes.real import ROOT

@@ -14,7 +14,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.records import Reconstruction
 from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
-from validation.checks.selfcalibration import (
+from validation.studies.selfcalibration import (
     MODES,
     SCENES,
     Cell,

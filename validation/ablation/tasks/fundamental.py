@@ -15,8 +15,8 @@ from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
-from validation.checks.epipolar_catalogue import METHODS, THRESHOLD_PX, TOLD_SIGMAS
-from validation.checks.epipolar_cube import CubePair, cube_pairs, measure_pair
+from validation.studies.epipolar_catalogue import METHODS, THRESHOLD_PX, TOLD_SIGMAS
+from validation.studies.epipolar_cube import CubePair, cube_pairs, measure_pair
 from validation.scenes.cube import make_cube
 
 BY_METHOD = {m.name: m for m in METHODS}

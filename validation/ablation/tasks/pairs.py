@@ -19,7 +19,7 @@ from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
 from thesisrecon.records import Image
 from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
-from validation.checks.front_end_pairs import MAX_SIZE_PX, Related
+from validation.studies.front_end_pairs import MAX_SIZE_PX, Related
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS, camera_pairs

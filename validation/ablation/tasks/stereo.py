@@ -14,7 +14,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.settings import unknown_word
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.ablation.study import Measure, Place
-from validation.checks.stereo import bad_pixels
+from validation.studies.stereo import bad_pixels
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 

@@ -13,7 +13,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.geometry.strata import Group
 from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
-from validation.checks.triangulation import POLYNOMIAL, SCENES, TWO_VIEWS, compare_on_rig, draw_rig
+from validation.studies.triangulation import POLYNOMIAL, SCENES, TWO_VIEWS, compare_on_rig, draw_rig
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bund
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import Reconstruction
-from validation.checks.bundle import FOCAL_K1, LOSS_PX, WITH_CENTRE, model_as_bundle, perturbed_model
+from validation.studies.bundle import FOCAL_K1, LOSS_PX, WITH_CENTRE, model_as_bundle, perturbed_model
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import OURS as OUR_CAMERAS

@@ -12,7 +12,7 @@ import PIL.Image
 from thesisrecon.arrays import F32
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import CohesiveScanlines, PairMatcher, SemiGlobal
-from validation.checks.stereo import bad_pixels, picture
+from validation.studies.stereo import bad_pixels, picture
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread

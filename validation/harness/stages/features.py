@@ -16,7 +16,7 @@ from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io.images import read_photographs
 from thesisrecon.records import Image
-from validation.checks.front_end_pairs import RIGHT_PX, PreparedViews, front_ends
+from validation.studies.front_end_pairs import RIGHT_PX, PreparedViews, front_ends
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.fundamental import MATCHES
