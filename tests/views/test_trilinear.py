@@ -66,9 +66,9 @@ def test_the_virtual_camera_sees_the_scene_projected_again(turn, baseline, R, t,
     X2 = X @ pair.R.T + pair.t
     X3 = X2 @ R.T + t
     virtual = seed_of_two(pair).moved(R, np.array(t), K=K)
-    xy, nearness = virtual.transfer(*_images(pair, X))
+    xy, inverse_depth = virtual.transfer(*_images(pair, X))
     np.testing.assert_allclose(xy, project(K @ np.eye(3, 4), X3), rtol=1e-10, atol=1e-8)
-    np.testing.assert_allclose(nearness, 1.0 / X3[:, 2], rtol=1e-9)
+    np.testing.assert_allclose(inverse_depth, 1.0 / X3[:, 2], rtol=1e-9)
 
 
 @exact
@@ -150,11 +150,11 @@ def test_without_motion_the_second_view_is_seen_and_any_line_through_a_match_say
     np.testing.assert_allclose(seed.transfer(xy1, xy2)[0], xy2, atol=1e-8)
     one, zero = np.ones(len(xy1)), np.zeros(len(xy1))
     virtual = seed.moved(np.eye(3), np.array([0.2, 0.3, 0.1]))
-    across, nearness = virtual.transfer(xy1, xy2)
+    across, inverse_depth = virtual.transfer(xy1, xy2)
     for lines in ([one, zero, -xy2[:, 0]], [one, one, -xy2.sum(axis=1)]):
         xy, near = virtual.transfer(xy1, xy2, lines=np.stack(lines, axis=1))
         np.testing.assert_allclose(xy, across, atol=1e-6)
-        np.testing.assert_allclose(near, nearness, rtol=1e-7)
+        np.testing.assert_allclose(near, inverse_depth, rtol=1e-7)
 
 
 def test_matches_beside_their_epipolar_lines_go_where_their_nearest_place_on_it_goes():
@@ -172,21 +172,23 @@ def test_disparities_of_nearness_are_their_differences():
     pair, X = _pair((0.05, -0.2, 0.1), (0.5, 0.2, 0.6, False)), _scene(8)
     virtual = seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, -1.0]))
     xy1, xy2 = _images(pair, X)
-    nearness = virtual.transfer(xy1, xy2)[1]
+    inverse_depth = virtual.transfer(xy1, xy2)[1]
     xy1_again, farther = _images(pair, 1.0001 * X)
     np.testing.assert_allclose(xy1_again, xy1, atol=1e-9)
-    change = np.abs(virtual.transfer(xy1, farther)[1] - nearness)
+    change = np.abs(virtual.transfer(xy1, farther)[1] - inverse_depth)
     expected = np.linalg.norm(farther - xy2, axis=1) / change
-    np.testing.assert_allclose(virtual.disparity_per_nearness(xy1, xy2), expected, rtol=1e-3)
+    np.testing.assert_allclose(virtual.disparity_per_inverse_depth(xy1, xy2), expected, rtol=1e-3)
 
 
 def test_points_behind_the_virtual_camera_have_no_place():
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
     X = _scene(4)
-    xy, nearness = seed_of_two(pair).moved(np.eye(3), np.array([0.0, 0.0, -6.0])).transfer(*_images(pair, X))
+    xy, inverse_depth = (
+        seed_of_two(pair).moved(np.eye(3), np.array([0.0, 0.0, -6.0])).transfer(*_images(pair, X))
+    )
     behind = (X @ pair.R.T + pair.t)[:, 2] < 6.0
     assert 5 < behind.sum() < 55
-    np.testing.assert_array_equal(np.isnan(nearness), behind)
+    np.testing.assert_array_equal(np.isnan(inverse_depth), behind)
     np.testing.assert_array_equal(np.isnan(xy[:, 0]), behind)
 
 
@@ -199,11 +201,11 @@ def test_nearness_orders_what_falls_on_one_pixel_as_mcmillan_paints_it(ahead, si
     X = centre + np.linspace(3.0, 8.0, 9)[:, None] * np.array([0.1, 0.15, 1.0])
     xy1, xy2 = _images(pair, X)
     virtual = seed_of_two(pair).moved(np.eye(3), -pair.R @ centre - pair.t)
-    xy, nearness = virtual.transfer(xy1, xy2)
+    xy, inverse_depth = virtual.transfer(xy1, xy2)
     np.testing.assert_allclose(xy, np.broadcast_to(xy[0], xy.shape), atol=1e-6)
     from_epipole = np.linalg.norm(xy1 - project(pair.K1 @ np.eye(3, 4), centre[None]), axis=1)
     assert (sign * np.diff(from_epipole) > 0.0).all()
-    assert (np.diff(nearness) < 0.0).all()
+    assert (np.diff(inverse_depth) < 0.0).all()
 
 
 def test_the_kernel_is_its_numpy_twin():
@@ -212,14 +214,14 @@ def test_the_kernel_is_its_numpy_twin():
     virtual = seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, -2.0]))
     places = rng.uniform(0, 600, (20, 30, 2)).astype(np.float32)
     places[3, 4] = np.nan
-    xy, nearness = np.empty((20, 30, 2)), np.empty((20, 30), np.float32)
-    transfer_rows(virtual.T, virtual.P2, places, 7, xy, nearness)
+    xy, inverse_depth = np.empty((20, 30, 2)), np.empty((20, 30), np.float32)
+    transfer_rows(virtual.T, virtual.P2, places, 7, xy, inverse_depth)
     x, y = np.meshgrid(np.arange(30.0), 7 + np.arange(20.0))
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
     expected = virtual.transfer(pixels, places.reshape(-1, 2).astype(np.float64))
-    assert 100 < np.isfinite(nearness).sum() < 600
+    assert 100 < np.isfinite(inverse_depth).sum() < 600
     np.testing.assert_allclose(xy.reshape(-1, 2), expected[0], rtol=2e-5)
-    np.testing.assert_allclose(nearness.ravel(), expected[1], rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(inverse_depth.ravel(), expected[1], rtol=2e-5, atol=1e-6)
 
 
 def _bad_pair(problem):

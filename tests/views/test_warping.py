@@ -240,7 +240,7 @@ def test_a_single_pixel_and_nothing_at_all() -> None:
 
 def test_wrong_calls_are_refused() -> None:
     image, xy, near = np.zeros((4, 5, 3)), np.zeros((4, 5, 2)), np.zeros((4, 5))
-    with pytest.raises(ValueError, match="nearness"):
+    with pytest.raises(ValueError, match="inverse_depth"):
         forward_warp(image, xy, near[:3], size=(4, 4))
     with pytest.raises(ValueError, match="target_xy"):
         forward_map(xy[:2], near, size=(4, 4))
@@ -248,5 +248,5 @@ def test_wrong_calls_are_refused() -> None:
         forward_map(xy, near, size=(0, 4))
     with pytest.raises(ValueError, match="step"):
         forward_map(xy, near, size=(4, 4), step=np.nan)
-    with pytest.raises(ValueError, match="nearness"):
+    with pytest.raises(ValueError, match="inverse_depth"):
         fill_holes(np.zeros((3, 3, 3), np.float32), np.zeros((2, 3), np.float32))

@@ -143,7 +143,7 @@ DARK, BRIGHT = 8.0, 247.0
 class Blending:
     """How two warped photographs become one.
 
-    Pixels whose nearness differs by no more than ``alike_px`` show the same surface. Weights are the
+    Pixels whose inverse depth differs by no more than ``alike_px`` show the same surface. Weights are the
     confidence, but at least ``least``; ``guessed`` of what only the other photograph's holes can show, whose
     disparity is that of the background beside it; ``rim`` is what is left of them beside a cut. Guessed
     disparities are the median of those around, weighted by their likeness in colour, which falls to 1 / e at

@@ -201,11 +201,11 @@ def blend(
 ) -> None:
     """One picture of two.
 
-    ``colors`` (H, W, 3) and nearness ``fronts`` (H, W) of both, NaN where nothing is; ``weights`` (h, w) of
+    ``colors`` (H, W, 3) and inverse depth ``fronts`` (H, W) of both, NaN where nothing is; ``weights`` (h, w) of
     the pixels of either photograph, those at or below ``limits[1]`` being guesses; ``sources`` (H, W, 2)
-    which pixel is seen. Where both are within ``limits[0]`` of each other's nearness their mean, weighted
+    which pixel is seen. Where both are within ``limits[0]`` of each other's inverse depth their mean, weighted
     further by 1 - s and s, s = ``limits[2]``; else what is no guess, of two that are none the nearer one, of
-    two that are the farther one. ``out``: colours and nearness, NaN where neither has any.
+    two that are the farther one. ``out``: colours and inverse depth, NaN where neither has any.
     """
     alike, guess, s = limits
     rgb, near = out

@@ -89,11 +89,11 @@ class VirtualTensor:
         return np.concatenate([along, -np.sum(along * xy2, axis=-1, keepdims=True)], axis=-1)
 
     def transfer(self, xy1: F64, xy2: F64, *, lines: F64 | None = None) -> tuple[F64, F64]:
-        """Pixels (N, 2) of the third view, x''^k = x^i l_j T_i^jk, and their nearness (N,), 1 / depth there.
+        """Pixels (N, 2) of the third view, x''^k = x^i l_j T_i^jk, and their inverse depth (N,), 1 / depth there.
 
         ``xy1``, ``xy2`` (N, 2) px are matches; ``lines`` (N, 3) of view 2 through the second,
         :meth:`lines_across` by default; any line but the epipolar one does for exact matches. Depth is z in
-        the third camera, in baselines. NaN where the point is behind it; the nearness of a match beyond
+        the third camera, in baselines. NaN where the point is behind it; the inverse depth of a match beyond
         infinity is negative.
         """
         x = homogenize(xy1)
@@ -103,11 +103,13 @@ class VirtualTensor:
         sweep = lines @ self.P2[:, 3]
         seen = -places[:, 2] * sweep > 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            nearness = np.where(seen, np.sum(lines * (x @ self.P2[:, :3].T), axis=1) / places[:, 2], np.nan)
-        return np.where(seen[:, None], dehomogenize(places), np.nan), nearness
+            inverse_depth = np.where(
+                seen, np.sum(lines * (x @ self.P2[:, :3].T), axis=1) / places[:, 2], np.nan
+            )
+        return np.where(seen[:, None], dehomogenize(places), np.nan), inverse_depth
 
-    def disparity_per_nearness(self, xy1: F64, xy2: F64) -> F64:
-        """How many pixels of view 2 matches (N, 2), (N, 2) are displaced by where their nearness in the third
+    def disparity_per_inverse_depth(self, xy1: F64, xy2: F64) -> F64:
+        """How many pixels of view 2 matches (N, 2), (N, 2) are displaced by where their inverse depth in the third
         view changes by one (first order); (N,). NaN at the epipole.
         """
         x = homogenize(xy1)
@@ -115,7 +117,7 @@ class VirtualTensor:
         lines, third = self.lines_across(xy1, xy2), self.P3[2]
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = -np.sum(lines * a, axis=1) / (lines @ a4)
-            # x_2 = (a + rho a_4) / w_2, and the nearness is rho / w_3.
+            # x_2 = (a + rho a_4) / w_2, and the inverse depth is rho / w_3.
             w2, w3 = a[:, 2] + rho * a4[2], x @ third[:3] + rho * third[3]
             along = np.linalg.norm(a4[:2] * a[:, 2:] - a[:, :2] * a4[2], axis=1) / w2**2
             return np.asarray(along * w3**2 / np.abs(x @ third[:3]))
@@ -127,7 +129,7 @@ def seed_of_two(pair: CalibratedPair) -> VirtualTensor:
 
 
 def seed_of_first(pair: CalibratedPair) -> VirtualTensor:
-    """The tensor <1, 2, 1> of two views, the first being the third: its nearness is that in view 1."""
+    """The tensor <1, 2, 1> of two views, the first being the third: its inverse depth is that in view 1."""
     return VirtualTensor(_tensor(pair.P2, np.eye(3, 4)), pair.P2, pair.K1)
 
 

@@ -31,19 +31,19 @@ from thesisrecon.views.warping_kernels import distances_to_known
 
 
 @njit(cache=True, nogil=True)
-def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, nearness: F32) -> None:
+def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_depth: F32) -> None:
     """Where the third view sees the pixels (x, y), y from ``first`` on, with matches ``places`` (H, W, 2).
 
-    Written are ``xy`` (H, W, 2) and ``nearness`` (H, W), as ``VirtualTensor.transfer`` has them; NaN where a
+    Written are ``xy`` (H, W, 2) and ``inverse_depth`` (H, W), as ``VirtualTensor.transfer`` has them; NaN where a
     match is.
     """
-    height, width = nearness.shape
+    height, width = inverse_depth.shape
     for row in range(height):
         y = float(first + row)
         for column in range(width):
             x = float(column)
             x2, y2 = float(places[row, column, 0]), float(places[row, column, 1])
-            xy[row, column, 0] = xy[row, column, 1] = nearness[row, column] = np.nan
+            xy[row, column, 0] = xy[row, column, 1] = inverse_depth[row, column] = np.nan
             if not (np.isfinite(x2) and np.isfinite(y2)):
                 continue
             a0 = P2[0, 0] * x + P2[0, 1] * y + P2[0, 2]
@@ -64,20 +64,22 @@ def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, nearness: F
                 continue
             xy[row, column, 0] = u / w
             xy[row, column, 1] = v / w
-            nearness[row, column] = (l0 * a0 + l1 * a1 + l2 * a2) / w
+            inverse_depth[row, column] = (l0 * a0 + l1 * a1 + l2 * a2) / w
 
 
 @njit(cache=True, nogil=True)
-def guess_rows(nearness: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32) -> None:
+def guess_rows(
+    inverse_depth: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32
+) -> None:
     """Nearness of all pixels of a photograph, into ``out`` (H, W): the known one, or that of a pixel around.
 
-    ``nearness`` of this photograph (H, W) and of the other (h, w), each in its own view, NaN = unknown;
+    ``inverse_depth`` of this photograph (H, W) and of the other (h, w), each in its own view, NaN = unknown;
     ``P2`` (3, 4) the other camera; ``distance`` (K, H, W) how many of the ``steps`` (K, 2) (down, right) lead
     to the next known pixel. Of these pixels the nearest is taken, unless its surface would stand in front of
     what the other photograph sees by more than ``step``: such a one only where all do. NaN where there is
     none.
     """
-    own, other = nearness
+    own, other = inverse_depth
     for y in range(own.shape[0]):
         for x in range(own.shape[1]):
             out[y, x] = own[y, x]
@@ -98,7 +100,7 @@ def guess_rows(nearness: tuple[F32, F32], P2: F64, steps: I32, distance: I16, st
 
 @njit(cache=True, nogil=True)
 def _stands_before(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> bool:
-    """Whether the point of a pixel at a nearness is in front of what the other photograph sees there."""
+    """Whether the point of a pixel at an inverse depth is in front of what the other photograph sees there."""
     u = P2[0, 0] * x + P2[0, 1] * y + P2[0, 2] + rho * P2[0, 3]
     v = P2[1, 0] * x + P2[1, 1] * y + P2[1, 2] + rho * P2[1, 3]
     w = P2[2, 0] * x + P2[2, 1] * y + P2[2, 2] + rho * P2[2, 3]
@@ -147,10 +149,10 @@ def complete_places(pair: CalibratedPair, places: Both32, *, agree_px: float) ->
     pairs = pair, pair.swapped()
     sure = [np.where(known[side][..., None], places[side], np.nan) for side in (0, 1)]
     own = [seed_of_first(one) for one in pairs]
-    nearness = [transfer_grid(own[side], sure[side])[1] for side in (0, 1)]
+    inverse_depth = [transfer_grid(own[side], sure[side])[1] for side in (0, 1)]
     steps = [surface_step(own[side], sure[side]) for side in (0, 1)]
     complete = [
-        _completed(pairs[side], sure[side], (nearness[side], nearness[1 - side]), steps[1 - side])
+        _completed(pairs[side], sure[side], (inverse_depth[side], inverse_depth[1 - side]), steps[1 - side])
         for side in (0, 1)
     ]
     return (complete[0], complete[1]), known
@@ -158,22 +160,22 @@ def complete_places(pair: CalibratedPair, places: Both32, *, agree_px: float) ->
 
 def transfer_grid(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
     """:meth:`VirtualTensor.transfer` of all pixels with matches ``places`` (H, W, 2); (H, W, 2), (H, W)."""
-    xy, nearness = np.empty(places.shape), np.empty(places.shape[:2], dtype=np.float32)
+    xy, inverse_depth = np.empty(places.shape), np.empty(places.shape[:2], dtype=np.float32)
 
     def work(rows: tuple[int, int]) -> None:
         part = slice(*rows)
-        transfer_rows(virtual.T, virtual.P2, places[part], rows[0], xy[part], nearness[part])
+        transfer_rows(virtual.T, virtual.P2, places[part], rows[0], xy[part], inverse_depth[part])
 
     in_strips(work, len(places), threads)
-    return xy, nearness
+    return xy, inverse_depth
 
 
 def surface_step(virtual: VirtualTensor, places: F32) -> float:
-    """``SURFACE_PX`` in units of a camera's nearness, for the middle one of the pixels of view 1."""
+    """``SURFACE_PX`` in units of a camera's inverse depth, for the middle one of the pixels of view 1."""
     known = np.isfinite(places[::SPARSE, ::SPARSE]).all(axis=2)
     y, x = (SPARSE * index for index in np.nonzero(known))
     pixels = np.stack([x, y], axis=1).astype(np.float64)
-    found = virtual.disparity_per_nearness(pixels, places[y, x].astype(np.float64))
+    found = virtual.disparity_per_inverse_depth(pixels, places[y, x].astype(np.float64))
     found = found[np.isfinite(found)]
     return SURFACE_PX / float(np.median(found)) if len(found) else np.inf
 
@@ -191,14 +193,14 @@ def _agreeing(places: F32, others: F32, agree_px: float) -> B8:
     return np.asarray(inside & (np.linalg.norm(others[y, x] - own, axis=2) <= agree_px))
 
 
-def _completed(pair: CalibratedPair, places: F32, nearness: tuple[F32, F32], step: float) -> F32:
-    """``places`` (H, W, 2) with guesses where NaN; ``nearness`` of this photograph and the other, ``step`` of
+def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32], step: float) -> F32:
+    """``places`` (H, W, 2) with guesses where NaN; ``inverse_depth`` of this photograph and the other, ``step`` of
     the other one's surfaces."""
-    own = nearness[0]
+    own = inverse_depth[0]
     distance = np.empty((len(DIRECTIONS), *own.shape), dtype=np.int16)
     distances_to_known(own, DIRECTIONS, distance)
     guessed = np.empty_like(own)
-    guess_rows(nearness, np.ascontiguousarray(pair.P2), DIRECTIONS, distance, step, guessed)
+    guess_rows(inverse_depth, np.ascontiguousarray(pair.P2), DIRECTIONS, distance, step, guessed)
     y, x = np.nonzero(np.isnan(own))
     X = np.stack([x, y, np.ones_like(x), guessed[y, x]], axis=1).astype(np.float64)
     complete = places.copy()
@@ -257,8 +259,8 @@ class TensorSynthesis:
                 f"{100.0 * seen.mean():.1f} % of its picture, needed {100.0 * LEAST_SEEN:.0f} %",
                 "it may be beyond the scene or look away: move it less (by baselines) or turn it back",
             )
-        rgb, nearness = self._mixed(layers, self._share_of_second(moved[0]), step)
-        filled = fill_holes(rgb, nearness, step=step)
+        rgb, inverse_depth = self._mixed(layers, self._share_of_second(moved[0]), step)
+        filled = fill_holes(rgb, inverse_depth, step=step)
         return np.asarray(np.clip(np.rint(filled), 0.0, 255.0), dtype=np.uint8)
 
     def _share_of_second(self, virtual: VirtualTensor) -> np.float32:
@@ -271,13 +273,13 @@ class TensorSynthesis:
     def _layer(
         self, side: int, virtual: VirtualTensor, size: tuple[int, int], step: float, threads: int
     ) -> tuple[F32, F32]:
-        """What the camera sees of one photograph, (H, W, 4), and its nearness (H, W); NaN where nothing."""
-        xy, nearness = transfer_grid(virtual, self.places[side], threads=threads)
-        source, front = forward_map(xy, nearness, size=size, step=step, threads=threads)
+        """What the camera sees of one photograph, (H, W, 4), and its inverse_depth (H, W); NaN where nothing."""
+        xy, inverse_depth = transfer_grid(virtual, self.places[side], threads=threads)
+        source, front = forward_map(xy, inverse_depth, size=size, step=step, threads=threads)
         return sample(self.levels[side], source, threads=threads), front
 
     def _mixed(self, layers: list[tuple[F32, F32]], share: np.float32, step: float) -> tuple[F32, F32]:
-        """Colours and nearness of both layers together; NaN where neither sees anything."""
+        """Colours and inverse depth of both layers together; NaN where neither sees anything."""
         (first, near1), (second, near2) = layers
         of_second = _weight_of_second(layers, share, step)
         dark, bright = self.gain**-share, self.gain ** (1 - share)

@@ -2,7 +2,7 @@
 
 Both ways of section 1 need it: interpolation (1.2) moves pixels along their rows, the trilinear tensor (1.3)
 anywhere. Instead of walking through the photograph in an order that lets nearer pixels overwrite farther ones
-(McMillan and Bishop 1995), the nearness of every pixel is compared: the same picture, whatever the order.
+(McMillan and Bishop 1995), the inverse depth of every pixel is compared: the same picture, whatever the order.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ DIRECTIONS = np.array(
 def forward_warp(
     image: ArrayLike,
     target_xy: F64 | F32,
-    nearness: F64 | F32,
+    inverse_depth: F64 | F32,
     *,
     size: tuple[int, int],
     step: float = np.inf,
@@ -36,53 +36,53 @@ def forward_warp(
 
     The pixels are corners of small triangles, within which places are interpolated and colours sampled by
     cubic convolution: exact to a fraction of a pixel where the photograph is linear. Neighbours are of one
-    surface where they come no more than 3 px apart and their nearness differs by no more than ``step``; at
+    surface where they come no more than 3 px apart and their inverse depth differs by no more than ``step``; at
     cuts every pixel covers half a pixel to each side. Surfaces seen from behind are not drawn.
 
     Parameters
     ----------
     image : (h, w, C) levels, C >= 1.
     target_xy : (h, w, 2) px where each pixel comes to lie, NaN = nowhere.
-    nearness : (h, w) larger in front of smaller, in any unit: a disparity, an inverse depth; NaN = nowhere.
+    inverse_depth : (h, w) larger in front of smaller, in any unit: a disparity, an inverse depth; NaN = nowhere.
     size : (width, height) of the picture.
-    step : greatest difference of the nearness of neighbours on one surface.
+    step : greatest difference of the inverse depth of neighbours on one surface.
     threads : draw strips of rows; the picture does not depend on them.
 
     Returns
     -------
-    (H, W, C) and the nearness (H, W) of what is seen, both float32, NaN where nothing lands.
+    (H, W, C) and the inverse depth (H, W) of what is seen, both float32, NaN where nothing lands.
 
     Raises
     ------
     ValueError : for shapes that do not belong together, sizes below one pixel and a negative step.
     """
     levels = np.ascontiguousarray(image, dtype=np.float32)
-    if levels.ndim != 3 or levels.shape[:2] != np.shape(nearness):
+    if levels.ndim != 3 or levels.shape[:2] != np.shape(inverse_depth):
         raise ValueError(
-            f"forward_warp takes an image (h, w, C) and its nearness (h, w); got {levels.shape} and "
-            f"{np.shape(nearness)}"
+            f"forward_warp takes an image (h, w, C) and its inverse_depth (h, w); got {levels.shape} and "
+            f"{np.shape(inverse_depth)}"
         )
-    source, front = forward_map(target_xy, nearness, size=size, step=step, threads=threads)
+    source, front = forward_map(target_xy, inverse_depth, size=size, step=step, threads=threads)
     return sample(levels, source, threads=threads), front
 
 
 def forward_map(
     target_xy: F64 | F32,
-    nearness: F64 | F32,
+    inverse_depth: F64 | F32,
     *,
     size: tuple[int, int],
     step: float = np.inf,
     threads: int = 1,
 ) -> tuple[F32, F32]:
-    """Which place (H, W, 2) of a photograph each pixel of another view sees, and its nearness (H, W).
+    """Which place (H, W, 2) of a photograph each pixel of another view sees, and its inverse depth (H, W).
 
     Arguments, NaN and errors as in :func:`forward_warp`, for several images of the same places.
     """
     target = np.ascontiguousarray(target_xy, dtype=np.float64)
-    near = np.ascontiguousarray(nearness, dtype=np.float32)
+    near = np.ascontiguousarray(inverse_depth, dtype=np.float32)
     if near.ndim != 2 or target.shape != (*near.shape, 2):
         raise ValueError(
-            f"target_xy must be (h, w, 2) and nearness (h, w); got {target.shape} and {near.shape}"
+            f"target_xy must be (h, w, 2) and inverse_depth (h, w); got {target.shape} and {near.shape}"
         )
     if min(size) < 1 or not step >= 0.0:
         raise ValueError(f"size must be at least 1 x 1 and step not negative; got {size} and {step}")
@@ -105,15 +105,15 @@ def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
     return out
 
 
-def fill_holes(rgb: F32, nearness: F32, *, step: float = 0.0, reach_px: float = np.inf) -> F32:
+def fill_holes(rgb: F32, inverse_depth: F32, *, step: float = 0.0, reach_px: float = np.inf) -> F32:
     """The picture with its holes filled from what is behind them: what was hidden is background.
 
-    Of the nearest known pixels in sixteen directions those count that are behind: their nearness is at most
+    Of the nearest known pixels in sixteen directions those count that are behind: their inverse depth is at most
     ``step``, or 0.4 of its range, above the least. Their colours are averaged, weighted by 1 / distance^2.
 
     Parameters
     ----------
-    rgb, nearness : (H, W, C) and (H, W) float32 of :func:`forward_warp`; NaN nearness = a hole.
+    rgb, inverse_depth : (H, W, C) and (H, W) float32 of :func:`forward_warp`; NaN inverse depth = a hole.
     reach_px : holes look no farther; with a finite reach some may stay.
 
     Returns
@@ -124,10 +124,12 @@ def fill_holes(rgb: F32, nearness: F32, *, step: float = 0.0, reach_px: float = 
     ------
     ValueError : for shapes that do not belong together.
     """
-    if rgb.ndim != 3 or rgb.shape[:2] != nearness.shape:
-        raise ValueError(f"rgb must be (H, W, C) and nearness (H, W); got {rgb.shape} and {nearness.shape}")
-    distance = np.empty((len(DIRECTIONS), *nearness.shape), dtype=np.int16)
-    distances_to_known(nearness, DIRECTIONS, distance)
+    if rgb.ndim != 3 or rgb.shape[:2] != inverse_depth.shape:
+        raise ValueError(
+            f"rgb must be (H, W, C) and inverse_depth (H, W); got {rgb.shape} and {inverse_depth.shape}"
+        )
+    distance = np.empty((len(DIRECTIONS), *inverse_depth.shape), dtype=np.int16)
+    distances_to_known(inverse_depth, DIRECTIONS, distance)
     filled = rgb.copy()
-    fill_from_behind(rgb, nearness, DIRECTIONS, distance, (step, reach_px), filled)
+    fill_from_behind(rgb, inverse_depth, DIRECTIONS, distance, (step, reach_px), filled)
     return filled

@@ -12,7 +12,7 @@ SLACK = 1e-7
 """Barycentric distance by which a triangle reaches beyond its edges, so that no rounding opens a crack."""
 
 BEHIND = 0.4
-"""Around a hole what is in this farther part of the range of nearness is behind it: a single far pixel is not
+"""Around a hole what is in this farther part of the range of inverse depth is behind it: a single far pixel is not
 all there is."""
 
 LEAST_AREA = 1e-9
@@ -20,10 +20,10 @@ LEAST_AREA = 1e-9
 
 
 @njit(cache=True, nogil=True)
-def _joined(target: F64, nearness: F32, a: tuple[int, int], b: tuple[int, int], limits: F64) -> bool:
+def _joined(target: F64, inverse_depth: F32, a: tuple[int, int], b: tuple[int, int], limits: F64) -> bool:
     """Whether two neighbouring pixels are of one surface; False where one of them is nowhere."""
     # Comparisons with NaN are false.
-    near = abs(nearness[a] - nearness[b]) <= limits[0]
+    near = abs(inverse_depth[a] - inverse_depth[b]) <= limits[0]
     dx, dy = target[a[0], a[1], 0] - target[b[0], b[1], 0], target[a[0], a[1], 1] - target[b[0], b[1], 1]
     return bool(near and abs(dx) <= limits[1] and abs(dy) <= limits[1])
 
@@ -31,7 +31,7 @@ def _joined(target: F64, nearness: F32, a: tuple[int, int], b: tuple[int, int], 
 @njit(cache=True, nogil=True)
 def _draw_triangle(
     target: F64,
-    nearness: F32,
+    inverse_depth: F32,
     corners: tuple[int, int, int, int, int, int],
     rows: tuple[int, int],
     source: F32,
@@ -48,8 +48,8 @@ def _draw_triangle(
         return
     low_y, high_y = min(0.0, by, cy) + ay - SLACK, max(0.0, by, cy) + ay + SLACK
     low_x, high_x = min(0.0, bx, cx) + ax - SLACK, max(0.0, bx, cx) + ax + SLACK
-    na = nearness[ya, xa]
-    nb, nc = nearness[yb, xb] - na, nearness[yc, xc] - na
+    na = inverse_depth[ya, xa]
+    nb, nc = inverse_depth[yb, xb] - na, inverse_depth[yc, xc] - na
     first, last = max(int(np.ceil(low_y)), rows[0]), min(int(np.floor(high_y)) + 1, rows[1])
     left, right = max(int(np.ceil(low_x)), 0), min(int(np.floor(high_x)) + 1, front.shape[1])
     for y in range(first, last):
@@ -69,19 +69,19 @@ def _draw_triangle(
 
 @njit(cache=True, nogil=True)
 def _slope(
-    target: F64, nearness: F32, at: tuple[int, int], step: tuple[int, int], limits: F64, out: F64
+    target: F64, inverse_depth: F32, at: tuple[int, int], step: tuple[int, int], limits: F64, out: F64
 ) -> int:
-    """Change of place and nearness (3,) per pixel towards ``step``, from the neighbours of the same surface;
+    """Change of place and inverse depth (3,) per pixel towards ``step``, from the neighbours of the same surface;
     how many of the two these are."""
-    height, width = nearness.shape
+    height, width = inverse_depth.shape
     ahead, behind = (at[0] + step[0], at[1] + step[1]), (at[0] - step[0], at[1] - step[1])
-    has_ahead = ahead[0] < height and ahead[1] < width and _joined(target, nearness, at, ahead, limits)
-    has_behind = behind[0] >= 0 and behind[1] >= 0 and _joined(target, nearness, at, behind, limits)
+    has_ahead = ahead[0] < height and ahead[1] < width and _joined(target, inverse_depth, at, ahead, limits)
+    has_behind = behind[0] >= 0 and behind[1] >= 0 and _joined(target, inverse_depth, at, behind, limits)
     to, fro = (ahead if has_ahead else at), (behind if has_behind else at)
     count = int(has_ahead) + int(has_behind)
     for k in range(2):
         out[k] = (target[to[0], to[1], k] - target[fro[0], fro[1], k]) / max(count, 1)
-    out[2] = (nearness[to] - nearness[fro]) / max(count, 1)
+    out[2] = (inverse_depth[to] - inverse_depth[fro]) / max(count, 1)
     return count
 
 
@@ -94,11 +94,11 @@ def _draw_footprint(
     picture: tuple[F32, F32],
 ) -> None:
     """Draw what a pixel covers, half a pixel to each side, moved as its neighbours are."""
-    target, nearness = surface
+    target, inverse_depth = surface
     source, front = picture
     across, down = np.empty(3), np.empty(3)
-    n_across = _slope(target, nearness, at, (0, 1), limits, across)
-    n_down = _slope(target, nearness, at, (1, 0), limits, down)
+    n_across = _slope(target, inverse_depth, at, (0, 1), limits, across)
+    n_down = _slope(target, inverse_depth, at, (1, 0), limits, down)
     if n_across == 2 and n_down == 2:
         return
     # A pixel without neighbours keeps its shape, as far as it is known.
@@ -109,7 +109,7 @@ def _draw_footprint(
     area = across[0] * down[1] - across[1] * down[0]
     if area < LEAST_AREA:
         return
-    tx, ty, near = target[at[0], at[1], 0], target[at[0], at[1], 1], nearness[at]
+    tx, ty, near = target[at[0], at[1], 0], target[at[0], at[1], 1], inverse_depth[at]
     reach_x = 0.5 * (abs(across[0]) + abs(down[0])) + SLACK
     reach_y = 0.5 * (abs(across[1]) + abs(down[1])) + SLACK
     first, last = max(int(np.ceil(ty - reach_y)), rows[0]), min(int(np.floor(ty + reach_y)) + 1, rows[1])
@@ -125,8 +125,8 @@ def _draw_footprint(
             if front[y, x] >= here:
                 continue
             front[y, x] = here
-            source[y, x, 0] = min(max(at[1] + u, 0.0), nearness.shape[1] - 1.0)
-            source[y, x, 1] = min(max(at[0] + v, 0.0), nearness.shape[0] - 1.0)
+            source[y, x, 0] = min(max(at[1] + u, 0.0), inverse_depth.shape[1] - 1.0)
+            source[y, x, 1] = min(max(at[0] + v, 0.0), inverse_depth.shape[0] - 1.0)
 
 
 @njit(cache=True, nogil=True)
@@ -144,48 +144,50 @@ def _beside(target: F64, a: tuple[int, int], reach: float, rows: tuple[int, int]
 
 @njit(cache=True, nogil=True)
 def draw_surface(
-    target: F64, nearness: F32, limits: F64, rows: tuple[int, int], source: F32, front: F32
+    target: F64, inverse_depth: F32, limits: F64, rows: tuple[int, int], source: F32, front: F32
 ) -> None:
     """Draw the surface of a photograph's pixels into rows [first, last) of another view, nearest in front.
 
-    ``target`` (h, w, 2) px where each pixel comes to lie and ``nearness`` (h, w), NaN = nowhere; ``limits``
-    (2,) greatest differences of nearness and of place (px) between neighbours of one surface. ``source``
-    (H, W, 2) px of the photograph seen at each pixel and ``front`` (H, W) its nearness, NaN where none.
+    ``target`` (h, w, 2) px where each pixel comes to lie and ``inverse_depth`` (h, w), NaN = nowhere; ``limits``
+    (2,) greatest differences of inverse depth and of place (px) between neighbours of one surface. ``source``
+    (H, W, 2) px of the photograph seen at each pixel and ``front`` (H, W) its inverse depth, NaN where none.
 
     Four pixels around a point are two triangles, three of which hang together one; at cuts and borders every
     pixel covers half a pixel to each side. Of equally near ones the first stays.
     """
-    height, width = nearness.shape
+    height, width = inverse_depth.shape
     for y in range(height):
         for x in range(width):
             a = (y, x)
             # What is nowhere has a NaN among these.
-            if np.isnan(nearness[a] + target[y, x, 0] + target[y, x, 1]):
+            if np.isnan(inverse_depth[a] + target[y, x, 0] + target[y, x, 1]):
                 continue
             if _beside(target, a, limits[1], rows):
                 continue
-            right = x + 1 < width and _joined(target, nearness, a, (y, x + 1), limits)
-            below = y + 1 < height and _joined(target, nearness, a, (y + 1, x), limits)
+            right = x + 1 < width and _joined(target, inverse_depth, a, (y, x + 1), limits)
+            below = y + 1 < height and _joined(target, inverse_depth, a, (y + 1, x), limits)
             if x + 1 < width and y + 1 < height:
-                across = _joined(target, nearness, (y + 1, x), (y + 1, x + 1), limits)
-                down = _joined(target, nearness, (y, x + 1), (y + 1, x + 1), limits)
+                across = _joined(target, inverse_depth, (y + 1, x), (y + 1, x + 1), limits)
+                down = _joined(target, inverse_depth, (y, x + 1), (y + 1, x + 1), limits)
                 corner_a, corner_d = right and below, across and down
                 if corner_a:
-                    _draw_triangle(target, nearness, (y, x, y, x + 1, y + 1, x), rows, source, front)
+                    _draw_triangle(target, inverse_depth, (y, x, y, x + 1, y + 1, x), rows, source, front)
                 if corner_d:
-                    _draw_triangle(target, nearness, (y + 1, x + 1, y + 1, x, y, x + 1), rows, source, front)
+                    _draw_triangle(
+                        target, inverse_depth, (y + 1, x + 1, y + 1, x, y, x + 1), rows, source, front
+                    )
                 # These two reach over the diagonal that the others leave.
                 if right and down and not (corner_a and corner_d):
-                    _draw_triangle(target, nearness, (y, x + 1, y + 1, x + 1, y, x), rows, source, front)
+                    _draw_triangle(target, inverse_depth, (y, x + 1, y + 1, x + 1, y, x), rows, source, front)
                 if below and across and not (corner_a and corner_d):
-                    _draw_triangle(target, nearness, (y + 1, x, y, x, y + 1, x + 1), rows, source, front)
+                    _draw_triangle(target, inverse_depth, (y + 1, x, y, x, y + 1, x + 1), rows, source, front)
             inner = right and below and x > 0 and y > 0
             if not (
                 inner
-                and _joined(target, nearness, a, (y, x - 1), limits)
-                and _joined(target, nearness, a, (y - 1, x), limits)
+                and _joined(target, inverse_depth, a, (y, x - 1), limits)
+                and _joined(target, inverse_depth, a, (y - 1, x), limits)
             ):
-                _draw_footprint((target, nearness), a, limits, rows, (source, front))
+                _draw_footprint((target, inverse_depth), a, limits, rows, (source, front))
 
 
 @njit(cache=True, nogil=True)
@@ -234,10 +236,10 @@ def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.floa
 
 
 @njit(cache=True, nogil=True)
-def distances_to_known(nearness: F32, steps: I32, distance: I16) -> None:
+def distances_to_known(inverse_depth: F32, steps: I32, distance: I16) -> None:
     """Into ``distance`` (K, H, W): how many of each of the ``steps`` (K, 2) (down, right) lead from a pixel
-    to the next whose nearness (H, W) is not NaN; 0 there, -1 where none does."""
-    height, width = nearness.shape
+    to the next whose inverse depth (H, W) is not NaN; 0 there, -1 where none does."""
+    height, width = inverse_depth.shape
     for k in range(steps.shape[0]):
         dy, dx = steps[k]
         # From where the step leads to where it comes from.
@@ -246,7 +248,7 @@ def distances_to_known(nearness: F32, steps: I32, distance: I16) -> None:
             for j in range(width):
                 x = width - 1 - j if dx > 0 else j
                 v, u = y + dy, x + dx
-                if not np.isnan(nearness[y, x]):
+                if not np.isnan(inverse_depth[y, x]):
                     distance[k, y, x] = 0
                 elif 0 <= v < height and 0 <= u < width and distance[k, v, u] >= 0:
                     distance[k, y, x] = distance[k, v, u] + 1
@@ -256,11 +258,11 @@ def distances_to_known(nearness: F32, steps: I32, distance: I16) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_from_behind(
-    rgb: F32, nearness: F32, steps: I32, distance: I16, limits: tuple[float, float], out: F32
+    rgb: F32, inverse_depth: F32, steps: I32, distance: I16, limits: tuple[float, float], out: F32
 ) -> None:
     """Give the holes of ``rgb`` (H, W, C) in ``out`` (H, W, C) the colours of what is behind them.
 
-    Of the known pixels that the ``steps`` lead to within ``limits[1]`` px those count whose ``nearness``
+    Of the known pixels that the ``steps`` lead to within ``limits[1]`` px those count whose ``inverse_depth``
     (H, W) is at most ``limits[0]``, or ``BEHIND`` of its range, above the least: the mean of their colours
     weighted by 1 / distance^2. NaN where no step leads anywhere; what is no hole is left alone.
     """
@@ -268,7 +270,7 @@ def fill_from_behind(
     colors = np.empty(rgb.shape[2])
     for y in range(rgb.shape[0]):
         for x in range(rgb.shape[1]):
-            if not np.isnan(nearness[y, x]):
+            if not np.isnan(inverse_depth[y, x]):
                 continue
             least, most, total = np.inf, -np.inf, 0.0
             colors[:] = 0.0
@@ -276,15 +278,15 @@ def fill_from_behind(
                 n = distance[k, y, x]
                 reach[k] = n * np.hypot(steps[k, 0], steps[k, 1]) if n > 0 else np.nan
                 if reach[k] <= limits[1]:
-                    least = min(least, nearness[y + n * steps[k, 0], x + n * steps[k, 1]])
-                    most = max(most, nearness[y + n * steps[k, 0], x + n * steps[k, 1]])
+                    least = min(least, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
+                    most = max(most, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
             behind = least + max(limits[0], BEHIND * (most - least))
             for k in range(steps.shape[0]):
                 if not reach[k] <= limits[1]:
                     continue
                 n = distance[k, y, x]
                 v, u = y + n * steps[k, 0], x + n * steps[k, 1]
-                if nearness[v, u] > behind:
+                if inverse_depth[v, u] > behind:
                     continue
                 weight = 1.0 / (reach[k] * reach[k])
                 total += weight
