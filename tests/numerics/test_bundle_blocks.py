@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.numerics.bundle_scenes import make_block
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.block_scatter import block_scatter, point_blocks
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import IntrinsicsPrior
 from thesisrecon.numerics.observations import Observations
 
 FREE = np.array([True, False, False, True, True, True])
@@ -16,7 +16,7 @@ SIGMA = 0.5
 def _scatter(block, xy, *, free=FREE, loss=20.0, std=np.inf):
     seen = Observations(block.view, block.point, xy)
     q = block.cameras.intrinsics
-    prior = IntrinsicsPrior(q, np.full_like(q, 1.0) * std)
+    prior = IntrinsicsPrior.unshared(q, np.full_like(q, 1.0) * std)
     options = BundleOptions(sigma_px=SIGMA, loss_px=loss * SIGMA, max_iterations=30, covariance=True)
     fit = refine_metric_bundle(block.cameras, block.X, seen, free=free, prior=prior, options=options)
     noise = (SIGMA, loss * SIGMA)

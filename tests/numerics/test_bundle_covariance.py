@@ -5,11 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, project_block
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import covariance as bundle_covariance
 from thesisrecon.numerics import reduced_solvers as kernels
 from thesisrecon.numerics.covariance import gauge_directions, robust_sigma
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import IntrinsicsPrior, MetricCameras
+from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 
 FREE = np.array([True, False, False, True, True, True])
@@ -28,7 +29,7 @@ def _own_focals(block, populations):
     std = np.full((6, 6), np.inf)
     std[0, 0] = 0.0
     spread = np.array([0.03, *[np.inf] * 5])
-    return cameras, IntrinsicsPrior(rows, std, np.array([-1, 1, 1, 1, 1, 1]), spread)
+    return cameras, IntrinsicsPrior.unshared(rows, std, kind=np.array([-1, 1, 1, 1, 1, 1]), spread=spread)
 
 
 @pytest.mark.parametrize("populations", [False, True])

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.numerics import schur
 from thesisrecon.numerics.elimination import Sums, sum_leverages
-from thesisrecon.numerics.levenberg_marquardt import LOSS_CODES, LOSSES, floored_diagonal
+from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
+from thesisrecon.numerics.losses import LOSS_CODES, LOSSES
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics.metric_cameras import (
     MetricCameras,
@@ -19,7 +20,7 @@ from thesisrecon.numerics.metric_cameras import (
     move_poses,
 )
 from thesisrecon.numerics.observations import Jacobians, Observations, Seen, Weighing, sort_observations
-from thesisrecon.numerics.projective_cameras import (
+from thesisrecon.numerics.projective_bundle import (
     UnitState,
     linearize_projective,
     projective_cost,

@@ -1,13 +1,8 @@
 import numpy as np
 import pytest
 
-from thesisrecon.numerics.levenberg_marquardt import (
-    LOSSES,
-    invert_information,
-    loss_code,
-    minimize_residuals,
-    solve_positive,
-)
+from thesisrecon.numerics.levenberg_marquardt import invert_information, minimize_residuals, solve_positive
+from thesisrecon.numerics.losses import LOSSES, loss_code
 
 
 @pytest.mark.parametrize("name", sorted(LOSSES))

@@ -4,10 +4,11 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import schur
-from thesisrecon.numerics.intrinsic_values import number_values
+from thesisrecon.numerics.intrinsic_unknowns import number_values
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import IntrinsicsPrior, MetricCameras
+from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.numerics.reduced_solvers import BandedCholesky, ConjugateGradients
 
@@ -168,7 +169,7 @@ def test_a_tight_prior_holds_and_a_loose_one_yields():
         std[0, 0] = std_rel
         return _refine(
             block.cameras, block.X, _seen(block), free=FOCAL, max_iterations=50,
-            prior=IntrinsicsPrior(mean, std), sigma_px=0.3,
+            prior=IntrinsicsPrior.unshared(mean, std), sigma_px=0.3,
         ).cameras.intrinsics[0, 0]  # fmt: skip
 
     assert focal(1e-7) == pytest.approx(mean[0, 0], rel=1e-3)
@@ -255,9 +256,8 @@ def test_wrong_calls_are_refused():
     refused("groups must lie", MetricCameras(c.R, c.t, q, c.group + 1))
     refused("observations need", observations=Observations(block.view, block.point[1:], block.xy))
     refused("fixed_views is one flag", fixed_views=np.zeros(3, bool))
-    refused("prior of shape", prior=IntrinsicsPrior(q, -known))
-    refused("population needs its spread", prior=IntrinsicsPrior(q, known, np.zeros(1, int)))
-    refused("above 0", prior=IntrinsicsPrior(q, known, np.zeros(1, int), np.zeros(6)))
+    refused("prior of shape", prior=IntrinsicsPrior.unshared(q, -known))
+    refused("above 0", prior=IntrinsicsPrior(q, known, np.zeros((1, 6), int), np.zeros(1, int), np.zeros(6)))
 
 
 def _varied(block, focals, *, seed=4, sigma=0.0):
@@ -309,7 +309,12 @@ def test_a_std_of_zero_holds_one_camera_at_its_mean_while_others_move():
     std = np.full_like(mean, np.inf)
     std[2, 0], mean[2, 0] = 0.0, 1234.0
     fit = _refine(
-        block.cameras, block.X, _seen(block), free=FOCAL, prior=IntrinsicsPrior(mean, std), covariance=True
+        block.cameras,
+        block.X,
+        _seen(block),
+        free=FOCAL,
+        prior=IntrinsicsPrior.unshared(mean, std),
+        covariance=True,
     )
     assert fit.cameras.intrinsics[2, 0] == pytest.approx(1234.0, rel=1e-12)
     assert not fit.intrinsics_covariance[2].any()
@@ -330,7 +335,9 @@ def test_a_camera_without_a_determined_focal_borrows_from_its_population():
     start = MetricCameras(cameras.R, cameras.t, start, cameras.group, cameras.shared)
     spread = np.array([0.02, *[np.inf] * 5])
     nothing = np.full_like(cameras.intrinsics, np.inf)
-    prior = IntrinsicsPrior(cameras.intrinsics, nothing, np.zeros(6, dtype=np.int64), spread)
+    prior = IntrinsicsPrior.unshared(
+        cameras.intrinsics, nothing, kind=np.zeros(6, dtype=np.int64), spread=spread
+    )
     fit = _refine(
         start, block.X, seen, free=FOCAL, prior=prior, sigma_px=0.3, max_iterations=100, covariance=True
     )
@@ -351,7 +358,7 @@ def test_the_population_is_the_quadratic_form_of_deviations_from_its_mean():
     std[1, 0], std[4, 0] = 0.0, 0.1
     population = np.array([0, 0, 0, 0, 7, -1])
     spread = np.array([0.05, np.inf, np.inf, np.inf, np.inf, np.inf])
-    prior = IntrinsicsPrior(cameras.intrinsics, std, population, spread)
+    prior = IntrinsicsPrior.unshared(cameras.intrinsics, std, kind=population, spread=spread)
     values, x, table = number_values(cameras, np.ones(6, bool), FOCAL, prior)
     np.testing.assert_allclose(table, cameras.intrinsics, rtol=1e-14)
     assert (values.seen, values.size) == (5, 6)
@@ -382,8 +389,8 @@ def test_a_population_counts_a_value_that_cameras_share_once(shared, distinct):
         cameras.intrinsics[:, 0] = cameras.intrinsics[first, 0]
     cameras = MetricCameras(cameras.R, cameras.t, cameras.intrinsics, cameras.group, table)
     nothing = np.full_like(cameras.intrinsics, np.inf)
-    prior = IntrinsicsPrior(
-        cameras.intrinsics, nothing, np.zeros(6, np.int64), np.array([0.05, *[np.inf] * 5])
+    prior = IntrinsicsPrior.unshared(
+        cameras.intrinsics, nothing, kind=np.zeros(6, np.int64), spread=np.array([0.05, *[np.inf] * 5])
     )
     values, x, _ = number_values(cameras, np.ones(6, bool), FOCAL, prior)
     log_f = np.log(cameras.intrinsics[distinct, 0])

@@ -7,7 +7,7 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 
-from thesisrecon.numerics.morton_order import morton_pair_order
+from thesisrecon.numerics.observations import morton_pair_order
 
 
 def times_made(first: np.ndarray, second: np.ndarray, room: int) -> int:

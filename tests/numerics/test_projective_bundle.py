@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.numerics.bundle_scenes import make_block
-from thesisrecon.numerics.observations import whitening_transform
+from thesisrecon.geometry.homogeneous import whitening_transform
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 
 

@@ -11,14 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from thesisrecon.numerics.noise import (
-    draw_sample,
-    noise_scale,
-    noise_width,
-    required_samples,
-    trimmed_noise_scale,
-)
-from thesisrecon.numerics.ransac import SampleConsensus
+from thesisrecon.numerics.noise import noise_scale, noise_width, trimmed_noise_scale
+from thesisrecon.numerics.ransac import SampleConsensus, draw_sample, required_samples
 
 
 @settings(max_examples=100, deadline=None)

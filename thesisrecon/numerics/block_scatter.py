@@ -15,12 +15,14 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry.homogeneous import scene_frame
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import metric_cameras as kernels
 from thesisrecon.numerics.covariance import gauge_directions, invert_in_inner_gauge
-from thesisrecon.numerics.intrinsic_values import IntrinsicValues, number_values
-from thesisrecon.numerics.levenberg_marquardt import LOSS_CODES
-from thesisrecon.numerics.metric_cameras import POSE_DOF, IntrinsicsPrior, MetricCameras, MetricModel
-from thesisrecon.numerics.observations import Jacobians, Observations, Seen, Weighing, scene_frame
+from thesisrecon.numerics.intrinsic_unknowns import IntrinsicValues, number_values
+from thesisrecon.numerics.losses import LOSS_CODES
+from thesisrecon.numerics.metric_cameras import POSE_DOF, MetricCameras, MetricModel
+from thesisrecon.numerics.observations import Jacobians, Observations, Seen, Weighing
 
 # Unknowns of poses that take part in the judgement beside all of the intrinsics.
 POSES_JUDGED = 30

@@ -339,3 +339,25 @@ def mark_pairs(start: I64, view: I64, block: I64, seen: NDArray[np.bool_]) -> No
                 for m in range(k, start[j + 1]):
                     if block[view[m]] >= 0:
                         seen[v, block[view[m]]] = True
+
+
+@njit(cache=True, nogil=True)
+def revert_cheirality_violations(
+    start: I64, view_index: I64, row_before: F64, row_after: F64, X_before: F64, X_after: F64
+) -> None:
+    """Put back the points whose step takes them through the focal plane of a view that sees them.
+
+    ``row`` (V, 4) third rows of the cameras; X (N, 4), or (N, 3) with a fourth coordinate 1.
+    """
+    d = X_before.shape[1]
+    for j in range(len(start) - 1):
+        for k in range(start[j], start[j + 1]):
+            v = view_index[k]
+            before = row_before[v, 3] if d == 3 else 0.0
+            after = row_after[v, 3] if d == 3 else 0.0
+            for c in range(d):
+                before += row_before[v, c] * X_before[j, c]
+                after += row_after[v, c] * X_after[j, c]
+            if before * after < 0.0:
+                X_after[j] = X_before[j]
+                break

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64
+from thesisrecon.geometry.homogeneous import scene_frame
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.covariance import (
     SIMILARITY_DOF,
     CovarianceInput,
@@ -16,16 +18,16 @@ from thesisrecon.numerics.covariance import (
     robust_sigma,
 )
 from thesisrecon.numerics.elimination import sum_leverages
-from thesisrecon.numerics.intrinsic_values import (
+from thesisrecon.numerics.intrinsic_unknowns import (
     IntrinsicColumns,
     IntrinsicValues,
     number_values,
     place_intrinsics,
 )
-from thesisrecon.numerics.levenberg_marquardt import LossName, Solution, loss_code, run_levenberg_marquardt
+from thesisrecon.numerics.levenberg_marquardt import Solution, run_levenberg_marquardt
+from thesisrecon.numerics.losses import LossName, loss_code
 from thesisrecon.numerics.metric_cameras import (
     POSE_DOF,
-    IntrinsicsPrior,
     MetricCameras,
     MetricModel,
     check_cameras,
@@ -41,7 +43,6 @@ from thesisrecon.numerics.observations import (
     Seen,
     SortedObservations,
     Weighing,
-    scene_frame,
     sort_observations,
 )
 from thesisrecon.numerics.schur import (

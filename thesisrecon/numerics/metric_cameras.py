@@ -13,8 +13,10 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics.losses import loss_curvature, loss_value, loss_weight
 from thesisrecon.numerics.observations import Jacobians, Seen, Weighing
-from thesisrecon.numerics.small_solvers import away_from_zero, loss_curvature, loss_value, loss_weight
+from thesisrecon.numerics.small_solvers import away_from_zero
 
 
 class MetricModel(NamedTuple):
@@ -205,26 +207,6 @@ class MetricCameras:
         return np.asarray(self.K @ np.concatenate([self.R, self.t[:, :, None]], axis=2))
 
 
-@dataclass(frozen=True)
-class IntrinsicsPrior:
-    """What is known of the intrinsics: ``mean``, ``std`` (G, C), one row for each row of ``intrinsics``.
-
-    Units are those of the intrinsics (px; aspect and k1 pure numbers), but the focal's std is relative: the
-    prior acts on log f. std 0: the value is the mean and does not move. std inf: nothing is known. Rows that
-    share a value have one prior for it: the tightest of theirs.
-
-    ``population`` (G,): rows of equal number are cameras of one kind, whose values scatter about a common
-    mean that is not known, with standard deviation ``spread`` (C,), or (G, C) where each kind has its own
-    (that of its first row counts; relative for the focal; inf = no such assumption): a camera whose own
-    photographs do not determine a value borrows it from the others. -1: of no kind.
-    """
-
-    mean: F64
-    std: F64
-    population: I64 | None = None
-    spread: F64 | None = None
-
-
 def check_cameras(cameras: MetricCameras, X: F64, free: B8) -> None:
     """Refuse wrong shapes and values with ``ValueError``."""
     n_views, n_rows, width = len(cameras.R), len(cameras.intrinsics), cameras.intrinsics.shape[-1]
@@ -260,11 +242,9 @@ def check_prior(prior: IntrinsicsPrior, shape: tuple[int, ...]) -> None:
         raise ValueError(
             f"a prior of shape {shape} needs stds >= 0 and, where they are finite, means and positive focals"
         )
-    if (prior.population is None) != (prior.spread is None):
-        raise ValueError("a population needs its spread, and a spread its population")
-    if prior.population is not None and prior.spread is not None:
-        shapes = (np.shape(prior.population), np.shape(prior.spread))
-        if shapes not in ((shape[:1], shape[1:]), (shape[:1], shape)) or not (prior.spread > 0.0).all():
-            raise ValueError(
-                f"population is (G,) and spread (C,) or (G, C) above 0; got {shapes}, {prior.spread}"
-            )
+    if np.shape(prior.kind) != shape[:1]:
+        raise ValueError(f"kind is (G,); got shape {np.shape(prior.kind)}")
+    if prior.spread is not None and not (
+        np.shape(prior.spread) in (shape[1:], shape) and (prior.spread > 0.0).all()
+    ):
+        raise ValueError(f"spread is (C,) or (G, C) above 0; got {prior.spread}")

@@ -5,27 +5,149 @@ fixed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.numerics import projective_cameras as kernels
-from thesisrecon.numerics.levenberg_marquardt import loss_code, run_levenberg_marquardt
-from thesisrecon.numerics.observations import (
-    Jacobians,
-    Seen,
-    SortedObservations,
-    Weighing,
-    pixel_conditioning,
-    sort_observations,
-    whitening_transform,
-)
-from thesisrecon.numerics.projective_cameras import UnitState
+from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
+from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
+from thesisrecon.numerics.losses import loss_code, loss_value, loss_weight
+from thesisrecon.numerics.observations import Jacobians, Seen, SortedObservations, Weighing, sort_observations
 from thesisrecon.numerics.schur import BundleLayout, BundleStep, BundleSystem, hold_flipping, lay_out
+from thesisrecon.numerics.small_solvers import away_from_zero
 
 VIEW_DOF = 11
+
+
+class UnitState(NamedTuple):
+    """Unit cameras ``P`` (V, 12) and points ``X`` (N, 4) with the Householder vectors and factors that span
+    their tangent spaces."""
+
+    P: F64
+    X: F64
+    vP: F64
+    bP: F64
+    vX: F64
+    bX: F64
+
+    @classmethod
+    def at(cls, P: F64, X: F64) -> UnitState:
+        """The state of unit cameras (V, 12) and points (N, 4)."""
+        vP, vX, bP, bX = np.empty_like(P), np.empty_like(X), np.empty(len(P)), np.empty(len(X))
+        tangent_reflectors(P, vP, bP)
+        tangent_reflectors(X, vX, bX)
+        return cls(P, X, vP, bP, vX, bX)
+
+
+@njit(cache=True, nogil=True)
+def tangent_reflectors(p: F64, v: F64, beta: F64) -> None:
+    """Householder vectors (n, d) and factors (n,) that take unit rows p to -+e0: columns 1.. span p's tangent
+    space."""
+    for i in range(p.shape[0]):
+        for c in range(p.shape[1]):
+            v[i, c] = p[i, c]
+        v[i, 0] += 1.0 if p[i, 0] >= 0.0 else -1.0
+        norm = 0.0
+        for c in range(p.shape[1]):
+            norm += v[i, c] * v[i, c]
+        beta[i] = 2.0 / norm if norm > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
+    """Unit rows moved along their tangent space: normalise(p + H[:, 1:] step); signs are kept."""
+    d = p.shape[1]
+    for i in range(p.shape[0]):
+        along = 0.0
+        for c in range(1, d):
+            along += v[i, c] * step[i, c - 1]
+        norm = 0.0
+        for c in range(d):
+            moved = p[i, c] - beta[i] * along * v[i, c]
+            if c > 0:
+                moved += step[i, c - 1]
+            out[i, c] = moved
+            norm += moved * moved
+        norm = np.sqrt(norm)
+        for c in range(d):
+            out[i, c] /= norm if norm > 0.0 else 1.0
+
+
+@njit(cache=True, nogil=True)
+def project_projective(P: F64, X: F64, seen: Seen, residual: F64, depth: F64) -> None:
+    """Fill residual (K, 2) = projection - xy and depth (K,) = third row of P X; P (V, 3, 4), X (N, 4)."""
+    for k in range(len(seen.xy)):
+        p, x = P[seen.view_index[k]], X[seen.point_index[k]]
+        z0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]
+        z1 = p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]
+        z2 = p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3]
+        w = away_from_zero(z2)
+        depth[k] = z2
+        residual[k, 0] = z0 / w - seen.xy[k, 0]
+        residual[k, 1] = z1 / w - seen.xy[k, 1]
+
+
+@njit(cache=True, nogil=True)
+def linearize_projective(state: UnitState, seen: Seen, weighing: Weighing, J: Jacobians) -> float:
+    """Fill J with weighted residuals, A (K, 2, 11) and B (K, 2, 3) in the tangent spaces; returns the cost.
+
+    With u = P X: d pi = (1 / u2) [[1, 0, -x], [0, 1, -y]] du (methods 6.7). ``weighing.sigma`` is not used.
+    """
+    cost = 0.0
+    for k in range(len(seen.xy)):
+        i, j = seen.view_index[k], seen.point_index[k]
+        p, x, v, y = state.P[i], state.X[j], state.vP[i], state.vX[j]
+        bP, bX = state.bP[i], state.bX[j]
+        A, B = J.A[k], J.B[k]
+        u0 = p[0] * x[0] + p[1] * x[1] + p[2] * x[2] + p[3] * x[3]
+        u1 = p[4] * x[0] + p[5] * x[1] + p[6] * x[2] + p[7] * x[3]
+        w = away_from_zero(p[8] * x[0] + p[9] * x[1] + p[10] * x[2] + p[11] * x[3])
+        a, b = u0 / w, u1 / w
+        r0, r1 = a - seen.xy[k, 0], b - seen.xy[k, 1]
+        s = r0 * r0 + r1 * r1
+        cost += loss_value(weighing.code, s, weighing.delta)
+        root = np.sqrt(loss_weight(weighing.code, s, weighing.delta))
+        J.residual[k, 0], J.residual[k, 1] = root * r0, root * r1
+        f = root / w
+        e0 = x[0] * v[0] + x[1] * v[1] + x[2] * v[2] + x[3] * v[3]
+        e1 = x[0] * v[4] + x[1] * v[5] + x[2] * v[6] + x[3] * v[7]
+        e2 = x[0] * v[8] + x[1] * v[9] + x[2] * v[10] + x[3] * v[11]
+        c0, c1 = bP * f * (e0 - a * e2), bP * f * (e1 - b * e2)
+        for c in range(1, 12):
+            A[0, c - 1] = -c0 * v[c]
+            A[1, c - 1] = -c1 * v[c]
+        for c in range(4):
+            fx = f * x[c]
+            if c > 0:
+                A[0, c - 1] += fx
+            A[1, 3 + c] += fx
+            A[0, 7 + c] -= a * fx
+            A[1, 7 + c] -= b * fx
+        d0 = d1 = 0.0
+        for c in range(4):
+            d0 += f * (p[c] - a * p[8 + c]) * y[c]
+            d1 += f * (p[4 + c] - b * p[8 + c]) * y[c]
+        for c in range(1, 4):
+            B[0, c - 1] = f * (p[c] - a * p[8 + c]) - bX * d0 * y[c]
+            B[1, c - 1] = f * (p[4 + c] - b * p[8 + c]) - bX * d1 * y[c]
+    return 0.5 * cost
+
+
+@njit(cache=True, nogil=True)
+def projective_cost(state: UnitState, seen: Seen, weighing: Weighing) -> float:
+    """1/2 sum rho of the residuals."""
+    cost = 0.0
+    for k in range(len(seen.xy)):
+        p, x = state.P[seen.view_index[k]], state.X[seen.point_index[k]]
+        u0 = p[0] * x[0] + p[1] * x[1] + p[2] * x[2] + p[3] * x[3]
+        u1 = p[4] * x[0] + p[5] * x[1] + p[6] * x[2] + p[7] * x[3]
+        w = away_from_zero(p[8] * x[0] + p[9] * x[1] + p[10] * x[2] + p[11] * x[3])
+        r0, r1 = u0 / w - seen.xy[k, 0], u1 / w - seen.xy[k, 1]
+        cost += loss_value(weighing.code, r0 * r0 + r1 * r1, weighing.delta)
+    return 0.5 * cost
 
 
 @dataclass(frozen=True)
@@ -54,7 +176,7 @@ class _ProjectiveProblem:
     def linearize(self, state: UnitState) -> BundleSystem:
         def work(which: slice, seen: Seen) -> float:
             part = self.jacobians.part(which.start, which.stop)
-            return float(kernels.linearize_projective(state, seen, self.weighing, part))
+            return float(linearize_projective(state, seen, self.weighing, part))
 
         cost = sum(self.layout.over_observations(work))
         return BundleSystem(cost, self.layout, self.jacobians)
@@ -64,8 +186,8 @@ class _ProjectiveProblem:
         views = np.zeros((len(state.P), VIEW_DOF))
         views[block >= 0] = step.cameras.reshape(-1, VIEW_DOF)
         P, X = np.empty_like(state.P), np.empty_like(state.X)
-        kernels.tangent_step(state.P, state.vP, state.bP, views, P)
-        kernels.tangent_step(state.X, state.vX, state.bX, step.points, X)
+        tangent_step(state.P, state.vP, state.bP, views, P)
+        tangent_step(state.X, state.vX, state.bX, step.points, X)
         hold_flipping(self.layout, state.P[:, 8:], P[:, 8:], state.X, X)
         return UnitState.at(P, X)
 
@@ -74,16 +196,14 @@ class _ProjectiveProblem:
         residual, depth = np.empty((K, 2)), np.empty(K)
 
         def work(which: slice, seen: Seen) -> None:
-            kernels.project_projective(
-                state.P.reshape(-1, 3, 4), state.X, seen, residual[which], depth[which]
-            )
+            project_projective(state.P.reshape(-1, 3, 4), state.X, seen, residual[which], depth[which])
 
         self.layout.over_observations(work)
         return residual
 
     def cost(self, state: UnitState) -> float:
         def work(_: slice, seen: Seen) -> float:
-            return float(kernels.projective_cost(state, seen, self.weighing))
+            return float(projective_cost(state, seen, self.weighing))
 
         return sum(self.layout.over_observations(work))
 

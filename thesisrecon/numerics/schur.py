@@ -23,11 +23,11 @@ from thesisrecon.numerics.elimination import (
     Sums,
     eliminate_points,
     mark_pairs,
+    revert_cheirality_violations,
     substitute_points,
 )
 from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
 from thesisrecon.numerics.observations import Jacobians, Seen, SortedObservations
-from thesisrecon.numerics.point_kernels import revert_cheirality_violations
 from thesisrecon.numerics.reduced_solvers import ReducedSolver, ReducedSystem, add_diagonal, choose_solver
 
 Result = TypeVar("Result")

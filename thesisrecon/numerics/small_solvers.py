@@ -2,57 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64
 
 TINY = 1e-12
-
-
-@njit(cache=True, nogil=True, inline="always")
-def loss_value(code: int, s: float, delta: float) -> float:
-    """rho(s) of the losses of losses.py, numbered in its order."""
-    d2 = delta * delta
-    if code == 1:
-        return s if s <= d2 else 2.0 * delta * math.sqrt(s) - d2
-    if code == 2:
-        return 2.0 * d2 * (math.sqrt(1.0 + s / d2) - 1.0)
-    if code == 3:
-        return d2 * math.log1p(s / d2)
-    if code == 4:
-        return min(s, d2)
-    return s
-
-
-@njit(cache=True, nogil=True, inline="always")
-def loss_weight(code: int, s: float, delta: float) -> float:
-    """rho'(s)."""
-    d2 = delta * delta
-    if code == 1:
-        return 1.0 if s <= d2 else delta / math.sqrt(s)
-    if code == 2:
-        return 1.0 / math.sqrt(1.0 + s / d2)
-    if code == 3:
-        return 1.0 / (1.0 + s / d2)
-    if code == 4:
-        return 1.0 if s <= d2 else 0.0
-    return 1.0
-
-
-@njit(cache=True, nogil=True, inline="always")
-def loss_curvature(code: int, s: float, delta: float) -> float:
-    """1 + 2 s rho'' / rho': how much of the curvature along a residual its loss leaves."""
-    u = s / (delta * delta)
-    if code == 1:
-        return 1.0 if u <= 1.0 else 0.0
-    if code == 2:
-        return 1.0 / (1.0 + u)
-    if code == 3:
-        return (1.0 - u) / (1.0 + u)
-    return 1.0
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.numerics.metric_cameras import FOCAL, POSE_DOF, IntrinsicsPrior, MetricCameras
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics.metric_cameras import FOCAL, POSE_DOF, MetricCameras
 
 NONE = -1
 # exp of more than this is never a focal; the bound only matters for steps that will be refused.
@@ -94,7 +95,7 @@ def number_values(
     one that no photograph sees is no unknown.
     """
     table = _with_log_focal(cameras.intrinsics)
-    nothing = IntrinsicsPrior(cameras.intrinsics, np.full_like(table, np.inf))
+    nothing = IntrinsicsPrior.unshared(cameras.intrinsics, np.full_like(table, np.inf))
     prior = prior or nothing
     number = np.full(table.shape, NONE, dtype=np.int64)
     parts = _Parts([], [], [])
@@ -104,11 +105,11 @@ def number_values(
         value = np.unique(sharing, return_inverse=True)[1].astype(np.int64)
         table[:, c], number[:, c] = _number_column(int(c), value, (table[:, c], used), prior, parts)
     seen = len(parts.start)
-    if prior.population is not None and prior.spread is not None:
+    if prior.spread is not None:
         spread = np.broadcast_to(prior.spread, table.shape)
         for c in np.flatnonzero(free):
-            for kind in np.unique(prior.population[prior.population >= 0]):
-                rows = np.flatnonzero((prior.population == kind) & used)
+            for kind in np.unique(prior.kind[prior.kind >= 0]):
+                rows = np.flatnonzero((prior.kind == kind) & used)
                 if not len(rows) or not np.isfinite(spread[rows[0], c]):
                     continue
                 sharing = rows if cameras.shared is None else cameras.shared[rows, c]
