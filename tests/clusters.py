@@ -1,16 +1,12 @@
 """A Dask cluster on loopback."""
 
-from __future__ import annotations
-
 import logging
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
 
 @pytest.fixture(scope="module")
-def dask_cluster() -> Iterator[Any]:
+def dask_cluster():
     """A scheduler and two worker processes on loopback."""
     distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
     with distributed.LocalCluster(
@@ -24,6 +20,6 @@ def dask_cluster() -> Iterator[Any]:
         yield running
 
 
-def address(running: Any) -> str:
+def address(running):
     """What the command line calls it."""
     return str(running.scheduler_address).replace("tcp://", "dask://")

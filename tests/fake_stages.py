@@ -5,11 +5,8 @@ Every call that computes something is written to ``CALLS``.
 
 # ruff: noqa: ARG002 (a fake takes what the real stage takes, and ignores most of it)
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import count
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -35,12 +32,12 @@ from thesisrecon.records import (
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.stereo.neighbours import SparsePoints
 
-CALLS: list[str] = []
+CALLS = []
 WIDTH, HEIGHT, POINTS = 96, 80, 30
 K = np.array([[100.0, 0.0, 47.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])
 
 
-def photographs(n: int) -> list[Image]:
+def photographs(n):
     """n different pictures named 00.png, 01.png, ..."""
     rng = np.random.default_rng(5)
     pictures = []
@@ -51,12 +48,12 @@ def photographs(n: int) -> list[Image]:
     return pictures
 
 
-def scene_points() -> np.ndarray:
+def scene_points():
     X = np.random.default_rng(1).uniform(-1.0, 1.0, (POINTS, 3)) + np.array([0.0, 0.0, 5.0])
     return np.column_stack([X, np.ones(POINTS)])
 
 
-def scene_camera(i: int) -> np.ndarray:
+def scene_camera(i):
     angle = 0.1 * i
     R = np.array(
         [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]], dtype=np.float64
@@ -64,7 +61,7 @@ def scene_camera(i: int) -> np.ndarray:
     return compose_camera(K, R, -R @ np.array([0.5 * i, 0.02 * i, 0.0]))
 
 
-def view_of(image: Image) -> int:
+def view_of(image):
     return int(image.name[:2])
 
 
@@ -72,7 +69,7 @@ def view_of(image: Image) -> int:
 class FakeDetector:
     version: int = 0
 
-    def detect(self, image: Image) -> Features:
+    def detect(self, image):
         CALLS.append(f"detect {image.name}")
         xy = project(scene_camera(view_of(image)), scene_points())
         return Features(xy, np.ones(POINTS, np.float32), np.ones(POINTS, np.float32))
@@ -83,11 +80,11 @@ class FakeMatcher:
     fail_pair: tuple[int, int] = (-1, -1)
     interrupt_after: int = -1
 
-    def prepare(self, image: Image, features: Features) -> Features:
+    def prepare(self, image, features):
         CALLS.append(f"prepare {image.name}")
         return features
 
-    def match(self, view1: Any, view2: Any, *, pair: Any, estimate_fundamental: Any, rng: Any) -> Matches:
+    def match(self, view1, view2, *, pair, estimate_fundamental, rng):
         CALLS.append(f"match {pair}")
         assert callable(estimate_fundamental)
         if pair == self.fail_pair:
@@ -101,7 +98,7 @@ class FakeMatcher:
 
 @dataclass(frozen=True)
 class FakeEstimator:
-    def estimate(self, xy1: Any, xy2: Any, rng: Any) -> FundamentalFit:
+    def estimate(self, xy1, xy2, rng):
         assert xy1.shape == xy2.shape
         rng.standard_normal()
         F = np.eye(3) / np.sqrt(3.0)
@@ -112,7 +109,7 @@ class FakeEstimator:
 class FakeVerifier:
     accept: bool = True
 
-    def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
+    def verify(self, matches, fit, rng):
         return TwoView(
             i=matches.i,
             j=matches.j,
@@ -132,7 +129,7 @@ class FakeVerifier:
 
 @dataclass(frozen=True)
 class FakeTracks:
-    def build(self, prepared: Any, pairs: Any, rng: Any) -> Tracks:
+    def build(self, prepared, pairs, rng):
         CALLS.append("tracks")
         views = len(prepared)
         point, view = (a.ravel() for a in np.meshgrid(np.arange(POINTS), np.arange(views), indexing="ij"))
@@ -144,9 +141,7 @@ class FakeTracks:
 class FakeProjective:
     fail_below: int = 0
 
-    def reconstruct(
-        self, tracks: Tracks, pairs: Any, sizes: Any, *, rng: Any, attempt: int = 0
-    ) -> Reconstruction:
+    def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):
         CALLS.append(f"projective {attempt}")
         assert sizes.shape == (tracks.n_views, 2)
         if attempt < self.fail_below:
@@ -170,9 +165,9 @@ class FakeCalibrator:
     identifiable: bool = True
     skew_px: float = 0.0
 
-    def calibrate(self, reconstruction: Reconstruction, *, assumed: Any, rng: Any) -> SelfCalibration:
-        CALLS.append(f"calibrate prior={assumed.focal_known.any()}")
-        Ks = np.broadcast_to(K, (len(assumed.mean), 3, 3)).copy()
+    def calibrate(self, reconstruction, *, prior, rng):
+        CALLS.append(f"calibrate prior={prior.focal_known.any()}")
+        Ks = np.broadcast_to(K, (len(prior.mean), 3, 3)).copy()
         Ks[:, 0, 1] = self.skew_px
         upgrade = Upgrade(np.eye(4), Ks, 0.0, "fake")
         why = () if self.identifiable else ("the camera only rotates",)
@@ -184,12 +179,10 @@ class FakeMetric:
     trusted_from: int = 0
     failed_checks: tuple[str, ...] = ("odd focal",)
 
-    def refine(
-        self, reconstruction: Reconstruction, calibration: Any, *, assumed: Any, rng: Any
-    ) -> MetricResult:
+    def refine(self, reconstruction, calibration, *, prior, rng):
         attempt = sum(call.startswith("metric") for call in CALLS)
         CALLS.append(f"metric {attempt}")
-        views = len(assumed.mean)
+        views = len(prior.mean)
         intervals = {
             "focal_px": IntrinsicInterval(100.0, 1.0, "fake"),
             "principal_x_px": IntrinsicInterval(47.0, 0.5, "fake"),
@@ -209,7 +202,7 @@ class FakeDense:
 
     confirmed: bool = True
 
-    def prepare(self, images: Any, reconstruction: Reconstruction) -> MultiViewScene:
+    def prepare(self, images, reconstruction):
         CALLS.append("prepare dense")
         P = reconstruction.P
         views = {
@@ -220,10 +213,10 @@ class FakeDense:
         points = SparsePoints(np.zeros((0, 3)), np.zeros((len(P), 0), dtype=bool))
         return MultiViewScene(views, points, dict.fromkeys(views, ()))
 
-    def surroundings(self, scene: MultiViewScene, view: int) -> frozenset[int]:
+    def surroundings(self, scene, view):
         return frozenset({view, *list(scene.views)[:2]})
 
-    def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
+    def depth_map(self, scene, view):
         CALLS.append(f"depth {view}")
         shape, P = scene.views[view].rgb.shape[:2], scene.views[view].P
         y, x = np.indices(shape)
@@ -231,12 +224,12 @@ class FakeDense:
         depth = ((8.0 + np.linalg.solve(P[:, :3], P[:, 3])[2]) / rays[..., 2]).astype(np.float32)
         return DepthMap(view, P, depth, np.full_like(depth, 0.01), np.ones(shape, dtype=np.uint8))
 
-    def confirm(self, scene: Any, depth_maps: Any, view: int) -> DepthMap:
+    def confirm(self, scene, depth_maps, view):
         depth = depth_maps[view].depth
         return replace(depth_maps[view], depth=depth if self.confirmed else np.full_like(depth, np.nan))
 
 
-def fake_config(**changes: Any) -> PipelineConfig:
+def fake_config(**changes):
     """A pipeline of fakes."""
     config = PipelineConfig(
         features=FakeDetector(),
@@ -252,11 +245,11 @@ def fake_config(**changes: Any) -> PipelineConfig:
     return replace(config, **changes)
 
 
-def interrupt_at(stage: str, done: int) -> Any:
+def interrupt_at(stage, done):
     """A progress listener that presses Ctrl-C when so much of a stage is done."""
     heard = count()
 
-    def hear(name: str, finished: int, _total: int) -> None:
+    def hear(name, finished, _total):
         next(heard)
         if name == stage and finished == done:
             raise KeyboardInterrupt

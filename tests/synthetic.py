@@ -1,7 +1,5 @@
 """A small general scene with exact truth, for the tests of the geometric stages."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,26 +22,26 @@ class TrueScene:
     sizes: np.ndarray
 
     @property
-    def P(self) -> np.ndarray:
+    def P(self):
         return compose_camera(self.K, self.R, self.t)
 
     @property
-    def centres(self) -> np.ndarray:
+    def centres(self):
         return -np.einsum("vba,vb->va", self.R, self.t)
 
 
 def make_scene(
     *,
-    views: int = 8,
-    points: int = 300,
-    sigma_px: float = 0.0,
-    focal: float = 1500.0,
-    zoom: float = 0.0,
-    principal_shift: tuple[float, float] = (0.0, 0.0),
-    k1: float = 0.0,
-    seen_share: float = 0.75,
-    seed: int = 0,
-) -> TrueScene:
+    views=8,
+    points=300,
+    sigma_px=0.0,
+    focal=1500.0,
+    zoom=0.0,
+    principal_shift=(0.0, 0.0),
+    k1=0.0,
+    seen_share=0.75,
+    seed=0,
+):
     """Cameras on an irregular cap around a cloud of points, turned and rolled as a hand would."""
     rng = np.random.default_rng(seed)
     size = np.array([1536, 1024])
@@ -79,7 +77,7 @@ def make_scene(
     return TrueScene(Ka, Ra, ta, X, k1, tracks, np.tile(size, (views, 1)))
 
 
-def with_poses(scene: TrueScene, R: np.ndarray, centres: np.ndarray) -> TrueScene:
+def with_poses(scene, R, centres):
     """The same points seen without noise by cameras that stand and look elsewhere."""
     t = -np.einsum("vab,vb->va", R, centres)
     view, point = scene.tracks.view_index, scene.tracks.point_index
@@ -90,7 +88,7 @@ def with_poses(scene: TrueScene, R: np.ndarray, centres: np.ndarray) -> TrueScen
     return replace(scene, R=R, t=t, tracks=replace(scene.tracks, xy=xy))
 
 
-def projective_reconstruction(scene: TrueScene, *, seed: int = 0) -> Reconstruction:
+def projective_reconstruction(scene, *, seed=0):
     """The true cameras and points moved by a random projective transform, with random scales and signs."""
     rng = np.random.default_rng(seed)
     G = np.eye(4) + 0.3 * rng.normal(size=(4, 4))
@@ -113,7 +111,7 @@ def projective_reconstruction(scene: TrueScene, *, seed: int = 0) -> Reconstruct
     )
 
 
-def true_pairs(scene: TrueScene) -> list[TwoView]:
+def true_pairs(scene):
     """Every pair with its true F and all common points as verified matches."""
     t = scene.tracks
     table = np.full((t.n_views, t.n_points), -1)

@@ -1,7 +1,5 @@
 """The front doors of single stages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +11,14 @@ import thesisrecon
 from tests import fake_stages as fakes
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsAssumption
+from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.records import Image, Reconstruction, TexturedMesh, Tracks
 from thesisrecon.report.summary import original_from_working, point_colours
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 
 
-def small_reconstruction() -> Reconstruction:
+def small_reconstruction():
     """Two points seen by two views of which the second is of another size."""
     view, point = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
     xy = np.array([[1.0, 2.0], [3.2, 0.4], [0.0, 0.0], [90.0, 90.0]])
@@ -38,7 +36,7 @@ def small_reconstruction() -> Reconstruction:
     )
 
 
-def test_two_photographs_give_verified_matches_and_f() -> None:
+def test_two_photographs_give_verified_matches_and_f():
     paths = sorted(COURTYARD.iterdir())[:2]
     config = PipelineConfig(images=ImageOptions(max_size_px=640))
     pair = thesisrecon.match_pair(paths[0], paths[1], config=config)
@@ -52,7 +50,7 @@ def test_two_photographs_give_verified_matches_and_f() -> None:
     np.testing.assert_array_equal(again.xy2, pair.xy2)
 
 
-def test_photographs_that_cannot_be_read_or_matched_are_failures(tmp_path: Path) -> None:
+def test_photographs_that_cannot_be_read_or_matched_are_failures(tmp_path):
     (tmp_path / "a.jpg").write_text("no picture")
     noise = [np.random.default_rng(k).integers(0, 256, (200, 200, 3), dtype=np.uint8) for k in range(2)]
     with pytest.raises(StageFailure, match=r"a\.jpg is not an image"):
@@ -61,17 +59,17 @@ def test_photographs_that_cannot_be_read_or_matched_are_failures(tmp_path: Path)
         thesisrecon.match_pair(*noise)
 
 
-def test_self_calibration_groups_views_by_size_and_takes_a_prior() -> None:
+def test_self_calibration_groups_views_by_size_and_takes_a_prior():
     heard = []
 
     class Listening(fakes.FakeCalibrator):
-        def calibrate(self, reconstruction, *, assumed, rng):  # type: ignore[no-untyped-def]
-            heard.append(assumed)
-            return super().calibrate(reconstruction, assumed=assumed, rng=rng)
+        def calibrate(self, reconstruction, *, prior, rng):
+            heard.append(prior)
+            return super().calibrate(reconstruction, prior=prior, rng=rng)
 
     config = fakes.fake_config(selfcalibration=Listening())
     thesisrecon.self_calibrate(small_reconstruction(), config=config)
-    wish = IntrinsicsAssumption(focal_px=50.0, focal_std_rel=0.1, cameras="per-image")
+    wish = IntrinsicsOptions(focal_px=50.0, focal_std_rel=0.1, cameras="per-image")
     thesisrecon.self_calibrate(small_reconstruction(), config=replace(config, intrinsics=wish))
     assert heard[0].group.tolist() == [0, 1]
     assert not heard[0].focal_known.any()
@@ -79,13 +77,13 @@ def test_self_calibration_groups_views_by_size_and_takes_a_prior() -> None:
     assert heard[1].mean[:, 0].tolist() == [50.0, 50.0]
 
 
-def test_only_a_projective_reconstruction_is_calibrated() -> None:
+def test_only_a_projective_reconstruction_is_calibrated():
     metric = replace(small_reconstruction(), stratum="metric")
     with pytest.raises(ValueError, match="takes a projective reconstruction; got metric"):
         thesisrecon.self_calibrate(metric)
 
 
-def test_triangulate_and_estimate_fundamental_are_front_doors() -> None:
+def test_triangulate_and_estimate_fundamental_are_front_doors():
     X, P = fakes.scene_points(), np.stack([fakes.scene_camera(0), fakes.scene_camera(2)])
     xy = np.stack([(X @ camera.T)[:, :2] / (X @ camera.T)[:, 2:] for camera in P])
     found = thesisrecon.triangulate(P, xy)
@@ -93,11 +91,11 @@ def test_triangulate_and_estimate_fundamental_are_front_doors() -> None:
     fit = thesisrecon.estimate_fundamental(xy[0], xy[1])
     assert fit.inliers.sum() >= 25
     with pytest.raises(AttributeError, match="no attribute 'reconstrukt'"):
-        _ = thesisrecon.reconstrukt  # type: ignore[attr-defined]
+        _ = thesisrecon.reconstrukt
     assert set(thesisrecon.__all__) == set(dir(thesisrecon))
 
 
-def test_points_take_the_mean_colour_of_where_they_are_seen() -> None:
+def test_points_take_the_mean_colour_of_where_they_are_seen():
     images = []
     for width, height in ((96, 80), (48, 40)):
         rgb = np.zeros((height, width, 3), np.uint8)
@@ -107,14 +105,14 @@ def test_points_take_the_mean_colour_of_where_they_are_seen() -> None:
     assert colours.tolist() == [[2, 1, 0], [0, 0, 0], [128, 128, 128]]
 
 
-def test_pixels_go_back_to_the_original_as_they_came() -> None:
+def test_pixels_go_back_to_the_original_as_they_came():
     scale = 0.4
     original = np.array([123.0, 45.0])
     working = (original + 0.5) * scale - 0.5
     np.testing.assert_allclose(original_from_working(scale) @ [*working, 1.0], [*original, 1.0])
 
 
-def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path: Path) -> None:
+def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path):
     rng = np.random.default_rng(0)
     wall = np.asarray(
         PIL.Image.fromarray(rng.integers(0, 256, (20, 40), dtype=np.uint8)).resize((160, 80)), dtype=np.uint8
@@ -134,7 +132,7 @@ def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path: Path) -> No
         thesisrecon.match_rectified(left, right[:-2], max_disparity_px=12)
 
 
-def test_a_model_is_rendered_through_the_front_door() -> None:
+def test_a_model_is_rendered_through_the_front_door():
     triangle = np.array([[-1.0, -1.0, 2.0], [-1.0, 1.0, 2.0], [1.0, 0.0, 2.0]])
     mesh = TexturedMesh(triangle, np.array([[0, 1, 2]]))
     K = np.array([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])

@@ -6,7 +6,6 @@ Each test collects all offenders and names them in its message.
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +17,7 @@ STAGES = {
     "features", "matching", "epipolar", "projective", "selfcalibration", "metric", "stereo", "surface",
     "views",
 }  # fmt: skip
-FOUNDATIONS = {"arrays", "camera", "errors", "records", "geometry", "numerics"}
+FOUNDATIONS = {"arrays", "camera", "errors", "intrinsics", "records", "geometry", "numerics"}
 COMPOSERS = {"__init__", "config", "api", "pipeline", "view_interpolation", "view_synthesis"}
 """Only these may import several stages: they pass to a stage what it needs of another one."""
 CORE = {"numpy", "scipy", "numba", "PIL", "trimesh", "jinja2", "plotly", "rich", "typer"}
@@ -34,14 +33,14 @@ MOST_KERNEL_ARGUMENTS = 8
 
 
 @cache
-def tree_of(path: Path) -> ast.Module:
+def tree_of(path):
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
 @cache
-def imported_modules(path: Path) -> frozenset[str]:
+def imported_modules(path):
     """Return the full names of all imported modules; ``from a import b`` gives both a and a.b."""
-    names: set[str] = set()
+    names = set()
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
@@ -51,56 +50,56 @@ def imported_modules(path: Path) -> frozenset[str]:
     return frozenset(names)
 
 
-def parts_used(path: Path) -> set[str]:
+def parts_used(path):
     """Return the folders and top-level modules of the package that a file imports."""
     return {n.split(".")[1] for n in imported_modules(path) if n.startswith("thesisrecon.")}
 
 
-def home(path: Path) -> str:
+def home(path):
     """Return the folder or top-level module of the package that a file belongs to."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-def modules_of(parts: set[str]) -> Iterator[Path]:
+def modules_of(parts):
     return (path for path in MODULES if home(path) in parts)
 
 
-def report(offenders: dict[Path, set[str]]) -> list[str]:
+def report(offenders):
     return [f"{path.relative_to(ROOT)}: {sorted(found)}" for path, found in offenders.items() if found]
 
 
-def test_no_import_is_relative() -> None:
+def test_no_import_is_relative():
     assert report({p: {n for n in imported_modules(p) if n.startswith(".")} for p in MODULES}) == []
 
 
-def test_the_package_imports_only_its_core_dependencies() -> None:
+def test_the_package_imports_only_its_core_dependencies():
     allowed = set(sys.stdlib_module_names) | {"thesisrecon"} | CORE
     foreign = {p: {n.split(".")[0] for n in imported_modules(p)} - allowed for p in MODULES}
     assert report({p: names - OPTIONAL.get(home(p), set()) for p, names in foreign.items()}) == []
 
 
-def test_a_stage_imports_only_foundations_and_itself() -> None:
+def test_a_stage_imports_only_foundations_and_itself():
     assert report({p: parts_used(p) - FOUNDATIONS - {home(p)} for p in modules_of(STAGES)}) == []
 
 
-def test_foundations_import_only_foundations() -> None:
+def test_foundations_import_only_foundations():
     used = {p: parts_used(p) - FOUNDATIONS for p in modules_of(FOUNDATIONS)}
     used |= {p: names | ({"logging", "random"} & imported_modules(p)) for p, names in used.items()}
     assert report(used) == []
 
 
-def test_io_and_report_import_no_stage_and_no_composer() -> None:
+def test_io_and_report_import_no_stage_and_no_composer():
     above = STAGES | COMPOSERS | {"cli"}
     assert report({p: parts_used(p) & above for p in modules_of({"io", "report"})}) == []
 
 
-def test_only_composers_import_several_stages() -> None:
+def test_only_composers_import_several_stages():
     used = {p: parts_used(p) & STAGES for p in MODULES if home(p) not in COMPOSERS}
     assert report({p: stages for p, stages in used.items() if len(stages) > 1}) == []
 
 
-def test_mathematics_touches_no_file_and_no_global_randomness() -> None:
-    found: dict[Path, set[str]] = {}
+def test_mathematics_touches_no_file_and_no_global_randomness():
+    found = {}
     for path in modules_of(FOUNDATIONS | STAGES):
         called = {ast.unparse(node.func) for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)}
         found[path] = {name for name in called if name.split(".")[-1] in FILE_CALLS}
@@ -108,19 +107,19 @@ def test_mathematics_touches_no_file_and_no_global_randomness() -> None:
     assert report(found) == []
 
 
-def test_no_folder_is_nested_in_a_chapter() -> None:
+def test_no_folder_is_nested_in_a_chapter():
     assert [str(p.relative_to(ROOT)) for p in MODULES if len(p.relative_to(PACKAGE).parts) > 2] == []
 
 
-def test_chapters_export_nothing() -> None:
+def test_chapters_export_nothing():
     """A name is imported from the module that defines it; only ``thesisrecon`` itself exports names."""
     chapters = [p for p in MODULES if p.name == "__init__.py" and p.parent != PACKAGE]
     code = {p: {ast.unparse(node) for node in tree_of(p).body[1:]} for p in chapters}
     assert report(code) == []
 
 
-def test_array_types_are_defined_once() -> None:
-    found: dict[Path, set[str]] = {}
+def test_array_types_are_defined_once():
+    found = {}
     for path in modules_of({home(p) for p in MODULES} - {"arrays"}):
         for node in tree_of(path).body:
             value = getattr(node, "value", None)
@@ -139,11 +138,11 @@ class Kernel(NamedTuple):
     inlined: bool
 
 
-def is_named_call(node: ast.AST) -> bool:
+def is_named_call(node):
     return isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
 
 
-def kernels_in(tree: ast.Module, place: str) -> dict[str, Kernel]:
+def kernels_in(tree, place):
     """Return all functions of a module under ``@njit(...)``, by name."""
     found = {}
     for node in tree.body:
@@ -159,7 +158,7 @@ def kernels_in(tree: ast.Module, place: str) -> dict[str, Kernel]:
     return found
 
 
-def not_inlined(kernels: dict[str, list[Kernel]]) -> list[str]:
+def not_inlined(kernels):
     """Return called functions that reorder sums, or inline one that does, and are not inlined themselves."""
     every = [kernel for named in kernels.values() for kernel in named]
     reordering = {name for name, named in kernels.items() if any(k.reorders for k in named)}
@@ -172,21 +171,21 @@ def not_inlined(kernels: dict[str, list[Kernel]]) -> list[str]:
 
 
 @cache
-def all_kernels() -> dict[str, list[Kernel]]:
-    kernels: dict[str, list[Kernel]] = {}
+def all_kernels():
+    kernels = {}
     for path in MODULES:
         for name, kernel in kernels_in(tree_of(path), str(path.relative_to(PACKAGE))).items():
             kernels.setdefault(name, []).append(kernel)
     return kernels
 
 
-def test_kernels_take_few_arguments() -> None:
+def test_kernels_take_few_arguments():
     every = [kernel for named in all_kernels().values() for kernel in named]
     assert len(every) > 100
     assert [f"{k.place}: {k.arguments}" for k in every if k.arguments > MOST_KERNEL_ARGUMENTS] == []
 
 
-def test_kernels_that_reorder_sums_are_inlined_into_their_callers() -> None:
+def test_kernels_that_reorder_sums_are_inlined_into_their_callers():
     """A function with ``fastmath`` that several kernels link may be optimised differently in each copy.
 
     Which copy a process calls depends on the kernel that it loads first, so a run that compiles and one that
@@ -196,7 +195,7 @@ def test_kernels_that_reorder_sums_are_inlined_into_their_callers() -> None:
     assert not_inlined(all_kernels()) == []
 
 
-def test_the_inlining_rule_finds_offenders() -> None:
+def test_the_inlining_rule_finds_offenders():
     source = """
 @njit(cache=True, fastmath=True{0})
 def total(a): ...
@@ -210,7 +209,7 @@ def outer(a):
     return between(a)
 """
 
-    def offenders(first: str, second: str) -> list[str]:
+    def offenders(first, second):
         found = kernels_in(ast.parse(source.format(first, second)), "a.py")
         return not_inlined({name: [kernel] for name, kernel in found.items()})
 
@@ -226,7 +225,7 @@ LATE = {
 }  # fmt: skip
 
 
-def test_imports_load_only_what_they_need() -> None:
+def test_imports_load_only_what_they_need():
     """Heavy modules are loaded by the calls that use them."""
     cases = [
         ("import thesisrecon; thesisrecon.__version__", HEAVY),

@@ -2,13 +2,9 @@
 lost.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -21,7 +17,7 @@ SMALL = ["--max-size", "480", "--threads", "2", "--until", "metric"]
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
     return folder
@@ -30,15 +26,15 @@ def folder(tmp_path: Path) -> Path:
 class Answer:
     """Exit code, the one sentence, and the summary (None where no run began)."""
 
-    def __init__(self, code: int, sentence: str, out: Path) -> None:
+    def __init__(self, code, sentence, out):
         self.code, self.sentence = code, sentence
         path = out / "summary.json"
-        self.summary: Any = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        self.summary = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
 @pytest.fixture
-def reconstruct(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
-    def run(*options: str, out: Path | None = None) -> Answer:
+def reconstruct(folder, tmp_path, capsys):
+    def run(*options, out=None):
         out = tmp_path / "out" if out is None else out
         code = run_command(["reconstruct", str(folder), "-o", str(out), *SMALL, *options])
         sentence = capsys.readouterr().err
@@ -49,26 +45,26 @@ def reconstruct(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     return run
 
 
-def courtyard(n: int) -> list[Path]:
+def courtyard(n):
     return sorted(COURTYARD.iterdir())[:n]
 
 
-def picture(k: int) -> PIL.Image.Image:
+def picture(k):
     with PIL.Image.open(courtyard(k + 1)[k]) as file:
         return file.convert("RGB")
 
 
-def refused(answer: Answer) -> dict[str, str]:
+def refused(answer):
     return {entry["name"]: entry["reason"] for entry in answer.summary["refused"]}
 
 
-def test_an_empty_folder(reconstruct: Callable[..., Answer]) -> None:
+def test_an_empty_folder(reconstruct):
     answer = reconstruct()
     assert answer.code == 2
     assert "there are no photographs in" in answer.sentence
 
 
-def test_one_image(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_one_image(folder, reconstruct):
     shutil.copy(courtyard(1)[0], folder)
     answer = reconstruct()
     assert answer.code == 3
@@ -76,7 +72,7 @@ def test_one_image(folder: Path, reconstruct: Callable[..., Answer]) -> None:
     assert answer.summary["images"] == 1
 
 
-def test_two_identical_images(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_two_identical_images(folder, reconstruct):
     for name in ("a.jpg", "b.jpg"):
         shutil.copy(courtyard(1)[0], folder / name)
     answer = reconstruct()
@@ -84,7 +80,7 @@ def test_two_identical_images(folder: Path, reconstruct: Callable[..., Answer]) 
     assert "b.jpg has the same pixels as a.jpg" in answer.sentence
 
 
-def test_damaged_files_among_good_ones(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_damaged_files_among_good_ones(folder, reconstruct):
     """A text named .jpg and a truncated JPEG are refused with their reasons; the others go on to cameras."""
     for path in courtyard(5):
         shutil.copy(path, folder / f"good {path.name}")
@@ -100,7 +96,7 @@ def test_damaged_files_among_good_ones(folder: Path, reconstruct: Callable[..., 
     assert "letter.jpg" in page
 
 
-def test_every_kind_of_pixel_in_one_scene(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_every_kind_of_pixel_in_one_scene(folder, reconstruct):
     """16-bit, grey, RGBA and CMYK images, an EXIF rotation, spaces and letters beyond ASCII: all become
     cameras.
     """
@@ -121,7 +117,7 @@ def test_every_kind_of_pixel_in_one_scene(folder: Path, reconstruct: Callable[..
     assert {camera["camera"] for camera in cameras.values()} == {0}
 
 
-def test_mixed_sizes_are_different_cameras(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_mixed_sizes_are_different_cameras(folder, reconstruct):
     for k in range(6):
         scale = 0.75 if k % 2 else 1.0
         image = picture(k)
@@ -134,7 +130,7 @@ def test_mixed_sizes_are_different_cameras(folder: Path, reconstruct: Callable[.
     assert np.ptp(focals) < 0.1 * np.mean(focals)
 
 
-def test_blank_images(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_blank_images(folder, reconstruct):
     for k in range(3):
         PIL.Image.new("RGB", (400, 300), (200, 190, 60 * k)).save(folder / f"{k}.png")
     answer = reconstruct()
@@ -143,7 +139,7 @@ def test_blank_images(folder: Path, reconstruct: Callable[..., Answer]) -> None:
     assert "blank" in answer.sentence
 
 
-def test_noise_images(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_noise_images(folder, reconstruct):
     rng = np.random.default_rng(0)
     for k in range(3):
         PIL.Image.fromarray(rng.integers(0, 256, (300, 400, 3), dtype=np.uint8)).save(folder / f"{k}.png")
@@ -153,7 +149,7 @@ def test_noise_images(folder: Path, reconstruct: Callable[..., Answer]) -> None:
     assert answer.summary["pairs"]["matched"] == 3
 
 
-def test_almost_featureless_images(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_almost_featureless_images(folder, reconstruct):
     """A soft gradient passes for a photograph, but has no corner to match."""
     ramp = np.linspace(0, 255, 400)[None, :] * np.ones((300, 1))
     for k in range(2):
@@ -166,7 +162,7 @@ def test_almost_featureless_images(folder: Path, reconstruct: Callable[..., Answ
     assert "the best of 1 pair has 0 verified matches" in answer.sentence
 
 
-def test_two_views_are_too_few_for_self_calibration(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_two_views_are_too_few_for_self_calibration(folder, reconstruct):
     for path in courtyard(2):
         shutil.copy(path, folder)
     answer = reconstruct()
@@ -180,21 +176,21 @@ K = np.array([[480.0, 0.0, 239.5], [0.0, 480.0, 179.5], [0.0, 0.0, 1.0]])
 K_PICTURE = np.array([[800.0, 0.0, 511.5], [0.0, 800.0, 383.5], [0.0, 0.0, 1.0]])
 
 
-def rotation(x: float, y: float) -> np.ndarray:
+def rotation(x, y):
     """About the x axis after the y axis, in radians."""
     about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
     about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
     return about_x @ about_y
 
 
-def seen_through(H: np.ndarray) -> PIL.Image.Image:
+def seen_through(H):
     """The first photograph of the courtyard where pixel x shows its pixel H x."""
     perspective, bicubic = PIL.Image.Transform.PERSPECTIVE, PIL.Image.Resampling.BICUBIC
     coefficients = tuple((H / H[2, 2]).ravel()[:8].tolist())
     return picture(0).transform(SIZE, perspective, coefficients, bicubic, fillcolor=(128, 128, 128))
 
 
-def test_a_flat_poster_has_no_parallax(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_a_flat_poster_has_no_parallax(folder, reconstruct):
     """Four cameras walk round a plane, the poster z = 1: x ~ K R (X - C)."""
     for k, angle in enumerate((-0.4, -0.15, 0.15, 0.4)):
         R = rotation(0.1 * (-1) ** k, angle)
@@ -207,7 +203,7 @@ def test_a_flat_poster_has_no_parallax(folder: Path, reconstruct: Callable[..., 
     assert answer.summary["pairs"]["accepted"] >= 3
 
 
-def test_a_camera_that_only_turns_has_no_parallax(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_a_camera_that_only_turns_has_no_parallax(folder, reconstruct):
     for k, (x, y) in enumerate([(-0.05, -0.18), (0.04, -0.06), (0.0, 0.07), (-0.03, 0.19)]):
         seen_through(K_PICTURE @ rotation(x, y).T @ np.linalg.inv(K)).save(folder / f"{k}.png")
     answer = reconstruct()
@@ -216,9 +212,7 @@ def test_a_camera_that_only_turns_has_no_parallax(folder: Path, reconstruct: Cal
     assert answer.summary["pairs"]["accepted"] >= 3
 
 
-def test_an_output_folder_that_cannot_be_written(
-    folder: Path, tmp_path: Path, reconstruct: Callable[..., Answer]
-) -> None:
+def test_an_output_folder_that_cannot_be_written(folder, tmp_path, reconstruct):
     for path in courtyard(2):
         shutil.copy(path, folder)
     (tmp_path / "file").write_text("in the way")
@@ -227,7 +221,7 @@ def test_an_output_folder_that_cannot_be_written(
     assert "cannot be written" in answer.sentence
 
 
-def test_an_output_folder_of_something_else(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_an_output_folder_of_something_else(folder, reconstruct):
     for path in courtyard(2):
         shutil.copy(path, folder)
     answer = reconstruct(out=folder)
@@ -235,7 +229,7 @@ def test_an_output_folder_of_something_else(folder: Path, reconstruct: Callable[
     assert "which is of no run" in answer.sentence
 
 
-def test_an_output_folder_of_another_config(folder: Path, reconstruct: Callable[..., Answer]) -> None:
+def test_an_output_folder_of_another_config(folder, reconstruct):
     for path in courtyard(2):
         shutil.copy(path, folder)
     assert reconstruct("--until", "features").code == 0

@@ -5,66 +5,53 @@ A result or one sentence, no warnings, and the cameras in any case.
 
 # ruff: noqa: ARG002 (a stage that knows the answer ignores most of what it is given)
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
 from tests.fake_stages import FakeMetric, fake_config
-from tests.stereo.depth_scenes import Walled
-from tests.stereo.hard_scenes import (
-    blank_wall,
-    fence,
-    looking_ahead,
-    photograph_scene,
-    tunnel,
-)
-from thesisrecon.config import PipelineConfig, preset
+from tests.stereo.hard_scenes import blank_wall, fence, looking_ahead, photograph_scene, tunnel
+from thesisrecon.config import preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import Image, MetricResult, Reconstruction, RunResult, Tracks
 
 
-def abreast(baseline: float, views: int = 3) -> Walled:
+def abreast(baseline, views=3):
     P = looking_ahead([[baseline * (k - (views - 1) / 2), 0.0, 0.0] for k in range(views)])
     return photograph_scene(P, fence())
 
 
-def ahead() -> Walled:
+def ahead():
     return photograph_scene(looking_ahead([[0.0, 0.0, z] for z in (0.0, 0.4, 0.8)]), tunnel())
 
 
-def blank(rim: float) -> Walled:
+def blank(rim):
     P = looking_ahead([[x, 0.0, 0.0] for x in (-0.4, 0.0, 0.4)])
     return photograph_scene(P, blank_wall(rim))
 
 
-def of_elsewhere() -> Walled:
+def of_elsewhere():
     """Three views and one that shares nothing with them."""
     P = looking_ahead([[x, 0.0, 0.0] for x in (-0.4, 0.0, 0.4, 40.0)])
     return photograph_scene(P, fence())
 
 
-def without_points() -> Walled:
+def without_points():
     scene = abreast(0.4)
     r = scene.reconstruction
     return replace(scene, reconstruction=replace(r, inlier=np.zeros_like(r.inlier)))
 
 
-def far_smaller() -> Walled:
+def far_smaller():
     P = looking_ahead([[x, 0.0, 0.0] for x in (-0.4, 0.0, 0.4, 0.8)])
     P[3] = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]]) @ P[3]
     return photograph_scene(P, fence()[:1], sizes=[(200, 150)] * 3 + [(100, 75)])
 
 
-def burnt_out() -> Walled:
+def burnt_out():
     scene = abreast(0.4)
     for image in scene.images:
         image.rgb[:60] = 255
@@ -72,13 +59,13 @@ def burnt_out() -> Walled:
     return scene
 
 
-HOPELESS: dict[str, Callable[[], Walled]] = {
+HOPELESS = {
     "no baseline": lambda: abreast(0.0),
     "hardly a baseline": lambda: abreast(5e-4),
     "no texture": lambda: blank(0.0),
     "no points": without_points,
 }
-PARTLY: dict[str, Callable[[], Walled]] = {
+PARTLY = {
     "forward": ahead,
     "tiny baseline": lambda: abreast(0.05),
     "a fence": lambda: abreast(0.4),
@@ -86,7 +73,7 @@ PARTLY: dict[str, Callable[[], Walled]] = {
     "a small photograph": far_smaller,
     "burnt out": burnt_out,
 }
-MADE: dict[str, Walled] = {}
+MADE = {}
 
 
 @dataclass(frozen=True)
@@ -96,50 +83,48 @@ class Given:
     scene: str
 
     @property
-    def truth(self) -> Reconstruction:
+    def truth(self):
         return MADE[self.scene].reconstruction
 
-    def build(self, prepared: Any, pairs: Any, rng: Any) -> Tracks:
+    def build(self, prepared, pairs, rng):
         return self.truth.tracks
 
-    def reconstruct(
-        self, tracks: Any, pairs: Any, sizes: Any, *, rng: Any, attempt: int = 0
-    ) -> Reconstruction:
+    def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):
         return replace(self.truth, stratum="projective", K=None, distortion=None)
 
-    def refine(self, reconstruction: Any, calibration: Any, *, assumed: Any, rng: Any) -> MetricResult:
-        told = FakeMetric().refine(reconstruction, calibration, assumed=assumed, rng=rng)
+    def refine(self, reconstruction, calibration, *, prior, rng):
+        told = FakeMetric().refine(reconstruction, calibration, prior=prior, rng=rng)
         return replace(told, reconstruction=self.truth)
 
 
-def photographs(name: str) -> list[Image]:
+def photographs(name):
     if name not in MADE:
         MADE[name] = (HOPELESS | PARTLY)[name]()
     # The fake front end reads a number from the name.
     return [replace(image, name=f"{k:02d}.png") for k, image in enumerate(MADE[name].images)]
 
 
-def config(name: str, base: str) -> PipelineConfig:
+def config(name, base):
     chosen = preset(base)
     return fake_config(
         tracks=Given(name), projective=Given(name), metric=Given(name), dense=chosen.dense, model=chosen.model
     )
 
 
-def run(name: str, out: Path, base: str = "default", **given: Any) -> RunResult:
+def run(name, out, base="default", **given):
     images = photographs(name)
     return reconstruct(images, out, config=config(name, base), threads=2, **given)
 
 
-def summary(out: Path) -> Any:
+def summary(out):
     return json.loads((out / "summary.json").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize(("name", "base"), [*((n, "default") for n in HOPELESS), ("no texture", "thesis")])
-def test_no_depths_are_one_sentence_and_the_cameras_stay(name: str, base: str, tmp_path: Path) -> None:
+def test_no_depths_are_one_sentence_and_the_cameras_stay(name, base, tmp_path):
     result = run(name, tmp_path, base)
     assert result.mesh is None
-    told = [w for w in result.warnings if "there is no model" in w]
+    told = [w for w in result.warnings if "No surface model was built" in w]
     assert len(told) == 1
     assert "no depths were found" in told[0]
     assert summary(tmp_path)["registered"] == len(MADE[name].images)
@@ -147,14 +132,14 @@ def test_no_depths_are_one_sentence_and_the_cameras_stay(name: str, base: str, t
     assert (tmp_path / "report.html").exists()
 
 
-def test_who_asks_for_the_model_is_refused(tmp_path: Path) -> None:
+def test_who_asks_for_the_model_is_refused(tmp_path):
     with pytest.raises(StageFailure, match="no depths were found"):
         run("no texture", tmp_path, until="model")
     assert "no depths" in summary(tmp_path)["failure"]
 
 
 @pytest.mark.parametrize(("name", "base"), [*((n, "default") for n in PARTLY), ("a fence", "thesis")])
-def test_what_can_be_seen_becomes_a_model(name: str, base: str, tmp_path: Path) -> None:
+def test_what_can_be_seen_becomes_a_model(name, base, tmp_path):
     result = run(name, tmp_path, base)
     assert result.mesh is not None
     assert len(result.mesh.faces) > 100

@@ -1,8 +1,6 @@
 """A set as people have them, from the command line to the model: burnt-out skies, one photograph far smaller
 than the others, one of something else."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -18,7 +16,7 @@ COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
     for k, path in enumerate(sorted(COURTYARD.iterdir())[:5]):
@@ -37,7 +35,7 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def test_the_others_become_a_model(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_others_become_a_model(folder, tmp_path, capsys):
     out = tmp_path / "out"
     command = ["reconstruct", str(folder), "-o", str(out), "--max-size", "240", "--threads", "2"]
     assert run_command(command) == 0

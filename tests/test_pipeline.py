@@ -2,14 +2,10 @@
 fakes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -21,32 +17,32 @@ from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.intrinsics import IntrinsicsAssumption, camera_groups, prior_warnings
+from thesisrecon.intrinsics import IntrinsicsOptions, camera_groups, prior_warnings
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import Image, RunResult
+from thesisrecon.records import Image
 from thesisrecon.runtime.executors import Workers
 from thesisrecon.runtime.run import stream
 from thesisrecon.views.render import render
 
 
 @pytest.fixture(autouse=True)
-def _forget_calls() -> None:
+def _forget_calls():
     CALLS.clear()
 
 
-def run(out: Path, n: int = 4, **given: Any) -> RunResult:
+def run(out, n=4, **given):
     given.setdefault("config", fake_config())
     given.setdefault("threads", 2)
     given.setdefault("until", "metric")
     return reconstruct(photographs(n), out, **given)
 
 
-def read(path: Path) -> Any:
+def read(path):
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def kept_bytes(out: Path) -> dict[str, str]:
+def kept_bytes(out):
     """Every result file of a run and its hash."""
     files = [
         *out.glob("0*/*.npz"),
@@ -57,7 +53,7 @@ def kept_bytes(out: Path) -> dict[str, str]:
     return {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
 
 
-def test_a_run_leaves_everything_it_promises(tmp_path: Path) -> None:
+def test_a_run_leaves_everything_it_promises(tmp_path):
     result = run(tmp_path / "out")
     out = tmp_path / "out"
     assert result.metric is not None
@@ -90,7 +86,7 @@ def test_a_run_leaves_everything_it_promises(tmp_path: Path) -> None:
     assert manifest["report"]["counts"]["accepted"] == 6
 
 
-def test_summary_and_cameras_are_in_original_pixels(tmp_path: Path) -> None:
+def test_summary_and_cameras_are_in_original_pixels(tmp_path):
     """Photographs at half size: (x + 0.5) / s - 0.5, focal and residuals by 1 / s."""
     images = [Image(i.name, i.rgb, (2 * fakes.WIDTH, 2 * fakes.HEIGHT)) for i in photographs(3)]
     result = reconstruct(images, tmp_path, config=fake_config(), until="metric")
@@ -106,10 +102,10 @@ def test_summary_and_cameras_are_in_original_pixels(tmp_path: Path) -> None:
     np.testing.assert_allclose(table["centre"], [0.5, 0.02, 0.0], atol=1e-12)
 
 
-def test_cameras_with_skew_are_written_where_they_can_be(tmp_path: Path) -> None:
+def test_cameras_with_skew_are_written_where_they_can_be(tmp_path):
     """COLMAP has no camera with skew; everything else is there, and nothing of an older model stays."""
     assert (run(tmp_path).out / "sparse" / "0" / "cameras.bin").is_file()
-    wish = IntrinsicsAssumption(skew="constant", skew_std_px=5.0)
+    wish = IntrinsicsOptions(skew="constant", skew_std_px=5.0)
     config = fake_config(intrinsics=wish, selfcalibration=fakes.FakeCalibrator(skew_px=2.0))
     result = run(tmp_path, config=config, overwrite=True)
     (sentence,) = (w for w in result.summary["warnings"] if "sparse/0" in w)
@@ -120,7 +116,7 @@ def test_cameras_with_skew_are_written_where_they_can_be(tmp_path: Path) -> None
     assert [view["K"][0][1] for view in read(tmp_path / "cameras.json")["cameras"]] == [2.0] * 4
 
 
-def test_a_second_run_computes_nothing(tmp_path: Path) -> None:
+def test_a_second_run_computes_nothing(tmp_path):
     first = run(tmp_path)
     before = kept_bytes(tmp_path)
     CALLS.clear()
@@ -137,7 +133,7 @@ def test_a_second_run_computes_nothing(tmp_path: Path) -> None:
     ("stage", "done"),
     [("features", 2), ("matches", 0), ("matches", 3), ("projective", 0), ("projective", 1), ("metric", 0)],
 )
-def test_a_run_stopped_anywhere_goes_on_and_ends_the_same(tmp_path: Path, stage: str, done: int) -> None:
+def test_a_run_stopped_anywhere_goes_on_and_ends_the_same(tmp_path, stage, done):
     run(tmp_path / "whole", threads=1)
     whole = list(CALLS)
     CALLS.clear()
@@ -149,7 +145,7 @@ def test_a_run_stopped_anywhere_goes_on_and_ends_the_same(tmp_path: Path, stage:
     assert sorted(computed) == sorted(call for call in whole if not call.startswith(("prepare", "metric")))
 
 
-def test_a_run_to_its_end_leaves_a_textured_model(tmp_path: Path) -> None:
+def test_a_run_to_its_end_leaves_a_textured_model(tmp_path):
     result = run(tmp_path / "a", until="model", threads=1)
     assert result.mesh is not None
     np.testing.assert_allclose(result.mesh.vertices[:, 2], 8.0, atol=0.02)
@@ -166,7 +162,7 @@ def test_a_run_to_its_end_leaves_a_textured_model(tmp_path: Path) -> None:
         assert (other / "model.glb").read_bytes() == (tmp_path / "a" / "model.glb").read_bytes()
 
 
-def test_a_run_stopped_between_depth_maps_goes_on(tmp_path: Path) -> None:
+def test_a_run_stopped_between_depth_maps_goes_on(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, until="model", threads=1, progress=interrupt_at("dense", 2))
     CALLS.clear()
@@ -179,7 +175,7 @@ def test_a_run_stopped_between_depth_maps_goes_on(tmp_path: Path) -> None:
     assert not [call for call in CALLS if call.startswith("depth")]
 
 
-def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path: Path) -> None:
+def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path):
     config = fake_config(dense=fakes.FakeDense(confirmed=False))
     with pytest.raises(StageFailure, match="no depths were found"):
         run(tmp_path, until="model", config=config)
@@ -187,18 +183,19 @@ def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path: Path) -> None:
     assert "no depths" in read(tmp_path / "summary.json")["failure"]
 
 
-def test_who_asks_for_no_surface_by_name_is_content_with_the_cameras(tmp_path: Path) -> None:
+def test_who_asks_for_no_surface_by_name_is_content_with_the_cameras(tmp_path):
     config = fake_config(dense=fakes.FakeDense(confirmed=False))
     result = run(tmp_path, until=None, config=config)
     assert result.mesh is None
     summary = read(tmp_path / "summary.json")
     assert (summary["failure"], summary["model"], summary["registered"]) == (None, None, 4)
     assert any(
-        warning.startswith("there is no model: no depths were found") for warning in summary["warnings"]
+        warning.startswith("No surface model was built: no depths were found")
+        for warning in summary["warnings"]
     )
 
 
-def test_the_end_is_a_model_unless_told_otherwise(tmp_path: Path) -> None:
+def test_the_end_is_a_model_unless_told_otherwise(tmp_path):
     result = run(tmp_path, until=None)
     assert result.mesh is not None
     summary = read(tmp_path / "summary.json")
@@ -215,7 +212,7 @@ def test_the_end_is_a_model_unless_told_otherwise(tmp_path: Path) -> None:
     ]
 
 
-def test_a_damaged_result_is_computed_again(tmp_path: Path) -> None:
+def test_a_damaged_result_is_computed_again(tmp_path):
     run(tmp_path)
     before = kept_bytes(tmp_path)
     CALLS.clear()
@@ -231,13 +228,13 @@ def test_a_damaged_result_is_computed_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [{"threads": 1}, {"threads": 3}, {"threads": 2, "executor": "processes"}])
-def test_workers_change_no_byte(tmp_path: Path, options: Any) -> None:
+def test_workers_change_no_byte(tmp_path, options):
     run(tmp_path / "a", threads=2)
     run(tmp_path / "b", **options)
     assert kept_bytes(tmp_path / "a") == kept_bytes(tmp_path / "b")
 
 
-def test_the_seed_matters_and_streams_are_apart(tmp_path: Path) -> None:
+def test_the_seed_matters_and_streams_are_apart(tmp_path):
     run(tmp_path / "a")
     run(tmp_path / "b", seed=1)
     a, b = kept_bytes(tmp_path / "a"), kept_bytes(tmp_path / "b")
@@ -249,7 +246,7 @@ def test_the_seed_matters_and_streams_are_apart(tmp_path: Path) -> None:
     assert len(draws) == 12
 
 
-def test_another_run_is_refused_and_overwrite_keeps_what_is_the_same(tmp_path: Path) -> None:
+def test_another_run_is_refused_and_overwrite_keeps_what_is_the_same(tmp_path):
     run(tmp_path)
     CALLS.clear()
     changed = fake_config(
@@ -263,23 +260,21 @@ def test_another_run_is_refused_and_overwrite_keeps_what_is_the_same(tmp_path: P
     assert any("only rotates" in warning for warning in result.warnings)
 
 
-def test_the_folder_is_judged_before_any_photograph_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_folder_is_judged_before_any_photograph_is_read(tmp_path, monkeypatch):
     run(tmp_path / "out")
     (tmp_path / "file").write_text("in the way")
 
-    def read_nothing(*_: Any, **__: Any) -> None:
+    def read_nothing(*_, **__):
         raise AssertionError("photographs were read")
 
-    monkeypatch.setattr("thesisrecon.io.images.read_photographs", read_nothing)
+    monkeypatch.setattr("thesisrecon.io.images.read_images", read_nothing)
     with pytest.raises(UsageError, match="seed was 0 there and is 1 here"):
         run(tmp_path / "out", seed=1)
     with pytest.raises(UsageError, match="cannot be written"):
         run(tmp_path / "file" / "out")
 
 
-def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path: Path) -> None:
+def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path):
     run(tmp_path, 3)
     CALLS.clear()
     run(tmp_path, 4, overwrite=True)
@@ -291,7 +286,7 @@ def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path
     ]
 
 
-def test_the_page_is_called_after_the_photographs(tmp_path: Path) -> None:
+def test_the_page_is_called_after_the_photographs(tmp_path):
     (tmp_path / "castle").mkdir()
     for image in photographs(2):
         PIL.Image.fromarray(image.rgb).save(tmp_path / "castle" / image.name)
@@ -303,7 +298,7 @@ def test_the_page_is_called_after_the_photographs(tmp_path: Path) -> None:
 MODEL = ("points.ply", "cameras.json", "sparse")
 
 
-def test_an_earlier_end_leaves_the_finished_result(tmp_path: Path) -> None:
+def test_an_earlier_end_leaves_the_finished_result(tmp_path):
     run(tmp_path)
     before = {name: (tmp_path / name).read_bytes() for name in ("summary.json", "report.html", "points.ply")}
     early = run(tmp_path, until="features")
@@ -312,14 +307,14 @@ def test_an_earlier_end_leaves_the_finished_result(tmp_path: Path) -> None:
     assert any("up to metric: its summary and page are kept" in warning for warning in early.warnings)
 
 
-def test_an_earlier_end_of_another_run_replaces_the_finished_result(tmp_path: Path) -> None:
+def test_an_earlier_end_of_another_run_replaces_the_finished_result(tmp_path):
     run(tmp_path)
     run(tmp_path, until="features", seed=1, overwrite=True)
     assert read(tmp_path / "summary.json")["until"] == "features"
     assert not any((tmp_path / name).exists() for name in MODEL)
 
 
-def test_a_failure_leaves_no_model_of_the_run_before(tmp_path: Path) -> None:
+def test_a_failure_leaves_no_model_of_the_run_before(tmp_path):
     run(tmp_path)
     assert all((tmp_path / name).exists() for name in MODEL)
     with pytest.raises(StageFailure):
@@ -328,14 +323,14 @@ def test_a_failure_leaves_no_model_of_the_run_before(tmp_path: Path) -> None:
     assert "the initial pair is bad" in read(tmp_path / "summary.json")["failure"]
 
 
-def test_a_replaced_run_leaves_no_result_even_if_the_new_one_is_interrupted(tmp_path: Path) -> None:
+def test_a_replaced_run_leaves_no_result_even_if_the_new_one_is_interrupted(tmp_path):
     run(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, seed=1, overwrite=True, threads=1, progress=interrupt_at("matches", 1))
     assert not any((tmp_path / name).exists() for name in (*MODEL, "summary.json", "report.html"))
 
 
-def test_until_ends_early_and_a_longer_run_goes_on(tmp_path: Path) -> None:
+def test_until_ends_early_and_a_longer_run_goes_on(tmp_path):
     assert run(tmp_path, until="features").pairs == ()
     assert run(tmp_path, until="matches").tracks is None
     projective = run(tmp_path, until="projective")
@@ -347,7 +342,7 @@ def test_until_ends_early_and_a_longer_run_goes_on(tmp_path: Path) -> None:
     assert CALLS == ["calibrate prior=False", "metric 0"]
 
 
-def test_a_distrusted_result_is_tried_from_other_pairs(tmp_path: Path) -> None:
+def test_a_distrusted_result_is_tried_from_other_pairs(tmp_path):
     result = run(tmp_path, config=fake_config(metric=fakes.FakeMetric(trusted_from=1)))
     assert [c for c in CALLS if c.startswith("projective")] == ["projective 0", "projective 1"]
     assert result.metric is not None
@@ -355,7 +350,7 @@ def test_a_distrusted_result_is_tried_from_other_pairs(tmp_path: Path) -> None:
     assert any("2 initial pairs" in warning for warning in result.warnings)
 
 
-def test_a_result_that_nobody_trusts_is_written_with_its_warning(tmp_path: Path) -> None:
+def test_a_result_that_nobody_trusts_is_written_with_its_warning(tmp_path):
     result = run(tmp_path, config=fake_config(metric=fakes.FakeMetric(trusted_from=9)))
     assert sum(c.startswith("projective") for c in CALLS) == 3
     assert any("not to be trusted: odd focal" in warning for warning in result.warnings)
@@ -364,7 +359,7 @@ def test_a_result_that_nobody_trusts_is_written_with_its_warning(tmp_path: Path)
     assert "odd focal" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_every_doubt_is_said_once(tmp_path: Path) -> None:
+def test_every_doubt_is_said_once(tmp_path):
     doubted = fake_config(
         metric=fakes.FakeMetric(trusted_from=9, failed_checks=("odd focal", "the camera only rotates")),
         selfcalibration=fakes.FakeCalibrator(identifiable=False),
@@ -374,12 +369,12 @@ def test_every_doubt_is_said_once(tmp_path: Path) -> None:
     assert sum(warning.count("odd focal") for warning in warnings) == 1
 
 
-def test_a_failed_attempt_is_followed_by_another(tmp_path: Path) -> None:
+def test_a_failed_attempt_is_followed_by_another(tmp_path):
     result = run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=2)))
     assert result.metric is not None
 
 
-def test_a_failure_keeps_what_was_computed_and_says_why(tmp_path: Path) -> None:
+def test_a_failure_keeps_what_was_computed_and_says_why(tmp_path):
     config = fake_config(projective=fakes.FakeProjective(fail_below=9))
     with pytest.raises(StageFailure, match=r"the initial pair is bad; attempt 0"):
         run(tmp_path, config=config)
@@ -389,35 +384,35 @@ def test_a_failure_keeps_what_was_computed_and_says_why(tmp_path: Path) -> None:
     assert "the initial pair is bad" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_pair_that_fails_is_a_refused_pair(tmp_path: Path) -> None:
+def test_a_pair_that_fails_is_a_refused_pair(tmp_path):
     result = run(tmp_path, config=fake_config(matching=fakes.FakeMatcher(fail_pair=(0, 2))))
     refused = [pair for pair in result.pairs if not pair.accepted]
     assert [(pair.i, pair.j) for pair in refused] == [(0, 2)]
     assert refused[0].reason.startswith("only 3 matches")
 
 
-def test_no_accepted_pair_is_a_failure_with_the_best_pair_named(tmp_path: Path) -> None:
+def test_no_accepted_pair_is_a_failure_with_the_best_pair_named(tmp_path):
     with pytest.raises(StageFailure, match=r"best of 6 pairs has 30 verified matches: too few verified"):
         run(tmp_path, config=fake_config(verification=fakes.FakeVerifier(accept=False)))
 
 
-def test_cameras_are_shared_by_size_or_not_at_all() -> None:
+def test_cameras_are_shared_by_size_or_not_at_all():
     sizes = [(4, 3), (3, 4), (4, 3)]
     assert camera_groups(sizes, "shared").tolist() == [0, 1, 0]
     assert camera_groups(sizes, "per-image").tolist() == [0, 1, 2]
 
 
-def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path: Path) -> None:
-    wish = IntrinsicsAssumption(focal_px=100.0, focal_std_rel=0.1)
+def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path):
+    wish = IntrinsicsOptions(focal_px=100.0, focal_std_rel=0.1)
     run(tmp_path, config=fake_config(intrinsics=wish))
     assert "calibrate prior=True" in CALLS
 
 
-def test_a_wish_for_exif_that_no_photograph_grants_is_answered(tmp_path: Path) -> None:
-    wish = IntrinsicsAssumption(exif=True, focal_std_rel=0.1)
+def test_a_wish_for_exif_that_no_photograph_grants_is_answered(tmp_path):
+    wish = IntrinsicsOptions(exif=True, focal_std_rel=0.1)
     result = run(tmp_path, config=fake_config(intrinsics=wish))
     assert "calibrate prior=False" in CALLS
-    sentence = "none of the 4 photographs names its focal length; no prior was used"
+    sentence = "No EXIF focal length was found in 4 images: no focal prior is used"
     assert sentence in result.summary["warnings"]
     assert sentence in (tmp_path / "report.html").read_text(encoding="utf-8")
 
@@ -425,20 +420,18 @@ def test_a_wish_for_exif_that_no_photograph_grants_is_answered(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("wish", "focal_px", "words"),
     [
-        (IntrinsicsAssumption(exif=True, focal_std_rel=0.1), [800.0, np.nan], "1 of the 2 photographs"),
-        (IntrinsicsAssumption(exif=True, focal_std_rel=0.1), [800.0, 900.0], None),
-        (IntrinsicsAssumption(exif=True, focal_px=9.0, focal_std_rel=0.1), [np.nan, np.nan], None),
-        (IntrinsicsAssumption(), [np.nan, np.nan], None),
+        (IntrinsicsOptions(exif=True, focal_std_rel=0.1), [800.0, np.nan], "1 of the 2 images"),
+        (IntrinsicsOptions(exif=True, focal_std_rel=0.1), [800.0, 900.0], None),
+        (IntrinsicsOptions(exif=True, focal_px=9.0, focal_std_rel=0.1), [np.nan, np.nan], None),
+        (IntrinsicsOptions(), [np.nan, np.nan], None),
     ],
 )
-def test_only_an_unanswered_wish_is_worth_a_warning(
-    wish: IntrinsicsAssumption, focal_px: list[float], words: str | None
-) -> None:
+def test_only_an_unanswered_wish_is_worth_a_warning(wish, focal_px, words):
     warnings = prior_warnings(wish, np.array(focal_px))
     assert [words in warning for warning in warnings] == ([True] if words else [])
 
 
-def test_photographs_are_reduced_to_the_size_of_the_config(tmp_path: Path) -> None:
+def test_photographs_are_reduced_to_the_size_of_the_config(tmp_path):
     big = [np.array(i.rgb).repeat(3, 0).repeat(3, 1) for i in photographs(2)]
     config = replace(fake_config(), images=ImageOptions(max_size_px=144), features=NamelessDetector())
     result = reconstruct(big, tmp_path, config=config, until="features")
@@ -449,7 +442,7 @@ def test_photographs_are_reduced_to_the_size_of_the_config(tmp_path: Path) -> No
 class NamelessDetector(fakes.FakeDetector):
     """Images given as arrays have no number in their names."""
 
-    def detect(self, image: Image) -> Any:
+    def detect(self, image):
         return super().detect(replace(image, name="00"))
 
 
@@ -464,37 +457,35 @@ class NamelessDetector(fakes.FakeDetector):
         ({"seed": -1}, "at least 0"),
     ],
 )
-def test_wrong_wishes_get_a_sentence_before_anything_is_made(
-    tmp_path: Path, options: Any, words: str
-) -> None:
+def test_wrong_wishes_get_a_sentence_before_anything_is_made(tmp_path, options, words):
     with pytest.raises(UsageError, match=words):
         run(tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
-def test_an_output_folder_without_a_name_is_refused() -> None:
+def test_an_output_folder_without_a_name_is_refused():
     with pytest.raises(UsageError, match="has no name"):
         reconstruct(photographs(2), "", config=fake_config())
 
 
-def test_an_unknown_option_is_a_wrong_call(tmp_path: Path) -> None:
+def test_an_unknown_option_is_a_wrong_call(tmp_path):
     with pytest.raises(TypeError, match="did you mean threads"):
         run(tmp_path / "out", thread=3)
 
 
-def test_the_first_error_of_a_worker_ends_the_rest() -> None:
-    def fail(n: int) -> int:
+def test_the_first_error_of_a_worker_ends_the_rest():
+    def fail(n):
         if n == 3:
             raise StageFailure("three")
         return n
 
-    heard: list[int] = []
+    heard = []
     with pytest.raises(StageFailure, match="three"):
         Workers(2).run(fail, [(n,) for n in range(1000)], lambda n, _: heard.append(n))
     assert len(heard) < 1000
 
 
-def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path: Path) -> None:
+def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path):
     config = fake_config(pairs=SequenceWindow(1))
     result = run(tmp_path, config=config, until="matches")
     assert [(pair.i, pair.j) for pair in result.pairs] == [(0, 1), (1, 2), (2, 3)]
@@ -510,7 +501,7 @@ def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path: Path) -> 
     assert "pairs" not in more.summary["resumed"]
 
 
-def test_a_list_that_names_no_photograph_is_refused_before_anything_is_computed(tmp_path: Path) -> None:
+def test_a_list_that_names_no_photograph_is_refused_before_anything_is_computed(tmp_path):
     with pytest.raises(UsageError, match=r"'9\.png', which is none of the 4 photographs"):
         run(tmp_path, config=fake_config(pairs=ListedPairs((("00.png", "9.png"),))))
     assert CALLS == []

@@ -1,13 +1,11 @@
 """What the records themselves compute."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon.records import DisparityMap
 
 
-def test_holes_are_filled_with_what_is_farther() -> None:
+def test_holes_are_filled_with_what_is_farther():
     nan = np.nan
     disparity = np.array([[nan, 5, nan, nan, 3, nan], [nan] * 6, [1, nan, 4, nan, 2, 2]], dtype=np.float32)
     filled = DisparityMap(disparity, np.isfinite(disparity).astype(np.float32), 0.5).filled()

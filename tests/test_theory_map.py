@@ -54,7 +54,7 @@ def test_every_row_names_code_and_every_equation_has_a_row():
     assert len(CODE) > 80
     assert len(NAMED_TESTS) > 50
     assert all("`" in cells[2] or "`" in cells[3] for cells in ROWS)
-    covered: set[tuple[int, int]] = set()
+    covered = set()
     for cells in ROWS:
         numbers = [(int(a), int(b)) for a, b in re.findall(r"\((\d)\.(\d+)\)", cells[0])]
         covered.update(numbers)

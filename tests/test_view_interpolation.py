@@ -1,7 +1,5 @@
 """Views between photographs: the front door, what is refused, and the command."""
 
-from __future__ import annotations
-
 import json
 from importlib import import_module
 from pathlib import Path
@@ -27,20 +25,18 @@ SHIFT = 6
 
 
 @pytest.fixture(scope="module")
-def wall() -> tuple[np.ndarray, np.ndarray]:
+def wall():
     """A textured wall from two places, ``SHIFT`` px apart."""
     rgb = np.stack([texture(90, 170, seed) for seed in (0, 1, 2)], axis=-1).astype(np.uint8)
     return rgb[:, :160], np.ascontiguousarray(rgb[:, SHIFT : 160 + SHIFT])
 
 
-def photograph(seed: int, size: tuple[int, int] = (40, 30)) -> Image:
+def photograph(seed, size=(40, 30)):
     rgb = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
     return Image(f"{seed}.jpg", rgb, size)
 
 
-def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities(
-    wall: tuple[np.ndarray, np.ndarray], tmp_path: Path
-) -> None:
+def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities(wall, tmp_path):
     left, right = wall
     expected = np.roll(left, -SHIFT // 2, axis=1)[:, 10:-20].astype(int)
     d = np.full(left.shape[:2], SHIFT, dtype=np.float32)
@@ -58,7 +54,7 @@ def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities
     assert grey.shape == left.shape
 
 
-def test_wrong_calls_of_the_front_door_are_refused(wall: tuple[np.ndarray, np.ndarray]) -> None:
+def test_wrong_calls_of_the_front_door_are_refused(wall):
     left, right = wall
     with pytest.raises(ValueError, match="from 0"):
         thesisrecon.interpolate_view(left, right, 1.5)
@@ -77,18 +73,16 @@ def test_wrong_calls_of_the_front_door_are_refused(wall: tuple[np.ndarray, np.nd
         thesisrecon.interpolate_view(Path("nowhere.png"), right, 0.5)
 
 
-def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monkeypatch):
     a, b = photograph(0), photograph(1)
     with pytest.raises(UsageError, match=r"0\.jpg and 0\.jpg are the same photograph"):
-        between.relate(a, Image("0.jpg", a.rgb.copy(), a.size))
+        between.prepare_pair(a, Image("0.jpg", a.rgb.copy(), a.size))
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
-        between.relate(a, photograph(2, (40, 20)))
+        between.prepare_pair(a, photograph(2, (40, 20)))
     with pytest.raises(UsageError, match="same photograph"):
-        between.interpolation_film([a, b, a], 3)
+        between.interpolated_sequence([a, b, a], 3)
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
-        between.interpolation_film([a, b, photograph(2, (40, 20))], 3)
+        between.interpolated_sequence([a, b, photograph(2, (40, 20))], 3)
     # Forward motion: both epipoles at (21, 14).
     e, rng = np.array([21.0, 14.0]), np.random.default_rng(0)
     xy = rng.uniform((0.0, 0.0), (40.0, 30.0), (100, 2))
@@ -98,55 +92,53 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(
     with pytest.raises(
         StageFailure, match=r"moved towards what they show, or away; .*\(21, 14\) px of the first"
     ):
-        between.relate(a, b)
+        between.prepare_pair(a, b)
     # A photograph and a copy of it, saved anew: this F is as good as any.
     pair.xy2 = xy + rng.normal(0.0, 0.01, xy.shape)
     with pytest.raises(StageFailure, match="no parallax"):
-        between.relate(a, b)
+        between.prepare_pair(a, b)
 
 
-def test_what_cannot_be_rectified_is_told_without_the_library_s_other_ways(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_cannot_be_rectified_is_told_without_the_library_s_other_ways(monkeypatch):
     class Dense:
         failure = StageFailure("too distorted", "a number", "rectify in polar coordinates")
 
-        def match_two_views(self, *_: Any, **__: Any) -> None:
+        def match_two_views(self, *_, **__):
             raise self.failure
 
     F = cross_matrix(np.array([1.0, 0.0, 0.0]))
     pair = SimpleNamespace(F=F, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
     monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
-    config: Any = SimpleNamespace(dense=Dense())
+    config = SimpleNamespace(dense=Dense())
     with pytest.raises(
         StageFailure, match=r"too distorted; a number; take them from places beside each other"
     ):
-        between.relate(photograph(0), photograph(1), config=config)
+        between.prepare_pair(photograph(0), photograph(1), config=config)
     Dense.failure = StageFailure("no parallax")
     with pytest.raises(StageFailure, match="no parallax"):
-        between.relate(photograph(0), photograph(1), config=config)
+        between.prepare_pair(photograph(0), photograph(1), config=config)
 
 
 @pytest.fixture
-def still(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+def still(monkeypatch):
     """Photographs of one place: every pixel stays, and what is related is noted."""
-    related: list[tuple[str, str]] = []
+    related = []
 
-    def relate(first: Image, second: Image, **_: Any) -> Any:
+    def prepare_pair(first, second, **_):
         related.append((first.name, second.name))
         nothing = unsure(np.zeros(first.rgb.shape[:2], np.float32))
         return pair_of_rectified(first.rgb, second.rgb, (nothing, nothing))
 
-    monkeypatch.setattr(between, "relate", relate)
+    monkeypatch.setattr(between, "prepare_pair", prepare_pair)
     return related
 
 
-def even(name: str, level: int) -> Image:
+def even(name, level):
     return Image(name, np.full((24, 32, 3), level, dtype=np.uint8), (32, 24))
 
 
-def test_a_film_of_two_goes_from_one_to_the_other(still: list[tuple[str, str]]) -> None:
-    film = between.interpolation_film([even("a", 100), even("b", 200)], 5)
+def test_a_film_of_two_goes_from_one_to_the_other(still):
+    film = between.interpolated_sequence([even("a", 100), even("b", 200)], 5)
     assert film.captions[1] == "75 % a, 25 % b"
     assert film.places[4] == {"shares": [0.0, 1.0]}
     levels = [float(film.draw(k, 1).mean()) for k in range(5)]
@@ -157,14 +149,14 @@ def test_a_film_of_two_goes_from_one_to_the_other(still: list[tuple[str, str]]) 
     assert film.told["violating_monotonicity"] == [0.0]
     assert "0.0 % of these violate monotonicity" in film.notes[0]
     assert still == [("a", "b")]
-    assert between.interpolation_film([even("a", 100), even("b", 200)], 1).captions == ("50 % a, 50 % b",)
+    assert between.interpolated_sequence([even("a", 100), even("b", 200)], 1).captions == ("50 % a, 50 % b",)
     for photographs, frames in (([even("a", 1)], 3), ([even("a", 1), even("b", 2)], 0)):
         with pytest.raises(ValueError, match="2 or 3"):
-            between.interpolation_film(photographs, frames)
+            between.interpolated_sequence(photographs, frames)
 
 
-def test_a_film_of_three_crosses_the_triangle(still: list[tuple[str, str]]) -> None:
-    film = between.interpolation_film([even("a", 100), even("b", 200), even("c", 50)], 5)
+def test_a_film_of_three_crosses_the_triangle(still):
+    film = between.interpolated_sequence([even("a", 100), even("b", 200), even("c", 50)], 5)
     assert [place["shares"] for place in film.places] == [
         [1.0, 0.0, 0.0],
         [0.75, 0.25, 0.0],
@@ -180,7 +172,7 @@ def test_a_film_of_three_crosses_the_triangle(still: list[tuple[str, str]]) -> N
     assert len(film.notes) == 2
 
 
-def test_a_place_in_the_triangle_is_reached_by_interpolating_twice(still: list[tuple[str, str]]) -> None:
+def test_a_place_in_the_triangle_is_reached_by_interpolating_twice(still):
     three = [even("a", 100), even("b", 100), even("c", 100)]
     for weights, expected in (
         ((0.2, 0.3, 0.5), [("a", "b"), ("the view between", "c")]),
@@ -197,9 +189,7 @@ def test_a_place_in_the_triangle_is_reached_by_interpolating_twice(still: list[t
             between.interpolate_three(three, weights)
 
 
-def test_the_command_writes_frames_an_animation_and_a_page(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
     photographs = [str(COURTYARD / f"000{k}.jpg") for k in (6, 7)]
     out = tmp_path / "früm one to other"
     options = ["--frames", "3", "--max-size", "512", "--threads", "2", "-o", str(out)]
@@ -247,9 +237,7 @@ def test_the_command_writes_frames_an_animation_and_a_page(
         (["folder", "--method", "interpolation"], "--method is of views between photographs", 2),
     ],
 )
-def test_bad_input_of_the_command_gets_one_sentence(
-    arguments: list[str], words: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_path, capsys):
     (tmp_path / "copy.jpg").write_bytes((COURTYARD / "0004.jpg").read_bytes())
     (tmp_path / "text.jpg").write_text("no picture", encoding="utf-8")
     (tmp_path / "folder").mkdir()
@@ -271,7 +259,7 @@ def test_bad_input_of_the_command_gets_one_sentence(
     assert not out.exists()
 
 
-def test_wishes_name_what_is_wrong(tmp_path: Path) -> None:
+def test_wishes_name_what_is_wrong(tmp_path):
     photographs = (COURTYARD / "0004.jpg", COURTYARD / "0005.jpg")
     with pytest.raises(UsageError, match="unknown method"):
         BetweenWishes(photographs, method="guessing")
@@ -281,6 +269,6 @@ def test_wishes_name_what_is_wrong(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_has_its_film(method: str) -> None:
+def test_every_method_has_its_film(method):
     module, name = METHODS[method]
     assert callable(getattr(import_module(module), name))

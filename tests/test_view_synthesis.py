@@ -1,10 +1,7 @@
 """Views without a model from two photographs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import PIL.Image
@@ -14,8 +11,8 @@ import thesisrecon
 from thesisrecon.cli.view_files import BetweenWishes, write_between
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.intrinsics import IntrinsicsAssumption
-from thesisrecon.view_synthesis import match_photographs, tensor_film, tensor_views
+from thesisrecon.intrinsics import IntrinsicsOptions
+from thesisrecon.view_synthesis import match_images, prepare_trilinear_views, trilinear_sequence
 from thesisrecon.views.virtual_camera import VirtualCamera
 from validation.scenes.real import load_fixture_scene
 
@@ -25,7 +22,7 @@ SMALL = PipelineConfig(images=ImageOptions(max_size_px=512))
 
 @pytest.fixture(scope="module")
 def found():
-    return match_photographs(SCENE.image_paths[6], SCENE.image_paths[7], config=SMALL)
+    return match_images(SCENE.image_paths[6], SCENE.image_paths[7], config=SMALL)
 
 
 def _photograph(k):
@@ -38,7 +35,7 @@ def _psnr(a, b):
 
 
 def test_calibrated_photographs_show_a_third_one(found):
-    views = tensor_views(found, K=SCENE.K[6], config=SMALL)
+    views = prepare_trilinear_views(found, K=SCENE.K[6], config=SMALL)
     R, C = SCENE.R, SCENE.C
     baseline = np.linalg.norm(C[7] - C[6])
     np.testing.assert_allclose(views.pair.t, R[7] @ (C[6] - C[7]) / baseline, atol=0.01)
@@ -51,7 +48,7 @@ def test_calibrated_photographs_show_a_third_one(found):
 
 
 def test_at_their_own_places_the_photographs_are_seen_again(found):
-    guessed = tensor_views(found, config=SMALL)
+    guessed = prepare_trilinear_views(found, config=SMALL)
     np.testing.assert_allclose(guessed.pair.K1[0], [512.0, 0.0, 255.5])
     first, second = (guessed.render(camera) for camera in guessed.along(2))
     assert np.mean(second != found.images[1].rgb) < 1e-3
@@ -60,8 +57,8 @@ def test_at_their_own_places_the_photographs_are_seen_again(found):
 
 
 def test_what_is_told_of_the_focal_length_is_taken(found):
-    told = replace(SMALL, intrinsics=IntrinsicsAssumption(focal="known", focal_px=900.0))
-    assert tensor_views(found, config=told).pair.K1[0, 0] == 450.0
+    told = replace(SMALL, intrinsics=IntrinsicsOptions(focal="known", focal_px=900.0))
+    assert prepare_trilinear_views(found, config=told).pair.K1[0, 0] == 450.0
 
 
 def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
@@ -80,7 +77,7 @@ def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
     picture = thesisrecon.synthesize_view(SCENE.image_paths[6], SCENE.image_paths[7], *motion, config=SMALL)
     assert picture.shape == (384, 512, 3)
     assert picture.dtype == np.uint8
-    views = tensor_views(found, config=SMALL)
+    views = prepare_trilinear_views(found, config=SMALL)
     np.testing.assert_array_equal(
         picture, views.render(VirtualCamera(*motion, views.pair.K2, views.sizes[1]), threads=2)
     )
@@ -90,7 +87,7 @@ def test_cameras_in_one_place_show_no_parallax():
     """As of one camera with another principal point."""
     picture = _photograph(6)
     with pytest.raises(StageFailure, match="show no parallax: the camera only turned"):
-        match_photographs(picture[:, :-32].copy(), picture[:, 32:].copy(), config=SMALL)
+        match_images(picture[:, :-32].copy(), picture[:, 32:].copy(), config=SMALL)
 
 
 def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
@@ -116,11 +113,11 @@ def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
 def test_films_are_of_two_different_photographs(found):
     first, second = found.images
     with pytest.raises(UsageError, match="2 photographs; got 3"):
-        tensor_film((first, second, first), 5)
+        trilinear_sequence((first, second, first), 5)
     with pytest.raises(UsageError, match="the same photograph"):
-        tensor_film((first, first), 5)
+        trilinear_sequence((first, first), 5)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(UsageError, match="there is no photograph"):
-        match_photographs(tmp_path / "none.png", tmp_path / "none.png")
+        match_images(tmp_path / "none.png", tmp_path / "none.png")

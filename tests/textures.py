@@ -1,15 +1,12 @@
 """Random textures and a stereo scene whose correspondence is known."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from thesisrecon.arrays import B8, F64
 from thesisrecon.records import FundamentalFit, Image
 
 
-def texture(height: int, width: int, seed: int = 0) -> F64:
+def texture(height, width, seed=0):
     """(H, W) grey values about 128: noise of several sizes, as rich in corners as a stone wall."""
     rng = np.random.default_rng(seed)
     total = np.zeros((height, width))
@@ -19,18 +16,18 @@ def texture(height: int, width: int, seed: int = 0) -> F64:
     return np.clip(128.0 + 38.0 * total / total.std(), 0.0, 255.0)
 
 
-def photograph(gray: F64, name: str = "a.png") -> Image:
+def photograph(gray, name="a.png"):
     """A grey photograph."""
     values = np.clip(np.rint(gray), 0, 255).astype(np.uint8)
     return Image(name, np.repeat(values[:, :, None], 3, axis=2), (gray.shape[1], gray.shape[0]))
 
 
-def disparity(xy2: F64) -> F64:
+def disparity(xy2):
     """(N,) disparity of the stereo scene at pixels of the second image: x1 = x2 + disparity, y1 = y2."""
     return 14.0 + 5.0 * np.sin(xy2[:, 0] / 60.0) + 4.0 * np.cos(xy2[:, 1] / 45.0)
 
 
-def stereo_scene(height: int = 300, width: int = 420, seed: int = 3) -> tuple[Image, Image]:
+def stereo_scene(height=300, width=420, seed=3):
     """Two photographs of a curved surface by cameras side by side; the second is darker and duller."""
     first = texture(height, width, seed)
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
@@ -39,9 +36,9 @@ def stereo_scene(height: int = 300, width: int = 420, seed: int = 3) -> tuple[Im
     return photograph(first, "left.png"), photograph(0.8 * second + 10.0, "right.png")
 
 
-def sideways_fundamental(xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit:
+def sideways_fundamental(xy1, xy2, rng):
     """The true F of cameras side by side, with the matches that obey it: stands in for chapter 5."""
     del rng
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) / np.sqrt(2.0)
-    inliers: B8 = np.abs(xy1[:, 1] - xy2[:, 1]) < 2.0
+    inliers = np.abs(xy1[:, 1] - xy2[:, 1]) < 2.0
     return FundamentalFit(F, inliers, 0.5, np.eye(9))

@@ -1,7 +1,5 @@
 """The command line on the project's own photographs: one whole run, killed once, and what it prints."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -11,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ import pytest
 from thesisrecon.cli import main as cli
 from thesisrecon.cli.inspect import intrinsic_lines, time_taken
 from thesisrecon.cli.main import run_command
-from thesisrecon.io import lists as demo
+from thesisrecon.io import pair_list as demo
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
 
 ROOT = Path(__file__).parents[2]
@@ -29,7 +26,7 @@ SMALL = ["--max-size", "640", "--threads", "2", "--until", "metric"]
 
 
 @pytest.fixture(scope="module")
-def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def photographs(tmp_path_factory):
     """A few neighbouring views of the courtyard, in a folder whose name has a space and a letter beyond
     ASCII.
     """
@@ -40,12 +37,12 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def command(*arguments: str | Path) -> list[str]:
+def command(*arguments):
     return [sys.executable, "-m", "thesisrecon", *map(str, arguments)]
 
 
 @pytest.fixture(scope="module")
-def killed_and_resumed(photographs: Path) -> tuple[Path, int]:
+def killed_and_resumed(photographs):
     """The output of a run that was killed while it matched and then started again; and how many pairs were
     kept.
     """
@@ -69,11 +66,11 @@ def killed_and_resumed(photographs: Path) -> tuple[Path, int]:
     return out, kept
 
 
-def read(path: Path) -> Any:
+def read(path):
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed: tuple[Path, int]) -> None:
+def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed):
     out, kept = killed_and_resumed
     assert kept >= 2
     summary = read(out / "summary.json")
@@ -85,9 +82,7 @@ def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed:
     assert summary["points"] > 300
 
 
-def test_a_kill_and_the_number_of_threads_change_no_byte(
-    killed_and_resumed: tuple[Path, int], photographs: Path, tmp_path: Path
-) -> None:
+def test_a_kill_and_the_number_of_threads_change_no_byte(killed_and_resumed, photographs, tmp_path):
     out, _ = killed_and_resumed
     # A process of its own: the command caps the threads of linear algebra before NumPy is imported.
     arguments = command("reconstruct", photographs, "-o", tmp_path / "out", *SMALL, "--threads", "1")
@@ -95,7 +90,7 @@ def test_a_kill_and_the_number_of_threads_change_no_byte(
     assert kept_bytes(tmp_path / "out") == kept_bytes(out)
 
 
-def kept_bytes(out: Path) -> dict[str, bytes]:
+def kept_bytes(out):
     """Every result file of a run."""
     files = [
         *out.glob("0*/*.npz"),
@@ -106,9 +101,7 @@ def kept_bytes(out: Path) -> dict[str, bytes]:
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(files)}
 
 
-def test_the_preset_of_the_thesis_runs_to_the_end(
-    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_preset_of_the_thesis_runs_to_the_end(photographs, tmp_path, capsys):
     out = tmp_path / "out"
     assert run_command(["reconstruct", str(photographs), "-o", str(out), "--preset", "thesis", *SMALL]) == 0
     assert "photographs registered" in capsys.readouterr().out
@@ -117,25 +110,21 @@ def test_the_preset_of_the_thesis_runs_to_the_end(
     assert summary["registered"] + len(summary["refused"]) == VIEWS
 
 
-def truth_focal(truth: Any) -> float:
+def truth_focal(truth):
     """The true focal length (px) of the courtyard's one camera."""
     cameras = truth["cameras"] if "cameras" in truth else truth["images"]
     first = next(iter(cameras.values())) if isinstance(cameras, dict) else cameras[0]
     return float(np.array(first["K"] if "K" in first else truth["K"])[0][0])
 
 
-def test_inspect_prints_what_was_found(
-    killed_and_resumed: tuple[Path, int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inspect_prints_what_was_found(killed_and_resumed, capsys):
     assert run_command(["inspect", str(killed_and_resumed[0])]) == 0
     printed = capsys.readouterr().out
     assert f"{VIEWS} of {VIEWS} photographs registered" in printed
     assert "camera 0: focal" in printed
 
 
-def test_an_early_end_prints_what_its_stage_found(
-    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_early_end_prints_what_its_stage_found(photographs, tmp_path, capsys):
     few, out = tmp_path / "few", tmp_path / "out"
     few.mkdir()
     for path in sorted(photographs.iterdir())[:2]:
@@ -152,9 +141,7 @@ def test_an_early_end_prints_what_its_stage_found(
         assert re.match(words, capsys.readouterr().out)
 
 
-def test_a_finished_run_is_not_touched_by_another_config(
-    killed_and_resumed: tuple[Path, int], photographs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_finished_run_is_not_touched_by_another_config(killed_and_resumed, photographs, capsys):
     out, _ = killed_and_resumed
     before = (out / "summary.json").read_bytes()
     arguments = ["reconstruct", str(photographs), "-o", str(out), "--max-size", "700"]
@@ -163,9 +150,7 @@ def test_a_finished_run_is_not_touched_by_another_config(
     assert (out / "summary.json").read_bytes() == before
 
 
-def test_the_written_config_runs_again(
-    killed_and_resumed: tuple[Path, int], photographs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_written_config_runs_again(killed_and_resumed, photographs, capsys):
     out, _ = killed_and_resumed
     arguments = ["reconstruct", str(photographs), "-o", str(out), "--config", str(out / "config.toml")]
     assert run_command([*arguments, "--threads", "2", "--until", "metric"]) == 0
@@ -199,13 +184,7 @@ def test_the_written_config_runs_again(
         (["rebuild"], "rebuild"),
     ],
 )
-def test_a_wrong_command_gets_one_sentence_and_exit_2(
-    arguments: list[str],
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_wrong_command_gets_one_sentence_and_exit_2(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run_command(arguments) == 2
     printed = capsys.readouterr()
@@ -215,14 +194,12 @@ def test_a_wrong_command_gets_one_sentence_and_exit_2(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_focal_length_is_given_as_the_readme_says(
-    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_focal_length_is_given_as_the_readme_says(photographs, tmp_path, monkeypatch):
     words = "--set intrinsics.focal_px=1200 --set intrinsics.focal_std_rel=0.05"
     assert f"`{words}`" in (ROOT / "README.md").read_text(encoding="utf-8")
-    asked: list[Any] = []
+    asked = []
 
-    def listen(*_: Any, config: Any, **__: Any) -> None:
+    def listen(*_, config, **__):
         asked.append(config.intrinsics)
         raise KeyboardInterrupt
 
@@ -232,15 +209,15 @@ def test_the_focal_length_is_given_as_the_readme_says(
     assert (asked[0].focal_px, asked[0].focal_std_rel) == (1200.0, 0.05)
 
 
-def test_the_last_line_tells_the_time_of_this_run() -> None:
+def test_the_last_line_tells_the_time_of_this_run():
     whole = {"seconds": {"total": 40.0}, "elapsed_seconds": 41.5, "resumed": []}
     assert time_taken(whole) == "41.5 s"
     again = {**whole, "elapsed_seconds": 1.5, "resumed": ["features"]}
     assert time_taken(again) == "1.5 s (40.0 s with what was kept of an earlier run)"
 
 
-def test_every_camera_has_a_line_with_what_was_estimated_of_it() -> None:
-    def view(camera: int, focal: float, **more: float) -> dict[str, Any]:
+def test_every_camera_has_a_line_with_what_was_estimated_of_it():
+    def view(camera, focal, **more):
         values = {"focal_px": focal, "principal_x_px": 5.0, "principal_y_px": 4.0, **more}
         return {"camera": camera} | {
             name: {"value": value, "std": 0.0 if value == 1.0 else 0.5, "source": "x"}
@@ -255,10 +232,8 @@ def test_every_camera_has_a_line_with_what_was_estimated_of_it() -> None:
     assert lines[1].endswith("aspect 1.20000 +- 0.50000, skew 2.00 +- 0.50 px")
 
 
-def test_ctrl_c_says_how_to_go_on(
-    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupt(*_: Any, **__: Any) -> None:
+def test_ctrl_c_says_how_to_go_on(photographs, tmp_path, monkeypatch, capsys):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", interrupt)
@@ -266,10 +241,8 @@ def test_ctrl_c_says_how_to_go_on(
     assert "the same command goes on" in capsys.readouterr().err
 
 
-def test_an_error_in_the_program_is_a_sentence_too(
-    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fail(*_: Any, **__: Any) -> None:
+def test_an_error_in_the_program_is_a_sentence_too(photographs, tmp_path, monkeypatch, capsys):
+    def fail(*_, **__):
         raise IndexError("index 3 is out of bounds")
 
     monkeypatch.delenv(cli.DEBUG_VARIABLE, raising=False)
@@ -282,7 +255,7 @@ def test_an_error_in_the_program_is_a_sentence_too(
         run_command(arguments)
 
 
-def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_and_version(capsys):
     assert run_command(["--version"]) == 0
     assert run_command([]) == 0
     assert run_command(["reconstruct", "--help"]) == 0
@@ -292,18 +265,14 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
         assert option in printed
 
 
-def test_the_demo_without_its_photographs_says_where_they_were_looked_for(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_demo_without_its_photographs_says_where_they_were_looked_for(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(demo, "files", lambda _: tmp_path / "thesisrecon")
     assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
     assert str(tmp_path / "thesisrecon" / "courtyard") in capsys.readouterr().err
 
 
-def test_kernels_that_can_be_kept_nowhere_are_told_with_the_remedy(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(*_: Any) -> None:
+def test_kernels_that_can_be_kept_nowhere_are_told_with_the_remedy(monkeypatch, tmp_path, capsys):
+    def refuse(*_):
         raise RuntimeError("cannot cache function 'f': no locator available for file 'g'")
 
     monkeypatch.setattr(cli, "_run", refuse)
@@ -312,16 +281,13 @@ def test_kernels_that_can_be_kept_nowhere_are_told_with_the_remedy(
 
 
 @pytest.mark.parametrize(
-    ("wish", "kind"),
-    [("all", AllPairs()), ("overlap", OverlapEstimate()), ("window:3", SequenceWindow(3))],
+    ("wish", "kind"), [("all", AllPairs()), ("overlap", OverlapEstimate()), ("window:3", SequenceWindow(3))]
 )
-def test_the_pairs_of_the_command_are_those_of_the_settings(wish: str, kind: object) -> None:
+def test_the_pairs_of_the_command_are_those_of_the_settings(wish, kind):
     assert cli._config(None, None, cli._option_tables(None, None, wish), []).pairs == kind
 
 
-def test_a_list_of_pairs_is_read_matched_and_told(
-    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_list_of_pairs_is_read_matched_and_told(photographs, tmp_path, capsys):
     names = sorted(path.name for path in photographs.iterdir())
     wish, out = tmp_path / "pairs.txt", tmp_path / "out"
     wish.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
@@ -343,7 +309,7 @@ def test_a_list_of_pairs_is_read_matched_and_told(
     assert (out / "report.html").is_file()
 
 
-def test_a_list_of_pairs_that_was_mended_needs_no_overwriting(photographs: Path, tmp_path: Path) -> None:
+def test_a_list_of_pairs_that_was_mended_needs_no_overwriting(photographs, tmp_path):
     names = sorted(path.name for path in photographs.iterdir())
     wish, out = tmp_path / "pairs.txt", tmp_path / "out"
     given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]

@@ -1,7 +1,5 @@
 """``thesisrecon views`` on a small run made by hand: the painted sphere and the cameras around it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -26,7 +24,7 @@ SIZE = SHAPE[::-1]
 COUNT = 8
 
 
-def write_cameras(out: Path) -> None:
+def write_cameras(out):
     """``cameras.json`` by the writer of runs."""
     P = np.array([depth_map.P for depth_map in ring_of(COUNT)])
     K = np.array([decompose_camera(p)[0] for p in P])
@@ -50,7 +48,7 @@ def write_cameras(out: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TexturedMesh]:
+def sphere(tmp_path_factory):
     """A folder as a run leaves it, and the model in it."""
     out = tmp_path_factory.mktemp("views") / "a rün"
     maps = ring_of(COUNT)
@@ -62,17 +60,17 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TexturedMesh
 
 
 @pytest.fixture
-def run(sphere: tuple[Path, TexturedMesh], tmp_path: Path) -> Path:
+def run(sphere, tmp_path):
     """A copy of the run for one test."""
     return Path(shutil.copytree(sphere[0], tmp_path / sphere[0].name))
 
 
-def pixels(path: Path) -> np.ndarray:
+def pixels(path):
     with PIL.Image.open(path) as image:
         return np.asarray(image.convert("RGB")).astype(int)
 
 
-def difference_from_photograph(frame: Path, view: int) -> float:
+def difference_from_photograph(frame, view):
     """Median difference of colours from photograph ``view`` on the sphere, well inside it."""
     truth = photograph(ring_of(COUNT)[view]).rgb.astype(int)
     y, x = np.indices(SHAPE)
@@ -80,9 +78,7 @@ def difference_from_photograph(frame: Path, view: int) -> float:
     return float(np.median(np.abs(pixels(frame) - truth)[inside]))
 
 
-def test_interpolation_begins_and_ends_as_the_photographs(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_interpolation_begins_and_ends_as_the_photographs(run, capsys):
     assert run_command(["views", str(run), "--path", "interpolate", "--frames", "5", "--threads", "2"]) == 0
     folder = run / "views" / "interpolate"
     said = capsys.readouterr()
@@ -101,9 +97,7 @@ def test_interpolation_begins_and_ends_as_the_photographs(
     np.testing.assert_allclose(told["frames"][-1]["R"], cameras[-1]["R"], atol=1e-9)
 
 
-def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(
-    run: Path, tmp_path: Path
-) -> None:
+def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(run, tmp_path):
     wanted = ["views", str(run), "--path", "orbit", "--frames", "6", "--size", "120x80"]
     wanted += ["--background", "#102030"]
     for threads in ("1", "2"):
@@ -122,7 +116,7 @@ def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(
     assert np.abs(frames[0] - frames[3]).mean() > 4
 
 
-def test_light_changes_the_colours_and_a_bare_model_is_lit(run: Path, tmp_path: Path) -> None:
+def test_light_changes_the_colours_and_a_bare_model_is_lit(run, tmp_path):
     mean = {}
     for light in ("none", "camera", "sun"):
         folder = tmp_path / light
@@ -140,7 +134,7 @@ def test_light_changes_the_colours_and_a_bare_model_is_lit(run: Path, tmp_path: 
     assert len(np.unique(shown)) > 5
 
 
-def test_a_shorter_command_leaves_none_of_the_frames_before(run: Path) -> None:
+def test_a_shorter_command_leaves_none_of_the_frames_before(run):
     small = ["views", str(run), "--size", "40x30", "-o", str(run / "film"), "--frames"]
     assert run_command([*small, "4"]) == 0
     assert run_command([*small, "2", "--path", "interpolate"]) == 0
@@ -163,9 +157,7 @@ def test_a_shorter_command_leaves_none_of_the_frames_before(run: Path) -> None:
         (["-o", ""], "the folder has no name"),
     ],
 )
-def test_wrong_wishes_get_one_sentence(
-    options: list[str], words: str, run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_wishes_get_one_sentence(options, words, run, capsys):
     assert run_command(["views", str(run), *options]) == 2
     said = capsys.readouterr().err
     assert words in said
@@ -173,8 +165,8 @@ def test_wrong_wishes_get_one_sentence(
     assert not (run / "views").exists()
 
 
-def test_what_is_missing_is_named(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def told(out: Path) -> str:
+def test_what_is_missing_is_named(run, tmp_path, capsys):
+    def told(out):
         assert run_command(["views", str(out)]) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1
@@ -190,12 +182,12 @@ def test_what_is_missing_is_named(run: Path, tmp_path: Path, capsys: pytest.Capt
     (run / "model.glb").unlink()
     assert "has no model yet (model.glb)" in (said := told(run))
     assert "without --until" in said
-    reason = "there is no model: no depths were found; none of 4 views agrees with another."
+    reason = "No surface model was built: no depths were found; none of 4 views agrees with another."
     (run / "summary.json").write_text(json.dumps({"warnings": ["something else", reason]}))
     assert f"found its cameras and no surface: {reason}" in told(run)
 
 
-def test_a_folder_of_photographs_is_not_written_over(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_photographs_is_not_written_over(run, capsys):
     photographs = run / "photographs"
     photographs.mkdir()
     (photographs / "frame-0001.png").write_bytes(b"dear")
@@ -206,8 +198,8 @@ def test_a_folder_of_photographs_is_not_written_over(run: Path, capsys: pytest.C
     assert "cannot be used" in capsys.readouterr().err
 
 
-def test_progress_is_told_to_its_end(run: Path) -> None:
-    heard: list[tuple[str, int, int]] = []
+def test_progress_is_told_to_its_end(run):
+    heard = []
     wishes = ViewWishes(frames=3, size=(40, 30))
     written = write_views(run, run / "film", wishes, threads=2, progress=lambda *step: heard.append(step))
     assert heard == [("views", k, 4) for k in range(1, 5)]

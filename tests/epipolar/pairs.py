@@ -1,7 +1,5 @@
 """Two views of synthetic scenes with known geometry."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 
 SIZE = (1280.0, 960.0)
@@ -26,7 +25,7 @@ class Pair:
     P2: F64
 
 
-def make_pair(n: int, rng: np.random.Generator, *, planar: bool = False) -> Pair:
+def make_pair(n, rng, *, planar=False):
     """n points about 5 units in front of two cameras one unit apart, turned by about 10 degrees."""
     X = rng.uniform(-1.2, 1.2, (n, 3))
     if planar:
@@ -38,7 +37,7 @@ def make_pair(n: int, rng: np.random.Generator, *, planar: bool = False) -> Pair
     return Pair(project(P1, X), project(P2, X), fundamental_from_cameras(P1, P2), P1, P2)
 
 
-def spoil(pair: Pair, rng: np.random.Generator, *, sigma: float, outliers: float) -> tuple[F64, F64, F64]:
+def spoil(pair, rng, *, sigma, outliers):
     """Noise on every coordinate, a share of image 2's points anywhere; xy1, xy2 and which are wrong (N,)."""
     xy1 = pair.xy1 + rng.normal(0.0, sigma, pair.xy1.shape)
     xy2 = pair.xy2 + rng.normal(0.0, sigma, pair.xy2.shape)
@@ -47,6 +46,15 @@ def spoil(pair: Pair, rng: np.random.Generator, *, sigma: float, outliers: float
     return xy1, xy2, wrong
 
 
-def angle_between(F1: F64, F2: F64) -> float:
+def angle_between(F1, F2):
     """Angle of two unit matrices up to sign, rad."""
     return float(min(np.linalg.norm(F1 - F2), np.linalg.norm(F1 + F2)))
+
+
+def oriented(f, points, sample):
+    """Whether the sample can be in front of both cameras: e2 x x2 and F x1 agree in sign for all or none."""
+    F = f.reshape(3, 3)
+    e2 = np.linalg.svd(F)[0][:, 2]
+    x1, x2 = homogenize(points[sample, :2]), homogenize(points[sample, 2:])
+    sides = np.sum((x1 @ F.T) * np.cross(e2, x2), axis=1)
+    return bool((sides >= 0.0).all() or (sides <= 0.0).all())

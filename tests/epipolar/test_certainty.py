@@ -1,25 +1,23 @@
 """Whether an F is determined is told from the matches off the plane, not from the number of inliers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.degeneracy import (
+    NEIGHBOURS,
     assess_degeneracy,
-    find_dominant_plane,
+    contradicted_shares,
+    geometries_of_plane,
     log10_false_alarms,
     multiplicity_weights,
-    plane_covariance,
 )
-from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.frame import PairFrame
-from thesisrecon.epipolar.plane_kernels import (
-    NEIGHBOURS,
-    contradicted_shares,
+from thesisrecon.epipolar.locally_optimised import estimate_fundamental
+from thesisrecon.epipolar.planes import (
     count_transferred,
-    geometries_of_plane,
+    find_dominant_plane,
+    plane_covariance,
     plane_distances,
     plane_normal_equations,
     refine_plane,

@@ -1,7 +1,5 @@
 """Planes, rotations and translations are named, at every noise; general scenes are not called degenerate."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,8 +10,8 @@ from thesisrecon.epipolar.configuration import (
     turned_camera,
     turning_ratio,
 )
-from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point
+from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize

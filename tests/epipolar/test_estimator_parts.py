@@ -1,7 +1,5 @@
 """Each part of the judgement and of the estimators does what it is there for: none can be left out unseen."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.epipolar.pairs import angle_between, make_pair, spoil
@@ -10,7 +8,7 @@ from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_sampson
-from thesisrecon.epipolar.search import sampson_distances
+from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.geometry.two_view import sampson_residuals, unit_norm

@@ -1,16 +1,13 @@
 """Linear solvers, refinements and the robust estimators on scenes with truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.epipolar.pairs import Pair, angle_between, make_pair, spoil
-from thesisrecon.epipolar.estimation import estimate_fundamental
+from tests.epipolar.pairs import angle_between, make_pair, spoil
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
-from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
 from thesisrecon.errors import StageFailure
@@ -25,7 +22,7 @@ ROBUST = [
 ]
 
 
-def error_px(F, pair: Pair) -> float:
+def error_px(F, pair):
     """RMS distance of exact matches to their epipolar lines."""
     return float(np.sqrt(np.mean(symmetric_residuals(F, pair.xy1, pair.xy2) ** 2) / 2))
 

@@ -1,8 +1,5 @@
 """Matches no pair of photographs has: every function answers with finite numbers or refuses by name."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 
 import numpy as np
@@ -10,8 +7,8 @@ import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.configuration import classify_configuration
-from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
+from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.precision import epipolar_distance_interval, epipoles_of
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
@@ -81,7 +78,7 @@ def default_with_all_it_says(xy1, xy2):
     return fit, epipolar_distance_interval(fit, xy1, xy2), e1.direction, e2.direction, e1.covariance
 
 
-FUNCTIONS: dict[str, Callable[..., object]] = {
+FUNCTIONS = {
     "default": default_with_all_it_says,
     "named": lambda a, b: classify_configuration(
         (fit := estimate_fundamental(a, b)).F, a, b, inliers=fit.inliers
@@ -101,7 +98,7 @@ FUNCTIONS: dict[str, Callable[..., object]] = {
 }
 
 
-def holds_nan(answer: object) -> bool:
+def holds_nan(answer):
     """NaN anywhere in an answer but where it says by its definition that there is no such number."""
     if is_dataclass(answer):
         return any(

@@ -1,7 +1,5 @@
 """Section 5.4: the two tests of the text and the one by Sampson's distance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

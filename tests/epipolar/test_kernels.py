@@ -1,15 +1,14 @@
 """The compiled loops against plain NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.epipolar.pairs import make_pair
+from tests.epipolar.pairs import make_pair, oriented
+from thesisrecon.epipolar import linear
 from thesisrecon.epipolar import refinement as rank2
-from thesisrecon.epipolar import search as kernels
+from thesisrecon.epipolar import sampling as kernels
 from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import algebraic_residuals, sampson_residuals, symmetric_residuals
@@ -36,7 +35,7 @@ def test_pencil_spans_the_null_space(seed):
     points, _ = noisy_points(seed)
     pencil = np.empty((2, 9))
     sample = np.arange(10, 17)
-    assert kernels.null_pencil(points, sample, pencil)
+    assert linear.null_pencil(points, sample, pencil)
     np.testing.assert_allclose(pencil @ pencil.T, np.eye(2), atol=1e-12)
     assert np.abs(equations(points[sample]) @ pencil.T).max() < 1e-12
 
@@ -44,17 +43,17 @@ def test_pencil_spans_the_null_space(seed):
 def test_dependent_equations_have_no_pencil():
     points, _ = noisy_points(0)
     points[16] = points[15]
-    assert not kernels.null_pencil(points, np.arange(10, 17), np.empty((2, 9)))
+    assert not linear.null_pencil(points, np.arange(10, 17), np.empty((2, 9)))
 
 
 @settings(max_examples=50, deadline=None)
 @given(seeds)
 def test_determinants(seed):
     f, g = np.random.default_rng(seed).normal(size=(2, 9))
-    assert kernels.det3(f) == pytest.approx(np.linalg.det(f.reshape(3, 3)), abs=1e-12)
+    assert linear.det3(f) == pytest.approx(np.linalg.det(f.reshape(3, 3)), abs=1e-12)
     h = 1e-5
-    slope = (kernels.det3(f + h * g) - kernels.det3(f - h * g)) / (2 * h)
-    assert kernels.mixed_det3(f, g) == pytest.approx(slope, abs=1e-7)
+    slope = (linear.det3(f + h * g) - linear.det3(f - h * g)) / (2 * h)
+    assert linear.mixed_det3(f, g) == pytest.approx(slope, abs=1e-7)
 
 
 @settings(max_examples=100, deadline=None)
@@ -64,7 +63,7 @@ def test_cubic_with_three_real_roots(expected):
     roots = np.empty(3)
     full = np.concatenate([expected, np.repeat(expected[-1:], 3 - len(expected))])
     _, a, b, c = np.poly(full)
-    found = np.sort(roots[: kernels.monic_cubic_roots(a, b, c, roots)])
+    found = np.sort(roots[: linear.monic_cubic_roots(a, b, c, roots)])
     for x in expected:
         assert np.abs(found - x).min() < 1e-3
     if len(expected) == 3:
@@ -76,7 +75,7 @@ def test_cubic_with_three_real_roots(expected):
 def test_cubic_with_one_real_root(x, re, im):
     _, a, b, c = np.real(np.poly([x, re + 1j * im, re - 1j * im]))
     roots = np.empty(3)
-    assert kernels.monic_cubic_roots(a, b, c, roots) == 1
+    assert linear.monic_cubic_roots(a, b, c, roots) == 1
     assert roots[0] == pytest.approx(x, abs=1e-6)
 
 
@@ -88,7 +87,7 @@ def test_no_singular_member_is_lost_at_infinity(turn):
     basis = np.linalg.qr(np.stack([first, second]).T)[0].T
     c, s = np.cos(turn), np.sin(turn)
     F = np.empty((3, 9))
-    count = kernels.singular_members(np.array([[c, s], [-s, c]]) @ basis, F)
+    count = linear.singular_members(np.array([[c, s], [-s, c]]) @ basis, F)
     found = [np.diag(f.reshape(3, 3)) for f in F[:count]]
     assert count == 3
     for expected in (np.array([1.0, 2.0, 0.0]), np.array([0.0, 3.0, -1.0]), np.array([3.0, 0.0, 2.0])):
@@ -99,7 +98,7 @@ def test_no_singular_member_is_lost_at_infinity(turn):
 def test_a_pencil_of_singular_matrices_has_no_answer():
     pencil = np.zeros((2, 9))
     pencil[0, 0] = pencil[1, 4] = 1.0
-    assert kernels.singular_members(pencil, np.empty((3, 9))) == 0
+    assert linear.singular_members(pencil, np.empty((3, 9))) == 0
 
 
 @settings(max_examples=30, deadline=None)
@@ -143,14 +142,14 @@ def test_sequential_test_gives_up_wrong_matrices_early_and_keeps_right_ones():
 def test_true_geometry_keeps_the_orientation_and_a_point_behind_breaks_it(seed):
     points, f = noisy_points(seed)
     sample = np.arange(7)
-    assert kernels.oriented(f, points, sample)
-    assert kernels.oriented(-f, points, sample)
+    assert oriented(f, points, sample)
+    assert oriented(-f, points, sample)
     F = f.reshape(3, 3)
     e2 = np.linalg.svd(F)[0][:, 2]
     far = e2[:2] / e2[2]
     if np.linalg.norm(far - points[3, 2:]) > 0.5:
         points[3, 2:] = far + (far - points[3, 2:])
-        assert not kernels.oriented(f, points, sample)
+        assert not oriented(f, points, sample)
 
 
 def robust_cost(f, points, criterion, gate, delta):

@@ -1,20 +1,17 @@
 """What only the default estimator promises: the bound at any noise, inliers in the tail, agreement."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.epipolar.estimation import estimate_fundamental
-from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
 from thesisrecon.epipolar.refinement import refine_reprojection
 from thesisrecon.geometry.two_view import sampson_residuals, symmetric_residuals
 
 FAST = LocallyOptimisedRansac()
 
 
-def squared_error(F, pair, good) -> float:
+def squared_error(F, pair, good):
     return float(np.mean(symmetric_residuals(F, pair.xy1[good], pair.xy2[good]) ** 2) / 2.0)
 
 

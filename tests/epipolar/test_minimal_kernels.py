@@ -1,17 +1,15 @@
 """The batched seven-point solver against the exact one and NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.epipolar.pairs import make_pair
-from thesisrecon.epipolar import search as kernels
-from thesisrecon.epipolar import seven_point as minimal
+from tests.epipolar.pairs import make_pair, oriented
+from thesisrecon.epipolar import linear as minimal
+from thesisrecon.epipolar import sampling as kernels
 from thesisrecon.epipolar.frame import PairFrame
-from thesisrecon.numerics.noise import draw_sample
+from thesisrecon.numerics.ransac import draw_sample
 
 seeds = st.integers(0, 2**31)
 
@@ -48,8 +46,8 @@ def test_every_oriented_solution_of_the_exact_solver_is_found_and_no_other(seed)
     for lane, sample in enumerate(samples):
         expected = [
             f
-            for f in exact[: kernels.seven_point(points, sample, exact)].copy()
-            if kernels.oriented(f, points, sample)
+            for f in exact[: minimal.seven_point(points, sample, exact)].copy()
+            if oriented(f, points, sample)
         ]
         count = minimal.lane_solutions(Y, lane, np.empty(9), found)
         counts += count != len(expected)

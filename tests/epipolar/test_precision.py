@@ -1,7 +1,5 @@
 """The bound, the intervals of epipolar distances and of epipoles, and who reaches them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,11 +20,11 @@ from thesisrecon.epipolar.precision import (
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
 from thesisrecon.records import FundamentalFit
-from validation.studies.epipolar import DEFAULT, GOLD, check_precision
 from validation.scenes.two_views import make_two_views
+from validation.studies.epipolar import DEFAULT, GOLD, check_precision
 
 
-def bound_of(seed: int, n: int = 40, sigma: float = 0.5):
+def bound_of(seed, n=40, sigma=0.5):
     scene = make_two_views(Configuration.GENERAL, n, np.random.default_rng(seed))
     return scene, fundamental_bound(scene.P1, scene.P2, scene.X, sigma_px=sigma)
 

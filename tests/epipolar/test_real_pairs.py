@@ -1,15 +1,12 @@
 """Chapter 5 on real matches: turntable tracks with known cameras, hand-labelled wrong matches."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from thesisrecon.epipolar.estimation import estimate_fundamental
-from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 
@@ -17,7 +14,7 @@ pytestmark = pytest.mark.real
 DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).resolve().parents[2] / "../shared/data"))
 
 
-def load(name: str) -> np.ndarray:
+def load(name):
     path = DATA / name
     if not path.exists():
         pytest.skip(f"the real data are not on this machine ({name})")

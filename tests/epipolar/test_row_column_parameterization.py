@@ -1,7 +1,5 @@
 """Section 5.3: the 36 maps of matrices of rank 2 by a dependent row and column."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

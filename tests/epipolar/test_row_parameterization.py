@@ -1,7 +1,5 @@
 """The thesis' parameters reach every matrix of rank 2, and the minimum of the orthonormal ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The tensor of least reprojection error: its steps, its noise, what it refuses, and real photographs."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.arrays import F64
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
     NO_SEGMENTS,
@@ -42,7 +39,7 @@ from thesisrecon.geometry.three_view import (
 DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).resolve().parents[2] / "../shared/data"))
 
 
-def three_cameras(rng: np.random.Generator) -> F64:
+def three_cameras(rng):
     """Cameras 8 units from the origin, some 20 degrees apart."""
     K = calibration_matrix(1200.0, 1180.0, 640.0, 480.0, skew=3.0)
     cameras = []
@@ -52,7 +49,7 @@ def three_cameras(rng: np.random.Generator) -> F64:
     return np.stack(cameras)
 
 
-def matches(P: F64, rng: np.random.Generator, n: int, m: int, sigma: float) -> tuple[F64, F64]:
+def matches(P, rng, n, m, sigma):
     X, A, B = (rng.uniform(-2.0, 2.0, (k, 3)) for k in (n, m, m))
     points = np.stack([project(camera, X) for camera in P])
     segments = np.stack([np.stack([project(camera, A), project(camera, B)], axis=1) for camera in P])
@@ -62,11 +59,11 @@ def matches(P: F64, rng: np.random.Generator, n: int, m: int, sigma: float) -> t
     )
 
 
-def point_transfer_px(T: F64, points: F64) -> F64:
+def point_transfer_px(T, points):
     return np.linalg.norm(transfer_points(T, points[0], points[1]) - points[2], axis=1)
 
 
-def line_transfer_px(T: F64, segments: F64) -> F64:
+def line_transfer_px(T, segments):
     """RMS distance of the third segment's ends to the transferred line; (M,)."""
     ends = homogenize(segments)
     l1, l2 = line_through(ends[:2, :, 0], ends[:2, :, 1])
@@ -226,7 +223,7 @@ def _single_steps(system, h):
         yield TrifocalStep(np.zeros(24), np.zeros_like(points.h), move), lines.h[5, k]
 
 
-def _scaled(step: TrifocalStep, by: float) -> TrifocalStep:
+def _scaled(step, by):
     return TrifocalStep(by * step.cameras, by * step.points, by * step.lines)
 
 
@@ -269,7 +266,7 @@ def test_matches_that_cannot_work_are_named():
             refine_trifocal(start, points, segments)
 
 
-def _read(kind: str) -> F64:
+def _read(kind):
     """Corners (3, N, 2) or segments (3, M, 4) that are matched in all three views of merton1."""
     folder = DATA / "merton1" / "2D"
     rows = [line.split() for line in (folder / f"nview-{kind}").read_text().splitlines()]

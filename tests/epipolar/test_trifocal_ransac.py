@@ -1,9 +1,5 @@
 """Three views with wrong tracks: the six-point solver, its distances, the search, what it refuses."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,7 +14,6 @@ from tests.epipolar.test_trifocal_estimation import (
     three_cameras,
 )
 from tests.geometry.properties import holds_for_every
-from thesisrecon.arrays import F64
 from thesisrecon.epipolar.six_point import (
     SAMPLE,
     draw_samples,
@@ -30,7 +25,6 @@ from thesisrecon.epipolar.six_point import (
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
     NO_SEGMENTS,
-    TrifocalFit,
     _off_principal_planes,
     estimate_trifocal,
     refine_trifocal,
@@ -46,19 +40,19 @@ from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 SCALE = 1.0 / 300.0
 
 
-def tracks(points: F64) -> F64:
+def tracks(points):
     """Rows of six in a frame of one scale."""
     offsets = points - points.mean(axis=1, keepdims=True)
     return np.ascontiguousarray((SCALE * offsets).swapaxes(0, 1).reshape(-1, 6))
 
 
-def distances(P: F64, track: F64) -> F64:
+def distances(P, track):
     out = np.empty(len(track))
     reprojection_distances(P, track, out)
     return out
 
 
-def six_point_numpy(track: F64) -> list[F64]:
+def six_point_numpy(track):
     """The solver in plain NumPy: X6 from the pencil of (5.2) with a polynomial fitted to its determinant."""
     to_pixels, rows = [], [np.ones(6)]
     places = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
@@ -146,7 +140,7 @@ def test_distances_are_those_of_the_least_reprojection_error():
     for k in range(0, 40, 8):
         start = X[k, :3] / X[k, 3]
 
-        def off(x: F64, k: int = k) -> F64:
+        def off(x, k=k):
             return (np.stack([project(camera, x[None])[0] for camera in P]) - points[:, k]).ravel()
 
         best = minimize_residuals(off, start).x
@@ -175,7 +169,7 @@ def test_the_noise_of_tracks_is_found_among_wrong_ones(sigma):
     assert noise_of_tracks(np.zeros(20), 2.0, 600.0) < 1e-4
 
 
-def planted(rng: np.random.Generator, n: int, share: float, sigma: float) -> tuple[F64, F64, F64]:
+def planted(rng, n, share, sigma):
     """Cameras, tracks with a share of them put anywhere, which they are."""
     P = three_cameras(rng)
     points = matches(P, rng, n, 0, sigma)[0]
@@ -275,7 +269,7 @@ def test_wrong_calls():
 KINDS = ["scene", "integers", "huge", "tiny", "few places", "one view still", "line", "duplicates", "nan"]
 
 
-def _strange(rng: np.random.Generator, kind: str, n: int, m: int) -> tuple[F64, F64]:
+def _strange(rng, kind, n, m):
     points, segments = matches(three_cameras(rng), rng, n, m, float(rng.choice([0.0, 0.5])))
     if kind == "integers":
         points, segments = rng.integers(0, 4, points.shape) * 1.0, rng.integers(0, 4, segments.shape) * 1.0
@@ -295,7 +289,7 @@ def _strange(rng: np.random.Generator, kind: str, n: int, m: int) -> tuple[F64, 
     return points, segments
 
 
-def _outcome(attempt: Callable[[], TrifocalFit]) -> tuple[Exception | None, TrifocalFit | None]:
+def _outcome(attempt):
     try:
         return None, attempt()
     except (ValueError, StageFailure) as failure:

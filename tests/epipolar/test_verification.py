@@ -1,25 +1,24 @@
 """Which pairs are believed, and how planar they are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from tests.epipolar.pairs import SIZE, Pair, make_pair, spoil
-from thesisrecon.epipolar.estimation import estimate_fundamental
-from thesisrecon.epipolar.verification import PairVerification, homography_inlier_ratio, plane_homographies
+from thesisrecon.epipolar.locally_optimised import estimate_fundamental
+from thesisrecon.epipolar.planes import homography_inlier_ratio, plane_homographies
+from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.two_view import homography_residuals
 from thesisrecon.records import FundamentalFit, Matches
 
 
-def as_matches(xy1, xy2) -> Matches:
+def as_matches(xy1, xy2):
     n = len(xy1)
     affine = np.tile(np.eye(2), (n, 1, 1))
     return Matches(2, 5, np.arange(n), np.arange(n)[::-1].copy(), xy1, xy2, np.ones(n, np.float32), affine)
 
 
-def verified(pair: Pair, *, outliers: float, seed: int = 0, variant: PairVerification | None = None):
+def verified(pair, *, outliers, seed=0, variant=None):
     xy1, xy2, wrong = spoil(pair, np.random.default_rng(seed), sigma=0.3, outliers=outliers)
     fit = estimate_fundamental(xy1, xy2)
     return (

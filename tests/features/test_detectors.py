@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import erf
 
 from tests.textures import photograph, texture
-from thesisrecon.arrays import F64
 from thesisrecon.features.harris import CornerMeasure, HarrisCorners, find_corners, select_spread
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.records import Image
@@ -20,7 +17,7 @@ VARIANTS = [
 Variant = HarrisCorners | MultiScaleCorners
 
 
-def chessboard(dx: float, dy: float) -> Image:
+def chessboard(dx, dy):
     """Four quadrants meeting at (60 + dx, 50 + dy); an edge is the integral of a Gaussian of sigma 0.4."""
     x, y = np.arange(120) - 60 - dx, np.arange(100) - 50 - dy
     return photograph(128 + 90 * erf(x / 0.57)[None] * erf(y / 0.57)[:, None])
@@ -28,14 +25,14 @@ def chessboard(dx: float, dy: float) -> Image:
 
 @pytest.mark.parametrize("variant", [HarrisCorners(), MultiScaleCorners(upsample_below_px=0)])
 @pytest.mark.parametrize(("dx", "dy"), [(0.0, 0.0), (0.3, -0.2), (-0.45, 0.4)])
-def test_a_corner_is_found_between_the_pixels(variant: Variant, dx: float, dy: float) -> None:
+def test_a_corner_is_found_between_the_pixels(variant, dx, dy):
     features = variant.detect(chessboard(dx, dy))
     distance = np.linalg.norm(features.xy - (60 + dx, 50 + dy), axis=1)
     assert distance.min() < 0.25
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_corners_are_sorted_inside_and_the_same_each_time(variant: Variant) -> None:
+def test_corners_are_sorted_inside_and_the_same_each_time(variant):
     image = photograph(texture(200, 260))
     features, again = variant.detect(image), variant.detect(image)
     assert len(features.xy) > 300
@@ -50,7 +47,7 @@ def test_corners_are_sorted_inside_and_the_same_each_time(variant: Variant) -> N
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (9, 9), (20, 20), (5, 400), (64, 48)])
 @pytest.mark.parametrize("kind", ["blank", "noise"])
-def test_tiny_blank_and_noisy_images_do_no_harm(variant: Variant, size: tuple[int, int], kind: str) -> None:
+def test_tiny_blank_and_noisy_images_do_no_harm(variant, size, kind):
     rng = np.random.default_rng(0)
     gray = np.full(size, 77.0) if kind == "blank" else rng.uniform(0, 255, size)
     features = variant.detect(photograph(gray))
@@ -60,7 +57,7 @@ def test_tiny_blank_and_noisy_images_do_no_harm(variant: Variant, size: tuple[in
         assert len(features.xy) == 0
 
 
-def test_thesis_corners_keep_their_distance_and_their_number() -> None:
+def test_thesis_corners_keep_their_distance_and_their_number():
     features = HarrisCorners(max_corners=150, spacing_rel=0.02).detect(photograph(texture(300, 400)))
     distance = np.linalg.norm(features.xy[:, None] - features.xy[None], axis=2) + 1e9 * np.eye(
         len(features.xy)
@@ -69,7 +66,7 @@ def test_thesis_corners_keep_their_distance_and_their_number() -> None:
     assert distance.min() >= 0.02 * 400
 
 
-def test_corners_cover_the_image_though_one_side_is_faint() -> None:
+def test_corners_cover_the_image_though_one_side_is_faint():
     gray = texture(400, 1100)
     gray[:, 550:] = 128 + 0.15 * (gray[:, 550:] - 128)
     features = MultiScaleCorners(full_corners=600, half_corners=300).detect(photograph(gray))
@@ -77,7 +74,7 @@ def test_corners_cover_the_image_though_one_side_is_faint() -> None:
 
 
 @pytest.mark.parametrize(("width", "scales"), [(420, {0.5, 1.0}), (1040, {1.0, 2.0})])
-def test_two_sizes_and_seeds_twice_in_the_pixels_of_the_photograph(width: int, scales: set[float]) -> None:
+def test_two_sizes_and_seeds_twice_in_the_pixels_of_the_photograph(width, scales):
     features = MultiScaleCorners().detect(photograph(texture(300, width)))
     assert set(features.scale.tolist()) == scales
     seeds = features.seeds
@@ -89,7 +86,7 @@ def test_two_sizes_and_seeds_twice_in_the_pixels_of_the_photograph(width: int, s
     assert (seeds.xy <= (width - 1, 299)).all()
 
 
-def test_turned_patches_turn_with_the_photograph() -> None:
+def test_turned_patches_turn_with_the_photograph():
     gray = texture(301, 301, 8)
     one = MultiScaleCorners().detect(photograph(gray)).seeds
     two = MultiScaleCorners().detect(photograph(np.rot90(gray))).seeds
@@ -111,15 +108,15 @@ def test_turned_patches_turn_with_the_photograph() -> None:
 
 
 @pytest.mark.parametrize("formula", ["noble", "harris"])
-def test_both_formulas_find_the_same_corner_and_no_edge(formula: str) -> None:
-    measure = CornerMeasure(formula=formula)  # type: ignore[arg-type]
+def test_both_formulas_find_the_same_corner_and_no_edge(formula):
+    measure = CornerMeasure(formula=formula)
     xy, response = find_corners(chessboard(0.3, -0.2).gray[None], measure)
     # det - k trace^2 has the flatter top.
     assert np.linalg.norm(xy[0] - (60.3, 49.8)) < (0.25 if formula == "noble" else 0.5)
     assert (response[1:] < 0.01 * response[0]).all()
 
 
-def test_a_grey_photograph_has_the_same_response_in_colour() -> None:
+def test_a_grey_photograph_has_the_same_response_in_colour():
     image = photograph(texture(90, 110))
     gray, colour = CornerMeasure(), CornerMeasure(colour=True)
     one, three = gray.response(gray.channels(image)), colour.response(colour.channels(image))
@@ -127,7 +124,7 @@ def test_a_grey_photograph_has_the_same_response_in_colour() -> None:
     assert np.abs(one - three).max() < 1e-4 * one.max()
 
 
-def test_corners_that_only_colour_shows_are_found_in_colour() -> None:
+def test_corners_that_only_colour_shows_are_found_in_colour():
     """Red and green squares of one luminance."""
     board = chessboard(0.0, 0.0).rgb[:, :, 0] > 128
     rgb = np.where(board[:, :, None], np.array([200, 60, 90]), np.array([50, 136, 91])).astype(np.uint8)
@@ -137,15 +134,15 @@ def test_corners_that_only_colour_shows_are_found_in_colour() -> None:
     assert np.linalg.norm(found[True].xy[0] - (60.0, 50.0)) < 3.0
 
 
-def test_the_derivation_kernel_is_scaled_to_slope_one() -> None:
+def test_the_derivation_kernel_is_scaled_to_slope_one():
     channels = texture(70, 80)[None].astype(np.float32)
     one = CornerMeasure().response(channels)
     twice = CornerMeasure(derivative_taps=(-3.0, 0.0, 3.0)).response(channels)
     assert np.abs(one - twice).max() < 1e-5 * one.max()
 
 
-def test_without_surface_fit_corners_stay_on_pixels_and_with_it_they_are_nearer() -> None:
-    error: dict[bool, list[F64]] = {False: [], True: []}
+def test_without_surface_fit_corners_stay_on_pixels_and_with_it_they_are_nearer():
+    error = {False: [], True: []}
     for dx, dy in np.random.default_rng(1).uniform(-0.5, 0.5, (12, 2)):
         for subpixel, told in error.items():
             measure = CornerMeasure(subpixel=subpixel)
@@ -155,7 +152,7 @@ def test_without_surface_fit_corners_stay_on_pixels_and_with_it_they_are_nearer(
     assert np.mean(error[True]) < 0.5 * np.mean(error[False])
 
 
-def brute_force_suppression(xy: F64, response: F64, count: int) -> set[int]:
+def brute_force_suppression(xy, response, count):
     """The ``count`` corners that keep longest as the circle around each shrinks that no clearly stronger one
     may enter."""
     radius = np.full(len(xy), np.inf)
@@ -166,7 +163,7 @@ def brute_force_suppression(xy: F64, response: F64, count: int) -> set[int]:
     return set(np.argsort(-radius, kind="stable")[:count].tolist())
 
 
-def test_spread_selection_is_adaptive_non_maximal_suppression() -> None:
+def test_spread_selection_is_adaptive_non_maximal_suppression():
     rng = np.random.default_rng(5)
     xy, response = rng.uniform(0, 300, (120, 2)), np.sort(rng.exponential(size=120))[::-1]
     kept = select_spread(xy, response.astype(np.float32), 40, pool=120)
@@ -175,9 +172,9 @@ def test_spread_selection_is_adaptive_non_maximal_suppression() -> None:
 
 
 @pytest.mark.parametrize("selection", ["spacing", "spread", "strongest"])
-def test_each_selection_keeps_the_number_and_the_strongest(selection: str) -> None:
+def test_each_selection_keeps_the_number_and_the_strongest(selection):
     image = photograph(texture(300, 400))
-    variant = HarrisCorners(max_corners=100, selection=selection, threshold_rel=0.0)  # type: ignore[arg-type]
+    variant = HarrisCorners(max_corners=100, selection=selection, threshold_rel=0.0)
     all_of_them = HarrisCorners(max_corners=10**6, selection="strongest", threshold_rel=0.0).detect(image)
     features = variant.detect(image)
     assert len(features.xy) == 100
@@ -186,7 +183,7 @@ def test_each_selection_keeps_the_number_and_the_strongest(selection: str) -> No
         assert np.array_equal(features.xy, all_of_them.xy[:100])
 
 
-def test_the_strongest_of_each_size_where_corners_are_not_spread() -> None:
+def test_the_strongest_of_each_size_where_corners_are_not_spread():
     gray = texture(400, 1100)
     gray[:, 550:] = 128 + 0.15 * (gray[:, 550:] - 128)
     features = MultiScaleCorners(full_corners=600, half_corners=0, spread=False).detect(photograph(gray))
@@ -205,9 +202,9 @@ def test_the_strongest_of_each_size_where_corners_are_not_spread() -> None:
         ("integration_sigma_px", 0.0),
     ],
 )
-def test_a_measure_that_cannot_be_is_refused(field: str, value: object) -> None:
+def test_a_measure_that_cannot_be_is_refused(field, value):
     with pytest.raises(ValueError, match=field):
-        CornerMeasure(**{field: value})  # type: ignore[arg-type]
+        CornerMeasure(**{field: value})
 
 
 @pytest.mark.parametrize(
@@ -224,12 +221,12 @@ def test_a_measure_that_cannot_be_is_refused(field: str, value: object) -> None:
         (MultiScaleCorners, "levels", 0),
     ],
 )
-def test_a_detector_that_cannot_be_is_refused(kind: type, field: str, value: float) -> None:
+def test_a_detector_that_cannot_be_is_refused(kind, field, value):
     with pytest.raises(ValueError, match=field):
         kind(**{field: value})
 
 
-def test_values_that_are_not_finite_are_refused() -> None:
+def test_values_that_are_not_finite_are_refused():
     gray = texture(60, 60).astype(np.float32)
     gray[30, 30] = np.nan
     with pytest.raises(ValueError, match="NaN"):

@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordinates, maximum_filter
 
 from tests.textures import texture
-from thesisrecon.arrays import F32, F64
 from thesisrecon.features.kernels import (
     corner_response,
     fit_maxima,
@@ -16,7 +13,7 @@ from thesisrecon.features.kernels import (
 from thesisrecon.geometry.raster import gaussian_taps
 
 
-def moments_twin(channels: F32, derivative: F32, taps: F32) -> F64:
+def moments_twin(channels, derivative, taps):
     """(3, H, W): M11, M12, M22 by convolutions, summed over the channels."""
     total = np.zeros((3, *channels.shape[1:]))
     for channel in channels.astype(np.float64):
@@ -29,9 +26,7 @@ def moments_twin(channels: F32, derivative: F32, taps: F32) -> F64:
 @pytest.mark.parametrize("trace_weight", [0.0, 0.04])
 @pytest.mark.parametrize("derivative", [(-0.5, 0.0, 0.5), (0.1, -0.8, 0.0, 0.8, -0.1)])
 @pytest.mark.parametrize("count", [1, 3])
-def test_corner_response_equals_its_numpy_twin(
-    trace_weight: float, derivative: tuple[float, ...], count: int
-) -> None:
+def test_corner_response_equals_its_numpy_twin(trace_weight, derivative, count):
     channels = np.stack([texture(60, 83, seed).astype(np.float32) for seed in range(count)])
     taps, along = gaussian_taps(1.5), np.array(derivative, np.float32)
     found = corner_response(channels, along, taps, trace_weight)
@@ -45,7 +40,7 @@ def test_corner_response_equals_its_numpy_twin(
     assert not found[:, -border:].any()
 
 
-def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there() -> None:
+def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there():
     # Without clipping at 255 no two neighbours are equal, so that every maximum is one.
     response = (
         gaussian_filter(np.random.default_rng(2).normal(size=(50, 70)), 1.5).astype(np.float32) * 500 + 130
@@ -66,7 +61,7 @@ def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there() -
         assert np.abs(step * inside - (x - column, y - row)).max() < 1e-3
 
 
-def test_suppression_radii_equal_their_numpy_twin() -> None:
+def test_suppression_radii_equal_their_numpy_twin():
     rng = np.random.default_rng(4)
     xy = rng.uniform(0, 500, (300, 2)).astype(np.float32)
     response = np.sort(rng.exponential(size=300).astype(np.float32))[::-1].copy()
@@ -76,7 +71,7 @@ def test_suppression_radii_equal_their_numpy_twin() -> None:
     assert np.allclose(squared_suppression_radii(xy, response, 0.9), twin, rtol=1e-5)
 
 
-def test_patches_equal_their_numpy_twin() -> None:
+def test_patches_equal_their_numpy_twin():
     image = texture(80, 90, 5).astype(np.float32)
     xy = np.array([[40.3, 35.7], [3.0, 4.0], [86.5, 77.0]])
     angle = np.array([0.0, 0.7, -2.0], np.float32)
@@ -89,7 +84,7 @@ def test_patches_equal_their_numpy_twin() -> None:
         assert np.abs(patch.reshape(8, 8) - twin).max() < 1e-2
 
 
-def test_kept_corners_are_apart_and_nobody_is_dropped_without_reason() -> None:
+def test_kept_corners_are_apart_and_nobody_is_dropped_without_reason():
     xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
     kept = keep_apart(xy, np.arange(400), 6.0)
     distance = np.linalg.norm(xy[:, None] - xy[kept][None], axis=2)

@@ -1,7 +1,5 @@
 """Section 3.5: the camera, its parts, its centre, and what it sees in front."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -100,7 +98,7 @@ def test_3_5_1_normalised_cameras_have_a_centre_with_last_entry_one(rng):
         np.testing.assert_allclose(normal, normalize_camera(P), rtol=1e-9)
 
 
-def test_3_5_1_cameras_at_infinity_cannot_be_normalised() -> None:
+def test_3_5_1_cameras_at_infinity_cannot_be_normalised():
     with pytest.raises(ValueError, match="singular"):
         normalize_camera(np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]]))
     for refuse in (normalize_camera, decompose_camera):

@@ -1,7 +1,5 @@
 """Section 3.4.6: conics, dual conics, quadrics, dual quadrics and the absolute ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -43,7 +41,7 @@ from thesisrecon.geometry.strata import (
 dimensions = st.sampled_from([3, 4])
 
 
-def _round(rng: np.random.Generator, d: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+def _round(rng, d, n):
     """An ellipse or ellipsoid (d, d) about the origin and n of its points (n, d)."""
     T = np.eye(d)
     T[:-1] += 0.3 * rng.uniform(-1.0, 1.0, (d - 1, d))
@@ -61,7 +59,7 @@ def test_3_1_five_points_determine_a_conic(rng):
     assert gap(conic_through(x), C) < 1e-5
 
 
-def test_3_1_points_that_leave_a_conic_free_are_refused() -> None:
+def test_3_1_points_that_leave_a_conic_free_are_refused():
     on_line = homogenize(np.column_stack([np.arange(5.0), np.arange(5.0)]))
     with pytest.raises(ValueError, match="determine one conic"):
         conic_through(on_line)
@@ -86,7 +84,7 @@ def test_3_4_and_3_10_tangents_belong_to_the_inverse(rng, d):
     assert gap(dual(dual(C)), C) < 1e-9
 
 
-def test_3_4_the_dual_of_two_lines_is_their_point() -> None:
+def test_3_4_the_dual_of_two_lines_is_their_point():
     l, m = np.array([1.0, 0.0, -2.0]), np.array([0.0, 1.0, 3.0])
     meet = np.cross(l, m)
     assert gap(dual(np.outer(l, m) + np.outer(m, l)), np.outer(meet, meet)) < 1e-12
@@ -173,7 +171,7 @@ def test_3_12_to_3_15_images_of_the_absolute_conic_are_those_of_the_calibration(
     np.testing.assert_allclose(calibration_from_image(scale * image_of_absolute_conic(K)), K, atol=1e-3)
 
 
-def test_3_14_conics_of_no_camera_are_refused() -> None:
+def test_3_14_conics_of_no_camera_are_refused():
     for wrong in (np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, 0.0]), np.full((3, 3), np.nan)):
         with pytest.raises(ValueError, match="definite"):
             calibration_from_dual_image(wrong)

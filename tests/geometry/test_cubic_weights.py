@@ -1,14 +1,12 @@
 """Weights of interpolations against their plain formulas."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from thesisrecon.geometry.raster import cubic_weights
 
 
-def keys_kernel(x: np.ndarray) -> np.ndarray:
+def keys_kernel(x):
     """Keys' kernel with a = -1/2 at distances x from a pixel, written as in the paper."""
     s = np.abs(x)
     near = 1.5 * s**3 - 2.5 * s**2 + 1.0
@@ -17,7 +15,7 @@ def keys_kernel(x: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.73, 1.0])
-def test_cubic_weights_are_those_of_keys(share: float) -> None:
+def test_cubic_weights_are_those_of_keys(share):
     weights = np.empty(4)
     cubic_weights(share, weights)
     np.testing.assert_allclose(weights, keys_kernel(share - np.arange(-1.0, 3.0)), atol=1e-15)

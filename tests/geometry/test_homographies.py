@@ -1,7 +1,5 @@
 """Sections 3.6.1 and 3.6.4: homographies of planes, their epipoles, fundamental matrices and cameras."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -31,7 +29,7 @@ from thesisrecon.geometry.two_view import (
 )
 
 
-def _canonical(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _canonical(rng):
     """[I 0] and another camera of a projective frame, entries of size one."""
     scale = np.diag([1e-3, 1e-3, 1.0])
     P1, P2 = (scale @ random_camera(rng)[0] for _ in range(2))
@@ -70,7 +68,7 @@ def test_3_29_to_3_31_homographies_of_a_plane(rng):
     assert gap(moved, H) < 1e-6
 
 
-def test_3_29_planes_through_the_origin_and_through_centres() -> None:
+def test_3_29_planes_through_the_origin_and_through_centres():
     rng = np.random.default_rng(3)
     (P1, *_), (P2, *_) = random_camera(rng), random_camera(rng)
     X, Y = random_points(rng, 2)

@@ -1,7 +1,5 @@
 """Section 3.2: incidence, joins and meets."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.geometry.properties import gap, holds_for_every, random_camera, random_points

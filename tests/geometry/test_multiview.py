@@ -1,7 +1,5 @@
 """Theorems of section 3.6 on random cameras and points."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -99,7 +97,7 @@ def test_3_42_the_default_planes_are_the_true_one_and_its_twisted_twin_where_cal
     assert _distance_from_rotations(F, rotation_planes(F)[0]) <= min(residual) + 1e-12
 
 
-def _distance_from_rotations(F: np.ndarray, plane: np.ndarray) -> float:
+def _distance_from_rotations(F, plane):
     """Frobenius distance of the left part from the nearest multiple of an orthogonal matrix."""
     s = np.linalg.svd(canonical_cameras(F, plane=plane)[1][:, :3], compute_uv=False)
     return float(np.linalg.norm(s - s.mean()))
@@ -194,7 +192,7 @@ def test_canonical_cameras_project_what_the_true_cameras_see():
     assert np.abs(dehomogenize(X @ P1.T) - pair.xy1).max() < 1e-5
 
 
-def test_3_34_the_pair_in_the_other_order_has_the_transpose() -> None:
+def test_3_34_the_pair_in_the_other_order_has_the_transpose():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         P1, P2 = rng.normal(size=(2, 3, 4))

@@ -1,7 +1,5 @@
 """Arrays that no decomposition takes are refused by a sentence that names the function."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Table 3.3 and section 3.4: each stratum's transforms keep its own invariants and break the next one's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -102,7 +100,7 @@ def test_3_4_each_group_holds_its_members_and_is_closed(rng, group):
     assert ORDER.index(group_of(np.linalg.inv(G))) >= ORDER.index(group)
 
 
-def test_3_4_a_reflection_is_affine_only_and_wrong_matrices_are_refused() -> None:
+def test_3_4_a_reflection_is_affine_only_and_wrong_matrices_are_refused():
     assert group_of(np.diag([1.0, 1.0, -1.0, 1.0])) == "affine"
     assert group_of(np.eye(4)) == "euclidean"
     for wrong in (np.eye(3), np.full((4, 4), np.nan), np.diag([1.0, 1.0, 1.0, 0.0])):
@@ -112,7 +110,7 @@ def test_3_4_a_reflection_is_affine_only_and_wrong_matrices_are_refused() -> Non
         affine_transform(np.diag([1.0, 1.0, 0.0]), np.zeros(3))
 
 
-def _tangent_vectors(group: str, rng: np.random.Generator) -> np.ndarray:
+def _tangent_vectors(group, rng):
     """Small moves away from the identity within a group, without its scale."""
     moves = []
     for _ in range(40):
@@ -155,7 +153,7 @@ def test_3_4_2_projective_invariants_are_kept_by_all(rng, group):
         assert curvature_sign(transform_conics(G, Q)) == sign
 
 
-def test_3_4_2_cross_ratio_at_the_base_point_and_where_it_does_not_exist() -> None:
+def test_3_4_2_cross_ratio_at_the_base_point_and_where_it_does_not_exist():
     base, direction = np.array([0.0, 1.0, 2.0, 1.0]), np.array([1.0, 0.0, 0.5, 0.0])
     x = base + np.array([0.0, 1.0, 3.0, 0.0])[:, None] * direction
     x[3] = direction
@@ -255,14 +253,14 @@ def test_3_4_1_stratified_and_direct_upgrades_restore_angles(rng):
         assert np.isfinite(dehomogenize(Y)).all()
 
 
-def test_3_4_4_conics_of_no_metric_frame_are_refused() -> None:
+def test_3_4_4_conics_of_no_metric_frame_are_refused():
     with pytest.raises(ValueError, match="definite"):
         metric_from_affine(np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(ValueError, match="semi-definite"):
         metric_from_projective(np.diag([1.0, 1.0, -1.0, 0.0]))
 
 
-def test_the_corner_of_a_cube_holds_a_sixth_of_it() -> None:
+def test_the_corner_of_a_cube_holds_a_sixth_of_it():
     corner = np.column_stack([2.0 * np.vstack([np.zeros(3), np.eye(3)]), np.ones(4)])
     assert volume(corner) == pytest.approx(8.0 / 6.0, rel=1e-12)
     assert volume(corner[[1, 0, 2, 3]]) == pytest.approx(-8.0 / 6.0, rel=1e-12)

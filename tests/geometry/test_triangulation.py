@@ -1,7 +1,5 @@
 """Section 6.3: five methods of triangulation against plain twins, each other and what a minimum must be."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -10,7 +8,6 @@ from scipy.spatial.transform import Rotation
 import thesisrecon
 from tests.geometry import triangulation_twins as twins
 from tests.geometry.properties import holds_for_every, random_camera
-from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_centre, compose_camera, project
 from thesisrecon.geometry.optimal_triangulation import (
     correct_matches,
@@ -46,7 +43,7 @@ RELATIVE, ROUNDING_PX = 1e-9, 1e-11
 """Costs are equal to 1e-9 of themselves, or where the distances they are made of agree to rounding."""
 
 
-def two_views(kind: str, rng: np.random.Generator, n: int = 40) -> tuple[F64, F64]:
+def two_views(kind, rng, n=40):
     """P (2, 3, 4) and exact points X (n, 4) of one kind of geometry."""
     R = Rotation.from_rotvec(rng.normal(0.0, 0.2, 3)).as_matrix()
     c = rng.normal(size=3)
@@ -77,17 +74,17 @@ def two_views(kind: str, rng: np.random.Generator, n: int = 40) -> tuple[F64, F6
     return P, X
 
 
-def images(P: F64, X: F64) -> F64:
+def images(P, X):
     return np.stack([project(camera, X) for camera in P])
 
 
-def excess(cost: F64, least: F64) -> float:
+def excess(cost, least):
     """Largest excess of costs over others, less what rounding of distances explains, as a share of them."""
     allowed = 2.0 * np.sqrt(least) * ROUNDING_PX + ROUNDING_PX**2
     return float(np.max((cost - least - allowed) / (least + 1e-300)))
 
 
-def polished(P: F64, X: F64, xy: F64) -> F64:
+def polished(P, X, xy):
     """X after as many descent steps as lower the reprojection error, from X itself."""
     n = xy.shape[1]
     cameras = np.ascontiguousarray(P / np.linalg.norm(P, axis=(1, 2), keepdims=True))
@@ -114,7 +111,7 @@ def test_6_3_3_polynomial_cost_is_the_optimum_in_every_geometry(rng, kind, sigma
         assert excess(many, cost) < RELATIVE
 
 
-def cost_of_planes(P: F64, xy: F64) -> F64:
+def cost_of_planes(P, xy):
     """Least sum of squared distances over a pencil of 4000 epipolar planes, per match."""
     centres = camera_centre(P)
     N = np.linalg.svd(centres / np.linalg.norm(centres, axis=1, keepdims=True))[2][2:]
@@ -185,7 +182,7 @@ def test_6_3_optimal_methods_do_not_depend_on_the_frame_of_space(rng, kind):
     np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-11)
 
 
-def several_views(rng: np.random.Generator, sigma_px: float, n: int = 12) -> tuple[F64, F64]:
+def several_views(rng, sigma_px, n=12):
     """Five cameras about the origin and noisy pixels (5, n, 2), a third of them not seen."""
     P = np.stack([random_camera(rng)[0] for _ in range(5)]) * rng.uniform(0.2, 5.0, (5, 1, 1))
     X = np.column_stack([rng.uniform(-1.0, 1.0, (n, 3)), np.ones(n)])
@@ -322,7 +319,7 @@ def test_what_single_methods_refuse():
     with pytest.raises(ValueError, match="finite cameras"):
         triangulate_midpoint(np.stack([P[0], np.eye(3, 4) * [[1.0], [1.0], [0.0]] + [0, 0, 0, 1.0]]), xy)
     with pytest.raises(ValueError, match="polynomial, linear, midpoint, iterated, optimal"):
-        triangulate(P, xy, method="guess")  # type: ignore[arg-type]
+        triangulate(P, xy, method="guess")
     with pytest.raises(ValueError, match="rank 2"):
         correct_matches(np.outer([1.0, 2.0, 3.0], [2.0, 1.0, 1.0]), *xy)
     with pytest.raises(ValueError, match=r"two \(N, 2\) arrays"):

@@ -1,7 +1,5 @@
 """Section 3.6.3: the trifocal tensor of cameras, its constraints, transfers and linear estimate."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -37,16 +35,16 @@ from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_re
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 
 
-def three_cameras(rng: np.random.Generator) -> np.ndarray:
+def three_cameras(rng):
     return np.stack([random_camera(rng)[0] for _ in range(3)])
 
 
-def seen_points(P: np.ndarray, rng: np.random.Generator, n: int) -> np.ndarray:
+def seen_points(P, rng, n):
     X = rng.uniform(-1.5, 1.5, (n, 3))
     return np.stack([project(camera, X) for camera in P])
 
 
-def seen_segments(P: np.ndarray, rng: np.random.Generator, m: int) -> np.ndarray:
+def seen_segments(P, rng, m):
     """Pieces of lines of space, other pieces in every view."""
     A, B = rng.uniform(-1.5, 1.5, (2, m, 3))
     share = rng.uniform((-0.2, 0.7), (0.3, 1.2), (3, m, 2))[..., None]
@@ -56,7 +54,7 @@ def seen_segments(P: np.ndarray, rng: np.random.Generator, m: int) -> np.ndarray
     )
 
 
-def lines_of(segments: np.ndarray) -> np.ndarray:
+def lines_of(segments):
     return unit_normals(line_through(homogenize(segments[..., 0, :]), homogenize(segments[..., 1, :])))
 
 
@@ -212,7 +210,7 @@ def test_given_epipoles_the_constrained_solution_is_the_tensor_of_the_cameras(rn
     assert gap(conditioned, noisy) < 1e-6
 
 
-def test_wrong_triplets_are_refused() -> None:
+def test_wrong_triplets_are_refused():
     rng = np.random.default_rng(0)
     P = three_cameras(rng)
     points, segments = seen_points(P, rng, 6), seen_segments(P, rng, 3)
@@ -229,7 +227,7 @@ def test_wrong_triplets_are_refused() -> None:
         estimate_tensor_linear(points, segments)
 
 
-def test_coplanar_and_equal_points_are_refused() -> None:
+def test_coplanar_and_equal_points_are_refused():
     rng = np.random.default_rng(1)
     P = three_cameras(rng)
     X = np.column_stack([rng.uniform(-1.5, 1.5, (20, 2)), np.zeros(20)])

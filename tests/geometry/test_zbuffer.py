@@ -1,11 +1,8 @@
 """The z-buffer against rays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from thesisrecon.arrays import F64, I64
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.zbuffer import Raster, rasterize
@@ -14,14 +11,14 @@ K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])
 SIZE = (64, 48)
 
 
-def soup(rng: np.random.Generator, count: int = 60) -> tuple[F64, I64]:
+def soup(rng, count=60):
     """Triangles about (0, 0, 5), some of them large."""
     middle = rng.uniform([-3, -2, 3], [3, 2, 8], (count, 1, 3))
     vertices = (middle + rng.normal(0.0, 0.8, (count, 3, 3))).reshape(-1, 3)
     return vertices, np.arange(3 * count).reshape(-1, 3)
 
 
-def cast_rays(vertices: F64, faces: I64, camera: Camera) -> tuple[F64, I64]:
+def cast_rays(vertices, faces, camera):
     """Depth (H, W) and face by intersecting every ray with every triangle: the plain twin."""
     width, height = camera.size
     y, x = np.mgrid[:height, :width]
@@ -40,7 +37,7 @@ def cast_rays(vertices: F64, faces: I64, camera: Camera) -> tuple[F64, I64]:
     return depth.reshape(height, width), face.reshape(height, width)
 
 
-def camera_at(rng: np.random.Generator, distance: float = 0.0) -> Camera:
+def camera_at(rng, distance=0.0):
     angle = rng.normal(0.0, 0.2, 3)
     turn = np.array([[0, -angle[2], angle[1]], [angle[2], 0, -angle[0]], [-angle[1], angle[0], 0]])
     R = np.linalg.qr(np.eye(3) + turn)[0]
@@ -50,7 +47,7 @@ def camera_at(rng: np.random.Generator, distance: float = 0.0) -> Camera:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("distance", [0.0, -4.5], ids=["before", "within"])
-def test_what_is_seen_is_what_rays_meet(seed: int, distance: float) -> None:
+def test_what_is_seen_is_what_rays_meet(seed, distance):
     rng = np.random.default_rng(seed)
     vertices, faces = soup(rng)
     camera = camera_at(rng, distance)
@@ -64,7 +61,7 @@ def test_what_is_seen_is_what_rays_meet(seed: int, distance: float) -> None:
 
 
 @pytest.mark.parametrize("unit", [2.0**-30, 2.0**30])
-def test_the_unit_of_length_changes_nothing(unit: float) -> None:
+def test_the_unit_of_length_changes_nothing(unit):
     vertices, faces = soup(np.random.default_rng(6))
     camera = camera_at(np.random.default_rng(7), -4.5)
     other = Camera(camera.K, camera.R, unit * camera.t, SIZE)
@@ -74,7 +71,7 @@ def test_the_unit_of_length_changes_nothing(unit: float) -> None:
     np.testing.assert_array_equal(scaled.depth, np.float32(unit) * one.depth)
 
 
-def test_points_are_where_the_corners_say() -> None:
+def test_points_are_where_the_corners_say():
     rng = np.random.default_rng(5)
     vertices, faces = soup(rng)
     camera = camera_at(rng)
@@ -87,7 +84,7 @@ def test_points_are_where_the_corners_say() -> None:
     np.testing.assert_allclose(xyz[:, 2], raster.depth[seen], rtol=1e-4)
 
 
-def test_no_crack_opens_between_faces() -> None:
+def test_no_crack_opens_between_faces():
     rng = np.random.default_rng(2)
     n = 25
     v, u = np.mgrid[:n, :n] / (n - 1.0)
@@ -97,7 +94,7 @@ def test_no_crack_opens_between_faces() -> None:
     assert (rasterize(vertices, faces, Camera(K, np.eye(3), np.zeros(3), SIZE)).face >= 0).all()
 
 
-def test_threads_change_nothing() -> None:
+def test_threads_change_nothing():
     rng = np.random.default_rng(3)
     vertices, faces = soup(rng)
     one, three = (rasterize(vertices, faces, camera_at(np.random.default_rng(1)), threads=n) for n in (1, 3))
@@ -105,7 +102,7 @@ def test_threads_change_nothing() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
 
 
-def test_a_camera_is_that_of_its_matrix() -> None:
+def test_a_camera_is_that_of_its_matrix():
     camera = camera_at(np.random.default_rng(4), 1.0)
     again = Camera.from_matrix(-3.0 * camera.P, SIZE)
     np.testing.assert_allclose(again.P, camera.P, atol=1e-9)

@@ -1,20 +1,16 @@
 """Triangulation in plain NumPy, written for clarity: what the compiled methods are compared with."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import least_squares
 
-from thesisrecon.arrays import F64
 
-
-def reprojection_costs(P: F64, X: F64, xy: F64) -> F64:
+def reprojection_costs(P, X, xy):
     """Sum over the views that see it of squared distances, per point; P (V, 3, 4), X (N, 4), xy (V, N, 2)."""
     xh = np.einsum("vab,nb->vna", P, X)
     return np.asarray(np.nansum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=(0, 2)))
 
 
-def view_scales(P: F64, xy: F64) -> F64:
+def view_scales(P, xy):
     """1 over the norm of M's first two rows, the pixels' origin in the middle of the view's points."""
     middle = np.nanmean(xy, axis=1)
     return np.asarray(
@@ -22,7 +18,7 @@ def view_scales(P: F64, xy: F64) -> F64:
     )
 
 
-def linear_point(P: F64, scale: F64, xy: F64) -> F64:
+def linear_point(P, scale, xy):
     """Least singular vector of the rows of one point; P (V, 3, 4), scale (V,), xy (V, 2)."""
     rows = [
         scale[v] * (xy[v, i] * P[v, 2] - P[v, i])
@@ -33,7 +29,7 @@ def linear_point(P: F64, scale: F64, xy: F64) -> F64:
     return np.asarray(np.linalg.svd(np.array(rows))[2][3])
 
 
-def iterated_point(P: F64, scale: F64, xy: F64, *, passes: int = 10, tolerance: float = 1e-6) -> F64:
+def iterated_point(P, scale, xy, *, passes=10, tolerance=1e-6):
     """Rows over the depths of the pass before, until these rest; else the better of last and first."""
     first = X = linear_point(P, scale, xy)
     before = None
@@ -46,7 +42,7 @@ def iterated_point(P: F64, scale: F64, xy: F64, *, passes: int = 10, tolerance: 
     return X if last < one else first
 
 
-def midpoint(P: F64, xy: F64) -> F64:
+def midpoint(P, xy):
     """Point (3,) nearest to the rays of one point."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for camera, pixel in zip(P, xy, strict=True):
@@ -59,10 +55,10 @@ def midpoint(P: F64, xy: F64) -> F64:
     return np.asarray(np.linalg.solve(A, b))
 
 
-def least_reprojection_cost(P: F64, xy: F64, start: F64) -> float:
+def least_reprojection_cost(P, xy, start):
     """Cost of the least-squares optimum of one point from a finite start (4,)."""
 
-    def residual(x: F64) -> F64:
+    def residual(x):
         xh = P @ np.append(x, 1.0)
         return np.asarray((xh[:, :2] / xh[:, 2:] - xy).ravel())
 
@@ -70,7 +66,7 @@ def least_reprojection_cost(P: F64, xy: F64, start: F64) -> float:
     return float(2.0 * best.cost)
 
 
-def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
+def correct_matches(F, xy1, xy2):
     """Hartley and Sturm's polynomial method step by step: shift, turn, six roots, infinity, feet, back."""
     E1, f = _to_origin_and_axis(xy1, np.linalg.svd(F)[2][2])
     E2, g = _to_origin_and_axis(xy2, np.linalg.svd(F)[0][:, 2])
@@ -87,7 +83,7 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     return feet1, feet2
 
 
-def _to_origin_and_axis(xy: F64, epipole: F64) -> tuple[F64, F64]:
+def _to_origin_and_axis(xy, epipole):
     """Rigid motions (N, 3, 3) that take each point to the origin and the epipole to (1, 0, f); and f (N,)."""
     E, f = np.empty((len(xy), 3, 3)), np.empty(len(xy))
     for n, (x, y) in enumerate(xy):
@@ -98,14 +94,14 @@ def _to_origin_and_axis(xy: F64, epipole: F64) -> tuple[F64, F64]:
     return E, f
 
 
-def _best_parameter(a: float, b: float, c: float, d: float, f: float, g: float) -> tuple[float, float]:
+def _best_parameter(a, b, c, d, f, g):
     """The best stationary point of s(t), homogeneous: (t, 1), or (1, 0) for infinity (methods 6.3.3)."""
     p = np.array([a * a + g * g * c * c, 2 * (a * b + g * g * c * d), b * b + g * g * d * d])
     q, r = np.array([f**4, 0.0, 2 * f**2, 0.0, 1.0]), np.array([a * c, a * d + b * c, b * d])
     polynomial = -(a * d - b * c) * np.convolve(q, r)
     polynomial[1:] += np.append(np.convolve(p, p), 0.0)[:6]
 
-    def cost(t: float) -> float:
+    def cost(t):
         return t**2 / (1 + f**2 * t**2) + (c * t + d) ** 2 / ((a * t + b) ** 2 + g**2 * (c * t + d) ** 2)
 
     candidates = [(cost(t), (float(t), 1.0)) for t in np.roots(polynomial).real]
@@ -115,7 +111,7 @@ def _best_parameter(a: float, b: float, c: float, d: float, f: float, g: float) 
     return min(candidates)[1]
 
 
-def _foot(E: F64, line: F64) -> F64:
+def _foot(E, line):
     """Nearest point of a line to the origin, moved back."""
     u, v, w = line
     back = np.linalg.solve(E, [-u * w, -v * w, u * u + v * v])

@@ -1,10 +1,7 @@
 """Command lines whose answers are one sentence, within bounds of time and memory."""
 
-from __future__ import annotations
-
 import resource
 import signal
-from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -17,10 +14,10 @@ GROWTH_MB = 600
 
 
 @pytest.fixture(autouse=True)
-def bounded() -> Iterator[None]:
+def bounded():
     """Ends what waits for ever, and finds what took more memory than it may."""
 
-    def stop(*_: object) -> None:
+    def stop(*_):
         raise TimeoutError("it waits for something")
 
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -33,10 +30,10 @@ def bounded() -> Iterator[None]:
 
 
 @pytest.fixture
-def told(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def told(capsys):
     """Runs a command line, holds its code and the form of its sentence, and returns that."""
 
-    def run(arguments: list[str], code: int) -> str:
+    def run(arguments, code):
         capsys.readouterr()
         found = run_command(arguments)
         said = capsys.readouterr()
@@ -52,10 +49,10 @@ def told(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 @pytest.fixture
-def validated(capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], str]:
+def validated(capsys):
     """Runs a command of the validation that has to end with exit code 2 before it begins."""
 
-    def run(arguments: list[str]) -> str:
+    def run(arguments):
         assert run_validation(arguments) == 2
         said = capsys.readouterr()
         assert said.out == ""

@@ -1,7 +1,5 @@
 """Files that a careless or ill-meaning hand may leave in a folder, made from nothing and small."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -20,32 +18,32 @@ FEATURES = ["--until", "features", "--threads", "1", "--max-size", "1600"]
 TOO_LONG = "x" * 5000
 
 
-def picture(seed: int = 0, size: tuple[int, int] = (96, 80)) -> PIL.Image.Image:
+def picture(seed=0, size=(96, 80)):
     """A colourful picture without two equal corners."""
     rng = np.random.default_rng(seed)
     coarse = PIL.Image.fromarray(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8))
     return coarse.resize(size, PIL.Image.Resampling.BICUBIC)
 
 
-def encoded(kind: str, image: PIL.Image.Image | None = None, **options: object) -> bytes:
+def encoded(kind, image=None, **options):
     """The bytes of a picture in that format."""
     stream = io.BytesIO()
     (image or picture()).save(stream, kind, **options)
     return stream.getvalue()
 
 
-def png(width: int, height: int, *, pixels: bytes = b"", before: bytes = b"") -> bytes:
+def png(width, height, *, pixels=b"", before=b""):
     """A PNG that claims this size, whatever of its ``pixels`` there is; ``before`` stands ahead of them."""
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     parts = chunk(b"IHDR", header) + before + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + parts
 
 
-def chunk(kind: bytes, data: bytes) -> bytes:
+def chunk(kind, data):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def bomb() -> bytes:
+def bomb():
     """30,000 x 30,000 pixels, of which the first 400 rows are there, in 100 kB."""
     packer, rows = zlib.compressobj(9), bytes(3 * 30_000 + 1) * 100
     data = b"".join(packer.compress(rows) for _ in range(4)) + packer.flush()
@@ -53,7 +51,7 @@ def bomb() -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
-def large_palette() -> bytes:
+def large_palette():
     """10,000 x 8000 pixels of one transparent colour of a palette, in 80 kB."""
     header = struct.pack(">IIBBBBB", 10_000, 8000, 8, 3, 0, 0, 0)
     pixels = _rows_of_nothing(10_001, 8000)
@@ -61,34 +59,34 @@ def large_palette() -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts) + chunk(b"IEND", b"")
 
 
-def _rows_of_nothing(width: int, count: int) -> bytes:
+def _rows_of_nothing(width, count):
     packer = zlib.compressobj(9)
     return b"".join(packer.compress(bytes(width)) for _ in range(count)) + packer.flush()
 
 
-def text_bomb() -> bytes:
+def text_bomb():
     """A good PNG with a note of 256 MiB, packed."""
     note = b"Comment\0\0" + zlib.compress(bytes(2**28), 9)
     whole = encoded("PNG")
     return whole[:33] + chunk(b"zTXt", note) + whole[33:]
 
 
-def writes(content: bytes | str) -> Make:
+def writes(content):
     """The maker of a file of this content."""
     data = content.encode("utf-8") if isinstance(content, str) else content
     return lambda path: path.write_bytes(data)
 
 
-def links(target: str) -> Make:
+def links(target):
     """The maker of a symbolic link; ``{here}`` is the folder it stands in."""
     return lambda path: path.symlink_to(target.format(here=path.parent))
 
 
-def pipe(path: Path) -> None:
+def pipe(path):
     os.mkfifo(path)
 
 
-def listens(path: Path) -> None:
+def listens(path):
     """A socket that nobody listens to any more."""
     with socket.socket(socket.AF_UNIX) as ear:
         # Names of sockets are short.
@@ -100,17 +98,17 @@ def listens(path: Path) -> None:
             os.chdir(here)
 
 
-def sparse(size: int, begin: bytes = b"") -> Make:
+def sparse(size, begin=b""):
     """The maker of a file that claims this size and takes no room."""
 
-    def make(path: Path) -> None:
+    def make(path):
         path.write_bytes(begin)
         os.truncate(path, size)
 
     return make
 
 
-def unreadable(path: Path) -> None:
+def unreadable(path):
     """A file that opens and cannot be read, not even by root."""
     if os.geteuid() == 0:
         path.symlink_to("/proc/self/mem")
@@ -119,11 +117,11 @@ def unreadable(path: Path) -> None:
         path.chmod(0)
 
 
-def deep_json(depth: int = 200_000) -> str:
+def deep_json(depth=200_000):
     return "[" * depth + "]" * depth
 
 
-def glb(header: object, data: bytes = b"") -> bytes:
+def glb(header, data=b""):
     """A GLB of this header and these numbers."""
     told = json.dumps(header).encode()
     told += b" " * (-len(told) % 4)
@@ -133,10 +131,10 @@ def glb(header: object, data: bytes = b"") -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
 
-def triangle(**changes: object) -> tuple[dict[str, object], bytes]:
+def triangle(**changes):
     """The header and the numbers of a GLB of one triangle."""
     data = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + np.arange(3, dtype="<u4").tobytes()
-    header: dict[str, object] = {
+    header = {
         "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -155,12 +153,12 @@ def triangle(**changes: object) -> tuple[dict[str, object], bytes]:
     return header | changes, data
 
 
-def glb_of(told: bytes) -> bytes:
+def glb_of(told):
     """A GLB of this text alone."""
     return struct.pack("<4sIIII", b"glTF", 2, 20 + len(told), len(told), 0x4E4F534A) + told
 
 
-def folder_of(place: Path, name: str) -> Path:
+def folder_of(place, name):
     """A folder of photographs with a snare."""
     folder = place / name
     folder.mkdir()
@@ -168,7 +166,7 @@ def folder_of(place: Path, name: str) -> Path:
     return folder
 
 
-def require_sentence(said: str) -> None:
+def require_sentence(said):
     """One line for a person: no trace, no control characters, not endless."""
     assert said.endswith("\n")
     assert not any(unicodedata.category(c) == "Cc" for c in said[:-1])

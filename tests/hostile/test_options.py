@@ -1,17 +1,12 @@
 """Wishes of the command line that cannot be granted: paths, settings, lists of pairs."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
 from tests.hostile import files
 from tests.hostile.files import links, picture, pipe, sparse, writes
 
 # The words of a command in a folder that has photographs in ``in``; what is said.
-WISHES: list[tuple[str, list[str], Callable[[Path], object], str]] = [
+WISHES = [
     ("images too long", [files.TOO_LONG, "-o", "out"], lambda _: None, "File name too long"),
     ("images round", ["round", "-o", "out"], lambda p: links("{here}/round")(p / "round"), "round"),
     ("images a pipe", ["pipe", "-o", "out"], lambda p: pipe(p / "pipe"), "is not a folder"),
@@ -52,14 +47,7 @@ WISHES: list[tuple[str, list[str], Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("arguments", "make", "words"), [w[1:] for w in WISHES], ids=[w[0] for w in WISHES])
-def test_wishes_that_cannot_be_granted(
-    arguments: list[str],
-    make: Callable[[Path], object],
-    words: str,
-    tmp_path: Path,
-    told: Callable[..., str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_wishes_that_cannot_be_granted(arguments, make, words, tmp_path, told, monkeypatch):
     files.folder_of(tmp_path, "in")
     make(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -68,7 +56,7 @@ def test_wishes_that_cannot_be_granted(
     assert not (tmp_path / "elsewhere").exists()
 
 
-CONFIGS: list[tuple[str, str | bytes]] = [
+CONFIGS = [
     ("features = 3", "takes a table"),
     ("features = [1, 2]", "takes a table"),
     ("[[features]]\nlevels = 1", "takes a table"),
@@ -98,9 +86,7 @@ CONFIGS: list[tuple[str, str | bytes]] = [
 
 
 @pytest.mark.parametrize(("text", "words"), CONFIGS, ids=[str(k) for k in range(len(CONFIGS))])
-def test_settings_of_wrong_types(
-    text: str | bytes, words: str, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_settings_of_wrong_types(text, words, tmp_path, told):
     folder = files.folder_of(tmp_path, "in")
     writes(text)(tmp_path / "c.toml")
     out = tmp_path / "out"
@@ -109,7 +95,7 @@ def test_settings_of_wrong_types(
     assert not out.exists()
 
 
-PAIRS: list[tuple[str, str | bytes]] = [
+PAIRS = [
     ("line 1 of", b"\0\0\0"),
     ("not a UTF-8 text", b"\xff\xfe\0"),
     ("line 1 of", "a.png " * 100_000),
@@ -122,9 +108,7 @@ PAIRS: list[tuple[str, str | bytes]] = [
 
 
 @pytest.mark.parametrize(("words", "text"), PAIRS, ids=[str(k) for k in range(len(PAIRS))])
-def test_lists_of_pairs_that_are_none(
-    words: str, text: str | bytes, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_lists_of_pairs_that_are_none(words, text, tmp_path, told):
     folder = files.folder_of(tmp_path, "in")
     (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
     writes(text)(tmp_path / "pairs.txt")
@@ -137,5 +121,5 @@ def test_lists_of_pairs_that_are_none(
     [("/dev/null", "cannot be written"), (files.TOO_LONG, "File name too long"), (" ", "has no name")],
     ids=["device", "too long", "nothing"],
 )
-def test_the_demo_is_as_careful(out: str, words: str, told: Callable[..., str]) -> None:
+def test_the_demo_is_as_careful(out, words, told):
     assert words in told(["demo", "-o", out], 2)

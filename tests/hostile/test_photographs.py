@@ -1,14 +1,9 @@
 """Hostile and odd photographs through the command line: refused in one sentence, or read in spite of all."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
 import unicodedata
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -19,7 +14,7 @@ from tests.hostile import files
 from tests.hostile.files import FEATURES, links, picture, pipe, sparse, writes
 
 # Photographs that are none: name, how it is made, what is said of it.
-NO_PHOTOGRAPHS: list[tuple[str, files.Make, str]] = [
+NO_PHOTOGRAPHS = [
     ("gone.png", links("{here}/nowhere.png"), "cannot be read: No such file"),
     ("round.png", links("{here}/round.png"), "cannot be read: Too many levels of symbolic links"),
     ("pipe.jpg", pipe, "is a pipe, a device or a socket"),
@@ -55,9 +50,7 @@ NO_PHOTOGRAPHS: list[tuple[str, files.Make, str]] = [
 
 
 @pytest.mark.parametrize(("name", "make", "words"), NO_PHOTOGRAPHS, ids=[name for name, *_ in NO_PHOTOGRAPHS])
-def test_what_is_no_photograph_is_refused(
-    name: str, make: files.Make, words: str, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_what_is_no_photograph_is_refused(name, make, words, tmp_path, told):
     (tmp_path / "in").mkdir()
     make(tmp_path / "in" / name)
     said = told(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
@@ -67,7 +60,7 @@ def test_what_is_no_photograph_is_refused(
     assert [entry["name"] for entry in summary["refused"]] == [name]
 
 
-def test_a_picture_below_the_limit_is_held_once(tmp_path: Path, told: Callable[..., str]) -> None:
+def test_a_picture_below_the_limit_is_held_once(tmp_path, told):
     """80 megapixels of one byte each; as colours with alpha they would take 320 MB, several times over."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "large.png").write_bytes(files.large_palette())
@@ -77,27 +70,27 @@ def test_a_picture_below_the_limit_is_held_once(tmp_path: Path, told: Callable[.
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 250 * 2**10
 
 
-def with_exif(data: bytes) -> bytes:
+def with_exif(data):
     return files.encoded("JPEG", exif=b"Exif\0\0" + data)
 
 
-def animated() -> bytes:
+def animated():
     return files.encoded("GIF", save_all=True, append_images=[picture(k) for k in range(1, 5)])
 
 
-def with_nan() -> bytes:
+def with_nan():
     values = np.asarray(picture().convert("L")).astype(np.float32)
     values[::7] = np.nan
     values[3, 3], values[4, 4] = np.inf, -np.inf
     return files.encoded("TIFF", PIL.Image.fromarray(values))
 
 
-def sixteen_bits() -> bytes:
+def sixteen_bits():
     grey = np.asarray(picture().convert("L")).astype(np.uint16) * 257
     return files.encoded("PNG", PIL.Image.fromarray(grey))
 
 
-def wrong_focal(value: object) -> bytes:
+def wrong_focal(value):
     exif = PIL.Image.Exif()
     exif[0x8769] = {0xA405: value}
     return files.encoded("JPEG", exif=exif)
@@ -107,7 +100,7 @@ PROFILE = PIL.ImageCms.ImageCmsProfile(PIL.ImageCms.createProfile("LAB")).tobyte
 
 
 # What looks odd and is a photograph.
-PHOTOGRAPHS: list[tuple[str, bytes]] = [
+PHOTOGRAPHS = [
     ("sixteen bits.png", sixteen_bits()),
     ("cmyk.jpg", files.encoded("JPEG", picture().convert("CMYK"))),
     ("palette.png", files.encoded("PNG", picture().convert("P"))),
@@ -131,9 +124,7 @@ PHOTOGRAPHS: list[tuple[str, bytes]] = [
 
 
 @pytest.mark.parametrize(("name", "content"), PHOTOGRAPHS, ids=[name for name, _ in PHOTOGRAPHS])
-def test_odd_photographs_are_read(
-    name: str, content: bytes, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_odd_photographs_are_read(name, content, tmp_path, told):
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / name).write_bytes(content)
     wish = ["--set", "intrinsics.exif=true", "--set", "intrinsics.focal_std_rel=0.1"]
@@ -141,9 +132,7 @@ def test_odd_photographs_are_read(
     assert "corners in 1 photograph" in said or "1 of 1 photograph read" in said
 
 
-def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(
-    tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, told):
     folder = files.folder_of(tmp_path, "in")
     (tmp_path / "outside.png").write_bytes(files.encoded("PNG", picture(1)))
     (folder / "b.png").symlink_to(tmp_path / "outside.png")
@@ -161,7 +150,7 @@ def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(
     assert "folders in it are not searched" in said
 
 
-def test_thousands_of_tiny_files_are_one_sentence(tmp_path: Path, told: Callable[..., str]) -> None:
+def test_thousands_of_tiny_files_are_one_sentence(tmp_path, told):
     (tmp_path / "in").mkdir()
     tiny = files.encoded("PNG", picture(size=(8, 8)))
     for k in range(2000):
@@ -171,15 +160,13 @@ def test_thousands_of_tiny_files_are_one_sentence(tmp_path: Path, told: Callable
     assert "and 1997 more" in said
 
 
-def test_a_file_that_vanishes_while_others_are_read(
-    tmp_path: Path, told: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_vanishes_while_others_are_read(tmp_path, told, monkeypatch):
     folder = files.folder_of(tmp_path, "in")
     for k in range(3):
         (folder / f"b{k}.png").write_bytes(files.encoded("PNG", picture(k + 1)))
     opened = PIL.Image.open
 
-    def open_and_take_away(file: Any, **options: Any) -> Any:
+    def open_and_take_away(file, **options):
         (folder / "b1.png").unlink(missing_ok=True)
         return opened(file, **options)
 
@@ -189,7 +176,7 @@ def test_a_file_that_vanishes_while_others_are_read(
     assert "in 3 photographs" in said
 
 
-NAMES: list[str] = [
+NAMES = [
     "<img src=x onerror=alert(1)>.png",
     "\"'><script>alert(2)<\u2215script>.png",
     "{{ 7 * 7 }} %s %n $(id) `id` ;&|.png",
@@ -209,7 +196,7 @@ NAMES: list[str] = [
 ]
 
 
-def test_names_are_told_apart_and_shown_in_one_line(tmp_path: Path, told: Callable[..., str]) -> None:
+def test_names_are_told_apart_and_shown_in_one_line(tmp_path, told):
     (tmp_path / "in").mkdir()
     for k, name in enumerate(NAMES):
         (tmp_path / "in" / name).write_bytes(files.encoded("PNG", picture(k)))

@@ -1,13 +1,10 @@
 """Run folders that are damaged, of another version, or laid as a snare."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +16,7 @@ from tests.hostile.files import FEATURES, links, pipe, sparse, writes
 CHANGED = "01-features/00000.npz was damaged or changed by another program, and is computed again"
 
 
-def finished_run(tmp_path: Path, told: Callable[..., str]) -> tuple[list[str], Path]:
+def finished_run(tmp_path, told):
     """A command that was carried out, and its folder."""
     out = tmp_path / "out"
     command = ["reconstruct", str(files.folder_of(tmp_path, "in")), "-o", str(out), *FEATURES]
@@ -27,21 +24,21 @@ def finished_run(tmp_path: Path, told: Callable[..., str]) -> tuple[list[str], P
     return command, out
 
 
-def pickled(path: Path) -> None:
+def pickled(path):
     """An npz whose description runs a program when it is unpickled."""
 
     class Snare:
-        def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        def __reduce__(self):
             return os.system, (f"touch {path.parent / 'sprung'}",)
 
     np.savez(path, description=np.array([Snare()], dtype=object))
 
 
-def packed_bomb(path: Path) -> None:
+def packed_bomb(path):
     np.savez_compressed(path, description=np.zeros(2**27, np.uint8))
 
 
-RECORDS: list[tuple[str, files.Make]] = [
+RECORDS = [
     ("pickle", pickled),
     ("packed", packed_bomb),
     ("empty", writes(b"")),
@@ -55,10 +52,10 @@ RECORDS: list[tuple[str, files.Make]] = [
 ]
 
 
-def rewritten(change: Callable[[dict[str, np.ndarray]], object]) -> Callable[[Path], None]:
+def rewritten(change):
     """A record as another program writes it that has changed its arrays: a good npz."""
 
-    def make(path: Path) -> None:
+    def make(path):
         with np.load(path) as file:
             arrays = {name: file[name].copy() for name in file.files}
         change(arrays)
@@ -68,7 +65,7 @@ def rewritten(change: Callable[[dict[str, np.ndarray]], object]) -> Callable[[Pa
     return make
 
 
-REWRITTEN: list[tuple[str, Callable[[Path], None]]] = [
+REWRITTEN = [
     ("NaN", rewritten(lambda arrays: arrays["array0"].fill(np.nan))),
     ("far outside", rewritten(lambda arrays: arrays["array0"].fill(1e9))),
     ("no corners", rewritten(lambda arrays: arrays.update(array0=arrays["array0"][:0]))),
@@ -78,9 +75,7 @@ REWRITTEN: list[tuple[str, Callable[[Path], None]]] = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in RECORDS], ids=[name for name, _ in RECORDS])
-def test_a_record_that_is_none_is_computed_again_or_refused(
-    make: files.Make, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_a_record_that_is_none_is_computed_again_or_refused(make, tmp_path, told):
     command, out = finished_run(tmp_path, told)
     (record,) = (out / "01-features").glob("*.npz")
     whole = record.read_bytes()
@@ -96,9 +91,7 @@ def test_a_record_that_is_none_is_computed_again_or_refused(
 
 
 @pytest.mark.parametrize("make", [make for _, make in REWRITTEN], ids=[name for name, _ in REWRITTEN])
-def test_a_record_that_another_program_wrote_is_computed_again(
-    make: Callable[[Path], None], tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_a_record_that_another_program_wrote_is_computed_again(make, tmp_path, told):
     command, out = finished_run(tmp_path, told)
     (record,) = (out / "01-features").glob("*.npz")
     whole = record.read_bytes()
@@ -109,8 +102,8 @@ def test_a_record_that_another_program_wrote_is_computed_again(
     assert CHANGED in json.loads((out / "summary.json").read_text(encoding="utf-8"))["warnings"]
 
 
-def manifest(report: object) -> Callable[[Path], None]:
-    def make(path: Path) -> None:
+def manifest(report):
+    def make(path):
         content = json.loads(path.read_text(encoding="utf-8"))
         path.write_text(json.dumps({**content, "report": report}), encoding="utf-8")
 
@@ -118,7 +111,7 @@ def manifest(report: object) -> Callable[[Path], None]:
 
 
 GOOD_REPORT = {"stage": "features", "seconds": 1.0, "counts": {}, "metrics": {}, "warnings": []}
-MANIFESTS: list[tuple[str, Callable[[Path], object]]] = [
+MANIFESTS = [
     ("deep", writes(files.deep_json())),
     ("list", writes("[]")),
     ("no report", manifest(None)),
@@ -131,9 +124,7 @@ MANIFESTS: list[tuple[str, Callable[[Path], object]]] = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in MANIFESTS], ids=[name for name, _ in MANIFESTS])
-def test_a_manifest_that_is_none_is_written_again(
-    make: Callable[[Path], object], tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_a_manifest_that_is_none_is_written_again(make, tmp_path, told):
     command, out = finished_run(tmp_path, told)
     make(out / "01-features" / "manifest.json")
     told(command, 0)
@@ -142,7 +133,7 @@ def test_a_manifest_that_is_none_is_written_again(
     assert isinstance(report["seconds"], float)
 
 
-RUN_FILES: list[tuple[str, files.Make, str]] = [
+RUN_FILES = [
     ("another version", writes('{"version": 2, "seed": 0}'), "version was 2 there and is 1 here"),
     ("a list", writes("[1, 2]"), "holds another run"),
     ("wrong types", writes('{"version": 1, "seed": {}, "settings": []}'), "seed was {} there"),
@@ -151,9 +142,7 @@ RUN_FILES: list[tuple[str, files.Make, str]] = [
 
 
 @pytest.mark.parametrize(("make", "words"), [r[1:] for r in RUN_FILES], ids=[r[0] for r in RUN_FILES])
-def test_the_folder_of_another_version(
-    make: files.Make, words: str, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_the_folder_of_another_version(make, words, tmp_path, told):
     folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
     out.mkdir()
     make(out / "run.json")
@@ -165,9 +154,7 @@ def test_the_folder_of_another_version(
 
 
 @pytest.mark.parametrize("make", [pipe, links("/dev/zero"), writes(files.deep_json()), sparse(10**13)])
-def test_a_run_file_that_is_none_is_another_run(
-    make: files.Make, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_a_run_file_that_is_none_is_another_run(make, tmp_path, told):
     """What names no run may be replaced: nothing of a run stands beside it."""
     folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
     out.mkdir()
@@ -176,7 +163,7 @@ def test_a_run_file_that_is_none_is_another_run(
     assert json.loads((out / "run.json").read_text(encoding="utf-8"))["seed"] == 0
 
 
-def test_nothing_is_written_through_the_links_of_a_folder(tmp_path: Path, told: Callable[..., str]) -> None:
+def test_nothing_is_written_through_the_links_of_a_folder(tmp_path, told):
     """A folder from elsewhere may hold links where files are begun or stand when they are whole."""
     command, out = finished_run(tmp_path, told)
     victim = tmp_path / "letter.txt"
@@ -193,8 +180,8 @@ def test_nothing_is_written_through_the_links_of_a_folder(tmp_path: Path, told: 
     assert not any(path.is_symlink() for path in out.rglob("*.*"))
 
 
-def summary_of_run(**changes: object) -> str:
-    whole: dict[str, object] = {
+def summary_of_run(**changes):
+    whole = {
         "images": 2, "registered": 2, "points": 9, "stratum": "metric", "reprojection_rms_px": 0.1,
         "reprojection_median_px": 0.1, "cameras": [], "refused": [], "warnings": [], "failure": "",
         "pairs": {"matched": 1, "accepted": 1, "verified_matches": 9}, "resumed": [],
@@ -203,7 +190,7 @@ def summary_of_run(**changes: object) -> str:
     return json.dumps(whole | changes)
 
 
-SUMMARIES: list[tuple[str, files.Make, str]] = [
+SUMMARIES = [
     ("absent", lambda _: None, "holds no summary of a run"),
     ("pipe", pipe, "holds no summary of a run"),
     ("device", links("/dev/zero"), "holds no summary of a run"),
@@ -223,14 +210,12 @@ SUMMARIES: list[tuple[str, files.Make, str]] = [
 
 
 @pytest.mark.parametrize(("make", "words"), [s[1:] for s in SUMMARIES], ids=[s[0] for s in SUMMARIES])
-def test_inspect_refuses_what_is_no_summary(
-    make: files.Make, words: str, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_inspect_refuses_what_is_no_summary(make, words, tmp_path, told):
     make(tmp_path / "summary.json")
     assert words in told(["inspect", str(tmp_path)], 2)
 
 
-def test_inspect_lets_nothing_through_to_the_terminal(tmp_path: Path, told: Callable[..., str]) -> None:
+def test_inspect_lets_nothing_through_to_the_terminal(tmp_path, told):
     warnings = ["\x1b]0;title\x07", "two\nlines", "\ud800", "\u202eturned"]
     (tmp_path / "summary.json").write_text(summary_of_run(warnings=warnings), encoding="utf-8")
     said = told(["inspect", str(tmp_path)], 0).splitlines()
@@ -250,7 +235,7 @@ def test_inspect_lets_nothing_through_to_the_terminal(tmp_path: Path, told: Call
         (["views", "in"], 2),
     ],
 )
-def test_programs_of_their_own_end_so_too(arguments: list[str], code: int, tmp_path: Path) -> None:
+def test_programs_of_their_own_end_so_too(arguments, code, tmp_path):
     """With an address space of 6 GiB, and another alphabet on the terminal."""
     folder = tmp_path / "in"
     folder.mkdir()

@@ -1,10 +1,6 @@
 """The validation beside COLMAP models, cameras, reports and studies that are damaged."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +12,7 @@ from tests.io.test_colmap import _plain_names
 from thesisrecon.io.colmap_files import write_colmap_model
 
 
-def own_scene(tmp_path: Path, *, binary: bool) -> Path:
+def own_scene(tmp_path, *, binary):
     """Photographs with a COLMAP model as their truth."""
     model = _plain_names(SMALL_MODEL)
     write_colmap_model(tmp_path / "in" / "sparse" / "0", model, binary=binary)
@@ -26,9 +22,7 @@ def own_scene(tmp_path: Path, *, binary: bool) -> Path:
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_binary_model_that_is_cut_anywhere_is_refused(
-    name: str, tmp_path: Path, validated: Callable[[list[str]], str]
-) -> None:
+def test_a_binary_model_that_is_cut_anywhere_is_refused(name, tmp_path, validated):
     """At every hundredth byte."""
     folder = own_scene(tmp_path, binary=True)
     path = folder / "sparse" / "0" / f"{name}.bin"
@@ -41,7 +35,7 @@ def test_a_binary_model_that_is_cut_anywhere_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-TEXTS: list[tuple[str, str, str, str]] = [
+TEXTS = [
     ("cameras", " 600 ", " nan ", "a parameter that is not a finite number"),
     ("cameras", " 600 ", " -inf ", "a parameter that is not a finite number"),
     ("cameras", "SIMPLE_PINHOLE", "<script>", "has the unknown camera model '<script>'"),
@@ -55,9 +49,7 @@ TEXTS: list[tuple[str, str, str, str]] = [
 
 
 @pytest.mark.parametrize(("name", "old", "new", "words"), TEXTS, ids=[str(k) for k in range(len(TEXTS))])
-def test_a_text_model_of_wrong_numbers_is_refused(
-    name: str, old: str, new: str, words: str, tmp_path: Path, validated: Callable[[list[str]], str]
-) -> None:
+def test_a_text_model_of_wrong_numbers_is_refused(name, old, new, words, tmp_path, validated):
     folder = own_scene(tmp_path, binary=False)
     path = folder / "sparse" / "0" / f"{name}.txt"
     text = path.read_text(encoding="utf-8")
@@ -71,9 +63,7 @@ TRUTHS += [json.dumps({"cameras": {"a.png": {"K": [[1]], "R": np.eye(3).tolist()
 
 
 @pytest.mark.parametrize("text", TRUTHS, ids=[str(k) for k in range(len(TRUTHS))])
-def test_a_truth_of_wrong_types_is_refused(
-    text: str, tmp_path: Path, validated: Callable[[list[str]], str]
-) -> None:
+def test_a_truth_of_wrong_types_is_refused(text, tmp_path, validated):
     files.folder_of(tmp_path, "images")
     (tmp_path / "cameras.json").write_text(text, encoding="utf-8")
     said = validated(["report", "-o", str(tmp_path / "out"), "--images", str(tmp_path)])
@@ -81,15 +71,13 @@ def test_a_truth_of_wrong_types_is_refused(
 
 
 @pytest.mark.parametrize("make", [pipe, links("/dev/zero"), sparse(10**13), writes(files.deep_json())])
-def test_a_report_to_compare_with_that_is_none(
-    make: files.Make, tmp_path: Path, validated: Callable[[list[str]], str]
-) -> None:
+def test_a_report_to_compare_with_that_is_none(make, tmp_path, validated):
     make(tmp_path / "results.json")
     command = ["report", "-o", str(tmp_path / "out"), "--against", str(tmp_path)]
     assert "holds no report to compare with" in validated(command)
 
 
-STUDIES: list[tuple[files.Make, str]] = [
+STUDIES = [
     (pipe, "cannot be read: it is a pipe"),
     (links("/dev/zero"), "cannot be read: it is a pipe, a device"),
     (sparse(10**13), "cannot be read: it is larger"),
@@ -103,9 +91,7 @@ STUDIES: list[tuple[files.Make, str]] = [
 
 
 @pytest.mark.parametrize(("make", "words"), STUDIES, ids=[str(k) for k in range(len(STUDIES))])
-def test_a_study_that_is_none(
-    make: files.Make, words: str, tmp_path: Path, validated: Callable[[list[str]], str]
-) -> None:
+def test_a_study_that_is_none(make, words, tmp_path, validated):
     make(tmp_path / "study.toml")
     command = ["ablate", str(tmp_path / "study.toml"), "-o", str(tmp_path / "out"), "--plan"]
     assert words in validated(command)

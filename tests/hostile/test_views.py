@@ -1,10 +1,6 @@
 """``thesisrecon views`` of models, cameras and photographs that are none."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,17 +8,17 @@ import pytest
 from tests.hostile import files
 from tests.hostile.files import links, picture, pipe, sparse, writes
 
-CAMERA: dict[str, object] = {
+CAMERA = {
     "name": "a.png", "width": 160, "height": 120, "K": [[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]],
     "R": np.eye(3).tolist(), "t": [0.0, 0.0, 3.0],
 }  # fmt: skip
 
 
-def camera(**changes: object) -> files.Make:
+def camera(**changes):
     return writes(json.dumps({"cameras": [CAMERA | changes]}))
 
 
-NO_CAMERAS: list[tuple[str, files.Make]] = [
+NO_CAMERAS = [
     ("pipe", pipe),
     ("device", links("/dev/zero")),
     ("deep", writes(files.deep_json())),
@@ -45,9 +41,7 @@ NO_CAMERAS: list[tuple[str, files.Make]] = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in NO_CAMERAS], ids=[name for name, _ in NO_CAMERAS])
-def test_views_refuses_what_are_no_cameras(
-    make: files.Make, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_views_refuses_what_are_no_cameras(make, tmp_path, told):
     (tmp_path / "model.glb").write_bytes(files.glb(*files.triangle()))
     make(tmp_path / "cameras.json")
     said = told(["views", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
@@ -55,7 +49,7 @@ def test_views_refuses_what_are_no_cameras(
     assert not (tmp_path / "views").exists()
 
 
-def numbered(values: object, **changes: object) -> bytes:
+def numbered(values, **changes):
     """A triangle whose corners or faces are these numbers."""
     header, data = files.triangle(**changes)
     array = np.asarray(values)
@@ -64,23 +58,23 @@ def numbered(values: object, **changes: object) -> bytes:
     )
 
 
-def textured(blob: bytes) -> bytes:
+def textured(blob):
     header, data = files.triangle(
         images=[{"bufferView": 2, "mimeType": "image/png"}],
         textures=[{"source": 0}],
         materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
     )
-    header["bufferViews"] += [{"buffer": 0, "byteOffset": 48, "byteLength": len(blob)}]  # type: ignore[operator]
+    header["bufferViews"] += [{"buffer": 0, "byteOffset": 48, "byteLength": len(blob)}]
     header["buffers"] = [{"byteLength": 48 + len(blob)}]
     return files.glb(header, data + blob)
 
 
-def changed(**changes: object) -> bytes:
+def changed(**changes):
     return files.glb(*files.triangle(**changes))
 
 
 ACCESSOR = {"componentType": 5126, "type": "VEC3"}
-NO_MODELS: list[tuple[str, files.Make, str]] = [
+NO_MODELS = [
     ("device", links("/dev/zero"), "no model yet"),
     ("10 TiB", sparse(10**13, b"glTF"), "is larger than"),
     ("text", writes("dear reader, dear reader"), "it is no GLB"),
@@ -95,11 +89,7 @@ NO_MODELS: list[tuple[str, files.Make, str]] = [
     ("a file", writes(changed(buffers=[{"uri": "/etc/passwd", "byteLength": 48}])), "it names another file"),
     ("a picture", writes(changed(images=[{"uri": "/dev/zero"}])), "it names another file"),
     ("no view", writes(changed(accessors=[ACCESSOR | {"count": 10}])), "it claims 10 numbers in"),
-    (
-        "count",
-        writes(changed(accessors=[ACCESSOR | {"count": 10**12, "bufferView": 0}])),
-        "it claims 10000",
-    ),
+    ("count", writes(changed(accessors=[ACCESSOR | {"count": 10**12, "bufferView": 0}])), "it claims 10000"),
     ("count in words", writes(changed(accessors=[ACCESSOR | {"count": "many"}])), "it claims many numbers"),
     ("itself", writes(changed(nodes=[{"children": [0], "mesh": 0}])), "its nodes hold each other"),
     ("circle", writes(changed(nodes=[{"children": [1]}, {"children": [0]}])), "its nodes hold each other"),
@@ -113,9 +103,7 @@ NO_MODELS: list[tuple[str, files.Make, str]] = [
 
 
 @pytest.mark.parametrize(("make", "words"), [m[1:] for m in NO_MODELS], ids=[m[0] for m in NO_MODELS])
-def test_views_refuses_what_is_no_model(
-    make: files.Make, words: str, tmp_path: Path, told: Callable[..., str]
-) -> None:
+def test_views_refuses_what_is_no_model(make, words, tmp_path, told):
     make(tmp_path / "model.glb")
     camera()(tmp_path / "cameras.json")
     said = told(["views", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
@@ -124,7 +112,7 @@ def test_views_refuses_what_is_no_model(
     assert not (tmp_path / "views").exists()
 
 
-BETWEEN: list[tuple[str, list[str], int, str]] = [
+BETWEEN = [
     ("device", ["/dev/zero", "a.png"], 2, "there is no photograph /dev/zero"),
     ("pipe", ["pipe.png", "a.png"], 2, "there is no photograph"),
     ("round", ["round.png", "a.png"], 2, "there is no photograph"),
@@ -138,14 +126,7 @@ BETWEEN: list[tuple[str, list[str], int, str]] = [
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [b[1:] for b in BETWEEN], ids=[b[0] for b in BETWEEN])
-def test_views_between_what_is_no_photograph(
-    words: list[str],
-    code: int,
-    said: str,
-    tmp_path: Path,
-    told: Callable[..., str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_views_between_what_is_no_photograph(words, code, said, tmp_path, told, monkeypatch):
     folder = files.folder_of(tmp_path, "in")
     (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
     (folder / "bomb.png").write_bytes(files.png(30_000, 30_000))

@@ -1,9 +1,6 @@
 """``cameras.json`` read again."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,13 +20,13 @@ ONE = {
 }
 
 
-def written(folder: Path, content: object) -> Path:
+def written(folder, content):
     path = folder / "cameras.json"
     path.write_text(json.dumps(content), encoding="utf-8")
     return path
 
 
-def test_cameras_are_those_of_the_file_in_its_order(tmp_path: Path) -> None:
+def test_cameras_are_those_of_the_file_in_its_order(tmp_path):
     cameras = read_cameras(written(tmp_path, {"cameras": [{**ONE, "name": "b.jpg"}, ONE]}))
     assert list(cameras) == ["b.jpg", "a.jpg"]
     assert cameras["a.jpg"].size == (160, 120)
@@ -49,12 +46,12 @@ def test_cameras_are_those_of_the_file_in_its_order(tmp_path: Path) -> None:
         ("text", "does not hold cameras"),
     ],
 )
-def test_other_files_are_told_in_a_sentence(content: object, words: str, tmp_path: Path) -> None:
+def test_other_files_are_told_in_a_sentence(content, words, tmp_path):
     with pytest.raises(UsageError, match=words):
         read_cameras(written(tmp_path, content))
 
 
-def test_an_absent_or_damaged_file_is_told(tmp_path: Path) -> None:
+def test_an_absent_or_damaged_file_is_told(tmp_path):
     with pytest.raises(UsageError, match=r"there is no cameras\.json"):
         read_cameras(tmp_path / "cameras.json")
     (tmp_path / "cameras.json").write_text("{", encoding="utf-8")

@@ -1,8 +1,5 @@
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +19,7 @@ NAMES = ["a b.jpg", "böld.jpg", "c.jpg", "d.jpg", "e.jpg"]
 SIZE = (512, 384)
 
 
-def _scene(*, k1: float = 0.0, aspect: float = 1.0, noise_px: float = 0.3) -> Reconstruction:
+def _scene(*, k1=0.0, aspect=1.0, noise_px=0.3):
     """Five views of forty points; view 3 is not registered, every ninth point not valid, some outliers."""
     rng = np.random.default_rng(5)
     X = np.column_stack([rng.uniform(-1, 1, (N, 3)), np.ones(N)])
@@ -55,7 +52,7 @@ def _scene(*, k1: float = 0.0, aspect: float = 1.0, noise_px: float = 0.3) -> Re
     )
 
 
-def _export(reconstruction: Reconstruction, *, scales: np.ndarray | None = None) -> ColmapModel:
+def _export(reconstruction, *, scales=None):
     return colmap_from_reconstruction(
         reconstruction,
         NAMES,
@@ -65,7 +62,7 @@ def _export(reconstruction: Reconstruction, *, scales: np.ndarray | None = None)
     )
 
 
-def _plain_names(model: ColmapModel) -> ColmapModel:
+def _plain_names(model):
     images = tuple(replace(image, name=image.name.replace(" ", "_")) for image in model.images)
     return replace(model, images=images)
 
@@ -81,9 +78,7 @@ def _plain_names(model: ColmapModel) -> ColmapModel:
 )
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize("scale", [(1.0, 1.0), (2.0, 2.0), (1.5, 1.4987)])
-def test_pycolmap_projects_as_we_do(
-    tmp_path: Path, k1: float, aspect: float, kind: str, binary: bool, scale: tuple[float, float]
-) -> None:
+def test_pycolmap_projects_as_we_do(tmp_path, k1, aspect, kind, binary, scale):
     pycolmap = pytest.importorskip("pycolmap")
     ours = _scene(k1=k1, aspect=aspect)
     model = _plain_names(_export(ours, scales=np.tile(scale, (V, 1))))
@@ -117,7 +112,7 @@ def test_pycolmap_projects_as_we_do(
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_round_trip_keeps_every_byte(tmp_path: Path, binary: bool) -> None:
+def test_round_trip_keeps_every_byte(tmp_path, binary):
     model = _plain_names(_export(_scene(k1=0.05)))
     write_colmap_model(tmp_path / "first", model, binary=binary)
     write_colmap_model(tmp_path / "second", read_colmap_model(tmp_path / "first"), binary=binary)
@@ -127,7 +122,7 @@ def test_round_trip_keeps_every_byte(tmp_path: Path, binary: bool) -> None:
     assert len(first) == 5
 
 
-def test_binary_and_text_hold_the_same_model(tmp_path: Path) -> None:
+def test_binary_and_text_hold_the_same_model(tmp_path):
     model = _plain_names(_export(_scene(k1=0.05)))
     write_colmap_model(tmp_path / "text", model, binary=False)
     write_colmap_model(tmp_path / "direct", model)
@@ -137,7 +132,7 @@ def test_binary_and_text_hold_the_same_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_files_of_pycolmap_are_read_and_written_back_alike(tmp_path: Path, binary: bool) -> None:
+def test_files_of_pycolmap_are_read_and_written_back_alike(tmp_path, binary):
     pycolmap = pytest.importorskip("pycolmap")
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=2,
@@ -160,7 +155,7 @@ def test_files_of_pycolmap_are_read_and_written_back_alike(tmp_path: Path, binar
         assert (tmp_path / "ours" / name).read_bytes() == (tmp_path / "theirs" / name).read_bytes()
 
 
-def test_images_that_share_a_rig_are_read_with_their_whole_poses(tmp_path: Path) -> None:
+def test_images_that_share_a_rig_are_read_with_their_whole_poses(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     theirs = pycolmap.synthesize_dataset(
         pycolmap.SyntheticDatasetOptions(
@@ -175,7 +170,7 @@ def test_images_that_share_a_rig_are_read_with_their_whole_poses(tmp_path: Path)
         np.testing.assert_allclose(pose, image.cam_from_world().matrix(), atol=1e-9)
 
 
-def test_folder_without_rigs_and_frames_is_read(tmp_path: Path) -> None:
+def test_folder_without_rigs_and_frames_is_read(tmp_path):
     model = _export(_scene())
     write_colmap_model(tmp_path, model)
     whole = read_colmap_model(tmp_path)
@@ -186,7 +181,7 @@ def test_folder_without_rigs_and_frames_is_read(tmp_path: Path) -> None:
     assert [image.name for image in old.images] == [NAMES[i] for i in (0, 1, 2, 4)]
 
 
-def test_import_gives_back_what_was_exported(tmp_path: Path) -> None:
+def test_import_gives_back_what_was_exported(tmp_path):
     ours = _scene(k1=-0.08)
     write_colmap_model(tmp_path, _export(ours))
     back = reconstruction_from_colmap(read_colmap_model(tmp_path), names=NAMES)
@@ -208,7 +203,7 @@ def test_import_gives_back_what_was_exported(tmp_path: Path) -> None:
     assert (np.diff(keys) > 0).all()
 
 
-def test_views_of_a_group_share_a_camera_only_where_their_intrinsics_agree() -> None:
+def test_views_of_a_group_share_a_camera_only_where_their_intrinsics_agree():
     ours = _scene()
     assert len(_export(ours).cameras) == 1
     assert ours.K is not None
@@ -220,7 +215,7 @@ def test_views_of_a_group_share_a_camera_only_where_their_intrinsics_agree() -> 
     assert [image.camera_id for image in model.images] == [1, 2, 1, 1]
 
 
-def test_cameras_carry_the_sizes_of_the_photographs() -> None:
+def test_cameras_carry_the_sizes_of_the_photographs():
     ours, scales = _scene(), np.full(V, 3.001)
     guessed = _export(ours, scales=scales).cameras[0]
     assert (guessed.width, guessed.height) == (1537, 1152)
@@ -235,7 +230,7 @@ def test_cameras_carry_the_sizes_of_the_photographs() -> None:
     assert (model.cameras[0].width, model.cameras[0].height) == (1537, 1155)
 
 
-def test_a_point_seen_twice_in_an_image_keeps_its_first_observation() -> None:
+def test_a_point_seen_twice_in_an_image_keeps_its_first_observation():
     model = _export(_scene())
     image, points = model.images[0], model.points
     # Point 0 is listed once more, by a second image point of the same image.
@@ -254,7 +249,7 @@ def test_a_point_seen_twice_in_an_image_keeps_its_first_observation() -> None:
     np.testing.assert_array_equal(once.tracks.xy, again.tracks.xy)
 
 
-def test_export_refuses_what_colmap_cannot_hold() -> None:
+def test_export_refuses_what_colmap_cannot_hold():
     ours = _scene()
     assert ours.K is not None
     K = ours.K.copy()
@@ -271,7 +266,7 @@ def test_export_refuses_what_colmap_cannot_hold() -> None:
         _export(ours, scales=np.zeros(V))
 
 
-def test_import_refuses_distortion_it_has_no_camera_for() -> None:
+def test_import_refuses_distortion_it_has_no_camera_for():
     model = _export(_scene())
     fisheye = replace(
         model.cameras[0], model="OPENCV_FISHEYE", params=(500.0, 500.0, 250.0, 200.0, 0.1, 0, 0, 0)
@@ -291,7 +286,7 @@ def test_import_refuses_distortion_it_has_no_camera_for() -> None:
         reconstruction_from_colmap(model, names=["other.jpg"])
 
 
-def test_a_lens_of_three_coefficients_goes_out_and_comes_back(tmp_path: Path) -> None:
+def test_a_lens_of_three_coefficients_goes_out_and_comes_back(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     ours = replace(_scene(), distortion=np.tile([-0.1, 0.05, -0.02], (V, 1)))
     model = _plain_names(_export(ours))
@@ -311,7 +306,7 @@ def test_a_lens_of_three_coefficients_goes_out_and_comes_back(tmp_path: Path) ->
     np.testing.assert_allclose(back.distortion[0], ours.distortion[0])
 
 
-def test_writing_refuses_an_inconsistent_model(tmp_path: Path) -> None:
+def test_writing_refuses_an_inconsistent_model(tmp_path):
     model = _export(_scene())
     with pytest.raises(ValueError, match="does not exist"):
         write_colmap_model(tmp_path, replace(model, cameras=()))
@@ -332,7 +327,7 @@ def test_writing_refuses_an_inconsistent_model(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-def test_files_cut_short_anywhere_are_refused_with_a_sentence(tmp_path: Path, name: str, suffix: str) -> None:
+def test_files_cut_short_anywhere_are_refused_with_a_sentence(tmp_path, name, suffix):
     write_colmap_model(tmp_path, _plain_names(_export(_scene())), binary=suffix == ".bin")
     path = tmp_path / f"{name}{suffix}"
     whole = path.read_bytes()
@@ -351,7 +346,7 @@ def test_files_cut_short_anywhere_are_refused_with_a_sentence(tmp_path: Path, na
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("count", [2**20, 2**40, 2**63, 2**64 - 1])
-def test_hostile_counts_allocate_nothing(tmp_path: Path, name: str, count: int) -> None:
+def test_hostile_counts_allocate_nothing(tmp_path, name, count):
     write_colmap_model(tmp_path, _export(_scene()))
     path = tmp_path / f"{name}.bin"
     path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
@@ -359,7 +354,7 @@ def test_hostile_counts_allocate_nothing(tmp_path: Path, name: str, count: int) 
         read_colmap_model(tmp_path)
 
 
-def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+def test_numbers_that_are_not_finite_are_refused(tmp_path):
     write_colmap_model(tmp_path, _plain_names(_export(_scene())), binary=False)
     for name, field in (("cameras", 4), ("images", 1), ("points3D", 2)):
         path = tmp_path / f"{name}.txt"
@@ -379,9 +374,7 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(name=st.sampled_from(["cameras", "images", "points3D"]), seed=st.integers(0, 2**32 - 1))
-def test_damaged_bytes_never_end_in_a_trace(
-    tmp_path_factory: pytest.TempPathFactory, name: str, seed: int
-) -> None:
+def test_damaged_bytes_never_end_in_a_trace(tmp_path_factory, name, seed):
     rng = np.random.default_rng(seed)
     folder = tmp_path_factory.mktemp("damaged")
     write_colmap_model(folder, _SMALL)
@@ -397,12 +390,12 @@ def test_damaged_bytes_never_end_in_a_trace(
         return
 
 
-def test_a_folder_without_a_model_says_what_is_missing(tmp_path: Path) -> None:
+def test_a_folder_without_a_model_says_what_is_missing(tmp_path):
     with pytest.raises(StageFailure, match="holds no COLMAP model"):
         read_colmap_model(tmp_path)
 
 
-def test_an_image_without_points_survives_both_forms(tmp_path: Path) -> None:
+def test_an_image_without_points_survives_both_forms(tmp_path):
     model = _plain_names(_export(_scene()))
     lonely = replace(
         model.images[0], image_id=99, name="z.jpg", xy=np.zeros((0, 2)), point_ids=np.zeros(0, np.int64)
@@ -415,7 +408,7 @@ def test_an_image_without_points_survives_both_forms(tmp_path: Path) -> None:
         assert back.images[0].name == "z.jpg"
 
 
-def test_an_empty_model_survives_both_forms(tmp_path: Path) -> None:
+def test_an_empty_model_survives_both_forms(tmp_path):
     none = np.zeros(0, dtype=np.int64)
     points = ColmapPoints(
         none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(1, np.int64), none, none

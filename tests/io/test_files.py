@@ -1,13 +1,10 @@
 """Files that appear whole or not at all, on disks that fill and in places that cannot be written."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pickle
 import resource
 import subprocess
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,12 +21,12 @@ from validation.studies.full_disk import disk_ends, remount, small_disk
 MANY = np.zeros((20_000, 3))
 
 
-def entries(folder: Path) -> dict[str, bytes]:
+def entries(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 @contextmanager
-def no_larger_than(size: int) -> Iterator[None]:
+def no_larger_than(size):
     """No file may grow beyond that size: what a full disk does to one, for whoever may not mount any."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
@@ -40,7 +37,7 @@ def no_larger_than(size: int) -> Iterator[None]:
 
 
 @contextmanager
-def read_only(folder: Path) -> Iterator[None]:
+def read_only(folder):
     """Nothing can be made in this folder. Permissions are nothing to root, who may mark it instead."""
     if os.geteuid():
         folder.chmod(0o500)
@@ -58,7 +55,7 @@ def read_only(folder: Path) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
-def test_what_cannot_be_written_leaves_the_file_before_it(tmp_path: Path, number: int) -> None:
+def test_what_cannot_be_written_leaves_the_file_before_it(tmp_path, number):
     path = tmp_path / "a.json"
     write_json(path, {"a": 1})
     before = entries(tmp_path)
@@ -69,7 +66,7 @@ def test_what_cannot_be_written_leaves_the_file_before_it(tmp_path: Path, number
     assert isinstance(refused.value, UsageError)
 
 
-def test_a_file_that_grows_too_large_leaves_nothing_of_itself(tmp_path: Path) -> None:
+def test_a_file_that_grows_too_large_leaves_nothing_of_itself(tmp_path):
     """The system itself cuts it off in the middle."""
     (tmp_path / "points.ply").write_bytes(b"before")
     with no_larger_than(100_000):
@@ -80,7 +77,7 @@ def test_a_file_that_grows_too_large_leaves_nothing_of_itself(tmp_path: Path) ->
     assert entries(tmp_path) == {"points.ply": b"before"}
 
 
-def test_each_file_of_a_model_is_whole_or_absent(tmp_path: Path) -> None:
+def test_each_file_of_a_model_is_whole_or_absent(tmp_path):
     none, no_ids = np.zeros((0, 3)), np.zeros(0, np.int64)
     points = ColmapPoints(
         no_ids, none, none.astype(np.uint8), none[:, 0], np.zeros(1, np.int64), no_ids, no_ids
@@ -90,7 +87,7 @@ def test_each_file_of_a_model_is_whole_or_absent(tmp_path: Path) -> None:
     assert sorted(entries(tmp_path / "0")) == ["cameras.bin", "rigs.bin"]
 
 
-def test_a_disk_that_is_full_or_read_only(tmp_path: Path) -> None:
+def test_a_disk_that_is_full_or_read_only(tmp_path):
     try:
         with small_disk(tmp_path / "disk", "64k") as disk:
             write_json(disk / "a.json", [1])
@@ -110,7 +107,7 @@ def test_a_disk_that_is_full_or_read_only(tmp_path: Path) -> None:
         pytest.skip(str(error))
 
 
-def test_a_folder_where_nothing_can_be_made(tmp_path: Path) -> None:
+def test_a_folder_where_nothing_can_be_made(tmp_path):
     write_text(tmp_path / "a.txt", "before")
     with read_only(tmp_path):
         for write in (write_text, write_json):
@@ -121,7 +118,7 @@ def test_a_folder_where_nothing_can_be_made(tmp_path: Path) -> None:
     assert entries(tmp_path) == {"a.txt": b"before"}
 
 
-def test_a_file_stands_where_a_folder_belongs(tmp_path: Path) -> None:
+def test_a_file_stands_where_a_folder_belongs(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     for path in (tmp_path / "file" / "x", tmp_path / "file" / "deep" / "x"):
@@ -132,7 +129,7 @@ def test_a_file_stands_where_a_folder_belongs(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder"]
 
 
-def test_the_sentence_survives_the_way_from_a_worker() -> None:
+def test_the_sentence_survives_the_way_from_a_worker():
     refused = OutputError(Path("a"), OSError(errno.ENOSPC, "No space left on device"), kept="out")
     again = pickle.loads(pickle.dumps(refused))
     assert str(again) == str(refused)
@@ -140,7 +137,7 @@ def test_the_sentence_survives_the_way_from_a_worker() -> None:
     assert set(DISK) <= set(MEND)
 
 
-def test_json_has_no_nan(tmp_path: Path) -> None:
+def test_json_has_no_nan(tmp_path):
     write_json(
         tmp_path / "a.json",
         {"a": float("nan"), "b": [np.float64(1.5), np.int64(2)], "c": np.array([np.inf, 1])},
@@ -149,7 +146,7 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
     assert read_json(tmp_path / "b.json") is None
 
 
-def test_names_of_what_a_kill_leaves() -> None:
+def test_names_of_what_a_kill_leaves():
     assert is_partial(".points.ply.partial")
     assert not is_partial("points.ply.partial")
     assert not is_partial(".lock")

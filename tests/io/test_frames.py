@@ -1,9 +1,5 @@
 """Frames and moving pictures, read again by Pillow."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import PIL.Image
 import pytest
@@ -12,18 +8,18 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
 
 
-def picture(k: int) -> np.ndarray:
+def picture(k):
     """A smooth picture with a bright bar at another place in each."""
     rgb = np.tile(np.linspace(30, 200, 64).astype(np.uint8)[None, :, None], (48, 1, 3))
     rgb[8 * k : 8 * k + 8] = [220, 40, 60]
     return rgb
 
 
-def frames(folder: Path, count: int) -> list[Path]:
+def frames(folder, count):
     return [write_frame(folder, k + 1, picture(k)) for k in range(count)]
 
 
-def test_frames_are_numbered_from_one_and_hold_their_picture(tmp_path: Path) -> None:
+def test_frames_are_numbered_from_one_and_hold_their_picture(tmp_path):
     written = frames(tmp_path / "new", 3)
     assert [path.name for path in written] == ["frame-0001.png", "frame-0002.png", "frame-0003.png"]
     assert frame_name(12345) == "frame-12345.png"
@@ -34,7 +30,7 @@ def test_frames_are_numbered_from_one_and_hold_their_picture(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("suffix", "apart"), [(".webp", 4.0), (".png", 0.0)])
-def test_an_animation_plays_all_frames_for_ever(suffix: str, apart: float, tmp_path: Path) -> None:
+def test_an_animation_plays_all_frames_for_ever(suffix, apart, tmp_path):
     path = write_animation(tmp_path / f"all{suffix}", frames(tmp_path, 4), milliseconds=50)
     with PIL.Image.open(path) as image:
         assert image.n_frames == 4
@@ -50,13 +46,13 @@ def test_an_animation_plays_all_frames_for_ever(suffix: str, apart: float, tmp_p
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".png"])
-def test_one_frame_is_an_animation_too(suffix: str, tmp_path: Path) -> None:
+def test_one_frame_is_an_animation_too(suffix, tmp_path):
     path = write_animation(tmp_path / f"one{suffix}", frames(tmp_path, 1))
     with PIL.Image.open(path) as image:
         assert image.size == (64, 48)
 
 
-def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_told(tmp_path):
     (one,) = frames(tmp_path, 1)
     with pytest.raises(ValueError, match=r"written as \.webp or \.png; got all\.gif"):
         write_animation(tmp_path / "all.gif", [one])

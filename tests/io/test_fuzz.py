@@ -1,7 +1,5 @@
 """Readers given random bytes, and good files with something changed: they read, or raise what they say."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from contextlib import suppress
@@ -27,9 +25,9 @@ from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_files import read_colmap_model, write_colmap_model
 from thesisrecon.io.exports import read_cameras
 from thesisrecon.io.files import read_json, read_text
-from thesisrecon.io.images import read_photographs
-from thesisrecon.io.lists import read_pairs
+from thesisrecon.io.images import read_images
 from thesisrecon.io.meshes import read_mesh, write_mesh
+from thesisrecon.io.pair_list import read_pairs
 from thesisrecon.runtime.record_files import ChangedRecord, bytes_from_record, read_record
 from thesisrecon.runtime.run_folder import StageFolder
 
@@ -53,26 +51,26 @@ class Reader:
     raises: tuple[type[Exception], ...] = ()
 
 
-def colmap(name: str) -> Reader:
+def colmap(name):
     """One file of a COLMAP model."""
 
-    def make(folder: Path) -> None:
+    def make(folder):
         write_colmap_model(folder, _plain_names(_SMALL), binary=name.endswith(".bin"))
 
-    def read(path: Path) -> None:
+    def read(path):
         reconstruction_from_colmap(read_colmap_model(path.parent))
 
     return Reader(name, make, read, (StageFailure,))
 
 
-def saved(kind: str) -> Reader:
+def saved(kind):
     """A photograph; one that is damaged is refused, and nothing is raised."""
     name = f"a.{kind.lower()}"
 
-    def make(folder: Path) -> None:
+    def make(folder):
         PIL.Image.fromarray(picture()).save(folder / name, kind)
 
-    return Reader(name, make, lambda path: read_photographs(path.parent, max_size_px=99))
+    return Reader(name, make, lambda path: read_images(path.parent, max_size_px=99))
 
 
 CAMERAS = {
@@ -97,21 +95,21 @@ SUMMARY = {
 }  # fmt: skip
 
 
-def as_json(content: object) -> Callable[[Path, str], None]:
+def as_json(content):
     return lambda folder, name: (folder / name).write_text(json.dumps(content), encoding="utf-8") and None
 
 
-def text_file(name: str, text: str, read: Callable[[Path], Any]) -> Reader:
+def text_file(name, text, read):
     return Reader(
         name, lambda folder: (folder / name).write_text(text, encoding="utf-8"), read, (UsageError,)
     )
 
 
-def inspected(path: Path) -> None:
+def inspected(path):
     assert run_command(["inspect", str(path.parent)]) in (0, 2)
 
 
-def as_written(path: Path) -> None:
+def as_written(path):
     record = read_record(path, "key")
     assert record is None or bytes_from_record(record, "key") == bytes_from_record(some_metric(), "key")
 
@@ -142,7 +140,7 @@ READERS = [
 
 
 @st.composite
-def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
+def damaged(draw, whole):
     """The bytes with a few of them changed, cut off, put in or said twice."""
     data = bytearray(whole)
     for _ in range(draw(st.integers(1, 4))):
@@ -165,16 +163,16 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
     return bytes(data)
 
 
-def read(reader: Reader, path: Path, content: bytes) -> None:
+def read(reader, path, content):
     path.write_bytes(content)
     with suppress(*reader.raises):
         reader.read(path)
 
 
 @pytest.fixture
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Reader, Path, bytes]:
+def place(request, tmp_path):
     """A reader, the file it reads and what that holds."""
-    reader: Reader = request.param
+    reader = request.param
     reader.make(tmp_path)
     whole = (tmp_path / reader.name).read_bytes()
     reader.read(tmp_path / reader.name)
@@ -187,9 +185,7 @@ each_reader = pytest.mark.parametrize("place", READERS, indirect=True, ids=[r.na
 @each_reader
 @few
 @given(data=st.data())
-def test_a_damaged_file_raises_only_what_its_reader_says(
-    place: tuple[Reader, Path, bytes], data: st.DataObject
-) -> None:
+def test_a_damaged_file_raises_only_what_its_reader_says(place, data):
     reader, path, whole = place
     read(reader, path, data.draw(damaged(whole)))
 
@@ -197,9 +193,7 @@ def test_a_damaged_file_raises_only_what_its_reader_says(
 @each_reader
 @settings(few, max_examples=25)
 @given(content=st.binary(max_size=300), head=st.sampled_from([0, 4, 8, 40]))
-def test_random_bytes_raise_only_what_their_reader_says(
-    place: tuple[Reader, Path, bytes], content: bytes, head: int
-) -> None:
+def test_random_bytes_raise_only_what_their_reader_says(place, content, head):
     """As they are, and after the beginning of a good file."""
     reader, path, whole = place
     read(reader, path, whole[:head] + content)
@@ -214,7 +208,7 @@ values = st.recursive(
 
 
 @st.composite
-def mistyped(draw: st.DrawFn, content: Any) -> Any:
+def mistyped(draw, content):
     """The tables with one of their parts of another type, or gone."""
     if isinstance(content, dict) and content and draw(st.booleans()):
         key = draw(st.sampled_from(sorted(content)))
@@ -234,16 +228,14 @@ TABLES = [(reader, content) for reader in READERS for name, content in (
 @pytest.mark.parametrize(("reader", "content"), TABLES, ids=[reader.name for reader, _ in TABLES])
 @few
 @given(data=st.data())
-def test_tables_of_other_types_raise_only_what_their_reader_says(
-    reader: Reader, content: Any, tmp_path: Path, data: st.DataObject
-) -> None:
+def test_tables_of_other_types_raise_only_what_their_reader_says(reader, content, tmp_path, data):
     told = json.dumps(data.draw(mistyped(content)))
     read(reader, tmp_path / reader.name, told.encode("utf-8", "surrogatepass"))
 
 
 @few
 @given(data=st.data())
-def test_settings_of_other_types_are_refused_in_a_sentence(data: st.DataObject) -> None:
+def test_settings_of_other_types_are_refused_in_a_sentence(data):
     whole = {"features": {"kind": "harris-corners"}, "intrinsics": {"focal_px": 9.0, "focal_std_rel": 0.1}}
     whole |= {"dense": {"linker": {"kind": "sequence-linking"}}, "images": {"max_size_px": 640}}
     try:

@@ -1,9 +1,5 @@
 """Meshes written and read again by another library."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import PIL.Image
 import pytest
@@ -14,7 +10,7 @@ from thesisrecon.io.meshes import read_mesh, unmerged, write_mesh
 from thesisrecon.records import TexturedMesh
 
 
-def roof() -> TexturedMesh:
+def roof():
     """Two faces with a common ridge at different places of the texture."""
     vertices = np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1.5], [1, 1, 2]])
     faces = np.array([[0, 1, 2], [1, 3, 2]])
@@ -24,7 +20,7 @@ def roof() -> TexturedMesh:
     return TexturedMesh(vertices, faces, uv=uv, texture=texture)
 
 
-def color_of(mesh: trimesh.Trimesh, face: int) -> np.ndarray:
+def color_of(mesh, face):
     """Colour in the middle of a face, by the texture coordinates of the file."""
     image = getattr(mesh.visual.material, "baseColorTexture", None) or mesh.visual.material.image
     u, v = mesh.visual.uv[mesh.faces[face]].mean(axis=0)
@@ -32,7 +28,7 @@ def color_of(mesh: trimesh.Trimesh, face: int) -> np.ndarray:
     return picture[int((1.0 - v) * picture.shape[0]), int(u * picture.shape[1])]
 
 
-def test_seams_have_a_vertex_for_each_place() -> None:
+def test_seams_have_a_vertex_for_each_place():
     mesh = roof()
     vertices, faces, uv = unmerged(mesh)
     assert len(vertices) == 6
@@ -41,7 +37,7 @@ def test_seams_have_a_vertex_for_each_place() -> None:
 
 
 @pytest.mark.parametrize("kind", ["glb", "obj"])
-def test_textures_are_where_they_were(kind: str, tmp_path: Path) -> None:
+def test_textures_are_where_they_were(kind, tmp_path):
     path = tmp_path / f"model.{kind}"
     write_mesh(path, roof())
     read = trimesh.load(path, process=False, force="mesh")
@@ -56,7 +52,7 @@ def test_textures_are_where_they_were(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
-def test_colours_of_vertices_are_kept(kind: str, tmp_path: Path) -> None:
+def test_colours_of_vertices_are_kept(kind, tmp_path):
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 102, 204]], dtype=np.uint8)
     path = tmp_path / f"model.{kind}"
     write_mesh(path, TexturedMesh(roof().vertices, roof().faces, colors=colors))
@@ -65,7 +61,7 @@ def test_colours_of_vertices_are_kept(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], colors)
 
 
-def test_a_bare_mesh_is_written_and_the_bytes_are_the_same_again(tmp_path: Path) -> None:
+def test_a_bare_mesh_is_written_and_the_bytes_are_the_same_again(tmp_path):
     mesh = TexturedMesh(roof().vertices, roof().faces)
     for kind in ("glb", "obj", "ply"):
         for name in ("one", "two"):
@@ -74,12 +70,12 @@ def test_a_bare_mesh_is_written_and_the_bytes_are_the_same_again(tmp_path: Path)
         assert len(trimesh.load(tmp_path / f"one.{kind}", process=False, force="mesh").faces) == 2
 
 
-def test_other_formats_are_refused(tmp_path: Path) -> None:
+def test_other_formats_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"\.glb, \.obj or \.ply"):
         write_mesh(tmp_path / "model.stl", roof())
 
 
-def test_a_textured_glb_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_a_textured_glb_is_read_as_it_was_written(tmp_path):
     mesh = roof()
     write_mesh(tmp_path / "model.glb", mesh)
     read = read_mesh(tmp_path / "model.glb")
@@ -98,7 +94,7 @@ def test_a_textured_glb_is_read_as_it_was_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.faces, read.faces)
 
 
-def test_a_large_glb_keeps_its_surface_and_its_order(tmp_path: Path) -> None:
+def test_a_large_glb_keeps_its_surface_and_its_order(tmp_path):
     rng = np.random.default_rng(0)
     vertices = rng.normal(size=(500, 3)) * [1, 10, 100] + [0, 0, 1000]
     faces = rng.permuted(np.tile(np.arange(500), (4000, 1)), axis=1)[:, :3]
@@ -112,7 +108,7 @@ def test_a_large_glb_keeps_its_surface_and_its_order(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.uv, uv, atol=1e-4)
 
 
-def test_colours_of_vertices_and_bare_meshes_are_read(tmp_path: Path) -> None:
+def test_colours_of_vertices_and_bare_meshes_are_read(tmp_path):
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 102, 204]], dtype=np.uint8)
     for given in (colors, None):
         write_mesh(tmp_path / "model.glb", TexturedMesh(roof().vertices, roof().faces, colors=given))
@@ -123,7 +119,7 @@ def test_colours_of_vertices_and_bare_meshes_are_read(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read.colors, given)
 
 
-def test_a_glb_that_cannot_be_read_is_told_in_a_sentence(tmp_path: Path) -> None:
+def test_a_glb_that_cannot_be_read_is_told_in_a_sentence(tmp_path):
     path = tmp_path / "model.glb"
     with pytest.raises(UsageError, match="there is no mesh"):
         read_mesh(path)

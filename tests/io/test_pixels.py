@@ -1,28 +1,25 @@
 """Pictures stripe by stripe: the pixels of the whole picture at once, in less room."""
 
-from __future__ import annotations
-
 import io
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import PIL.Image
 import pytest
 
-from thesisrecon.io.images import LARGEST_DECODED, read_photographs
-from thesisrecon.io.pixels import AS_STORED, TURNS, Picture, Room, Turn, at_working_size, bytes_to_decode
+from thesisrecon.io.images import LARGEST_DECODED, read_images
+from thesisrecon.io.pixels import AS_STORED, TURNS, Picture, Room, at_working_size, bytes_to_decode
 
 
-def coloured(width: int, height: int, mode: str = "RGB") -> PIL.Image.Image:
+def coloured(width, height, mode="RGB"):
     """Noise of several scales, so that every row and column is of its own."""
     rng = np.random.default_rng([width, height])
     coarse = PIL.Image.fromarray(rng.integers(0, 256, (height // 9, width // 9, 3), dtype=np.uint8))
     return coarse.resize((width, height), PIL.Image.Resampling.BICUBIC).convert(mode)
 
 
-def at_once(picture: PIL.Image.Image, size: tuple[int, int], max_size_px: int) -> np.ndarray:
+def at_once(picture, size, max_size_px):
     """The whole picture by Pillow's own way."""
     scale = max_size_px / max(picture.size)
     box = (0.0, 0.0, min(picture.width, size[0] / scale), min(picture.height, size[1] / scale))
@@ -31,7 +28,7 @@ def at_once(picture: PIL.Image.Image, size: tuple[int, int], max_size_px: int) -
 
 @pytest.mark.parametrize("turn", [AS_STORED, *TURNS.values()], ids=lambda turn: str(turn.method))
 @pytest.mark.parametrize(("width", "height"), [(1000, 667), (600, 1100)])
-def test_stripes_give_the_pixels_of_the_whole_picture(turn: Turn, width: int, height: int) -> None:
+def test_stripes_give_the_pixels_of_the_whole_picture(turn, width, height):
     upright = coloured(width, height)
     back = {PIL.Image.Transpose.ROTATE_90: 270, PIL.Image.Transpose.ROTATE_270: 90}.get(turn.method)
     if back is not None:
@@ -48,13 +45,13 @@ def test_stripes_give_the_pixels_of_the_whole_picture(turn: Turn, width: int, he
 
 
 @pytest.mark.parametrize("mode", ["L", "1", "P", "CMYK", "YCbCr", "LAB"])
-def test_colours_are_converted_alike_in_stripes(mode: str) -> None:
+def test_colours_are_converted_alike_in_stripes(mode):
     stored = coloured(500, 700, mode)
     found = at_working_size(Picture(stored), 200)
     np.testing.assert_array_equal(found, at_once(stored.convert("RGB"), (142, 200), 200))
 
 
-def test_every_stripe_of_a_deep_picture_has_the_range_of_all() -> None:
+def test_every_stripe_of_a_deep_picture_has_the_range_of_all():
     """The bright end stands below the first stripe."""
     values = np.repeat(np.arange(900, dtype=np.uint16)[:, None] * 4, 80, axis=1)
     for array in (values, values.astype(np.float32), values.astype(np.int32)):
@@ -63,10 +60,10 @@ def test_every_stripe_of_a_deep_picture_has_the_range_of_all() -> None:
         assert np.abs(found[..., 1] - values * (255.0 / top)).max() <= 0.51
 
 
-def test_threads_take_no_more_room_together_than_there_is() -> None:
+def test_threads_take_no_more_room_together_than_there_is():
     room, held, most = Room(100), [0], [0]
 
-    def use(amount: int) -> None:
+    def use(amount):
         with room.taken(amount):
             held[0] += amount
             most[0] = max(most[0], held[0] if amount <= 100 else 0)
@@ -84,7 +81,7 @@ def test_threads_take_no_more_room_together_than_there_is() -> None:
     assert 60 <= most[0] <= 100
 
 
-def test_an_error_gives_the_room_back() -> None:
+def test_an_error_gives_the_room_back():
     room = Room(10)
     with pytest.raises(KeyError), room.taken(10):
         raise KeyError
@@ -92,13 +89,13 @@ def test_an_error_gives_the_room_back() -> None:
         pass
 
 
-def opened(kind: str, image: PIL.Image.Image, **options: object) -> PIL.Image.Image:
+def opened(kind, image, **options):
     stream = io.BytesIO()
     image.save(stream, kind, **options)
     return PIL.Image.open(stream)
 
 
-def test_what_decoding_takes_depends_on_the_format() -> None:
+def test_what_decoding_takes_depends_on_the_format():
     image = coloured(90, 90)
     assert bytes_to_decode(opened("PNG", image)) == 4 * 8100
     assert bytes_to_decode(opened("JPEG", image)) == 4 * 8100
@@ -106,19 +103,17 @@ def test_what_decoding_takes_depends_on_the_format() -> None:
     assert bytes_to_decode(opened("WEBP", image)) == 16 * 8100
 
 
-def test_a_photograph_whose_decoder_takes_too_much_is_refused_before_it_begins(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photograph_whose_decoder_takes_too_much_is_refused_before_it_begins(tmp_path, monkeypatch):
     for name in ("a.webp", "b.png", "c.jpg"):
         options = {"progressive": True} if name == "c.jpg" else {}
         coloured(90, 80).save(tmp_path / name, **options)
     monkeypatch.setattr("thesisrecon.io.images.LARGEST_DECODED", 5 * 90 * 80)
-    read = read_photographs(tmp_path, max_size_px=1600)
+    read = read_images(tmp_path, max_size_px=1600)
     assert [image.name for image in read.images] == ["b.png"]
     assert "reading a WEBP of that size takes" in read.refused["a.webp"]
     assert "reading a JPEG in several scans of that size takes" in read.refused["c.jpg"]
     assert "save it as PNG or TIFF" in read.refused["a.webp"]
 
 
-def test_the_largest_sensors_are_read_in_every_kind_of_jpeg() -> None:
+def test_the_largest_sensors_are_read_in_every_kind_of_jpeg():
     assert LARGEST_DECODED > 10 * 14204 * 10652

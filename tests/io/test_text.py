@@ -1,14 +1,12 @@
 """Text that is safe to show, and files that are read within bounds."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
 import pytest
 
 from thesisrecon.errors import UsageError
-from thesisrecon.io.files import printable, read_bytes, read_text, shortened, without_middle
+from thesisrecon.io.files import printable, read_bytes, read_text, shorten_middle, shortened
 
 
 @pytest.mark.parametrize(
@@ -24,24 +22,24 @@ from thesisrecon.io.files import printable, read_bytes, read_text, shortened, wi
         ("<b>&\"'", "<b>&\"'"),
     ],
 )
-def test_names_are_shown_in_one_line_and_in_their_order(name: str, shown: str) -> None:
+def test_names_are_shown_in_one_line_and_in_their_order(name, shown):
     assert printable(name) == shown
     shown.encode("utf-8")
 
 
-def test_long_text_is_begun() -> None:
+def test_long_text_is_begun():
     assert shortened("x" * 60) == "x" * 60
     assert shortened("x" * 61) == "x" * 57 + "..."
 
 
-def test_a_long_sentence_keeps_its_beginning_and_its_end() -> None:
+def test_a_long_sentence_keeps_its_beginning_and_its_end():
     said = f"'--seed': '{'9' * 50}' is no integer"
-    assert without_middle(said, len(said)) == said
-    assert without_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
-    assert len(without_middle(said, 60)) == 60
+    assert shorten_middle(said, len(said)) == said
+    assert shorten_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
+    assert len(shorten_middle(said, 60)) == 60
 
 
-def test_only_regular_files_of_a_size_are_read(tmp_path: Path) -> None:
+def test_only_regular_files_of_a_size_are_read(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"\xef\xbb\xbfgr\xc3\xb6\xc3\x9fe")
     assert read_text(path) == "größe"

@@ -1,36 +1,32 @@
 """Photographs that corners and correlation cannot relate, and odd ones that they can, by the front door."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import zoom
 
 from tests.textures import disparity, photograph, sideways_fundamental, stereo_scene, texture
 from thesisrecon import match_pair
-from thesisrecon.arrays import F64, U8
 from thesisrecon.config import preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.strength import StrengthOfMatch
-from thesisrecon.records import TwoView
 
 SHAPE = (300, 420)
 PRESETS = pytest.mark.parametrize("name", ["default", "thesis"])
 
 
-def gray(values: F64) -> U8:
+def gray(values):
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def stereo() -> tuple[U8, U8]:
+def stereo():
     left, right = stereo_scene()
     return left.rgb, right.rgb
 
 
-def related(first: U8, second: U8, name: str) -> TwoView | None:
+def related(first, second, name):
     """The pair, or None where it is refused as one that does not match."""
     try:
         return match_pair(first, second, config=preset(name))
@@ -42,13 +38,13 @@ def related(first: U8, second: U8, name: str) -> TwoView | None:
 
 @PRESETS
 @pytest.mark.parametrize("level", [0, 128, 255])
-def test_a_photograph_without_texture_is_named(name: str, level: int) -> None:
+def test_a_photograph_without_texture_is_named(name, level):
     with pytest.raises(StageFailure, match="blank"):
         match_pair(np.full(SHAPE, level, np.uint8), stereo()[1], config=preset(name))
 
 
 @PRESETS
-def test_a_photograph_of_32_pixels_is_named_with_what_is_needed(name: str) -> None:
+def test_a_photograph_of_32_pixels_is_named_with_what_is_needed(name):
     left, right = stereo()
     with pytest.raises(StageFailure, match="32 x 32 pixels; 64 x 64"):
         match_pair(left[:32, :32].copy(), right[:32, :32].copy(), config=preset(name))
@@ -59,9 +55,7 @@ def test_a_photograph_of_32_pixels_is_named_with_what_is_needed(name: str) -> No
     [(MultiScaleCorners(), SeedsAndGrowth()), (HarrisCorners(), StrengthOfMatch())],
     ids=["default", "thesis"],
 )
-def test_the_stages_themselves_take_32_pixels(
-    detector: MultiScaleCorners | HarrisCorners, matcher: SeedsAndGrowth | StrengthOfMatch
-) -> None:
+def test_the_stages_themselves_take_32_pixels(detector, matcher):
     image = photograph(texture(32, 32))
     view = matcher.prepare(image, detector.detect(image))
     rng = np.random.default_rng(0)
@@ -70,7 +64,7 @@ def test_the_stages_themselves_take_32_pixels(
 
 
 @PRESETS
-def test_saturated_photographs_match_rightly_or_not_at_all(name: str) -> None:
+def test_saturated_photographs_match_rightly_or_not_at_all(name):
     """Six times too long exposed: only the darkest spots are left."""
     left, right = (gray(image[:, :, 0] * 6.0) for image in stereo())
     pair = related(left, right, name)
@@ -80,7 +74,7 @@ def test_saturated_photographs_match_rightly_or_not_at_all(name: str) -> None:
 
 @PRESETS
 @pytest.mark.parametrize("kind", ["chequers", "stripes", "noise"])
-def test_repeated_patterns_lines_and_noise_do_not_match(name: str, kind: str) -> None:
+def test_repeated_patterns_lines_and_noise_do_not_match(name, kind):
     rng = np.random.default_rng(0)
     rows, columns = np.indices(SHAPE)
     first = {
@@ -97,7 +91,7 @@ def test_repeated_patterns_lines_and_noise_do_not_match(name: str, kind: str) ->
 
 
 @PRESETS
-def test_one_photograph_twice_stays_where_it_is_and_determines_no_geometry(name: str) -> None:
+def test_one_photograph_twice_stays_where_it_is_and_determines_no_geometry(name):
     left = stereo()[0]
     pair = related(left, left.copy(), name)
     if pair is not None:
@@ -105,7 +99,7 @@ def test_one_photograph_twice_stays_where_it_is_and_determines_no_geometry(name:
         assert pair.undetermined
 
 
-def test_photographs_of_different_sizes_match() -> None:
+def test_photographs_of_different_sizes_match():
     left, right = stereo()
     half = match_pair(left, gray(zoom(right[:, :, 0].astype(np.float64), 0.5, order=1)))
     # scipy's zoom keeps the centres of the corner pixels.
@@ -119,6 +113,6 @@ def test_photographs_of_different_sizes_match() -> None:
     assert np.median(np.abs(upright.xy1[:, 0] - whole[:, 0] - disparity(whole))) < 0.1
 
 
-def test_numbers_that_are_no_pixels_are_refused() -> None:
+def test_numbers_that_are_no_pixels_are_refused():
     with pytest.raises(ValueError, match="uint8"):
         match_pair(np.full(SHAPE, np.nan), stereo()[1])

@@ -1,16 +1,13 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.textures import disparity, photograph, stereo_scene, texture
-from thesisrecon.arrays import F64, I64
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching.alignment import align_windows
 from thesisrecon.matching.growth import fit_local_affines, grow_corners
-from thesisrecon.matching.prepared import PreparedView, corner_patches, prepare_view
+from thesisrecon.matching.prepared import corner_patches, prepare_view
 from thesisrecon.matching.seeds import scan_correlations, update_column_best
 from thesisrecon.matching.strength import displacement_weight, relative_difference_weight, strength_of_match
 from thesisrecon.matching.tracks import chain_maps, unite
@@ -19,17 +16,17 @@ from thesisrecon.records import Features, Image
 RNG = np.random.default_rng(0)
 
 
-def unit(window: F64) -> F64:
+def unit(window):
     centred = window - window.mean()
     return np.asarray(centred / np.linalg.norm(centred))
 
 
-def prepared(gray: F64) -> PreparedView:
+def prepared(gray):
     image = photograph(gray)
     return prepare_view(image, HarrisCorners(spacing_rel=0.01).detect(image))
 
 
-def test_scan_equals_its_numpy_twin() -> None:
+def test_scan_equals_its_numpy_twin():
     correlation = RNG.uniform(-1, 1, (40, 60)).astype(np.float32)
     xy = RNG.uniform(0, 50, (60, 2)).astype(np.float32)
     index, value, competing_model = scan_correlations(correlation, xy, np.full(60, 15.0**2, np.float32))
@@ -40,7 +37,7 @@ def test_scan_equals_its_numpy_twin() -> None:
     assert np.allclose(competing_model, np.where(elsewhere, correlation, -1.0).max(axis=1))
 
 
-def test_column_best_over_blocks_equals_the_best_of_all_rows() -> None:
+def test_column_best_over_blocks_equals_the_best_of_all_rows():
     correlation = RNG.uniform(-1, 1, (50, 30)).astype(np.float32)
     value, index = np.full(30, -2.0, np.float32), np.zeros(30, np.int64)
     for first in range(0, 50, 16):
@@ -49,7 +46,7 @@ def test_column_best_over_blocks_equals_the_best_of_all_rows() -> None:
     assert np.array_equal(value, correlation.max(axis=0))
 
 
-def affine_twin(xy: F64, near: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, float]:
+def affine_twin(xy, near, xy1, xy2, prior):
     """One corner's local map by stacked least squares: rows are neighbours, the last four hold the prior."""
     d, a0 = xy1[near] - xy, prior[near].mean(axis=0)
     mean2 = (d**2).sum(axis=1).mean() + 1e-9
@@ -66,7 +63,7 @@ def affine_twin(xy: F64, near: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64
     return a0 + z[:2].T, z[2], float(np.sqrt(scale2))
 
 
-def test_local_affines_equal_their_numpy_twin() -> None:
+def test_local_affines_equal_their_numpy_twin():
     xy, xy1 = RNG.uniform(0, 100, (12, 2)), RNG.uniform(0, 100, (80, 2))
     xy2 = xy1 @ np.array([[1.1, 0.2], [-0.1, 0.9]]).T + (20, -7) + RNG.normal(size=(80, 2))
     prior = np.tile(np.eye(2), (80, 1, 1)) + 0.05 * RNG.normal(size=(80, 2, 2))
@@ -79,7 +76,7 @@ def test_local_affines_equal_their_numpy_twin() -> None:
         assert spread[n] == pytest.approx(s, abs=1e-6)
 
 
-def test_corner_patches_equal_their_numpy_twin_at_every_level() -> None:
+def test_corner_patches_equal_their_numpy_twin_at_every_level():
     view = prepared(texture(120, 150))
     xy = np.array([[60.3, 50.6], [70.0, 64.5], [3.0, 60.0]])
     scale = np.array([1.0, 2.0, 1.0], np.float32)
@@ -95,7 +92,7 @@ def test_corner_patches_equal_their_numpy_twin_at_every_level() -> None:
     assert not found[2].any()
 
 
-def test_growth_equals_its_numpy_twin() -> None:
+def test_growth_equals_its_numpy_twin():
     images = stereo_scene(200, 260)
     one, two = (prepare_view(i, HarrisCorners(spacing_rel=0.01).detect(i)) for i in images)
     xy1, xy2 = one.features.xy, two.features.xy
@@ -126,7 +123,7 @@ def test_growth_equals_its_numpy_twin() -> None:
 
 
 @pytest.mark.parametrize("affine_std", [0.0, 0.1])
-def test_alignment_finds_the_true_place_under_gain_and_bias(affine_std: float) -> None:
+def test_alignment_finds_the_true_place_under_gain_and_bias(affine_std):
     left, right = stereo_scene()
     one, two = (prepare_view(i, MultiScaleCorners().detect(i)) for i in (left, right))
     xy2 = np.stack(np.meshgrid(np.arange(60, 360, 21), np.arange(40, 260, 21)), -1).reshape(-1, 2) + 0.37
@@ -148,7 +145,7 @@ def test_alignment_finds_the_true_place_under_gain_and_bias(affine_std: float) -
     assert np.abs(np.linalg.det(maps[score > 0.9]) / slope[score > 0.9] - 1).mean() < 0.1
 
 
-def test_alignment_recovers_an_affine_map_it_was_not_told() -> None:
+def test_alignment_recovers_an_affine_map_it_was_not_told():
     gray = texture(240, 240, 5)
     truth = np.array([[1.08, 0.06], [-0.05, 0.95]])
     y, x = np.mgrid[0:240, 0:240].astype(np.float64)
@@ -168,7 +165,7 @@ def test_alignment_recovers_an_affine_map_it_was_not_told() -> None:
     assert np.median(np.abs(maps - truth).max(axis=(1, 2))) < 0.03
 
 
-def test_alignment_gives_up_on_blank_windows_and_outside() -> None:
+def test_alignment_gives_up_on_blank_windows_and_outside():
     blank, rich = prepared(np.full((100, 100), 80.0)), prepared(texture(100, 100))
     xy = np.array([[50.0, 50.0], [2.0, 50.0], [np.nan, 50.0]])
     args = (xy, np.ones(3, np.float32), xy, np.tile(np.eye(2), (3, 1, 1)))
@@ -181,7 +178,7 @@ def test_alignment_gives_up_on_blank_windows_and_outside() -> None:
     ]
 
 
-def test_alignment_drops_what_its_gradients_cannot_place() -> None:
+def test_alignment_drops_what_its_gradients_cannot_place():
     rich, straight = texture(100, 100, 3), np.repeat(texture(1, 100, 3), 100, axis=0)
     noise = RNG.normal(scale=2.0, size=(2, 100, 100))
     xy = np.array([[50.0, 50.0]])
@@ -193,7 +190,7 @@ def test_alignment_drops_what_its_gradients_cannot_place() -> None:
     assert kept == [True, False]
 
 
-def product_twin(a: F64, b: F64, closeness: float, terms: tuple[bool, bool, bool]) -> float:
+def product_twin(a, b, closeness, terms):
     lengths = np.linalg.norm(a), np.linalg.norm(b)
     factors = [max(float(a @ b) / (lengths[0] * lengths[1]), 0.0)]
     factors += [max(min(lengths), 1.0) / max(lengths), closeness]
@@ -202,9 +199,7 @@ def product_twin(a: F64, b: F64, closeness: float, terms: tuple[bool, bool, bool
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
 @pytest.mark.parametrize("terms", [(True, True, True), (False, True, False), (True, False, True)])
-def test_strength_of_match_equals_its_brute_force_twin(
-    tolerance: float, terms: tuple[bool, bool, bool]
-) -> None:
+def test_strength_of_match_equals_its_brute_force_twin(tolerance, terms):
     xy1, xy2 = RNG.uniform(0, 60, (25, 2)), RNG.uniform(0, 60, (30, 2))
     correlation = RNG.uniform(-1, 1, (25, 30)).astype(np.float32)
     near1, near2 = (
@@ -215,7 +210,7 @@ def test_strength_of_match_equals_its_brute_force_twin(
         correlation, (xy1, xy2), (near1, near2), (30.0, 4, 0.1), (tolerance, terms)
     )
 
-    def agreement(u: int, v: int, m: int, n: int) -> float:
+    def agreement(u, v, m, n):
         a, b, apart = xy2[v] - xy1[u], xy2[n] - xy1[m], float(np.linalg.norm(xy1[m] - xy1[u]))
         if tolerance:
             return float(np.exp(-0.5 * (np.linalg.norm(a - b) / (0.3 * apart + 1.0)) ** 2))
@@ -235,7 +230,7 @@ def test_strength_of_match_equals_its_brute_force_twin(
         assert strength[u] == pytest.approx(best, rel=1e-4)
 
 
-def test_displacements_that_agree_weigh_one() -> None:
+def test_displacements_that_agree_weigh_one():
     a, every = np.array([10.0, 0.0]), (True, True, True)
     assert displacement_weight(a, a, 1.0, every) == pytest.approx(1.0)
     assert displacement_weight(a, 0.5 * a, 1.0, every) == pytest.approx(0.5)
@@ -253,7 +248,7 @@ def test_displacements_that_agree_weigh_one() -> None:
 
 @pytest.mark.parametrize("colour", [False, True])
 @pytest.mark.parametrize("side", [7, 15])
-def test_products_of_corner_windows_are_normalised_cross_correlations(colour: bool, side: int) -> None:
+def test_products_of_corner_windows_are_normalised_cross_correlations(colour, side):
     """The formula of section 4.2.2, each colour by itself."""
     rng = np.random.default_rng(2)
     rgb = np.stack([texture(80, 90, seed) for seed in (1, 2, 3)], axis=2).astype(np.uint8)
@@ -264,11 +259,11 @@ def test_products_of_corner_windows_are_normalised_cross_correlations(colour: bo
     planes = list(np.moveaxis(rgb.astype(np.float64), 2, 0)) if colour else [image.gray.astype(np.float64)]
     k = side // 2
 
-    def window(plane: F64, n: int) -> F64:
+    def window(plane, n):
         x, y = xy[n].astype(int)
         return plane[y - k : y + k + 1, x - k : x + k + 1]
 
-    def correlation(a: F64, b: F64) -> float:
+    def correlation(a, b):
         return float(np.mean((a - a.mean()) * (b - b.mean())) / (a.std() * b.std()))
 
     for a, b in ((0, 1), (2, 2), (3, 7)):
@@ -276,11 +271,11 @@ def test_products_of_corner_windows_are_normalised_cross_correlations(colour: bo
         assert found[a] @ found[b] == pytest.approx(twin, abs=1e-4)
 
 
-def test_union_never_puts_two_corners_of_a_view_together() -> None:
+def test_union_never_puts_two_corners_of_a_view_together():
     view_of = np.repeat(np.arange(5), 20)
     edges = RNG.integers(0, 100, (150, 2))
     root = unite(edges, view_of, 5)
-    member: list[set[int]] = [{n} for n in range(100)]
+    member = [{n} for n in range(100)]
     for a, b in edges:
         together = member[a] | member[b]
         if len({view_of[n] for n in together}) == len(together):
@@ -290,7 +285,7 @@ def test_union_never_puts_two_corners_of_a_view_together() -> None:
         assert (root[a] == root[b]) == (b in member[a])
 
 
-def test_maps_chain_along_the_matches() -> None:
+def test_maps_chain_along_the_matches():
     a = np.array([[[1.1, 0.1], [0.0, 0.9]], [[0.8, 0.0], [0.2, 1.2]]])
     xy = np.array([[10.0, 10.0], [20.0, 12.0], [31.0, 13.0]])
     # Observation 1 is the middle: edge 0 leads from 0 to 1 (walked backwards), edge 1 from 1 to 2.

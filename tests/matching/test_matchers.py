@@ -1,26 +1,19 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from tests.textures import disparity, photograph, sideways_fundamental, stereo_scene, texture
-from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.matching.prepared import PreparedView
 from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
 from thesisrecon.matching.strength import StrengthOfMatch
-from thesisrecon.records import FundamentalFit, Image, Matches
+from thesisrecon.records import Image
 
 Detector = HarrisCorners | MultiScaleCorners
 Variant = SeedsAndGrowth | StrengthOfMatch
-VARIANTS: list[tuple[Detector, Variant]] = [
-    (MultiScaleCorners(), SeedsAndGrowth()),
-    (HarrisCorners(), StrengthOfMatch()),
-]
-SWITCHED: list[Variant] = [
+VARIANTS = [(MultiScaleCorners(), SeedsAndGrowth()), (HarrisCorners(), StrengthOfMatch())]
+SWITCHED = [
     SeedsAndGrowth(orientation="upright"),
     SeedsAndGrowth(orientation="turned"),
     SeedsAndGrowth(support="always"),
@@ -40,21 +33,21 @@ SWITCHED: list[Variant] = [
 BOTH = pytest.mark.parametrize(("detector", "variant"), VARIANTS, ids=["seeds", "strength"])
 
 
-def views(detector: Detector, variant: Variant, *images: Image) -> list[PreparedView]:
+def views(detector, variant, *images):
     return [variant.prepare(image, detector.detect(image)) for image in images]
 
 
-def run(variant: Variant, one: PreparedView, two: PreparedView) -> Matches:
+def run(variant, one, two):
     rng = np.random.default_rng(0)
     return variant.match(one, two, pair=(2, 5), estimate_fundamental=sideways_fundamental, rng=rng)
 
 
-def no_fundamental(xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit:
+def no_fundamental(xy1, xy2, rng):
     raise StageFailure("no geometry", f"{len(xy1)} matches of {len(xy2)}, {rng}")
 
 
 @BOTH
-def test_matches_are_right_one_to_one_and_reproducible(detector: Detector, variant: Variant) -> None:
+def test_matches_are_right_one_to_one_and_reproducible(detector, variant):
     one, two = views(detector, variant, *stereo_scene())
     matches, again = run(variant, one, two), run(variant, one, two)
     error = np.linalg.norm(
@@ -70,7 +63,7 @@ def test_matches_are_right_one_to_one_and_reproducible(detector: Detector, varia
         assert np.array_equal(getattr(matches, name), getattr(again, name))
 
 
-def test_alignment_brings_matches_to_a_twentieth_of_a_pixel() -> None:
+def test_alignment_brings_matches_to_a_twentieth_of_a_pixel():
     variant = SeedsAndGrowth()
     matches = run(variant, *views(MultiScaleCorners(), variant, *stereo_scene()))
     error = matches.xy1 - matches.xy2 - np.c_[disparity(matches.xy2), 0 * matches.score]
@@ -79,9 +72,7 @@ def test_alignment_brings_matches_to_a_twentieth_of_a_pixel() -> None:
 
 
 @BOTH
-def test_photographs_of_different_things_share_nothing_or_little(
-    detector: Detector, variant: Variant
-) -> None:
+def test_photographs_of_different_things_share_nothing_or_little(detector, variant):
     one, two = views(detector, variant, photograph(texture(300, 400, 1)), photograph(texture(300, 400, 2)))
     matches = run(variant, one, two)
     assert len(matches.xy1) == 0 or isinstance(variant, StrengthOfMatch)
@@ -89,9 +80,7 @@ def test_photographs_of_different_things_share_nothing_or_little(
 
 @BOTH
 @pytest.mark.parametrize("size", [(1, 1), (12, 12), (40, 60)])
-def test_blank_tiny_and_noisy_photographs_give_an_empty_answer(
-    detector: Detector, variant: Variant, size: tuple[int, int]
-) -> None:
+def test_blank_tiny_and_noisy_photographs_give_an_empty_answer(detector, variant, size):
     noise = np.random.default_rng(1).uniform(0, 255, size)
     images = [photograph(np.full(size, 9.0)), photograph(noise), photograph(noise[::-1])]
     prepared = views(detector, variant, *images)
@@ -102,7 +91,7 @@ def test_blank_tiny_and_noisy_photographs_give_an_empty_answer(
         run(variant, one, prepared[2])
 
 
-def test_no_fundamental_matrix_leaves_no_matches() -> None:
+def test_no_fundamental_matrix_leaves_no_matches():
     variant = SeedsAndGrowth()
     one, two = views(MultiScaleCorners(), variant, *stereo_scene())
     rng = np.random.default_rng(0)
@@ -110,7 +99,7 @@ def test_no_fundamental_matrix_leaves_no_matches() -> None:
     assert len(matches.xy1) == 0
 
 
-def test_corners_without_seeds_are_refused() -> None:
+def test_corners_without_seeds_are_refused():
     variant = SeedsAndGrowth()
     one, two = views(HarrisCorners(), variant, *stereo_scene(120, 160))
     with pytest.raises(UsageError, match=r"features\.kind=multi-scale-corners"):
@@ -118,7 +107,7 @@ def test_corners_without_seeds_are_refused() -> None:
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
-def test_seeds_find_a_photograph_that_was_turned(quarter_turns: int) -> None:
+def test_seeds_find_a_photograph_that_was_turned(quarter_turns):
     gray = texture(300, 420, 4)
     seeds = [MultiScaleCorners().detect(photograph(g)).seeds for g in (gray, np.rot90(gray, quarter_turns))]
     assert seeds[0] is not None
@@ -134,21 +123,19 @@ def test_seeds_find_a_photograph_that_was_turned(quarter_turns: int) -> None:
     assert support[right].mean() > 5.0 > 2.0 > support[~right].mean() if (~right).any() else True
 
 
-def errors(matches: Matches) -> F64:
+def errors(matches):
     found = matches.xy1 - matches.xy2 - np.c_[disparity(matches.xy2), 0 * matches.score]
     return np.asarray(np.linalg.norm(found, axis=1))
 
 
 @pytest.fixture(scope="module")
-def stereo() -> tuple[PreparedView, PreparedView]:
+def stereo():
     one, two = views(MultiScaleCorners(), SeedsAndGrowth(), *stereo_scene())
     return one, two
 
 
 @pytest.mark.parametrize("variant", SWITCHED, ids=repr)
-def test_every_switch_leaves_right_matches_one_to_one(
-    stereo: tuple[PreparedView, PreparedView], variant: Variant
-) -> None:
+def test_every_switch_leaves_right_matches_one_to_one(stereo, variant):
     if isinstance(variant, StrengthOfMatch):
         one, two = views(HarrisCorners(), variant, *stereo_scene())
     else:
@@ -163,16 +150,14 @@ def test_every_switch_leaves_right_matches_one_to_one(
         assert np.median(errors(matches)) < 0.05
 
 
-def test_growth_multiplies_the_matches_and_alignment_makes_them_finer(
-    stereo: tuple[PreparedView, PreparedView],
-) -> None:
+def test_growth_multiplies_the_matches_and_alignment_makes_them_finer(stereo):
     whole = run(SeedsAndGrowth(), *stereo)
     seeds, corners = run(SeedsAndGrowth(growth=False), *stereo), run(SeedsAndGrowth(align=False), *stereo)
     assert len(whole.xy1) > 1.5 * len(seeds.xy1)
     assert np.median(errors(corners)) > 3.0 * np.median(errors(whole))
 
 
-def test_relative_difference_and_thresholds_drop_wrong_matches() -> None:
+def test_relative_difference_and_thresholds_drop_wrong_matches():
     """Half of the second photograph shows something else."""
     left, right = stereo_scene()
     rgb = right.rgb.copy()
@@ -180,7 +165,7 @@ def test_relative_difference_and_thresholds_drop_wrong_matches() -> None:
     mixed = Image("mixed.png", rgb, right.original_size)
     wrong = []
     for weight, least in (("product", 0.0), ("product", 0.4), ("relative-difference", 0.4)):
-        variant = StrengthOfMatch(weight=weight, least_strength=least)  # type: ignore[arg-type]
+        variant = StrengthOfMatch(weight=weight, least_strength=least)
         matches = run(variant, *views(HarrisCorners(), variant, left, mixed))
         wrong.append(int((errors(matches) >= 1.5).sum()))
         assert (errors(matches) < 1.5).sum() > 700
@@ -193,9 +178,9 @@ def test_relative_difference_and_thresholds_drop_wrong_matches() -> None:
     ("field", "value"),
     [("window", 8), ("radius_rel", 0.0), ("candidates", 0), ("tolerance", 0.0), ("least_strength", 5.0)],
 )
-def test_a_strength_that_cannot_be_is_refused(field: str, value: float) -> None:
+def test_a_strength_that_cannot_be_is_refused(field, value):
     with pytest.raises(ValueError, match=field):
-        StrengthOfMatch(**{field: value})  # type: ignore[arg-type]
+        StrengthOfMatch(**{field: value})
 
 
 @pytest.mark.parametrize(
@@ -210,12 +195,12 @@ def test_a_strength_that_cannot_be_is_refused(field: str, value: float) -> None:
         ("affine_std", -1.0),
     ],
 )
-def test_a_growth_that_cannot_be_is_refused(field: str, value: float) -> None:
+def test_a_growth_that_cannot_be_is_refused(field, value):
     with pytest.raises(ValueError, match=field):
-        SeedsAndGrowth(**{field: value})  # type: ignore[arg-type]
+        SeedsAndGrowth(**{field: value})
 
 
-def test_corners_of_seeds_are_one_to_one_and_follow_the_map() -> None:
+def test_corners_of_seeds_are_one_to_one_and_follow_the_map():
     rng = np.random.default_rng(3)
     xy1 = rng.uniform(0, 400, (60, 2))
     turn = np.array([[0.0, -1.2], [1.2, 0.0]])

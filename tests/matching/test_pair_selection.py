@@ -1,12 +1,8 @@
 """Which pairs are matched: the wishes of the user, and the estimate of the overlap."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +12,6 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from tests.textures import photograph, texture
-from thesisrecon.config import PairSelector
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
@@ -36,28 +31,28 @@ from thesisrecon.matching.pair_selection import (
     connecting_pairs,
     most_alike,
 )
-from thesisrecon.records import Features, PairChoice
+from thesisrecon.records import Features
 
 SIDE, CROPS = 260, 14
 NO_FEATURES = Features(np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0, np.float32))
 
 
-def one_by_one(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+def one_by_one(function, items):
     return [function(item) for item in items]
 
 
-def names_of(n: int) -> list[str]:
+def names_of(n):
     return [f"{i:02d}.jpg" for i in range(n)]
 
 
-def choose(selector: PairSelector, n: int, features: Any = None, map_all: Any = one_by_one) -> PairChoice:
+def choose(selector, n, features=None, map_all=one_by_one):
     names = names_of(n)
     selector.check(names, ["blank.jpg"])
     rng = np.random.default_rng(0)
     return selector.select(names, features or [NO_FEATURES] * n, map_all=map_all, rng=rng)
 
 
-def as_set(pairs: Any) -> set[tuple[int, int]]:
+def as_set(pairs):
     return {(int(i), int(j)) for i, j in pairs}
 
 
@@ -68,7 +63,7 @@ def as_set(pairs: Any) -> set[tuple[int, int]]:
     "selector", [AllPairs(), OverlapEstimate(), SequenceWindow(99), SequenceWindow(99, loop=True)]
 )
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
-def test_all_pairs_of_a_small_set_in_order(selector: PairSelector, n: int) -> None:
+def test_all_pairs_of_a_small_set_in_order(selector, n):
     choice = choose(selector, n)
     assert choice.pairs.tolist() == [list(pair) for pair in combinations(range(n), 2)]
     assert choice.pairs.shape == (n * (n - 1) // 2, 2)
@@ -77,14 +72,14 @@ def test_all_pairs_of_a_small_set_in_order(selector: PairSelector, n: int) -> No
 
 
 @given(st.integers(2, 12), st.integers(1, 12))
-def test_a_window_takes_the_next_ones(n: int, window: int) -> None:
+def test_a_window_takes_the_next_ones(n, window):
     pairs = as_set(choose(SequenceWindow(window), n).pairs)
     assert pairs == {(i, j) for i, j in combinations(range(n), 2) if j - i <= window}
     looped = as_set(choose(SequenceWindow(window, loop=True), n).pairs)
     assert looped == {(i, j) for i, j in combinations(range(n), 2) if min(j - i, n - j + i) <= window}
 
 
-def test_listed_pairs_in_any_order_and_without_those_left_out() -> None:
+def test_listed_pairs_in_any_order_and_without_those_left_out():
     listed = (("03.jpg", "00.jpg"), ("01.jpg", "02.jpg"), ("blank.jpg", "02.jpg"))
     assert choose(ListedPairs(listed), 4).pairs.tolist() == [[0, 3], [1, 2]]
 
@@ -98,7 +93,7 @@ def test_listed_pairs_in_any_order_and_without_those_left_out() -> None:
         ((("00.jpg", "blank.jpg"),), "photographs were left out"),
     ],
 )
-def test_a_list_that_does_not_fit_the_photographs_is_refused(listed: Any, words: str) -> None:
+def test_a_list_that_does_not_fit_the_photographs_is_refused(listed, words):
     with pytest.raises(UsageError, match=words):
         choose(ListedPairs(listed), 4)
 
@@ -114,7 +109,7 @@ def test_a_list_that_does_not_fit_the_photographs_is_refused(listed: Any, words:
         (lambda: OverlapEstimate(words=0), "words must be at least 1"),
     ],
 )
-def test_wishes_that_cannot_be_meant_are_refused(make: Callable[[], Any], words: str) -> None:
+def test_wishes_that_cannot_be_meant_are_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -130,7 +125,7 @@ class Windows:
     wall: list[int]
     place: np.ndarray
 
-    def shared(self, i: int, j: int) -> float:
+    def shared(self, i, j):
         """The part of a window that two of them share."""
         if self.wall[i] != self.wall[j]:
             return 0.0
@@ -138,7 +133,7 @@ class Windows:
 
 
 @pytest.fixture(scope="module")
-def windows() -> Windows:
+def windows():
     rng = np.random.default_rng(7)
     walls = [texture(520, 700, seed) for seed in (1, 2)]
     wall = [k % 2 for k in range(CROPS)]
@@ -151,7 +146,7 @@ def windows() -> Windows:
 ESTIMATE = OverlapEstimate(all_up_to=2, nearest=1, shortlist=9, words=256)
 
 
-def test_pairs_that_overlap_are_chosen_and_few_others(windows: Windows) -> None:
+def test_pairs_that_overlap_are_chosen_and_few_others(windows):
     choice = choose(ESTIMATE, CROPS, windows.features)
     chosen, every = as_set(choice.pairs), list(combinations(range(CROPS), 2))
     much = {pair for pair in every if windows.shared(*pair) > 0.15}
@@ -163,7 +158,7 @@ def test_pairs_that_overlap_are_chosen_and_few_others(windows: Windows) -> None:
     assert str(choice.compared) in choice.how
 
 
-def test_every_photograph_is_paired_and_all_hang_together(windows: Windows) -> None:
+def test_every_photograph_is_paired_and_all_hang_together(windows):
     strict = replace(ESTIMATE, least_evidence=1e9)
     pairs = choose(strict, CROPS, windows.features).pairs
     assert set(pairs.ravel().tolist()) == set(range(CROPS))
@@ -172,8 +167,8 @@ def test_every_photograph_is_paired_and_all_hang_together(windows: Windows) -> N
     assert connected_components(graph, directed=False)[0] == 1
 
 
-def test_the_number_of_threads_changes_nothing(windows: Windows) -> None:
-    def in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+def test_the_number_of_threads_changes_nothing(windows):
+    def in_threads(function, items):
         with ThreadPoolExecutor(3) as pool:
             return list(pool.map(function, items))
 
@@ -181,20 +176,20 @@ def test_the_number_of_threads_changes_nothing(windows: Windows) -> None:
     assert alone.pairs.tolist() == together.pairs.tolist()
 
 
-def test_photographs_without_structure_are_no_obstacle(windows: Windows) -> None:
+def test_photographs_without_structure_are_no_obstacle(windows):
     blank = MultiScaleCorners().detect(photograph(np.full((SIDE, SIDE), 90.0)))
     choice = choose(ESTIMATE, CROPS, [*windows.features[:-1], blank])
     assert CROPS - 1 in choice.pairs
     assert len(choose(ESTIMATE, 5, [blank] * 5).pairs) >= 4
 
 
-def test_features_without_seeds_are_refused_with_the_way_out() -> None:
+def test_features_without_seeds_are_refused_with_the_way_out():
     features = [HarrisCorners(max_corners=20).detect(photograph(texture(80, 90, k))) for k in range(4)]
     with pytest.raises(UsageError, match=r"features\.kind=multi-scale-corners, or pairs\.kind=all-pairs"):
         choose(ESTIMATE, 4, features)
 
 
-def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows: Windows) -> None:
+def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
     image = photograph(texture(SIDE, SIDE, 5))
     turned = photograph(np.rot90(texture(SIDE, SIDE, 5)).copy())
     detector = MultiScaleCorners()
@@ -211,7 +206,7 @@ def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows: Windows)
         assert max(chance) < 2.0
 
 
-def test_photographs_of_one_wall_use_the_same_words(windows: Windows) -> None:
+def test_photographs_of_one_wall_use_the_same_words(windows):
     sketches = [subset_seeds(f.seeds, turned=False, per_scale=200) for f in windows.features if f.seeds]
     alike = bow_similarity(
         [s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
@@ -228,7 +223,7 @@ def test_photographs_of_one_wall_use_the_same_words(windows: Windows) -> None:
 
 
 @given(st.integers(2, 9), st.integers(1, 9), st.integers(0, 2**31))
-def test_the_most_alike_of_each(n: int, count: int, seed: int) -> None:
+def test_the_most_alike_of_each(n, count, seed):
     alike = np.random.default_rng(seed).random((n, n))
     alike += alike.T
     pairs = as_set(most_alike(alike, count))
@@ -239,7 +234,7 @@ def test_the_most_alike_of_each(n: int, count: int, seed: int) -> None:
 
 
 @given(st.integers(2, 9), st.integers(0, 2**31))
-def test_bridges_join_what_is_apart_by_the_best_pairs_and_nothing_else(n: int, seed: int) -> None:
+def test_bridges_join_what_is_apart_by_the_best_pairs_and_nothing_else(n, seed):
     rng = np.random.default_rng(seed)
     order = rng.random((n, n))
     order += order.T
@@ -254,12 +249,12 @@ def test_bridges_join_what_is_apart_by_the_best_pairs_and_nothing_else(n: int, s
         assert as_set(np.sort(added, axis=1)) == {max(across, key=lambda pair: order[pair])}
 
 
-def _parts(n: int, pairs: np.ndarray) -> Any:
+def _parts(n, pairs):
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(n, n))
     return connected_components(graph, directed=False)
 
 
-def mutual_best_numpy(correlation: Any, xy2: Any, apart2: Any) -> tuple[np.ndarray, np.ndarray]:
+def mutual_best_numpy(correlation, xy2, apart2):
     best, back = correlation.argmax(axis=1), correlation.argmax(axis=0)
     mutual = back[best] == np.arange(len(best))
     apart = ((xy2[None] - xy2[best][:, None]) ** 2).sum(axis=2) > apart2[best][:, None]
@@ -268,7 +263,7 @@ def mutual_best_numpy(correlation: Any, xy2: Any, apart2: Any) -> tuple[np.ndarr
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
-def test_mutual_best_is_its_numpy_twin(rows: int, columns: int, seed: int) -> None:
+def test_mutual_best_is_its_numpy_twin(rows, columns, seed):
     rng = np.random.default_rng(seed)
     correlation = rng.uniform(-1.0, 1.0, (rows, columns)).astype(np.float32)
     xy2 = rng.uniform(0.0, 10.0, (columns, 2)).astype(np.float32)
@@ -279,7 +274,7 @@ def test_mutual_best_is_its_numpy_twin(rows: int, columns: int, seed: int) -> No
     np.testing.assert_array_equal(competing_model, wanted_rival.astype(np.float32))
 
 
-def most_agreeing_numpy(xy1: Any, xy2: Any, scale: Any, angle: Any, limits: Any) -> int:
+def most_agreeing_numpy(xy1, xy2, scale, angle, limits):
     z1, z2 = xy1 @ [1.0, 1.0j], xy2 @ [1.0, 1.0j]
     turn = scale * np.exp(1j * angle)
     miss = np.abs(z2[:, None] + turn[:, None] * (z1[None] - z1[:, None]) - z2[None])
@@ -291,7 +286,7 @@ def most_agreeing_numpy(xy1: Any, xy2: Any, scale: Any, angle: Any, limits: Any)
 
 
 @given(st.integers(1, 14), st.integers(0, 2**31))
-def test_most_agreeing_is_its_numpy_twin(n: int, seed: int) -> None:
+def test_most_agreeing_is_its_numpy_twin(n, seed):
     rng = np.random.default_rng(seed)
     xy1, xy2 = rng.uniform(0.0, 30.0, (2, n, 2))
     scale, angle = rng.uniform(0.5, 2.0, n), rng.uniform(-4.0, 4.0, n)

@@ -1,21 +1,17 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.textures import photograph, sideways_fundamental, texture
-from thesisrecon.arrays import F64
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.matching.prepared import PreparedView
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.records import TwoView
 
 SHIFTS = np.array([[0.0, 0.0], [7.3, 0.0], [15.6, 0.0], [24.1, 0.0]])
 
 
-def panorama() -> tuple[list[PreparedView], list[TwoView]]:
+def panorama():
     """Four views of one plane: view i shows the scene point u at u - SHIFTS[i]."""
     wide = texture(200, 330, 9)
     y, x = np.mgrid[0:200, 0:280].astype(np.float64)
@@ -54,11 +50,11 @@ def panorama() -> tuple[list[PreparedView], list[TwoView]]:
 
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[list[PreparedView], list[TwoView]]:
+def scene():
     return panorama()
 
 
-def spread(view_index: F64, point_index: F64, xy: F64) -> F64:
+def spread(view_index, point_index, xy):
     """(K,) distance of each observation, brought to the scene, from the mean of its track."""
     placed = xy + SHIFTS[view_index]
     total = np.zeros((point_index.max() + 1, 2))
@@ -68,9 +64,7 @@ def spread(view_index: F64, point_index: F64, xy: F64) -> F64:
 
 
 @pytest.mark.parametrize("variant", [PlainTracks(), AlignedTracks()])
-def test_tracks_are_sorted_and_seen_once_in_at_least_two_views(
-    scene: tuple[list[PreparedView], list[TwoView]], variant: PlainTracks | AlignedTracks
-) -> None:
+def test_tracks_are_sorted_and_seen_once_in_at_least_two_views(scene, variant):
     tracks = variant.build(*scene, np.random.default_rng(0))
     key = tracks.point_index * 4 + tracks.view_index
     assert (np.diff(key) > 0).all()
@@ -81,9 +75,7 @@ def test_tracks_are_sorted_and_seen_once_in_at_least_two_views(
     assert (spread(tracks.view_index, tracks.point_index, tracks.xy) < 3.0).mean() > 0.98
 
 
-def test_alignment_brings_the_observations_of_a_track_to_one_spot(
-    scene: tuple[list[PreparedView], list[TwoView]],
-) -> None:
+def test_alignment_brings_the_observations_of_a_track_to_one_spot(scene):
     plain, aligned = (v.build(*scene, np.random.default_rng(0)) for v in (PlainTracks(), AlignedTracks()))
     before = np.median(spread(plain.view_index, plain.point_index, plain.xy))
     after = np.median(spread(aligned.view_index, aligned.point_index, aligned.xy))
@@ -92,16 +84,12 @@ def test_alignment_brings_the_observations_of_a_track_to_one_spot(
 
 
 @pytest.mark.parametrize("variant", [PlainTracks(), AlignedTracks()])
-def test_no_accepted_pair_gives_no_tracks(
-    scene: tuple[list[PreparedView], list[TwoView]], variant: PlainTracks | AlignedTracks
-) -> None:
+def test_no_accepted_pair_gives_no_tracks(scene, variant):
     tracks = variant.build(scene[0], [], np.random.default_rng(0))
     assert (tracks.n_points, len(tracks.xy), tracks.n_views) == (0, 0, 4)
 
 
-def test_a_false_link_does_not_join_two_corners_of_one_view(
-    scene: tuple[list[PreparedView], list[TwoView]],
-) -> None:
+def test_a_false_link_does_not_join_two_corners_of_one_view(scene):
     prepared, pairs = scene
     good = pairs[0]
     crossed = np.roll(good.index2, 1)

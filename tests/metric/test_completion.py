@@ -1,28 +1,25 @@
 """Lenses beyond one coefficient, cropped photographs, and cameras that the rest contradicts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
 from tests.metric.test_population import true_calibration
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.camera_matrix import project_camera
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.records import MetricResult, Reconstruction
 
 
-def refine(scene: TrueScene, *, start: Reconstruction | None = None, cameras: str = "shared") -> MetricResult:
+def refine(scene, *, start=None, cameras="shared"):
     start = projective_reconstruction(scene) if start is None else start
-    wish = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")
+    wish = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
     rng = np.random.default_rng(0)
-    assumed = assume(start, wish)
-    return MetricRefinement().refine(start, true_calibration(scene), assumed=assumed, rng=rng)
+    prior = prior_for(start, wish)
+    return MetricRefinement().refine(start, true_calibration(scene), prior=prior, rng=rng)
 
 
-def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it() -> None:
+def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it():
     scene = make_scene(points=500, seed=2)
     distortion, t = np.array([-0.03, 0.02, -0.02]), scene.tracks
     xy = np.empty_like(t.xy)
@@ -40,7 +37,7 @@ def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it() -> None:
     assert abs(focal.value - 1500.0) < 4.0 * focal.std < 6.0
 
 
-def test_a_principal_point_far_off_the_middle_is_found() -> None:
+def test_a_principal_point_far_off_the_middle_is_found():
     scene = make_scene(sigma_px=0.2, points=500, principal_shift=(120.0, -80.0), seed=3)
     K = refine(scene).reconstruction.K
     assert K is not None
@@ -48,7 +45,7 @@ def test_a_principal_point_far_off_the_middle_is_found() -> None:
     np.testing.assert_allclose(K[:, 0, 0], 1500.0, rtol=5e-3)
 
 
-def test_a_photograph_of_other_points_is_refused_with_its_share() -> None:
+def test_a_photograph_of_other_points_is_refused_with_its_share():
     scene = make_scene(sigma_px=0.3, points=500, seed=4)
     t, rng = scene.tracks, np.random.default_rng(5)
     # Two thirds of one view's matches are wrong: whatever its camera, most of them disagree.
@@ -67,7 +64,7 @@ def test_a_photograph_of_other_points_is_refused_with_its_share() -> None:
     assert not result.intrinsics[6]
 
 
-def test_a_camera_made_wrong_is_sought_again() -> None:
+def test_a_camera_made_wrong_is_sought_again():
     scene = make_scene(sigma_px=0.3, points=500, seed=5)
     start = projective_reconstruction(scene)
     # A camera that is metric but elsewhere: the upgrade cannot tell, its matches can.
@@ -81,7 +78,7 @@ def test_a_camera_made_wrong_is_sought_again() -> None:
     assert abs(ratio / (np.linalg.norm(truth[6] - truth[0]) / np.linalg.norm(truth[1] - truth[0])) - 1) < 0.01
 
 
-def _poses(reconstruction: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
+def _poses(reconstruction):
     assert reconstruction.K is not None
     pose = np.linalg.solve(reconstruction.K, reconstruction.P)
     return pose[:, :, :3], pose[:, :, 3]

@@ -1,29 +1,26 @@
 """Stated intervals hold the truth as often as they say; a floor stands only where the model is not true."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.metric.test_population import true_calibration
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric.adjustment import tail_width
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.metric.uncertainty import Borrowing, model_error_share
 from thesisrecon.numerics.block_scatter import BlockScatter
-from thesisrecon.records import MetricResult
 
 
-def refine(scene: TrueScene) -> MetricResult:
+def refine(scene):
     start = projective_reconstruction(scene)
     rng = np.random.default_rng(0)
-    return MetricRefinement().refine(start, true_calibration(scene), assumed=assume(start), rng=rng)
+    return MetricRefinement().refine(start, true_calibration(scene), prior=prior_for(start), rng=rng)
 
 
-def test_deviations_are_of_the_stated_size_on_normal_noise() -> None:
+def test_deviations_are_of_the_stated_size_on_normal_noise():
     deviations = []
     for seed in range(8):
         scene = make_scene(sigma_px=0.5, points=300, seed=seed, principal_shift=(5.0, -3.0))
@@ -39,7 +36,7 @@ def test_deviations_are_of_the_stated_size_on_normal_noise() -> None:
     assert 0.6 < np.sqrt(np.mean(np.square(deviations))) < 1.5
 
 
-def test_less_noise_is_a_narrower_interval_without_a_floor() -> None:
+def test_less_noise_is_a_narrower_interval_without_a_floor():
     stds = [
         refine(make_scene(sigma_px=sigma, points=300, seed=1)).intrinsics[0]["focal_px"].std
         for sigma in (0.5, 0.05)
@@ -48,7 +45,7 @@ def test_less_noise_is_a_narrower_interval_without_a_floor() -> None:
     assert stds[1] < 5e-4 * 1500.0
 
 
-def test_heavy_tails_bring_the_floor() -> None:
+def test_heavy_tails_bring_the_floor():
     scene = make_scene(sigma_px=0.05, points=300, seed=1)
     rng = np.random.default_rng(0)
     t = scene.tracks
@@ -59,8 +56,8 @@ def test_heavy_tails_bring_the_floor() -> None:
     assert "leaves out" in focal.source
 
 
-def test_the_share_of_model_error_follows_its_signs() -> None:
-    def scatter(contradiction: float, blocks: int = 32) -> BlockScatter:
+def test_the_share_of_model_error_follows_its_signs():
+    def scatter(contradiction, blocks=32):
         return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, blocks)
 
     assert model_error_share(scatter(1.0), 1.0) == 0.0
@@ -70,19 +67,19 @@ def test_the_share_of_model_error_follows_its_signs() -> None:
     assert model_error_share(scatter(1.0, blocks=1), 1.0) == 1.0
 
 
-def test_the_tail_of_normal_noise_is_one() -> None:
+def test_the_tail_of_normal_noise_is_one():
     lengths = np.linalg.norm(np.random.default_rng(0).normal(size=(4000, 2)), axis=1)
     assert tail_width(lengths, 1.0) == pytest.approx(1.0, abs=0.05)
     assert tail_width(10.0 * lengths, 1.0) == 3.0
 
 
-def test_what_else_is_estimated_has_an_interval_that_holds_it() -> None:
+def test_what_else_is_estimated_has_an_interval_that_holds_it():
     """Aspect, skew and the whole lens; what is assumed is told as assumed."""
     scene = make_scene(sigma_px=0.5, points=300, seed=2)
     start = projective_reconstruction(scene)
-    wish = IntrinsicsAssumption(aspect="constant", skew="constant", skew_std_px=50.0)
+    wish = IntrinsicsOptions(aspect="constant", skew="constant", skew_std_px=50.0)
     found = MetricRefinement().refine(
-        start, true_calibration(scene), assumed=assume(start, wish), rng=np.random.default_rng(0)
+        start, true_calibration(scene), prior=prior_for(start, wish), rng=np.random.default_rng(0)
     )
     for name, truth in (("aspect", 1.0), ("skew_px", 0.0), ("k2", 0.0), ("k3", 0.0)):
         interval = found.intrinsics[0][name]
@@ -94,7 +91,7 @@ def test_what_else_is_estimated_has_an_interval_that_holds_it() -> None:
     assert [(usual[n].value, usual[n].std) for n in ("aspect", "skew_px")] == [(1.0, 0.0), (0.0, 0.0)]
 
 
-def test_a_focal_is_borrowed_only_where_its_own_matches_say_less_than_is_stated() -> None:
+def test_a_focal_is_borrowed_only_where_its_own_matches_say_less_than_is_stated():
     lent = Borrowing(np.array([0.02, 0.001, 0.02]), np.array([0.1, 0.1, 0.9]))
     assert [lent.lends(view, 0.005) for view in range(3)] == [True, False, False]
     assert "8%, one standard deviation" in Borrowing(np.array([0.08]), np.ones(1)).warnings([0], 0.05)[0]

@@ -1,38 +1,28 @@
 """The metric stage on scenes with truth: exactness, freed lens, postponed cameras, honesty."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.similarity import estimate_similarity
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.metric.resection import resect_calibrated
-from thesisrecon.records import MetricResult, Reconstruction
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 
 
-def run(
-    scene: TrueScene,
-    *,
-    shared: bool = True,
-    reconstruction: Reconstruction | None = None,
-    variant: MetricRefinement | None = None,
-    wish: IntrinsicsAssumption | None = None,
-) -> MetricResult:
+def run(scene, *, shared=True, reconstruction=None, variant=None, wish=None):
     start = projective_reconstruction(scene) if reconstruction is None else reconstruction
-    assumed = assume(start, wish or IntrinsicsAssumption(cameras="shared" if shared else "per-image"))
+    prior = prior_for(start, wish or IntrinsicsOptions(cameras="shared" if shared else "per-image"))
     rng = np.random.default_rng(0)
-    calibration = HypothesesAndRefinement().calibrate(start, assumed=assumed, rng=rng)
-    return (variant or MetricRefinement()).refine(start, calibration, assumed=assumed, rng=rng)
+    calibration = HypothesesAndRefinement().calibrate(start, prior=prior, rng=rng)
+    return (variant or MetricRefinement()).refine(start, calibration, prior=prior, rng=rng)
 
 
-def centre_error(result: MetricResult, scene: TrueScene) -> float:
+def centre_error(result, scene):
     """Mean camera-centre error after similarity alignment, in units of the cameras' mutual distance."""
     views = result.reconstruction.registered
     C = camera_centre(result.reconstruction.P[views])
@@ -42,7 +32,7 @@ def centre_error(result: MetricResult, scene: TrueScene) -> float:
     return float(np.linalg.norm(moved - scene.centres[views], axis=1).mean() / spread)
 
 
-def test_noise_free_scene_comes_back_with_its_lens() -> None:
+def test_noise_free_scene_comes_back_with_its_lens():
     scene = make_scene(principal_shift=(9.0, -6.0), k1=0.03, points=400)
     result = run(scene)
     assert result.trusted
@@ -58,7 +48,7 @@ def test_noise_free_scene_comes_back_with_its_lens() -> None:
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_noisy_scene_is_right_within_its_own_intervals(shared: bool) -> None:
+def test_noisy_scene_is_right_within_its_own_intervals(shared):
     scene = make_scene(sigma_px=0.5, points=500, zoom=0.0 if shared else 0.3, seed=3)
     result = run(scene, shared=shared)
     assert result.trusted, result.failed_checks
@@ -70,7 +60,7 @@ def test_noisy_scene_is_right_within_its_own_intervals(shared: bool) -> None:
     assert centre_error(result, scene) < 0.01
 
 
-def test_a_postponed_camera_joins_by_calibrated_resection() -> None:
+def test_a_postponed_camera_joins_by_calibrated_resection():
     scene = make_scene(sigma_px=0.3, points=400, seed=4)
     start = projective_reconstruction(scene)
     registered = np.ones(8, dtype=bool)
@@ -84,7 +74,7 @@ def test_a_postponed_camera_joins_by_calibrated_resection() -> None:
     assert centre_error(result, scene) < 0.01
 
 
-def test_a_wrong_camera_of_the_projective_stage_is_caught_and_resected() -> None:
+def test_a_wrong_camera_of_the_projective_stage_is_caught_and_resected():
     scene = make_scene(sigma_px=0.3, points=400, seed=5)
     start = projective_reconstruction(scene)
     P = start.P.copy()
@@ -94,7 +84,7 @@ def test_a_wrong_camera_of_the_projective_stage_is_caught_and_resected() -> None
     assert centre_error(result, scene) < 0.01
 
 
-def test_a_view_without_points_keeps_its_reason() -> None:
+def test_a_view_without_points_keeps_its_reason():
     scene = make_scene(points=300, seed=6)
     t = scene.tracks
     keep = t.view_index != 7
@@ -112,15 +102,15 @@ def test_a_view_without_points_keeps_its_reason() -> None:
     assert result.intrinsics[7] == {}
 
 
-def test_fixed_principal_point_is_said_to_be_assumed() -> None:
+def test_fixed_principal_point_is_said_to_be_assumed():
     scene = make_scene(sigma_px=0.3, seed=7)
-    result = run(scene, wish=IntrinsicsAssumption(principal_point="known", k1="known"))
+    result = run(scene, wish=IntrinsicsOptions(principal_point="known", k1="known"))
     interval = result.intrinsics[0]["principal_x_px"]
     assert interval.value == pytest.approx((1536 - 1) / 2)
     assert interval.source == "assumed"
 
 
-def test_calibrated_resection_survives_half_wrong_points() -> None:
+def test_calibrated_resection_survives_half_wrong_points():
     scene = make_scene()
     rng = np.random.default_rng(0)
     Y = scene.X @ scene.R[0].T + scene.t[0]
@@ -135,7 +125,7 @@ def test_calibrated_resection_survives_half_wrong_points() -> None:
     assert found[2][~wrong].all()
 
 
-def test_the_same_seed_gives_the_same_bytes() -> None:
+def test_the_same_seed_gives_the_same_bytes():
     scene = make_scene(sigma_px=0.5, seed=8)
     first, second = run(scene), run(scene)
     assert first.reconstruction.P.tobytes() == second.reconstruction.P.tobytes()

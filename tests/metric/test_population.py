@@ -1,20 +1,18 @@
 """Cameras of one kind: how their scatter is measured, who borrows, and what is said of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.metric.uncertainty import OwnValues, estimate_population, measured_spread, outlying
-from thesisrecon.records import MetricResult, SelfCalibration, Upgrade
+from thesisrecon.records import SelfCalibration, Upgrade
 
 
-def true_calibration(scene: TrueScene) -> SelfCalibration:
+def true_calibration(scene):
     """The truth as an upgrade of ``projective_reconstruction``, focals 2 % off."""
     G = np.eye(4) + 0.3 * np.random.default_rng(0).normal(size=(4, 4))
     K = scene.K * np.array([1.02, 1.02, 1.0])[:, None]
@@ -23,14 +21,14 @@ def true_calibration(scene: TrueScene) -> SelfCalibration:
     return SelfCalibration(upgrade.metric_from_projective, K, np.zeros_like(K), True, (), (upgrade,))
 
 
-def refine(scene: TrueScene, *, alike: bool = True) -> MetricResult:
+def refine(scene, *, common_prior=True):
     start = projective_reconstruction(scene)
-    assumed = assume(start, IntrinsicsAssumption(cameras="per-image", alike=alike))
+    prior = prior_for(start, IntrinsicsOptions(cameras="per-image", common_prior=common_prior))
     rng = np.random.default_rng(0)
-    return MetricRefinement().refine(start, true_calibration(scene), assumed=assumed, rng=rng)
+    return MetricRefinement().refine(start, true_calibration(scene), prior=prior, rng=rng)
 
 
-def with_few_points(scene: TrueScene, view: int, count: int) -> TrueScene:
+def with_few_points(scene, view, count):
     """The scene with ``count`` observations left in one view."""
     t = scene.tracks
     here = np.flatnonzero(t.view_index == view)
@@ -42,7 +40,7 @@ def with_few_points(scene: TrueScene, view: int, count: int) -> TrueScene:
     )
 
 
-def test_the_spread_of_values_that_agree_is_small_and_of_zoomed_ones_large() -> None:
+def test_the_spread_of_values_that_agree_is_small_and_of_zoomed_ones_large():
     rng = np.random.default_rng(1)
     std = rng.uniform(0.002, 0.01, 30)
     same = measured_spread(std * rng.normal(size=30), std, std)
@@ -51,7 +49,7 @@ def test_the_spread_of_values_that_agree_is_small_and_of_zoomed_ones_large() -> 
     assert zoomed == pytest.approx(0.3, rel=0.5)
 
 
-def test_the_spread_is_that_of_the_values_beyond_their_noise_and_the_error_of_the_model() -> None:
+def test_the_spread_is_that_of_the_values_beyond_their_noise_and_the_error_of_the_model():
     rng = np.random.default_rng(2)
     std = np.full(12, 0.01)
     values = [0.02 * rng.normal(size=12) + std * rng.normal(size=12) for _ in range(200)]
@@ -60,7 +58,7 @@ def test_the_spread_is_that_of_the_values_beyond_their_noise_and_the_error_of_th
     assert measured_spread(np.zeros(1), np.ones(1), np.ones(1)) == np.inf
 
 
-def test_one_zoomed_camera_does_not_pull_the_rest() -> None:
+def test_one_zoomed_camera_does_not_pull_the_rest():
     rng = np.random.default_rng(3)
     std = np.full((9, 8), 0.001)
     value = 0.001 * rng.normal(size=(9, 8))
@@ -73,7 +71,7 @@ def test_one_zoomed_camera_does_not_pull_the_rest() -> None:
     assert outlying(value[:, 0], std[:, 0]).sum() == 1
 
 
-def test_nothing_is_borrowed_where_all_is_shared_or_too_few_are_alike() -> None:
+def test_nothing_is_borrowed_where_all_is_shared_or_too_few_are_common_prior():
     value, std = np.zeros((4, 8)), np.full((4, 8), 0.01)
     kind = np.zeros(4, dtype=np.int64)
     own = np.tile(np.arange(4)[:, None], (1, 8))
@@ -84,9 +82,9 @@ def test_nothing_is_borrowed_where_all_is_shared_or_too_few_are_alike() -> None:
     assert estimate_population(OwnValues(value, std, 0.0 * std, kind), own) is not None
 
 
-def test_a_badly_determined_focal_is_borrowed_and_named() -> None:
+def test_a_badly_determined_focal_is_borrowed_and_named():
     scene = with_few_points(make_scene(sigma_px=0.5, points=400, seed=11), 3, 30)
-    alone, together = refine(scene, alike=False), refine(scene)
+    alone, together = refine(scene, common_prior=False), refine(scene)
     assert alone.reconstruction.registered.all()
     assert together.reconstruction.registered.all()
     wide, narrow = alone.intrinsics[3]["focal_px"], together.intrinsics[3]["focal_px"]
@@ -106,7 +104,7 @@ def test_a_badly_determined_focal_is_borrowed_and_named() -> None:
         assert any("view 3" in said for said in alone.warnings)
 
 
-def test_zoomed_photographs_keep_their_own_focals() -> None:
+def test_zoomed_photographs_keep_their_own_focals():
     scene = make_scene(sigma_px=0.3, points=400, zoom=0.4, seed=12)
     result = refine(scene)
     K = result.reconstruction.K
@@ -115,7 +113,7 @@ def test_zoomed_photographs_keep_their_own_focals() -> None:
     assert not any("borrowed" in intervals["focal_px"].source for intervals in result.intrinsics)
 
 
-def test_kinds_of_different_sizes_have_spreads_of_their_own() -> None:
+def test_kinds_of_different_sizes_have_spreads_of_their_own():
     rng = np.random.default_rng(5)
     value, std = np.zeros((12, 8)), np.full((12, 8), 1e-3)
     value[:6, 0], value[6:, 0] = 0.001 * rng.normal(size=6), 0.2 * rng.normal(size=6)

@@ -1,27 +1,25 @@
 """The self-check leaves right models alone, and names the photograph that is wrong and the word that was."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from tests.synthetic import make_scene, projective_reconstruction, with_poses
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric.adjustment import Adjustment
 from thesisrecon.metric.checks import check_views, self_check, within_reach
 from thesisrecon.metric.model import MetricModel, camera_rows, project_observations, retriangulate
 from thesisrecon.metric.shared_camera import centre_of_a_bent_model, contradicted_focals
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.metric_cameras import MetricCameras
-from thesisrecon.records import Assumptions, IntrinsicInterval, SelfCalibration, Tracks
+from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
 
 SIGMAS, ANGLE = 7.0, 1e-3
 
 
-def true_model(scene: TrueScene, assumed: Assumptions) -> MetricModel:
-    group, shared = camera_rows(assumed)
+def true_model(scene, prior):
+    group, shared = camera_rows(prior)
     rows = np.zeros((len(shared), 8))
     first = [int(np.flatnonzero(group == g)[0]) for g in range(len(shared))]
     rows[:, :5] = [[scene.K[v, 0, 0], 1.0, 0.0, scene.K[v, 0, 2], scene.K[v, 1, 2]] for v in first]
@@ -32,11 +30,11 @@ def true_model(scene: TrueScene, assumed: Assumptions) -> MetricModel:
     return retriangulate(model, sigmas=SIGMAS, min_angle=ANGLE)
 
 
-def calibration_of(scene: TrueScene) -> SelfCalibration:
+def calibration_of(scene):
     return SelfCalibration(np.eye(4), scene.K, np.zeros_like(scene.K), True, ())
 
 
-def doubts_of(model: MetricModel, scene: TrueScene) -> tuple[dict[str, float], list[str]]:
+def doubts_of(model, scene):
     intervals = [
         {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 1.0, "")}
         for g in model.cameras.group
@@ -44,13 +42,13 @@ def doubts_of(model: MetricModel, scene: TrueScene) -> tuple[dict[str, float], l
     return self_check(model, calibration_of(scene), intervals, sigmas=SIGMAS)
 
 
-def setting(**known: object) -> tuple[TrueScene, Assumptions, MetricModel]:
+def setting(**known):
     scene = make_scene(sigma_px=0.5, seed=3)
-    assumed = assume(projective_reconstruction(scene), IntrinsicsAssumption(**known))  # type: ignore[arg-type]
-    return scene, assumed, true_model(scene, assumed)
+    prior = prior_for(projective_reconstruction(scene), IntrinsicsOptions(**known))
+    return scene, prior, true_model(scene, prior)
 
 
-def test_a_right_model_is_not_doubted() -> None:
+def test_a_right_model_is_not_doubted():
     scene, _, model = setting()
     check, failed_checks = doubts_of(model, scene)
     assert failed_checks == []
@@ -59,7 +57,7 @@ def test_a_right_model_is_not_doubted() -> None:
 
 
 @pytest.mark.parametrize("view", [0, 5])
-def test_a_camera_that_stands_elsewhere_is_named(view: int) -> None:
+def test_a_camera_that_stands_elsewhere_is_named(view):
     scene, _, model = setting()
     t = model.cameras.t.copy()
     t[view] += [0.4, -0.3, 0.2]
@@ -69,7 +67,7 @@ def test_a_camera_that_stands_elsewhere_is_named(view: int) -> None:
     assert any(doubt.startswith(f"view {view}:") for doubt in failed_checks)
 
 
-def test_several_wrong_cameras_share_a_sentence() -> None:
+def test_several_wrong_cameras_share_a_sentence():
     scene, _, model = setting()
     t = model.cameras.t.copy()
     t[[1, 6]] += [0.4, -0.3, 0.2]
@@ -78,13 +76,13 @@ def test_several_wrong_cameras_share_a_sentence() -> None:
     assert any("1" in doubt and "6" in doubt and doubt.startswith("views ") for doubt in failed_checks)
 
 
-def test_a_view_of_another_focal_asks_for_it() -> None:
+def test_a_view_of_another_focal_asks_for_it():
     scene = make_scene(sigma_px=0.3, seed=4)
     view = scene.tracks.view_index == 2
     centre = scene.K[2, :2, 2]
     xy = np.where(view[:, None], centre + 1.08 * (scene.tracks.xy - centre), scene.tracks.xy)
-    assumed = assume(projective_reconstruction(scene))
-    model = true_model(scene, assumed)
+    prior = prior_for(projective_reconstruction(scene))
+    model = true_model(scene, prior)
     # What the zoomed photograph shows, wherever it was explained before.
     zoomed = replace(model, tracks=replace(scene.tracks, xy=xy), sigma_px=12.0)
     off = check_views(zoomed, sigmas=SIGMAS).focal_off
@@ -93,7 +91,7 @@ def test_a_view_of_another_focal_asks_for_it() -> None:
     assert any("view 2 alone asks for a focal length" in doubt for doubt in doubts_of(zoomed, scene)[1])
 
 
-def test_points_behind_a_camera_are_told() -> None:
+def test_points_behind_a_camera_are_told():
     scene, _, model = setting()
     R, t = model.cameras.R.copy(), model.cameras.t.copy()
     about = np.diag([-1.0, 1.0, -1.0])
@@ -104,9 +102,9 @@ def test_points_behind_a_camera_are_told() -> None:
 
 
 @pytest.mark.parametrize(("off", "deviation", "told"), [(1.0, 0.01, 0), (1.05, 0.003, 1), (1.05, 0.1, 0)])
-def test_a_focal_that_the_photographs_contradict_is_told(off: float, deviation: float, told: int) -> None:
-    _, assumed, model = setting(focal_px=1500.0 * off, focal_std_rel=deviation)
-    adjustment = Adjustment(assumed, 0.0, 0.02)
+def test_a_focal_that_the_photographs_contradict_is_told(off, deviation, told):
+    _, prior, model = setting(focal_px=1500.0 * off, focal_std_rel=deviation)
+    adjustment = Adjustment(prior, 0.0, 0.02)
     model = adjustment.run(model, iterations=10)[0]
     model = retriangulate(model, sigmas=SIGMAS, min_angle=ANGLE)
     failed_checks = contradicted_focals(model, adjustment)
@@ -114,28 +112,28 @@ def test_a_focal_that_the_photographs_contradict_is_told(off: float, deviation: 
     assert all("contradict the focal length" in doubt for doubt in failed_checks)
 
 
-def test_a_known_focal_that_is_contradicted_is_told_once_and_no_weight_is_advised() -> None:
-    _, assumed, model = setting(focal="known", focal_px=1600.0)
-    failed_checks = contradicted_focals(model, Adjustment(assumed, 0.0, 0.02))
+def test_a_known_focal_that_is_contradicted_is_told_once_and_no_weight_is_advised():
+    _, prior, model = setting(focal="known", focal_px=1600.0)
+    failed_checks = contradicted_focals(model, Adjustment(prior, 0.0, 0.02))
     assert len(failed_checks) == 1
     assert "shorter" in failed_checks[0]
     assert "px" not in failed_checks[0]
     assert "focal_std_rel" not in failed_checks[0]
 
 
-def test_nothing_said_is_nothing_contradicted() -> None:
-    _, assumed, model = setting()
-    assert contradicted_focals(model, Adjustment(assumed, 0.0, 0.02)) == []
+def test_nothing_said_is_nothing_contradicted():
+    _, prior, model = setting()
+    assert contradicted_focals(model, Adjustment(prior, 0.0, 0.02)) == []
 
 
-def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_doubted() -> None:
+def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_doubted():
     rng = np.random.default_rng(0)
     row = make_scene(views=3, points=400, seed=1)
     centres = row.centres[0] + np.outer([0.0, 1.0, 2.0], [1.0, 0.05, 0.0])
     row = with_poses(row, np.repeat(row.R[:1], 3, axis=0), centres)
     noisy = replace(row.tracks, xy=row.tracks.xy + rng.normal(0.0, 0.5, row.tracks.xy.shape))
     scene = replace(row, tracks=noisy)
-    model = true_model(scene, assume(projective_reconstruction(scene)))
+    model = true_model(scene, prior_for(projective_reconstruction(scene)))
     noise = check_views(model, sigmas=SIGMAS).noise_px
     assert noise == pytest.approx(0.5, rel=0.2)
     xy, _ = project_observations(
@@ -147,7 +145,7 @@ def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_d
     assert not any("noise" in doubt for doubt in doubts_of(model, scene)[1])
 
 
-def test_two_photographs_from_one_place_are_not_doubted_for_what_only_they_share() -> None:
+def test_two_photographs_from_one_place_are_not_doubted_for_what_only_they_share():
     scene = make_scene(points=400, sigma_px=0.0, seed=3)
     R, centres = scene.R.copy(), scene.centres.copy()
     R[1], centres[1] = R[0], centres[0] + 1e-4
@@ -159,22 +157,22 @@ def test_two_photographs_from_one_place_are_not_doubted_for_what_only_they_share
     xy = t.xy + np.where((alone & (t.view_index == 1))[:, None], 30.0, 0.3) * rng.normal(size=t.xy.shape)
     seen = [values[keep] for values in (t.view_index, t.point_index, xy)]
     scene = replace(scene, tracks=Tracks(*seen, t.n_views, t.n_points))
-    model = true_model(scene, assume(projective_reconstruction(scene)))
+    model = true_model(scene, prior_for(projective_reconstruction(scene)))
     check, failed_checks = doubts_of(model, scene)
     assert failed_checks == []
     assert check["explained_share_worst_view"] > 0.9
     assert 0.2 < within_reach(model).mean() < 0.9
 
 
-def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself_too() -> None:
+def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself_too():
     scene = make_scene(sigma_px=0.3, principal_shift=(140.0, 0.0), seed=3)
-    assumed = assume(projective_reconstruction(scene))
-    model, adjustment = true_model(scene, assumed), Adjustment(assumed, 0.0, 0.02)
+    prior = prior_for(projective_reconstruction(scene))
+    model, adjustment = true_model(scene, prior), Adjustment(prior, 0.0, 0.02)
 
-    def scatter(contradiction: float) -> BlockScatter:
+    def scatter(contradiction):
         return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, 32)
 
     assert centre_of_a_bent_model(model, adjustment, scatter(3.0)) == []
     assert len(centre_of_a_bent_model(model, adjustment, scatter(12.0))) == 1
-    middle = true_model(make_scene(seed=3), assumed)
+    middle = true_model(make_scene(seed=3), prior)
     assert centre_of_a_bent_model(middle, adjustment, scatter(12.0)) == []

@@ -1,7 +1,5 @@
 """A small synthetic block of photographs for the tests of optimize."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,11 +21,11 @@ class Block:
     xy: F64
 
     @property
-    def Xh(self) -> F64:
+    def Xh(self):
         return np.column_stack([self.X, np.ones(len(self.X))])
 
 
-def project_block(cameras: MetricCameras, X: F64, view: F64, point: F64) -> F64:
+def project_block(cameras, X, view, point):
     """The model of the metric cameras in plain NumPy."""
     Y = np.einsum("kab,kb->ka", cameras.R[view], X[point]) + cameras.t[view]
     x, y = Y[:, 0] / Y[:, 2], Y[:, 1] / Y[:, 2]
@@ -36,15 +34,7 @@ def project_block(cameras: MetricCameras, X: F64, view: F64, point: F64) -> F64:
     return np.column_stack([f * x * d + skew * y * d + cx, aspect * f * y * d + cy])
 
 
-def make_block(
-    *,
-    views: int = 6,
-    points: int = 80,
-    k1: float = 0.0,
-    lens: tuple[float, ...] = (),
-    groups: int = 1,
-    seed: int = 3,
-) -> Block:
+def make_block(*, views=6, points=80, k1=0.0, lens=(), groups=1, seed=3):
     """Cameras on an arc looking inwards, turned about their axes; every point seen by most of them."""
     rng = np.random.default_rng(seed)
     middle = np.array([1.0, -2.0, 0.5])
@@ -62,7 +52,7 @@ def make_block(
     return Block(cameras, X, view, point, project_block(cameras, X, view, point))
 
 
-def perturbed(block: Block, *, seed: int = 5, size: float = 0.01) -> tuple[MetricCameras, F64]:
+def perturbed(block, *, seed=5, size=0.01):
     """Cameras and points moved off the truth."""
     rng = np.random.default_rng(seed)
     c = block.cameras

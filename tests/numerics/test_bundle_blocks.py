@@ -30,8 +30,8 @@ def test_the_variance_is_that_of_bundle_adjustment():
     scale = SIGMA / fit.sigma_px
     expected = scale**2 * np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2)
     expected[:, 0] /= fit.cameras.intrinsics[:, 0] ** 2
-    np.testing.assert_allclose(scatter.model, expected, rtol=0.02)
-    np.testing.assert_allclose(scatter.tied, scatter.model[0], rtol=1e-6)
+    np.testing.assert_allclose(scatter.variance, expected, rtol=0.02)
+    np.testing.assert_allclose(scatter.shared_variance, scatter.variance[0], rtol=1e-6)
     assert np.isnan(scatter.ratio[0, 1])
     assert scatter.blocks >= 8
 
@@ -40,8 +40,8 @@ def test_one_camera_behind_all_photographs_is_known_better_than_one_each():
     one, many = make_block(points=200), make_block(points=200, groups=6)
     noise = SIGMA * np.random.default_rng(0).normal(size=one.xy.shape)
     shared, own = _scatter(one, one.xy + noise)[1], _scatter(many, many.xy + noise)[1]
-    np.testing.assert_allclose(own.tied[FREE], shared.model[0, FREE], rtol=0.1)
-    assert (own.model[:, 0] > 1.5 * own.tied[0]).all()
+    np.testing.assert_allclose(own.shared_variance[FREE], shared.variance[0, FREE], rtol=0.1)
+    assert (own.variance[:, 0] > 1.5 * own.shared_variance[0]).all()
 
 
 def test_independent_noise_has_the_ratio_one_whatever_its_distribution():
@@ -53,11 +53,11 @@ def test_independent_noise_has_the_ratio_one_whatever_its_distribution():
         normal.append(_scatter(block, block.xy + noise)[1])
         noise *= np.where(rng.random(len(noise)) < 0.2, 4.0, 1.0)[:, None]
         heavy.append(_scatter(block, block.xy + noise, loss=1.5)[1])
-    assert np.mean([s.typical_ratio for s in normal]) == pytest.approx(1.0, abs=0.15)
-    assert np.mean([s.contradiction for s in normal]) == pytest.approx(1.0, abs=0.12)
-    assert np.mean([s.contradiction for s in heavy]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean([s.median_ratio for s in normal]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean([s.overdispersion for s in normal]) == pytest.approx(1.0, abs=0.12)
+    assert np.mean([s.overdispersion for s in heavy]) == pytest.approx(1.0, abs=0.15)
     # Four times as wide in a fifth of the matches: more than the size of the core says.
-    assert np.mean([s.typical_ratio for s in heavy]) > 1.3
+    assert np.mean([s.median_ratio for s in heavy]) > 1.3
 
 
 def test_priors_do_not_pass_for_contradictions():
@@ -67,7 +67,7 @@ def test_priors_do_not_pass_for_contradictions():
     std = 0.3 * np.sqrt(np.median(free.model, axis=0))
     told = [_scatter(block, block.xy + SIGMA * rng.normal(size=block.xy.shape), std=std)[1] for _ in range(6)]
     assert np.median([s.model[:, 3] / free.model[:, 3] for s in told]) < 0.15
-    assert np.mean([s.contradiction for s in told]) == pytest.approx(1.0, abs=0.25)
+    assert np.mean([s.overdispersion for s in told]) == pytest.approx(1.0, abs=0.25)
 
 
 def test_noise_that_neighbours_share_is_seen():
@@ -77,7 +77,7 @@ def test_noise_that_neighbours_share_is_seen():
     wave = rng.normal(size=(len(block.cameras.R), 2, 2))
     field = np.sin(np.einsum("kab,kb->ka", wave[block.view], block.xy / 150.0))
     _, scatter = _scatter(block, block.xy + 0.3 * SIGMA * rng.normal(size=field.shape) + SIGMA * field)
-    assert scatter.contradiction > 2.0
+    assert scatter.overdispersion > 2.0
 
 
 def test_blocks_are_of_neighbours_and_of_equal_size():

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.numerics import schur
-from thesisrecon.numerics.elimination import Sums, sum_leverages
+from thesisrecon.numerics.elimination import ReducedSums, sum_leverages
 from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
 from thesisrecon.numerics.losses import LOSS_CODES, LOSSES
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
@@ -19,7 +19,7 @@ from thesisrecon.numerics.metric_cameras import (
     metric_cost,
     move_poses,
 )
-from thesisrecon.numerics.observations import Jacobians, Observations, Seen, Weighing, sort_observations
+from thesisrecon.numerics.observations import Jacobians, Observations, Weighting, sort_observations
 from thesisrecon.numerics.projective_bundle import (
     UnitState,
     linearize_projective,
@@ -37,7 +37,7 @@ from thesisrecon.numerics.reduced_solvers import (
     fill_band,
     multiply,
 )
-from thesisrecon.numerics.schur import BundleSystem, CameraPrior, lay_out
+from thesisrecon.numerics.schur import BundleSystem, CameraPrior, build_layout
 
 
 def _linearized_metric(block, xy, loss="squared", delta=1.0, sigma=1.0):
@@ -45,10 +45,10 @@ def _linearized_metric(block, xy, loss="squared", delta=1.0, sigma=1.0):
     width = c.intrinsics.shape[1]
     J = Jacobians.empty(n, 6, width)
     model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
-    seen, weighing = Seen(block.view, block.point, xy), Weighing(sigma, LOSS_CODES[loss], delta)
+    seen, weighting = Observations(block.view, block.point, xy), Weighting(sigma, LOSS_CODES[loss], delta)
     own = np.zeros(0, dtype=np.int64)
-    cost = linearize_metric(model, seen, weighing, own, np.arange(width), J)
-    assert metric_cost(model, seen, weighing) == pytest.approx(cost, rel=1e-12)
+    cost = linearize_metric(model, seen, weighting, own, np.arange(width), J)
+    assert metric_cost(model, seen, weighting) == pytest.approx(cost, rel=1e-12)
     return cost, J
 
 
@@ -115,9 +115,9 @@ def test_projective_jacobians_match_finite_differences():
     view, point = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(7)))
     xy = rng.normal(size=(21, 2))
     J, state = Jacobians.empty(21, 11, 0), UnitState.at(P, X)
-    seen, weighing = Seen(view, point, xy), Weighing(1.0, 0, 1.0)
-    cost = linearize_projective(state, seen, weighing, J)
-    assert projective_cost(state, seen, weighing) == pytest.approx(cost, rel=1e-12)
+    seen, weighting = Observations(view, point, xy), Weighting(1.0, 0, 1.0)
+    cost = linearize_projective(state, seen, weighting, J)
+    assert projective_cost(state, seen, weighting) == pytest.approx(cost, rel=1e-12)
     z = np.einsum("kab,kb->ka", P.reshape(3, 3, 4)[view], X[point])
     np.testing.assert_allclose(J.residual, z[:, :2] / z[:, 2:] - xy, rtol=1e-12)
     assert cost == pytest.approx(0.5 * np.sum(J.residual**2))
@@ -153,14 +153,14 @@ def test_losses_of_the_kernels_are_those_of_numpy(loss):
 
 def _full_jacobian(J, layout):
     """All columns of one problem side by side: blocks of the views, border, points."""
-    o, places, C = layout.observations, layout.places, layout.width
-    edge = C * len(places.pair)
+    o, index, C = layout.observations, layout.index, layout.width
+    edge = C * len(index.pair)
     full = np.zeros((2 * len(o.xy), layout.size + 3 * (len(o.start) - 1)))
     for k in range(len(o.xy)):
-        rows, v, j = slice(2 * k, 2 * k + 2), places.block[o.view_index[k]], o.point_index[k]
+        rows, v, j = slice(2 * k, 2 * k + 2), index.block[o.view_index[k]], o.point_index[k]
         if v >= 0:
             full[rows, C * v : C * v + C] = J.A[k]
-        for f, column in enumerate(places.common[o.view_index[k]]):
+        for f, column in enumerate(index.common[o.view_index[k]]):
             if column >= 0:
                 full[rows, edge + column] += J.E[k, :, f]
         full[rows, layout.size + 3 * j : layout.size + 3 * j + 3] = J.B[k]
@@ -182,7 +182,7 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     own, common = np.array([0]), np.arange(1, 6)
     columns = np.arange(5) + 5 * c.group[:, None]
     columns[c.group == 1, 4] = -1
-    layout = lay_out(o, np.arange(6) - 1, width=7, common=columns, border=9)
+    layout = build_layout(o, np.arange(6) - 1, width=7, common=columns, border=9)
     assert isinstance(layout.solver, DenseCholesky)
     if solver == "banded":
         layout = replace(layout, solver=BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
@@ -190,8 +190,8 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
         layout = replace(layout, solver=ConjugateGradients(1e-13))
     J = layout.jacobians()
     model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
-    seen = Seen(o.view_index, o.point_index, o.xy)
-    cost = linearize_metric(model, seen, Weighing(1.0, 0, 1.0), own, common, J)
+    seen = Observations(o.view_index, o.point_index, o.xy)
+    cost = linearize_metric(model, seen, Weighting(1.0, 0, 1.0), own, common, J)
     gradient = np.zeros(layout.size)
     gradient[[6, 40]] = [3.0, -3.0]
     prior = CameraPrior(np.array([6, 40]), np.array([40, -1]), np.array([2e4, 5e3]), gradient)
@@ -250,7 +250,7 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
         dense[2 * row[i] : 2 * row[i] + 2, 2 * column[i] : 2 * column[i] + 2] = blocks[i]
     dense[:8, 8:], dense[8:, 8:] = border.reshape(8, 3), corner
     full = np.triu(dense) + np.triu(dense, 1).T
-    system = ReducedSystem(row, column, Sums(blocks, border, corner, *np.zeros((3, 11))))
+    system = ReducedSystem(row, column, ReducedSums(blocks, border, corner, *np.zeros((3, 11))))
     np.testing.assert_array_equal(np.triu(system.dense()), np.triu(dense))
     more, pair = np.arange(11.0), np.full((4, 4), -1)
     pair[row, column] = np.arange(6)
@@ -278,7 +278,7 @@ def test_every_solver_tells_a_system_that_is_not_positive(solver, spoiled, value
     row, column = np.array([0, 0, 1, 1, 2]), np.array([0, 1, 1, 2, 2])
     blocks, border, corner = np.zeros((5, 2, 2)), np.full((3, 2, 1), 0.1), np.eye(1)
     blocks[row == column] = np.eye(2)
-    sums = Sums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
+    sums = ReducedSums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
     system = ReducedSystem(row, column, sums)
     np.testing.assert_allclose(multiply(system, solver.solve(system)), 1.0, atol=1e-2)
     what = {"views": blocks, "corner": corner, "rhs": sums.rhs}[spoiled]
@@ -320,10 +320,10 @@ def test_bending_losses_keep_the_gradient_and_bend_the_curvature(loss):
     c, n = block.cameras, len(block.xy)
     xy = block.xy + np.random.default_rng(1).normal(size=block.xy.shape)
     model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
-    seen, own, common = Seen(block.view, block.point, xy), np.array([0, 3]), np.array([4, 5])
+    seen, own, common = Observations(block.view, block.point, xy), np.array([0, 3]), np.array([4, 5])
     plain, bent = Jacobians.empty(n, 8, 2), Jacobians.empty(n, 8, 2)
     for J, least in ((plain, 1.0), (bent, 0.2)):
-        linearize_metric(model, seen, Weighing(1.0, LOSS_CODES[loss], 1.1, least), own, common, J)
+        linearize_metric(model, seen, Weighting(1.0, LOSS_CODES[loss], 1.1, least), own, common, J)
     for a, b in ((plain.A, bent.A), (plain.E, bent.E), (plain.B, bent.B)):
         gradient = np.einsum("kic,ki->kc", a, plain.residual)
         np.testing.assert_allclose(np.einsum("kic,ki->kc", b, bent.residual), gradient, rtol=1e-9, atol=1e-9)

@@ -6,7 +6,7 @@ from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import schur
-from thesisrecon.numerics.intrinsic_unknowns import number_values
+from thesisrecon.numerics.intrinsic_unknowns import number_unknowns
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
@@ -184,13 +184,7 @@ def test_outliers_hardly_move_the_focal_under_a_robust_loss(loss):
     wrong = rng.choice(len(xy), 20, replace=False)
     xy[wrong] += rng.uniform(15.0, 40.0, size=(20, 2))
     result = _refine(
-        block.cameras,
-        block.X,
-        _seen(block, xy),
-        free=FOCAL,
-        loss=loss,
-        loss_px=0.5,
-        max_iterations=60,
+        block.cameras, block.X, _seen(block, xy), free=FOCAL, loss=loss, loss_px=0.5, max_iterations=60
     )
     assert result.cameras.intrinsics[0, 0] == pytest.approx(1200.0, rel=5e-3)
     assert result.sigma_px < 0.35
@@ -201,14 +195,7 @@ def test_fixed_and_unseen_parts_come_back_untouched():
     cameras, X = perturbed(block)
     X = np.concatenate([X, [[9.0, 9.0, 9.0]]])
     fixed = np.array([True, False, False, False, False, True])
-    result = _refine(
-        cameras,
-        X,
-        _seen(block),
-        free=np.zeros(6, bool),
-        fixed_views=fixed,
-        covariance=True,
-    )
+    result = _refine(cameras, X, _seen(block), free=np.zeros(6, bool), fixed_views=fixed, covariance=True)
     np.testing.assert_array_equal(result.cameras.R[fixed], cameras.R[fixed])
     np.testing.assert_array_equal(result.cameras.t[fixed], cameras.t[fixed])
     np.testing.assert_array_equal(result.cameras.intrinsics, cameras.intrinsics)
@@ -359,21 +346,21 @@ def test_the_population_is_the_quadratic_form_of_deviations_from_its_mean():
     population = np.array([0, 0, 0, 0, 7, -1])
     spread = np.array([0.05, np.inf, np.inf, np.inf, np.inf, np.inf])
     prior = IntrinsicsPrior.unshared(cameras.intrinsics, std, kind=population, spread=spread)
-    values, x, table = number_values(cameras, np.ones(6, bool), FOCAL, prior)
+    values, x, table = number_unknowns(cameras, np.ones(6, bool), FOCAL, prior)
     np.testing.assert_allclose(table, cameras.intrinsics, rtol=1e-14)
     assert (values.seen, values.size) == (5, 6)
     log_f = np.log(cameras.intrinsics[:4, 0])
     x[-1] = log_f.mean()
     expected = np.sum((log_f - log_f.mean()) ** 2) / 0.05**2 / 2.0
-    assert values.links.cost(x) == pytest.approx(expected)
+    assert values.terms.cost(x) == pytest.approx(expected)
     # Free values at the rows of 0, 2, 3 once the mean is marginalised: (I - 11'/4) / tau^2 of four members.
-    Q = values.links.information(values.size)
+    Q = values.terms.information(values.size)
     marginal = Q[:5, :5] - np.outer(Q[:5, 5], Q[5, :5]) / Q[5, 5]
     np.testing.assert_allclose(marginal[:3, :3], (np.eye(3) - 0.25) / 0.05**2, atol=1e-9)
     np.testing.assert_allclose(marginal[3:, 3:], np.diag([100.0, 0.0]), atol=1e-9)
     step = 1e-6 * np.eye(6)
-    slope = [(values.links.cost(x + h) - values.links.cost(x - h)) / 2e-6 for h in step]
-    np.testing.assert_allclose(values.links.gradient(x), slope, atol=1e-5)
+    slope = [(values.terms.cost(x + h) - values.terms.cost(x - h)) / 2e-6 for h in step]
+    np.testing.assert_allclose(values.terms.gradient(x), slope, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -392,8 +379,8 @@ def test_a_population_counts_a_value_that_cameras_share_once(shared, distinct):
     prior = IntrinsicsPrior.unshared(
         cameras.intrinsics, nothing, kind=np.zeros(6, np.int64), spread=np.array([0.05, *[np.inf] * 5])
     )
-    values, x, _ = number_values(cameras, np.ones(6, bool), FOCAL, prior)
+    values, x, _ = number_unknowns(cameras, np.ones(6, bool), FOCAL, prior)
     log_f = np.log(cameras.intrinsics[distinct, 0])
     assert values.size == len(distinct) + 1
     x[-1] = log_f.mean()
-    assert values.links.cost(x) == pytest.approx(np.sum((log_f - log_f.mean()) ** 2) / 0.05**2 / 2.0)
+    assert values.terms.cost(x) == pytest.approx(np.sum((log_f - log_f.mean()) ** 2) / 0.05**2 / 2.0)

@@ -1,7 +1,5 @@
 """Pairs are visited so that what was made of a view serves again."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 
 import numpy as np
@@ -10,9 +8,9 @@ import pytest
 from thesisrecon.numerics.observations import morton_pair_order
 
 
-def times_made(first: np.ndarray, second: np.ndarray, room: int) -> int:
+def times_made(first, second, room):
     """How often a view is made where those asked for last are kept in a room for so many."""
-    kept: OrderedDict[int, None] = OrderedDict()
+    kept = OrderedDict()
     made = 0
     for view in np.stack([first, second], axis=1).ravel().tolist():
         made += view not in kept
@@ -23,7 +21,7 @@ def times_made(first: np.ndarray, second: np.ndarray, room: int) -> int:
     return made
 
 
-def test_every_pair_is_visited_once_and_a_pair_and_its_turned_one_together() -> None:
+def test_every_pair_is_visited_once_and_a_pair_and_its_turned_one_together():
     i, j = np.array([5, 3, 9, 5, 0]), np.array([3, 5, 2, 9, 1])
     order = morton_pair_order(i, j)
     assert sorted(order) == [0, 1, 2, 3, 4]
@@ -33,7 +31,7 @@ def test_every_pair_is_visited_once_and_a_pair_and_its_turned_one_together() -> 
 
 
 @pytest.mark.parametrize("room", [16, 60, 120])
-def test_views_are_made_few_times_whatever_room_there_is(room: int) -> None:
+def test_views_are_made_few_times_whatever_room_there_is(room):
     i, j = np.divmod(np.arange(300 * 300), 300)
     i, j = i[i != j], j[i != j]
     order = morton_pair_order(i, j)

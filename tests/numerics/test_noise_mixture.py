@@ -1,7 +1,5 @@
 """The mixture of noise, its tail and wrong residuals; the width of Huber's loss that suits residuals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +15,7 @@ from thesisrecon.numerics.noise import (
 )
 
 
-def draw(n: int, wrong: float, tail: float, seed: int) -> np.ndarray:
+def draw(n, wrong, tail, seed):
     """Absolute residuals in order: noise of 0.5, a tail four times as wide, wrong ones up to 300."""
     rng = np.random.default_rng(seed)
     kind = rng.random(n)

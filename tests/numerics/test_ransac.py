@@ -1,7 +1,5 @@
 """Sampling, stopping and noise scale; nothing here knows what is sampled."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 

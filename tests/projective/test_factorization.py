@@ -1,25 +1,23 @@
 """Sturm and Triggs' factorisation, its iterated form, and the core of views that it begins with."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.projective.test_reconstruction import residuals
-from tests.synthetic import TrueScene, make_scene, true_pairs
+from tests.synthetic import make_scene, true_pairs
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.projective.factorization import (
     Factorization,
-    balanced,
+    balance_depths,
     depths_from_fundamentals,
     factorize,
     factorize_robustly,
     grow_core,
-    on_one_plane,
+    is_planar,
 )
 from thesisrecon.records import Tracks
 
@@ -27,21 +25,21 @@ STAR = [(0, k) for k in range(1, 6)]
 CHAIN = [(k, k + 1) for k in range(5)]
 
 
-def complete_table(seed: int, sigma_px: float = 0.0, points: int = 80) -> tuple[TrueScene, np.ndarray]:
+def complete_tracks(seed, sigma_px=0.0, points=80):
     """A scene of six views and its images (6, N, 2) of every point."""
     scene = make_scene(views=6, points=points, seed=seed)
     xy = np.stack([project(P, scene.X) for P in scene.P])
     return scene, xy + sigma_px * np.random.default_rng(seed).normal(size=xy.shape)
 
 
-def fundamentals(scene: TrueScene) -> dict[tuple[int, int], np.ndarray]:
+def fundamentals(scene):
     return {(p.i, p.j): -2.0 * p.F for p in true_pairs(scene)}
 
 
 @pytest.mark.parametrize("tree", [STAR, CHAIN])
 @pytest.mark.parametrize("seed", range(3))
 def test_depths_from_fundamental_matrices_are_those_of_the_cameras_up_to_scales(tree, seed):
-    scene, xy = complete_table(seed)
+    scene, xy = complete_tracks(seed)
     depths = depths_from_fundamentals(xy, fundamentals(scene), tree)
     true = np.einsum("vb,nb->vn", scene.P[:, 2], homogenize(scene.X))
     ratio = depths / true
@@ -53,7 +51,7 @@ def test_depths_from_fundamental_matrices_are_those_of_the_cameras_up_to_scales(
 @pytest.mark.parametrize("tree", [STAR, CHAIN])
 @pytest.mark.parametrize("seed", range(3))
 def test_exact_matches_factorise_exactly(tree, seed):
-    scene, xy = complete_table(seed)
+    scene, xy = complete_tracks(seed)
     factors = factorize(xy, depths_from_fundamentals(xy, fundamentals(scene), tree))
     assert factors.iterations == 0
     assert factors.gap < 1e-6
@@ -62,7 +60,7 @@ def test_exact_matches_factorise_exactly(tree, seed):
 
 def test_iterations_bring_the_factors_to_the_noise_and_any_depths_will_do_to_begin():
     for seed in range(3):
-        scene, xy = complete_table(seed, sigma_px=1.0)
+        scene, xy = complete_tracks(seed, sigma_px=1.0)
         depths = depths_from_fundamentals(xy, fundamentals(scene), STAR)
         once, often, affine = (
             factorize(xy, d, iterations=n).rms_px for d, n in ((depths, 0), (depths, 50), (None, 100))
@@ -80,13 +78,13 @@ def test_balanced_depths_weigh_every_view_and_every_point_alike():
     depths = (
         rng.uniform(0.5, 2.0, (4, 30)) * 10.0 ** rng.uniform(-3, 3, (4, 1)) * 10.0 ** rng.uniform(-3, 3, 30)
     )
-    squared = (balanced(depths, sizes) * sizes) ** 2
+    squared = (balance_depths(depths, sizes) * sizes) ** 2
     np.testing.assert_allclose(squared.sum(axis=0), 4.0, rtol=1e-3)
     np.testing.assert_allclose(squared.sum(axis=1), 30.0, rtol=1e-12)
 
 
 def test_wrong_tables_and_trees_are_refused():
-    scene, xy = complete_table(0)
+    scene, xy = complete_tracks(0)
     F = fundamentals(scene)
     with pytest.raises(ValueError, match="N >= 8"):
         factorize(xy[:, :7])
@@ -103,7 +101,7 @@ def test_wrong_tables_and_trees_are_refused():
 
 
 def test_points_that_disagree_are_left_out():
-    scene, xy = complete_table(1, sigma_px=0.5)
+    scene, xy = complete_tracks(1, sigma_px=0.5)
     xy[3, :6] += 25.0
     depths = depths_from_fundamentals(xy, fundamentals(scene), STAR)
     factors, kept = factorize_robustly(xy, depths, 7.0, 50)
@@ -152,8 +150,8 @@ def test_tracks_of_a_plane_that_all_of_a_core_share_do_not_begin_alone():
     tracks = Tracks(view, point, xy + np.random.default_rng(0).normal(0, 0.3, xy.shape), 4, 300)
     planar = replace(scene, X=X, tracks=tracks)
     images = np.stack([project(P, X) for P in scene.P])
-    assert on_one_plane(images[:, flat], STAR[:3], 1.0)
-    assert not on_one_plane(images, STAR[:3], 1.0)
+    assert is_planar(images[:, flat], STAR[:3], 1.0)
+    assert not is_planar(images, STAR[:3], 1.0)
     found = Factorization().reconstruct(tracks, true_pairs(planar), scene.sizes, rng=np.random.default_rng(0))
     assert found.registered.all()
     assert found.inlier.mean() > 0.98

@@ -1,35 +1,33 @@
 """Chapter 6 on exact and noisy tracks: all variants, the gate, the initial pair, robust resection."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.synthetic import TrueScene, make_scene, true_pairs
+from tests.synthetic import make_scene, true_pairs
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.projective.factorization import Factorization
-from thesisrecon.projective.growing import select_tracks, tracks_with_parallax
-from thesisrecon.projective.incremental import GatedIncremental, predicted_spread_px, resect_robust
+from thesisrecon.projective.incremental import IncrementalProjective, projection_std_px, resect_ransac
 from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs
+from thesisrecon.projective.model import select_tracks, select_tracks_with_parallax
 from thesisrecon.projective.sequential import SequentialProjective
-from thesisrecon.records import Reconstruction, Tracks
+from thesisrecon.records import Tracks
 
-VARIANTS = [GatedIncremental(), SequentialProjective(), Factorization()]
+VARIANTS = [IncrementalProjective(), SequentialProjective(), Factorization()]
 
 
-def residuals(found: Reconstruction) -> np.ndarray:
+def residuals(found):
     t, k = found.tracks, found.inlier
     xh = np.einsum("kab,kb->ka", found.P[t.view_index[k]], found.X[t.point_index[k]])
     return np.linalg.norm(xh[:, :2] / xh[:, 2:] - t.xy[k], axis=1)
 
 
-def projective_error(found: Reconstruction, scene: TrueScene) -> float:
+def projective_error(found, scene):
     """Largest distance (scene units) of the points from the truth after the best projective alignment."""
     valid = found.valid
     X, Y = found.X[valid], np.column_stack([scene.X[valid], np.ones(valid.sum())])
@@ -46,9 +44,7 @@ def projective_error(found: Reconstruction, scene: TrueScene) -> float:
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: type(v).__name__)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_exact_tracks_give_the_true_scene_up_to_a_projective_transform(
-    variant: GatedIncremental, seed: int
-) -> None:
+def test_exact_tracks_give_the_true_scene_up_to_a_projective_transform(variant, seed):
     scene = make_scene(seed=seed)
     found = variant.reconstruct(scene.tracks, true_pairs(scene), scene.sizes, rng=np.random.default_rng(0))
     assert found.stratum == "projective"
@@ -59,14 +55,14 @@ def test_exact_tracks_give_the_true_scene_up_to_a_projective_transform(
     assert projective_error(found, scene) < 1e-3
 
 
-def test_noise_comes_back_as_residual_and_wrong_observations_are_left_out() -> None:
+def test_noise_comes_back_as_residual_and_wrong_observations_are_left_out():
     scene = make_scene(seed=2, sigma_px=0.5, points=500)
     t = scene.tracks
     rng = np.random.default_rng(5)
     wrong = rng.random(len(t.xy)) < 0.05
     xy = t.xy + np.where(wrong[:, None], rng.uniform(-200, 200, t.xy.shape), 0.0)
     spoiled = replace(scene, tracks=replace(t, xy=xy))
-    found = GatedIncremental().reconstruct(spoiled.tracks, true_pairs(scene), scene.sizes, rng=rng)
+    found = IncrementalProjective().reconstruct(spoiled.tracks, true_pairs(scene), scene.sizes, rng=rng)
     assert found.registered.all()
     assert found.sigma_px == pytest.approx(0.5, rel=0.25)
     far = wrong & (np.linalg.norm(xy - t.xy, axis=1) > 30.0)
@@ -74,7 +70,7 @@ def test_noise_comes_back_as_residual_and_wrong_observations_are_left_out() -> N
     assert found.inlier[~wrong].mean() > 0.9
 
 
-def test_a_view_of_a_plane_is_postponed_with_its_reason() -> None:
+def test_a_view_of_a_plane_is_postponed_with_its_reason():
     scene = make_scene(seed=3, sigma_px=0.3, points=400)
     t = scene.tracks
     X = scene.X.copy()
@@ -89,13 +85,13 @@ def test_a_view_of_a_plane_is_postponed_with_its_reason() -> None:
     tracks = Tracks(t.view_index[keep], t.point_index[keep], pixels[keep], 8, 400)
     planar = replace(scene, tracks=tracks, X=X)
     pairs = [replace(p, accepted=p.j != 7) for p in true_pairs(planar)]
-    found = GatedIncremental().reconstruct(tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
+    found = IncrementalProjective().reconstruct(tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
     assert found.registered[:7].all()
     assert not found.registered[7]
     assert "plane" in found.reasons[7]
 
 
-def test_without_accepted_pairs_there_is_one_clear_sentence() -> None:
+def test_without_accepted_pairs_there_is_one_clear_sentence():
     scene = make_scene()
     pairs = [replace(p, accepted=False) for p in true_pairs(scene)]
     for variant in VARIANTS:
@@ -103,7 +99,7 @@ def test_without_accepted_pairs_there_is_one_clear_sentence() -> None:
             variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
 
 
-def test_pairs_that_homographies_explain_are_refused_as_a_turning_camera_or_a_plane() -> None:
+def test_pairs_that_homographies_explain_are_refused_as_a_turning_camera_or_a_plane():
     scene = make_scene()
     pairs = [replace(p, homography_inlier_ratio=0.99) for p in true_pairs(scene)]
     for variant in VARIANTS:
@@ -111,7 +107,7 @@ def test_pairs_that_homographies_explain_are_refused_as_a_turning_camera_or_a_pl
             variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
 
 
-def test_initial_cameras_have_the_fundamental_matrix_they_came_from() -> None:
+def test_initial_cameras_have_the_fundamental_matrix_they_came_from():
     scene = make_scene()
     pair = true_pairs(scene)[0]
     for sign in (1.0, -1.0):
@@ -132,7 +128,7 @@ def test_initial_cameras_have_the_fundamental_matrix_they_came_from() -> None:
 
 @pytest.mark.parametrize("roll_deg", [0.0, 90.0, 180.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_initial_cameras_put_infinity_beyond_the_scene_however_the_camera_is_held(roll_deg, seed) -> None:
+def test_initial_cameras_put_infinity_beyond_the_scene_however_the_camera_is_held(roll_deg, seed):
     scene = make_scene(seed=seed, sigma_px=1.0)
     roll = Rotation.from_euler("z", roll_deg, degrees=True).as_matrix()
     pair = true_pairs(scene)[0]
@@ -149,19 +145,16 @@ def test_initial_cameras_put_infinity_beyond_the_scene_however_the_camera_is_hel
     assert np.linalg.cond(np.linalg.inv(T2) @ P[1, :, :3] @ np.linalg.inv(P[0, :, :3]) @ T1) < 3.0
 
 
-def test_a_planar_pair_is_not_the_first_choice() -> None:
+def test_a_planar_pair_is_not_the_first_choice():
     pairs = true_pairs(make_scene())
     flat = [replace(p, homography_inlier_ratio=1.0 if (p.i, p.j) != (2, 5) else 0.3) for p in pairs]
     assert (
         rank_initial_pairs(make_scene().tracks, flat)[0].i,
         rank_initial_pairs(make_scene().tracks, flat)[0].j,
-    ) == (
-        2,
-        5,
-    )
+    ) == (2, 5)
 
 
-def test_robust_resection_finds_the_camera_among_wrong_points() -> None:
+def test_robust_resection_finds_the_camera_among_wrong_points():
     scene = make_scene()
     rng = np.random.default_rng(0)
     Xh = np.column_stack([scene.X, np.ones(len(scene.X))])
@@ -169,21 +162,21 @@ def test_robust_resection_finds_the_camera_among_wrong_points() -> None:
     xy = project(scene.P[1], Xh)
     wrong = np.arange(len(xy)) < 90
     xy[wrong] += rng.uniform(30, 300, (90, 2))
-    P, inlier = resect_robust(Xh, xy, threshold_px=2.0, rng=rng)
+    P, inlier = resect_ransac(Xh, xy, threshold_px=2.0, rng=rng)
     assert P is not None
     np.testing.assert_array_equal(inlier, ~wrong)
     np.testing.assert_allclose(project(P, Xh[~wrong]), xy[~wrong], atol=1e-3)
 
 
-def test_too_few_points_give_no_camera() -> None:
-    P, inlier = resect_robust(
+def test_too_few_points_give_no_camera():
+    P, inlier = resect_ransac(
         np.ones((5, 4)), np.ones((5, 2)), threshold_px=1.0, rng=np.random.default_rng(0)
     )
     assert P is None
     assert not inlier.any()
 
 
-def test_spread_of_the_gate_is_the_spread_of_perturbed_cameras() -> None:
+def test_spread_of_the_gate_is_the_spread_of_perturbed_cameras():
     scene = make_scene()
     rng = np.random.default_rng(0)
     X = np.column_stack([scene.X[:20], np.ones(20)])
@@ -192,10 +185,10 @@ def test_spread_of_the_gate_is_the_spread_of_perturbed_cameras() -> None:
     draws = P + (rng.normal(size=(20000, 12)) @ A.T).reshape(-1, 3, 4)
     xh = np.einsum("dab,nb->dna", draws, X)
     measured = np.sqrt((xh[..., :2] / xh[..., 2:]).var(axis=0).mean(axis=1))
-    np.testing.assert_allclose(predicted_spread_px(P, A @ A.T, X), measured, rtol=0.05)
+    np.testing.assert_allclose(projection_std_px(P, A @ A.T, X), measured, rtol=0.05)
 
 
-def test_selection_keeps_the_longest_tracks_of_every_view() -> None:
+def test_selection_keeps_the_longest_tracks_of_every_view():
     scene = make_scene(points=2000)
     keep = select_tracks(scene.tracks, np.ones(2000, dtype=bool), points_per_view=100)
     seen = np.bincount(scene.tracks.view_index[keep[scene.tracks.point_index]], minlength=8)
@@ -205,18 +198,18 @@ def test_selection_keeps_the_longest_tracks_of_every_view() -> None:
     assert length[keep].mean() > length.mean()
 
 
-def test_points_of_one_standpoint_do_not_take_part() -> None:
+def test_points_of_one_standpoint_do_not_take_part():
     scene = make_scene(points=200)
     pairs = [
         replace(p, homography_inlier_ratio=1.0 if (p.i, p.j) == (0, 1) else 0.3) for p in true_pairs(scene)
     ]
     t = scene.tracks
     only = np.bincount(t.point_index[t.view_index >= 2], minlength=200) == 0
-    np.testing.assert_array_equal(tracks_with_parallax(t, pairs), ~only)
-    assert tracks_with_parallax(t, [replace(p, homography_inlier_ratio=0.3) for p in pairs]).all()
+    np.testing.assert_array_equal(select_tracks_with_parallax(t, pairs), ~only)
+    assert select_tracks_with_parallax(t, [replace(p, homography_inlier_ratio=0.3) for p in pairs]).all()
 
 
-def test_every_photograph_twice_is_no_harder_than_once() -> None:
+def test_every_photograph_twice_is_no_harder_than_once():
     scene = make_scene(points=300, sigma_px=0.3, seed=11)
     t = scene.tracks
     rng = np.random.default_rng(0)
@@ -241,5 +234,5 @@ def test_every_photograph_twice_is_no_harder_than_once() -> None:
     pairs = [
         replace(p, homography_inlier_ratio=1.0 if p.i // 2 == p.j // 2 else 0.3) for p in true_pairs(twins)
     ]
-    found = GatedIncremental().reconstruct(tracks, pairs, twins.sizes, rng=rng)
+    found = IncrementalProjective().reconstruct(tracks, pairs, twins.sizes, rng=rng)
     assert found.registered.all(), found.reasons

@@ -1,9 +1,5 @@
-from __future__ import annotations
-
 import os
 import shutil
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
@@ -11,7 +7,7 @@ from tests.report.opened import ARGUMENTS
 
 
 @pytest.fixture(scope="package")
-def browser() -> Iterator[Any]:
+def browser():
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     path = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
     if path is None:

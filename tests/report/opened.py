@@ -1,10 +1,6 @@
 """The page in a browser, with all it complained of and asked for."""
 
-from __future__ import annotations
-
 import io
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image as PillowImage
@@ -27,18 +23,9 @@ ARGUMENTS = [
 class Witness:
     """An opened page with all it complained of and asked for."""
 
-    def __init__(
-        self,
-        browser: Any,
-        path: Path,
-        width: int,
-        *,
-        drawn: tuple[str, ...],
-        script: str = "",
-        **context: Any,
-    ) -> None:
-        self.errors: list[str] = []
-        self.requests: list[str] = []
+    def __init__(self, browser, path, width, *, drawn, script="", **context):
+        self.errors = []
+        self.requests = []
         self.context = browser.new_context(viewport={"width": width, "height": 900}, **context)
         self.page = self.context.new_page()
         if script:
@@ -51,11 +38,11 @@ class Witness:
         for name in drawn:
             self.page.wait_for_selector(f"#{name}[data-drawn]", timeout=60_000)
 
-    def _dialog(self, dialog: Any) -> None:
+    def _dialog(self, dialog):
         self.errors.append(f"dialog {dialog.message}")
         dialog.dismiss()
 
-    def pixels(self, selector: str) -> np.ndarray:
+    def pixels(self, selector):
         """(H, W, 3) of an element as it is shown."""
         shot = self.page.locator(selector).screenshot()
         return np.asarray(PillowImage.open(io.BytesIO(shot)).convert("RGB"))

@@ -1,15 +1,13 @@
 """A run that ended with a model: the painted sphere, seen from all round."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
 
 from tests.surface.sphere import SHAPE, K, photograph, ring_of
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.records import HeldOut, MetricResult, Reconstruction, StageReport, TexturedMesh, Tracks
-from thesisrecon.report.data import Photograph, ReportData
+from thesisrecon.records import HeldOut, MetricResult, Reconstruction, StageReport, Tracks
+from thesisrecon.report.data import ReportData, ReportImage
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.mesh import coarser
 from thesisrecon.surface.texture_atlas import TextureAtlas
@@ -19,14 +17,14 @@ NAMES = tuple(f"sphere {k} <b>.jpg" for k in range(8))
 
 
 @cache
-def sphere_model() -> TexturedMesh:
+def sphere_model():
     """The sphere in at most 6000 triangles with the texture of its photographs."""
     mesh = coarser(VolumetricFusion().fuse(ring_of()), 6_000)
     return TextureAtlas().texture(mesh, [photograph(m) for m in ring_of()])
 
 
 @cache
-def sphere_reconstruction() -> Reconstruction:
+def sphere_reconstruction():
     maps = ring_of()
     count = len(maps)
     X = np.random.default_rng(2).normal(size=(300, 3))
@@ -48,7 +46,7 @@ def sphere_reconstruction() -> Reconstruction:
     )
 
 
-def sphere_run() -> ReportData:
+def sphere_run():
     """The whole page of it: model, depth of all photographs but the last, the third held out."""
     maps = ring_of()
     rgb = [photograph(m).rgb for m in maps]
@@ -57,7 +55,7 @@ def sphere_run() -> ReportData:
     return ReportData(
         title="Sphere",
         photographs=tuple(
-            Photograph(name, SIZE, SIZE, pixels) for name, pixels in zip(NAMES, rgb, strict=True)
+            ReportImage(name, SIZE, SIZE, pixels) for name, pixels in zip(NAMES, rgb, strict=True)
         ),
         reports=(StageReport("dense", 2.0), StageReport("model", 1.0)),
         config_text="",

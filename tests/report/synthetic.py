@@ -1,25 +1,15 @@
 """A small made-up run: cameras on an arc before a curved, coloured wall, and all the page shows of it."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw
 
-from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.records import (
-    IntrinsicInterval,
-    MetricResult,
-    Reconstruction,
-    StageReport,
-    Tracks,
-    TwoView,
-)
-from thesisrecon.report.data import Photograph, ReportData
+from thesisrecon.records import IntrinsicInterval, MetricResult, Reconstruction, StageReport, Tracks, TwoView
+from thesisrecon.report.data import ReportData, ReportImage
 
 SIZE = (480, 320)
 K = np.array([[520.0, 0.0, 231.0], [0.0, 520.0, 166.0], [0.0, 0.0, 1.0]])
@@ -30,7 +20,7 @@ CONFIG = (
 )
 
 
-def made_up_points(rng: np.random.Generator, count: int) -> tuple[F64, np.ndarray]:
+def made_up_points(rng, count):
     """Points (N, 3) of a wall with a bulge, and colours (N, 3) uint8 that change over it."""
     u, v = rng.uniform(-1, 1, (2, count))
     depth = 6.0 - 1.2 * np.exp(-3 * (u**2 + v**2)) + 0.3 * np.sin(6 * u)
@@ -41,7 +31,7 @@ def made_up_points(rng: np.random.Generator, count: int) -> tuple[F64, np.ndarra
     return X, (colours + rng.normal(0, 10, colours.shape)).clip(0, 255).astype(np.uint8)
 
 
-def made_up_cameras(count: int) -> tuple[F64, F64]:
+def made_up_cameras(count):
     """World-to-camera R (C, 3, 3) and t (C, 3) of cameras on an arc that all look at the wall, y down."""
     rotations, translations = [], []
     for angle in np.linspace(-0.45, 0.45, count):
@@ -56,7 +46,7 @@ def made_up_cameras(count: int) -> tuple[F64, F64]:
     return np.stack(rotations), np.stack(translations)
 
 
-def made_up_photograph(xy: F64, colours: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def made_up_photograph(xy, colours, rng):
     """(H, W, 3) uint8: smooth shading with a disc of its own colour at every point."""
     coarse = rng.integers(70, 120, (5, 7, 3), dtype=np.uint8)
     picture = PillowImage.fromarray(coarse).resize(SIZE, PillowImage.Resampling.BICUBIC)
@@ -66,7 +56,7 @@ def made_up_photograph(xy: F64, colours: np.ndarray, rng: np.random.Generator) -
     return np.asarray(picture)
 
 
-def made_up_pair(i: int, j: int, cameras: tuple[F64, F64], xy: list[F64], seen: list[np.ndarray]) -> TwoView:
+def made_up_pair(i, j, cameras, xy, seen):
     """The true epipolar geometry of two of the cameras with the points both see."""
     R = cameras[0][j] @ cameras[0][i].T
     t = cameras[1][j] - R @ cameras[1][i]
@@ -92,7 +82,7 @@ def made_up_pair(i: int, j: int, cameras: tuple[F64, F64], xy: list[F64], seen: 
     )
 
 
-def made_up_run(*, names: list[str] | None = None, points: int = 1500, seed: int = 4) -> ReportData:
+def made_up_run(*, names=None, points=1500, seed=4):
     """A whole run with one refused view (the last) and one file that is no photograph."""
     rng = np.random.default_rng(seed)
     names = names or [f"IMG_{2040 + n}.JPG" for n in range(9)]
@@ -103,7 +93,7 @@ def made_up_run(*, names: list[str] | None = None, points: int = 1500, seed: int
     seen = [((p > 5) & (p < np.array(SIZE) - 6)).all(axis=1) & (rng.random(points) < 0.7) for p in xy]
     reconstruction = _reconstruction(X, cameras, xy, seen, rng)
     photographs = tuple(
-        Photograph(
+        ReportImage(
             name, SIZE, (SIZE[0] * 4, SIZE[1] * 4), made_up_photograph(p[s][:200], colours[s][:200], rng)
         )
         for name, p, s in zip(names, xy, seen, strict=True)
@@ -138,7 +128,7 @@ def made_up_run(*, names: list[str] | None = None, points: int = 1500, seed: int
     )
 
 
-def projective_run() -> ReportData:
+def projective_run():
     """The same run as it is when the user asked to end after the projective reconstruction."""
     data = made_up_run()
     assert data.metric is not None
@@ -149,9 +139,7 @@ def projective_run() -> ReportData:
     )
 
 
-def _reconstruction(
-    X: F64, cameras: tuple[F64, F64], xy: list[F64], seen: list[np.ndarray], rng: np.random.Generator
-) -> Reconstruction:
+def _reconstruction(X, cameras, xy, seen, rng):
     count = len(xy)
     point, view = np.nonzero(np.stack(seen, axis=1))
     clean = np.stack(xy, axis=1)[point, view]
@@ -174,7 +162,7 @@ def _reconstruction(
     )
 
 
-def _reports() -> tuple[StageReport, ...]:
+def _reports():
     return (
         StageReport("features", 1.4, {"corners": 27_000}, {}),
         StageReport(

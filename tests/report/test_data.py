@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -9,7 +7,7 @@ from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.records import HeldOut, TexturedMesh
 
 
-def test_the_metric_reconstruction_goes_before_the_projective_one() -> None:
+def test_the_metric_reconstruction_goes_before_the_projective_one():
     data, early = made_up_run(points=100), projective_run()
     assert data.metric is not None
     assert data.best_reconstruction is data.metric.reconstruction
@@ -17,7 +15,7 @@ def test_the_metric_reconstruction_goes_before_the_projective_one() -> None:
     assert dataclasses.replace(early, reconstruction=None).best_reconstruction is None
 
 
-def test_records_that_disagree_are_refused() -> None:
+def test_records_that_disagree_are_refused():
     data = made_up_run(points=100)
     with pytest.raises(ValueError, match="one camera per photograph"):
         dataclasses.replace(data, photographs=data.photographs[:-1])
@@ -28,7 +26,7 @@ def test_records_that_disagree_are_refused() -> None:
         dataclasses.replace(data, pairs=[wrong])
 
 
-def test_intrinsics_are_told_in_pixels_of_the_file() -> None:
+def test_intrinsics_are_told_in_pixels_of_the_file():
     data = made_up_run(points=100)  # worked at a quarter of the size
     assert data.metric is not None
     working, original = data.metric.intrinsics[0], data.original_intrinsics[0]
@@ -43,7 +41,7 @@ def test_intrinsics_are_told_in_pixels_of_the_file() -> None:
     assert dataclasses.replace(data, metric=None, colours=None).original_intrinsics == ({},) * 9
 
 
-def test_a_model_and_its_pictures_must_belong_to_the_run() -> None:
+def test_a_model_and_its_pictures_must_belong_to_the_run():
     data = made_up_run(points=100)
     mesh = TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))
     assert dataclasses.replace(data, model=mesh).model is mesh

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import base64
 import dataclasses
 import io
@@ -26,13 +24,13 @@ from thesisrecon.report.drawing import (
 )
 
 
-def opened(uri: str) -> PillowImage.Image:
+def opened(uri):
     head, text = uri.split(",", 1)
     assert head == "data:image/jpeg;base64"
     return PillowImage.open(io.BytesIO(base64.b64decode(text)))
 
 
-def test_a_thumbnail_keeps_the_aspect_and_shrinks_when_there_are_many() -> None:
+def test_a_thumbnail_keeps_the_aspect_and_shrinks_when_there_are_many():
     photograph = made_up_run(points=50).photographs[0]
     few, many = thumbnail(photograph, 10), thumbnail(photograph, 2000)
     assert few is not None
@@ -42,7 +40,7 @@ def test_a_thumbnail_keeps_the_aspect_and_shrinks_when_there_are_many() -> None:
     assert thumbnail(dataclasses.replace(photograph, rgb=None), 10) is None
 
 
-def test_the_lines_pass_through_the_numbered_matches() -> None:
+def test_the_lines_pass_through_the_numbered_matches():
     data = made_up_run(points=400)
     pair = data.pairs[2]
     flat = [np.full((SIZE[1], SIZE[0], 3), 90, dtype=np.uint8)] * 2
@@ -64,7 +62,7 @@ def test_the_lines_pass_through_the_numbered_matches() -> None:
     assert (np.ptp(right, axis=2) > 40).any(axis=0).mean() > 0.95
 
 
-def test_a_pair_without_pixels_or_matches_is_no_error() -> None:
+def test_a_pair_without_pixels_or_matches_is_no_error():
     data = made_up_run(points=100)
     pair = data.pairs[0]
     bare = dataclasses.replace(data.photographs[0], rgb=None)
@@ -73,7 +71,7 @@ def test_a_pair_without_pixels_or_matches_is_no_error() -> None:
     assert draw_pair(empty, data.photographs[0], data.photographs[1]) is not None
 
 
-def test_lines_are_cut_at_the_edges_of_the_photograph() -> None:
+def test_lines_are_cut_at_the_edges_of_the_photograph():
     level = clip_line(np.array([0.0, 1.0, -10.0]), 100, 50)
     assert level == ((-0.5, 10.0), (99.5, 10.0))
     upright = clip_line(np.array([1.0, 0.0, -10.0]), 100, 50)
@@ -82,7 +80,7 @@ def test_lines_are_cut_at_the_edges_of_the_photograph() -> None:
     assert clip_line(np.zeros(3), 100, 50) is None
 
 
-def test_spread_matches_are_different_and_far_apart() -> None:
+def test_spread_matches_are_different_and_far_apart():
     xy = np.random.default_rng(0).uniform(0, 100, (500, 2))
     chosen = spread_matches(xy, 12)
     assert len(set(chosen.tolist())) == 12
@@ -93,21 +91,21 @@ def test_spread_matches_are_different_and_far_apart() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3)])
-def test_odd_pictures_have_thumbnails(shape: tuple[int, int, int]) -> None:
+def test_odd_pictures_have_thumbnails(shape):
     photograph = dataclasses.replace(
         made_up_run(points=50).photographs[0], rgb=np.zeros(shape, dtype=np.uint8)
     )
     assert thumbnail(photograph, 3) is not None
 
 
-def lightness(rgb: np.ndarray) -> np.ndarray:
+def lightness(rgb):
     """CIE L* (...) of sRGB (..., 3)."""
     v = rgb / 255.0
     linear = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
     return np.asarray(116.0 * np.cbrt(linear @ (0.2126, 0.7152, 0.0722)) - 16.0)
 
 
-def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness() -> None:
+def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness():
     steps = np.diff(lightness(paint_scale(np.linspace(0, 1, 33)).astype(float)))
     assert steps.min() > 1.8
     assert steps.max() < 1.6 * steps.min()
@@ -116,7 +114,7 @@ def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness() -> None:
     assert tuple(ends[4]) == UNKNOWN
 
 
-def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown() -> None:
+def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
     depth = np.tile(np.linspace(2.0, 6.0, 300, dtype=np.float32), (200, 1))
     depth[:, 200:250] = np.nan
     depth[0, 0] = 1e4  # a stray takes none of the scale
@@ -135,20 +133,20 @@ def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown() -> None
 
 
 @pytest.mark.parametrize("value", [np.nan, 3.0])
-def test_depth_maps_without_depth_or_relief_are_no_error(value: float) -> None:
+def test_depth_maps_without_depth_or_relief_are_no_error(value):
     drawn = draw_depth(np.full((30, 40), value, dtype=np.float32))
     assert drawn.share == float(np.isfinite(value))
     np.testing.assert_equal((drawn.near, drawn.far), (value, value))
 
 
-def test_depth_pictures_shrink_when_there_are_many() -> None:
+def test_depth_pictures_shrink_when_there_are_many():
     rng = np.random.default_rng(1)
     noise = rng.uniform(1, 5, (480, 640)).astype(np.float32)  # the hardest picture for a JPEG
     assert draw_depth(noise, side=depth_side(10)).picture.width == 360
     assert 300 * len(draw_depth(noise, side=depth_side(300)).picture.uri) < 4_000_000
 
 
-def test_the_comparison_shows_what_differs() -> None:
+def test_the_comparison_shows_what_differs():
     real = np.full((300, 400, 3), 120, dtype=np.uint8)
     rendered, compared = real.copy(), np.ones((300, 400), dtype=bool)
     rendered[:, 200:] += np.uint8(DIFFERENCE_LIMIT)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 import json
 
@@ -10,7 +8,7 @@ from thesisrecon.report import figures as figures_module
 from thesisrecon.report.figures import build_scene, histogram_path, pair_matrix_figure, scene_figure
 
 
-def test_the_scene_is_valid_json_with_escaped_names() -> None:
+def test_the_scene_is_valid_json_with_escaped_names():
     data = made_up_run(names=["<b>one</b>.jpg", "two&.jpg", "three.jpg"], points=200)
     assert data.metric is not None
     scene = build_scene(data.metric.reconstruction)
@@ -23,7 +21,7 @@ def test_the_scene_is_valid_json_with_escaped_names() -> None:
     assert marks["text"] == ["1 · &lt;b&gt;one&lt;/b&gt;.jpg", "2 · two&amp;.jpg"]
 
 
-def test_the_matrix_is_symmetric_and_tells_refused_pairs_apart() -> None:
+def test_the_matrix_is_symmetric_and_tells_refused_pairs_apart():
     data = made_up_run(points=300)
     figure = pair_matrix_figure(data.pairs, [p.name for p in data.photographs])
     json.dumps(figure, allow_nan=False)
@@ -36,7 +34,7 @@ def test_the_matrix_is_symmetric_and_tells_refused_pairs_apart() -> None:
     assert refused["text"][bad.i][bad.j] == f"× {bad.inliers}"
 
 
-def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch):
     data = made_up_run(points=300)
     monkeypatch.setattr(figures_module, "MAX_MATRIX", 3)
     figure = pair_matrix_figure(data.pairs, [p.name for p in data.photographs])
@@ -46,14 +44,14 @@ def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch) -> None:  # t
     assert accepted["customdata"][0][0] == inside
 
 
-def test_a_pair_without_matches_has_a_colour() -> None:
+def test_a_pair_without_matches_has_a_colour():
     data = made_up_run(points=100)
     empty = dataclasses.replace(data.pairs[0], xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
     figure = pair_matrix_figure([empty], ["a", "b"])
     assert figure["data"][0]["z"][0][1] == 0.0
 
 
-def test_histogram_bars_stand_on_the_ground() -> None:
+def test_histogram_bars_stand_on_the_ground():
     path = histogram_path(np.array([0.5, 0.0, 1.0, 0.25]), 1.0, width=40, height=10)
     assert path.count("M") == 3
     assert path.startswith("M0.0 10.0v-5.0")

@@ -2,13 +2,10 @@
 names has the elements and attributes of the page of the same run with plain ones, and runs nothing of theirs.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -33,7 +30,7 @@ TEXTS = (0x010E, 0x010F, 0x0110, 0x013B, 0x8298)
 """Description, make, model, artist and copyright."""
 
 
-def photographs(folder: Path, names: list[str], *, snare: str) -> Path:
+def photographs(folder, names, *, snare):
     """Two photographs of a scene, an animation, and three files that are none, by these names."""
     folder.mkdir()
     exif = PIL.Image.Exif()
@@ -51,7 +48,7 @@ def photographs(folder: Path, names: list[str], *, snare: str) -> Path:
     return folder
 
 
-def page_of(place: Path, names: list[str], title: str, snare: str) -> Path:
+def page_of(place, names, title, snare):
     """The page of a run."""
     place.mkdir()
     folder, out = photographs(place / title, names, snare=snare), place / f"out {title}"
@@ -61,7 +58,7 @@ def page_of(place: Path, names: list[str], title: str, snare: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def pages(tmp_path_factory):
     """The same run with plain names and with evil ones."""
     place = tmp_path_factory.mktemp("pages")
     return (
@@ -73,36 +70,36 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 class Structure(HTMLParser):
     """Elements with the names of their attributes, in order, and what stands in those that are not shown."""
 
-    def __init__(self, page: str) -> None:
+    def __init__(self, page):
         super().__init__()
-        self.elements: list[tuple[str, tuple[str, ...]]] = []
-        self.hidden: list[str] = []
-        self.words: list[str] = []
+        self.elements = []
+        self.hidden = []
+        self.words = []
         self._inside = ""
         self.feed(page)
         self.close()
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.elements.append((tag, tuple(name for name, _ in attrs)))
         self._inside = tag
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self.elements.append((f"/{tag}", ()))
         self._inside = ""
 
-    def handle_comment(self, data: str) -> None:
+    def handle_comment(self, data):
         self.elements.append((f"comment {data}", ()))
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         (self.hidden if self._inside in ("script", "style") else self.words).append(data)
 
 
-def scripts(page: str) -> list[str]:
+def scripts(page):
     """The programs on a page; data are none."""
     return re.findall(r"<script>(.*?)</script>", page, re.S)
 
 
-def test_names_add_no_element_and_no_attribute(pages: tuple[Path, Path]) -> None:
+def test_names_add_no_element_and_no_attribute(pages):
     plain, evil = (path.read_text(encoding="utf-8") for path in pages)
     one, other = Structure(plain), Structure(evil)
     # How a number is worded may differ between runs; what stands around it may not.
@@ -119,13 +116,13 @@ def test_names_add_no_element_and_no_attribute(pages: tuple[Path, Path]) -> None
         json.loads(block)
 
 
-def test_headers_of_photographs_are_nowhere(pages: tuple[Path, Path]) -> None:
+def test_headers_of_photographs_are_nowhere(pages):
     for path in pages[1].parent.rglob("*"):
         if path.is_file():
             assert MARK.encode() not in path.read_bytes()
 
 
-def test_names_add_nothing_to_a_strip() -> None:
+def test_names_add_nothing_to_a_strip():
     frames = [("0 %", np.zeros((60, 80, 3), np.uint8)), ("100 %", np.zeros((60, 80, 3), np.uint8))]
     plain = strip_page("Between a and b", frames, notes=["c"])
     for snare in (*SNARES, "</script>", "</title>", "</style>"):
@@ -136,7 +133,7 @@ def test_names_add_nothing_to_a_strip() -> None:
 
 
 @pytest.mark.browser
-def test_nothing_of_theirs_runs_in_a_browser(pages: tuple[Path, Path], browser: Any) -> None:
+def test_nothing_of_theirs_runs_in_a_browser(pages, browser):
     opened = Witness(browser, pages[1], 1000, drawn=("matrix-figure",))
     opened.page.hover("#matrix-figure .nsewdrag")
     opened.page.wait_for_timeout(300)

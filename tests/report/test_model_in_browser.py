@@ -1,18 +1,11 @@
 """The model as a browser shows it."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
 from tests.report.opened import Witness
 from tests.report.sphere_run import sphere_run
 from tests.surface.sphere import SHAPE, K, photograph, ring_of
-from thesisrecon.arrays import F64
 from thesisrecon.report.page import write_report
 
 pytestmark = pytest.mark.browser
@@ -34,37 +27,31 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "report.html"
     write_report(path, sphere_run())
     return path
 
 
 @pytest.fixture(scope="module", params=[1400, 420], ids=["desktop", "narrow"])
-def opened(request: pytest.FixtureRequest, browser: Any, report: Path) -> Iterator[Witness]:
-    witness = Witness(
-        browser,
-        report,
-        request.param,
-        drawn=("model-figure",),
-        reduced_motion="reduce",
-    )
+def opened(request, browser, report):
+    witness = Witness(browser, report, request.param, drawn=("model-figure",), reduced_motion="reduce")
     yield witness
     witness.context.close()
 
 
 @pytest.fixture
-def witness(opened: Witness) -> Witness:
+def witness(opened):
     opened.page.locator("#model-reset").click()
     return opened
 
 
-def shown(witness: Witness) -> np.ndarray:
+def shown(witness):
     witness.page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     return witness.pixels(CANVAS).astype(int)
 
 
-def where(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def where(picture):
     """Row and column in the picture of every pixel of a photograph whose stand the viewer takes."""
     height, width = picture.shape[:2]
     side, up = (SHAPE[1] / 2 / K[0, 0], SHAPE[0] / 2 / K[1, 1])
@@ -75,20 +62,20 @@ def where(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.rint(row).astype(int), np.rint(column).astype(int)
 
 
-def apart(one: np.ndarray, two: np.ndarray) -> float:
+def apart(one, two):
     """Share of the pixels that differ clearly."""
     return float((np.abs(one - two).max(axis=2) > 30).mean())
 
 
-def inner(view: int) -> np.ndarray:
+def inner(view):
     """The pixels of a photograph where the sphere is, off its rim."""
-    seen: F64 = np.isfinite(ring_of()[view].depth).astype(float)
+    seen = np.isfinite(ring_of()[view].depth).astype(float)
     near = np.lib.stride_tricks.sliding_window_view(np.pad(seen, 3), (7, 7))
     return np.asarray(near.min(axis=(2, 3)) > 0)
 
 
 @pytest.mark.parametrize("view", [0, 3, 6])
-def test_where_a_photograph_was_taken_the_model_looks_like_it(witness: Witness, view: int) -> None:
+def test_where_a_photograph_was_taken_the_model_looks_like_it(witness, view):
     witness.page.select_option("#model-stand", str(view))
     picture = shown(witness)
     expected = photograph(ring_of()[view]).rgb.astype(int)
@@ -99,7 +86,7 @@ def test_where_a_photograph_was_taken_the_model_looks_like_it(witness: Witness, 
     assert np.abs(off - ground).max() <= 2
 
 
-def test_it_starts_at_a_photograph_and_comes_back_to_it(witness: Witness) -> None:
+def test_it_starts_at_a_photograph_and_comes_back_to_it(witness):
     start = shown(witness)
     witness.page.get_by_role("button", name="Shape").click()
     witness.page.locator("#model").get_by_role("button", name="From above").click()
@@ -110,7 +97,7 @@ def test_it_starts_at_a_photograph_and_comes_back_to_it(witness: Witness) -> Non
     assert witness.page.input_value("#model-stand") != ""
 
 
-def test_every_point_of_view_shows_all_of_the_model_in_its_middle(witness: Witness) -> None:
+def test_every_point_of_view_shows_all_of_the_model_in_its_middle(witness):
     pictures = []
     for name in ("Behind the cameras", "From above", "From the left", "From the right"):
         witness.page.locator("#model").get_by_role("button", name=name).click()
@@ -126,7 +113,7 @@ def test_every_point_of_view_shows_all_of_the_model_in_its_middle(witness: Witne
         assert all(apart(one, two) > 0.1 for two in pictures[:k])
 
 
-def test_shape_is_grey_and_texture_is_not(witness: Witness) -> None:
+def test_shape_is_grey_and_texture_is_not(witness):
     coloured = np.ptp(shown(witness), axis=2)
     witness.page.get_by_role("button", name="Shape").click()
     grey = np.ptp(shown(witness), axis=2)
@@ -139,7 +126,7 @@ def test_shape_is_grey_and_texture_is_not(witness: Witness) -> None:
     assert np.median(np.ptp(shown(witness), axis=2)[middle]) > 50
 
 
-def test_dragging_and_keys_turn_it(witness: Witness) -> None:
+def test_dragging_and_keys_turn_it(witness):
     start = shown(witness)
     box = witness.page.locator(CANVAS).bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -161,7 +148,7 @@ def test_dragging_and_keys_turn_it(witness: Witness) -> None:
     assert apart(shown(witness), start) == 0.0
 
 
-def test_the_wheel_moves_the_page_until_the_picture_was_clicked(witness: Witness) -> None:
+def test_the_wheel_moves_the_page_until_the_picture_was_clicked(witness):
     start = shown(witness)
     witness.page.locator(CANVAS).hover()
     before = witness.page.evaluate("scrollY")
@@ -178,7 +165,7 @@ def test_the_wheel_moves_the_page_until_the_picture_was_clicked(witness: Witness
     assert "awake" not in witness.page.locator("#model-figure").get_attribute("class")
 
 
-def test_it_comes_back_after_the_graphics_card_was_lost(witness: Witness) -> None:
+def test_it_comes_back_after_the_graphics_card_was_lost(witness):
     start = shown(witness)
     witness.page.evaluate(
         f"""new Promise(function (done) {{
@@ -194,7 +181,7 @@ def test_it_comes_back_after_the_graphics_card_was_lost(witness: Witness) -> Non
     assert apart(shown(witness), start) == 0.0
 
 
-def test_nothing_complains_reaches_out_or_is_too_wide(witness: Witness) -> None:
+def test_nothing_complains_reaches_out_or_is_too_wide(witness):
     assert witness.errors == []
     assert all(url.startswith(("file:", "data:", "blob:")) for url in witness.requests)
     assert (
@@ -202,14 +189,14 @@ def test_nothing_complains_reaches_out_or_is_too_wide(witness: Witness) -> None:
     )
 
 
-def test_pictures_of_depth_and_comparison_are_shown(witness: Witness) -> None:
+def test_pictures_of_depth_and_comparison_are_shown(witness):
     widths = witness.page.evaluate(
         "[...document.querySelectorAll('#depth img, #held-out img')].map(i => i.complete && i.naturalWidth)"
     )
     assert widths == [SHAPE[1]] * (7 + 3)
 
 
-def test_a_fine_screen_gets_at_most_twice_the_pixels_and_the_eye_glides(browser: Any, report: Path) -> None:
+def test_a_fine_screen_gets_at_most_twice_the_pixels_and_the_eye_glides(browser, report):
     drawn = ("model-figure", "scene-figure")
     screen = {"device_scale_factor": 3, "has_touch": True}
     witness = Witness(browser, report, 420, drawn=drawn, script=RECORD_VIEWS, **screen)
@@ -234,7 +221,7 @@ def test_a_fine_screen_gets_at_most_twice_the_pixels_and_the_eye_glides(browser:
     witness.context.close()
 
 
-def spread_fingers(witness: Witness) -> None:
+def spread_fingers(witness):
     """Two fingers on the middle of the canvas go apart."""
     hand = witness.context.new_cdp_session(witness.page)
     box = witness.page.locator(CANVAS).bounding_box()
@@ -244,7 +231,7 @@ def spread_fingers(witness: Witness) -> None:
         hand.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
 
-def test_without_webgl_a_sentence_says_so(browser: Any, report: Path) -> None:
+def test_without_webgl_a_sentence_says_so(browser, report):
     witness = Witness(browser, report, 1000, drawn=(), script=WITHOUT_WEBGL)
     text = witness.page.locator("#model-figure").inner_text()
     assert "no WebGL 2" in text

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import base64
 import dataclasses
 import hashlib
@@ -17,7 +15,7 @@ from tests.report.sphere_run import NAMES, sphere_run
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.records import IntrinsicInterval, TexturedMesh
-from thesisrecon.report.data import Photograph, ReportData
+from thesisrecon.report.data import ReportData, ReportImage
 from thesisrecon.report.page import render_report, write_report
 
 EVIL = [
@@ -31,14 +29,14 @@ EVIL = [
 class Structure(HTMLParser):
     """Tags, attributes that fetch, and the text of the data block of a page."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.tags: list[str] = []
-        self.addresses: list[str] = []
-        self.handlers: list[str] = []
-        self.ids: list[str] = []
+        self.tags = []
+        self.addresses = []
+        self.handlers = []
+        self.ids = []
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         for name, value in attrs:
             if name in {"src", "href"}:
@@ -49,25 +47,25 @@ class Structure(HTMLParser):
                 self.handlers.append(name)
 
 
-def structure_of(page: str) -> Structure:
+def structure_of(page):
     parser = Structure()
     parser.feed(page)
     return parser
 
 
 @pytest.fixture(scope="module")
-def page() -> str:
+def page():
     return render_report(made_up_run())
 
 
-def test_the_page_fetches_nothing_and_is_small(page: str) -> None:
+def test_the_page_fetches_nothing_and_is_small(page):
     structure = structure_of(page)
     assert all(address.startswith(("data:", "#")) for address in structure.addresses)
     assert len(page.encode()) < 10_000_000
     assert page.count("plotly.js v") == 1
 
 
-def test_the_page_holds_every_section_and_its_links_lead_somewhere(page: str) -> None:
+def test_the_page_holds_every_section_and_its_links_lead_somewhere(page):
     structure = structure_of(page)
     wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
     assert wanted == {"main", "view", "photographs", "pairs", "stages", "warnings", "config"}
@@ -84,11 +82,11 @@ def test_the_page_holds_every_section_and_its_links_lead_somewhere(page: str) ->
         assert text in page
 
 
-def test_the_same_data_gives_the_same_page(page: str) -> None:
+def test_the_same_data_gives_the_same_page(page):
     assert render_report(made_up_run()) == page
 
 
-def test_names_are_text_everywhere() -> None:
+def test_names_are_text_everywhere():
     page = render_report(dataclasses.replace(made_up_run(names=EVIL, points=200), title=EVIL[2]))
     structure = structure_of(page)
     assert structure.handlers == []
@@ -101,7 +99,7 @@ def test_names_are_text_everywhere() -> None:
     assert figures["matrix-figure"]["data"][0]["x"][0] == "1 · " + html.escape(EVIL[0])
 
 
-def test_runs_that_ended_early_say_how_far_they_got() -> None:
+def test_runs_that_ended_early_say_how_far_they_got():
     early = projective_run()
     page = render_report(early)
     assert "Ended early" in page
@@ -113,14 +111,14 @@ def test_runs_that_ended_early_say_how_far_they_got() -> None:
     assert "plotly.js v" not in page  # nothing to draw, nothing to carry
 
 
-def test_a_projective_camera_is_not_called_registered(page: str) -> None:
+def test_a_projective_camera_is_not_called_registered(page):
     projective = render_report(projective_run())
     assert projective.count('<span class="state open">projective camera</span>') == 8
     assert ">registered<" not in projective
     assert page.count('<span class="state good">registered</span>') == 8
 
 
-def test_the_caption_says_whether_points_are_left_out() -> None:
+def test_the_caption_says_whether_points_are_left_out():
     data = made_up_run(points=200)
     assert data.metric is not None
     assert "All 200 points are drawn;" in render_report(data)
@@ -134,14 +132,14 @@ def test_the_caption_says_whether_points_are_left_out() -> None:
     )
 
 
-def test_a_failed_run_without_anything_has_a_page() -> None:
+def test_a_failed_run_without_anything_has_a_page():
     failure = StageFailure("no photograph was found", "", "put JPEG files in the folder")
     page = render_report(ReportData("empty", (), (), "", {}, "0.1.0", failure=failure))
     for text in ("No photograph was found.", "No stage finished.", "Put JPEG files in the folder."):
         assert text in page
 
 
-def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn() -> None:
+def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
     data = dataclasses.replace(projective_run(), reconstruction=None, until="matches")
     nothing = dataclasses.replace(
         data.pairs[0],
@@ -159,7 +157,7 @@ def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn() -> None:
     assert structure_of(page).tags.count("figure") == 1  # the matrix
 
 
-def test_warnings_of_the_run_stand_beside_those_of_its_stages() -> None:
+def test_warnings_of_the_run_stand_beside_those_of_its_stages():
     data = projective_run()
     stage_warning = data.reports[1].warnings[0]
     summary = {"warnings": [stage_warning, "2 initial pairs were tried"]}
@@ -169,29 +167,29 @@ def test_warnings_of_the_run_stand_beside_those_of_its_stages() -> None:
     assert "2 initial pairs were tried" in section
 
 
-def test_a_name_that_is_no_unicode_can_be_written(tmp_path: Path) -> None:
+def test_a_name_that_is_no_unicode_can_be_written(tmp_path):
     write_report(tmp_path / "report.html", made_up_run(names=["a\udcff.jpg", "b.jpg", "c.jpg"], points=60))
     assert "a?.jpg" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_three_hundred_photographs_stay_under_the_limit() -> None:
+def test_three_hundred_photographs_stay_under_the_limit():
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
-    photographs = tuple(Photograph(f"{n}.jpg", (240, 160), (240, 160), noise) for n in range(300))
+    photographs = tuple(ReportImage(f"{n}.jpg", (240, 160), (240, 160), noise) for n in range(300))
     template = made_up_run(points=100).pairs[0]
     pairs = [dataclasses.replace(template, i=i, j=j) for i in range(300) for j in range(i + 1, 300)]
     data = ReportData("many", photographs, (), "", {}, "0.1.0", pairs=pairs)
     assert len(render_report(data).encode()) < 10_000_000
 
 
-def test_writing_is_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     data = dataclasses.replace(projective_run(), reconstruction=None, pairs=())
     target = tmp_path / "report.html"
     write_report(target, data)
     before = target.read_text(encoding="utf-8")
     assert before.endswith("</html>")
 
-    def refuse(self: Path, other: Path) -> Path:
+    def refuse(self, other):
         raise OSError(28, f"no room for {self.name} as {other.name}")
 
     monkeypatch.setattr(Path, "replace", refuse)
@@ -201,7 +199,7 @@ def test_writing_is_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_the_affine_stratum_is_drawn_where_there_is_one(page: str) -> None:
+def test_the_affine_stratum_is_drawn_where_there_is_one(page):
     assert 'id="affine-figure"' in page
     data = made_up_run()
     without = render_report(dataclasses.replace(data, affine=None))
@@ -212,7 +210,7 @@ def test_the_affine_stratum_is_drawn_where_there_is_one(page: str) -> None:
         dataclasses.replace(data, affine=fewer)
 
 
-def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison() -> None:
+def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
     data = sphere_run()
     page = render_report(data)
     structure = structure_of(page)
@@ -233,7 +231,7 @@ def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison() -> None:
     assert render_report(sphere_run()) == page
 
 
-def test_only_the_scripts_of_the_page_may_run() -> None:
+def test_only_the_scripts_of_the_page_may_run():
     for data, scripts in ((sphere_run(), 3), (made_up_run(points=50), 2)):
         page = render_report(data)
         policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
@@ -248,7 +246,7 @@ def test_only_the_scripts_of_the_page_may_run() -> None:
     assert "<script" not in nothing
 
 
-def test_without_a_model_nothing_of_it_is_on_the_page(page: str) -> None:
+def test_without_a_model_nothing_of_it_is_on_the_page(page):
     for trace in ('id="model', 'id="depth"', 'id="held-out"', "model.glb", "WebGL 2"):
         assert trace not in page
     empty = dataclasses.replace(sphere_run().model, faces=np.zeros((0, 3), dtype=np.int64))
@@ -257,7 +255,7 @@ def test_without_a_model_nothing_of_it_is_on_the_page(page: str) -> None:
         assert trace not in bare
 
 
-def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page() -> None:
+def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page():
     rng = np.random.default_rng(3)
     steps = 274
     n = (np.arange(steps)[:, None] * (steps + 1) + np.arange(steps)).ravel()
@@ -275,7 +273,7 @@ def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page() -> Non
     assert grown - len(render_report(dataclasses.replace(data, model=None))) < 8_000_000
 
 
-def test_the_table_of_cameras_has_a_column_for_whatever_was_estimated() -> None:
+def test_the_table_of_cameras_has_a_column_for_whatever_was_estimated():
     data = made_up_run()
     assert data.metric is not None
     square = {
@@ -284,9 +282,9 @@ def test_the_table_of_cameras_has_a_column_for_whatever_was_estimated() -> None:
     }
     own = {"aspect": IntrinsicInterval(1.0023, 0.0004, "b"), "skew_px": IntrinsicInterval(0.5, 0.1, "b")}
 
-    def told(more: dict[str, IntrinsicInterval]) -> str:
-        views = tuple({**view, **more} if view else {} for view in data.metric.intrinsics)  # type: ignore[union-attr]
-        metric = dataclasses.replace(data.metric, intrinsics=views)  # type: ignore[type-var]
+    def told(more):
+        views = tuple({**view, **more} if view else {} for view in data.metric.intrinsics)
+        metric = dataclasses.replace(data.metric, intrinsics=views)
         return render_report(dataclasses.replace(data, metric=metric))
 
     assert "Aspect (fy/fx)" not in told(square)

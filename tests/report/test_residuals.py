@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -16,7 +14,7 @@ from thesisrecon.report.data import (
 )
 
 
-def test_the_residuals_are_the_noise_that_was_added() -> None:
+def test_the_residuals_are_the_noise_that_was_added():
     data = made_up_run(points=1500)
     assert data.metric is not None
     reconstruction = data.metric.reconstruction
@@ -30,7 +28,7 @@ def test_the_residuals_are_the_noise_that_was_added() -> None:
     assert summary.median_px == pytest.approx(np.sqrt(2 * np.log(2)) * NOISE_PX, rel=0.03)
 
 
-def test_only_inliers_of_registered_views_and_valid_points_count() -> None:
+def test_only_inliers_of_registered_views_and_valid_points_count():
     data = made_up_run(points=200)
     assert data.metric is not None
     before = data.metric.reconstruction
@@ -42,7 +40,7 @@ def test_only_inliers_of_registered_views_and_valid_points_count() -> None:
     assert len(used_observations(dataclasses.replace(before, inlier=np.zeros_like(before.inlier)))) == 0
 
 
-def test_without_distortion_the_projective_residuals_grow_by_what_it_moved() -> None:
+def test_without_distortion_the_projective_residuals_grow_by_what_it_moved():
     reconstruction = projective_run().reconstruction
     assert reconstruction is not None
     summary = summarize_distances(np.concatenate(reprojection_distances(reconstruction)))
@@ -50,7 +48,7 @@ def test_without_distortion_the_projective_residuals_grow_by_what_it_moved() -> 
     assert summary.rms_px > 2 * NOISE_PX
 
 
-def test_histogram_holds_every_distance() -> None:
+def test_histogram_holds_every_distance():
     distances = np.array([0.0, 0.1, 0.49, 0.5, 7.0])
     shares = histogram_shares(distances, 0.5)
     assert len(shares) == BINS
@@ -59,7 +57,7 @@ def test_histogram_holds_every_distance() -> None:
     assert histogram_shares(np.zeros(0), 1.0).sum() == 0
 
 
-def test_common_limit_is_round_and_covers_the_distances() -> None:
+def test_common_limit_is_round_and_covers_the_distances():
     assert common_limit_px(np.full(100, 0.31)) == 0.5
     assert common_limit_px(np.full(100, 250.2)) == 251.0
     assert common_limit_px(np.zeros(0)) == 1.0

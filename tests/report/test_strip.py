@@ -1,10 +1,5 @@
 """The page of pictures in a row."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,12 +9,12 @@ from thesisrecon.report.page import strip_page
 LEVELS = (20, 120, 220)
 
 
-def page() -> str:
+def page():
     frames = [(f"picture <{k}>", np.full((60, 80, 3), level, np.uint8)) for k, level in enumerate(LEVELS)]
     return strip_page("Between <a> and b", frames, notes=["all is well"])
 
 
-def test_names_are_escaped_and_nothing_is_loaded() -> None:
+def test_names_are_escaped_and_nothing_is_loaded():
     text = page()
     assert "Between &lt;a&gt; and b" in text
     assert "picture <1>" not in text
@@ -30,7 +25,7 @@ def test_names_are_escaped_and_nothing_is_loaded() -> None:
 
 
 @pytest.mark.browser
-def test_one_turns_through_the_pictures(browser: Any, tmp_path: Path) -> None:
+def test_one_turns_through_the_pictures(browser, tmp_path):
     path = tmp_path / "strip.html"
     path.write_text(page(), encoding="utf-8")
     seen = Witness(browser, path, 900, drawn=())

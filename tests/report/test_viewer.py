@@ -1,19 +1,14 @@
 """What the page tells its viewer of the model."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pytest
 from PIL import Image as PillowImage
 
 from tests.report.sphere_run import NAMES, SIZE, sphere_model, sphere_reconstruction
-from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report import viewer
@@ -21,27 +16,27 @@ from thesisrecon.report.figures import upright_rotation
 from thesisrecon.report.viewer import LEVELS, viewer_data
 
 
-def unpacked(text: str, kind: str, columns: int) -> np.ndarray:
+def unpacked(text, kind, columns):
     return np.frombuffer(base64.b64decode(text), dtype=kind).reshape(-1, columns)
 
 
-def upright() -> F64:
+def upright():
     P = sphere_reconstruction().P
     return upright_rotation(np.stack([decompose_camera(p)[1] for p in P]))
 
 
-def data_of(mesh: TexturedMesh) -> dict[str, Any]:
+def data_of(mesh):
     return viewer_data(mesh, sphere_reconstruction(), NAMES)
 
 
-def corners(data: dict[str, Any]) -> F64:
+def corners(data):
     """(M, 3, 3) of every triangle as the viewer places it."""
     low, high = np.array(data["low"]), np.array(data["high"])
     positions = low + unpacked(data["positions"], "<u2", 3) / LEVELS * (high - low)
     return positions[unpacked(data["indices"], "<u4", 3)]
 
 
-def test_every_triangle_arrives_where_it_is_with_its_texture() -> None:
+def test_every_triangle_arrives_where_it_is_with_its_texture():
     mesh = sphere_model()
     assert mesh.uv is not None
     assert mesh.texture is not None
@@ -57,14 +52,14 @@ def test_every_triangle_arrives_where_it_is_with_its_texture() -> None:
     assert np.abs(np.asarray(picture).astype(int) - mesh.texture).mean() < 6.0
 
 
-def test_corners_that_agree_are_sent_once() -> None:
+def test_corners_that_agree_are_sent_once():
     mesh = sphere_model()
     assert mesh.uv is not None
     sent = len(unpacked(data_of(mesh)["positions"], "<u2", 3))
     assert len(mesh.vertices) < sent < 0.6 * 3 * len(mesh.faces)
 
 
-def test_a_model_with_colours_or_none_needs_no_texture() -> None:
+def test_a_model_with_colours_or_none_needs_no_texture():
     mesh = sphere_model()
     colors = np.random.default_rng(0).integers(0, 255, mesh.vertices.shape, dtype=np.uint8)
     bare = replace(mesh, uv=None, texture=None, untextured=None)
@@ -76,7 +71,7 @@ def test_a_model_with_colours_or_none_needs_no_texture() -> None:
     assert len(plain) == len(unpacked(data_of(bare)["positions"], "<u2", 3))
 
 
-def test_the_viewer_stands_where_photographs_were_taken() -> None:
+def test_the_viewer_stands_where_photographs_were_taken():
     data = data_of(sphere_model())
     names = [f"{k + 1} · {name}" for k, name in enumerate(NAMES)]
     assert [stand["name"] for stand in data["stands"]] == names
@@ -92,7 +87,7 @@ def test_the_viewer_stands_where_photographs_were_taken() -> None:
     assert 0 <= data["start"] < len(NAMES)
 
 
-def test_views_without_a_camera_are_no_stand() -> None:
+def test_views_without_a_camera_are_no_stand():
     reconstruction = sphere_reconstruction()
     registered = reconstruction.registered.copy()
     registered[3] = False
@@ -101,21 +96,21 @@ def test_views_without_a_camera_are_no_stand() -> None:
     assert [stand["name"][0] for stand in data["stands"]] == list("1235678")
 
 
-def test_a_texture_beyond_the_limit_is_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_texture_beyond_the_limit_is_reduced(monkeypatch):
     monkeypatch.setattr(viewer, "MAX_TEXELS", 100 * 100)
     data = data_of(sphere_model())
     picture = PillowImage.open(io.BytesIO(base64.b64decode(data["texture"].split(",")[1])))
     assert 0.9 * 100 * 100 < picture.width * picture.height <= 100 * 100
 
 
-def test_a_flat_model_has_a_box() -> None:
+def test_a_flat_model_has_a_box():
     mesh = TexturedMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]), np.array([[0, 1, 2]]))
     data = data_of(mesh)
     assert np.isfinite(corners(data)).all()
     assert (np.array(data["high"]) > data["low"]).all()
 
 
-def test_a_stray_does_not_take_the_resolution_of_the_rest() -> None:
+def test_a_stray_does_not_take_the_resolution_of_the_rest():
     mesh = sphere_model()
     assert mesh.uv is not None
     far = np.array([[500.0, 0, 0], [501, 0, 0], [500, 1, 0]])

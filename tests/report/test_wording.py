@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 
 import pytest
@@ -33,18 +31,18 @@ TIME = "Computing time of this result"
         (1520.34, float("inf"), "1520 (not determined)"),
     ],
 )
-def test_numbers_carry_as_many_digits_as_they_deserve(value: float, std: float, text: str) -> None:
+def test_numbers_carry_as_many_digits_as_they_deserve(value, std, text):
     assert plus_minus(value, std) == text
 
 
-def test_shared_values_are_one_and_varying_ones_a_range() -> None:
+def test_shared_values_are_one_and_varying_ones_a_range():
     same = [IntrinsicInterval(800.0, 1.5, "a")] * 3
     assert interval_of(same, "px") == "800.0 ± 1.5\u202fpx"
     varying = [*same, IntrinsicInterval(900.0, 1.5, "a")]
     assert interval_of(varying, "px") == "800.0 to 900.0\u202fpx (± 1.5)"
 
 
-def test_words_for_numbers() -> None:
+def test_words_for_numbers():
     assert decimals(0.256, 2) == "0.26"
     assert decimals(float("nan"), 2) == "–"
     assert grouped(1234567) == "1\u202f234\u202f567"
@@ -57,7 +55,7 @@ def test_words_for_numbers() -> None:
     assert named_number("score", float("nan")) == ("score", "nan")
 
 
-def test_the_verdict_is_honest() -> None:
+def test_the_verdict_is_honest():
     data = made_up_run(points=100)
     assert data.metric is not None
     assert judge(data).word == "Trusted, but incomplete"
@@ -69,7 +67,7 @@ def test_the_verdict_is_honest() -> None:
     assert "projective reconstruction" in early.sentence
 
 
-def test_a_failure_says_what_how_far_and_what_to_try() -> None:
+def test_a_failure_says_what_how_far_and_what_to_try():
     failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
     data = dataclasses.replace(projective_run(), reconstruction=None, until=None, failure=failure)
     verdict = judge(dataclasses.replace(data, reports=data.reports[:2]))
@@ -79,7 +77,7 @@ def test_a_failure_says_what_how_far_and_what_to_try() -> None:
     assert verdict.advice == "Take more photographs."
 
 
-def test_the_first_glance_tells_what_there_is() -> None:
+def test_the_first_glance_tells_what_there_is():
     labels = [fact.label for fact in first_glance(made_up_run(points=100), None)]
     assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", TIME]
     facts = first_glance(made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
@@ -89,7 +87,7 @@ def test_the_first_glance_tells_what_there_is() -> None:
     assert [fact.label for fact in first_glance(early, None)] == ["Photographs", "Pairs accepted", TIME]
 
 
-def test_pairs_that_leave_their_geometry_open_are_counted() -> None:
+def test_pairs_that_leave_their_geometry_open_are_counted():
     run = dataclasses.replace(projective_run(), reconstruction=None)
     unsure = DegeneracyReport(False, ("one homography explains the matches (plane)",))
     pairs = tuple(

@@ -1,7 +1,5 @@
 """Whoever does the work, the answers are the same bytes; whoever is lost, the run goes on."""
 
-from __future__ import annotations
-
 import builtins
 import concurrent.futures as futures
 import hashlib
@@ -10,10 +8,8 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +33,7 @@ NO_RESULT = ("seconds", "elapsed_seconds", "peak_memory_mb", "threads", "executo
 """What a summary says of how it came about."""
 
 
-def results(out: Path) -> dict[str, Any]:
+def results(out):
     """Every result file of a run by its hash, and its summary without times."""
     files = [
         *out.glob("0*/*.npz"),
@@ -45,9 +41,7 @@ def results(out: Path) -> dict[str, Any]:
         *out.glob("*.ply"),
         out / "cameras.json",
     ]
-    found: dict[str, Any] = {
-        str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)
-    }
+    found = {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
     model = out / "model.glb"
     found["model"] = hashlib.sha256(model.read_bytes()).hexdigest() if model.exists() else ""
     summary = read_json(out / "summary.json")
@@ -55,7 +49,7 @@ def results(out: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def serial(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path]:
+def serial(tmp_path_factory):
     """Four photographs of the courtyard, and their run with one worker."""
     place = tmp_path_factory.mktemp("serial")
     images = sorted(COURTYARD.iterdir())[4:8]
@@ -63,15 +57,13 @@ def serial(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path]:
     return images, place / "out"
 
 
-def small_job(images: list[Path], out: Path, **options: Any) -> None:
+def small_job(images, out, **options):
     config = replace(PipelineConfig(), images=ImageOptions(max_size_px=400))
     reconstruct(images, out, config=config, until="metric", **options)
 
 
 @pytest.mark.parametrize("kind", ["threads", "processes", "dask", "shuffled"])
-def test_the_sparse_job_has_the_same_bytes_whoever_does_it(
-    kind: str, serial: tuple[list[Path], Path], tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_the_sparse_job_has_the_same_bytes_whoever_does_it(kind, serial, tmp_path, request):
     images, out = serial
     if kind == "shuffled":
         images = [images[k] for k in np.random.default_rng(3).permutation(len(images))]
@@ -84,11 +76,9 @@ def test_the_sparse_job_has_the_same_bytes_whoever_does_it(
     assert read_json(tmp_path / "summary.json")["executor"] == executor
 
 
-def test_surfaces_have_the_same_bytes_on_a_cluster_and_in_an_executor_of_ones_own(
-    dask_cluster: Any, tmp_path: Path
-) -> None:
+def test_surfaces_have_the_same_bytes_on_a_cluster_and_in_an_executor_of_ones_own(dask_cluster, tmp_path):
     """Through all that fans out, with fake stages."""
-    given: dict[str, Any] = {"config": fake_config(), "threads": 2}
+    given = {"config": fake_config(), "threads": 2}
     reconstruct(photographs(4), tmp_path / "a", **given)
     reconstruct(photographs(4), tmp_path / "b", executor=address(dask_cluster), **given)
     with futures.ThreadPoolExecutor(2) as pool:
@@ -106,7 +96,7 @@ class DeadlyMatcher(fakes.FakeMatcher):
     told: str = ""
     fatal: tuple[int, int] = (1, 2)
 
-    def match(self, view1: Any, view2: Any, *, pair: Any, estimate_fundamental: Any, rng: Any) -> Any:
+    def match(self, view1, view2, *, pair, estimate_fundamental, rng):
         if tuple(pair) == self.fatal:
             try:
                 os.close(os.open(self.told, os.O_CREAT | os.O_EXCL))
@@ -117,18 +107,18 @@ class DeadlyMatcher(fakes.FakeMatcher):
         return super().match(view1, view2, pair=pair, estimate_fundamental=estimate_fundamental, rng=rng)
 
 
-def deadly(tmp_path: Path) -> PipelineConfig:
+def deadly(tmp_path):
     return fake_config(matching=DeadlyMatcher(told=str(tmp_path / "killed")))
 
 
-def undisturbed(tmp_path: Path) -> dict[str, Any]:
+def undisturbed(tmp_path):
     (tmp_path / "killed").touch()
     reconstruct(photographs(4), tmp_path / "whole", config=deadly(tmp_path), until="metric", threads=1)
     (tmp_path / "killed").unlink()
     return results(tmp_path / "whole")
 
 
-def test_a_worker_of_a_cluster_that_is_killed_loses_nothing(dask_cluster: Any, tmp_path: Path) -> None:
+def test_a_worker_of_a_cluster_that_is_killed_loses_nothing(dask_cluster, tmp_path):
     whole = undisturbed(tmp_path)
     executor, config = address(dask_cluster), deadly(tmp_path)
     reconstruct(photographs(4), tmp_path / "out", config=config, until="metric", executor=executor)
@@ -136,9 +126,9 @@ def test_a_worker_of_a_cluster_that_is_killed_loses_nothing(dask_cluster: Any, t
     assert results(tmp_path / "out") == whole
 
 
-def test_a_worker_process_that_is_killed_is_told_and_the_run_goes_on(tmp_path: Path) -> None:
+def test_a_worker_process_that_is_killed_is_told_and_the_run_goes_on(tmp_path):
     whole, config = undisturbed(tmp_path), deadly(tmp_path)
-    given: dict[str, Any] = {"config": config, "until": "metric", "threads": 2, "executor": "processes"}
+    given = {"config": config, "until": "metric", "threads": 2, "executor": "processes"}
     with pytest.raises(
         WorkersLost, match=r"ended unexpectedly .* \(in the stage matches\).* goes on from there"
     ):
@@ -148,7 +138,7 @@ def test_a_worker_process_that_is_killed_is_told_and_the_run_goes_on(tmp_path: P
 
 
 @pytest.fixture
-def lonely() -> Iterator[tuple[str, Any]]:
+def lonely():
     """A scheduler and its worker in this process, to be closed in the middle."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
@@ -164,14 +154,12 @@ def lonely() -> Iterator[tuple[str, Any]]:
         yield address(running), running
 
 
-def test_a_scheduler_that_dies_in_the_middle_is_told_and_the_run_goes_on(
-    lonely: tuple[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_that_dies_in_the_middle_is_told_and_the_run_goes_on(lonely, tmp_path, monkeypatch):
     executor, running = lonely
     monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
     monkeypatch.setattr(workers, "PATIENCE_S", 0.5)
 
-    def close_at_matches(stage: str, done: int, _: int) -> None:
+    def close_at_matches(stage, done, _):
         if stage == "matches" and done == 2:
             running.close()
 
@@ -192,22 +180,22 @@ def test_a_scheduler_that_dies_in_the_middle_is_told_and_the_run_goes_on(
 
 @dataclass(frozen=True)
 class SlowMatcher(fakes.FakeMatcher):
-    def match(self, *views: Any, **given: Any) -> Any:
+    def match(self, *views, **given):
         time.sleep(0.2)
         return super().match(*views, **given)
 
 
 @pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])
-def test_an_address_that_is_none_is_refused_before_anything_is_made(port: str, tmp_path: Path) -> None:
+def test_an_address_that_is_none_is_refused_before_anything_is_made(port, tmp_path):
     with pytest.raises(UsageError, match=r"dask://HOST:PORT, for instance .* got 'dask://there"):
         reconstruct(photographs(2), tmp_path / "out", config=fake_config(), executor=f"dask://there:{port}")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     found = builtins.__import__
 
-    def without(name: str, *given: Any, **more: Any) -> Any:
+    def without(name, *given, **more):
         if name.split(".")[0] == "distributed":
             raise ImportError(name)
         return found(name, *given, **more)
@@ -218,9 +206,7 @@ def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert not (tmp_path / "out").exists()
 
 
-def test_a_scheduler_that_does_not_answer_is_told_on_the_command_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scheduler_that_does_not_answer_is_told_on_the_command_line(monkeypatch, tmp_path, capsys):
     pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
     with socket.socket() as free:
@@ -234,34 +220,34 @@ def test_a_scheduler_that_does_not_answer_is_told_on_the_command_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_worker_with_other_code_is_refused() -> None:
+def test_a_worker_with_other_code_is_refused():
     with pytest.raises(UsageError, match="another version of thesisrecon"):
         workers._answer("another", b"")
 
 
-def test_a_task_that_a_worker_cannot_load_is_named() -> None:
+def test_a_task_that_a_worker_cannot_load_is_named():
     missing = b"cno_such_module\nfunction\n."
     with pytest.raises(UsageError, match="cannot load its task: No module named 'no_such_module'"):
         workers._answer(workers.package_key(), missing)
 
 
-def test_what_is_no_executor_is_refused() -> None:
+def test_what_is_no_executor_is_refused():
     with pytest.raises(UsageError, match="or a concurrent"):
-        Workers(1, 3)  # type: ignore[arg-type]
+        Workers(1, 3)
 
 
-def test_an_executor_is_given_few_tasks_at_a_time() -> None:
+def test_an_executor_is_given_few_tasks_at_a_time():
     """Large sets must not lie in memory as tasks."""
     asked, done = 0, 0
 
-    def tasks() -> Iterator[tuple[int]]:
+    def tasks():
         nonlocal asked
         for n in range(50):
             asked += 1
             assert asked - done <= 2 * workers.AHEAD + 2
             yield (n,)
 
-    def finished(_: int, __: Any) -> None:
+    def finished(_, __):
         nonlocal done
         done += 1
 
@@ -270,7 +256,7 @@ def test_an_executor_is_given_few_tasks_at_a_time() -> None:
     assert done == 50
 
 
-def test_workers_may_become_fewer_in_the_middle() -> None:
+def test_workers_may_become_fewer_in_the_middle():
     there, done = iter([4]), list[int]()
     with futures.ThreadPoolExecutor(1) as pool:
         remote = workers._Remote(pool, lambda: next(there, 1))
@@ -278,17 +264,17 @@ def test_workers_may_become_fewer_in_the_middle() -> None:
     assert sorted(done) == list(range(20))
 
 
-def test_what_is_prepared_stays_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[int] = []
+def test_what_is_prepared_stays_within_bounds(monkeypatch):
+    made = []
 
     class Counting(fakes.FakeMatcher):
-        def prepare(self, image: Any, features: Any) -> Any:
+        def prepare(self, image, features):
             del image
             made.append(features)
             return np.zeros(100)
 
     monkeypatch.setattr(preparing, "KEPT_BYTES", 4 * 800)
-    views = PreparedViews(Counting(), {i: (None, i) for i in range(6)})  # type: ignore[misc]
+    views = PreparedViews(Counting(), {i: (None, i) for i in range(6)})
     assert [len(view) for view in views] == [100] * 6
     assert [views[5] is views[5], made] == [True, [0, 1, 2, 3, 4, 5]]
     assert len(views[0]) == 100
@@ -299,7 +285,7 @@ def test_what_is_prepared_stays_within_bounds(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize(("pairs", "workers_there"), [(91, 2), (7, 4), (3000, 2)])
-def test_batches_hold_every_pair_once_and_few_views(pairs: int, workers_there: int) -> None:
+def test_batches_hold_every_pair_once_and_few_views(pairs, workers_there):
     views = next(n for n in range(100) if n * (n - 1) // 2 >= pairs)
     every = [(i, j) for i in range(views) for j in range(i + 1, views)][:pairs]
     numbers = list(range(0, pairs, 2))

@@ -1,12 +1,8 @@
 """Runs whose disk fills or is taken from them: a sentence, nothing half written, and the same bytes later."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,12 +14,12 @@ from validation.studies.full_disk import Refusal, SmallRuns, disk_ends, filled, 
 from validation.studies.kill_anywhere import different, outputs
 
 
-def run(out: Path, **options: Any) -> None:
+def run(out, **options):
     reconstruct(photographs(3), out, config=fake_config(), threads=1, **options)
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], int]:
+def whole(tmp_path_factory):
     """The outputs of a run to the model, and how many files it wrote."""
     out = tmp_path_factory.mktemp("whole") / "out"
     with disk_ends(0, 0) as written:
@@ -32,9 +28,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], i
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.55, 0.7, 0.85, 1.0])
-def test_a_run_whose_disk_is_full_goes_on_with_room(
-    share: float, whole: tuple[dict[str, bytes], int], tmp_path: Path
-) -> None:
+def test_a_run_whose_disk_is_full_goes_on_with_room(share, whole, tmp_path):
     wanted, count = whole
     out = tmp_path / "out"
     with disk_ends(1 + round(share * (count - 1)), errno.ENOSPC), pytest.raises(OutputError) as refused:
@@ -49,9 +43,7 @@ def test_a_run_whose_disk_is_full_goes_on_with_room(
     assert different(outputs(out), wanted) == ()
 
 
-def test_a_file_in_the_place_of_a_folder_of_the_run(
-    whole: tuple[dict[str, bytes], int], tmp_path: Path
-) -> None:
+def test_a_file_in_the_place_of_a_folder_of_the_run(whole, tmp_path):
     out = tmp_path / "out"
     run(out, until="features")
     (out / "02-matches").write_text("of nobody")
@@ -62,9 +54,7 @@ def test_a_file_in_the_place_of_a_folder_of_the_run(
     assert different(outputs(out), whole[0]) == ()
 
 
-def test_the_results_of_a_whole_run_stay_until_they_are_replaced(
-    whole: tuple[dict[str, bytes], int], tmp_path: Path
-) -> None:
+def test_the_results_of_a_whole_run_stay_until_they_are_replaced(whole, tmp_path):
     """Written anew over a full disk, no good file is lost or cut."""
     out = tmp_path / "out"
     run(out)
@@ -78,9 +68,7 @@ def test_the_results_of_a_whole_run_stay_until_they_are_replaced(
     assert different(outputs(out), whole[0]) == ()
 
 
-def test_the_command_says_it_in_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_it_in_a_sentence(tmp_path, monkeypatch, capsys):
     """On a small disk where one can be mounted, else one that is full by decree."""
     runs = SmallRuns(tmp_path, 2, 128, "features")
     wanted = runs.whole(tmp_path / "whole")
@@ -91,7 +79,7 @@ def test_the_command_says_it_in_a_sentence(
     assert refusal.wrong == ""
     assert "No space left on device; make room there" in refusal.said
 
-    def compile_kernels(*_: Any, **__: Any) -> None:
+    def compile_kernels(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device", "kernels/index.nbi")
 
     monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", compile_kernels)
@@ -102,7 +90,7 @@ def test_the_command_says_it_in_a_sentence(
     )
 
 
-def test_the_check_names_what_is_wrong() -> None:
+def test_the_check_names_what_is_wrong():
     said = "thesisrecon: a cannot be written: no; make room there, then the same command goes on\n"
     well = Refusal("file 1: No space left on device", 2, said, (), ())
     bad = Refusal("a disk of 3 KiB", 1, "Traceback\nOSError\n", ("points.ply",), ("model.glb",))

@@ -1,11 +1,8 @@
 """Records as files: only those of ours are made, as they were written, and nothing is unpacked."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +12,7 @@ from thesisrecon.records import Tracks
 from thesisrecon.runtime.record_files import ChangedRecord, _seal, bytes_from_record, read_record
 
 
-def saved(path: Path, record: object, *, packed: bool = False, **arrays: np.ndarray) -> Path:
+def saved(path, record, *, packed=False, **arrays):
     """A file that is sealed, whatever it holds."""
     told = json.dumps({"key": "k", "record": record}).encode()
     save = np.savez_compressed if packed else np.savez
@@ -25,7 +22,7 @@ def saved(path: Path, record: object, *, packed: bool = False, **arrays: np.ndar
     return path
 
 
-def refused(path: Path, words: str = "npz: ") -> bool:
+def refused(path, words="npz: "):
     with pytest.raises(ChangedRecord, match=words):
         read_record(path, "k")
     return True
@@ -34,7 +31,7 @@ def refused(path: Path, words: str = "npz: ") -> bool:
 REPORT = {"type": "StageReport", "fields": {"stage": "x", "seconds": 1.0}}
 
 
-def test_only_records_are_made(tmp_path: Path) -> None:
+def test_only_records_are_made(tmp_path):
     path = tmp_path / "a.npz"
     assert read_record(saved(path, REPORT), "k").stage == "x"
     assert read_record(path, "other") is None
@@ -44,7 +41,7 @@ def test_only_records_are_made(tmp_path: Path) -> None:
     assert read_record(saved(path, {"array": "array0"}, array0=np.arange(3)), "k").tolist() == [0, 1, 2]
 
 
-def test_nothing_is_unpacked(tmp_path: Path) -> None:
+def test_nothing_is_unpacked(tmp_path):
     path = saved(tmp_path / "a.npz", REPORT, packed=True)
     assert refused(path, "not compressed")
     with zipfile.ZipFile(path, "w") as archive:
@@ -56,7 +53,7 @@ def test_nothing_is_unpacked(tmp_path: Path) -> None:
 
 TRACKS = Tracks(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)), 1, 3)
 Change = Callable[[dict[str, Any]], object]
-CHANGES: list[tuple[str, Change]] = [
+CHANGES = [
     ("beyond the views", lambda parts: parts["array0"].__setitem__(1, 10**9)),
     ("below zero", lambda parts: parts["array1"].__setitem__(1, -1)),
     ("NaN", lambda parts: parts["array2"].__setitem__((0, 0), np.nan)),
@@ -71,14 +68,14 @@ CHANGES: list[tuple[str, Change]] = [
 ]
 
 
-def told_otherwise(parts: dict[str, Any]) -> np.ndarray:
+def told_otherwise(parts):
     told = parts["description"].tobytes().replace(b'"n_views": 1', b'"n_views": 2')
     assert told != parts["description"].tobytes()
     return np.frombuffer(told, dtype=np.uint8)
 
 
 @pytest.mark.parametrize("change", [change for _, change in CHANGES], ids=[name for name, _ in CHANGES])
-def test_what_another_program_has_written_anew_is_told(change: Change, tmp_path: Path) -> None:
+def test_what_another_program_has_written_anew_is_told(change, tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(bytes_from_record(TRACKS, "k"))
     assert read_record(path, "k").n_points == 3

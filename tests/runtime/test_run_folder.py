@@ -1,10 +1,7 @@
 """The run directory: records survive, damage is noticed, another run's folder is left alone."""
 
-from __future__ import annotations
-
 import importlib
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,14 +21,14 @@ from thesisrecon.runtime.record_files import ChangedRecord, bytes_from_record
 from thesisrecon.runtime.run_folder import RunDirectory, StageFolder, code_key, key_of
 
 
-def some_features(value: float = 1.0) -> Features:
+def some_features(value=1.0):
     seeds = Seeds(
         np.full((2, 2), value), np.ones(2, np.float32), np.zeros(2, np.float32), np.eye(2, dtype=np.float32)
     )
     return Features(np.arange(6.0).reshape(3, 2), np.ones(3, np.float32), np.zeros(3, np.float32), seeds)
 
 
-def some_metric() -> MetricResult:
+def some_metric():
     tracks = Tracks(np.zeros(1, np.int64), np.zeros(1, np.int64), np.ones((1, 2)), 2, 1)
     reconstruction = Reconstruction(
         stratum="metric",
@@ -49,7 +46,7 @@ def some_metric() -> MetricResult:
     return MetricResult(reconstruction, intervals, {"checked": 1.0}, False, ("a doubt",))
 
 
-def test_records_survive_the_disk(tmp_path: Path) -> None:
+def test_records_survive_the_disk(tmp_path):
     folder = StageFolder(tmp_path / "01")
     folder.save("a", "key", some_features())
     folder.save("b", "key", some_metric())
@@ -63,12 +60,12 @@ def test_records_survive_the_disk(tmp_path: Path) -> None:
     assert metric.reconstruction.registered.dtype == np.bool_
 
 
-def test_equal_records_give_equal_bytes() -> None:
+def test_equal_records_give_equal_bytes():
     assert bytes_from_record(some_metric(), "k") == bytes_from_record(some_metric(), "k")
     assert bytes_from_record(some_features(1.0), "k") != bytes_from_record(some_features(2.0), "k")
 
 
-def test_another_key_and_absence_mean_compute_and_damage_is_told(tmp_path: Path) -> None:
+def test_another_key_and_absence_mean_compute_and_damage_is_told(tmp_path):
     folder = StageFolder(tmp_path)
     assert folder.load("a", "key") is None
     folder.save("a", "key", some_features())
@@ -80,13 +77,13 @@ def test_another_key_and_absence_mean_compute_and_damage_is_told(tmp_path: Path)
             folder.load("a", "key")
 
 
-def test_a_pickle_is_never_loaded(tmp_path: Path) -> None:
+def test_a_pickle_is_never_loaded(tmp_path):
     np.savez(tmp_path / "a.npz", description=np.array([{"key": "key"}], dtype=object))
     with pytest.raises(ChangedRecord, match="allow_pickle"):
         StageFolder(tmp_path).load("a", "key")
 
 
-def test_the_manifest_ends_a_stage_and_sweeps_what_is_no_longer_part_of_it(tmp_path: Path) -> None:
+def test_the_manifest_ends_a_stage_and_sweeps_what_is_no_longer_part_of_it(tmp_path):
     folder = StageFolder(tmp_path)
     folder.save("old", "1", some_features())
     folder.save("new", "2", some_features())
@@ -99,7 +96,7 @@ def test_the_manifest_ends_a_stage_and_sweeps_what_is_no_longer_part_of_it(tmp_p
     assert folder.finished({"new": "2"}) is None
 
 
-def test_keys_tell_values_types_and_arrays_apart() -> None:
+def test_keys_tell_values_types_and_arrays_apart():
     keys = [key_of(1), key_of("1"), key_of(1, 1), key_of(np.arange(3)), key_of(np.arange(3.0)), key_of(None)]
     assert len(set(keys)) == len(keys)
     assert key_of({"a": 1, "b": 2}) == key_of({"b": 2, "a": 1})
@@ -107,14 +104,14 @@ def test_keys_tell_values_types_and_arrays_apart() -> None:
         key_of(object())
 
 
-def test_stages_have_different_code() -> None:
+def test_stages_have_different_code():
     assert code_key("thesisrecon.features.harris") != code_key("thesisrecon.matching.strength")
 
 
 IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "photographs": {"a.jpg": "1", "b.jpg": "2"}}
 
 
-def test_the_same_run_is_resumed_and_another_is_refused_with_what_differs(tmp_path: Path) -> None:
+def test_the_same_run_is_resumed_and_another_is_refused_with_what_differs(tmp_path):
     directory = RunDirectory(tmp_path / "new" / "out")
     with directory.claimed(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
@@ -140,7 +137,7 @@ def test_the_same_run_is_resumed_and_another_is_refused_with_what_differs(tmp_pa
         assert directory.stage("01").load("a", "key") is not None
 
 
-def test_settings_are_judged_before_the_photographs_are_known(tmp_path: Path) -> None:
+def test_settings_are_judged_before_the_photographs_are_known(tmp_path):
     directory = RunDirectory(tmp_path)
     with directory.claimed(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
@@ -154,11 +151,11 @@ def test_settings_are_judged_before_the_photographs_are_known(tmp_path: Path) ->
         pass
 
 
-def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_path: Path) -> None:
+def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_path):
     directory = RunDirectory(tmp_path / "out")
     results = ["summary.json", "sparse/0/cameras.bin", "absent.txt"]
 
-    def adopt(seed: int) -> None:
+    def adopt(seed):
         identity = {**IDENTITY, "seed": seed}
         with directory.claimed(identity, overwrite=True):
             directory.adopt(identity, overwrite=True, results=results)
@@ -175,7 +172,7 @@ def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_p
     assert (directory.path / "sparse" / "note.txt").exists()
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
     with (
         pytest.raises(UsageError, match=r"holds 'letter\.txt', which is of no run"),
@@ -185,7 +182,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     assert not (tmp_path / "run.json").exists()
 
 
-def test_two_runs_cannot_share_a_folder(tmp_path: Path) -> None:
+def test_two_runs_cannot_share_a_folder(tmp_path):
     directory = RunDirectory(tmp_path / "out")
     with (
         directory.claimed(IDENTITY, overwrite=False),
@@ -197,7 +194,7 @@ def test_two_runs_cannot_share_a_folder(tmp_path: Path) -> None:
         pass
 
 
-def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(UsageError, match="cannot be written"),
@@ -206,7 +203,7 @@ def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path: Path) -> None:
         pass
 
 
-def test_what_one_run_kept_another_takes_by_its_key(tmp_path: Path) -> None:
+def test_what_one_run_kept_another_takes_by_its_key(tmp_path):
     one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01-features") for name in "ab")
     one.save("00000", "key", some_features(2.0))
     assert two.load("00007", "other") is None
@@ -223,7 +220,7 @@ def test_what_one_run_kept_another_takes_by_its_key(tmp_path: Path) -> None:
     assert two.load("00007", "new") is not None
 
 
-def test_what_is_damaged_in_one_place_is_taken_from_the_other(tmp_path: Path) -> None:
+def test_what_is_damaged_in_one_place_is_taken_from_the_other(tmp_path):
     one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01") for name in "ab")
     one.save("0", "key", some_features())
     own, kept = tmp_path / "b" / "01" / "0.npz", tmp_path / "shared" / "01" / "key.npz"
@@ -237,7 +234,7 @@ def test_what_is_damaged_in_one_place_is_taken_from_the_other(tmp_path: Path) ->
         two.load("0", "key")
 
 
-def test_code_of_the_caller_counts_by_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_of_the_caller_counts_by_its_file(tmp_path, monkeypatch):
     keys = []
     for name, text in (("callers_one", "x = 1"), ("callers_two", "x = 1"), ("callers_one", "x = 2")):
         (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")

@@ -1,7 +1,5 @@
 """Programs that are told to stop: at once, with a sentence and its exit code, whatever they are at."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -73,13 +71,13 @@ AT_WORK = {
 }
 
 
-def program(folder: Path, work: str) -> list[str]:
+def program(folder, work):
     file = folder / "toy.py"
     file.write_text(PROGRAM.format(work=work))
     return [sys.executable, str(file), str(folder / "ready")]
 
 
-def is_alive(number: int) -> bool:
+def is_alive(number):
     try:
         return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except OSError:
@@ -88,7 +86,7 @@ def is_alive(number: int) -> bool:
 
 @pytest.mark.parametrize("what", AT_WORK)
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
-def test_a_program_is_ended_whatever_it_is_at(what: str, asked: signal.Signals, tmp_path: Path) -> None:
+def test_a_program_is_ended_whatever_it_is_at(what, asked, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ready = tmp_path / "ready"
     stop = stopped(program(tmp_path, AT_WORK[what]), ready.exists, asked, environment=environment)
@@ -98,9 +96,7 @@ def test_a_program_is_ended_whatever_it_is_at(what: str, asked: signal.Signals, 
 
 @pytest.mark.parametrize(("name", "slow"), [("thesisrecon", "cli"), ("validation", "command")])
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
-def test_a_command_is_ended_while_it_is_loaded(
-    name: str, slow: str, asked: signal.Signals, tmp_path: Path
-) -> None:
+def test_a_command_is_ended_while_it_is_loaded(name, slow, asked, tmp_path):
     ready = tmp_path / "ready"
     program = [sys.executable, "-c", LOADING, str(ready), name, f"{name}.{slow}"]
     stop = stopped(program, ready.exists, asked, environment={**os.environ, "PYTHONPATH": str(ROOT)})
@@ -109,7 +105,7 @@ def test_a_command_is_ended_while_it_is_loaded(
     assert stop.said == f"{name}: {word}; give the same command again\n"
 
 
-def test_what_a_program_was_started_to_ignore_it_ignores(tmp_path: Path) -> None:
+def test_what_a_program_was_started_to_ignore_it_ignores(tmp_path):
     ready = tmp_path / "ready"
     work = "Path(sys.argv[1]).touch(); time.sleep(0.5)"
     process = subprocess.Popen(
@@ -123,7 +119,7 @@ def test_what_a_program_was_started_to_ignore_it_ignores(tmp_path: Path) -> None
     assert process.wait() == 0
 
 
-def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(tmp_path):
     images, out = tmp_path / "images", tmp_path / "out"
     images.mkdir()
     for path in sorted(COURTYARD.iterdir())[:4]:
@@ -143,7 +139,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(tmp_path: Path) -> Non
     assert different(outputs(out), outputs(tmp_path / "whole")) == ()
 
 
-def test_a_pool_is_abandoned_at_once() -> None:
+def test_a_pool_is_abandoned_at_once():
     pool = ProcessPool(1)
     number = pool.submit(os.getpid).result()
     pool.submit(time.sleep, 600)
@@ -152,15 +148,15 @@ def test_a_pool_is_abandoned_at_once() -> None:
     assert not is_alive(number)
 
 
-def test_an_interrupt_carries_what_is_advised() -> None:
+def test_an_interrupt_carries_what_is_advised():
     with pytest.raises(KeyboardInterrupt, match="go on"), advised("begin again"), advised("go on"):
         raise KeyboardInterrupt
 
 
-def test_a_callers_own_program_is_interrupted_as_any_other(tmp_path: Path) -> None:
+def test_a_callers_own_program_is_interrupted_as_any_other(tmp_path):
     """The library leaves signals alone: Ctrl-C is an exception there, and the run goes on afterwards."""
 
-    def interrupt(stage: str, done: int, _: int) -> None:
+    def interrupt(stage, done, _):
         if (stage, done) == ("matches", 2):
             raise KeyboardInterrupt
 
@@ -172,7 +168,7 @@ def test_a_callers_own_program_is_interrupted_as_any_other(tmp_path: Path) -> No
     assert different(outputs(tmp_path / "out"), outputs(tmp_path / "whole")) == ()
 
 
-def test_the_check_names_what_is_wrong() -> None:
+def test_the_check_names_what_is_wrong():
     said = "thesisrecon: interrupted; the same command goes on\n"
     well = Stop("5 % (0.4 s)", 0.1, 130, said, 0, 3)
     bad = Stop("15 % (1.2 s)", 2.5, 1, "Traceback\nKeyboardInterrupt\n", 2, 4, ("points.ply",))

@@ -1,14 +1,12 @@
 """The affine stratum: what it keeps on exact data, and the front door to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import thesisrecon
-from tests.selfcalibration.stratified_scenes import CENTRED, assume, make_scene
+from tests.selfcalibration.stratified_scenes import CENTRED, make_scene, prior_for
 from tests.synthetic import projective_reconstruction
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
@@ -20,7 +18,7 @@ from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.stratified import Stratified
 
 
-def affine_map(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]:
+def affine_map(source, target):
     """Least-squares affine map (4, 3) of points (N, 3) and its largest residual."""
     homogeneous = np.column_stack([source, np.ones(len(source))])
     A = np.linalg.lstsq(homogeneous, target, rcond=None)[0]
@@ -29,7 +27,7 @@ def affine_map(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, floa
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("plane", [CheiralitySearch(), ModulusConstraint()], ids=lambda p: type(p).__name__)
-def test_the_located_plane_leaves_an_affine_map_to_the_scene(plane: object, seed: int) -> None:
+def test_the_located_plane_leaves_an_affine_map_to_the_scene(plane, seed):
     scene = make_scene(seed=seed)
     given = projective_reconstruction(scene, seed=seed)
     config = PipelineConfig(selfcalibration=Stratified(plane), intrinsics=CENTRED)
@@ -43,7 +41,7 @@ def test_the_located_plane_leaves_an_affine_map_to_the_scene(plane: object, seed
     np.testing.assert_allclose(affine_camera_centres(affine), centres, atol=1e-6)
 
 
-def test_parallels_stay_parallel_and_ratios_are_kept() -> None:
+def test_parallels_stay_parallel_and_ratios_are_kept():
     scene = make_scene(seed=1)
     rng = np.random.default_rng(0)
     start, step, ratio = rng.uniform(-1, 1, (50, 3)), np.array([0.3, -0.5, 0.4]), rng.uniform(0.2, 0.8, 50)
@@ -52,7 +50,7 @@ def test_parallels_stay_parallel_and_ratios_are_kept() -> None:
     points = np.concatenate([X, scene.X[150:]])
     given = projective_reconstruction(replace(scene, X=points), seed=1)
     answer = Stratified(ModulusConstraint()).calibrate(
-        given, assumed=assume(scene), rng=np.random.default_rng(0)
+        given, prior=prior_for(scene), rng=np.random.default_rng(0)
     )
     affine = upgrade_to_affine(given, answer.plane_at_infinity)
     a, b, c = affine.X[:150, :3].reshape(3, 50, 3)
@@ -64,7 +62,7 @@ def test_parallels_stay_parallel_and_ratios_are_kept() -> None:
     assert np.abs(directions - directions[0]).max() > 0.01
 
 
-def test_images_stay_what_they_are_and_depths_are_positive() -> None:
+def test_images_stay_what_they_are_and_depths_are_positive():
     scene = make_scene(seed=2)
     given = projective_reconstruction(scene, seed=2)
     affine = upgrade_to_affine(given, np.array([0.1, -0.2, 0.05, 1.0]))
@@ -82,7 +80,7 @@ def test_images_stay_what_they_are_and_depths_are_positive() -> None:
     assert np.median(true.X[t.point_index[t.view_index == view], 2]) == pytest.approx(1.0)
 
 
-def test_a_located_plane_is_not_needed_where_one_is_given() -> None:
+def test_a_located_plane_is_not_needed_where_one_is_given():
     given = projective_reconstruction(make_scene(seed=3), seed=3)
     plane = np.array([0.1, 0.0, -0.1, 1.0])
     np.testing.assert_array_equal(
@@ -90,7 +88,7 @@ def test_a_located_plane_is_not_needed_where_one_is_given() -> None:
     )
 
 
-def test_wrong_calls_and_hopeless_data_are_refused() -> None:
+def test_wrong_calls_and_hopeless_data_are_refused():
     given = projective_reconstruction(make_scene(seed=3), seed=3)
     affine = upgrade_to_affine(given, np.array([0.0, 0.0, 0.0, 1.0]))
     with pytest.raises(ValueError, match="affine"):

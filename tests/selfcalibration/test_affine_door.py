@@ -1,9 +1,5 @@
 """The affine stratum in the run's folder."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 from tests.synthetic import make_scene, projective_reconstruction
@@ -11,7 +7,7 @@ from thesisrecon.pipeline.outputs import write_affine
 from thesisrecon.selfcalibration.affine import upgrade_to_affine
 
 
-def test_points_and_camera_centres_are_written(tmp_path: Path) -> None:
+def test_points_and_camera_centres_are_written(tmp_path):
     affine = upgrade_to_affine(projective_reconstruction(make_scene()), np.array([0.02, -0.03, 0.01, 1.0]))
     colours = np.full((300, 3), 77, dtype=np.uint8)
     write_affine(tmp_path / "affine.ply", affine, colours)
@@ -25,6 +21,6 @@ def test_points_and_camera_centres_are_written(tmp_path: Path) -> None:
     np.testing.assert_allclose(vertices["xyz"][:-8], affine.X[near, :3], rtol=1e-5)
 
 
-def test_nothing_is_written_of_nothing(tmp_path: Path) -> None:
+def test_nothing_is_written_of_nothing(tmp_path):
     write_affine(tmp_path / "affine.ply", None, np.zeros((0, 3), dtype=np.uint8))
     assert not (tmp_path / "affine.ply").exists()

@@ -1,7 +1,5 @@
 """Critical motions by their measures and names, the counting argument, and the verdict with its sentences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,52 +8,52 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
-from thesisrecon.records import IdentifiabilityReport, Reconstruction, Tracks, Upgrade
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.records import Tracks, Upgrade
 from thesisrecon.selfcalibration.critical_motions import (
-    LEAST_MOVE,
     MAX_FOCAL_STD,
-    MIN_SIGNIFICANCE,
-    MOST_NOISE,
+    MAX_NOISE_RATIO,
+    MIN_INFINITY_SHIFT,
+    MIN_ROTATION_SIGNIFICANCE,
     UpgradedCameras,
-    infinity_shift,
+    infinite_homography_shift,
     measure_motion,
     nearest_critical_motion,
-    shifts_without_an_answer,
-    thickness,
+    planarity_ratio,
+    projective_infinity_shifts,
 )
-from thesisrecon.selfcalibration.frame import assumed_frame
+from thesisrecon.selfcalibration.frame import normalized_frame
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.identifiability import (
     check_identifiability,
-    spare_equations,
-    verdict_without_an_answer,
+    excess_equations,
+    identifiability_without_calibration,
 )
-from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
+from validation.scenes.critical import Motion, make_sequence, projective_estimate
 
 CRITICAL = [motion for motion in Motion if motion is not Motion.GENERAL]
 
 
-def true_cameras(scene: Sequence) -> UpgradedCameras:
+def true_cameras(scene):
     return UpgradedCameras(scene.K[:, 0, 0] / scene.sizes.max(axis=1), scene.R, scene.C, scene.X)
 
 
-def verdict_at_the_truth(scene: Sequence, cameras: str = "shared") -> IdentifiabilityReport:
+def report_at_the_truth(scene, cameras="shared"):
     """The verdict when self-calibration found the true answer."""
     rng = np.random.default_rng(0)
     estimate = projective_estimate(scene, rng)
-    known = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")
-    assumed = assume(estimate, known)
+    known = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
+    prior = prior_for(estimate, known)
     answer = HypothesesAndRefinement(search=None, subsets=0, focal_steps=17).calibrate(
-        estimate, assumed=assumed, rng=rng
+        estimate, prior=prior, rng=rng
     )
-    assert answer.verdict is not None
-    return answer.verdict
+    assert answer.identifiability is not None
+    return answer.identifiability
 
 
 @pytest.mark.parametrize("by_hand", [False, True], ids=["exact", "by hand"])
 @pytest.mark.parametrize("motion", CRITICAL, ids=lambda m: m.value)
-def test_a_critical_motion_is_named(motion: Motion, by_hand: bool) -> None:
+def test_a_critical_motion_is_named(motion, by_hand):
     for seed in range(5):
         scene = make_sequence(motion, np.random.default_rng(seed), by_hand=by_hand)
         name, nearness = nearest_critical_motion(measure_motion(true_cameras(scene)))
@@ -65,95 +63,96 @@ def test_a_critical_motion_is_named(motion: Motion, by_hand: bool) -> None:
         assert by_hand or nearness < 1e-3
 
 
-def test_cameras_that_hardly_turned_nor_moved_have_the_name_of_the_nearer_motion() -> None:
+def test_cameras_that_hardly_turned_nor_moved_have_the_name_of_the_nearer_motion():
     scene = make_sequence(Motion.TRANSLATION, np.random.default_rng(2))
     far = scene.X + 60.0 * scene.R[0, 2] * np.linalg.norm(scene.C.std(axis=0))
     cameras = replace(true_cameras(scene), X=far)
-    assert measure_motion(cameras)["travel_over_distance"] < 0.03
+    assert measure_motion(cameras)["centre_spread_over_distance"] < 0.03
     assert nearest_critical_motion(measure_motion(cameras))[0] == "pure translation"
     turns = Rotation.from_rotvec(np.radians(np.random.default_rng(3).normal(0.0, 2.0, (len(scene.R), 3))))
     turned = replace(cameras, R=turns.as_matrix() @ cameras.R, C=1e-3 * cameras.C)
     assert nearest_critical_motion(measure_motion(turned))[0] == "pure rotation"
 
 
-def test_general_motions_are_far_from_all() -> None:
+def test_general_motions_are_far_from_all():
     for seed in range(20):
         scene = make_sequence(Motion.GENERAL, np.random.default_rng(seed))
         assert nearest_critical_motion(measure_motion(true_cameras(scene)))[1] > 2.0
 
 
 @pytest.mark.parametrize("motion", [Motion.TRANSLATION, Motion.OPTICAL_AXIS])
-def test_cameras_that_did_not_tilt_show_it_whatever_focal_is_taken(motion: Motion) -> None:
+def test_cameras_that_did_not_tilt_show_it_whatever_focal_is_taken(motion):
     scene = make_sequence(motion, np.random.default_rng(3), zoom=0.3)
     cameras = true_cameras(scene)
     for factor in (0.3, 1.0, 4.0):
         H = replace(cameras, focal=factor * cameras.focal).infinite_homographies()
-        assert infinity_shift(H, roll=True) < 1e-9
-    assert (infinity_shift(H, roll=False) < 1e-9) == (motion is Motion.TRANSLATION)
+        assert infinite_homography_shift(H, roll=True) < 1e-9
+    assert (infinite_homography_shift(H, roll=False) < 1e-9) == (motion is Motion.TRANSLATION)
 
 
-def test_the_projective_cameras_alone_tell_that_nothing_tilted() -> None:
+def test_the_projective_cameras_alone_tell_that_nothing_tilted():
     scene = make_scene(seed=2)
     still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
     for some, small in ((still, True), (scene, False)):
         estimate = projective_reconstruction(some, seed=2)
-        frame = assumed_frame(estimate, assume(estimate))
-        assert (shifts_without_an_answer(frame.A, frame.a)["image_shift"] < 1e-9) == small
-        verdict = verdict_without_an_answer(estimate, assume(estimate))
-        assert not verdict.identifiable
-        assert (verdict.motion == "pure translation") == small
-        assert any("pure translation" in sentence for sentence in verdict.sentences) == small
+        frame = normalized_frame(estimate, prior_for(estimate))
+        assert (projective_infinity_shifts(frame.A, frame.a)["infinity_shift"] < 1e-9) == small
+        identifiability = identifiability_without_calibration(estimate, prior_for(estimate))
+        assert not identifiability.identifiable
+        assert (identifiability.motion == "pure translation") == small
+        assert any("pure translation" in sentence for sentence in identifiability.sentences) == small
 
 
-def test_thickness_forgives_a_few_far_points() -> None:
+def test_thickness_forgives_a_few_far_points():
     rng = np.random.default_rng(0)
     wall = rng.uniform(-1.0, 1.0, (300, 3)) * [1.0, 1.0, 0.005]
     wall[:5] += 30.0 * rng.normal(size=(5, 3))
-    assert thickness(wall) < 0.01
-    assert thickness(rng.uniform(-1.0, 1.0, (300, 3))) > 0.5
+    assert planarity_ratio(wall) < 0.01
+    assert planarity_ratio(rng.uniform(-1.0, 1.0, (300, 3))) > 0.5
 
 
 @pytest.mark.parametrize(
     ("known", "views", "spare"),
     [
         # m n_known + (m - 1) n_constant - 8 (methods 2.0)
-        (IntrinsicsAssumption(), 8, 8 * 4 + 7 - 8),
-        (IntrinsicsAssumption(cameras="per-image"), 8, 8 * 4 - 8),
-        (IntrinsicsAssumption(principal_point_std_rel=None), 8, 8 * 2 + 7 * 3 - 8),
-        (IntrinsicsAssumption(cameras="per-image", principal_point_std_rel=None), 3, 3 * 2 - 8),
-        (
-            IntrinsicsAssumption(aspect="constant", skew="constant", principal_point_std_rel=None),
-            3,
-            2 * 5 - 8,
-        ),
+        (IntrinsicsOptions(), 8, 8 * 4 + 7 - 8),
+        (IntrinsicsOptions(cameras="per-image"), 8, 8 * 4 - 8),
+        (IntrinsicsOptions(principal_point_std_rel=None), 8, 8 * 2 + 7 * 3 - 8),
+        (IntrinsicsOptions(cameras="per-image", principal_point_std_rel=None), 3, 3 * 2 - 8),
+        (IntrinsicsOptions(aspect="constant", skew="constant", principal_point_std_rel=None), 3, 2 * 5 - 8),
     ],
 )
-def test_the_counting_argument(known: IntrinsicsAssumption, views: int, spare: int) -> None:
+def test_the_counting_argument(known, views, spare):
     estimate = projective_reconstruction(make_scene(views=8))
     registered = np.arange(8) < views
-    assert spare_equations(assume(estimate, known), registered) == spare
+    assert excess_equations(prior_for(estimate, known), registered) == spare
 
 
-def test_a_turntable_is_settled_by_square_pixels_and_said_so() -> None:
-    verdict = verdict_at_the_truth(make_sequence(Motion.TURNTABLE, np.random.default_rng(4)))
-    assert verdict.identifiable
-    assert verdict.critical
-    assert verdict.motion == "turntable"
-    assert verdict.evidence["focal_std_rel_free"] > 3.0 * verdict.evidence["focal_std_rel_median"]
-    assert any("turntable" in sentence for sentence in verdict.sentences)
-    assert any("square pixels" in sentence for sentence in verdict.sentences)
+def test_a_turntable_is_settled_by_square_pixels_and_said_so():
+    identifiability = report_at_the_truth(make_sequence(Motion.TURNTABLE, np.random.default_rng(4)))
+    assert identifiability.identifiable
+    assert identifiability.critical
+    assert identifiability.motion == "turntable"
+    assert (
+        identifiability.evidence["focal_std_rel_free"]
+        > 3.0 * identifiability.evidence["focal_std_rel_median"]
+    )
+    assert any("turntable" in sentence for sentence in identifiability.sentences)
+    assert any("square pixels" in sentence for sentence in identifiability.sentences)
 
 
-def test_a_camera_that_rolled_only_is_refused_and_told_what_to_do() -> None:
+def test_a_camera_that_rolled_only_is_refused_and_told_what_to_do():
     for cameras in ("shared", "per-image"):
         scene = make_sequence(Motion.OPTICAL_AXIS, np.random.default_rng(5))
-        verdict = verdict_at_the_truth(scene, cameras)
-        assert not verdict.identifiable
-        assert verdict.motion == "rotation about the optical axis"
-        assert any("point the camera in different directions" in sentence for sentence in verdict.sentences)
+        identifiability = report_at_the_truth(scene, cameras)
+        assert not identifiability.identifiable
+        assert identifiability.motion == "rotation about the optical axis"
+        assert any(
+            "point the camera in different directions" in sentence for sentence in identifiability.sentences
+        )
 
 
-def test_a_turn_no_larger_than_what_lens_models_leave_out_tells_no_focal() -> None:
+def test_a_turn_no_larger_than_what_lens_models_leave_out_tells_no_focal():
     """Turned by less than a tenth of a degree, thousands of points: as rectified photographs seem to be."""
     scene, rng = make_sequence(Motion.TRANSLATION, np.random.default_rng(0)), np.random.default_rng(1)
     turns = Rotation.from_rotvec(np.radians(rng.normal(0.0, 0.07, (len(scene.R), 3)))).as_matrix()
@@ -162,35 +161,35 @@ def test_a_turn_no_larger_than_what_lens_models_leave_out_tells_no_focal() -> No
     x = np.einsum("kij,kj->ki", scene.P[view], homogenize(scene.X)[point])
     xy = dehomogenize(x) + scene.sigma_px * rng.standard_normal((len(view), 2))
     tracks = Tracks(view, point, xy, len(scene.R), len(scene.X))
-    verdict = verdict_at_the_truth(replace(scene, tracks=tracks))
-    assert verdict.evidence["turn_significance"] > MIN_SIGNIFICANCE
-    assert verdict.evidence["focal_std_rel"] < MAX_FOCAL_STD
-    assert verdict.evidence["image_shift_beyond_roll"] < LEAST_MOVE
-    assert not verdict.identifiable
-    assert any("what a lens model leaves out" in sentence for sentence in verdict.sentences)
+    identifiability = report_at_the_truth(replace(scene, tracks=tracks))
+    assert identifiability.evidence["rotation_significance"] > MIN_ROTATION_SIGNIFICANCE
+    assert identifiability.evidence["focal_std_rel"] < MAX_FOCAL_STD
+    assert identifiability.evidence["infinity_shift_beyond_roll"] < MIN_INFINITY_SHIFT
+    assert not identifiability.identifiable
+    assert any("what a lens model leaves out" in sentence for sentence in identifiability.sentences)
 
 
-def test_a_general_motion_needs_no_words() -> None:
-    verdict = verdict_at_the_truth(make_sequence(Motion.GENERAL, np.random.default_rng(6)))
-    assert 1e-4 < verdict.evidence["principal_point_std_free"] < 0.2
-    assert verdict.identifiable
-    assert not verdict.critical
-    assert verdict.sentences == ()
-    assert verdict.undetermined == ()
+def test_a_general_motion_needs_no_words():
+    identifiability = report_at_the_truth(make_sequence(Motion.GENERAL, np.random.default_rng(6)))
+    assert 1e-4 < identifiability.evidence["principal_point_std_free"] < 0.2
+    assert identifiability.identifiable
+    assert not identifiability.critical
+    assert identifiability.sentences == ()
+    assert identifiability.undetermined == ()
 
 
-def test_an_answer_that_explains_nothing_is_not_identifiable() -> None:
+def test_an_answer_that_explains_nothing_is_not_identifiable():
     scene = make_sequence(Motion.GENERAL, np.random.default_rng(7))
     estimate = projective_estimate(scene, np.random.default_rng(0))
-    assumed = assume(estimate)
+    prior = prior_for(estimate)
     G = np.eye(4)
     G[3, :3] = np.linalg.svd(estimate.X[estimate.valid])[2][3][:3]
-    verdict = check_identifiability(estimate, Upgrade(G, scene.K, 0.0, "made up"), assumed)
-    assert not verdict.identifiable
-    assert verdict.sentences
+    identifiability = check_identifiability(estimate, Upgrade(G, scene.K, 0.0, "made up"), prior)
+    assert not identifiability.identifiable
+    assert identifiability.sentences
 
 
-def bent_by_zooms() -> tuple[IdentifiabilityReport, IdentifiabilityReport]:
+def bent_by_zooms():
     """Verdicts on zoomed photographs that are said to have one focal length, and each its own."""
     scene = make_sequence(Motion.GENERAL, np.random.default_rng(8), zoom=0.15)
     t = scene.tracks
@@ -202,13 +201,13 @@ def bent_by_zooms() -> tuple[IdentifiabilityReport, IdentifiabilityReport]:
     estimate = replace(projective_estimate(scene, np.random.default_rng(0)), sigma_px=0.3)
     upgrade = Upgrade(metric_frame(estimate, scene), scene.K, 0.0, "truth")
     shared, own = (
-        check_identifiability(estimate, upgrade, assume(estimate, IntrinsicsAssumption(cameras=how)))
+        check_identifiability(estimate, upgrade, prior_for(estimate, IntrinsicsOptions(cameras=how)))
         for how in ("shared", "per-image")
     )
     return shared, own
 
 
-def metric_frame(estimate: Reconstruction, scene: Sequence) -> np.ndarray:
+def metric_frame(estimate, scene):
     """The projective transform that takes the estimate to the true cameras: rows of P T = lambda P_true."""
     registered = np.flatnonzero(estimate.registered)
     rows = []
@@ -220,20 +219,20 @@ def metric_frame(estimate: Reconstruction, scene: Sequence) -> np.ndarray:
     return np.asarray(np.linalg.inv(T))
 
 
-def test_noise_is_compared_with_what_the_projective_cameras_leave_not_with_a_floor() -> None:
+def test_noise_is_compared_with_what_the_projective_cameras_leave_not_with_a_floor():
     shared, own = bent_by_zooms()
-    assert shared.evidence["noise_over_projective"] > MOST_NOISE
+    assert shared.evidence["noise_ratio_to_projective"] > MAX_NOISE_RATIO
     assert not shared.identifiable
     assert any("zoomed" in sentence for sentence in shared.sentences)
     assert not any("turn the camera" in sentence or "px" in sentence for sentence in shared.sentences)
-    assert own.evidence["noise_over_projective"] < 1.3
+    assert own.evidence["noise_ratio_to_projective"] < 1.3
     assert own.identifiable
 
 
-def test_no_sentence_promises_a_focal_that_the_self_check_may_doubt() -> None:
+def test_no_sentence_promises_a_focal_that_the_self_check_may_doubt():
     for motion in (Motion.TURNTABLE, Motion.PLANAR, Motion.TRANSLATION):
         scene = make_sequence(motion, np.random.default_rng(4), by_hand=True)
-        for sentence in verdict_at_the_truth(scene).sentences:
+        for sentence in report_at_the_truth(scene).sentences:
             assert "all the same" not in sentence
             assert "focal length is known" not in sentence or "if the cameras are" in sentence
 
@@ -241,15 +240,13 @@ def test_no_sentence_promises_a_focal_that_the_self_check_may_doubt() -> None:
 @pytest.mark.parametrize(
     ("given", "advice"),
     [
-        (IntrinsicsAssumption(), ", or give the focal length"),
-        (IntrinsicsAssumption(focal_px=900.0, focal_std_rel=0.5), ", or give the focal length more exactly"),
-        (IntrinsicsAssumption(focal_px=900.0, focal="known"), " about the vertical and sideways"),
+        (IntrinsicsOptions(), ", or give the focal length"),
+        (IntrinsicsOptions(focal_px=900.0, focal_std_rel=0.5), ", or give the focal length more exactly"),
+        (IntrinsicsOptions(focal_px=900.0, focal="known"), " about the vertical and sideways"),
     ],
 )
-def test_nobody_is_told_to_give_a_focal_length_that_was_given(
-    given: IntrinsicsAssumption, advice: str
-) -> None:
+def test_nobody_is_told_to_give_a_focal_length_that_was_given(given, advice):
     scene = make_sequence(Motion.TRANSLATION, np.random.default_rng(5))
     estimate = projective_estimate(scene, np.random.default_rng(0))
-    sentences = verdict_without_an_answer(estimate, assume(estimate, given)).sentences
+    sentences = identifiability_without_calibration(estimate, prior_for(estimate, given)).sentences
     assert next(s for s in sentences if "turn the camera" in s).endswith(advice)

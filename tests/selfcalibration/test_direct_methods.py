@@ -1,7 +1,5 @@
 """Each direct method alone: exact on exact cameras, steady under noise, and what each refuses."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 
@@ -10,13 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction
+from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
-from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration.focal_scan import FocalScan, calibrations_of, scan_cost
+from thesisrecon.selfcalibration.focal_scan import FocalScan, calibrations_from_planes, scan_cost
 from thesisrecon.selfcalibration.focals_from_fundamental import FocalsFromFundamental
-from thesisrecon.selfcalibration.frame import assumed_frame
+from thesisrecon.selfcalibration.frame import normalized_frame
 from thesisrecon.selfcalibration.kruppa import KruppaEquations
 from thesisrecon.selfcalibration.quadric import (
     LinearQuadric,
@@ -39,13 +37,11 @@ EXACT = [
 ALONE = [LinearQuadric(), *EXACT]
 
 
-def name(method: object) -> str:
+def name(method):
     return type(method).__name__
 
 
-def assume(
-    scene: TrueScene, *, shared: bool = True, stds: tuple[float, ...] = (0.0, 0.0, 0.0)
-) -> Assumptions:
+def prior_for(scene, *, shared=True, stds=(0.0, 0.0, 0.0)):
     """The focal unknown, common or of each view; deviations of aspect, skew (px) and principal point (px),
     0 = known to be 1, 0 and the middle of the image."""
     n = len(scene.P)
@@ -54,34 +50,32 @@ def assume(
     middle = (scene.sizes - 1) / 2.0
     mean = np.column_stack([np.full(n, np.nan), np.ones(n), np.zeros(n), middle, np.zeros(n)])
     std = np.tile([np.inf, stds[0], stds[1], stds[2], stds[2], 0.05], (n, 1))
-    return Assumptions(np.stack(columns, axis=1), mean, std, common)
+    return IntrinsicsPrior(mean, std, np.stack(columns, axis=1), common)
 
 
-def calibrate(method: object, scene: TrueScene, assumed: Assumptions, *, seed: int = 0) -> SelfCalibration:
+def calibrate(method, scene, prior, *, seed=0):
     reconstruction = adjusted(scene, seed)
-    return method.calibrate(  # type: ignore[attr-defined]
-        reconstruction, assumed=assumed, rng=np.random.default_rng(seed)
-    )
+    return method.calibrate(reconstruction, prior=prior, rng=np.random.default_rng(seed))
 
 
-def adjusted(scene: TrueScene, seed: int) -> Reconstruction:
+def adjusted(scene, seed):
     """The projective bundle adjustment of the scene's observations, in a random frame."""
     rec, t = projective_reconstruction(scene, seed=seed), scene.tracks
     fitted = refine_projective_bundle(rec.P, rec.X, t.view_index, t.point_index, t.xy, max_iterations=30)
     return replace(rec, P=fitted.P, X=fitted.X)
 
 
-def focal_error(answer: SelfCalibration, scene: TrueScene) -> float:
+def focal_error(answer, scene):
     return float(np.abs(answer.K[:, 0, 0] / scene.K[:, 0, 0] - 1.0).max())
 
 
 @pytest.mark.parametrize("method", EXACT, ids=name)
 @pytest.mark.parametrize("zoom", [0.0, 0.3])
-def test_exact_cameras_give_the_exact_focals(method: object, zoom: float) -> None:
+def test_exact_cameras_give_the_exact_focals(method, zoom):
     scene = make_scene(zoom=zoom, seed=1)
     reconstruction = projective_reconstruction(scene, seed=1)
-    answer = method.calibrate(  # type: ignore[attr-defined]
-        reconstruction, assumed=assume(scene, shared=zoom == 0.0), rng=np.random.default_rng(0)
+    answer = method.calibrate(
+        reconstruction, prior=prior_for(scene, shared=zoom == 0.0), rng=np.random.default_rng(0)
     )
     np.testing.assert_allclose(answer.K, scene.K, rtol=1e-8, atol=1e-5)
     assert answer.identifiable
@@ -89,16 +83,14 @@ def test_exact_cameras_give_the_exact_focals(method: object, zoom: float) -> Non
 
 @pytest.mark.parametrize("method", EXACT, ids=name)
 @pytest.mark.parametrize("focal", [400.0, 15000.0])
-def test_wide_and_long_lenses_are_found_without_being_told(method: object, focal: float) -> None:
+def test_wide_and_long_lenses_are_found_without_being_told(method, focal):
     scene = at_distance(make_scene(seed=3), focal)
     reconstruction = projective_reconstruction(scene, seed=3)
-    answer = method.calibrate(  # type: ignore[attr-defined]
-        reconstruction, assumed=assume(scene), rng=np.random.default_rng(0)
-    )
+    answer = method.calibrate(reconstruction, prior=prior_for(scene), rng=np.random.default_rng(0))
     assert focal_error(answer, scene) < 1e-5
 
 
-def at_distance(scene: TrueScene, focal: float) -> TrueScene:
+def at_distance(scene, focal):
     """The same views through another lens: the image the same size, the scene's depth that of a longer or
     shorter one."""
     K = scene.K.copy()
@@ -108,7 +100,7 @@ def at_distance(scene: TrueScene, focal: float) -> TrueScene:
     return replace(scene, K=K, t=t, tracks=reprojected(replace(scene, K=K, t=t)))
 
 
-def reprojected(scene: TrueScene):  # type: ignore[no-untyped-def]
+def reprojected(scene):
     tracks = scene.tracks
     x = np.einsum("kab,kb->ka", scene.R[tracks.view_index], scene.X[tracks.point_index])
     x += scene.t[tracks.view_index]
@@ -119,23 +111,23 @@ def reprojected(scene: TrueScene):  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize(
     "method", [NonlinearQuadric(criterion=FREE), KruppaEquations(criterion=FREE)], ids=name
 )
-def test_all_intrinsics_of_a_constant_camera_are_found(method: object) -> None:
+def test_all_intrinsics_of_a_constant_camera_are_found(method):
     scene = make_scene(seed=2)
     K = np.array([[1500.0, 12.0, 790.0], [0.0, 1620.0, 480.0], [0.0, 0.0, 1.0]])
     scene = replace(scene, K=np.tile(K, (len(scene.P), 1, 1)))
     scene = replace(scene, tracks=reprojected(scene))
     reconstruction = projective_reconstruction(scene, seed=2)
-    free = assume(scene, stds=(np.inf, np.inf, np.inf))
-    answer = method.calibrate(reconstruction, assumed=free, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
+    free = prior_for(scene, stds=(np.inf, np.inf, np.inf))
+    answer = method.calibrate(reconstruction, prior=free, rng=np.random.default_rng(0))
     np.testing.assert_allclose(answer.K[0], K, rtol=1e-7, atol=1e-4)
 
 
 @pytest.mark.parametrize("method", [NonlinearQuadric(), KruppaEquations()], ids=name)
-def test_what_is_solved_for_has_a_deviation_of_the_size_of_its_error(method: object) -> None:
+def test_what_is_solved_for_has_a_deviation_of_the_size_of_its_error(method):
     scaled = []
     for seed in range(4):
         scene = make_scene(sigma_px=0.3, seed=seed, principal_shift=(20.0, -12.0))
-        answer = calibrate(method, scene, assume(scene, stds=(0.0, 0.0, 30.0)), seed=seed)
+        answer = calibrate(method, scene, prior_for(scene, stds=(0.0, 0.0, 30.0)), seed=seed)
         K, K_std, truth = answer.K[0], answer.K_std[0], scene.K[0]
         moved = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=bool)
         assert (K_std[moved] > 0.0).all()
@@ -145,74 +137,74 @@ def test_what_is_solved_for_has_a_deviation_of_the_size_of_its_error(method: obj
     assert 0.3 < np.sqrt(np.mean(np.square(scaled))) < 4.0
 
 
-def test_what_is_left_as_assumed_is_as_sure_as_the_assumption() -> None:
+def test_what_is_left_as_assumed_is_as_sure_as_the_assumption():
     scene = make_scene(sigma_px=0.3, seed=1)
-    told = calibrate(ScannedQuadric(), scene, assume(scene, stds=(0.05, 0.0, 10.0)), seed=1)
+    told = calibrate(ScannedQuadric(), scene, prior_for(scene, stds=(0.05, 0.0, 10.0)), seed=1)
     np.testing.assert_allclose(told.K_std[:, 0, 2], 10.0)
     np.testing.assert_allclose(told.K_std[:, 1, 2], 10.0)
     assert not told.K_std[:, 0, 1].any()
     relative = told.K_std / np.where(told.K == 0.0, 1.0, told.K)
     np.testing.assert_allclose(relative[:, 1, 1], np.hypot(relative[:, 0, 0], 0.05))
-    untold = calibrate(ScannedQuadric(), scene, assume(scene, stds=(0.0, 0.0, np.inf)), seed=1)
+    untold = calibrate(ScannedQuadric(), scene, prior_for(scene, stds=(0.0, 0.0, np.inf)), seed=1)
     assert np.isnan(untold.K_std[:, :2, 2]).all()
     assert (untold.K_std[:, 0, 0] > 0.0).all()
 
 
-def test_a_bias_is_no_deviation() -> None:
+def test_a_bias_is_no_deviation():
     scene = make_scene(sigma_px=0.3, seed=1)
-    answer = calibrate(LinearQuadric(), scene, assume(scene), seed=1)
+    answer = calibrate(LinearQuadric(), scene, prior_for(scene), seed=1)
     assert np.isnan(answer.K_std[:, (0, 1), (0, 1)]).all()
     assert not answer.K_std[:, 0, 1:].any()
 
 
-def test_a_principal_point_of_a_closed_form_has_no_deviation() -> None:
+def test_a_principal_point_of_a_closed_form_has_no_deviation():
     scene = make_scene(sigma_px=0.3, seed=1)
-    answer = calibrate(Stratified(refined=False), scene, assume(scene, stds=(0.0, 0.0, 30.0)), seed=1)
+    answer = calibrate(Stratified(refined=False), scene, prior_for(scene, stds=(0.0, 0.0, 30.0)), seed=1)
     assert np.abs(answer.K[:, :2, 2] - scene.K[:, :2, 2]).max() > 1e-6
     assert np.isnan(answer.K_std[:, :2, 2]).all()
-    refined = calibrate(Stratified(), scene, assume(scene, stds=(0.0, 0.0, 30.0)), seed=1)
+    refined = calibrate(Stratified(), scene, prior_for(scene, stds=(0.0, 0.0, 30.0)), seed=1)
     assert (refined.K_std[:, :2, 2] > 0.0).all()
 
 
-def test_a_known_aspect_and_principal_point_are_normalised_away() -> None:
+def test_a_known_aspect_and_principal_point_are_normalised_away():
     scene = make_scene(seed=4, principal_shift=(150.0, -90.0))
     K = scene.K.copy()
     K[:, 1, 1] *= 1.2
     scene = replace(scene, K=K)
     scene = replace(scene, tracks=reprojected(scene))
-    told = assume(scene)
+    told = prior_for(scene)
     told.mean[:, 1], told.mean[:, 3:5] = 1.2, scene.K[0, :2, 2]
     for method in EXACT:
         answer = method.calibrate(
-            projective_reconstruction(scene, seed=4), assumed=told, rng=np.random.default_rng(0)
+            projective_reconstruction(scene, seed=4), prior=told, rng=np.random.default_rng(0)
         )
         np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-4)
 
 
 @pytest.mark.parametrize("method", ALONE, ids=name)
-def test_noise_of_a_pixel_leaves_the_focal_within_a_few_percent(method: object) -> None:
+def test_noise_of_a_pixel_leaves_the_focal_within_a_few_percent(method):
     bound = 0.2 if isinstance(method, LinearQuadric) else 0.03
     errors = []
     for seed in range(3):
         scene = make_scene(sigma_px=1.0, seed=seed)
-        errors.append(focal_error(calibrate(method, scene, assume(scene), seed=seed), scene))
+        errors.append(focal_error(calibrate(method, scene, prior_for(scene), seed=seed), scene))
     assert np.median(errors) < bound
 
 
 @pytest.mark.parametrize("method", ALONE, ids=name)
-def test_two_cameras_and_nonsense_are_refused_with_a_reason(method: object) -> None:
+def test_two_cameras_and_nonsense_are_refused_with_a_reason(method):
     scene = make_scene()
     reconstruction = projective_reconstruction(scene)
     two = np.arange(len(scene.P)) < 2
     rng = np.random.default_rng(0)
     with pytest.raises(StageFailure, match="at least 3"):
-        method.calibrate(replace(reconstruction, registered=two), assumed=assume(scene), rng=rng)  # type: ignore[attr-defined]
+        method.calibrate(replace(reconstruction, registered=two), prior=prior_for(scene), rng=rng)
 
 
 @pytest.mark.parametrize("method", ALONE, ids=name)
 @settings(max_examples=6, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 10_000), kind=st.sampled_from(["random", "still", "same", "flat"]))
-def test_no_input_escapes_as_an_error_of_a_solver(method: object, seed: int, kind: str) -> None:
+def test_no_input_escapes_as_an_error_of_a_solver(method, seed, kind):
     scene = make_scene(views=4, points=40, seed=seed % 50)
     reconstruction = projective_reconstruction(scene, seed=seed)
     rng = np.random.default_rng(seed)
@@ -226,15 +218,13 @@ def test_no_input_escapes_as_an_error_of_a_solver(method: object, seed: int, kin
     else:
         P[:, 2] = P[:, 1]
     with contextlib.suppress(StageFailure):
-        answer = method.calibrate(  # type: ignore[attr-defined]
-            replace(reconstruction, P=P), assumed=assume(scene), rng=rng
-        )
+        answer = method.calibrate(replace(reconstruction, P=P), prior=prior_for(scene), rng=rng)
         assert np.isfinite(answer.K).all()
 
 
-def test_the_linear_quadric_is_the_true_one_at_the_true_normalising_focal() -> None:
+def test_the_linear_quadric_is_the_true_one_at_the_true_normalising_focal():
     scene = make_scene(seed=6)
-    frame = assumed_frame(projective_reconstruction(scene, seed=6), assume(scene))
+    frame = normalized_frame(projective_reconstruction(scene, seed=6), prior_for(scene))
     Q, null = rank_three(linear_quadric(frame, np.array([scene.K[0, 0, 0] / 1536.0])))
     assert np.sort(np.abs(np.linalg.eigvalsh(Q[0])))[0] < 1e-12
     np.testing.assert_allclose(Q[0] @ null[0], 0.0, atol=1e-12)
@@ -247,12 +237,12 @@ def test_the_linear_quadric_is_the_true_one_at_the_true_normalising_focal() -> N
 
 @settings(max_examples=25, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_calibrations_by_the_scan_are_those_of_the_triangular_factor(seed: int) -> None:
+def test_calibrations_by_the_scan_are_those_of_the_triangular_factor(seed):
     rng = np.random.default_rng(seed)
     scene = make_scene(views=4, seed=seed % 20)
-    frame = assumed_frame(projective_reconstruction(scene, seed=seed), assume(scene))
+    frame = normalized_frame(projective_reconstruction(scene, seed=seed), prior_for(scene))
     p, f = rng.normal(size=(3, 3)), rng.uniform(0.3, 3.0, 3)
-    K = calibrations_of(frame, p, f)
+    K = calibrations_from_planes(frame, p, f)
     C = (
         (frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :])
         * np.array([1.0, 1.0, 0.0])[None, None, None]

@@ -1,7 +1,5 @@
 """Focals from fundamental matrices: exact closed form, honest uncertainty, and what is named as open."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,26 +8,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tests.selfcalibration.test_direct_methods import adjusted, assume
+from tests.selfcalibration.test_direct_methods import adjusted, prior_for
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.selfcalibration.candidates import square_calibrations
+from thesisrecon.selfcalibration.candidates import square_pixel_calibrations
 from thesisrecon.selfcalibration.focals_from_fundamental import (
     FocalsFromFundamental,
     _dual_with_changes,
     bougnoux_focals,
-    independent_share,
+    focal_posterior,
+    independence_factor,
     kruppa_chi_square,
     kruppa_whitening,
     pair_focals,
-    vote_on_focals,
 )
-from thesisrecon.selfcalibration.frame import assumed_frame, focal_prior
+from thesisrecon.selfcalibration.frame import normalized_frame, weak_focal_prior
 from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_cost, kruppa_residuals
-from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs, fit_fundamental
+from thesisrecon.selfcalibration.pair_geometry import PairGeometry, fit_fundamental, pair_geometries
 
 
-def random_pair(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def random_pair(seed):
     """F of two cameras in general position, and their K."""
     rng = np.random.default_rng(seed)
     K = []
@@ -43,14 +41,14 @@ def random_pair(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 100_000), scale=st.sampled_from([-3.0, 1e-4, 1.0]))
-def test_the_closed_form_is_exact_at_any_scale_and_sign(seed: int, scale: float) -> None:
+def test_the_closed_form_is_exact_at_any_scale_and_sign(seed, scale):
     F, K1, K2 = random_pair(seed)
     np.testing.assert_allclose(bougnoux_focals(scale * F), [K1[0, 0] ** 2, K2[0, 0] ** 2], rtol=1e-6)
 
 
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 100_000))
-def test_the_kruppa_equations_hold_at_the_truth_and_not_beside_it(seed: int) -> None:
+def test_the_kruppa_equations_hold_at_the_truth_and_not_beside_it(seed):
     F, K1, K2 = random_pair(seed)
     residual = kruppa_residuals(F[None], dual_images(K1)[None, None], dual_images(K2)[None, None])
     assert np.abs(residual).max() < 1e-10
@@ -63,7 +61,7 @@ def test_the_kruppa_equations_hold_at_the_truth_and_not_beside_it(seed: int) -> 
 
 @settings(max_examples=30, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 100_000))
-def test_kruppa_residuals_bear_full_calibrations(seed: int) -> None:
+def test_kruppa_residuals_bear_full_calibrations(seed):
     rng = np.random.default_rng(seed)
     K = [np.array([[1.3, 0.05, 0.1], [0.0, 1.4, -0.2], [0.0, 0.0, 1.0]]), np.diag([0.7, 0.8, 1.0])]
     R = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)).as_matrix()
@@ -72,12 +70,12 @@ def test_kruppa_residuals_bear_full_calibrations(seed: int) -> None:
     assert np.abs(residual).max() < 1e-9
 
 
-def test_an_f_of_the_pairs_own_matches_has_an_honest_covariance() -> None:
+def test_an_f_of_the_pairs_own_matches_has_an_honest_covariance():
     chi = []
     for seed in range(12):
         scene = make_scene(views=4, sigma_px=1.0, seed=seed)
-        frame = assumed_frame(projective_reconstruction(scene, seed=seed), assume(scene))
-        pairs = camera_pairs(frame, projective_reconstruction(scene, seed=seed))
+        frame = normalized_frame(projective_reconstruction(scene, seed=seed), prior_for(scene))
+        pairs = pair_geometries(frame, projective_reconstruction(scene, seed=seed))
         log_f = np.log(scene.K[:1, 0, 0] / 1536.0)
         chi.append(kruppa_chi_square(pairs, log_f, log_f, cell=0.0, principal_std=0.0)[:, 0])
     chi = np.concatenate(chi)
@@ -86,12 +84,12 @@ def test_an_f_of_the_pairs_own_matches_has_an_honest_covariance() -> None:
     assert np.mean(chi < 5.99) > 0.85
 
 
-def test_the_deviation_of_a_pair_tells_the_size_of_its_error() -> None:
+def test_the_deviation_of_a_pair_tells_the_size_of_its_error():
     z, finite = [], []
     for seed in range(10):
         scene = make_scene(views=5, sigma_px=0.7, seed=seed)
-        frame = assumed_frame(projective_reconstruction(scene, seed=seed), assume(scene))
-        pairs = camera_pairs(frame, projective_reconstruction(scene, seed=seed))
+        frame = normalized_frame(projective_reconstruction(scene, seed=seed), prior_for(scene))
+        pairs = pair_geometries(frame, projective_reconstruction(scene, seed=seed))
         for F, covariance in zip(pairs.F, pairs.covariance, strict=True):
             found = pair_focals(F, covariance)
             sure = np.isfinite(found.std)
@@ -101,7 +99,7 @@ def test_the_deviation_of_a_pair_tells_the_size_of_its_error() -> None:
     assert 0.5 < np.sqrt(np.median(np.square(z))) < 1.1
 
 
-def test_pairs_whose_axes_meet_are_called_open_and_not_wrong() -> None:
+def test_pairs_whose_axes_meet_are_called_open_and_not_wrong():
     scene = make_scene(views=6, sigma_px=0.5, seed=3)
     R, t = [], []
     for centre in scene.centres:
@@ -117,12 +115,12 @@ def test_pairs_whose_axes_meet_are_called_open_and_not_wrong() -> None:
     noisy = pixel[:, :2] / pixel[:, 2:] + rng.normal(0.0, 0.5, (len(pixel), 2))
     fixating = replace(fixating, tracks=replace(scene.tracks, xy=noisy))
     rec = projective_reconstruction(fixating, seed=3)
-    pairs = camera_pairs(assumed_frame(rec, assume(scene)), rec)
+    pairs = pair_geometries(normalized_frame(rec, prior_for(scene)), rec)
     std = np.array([pair_focals(F, C).std for F, C in zip(pairs.F, pairs.covariance, strict=True)])
     assert np.isinf(std).mean() > 0.9
 
 
-def test_a_camera_that_no_pair_speaks_for_is_named() -> None:
+def test_a_camera_that_no_pair_speaks_for_is_named():
     scene = make_scene(views=5, sigma_px=0.5, zoom=0.2, seed=4)
     tracks = scene.tracks
     # The last view keeps 12 observations: no pair of it has enough.
@@ -132,7 +130,7 @@ def test_a_camera_that_no_pair_speaks_for_is_named() -> None:
     )
     scene = replace(scene, tracks=fewer)
     answer = FocalsFromFundamental().calibrate(
-        adjusted(scene, 4), assumed=assume(scene, shared=False), rng=np.random.default_rng(0)
+        adjusted(scene, 4), prior=prior_for(scene, shared=False), rng=np.random.default_rng(0)
     )
     assert not answer.identifiable
     assert any("open" in reason and "number 4" in reason for reason in answer.reasons)
@@ -141,47 +139,47 @@ def test_a_camera_that_no_pair_speaks_for_is_named() -> None:
     assert (error < 5.0 * answer.K_std[:4, 0, 0] / answer.K[:4, 0, 0]).all()
 
 
-def test_wrong_pairs_do_not_carry_the_vote() -> None:
+def test_wrong_pairs_do_not_carry_the_vote():
     scene = make_scene(views=8, sigma_px=0.5, seed=5)
     rec = projective_reconstruction(scene, seed=5)
-    frame = assumed_frame(rec, assume(scene))
-    pairs = camera_pairs(frame, rec)
+    frame = normalized_frame(rec, prior_for(scene))
+    pairs = pair_geometries(frame, rec)
     F = pairs.F.copy()
     for m in range(0, len(F), 4):
         F[m] = random_pair(m)[0]
     wrong = PairGeometry(pairs.i, pairs.j, F, pairs.covariance)
-    prior = focal_prior(np.array([np.nan]), np.array([np.inf]))
-    vote = vote_on_focals(wrong, frame.group, np.linspace(-2.0, 4.0, 151), prior=prior)
+    prior = weak_focal_prior(np.array([np.nan]), np.array([np.inf]))
+    vote = focal_posterior(wrong, frame.group, np.linspace(-2.0, 4.0, 151), prior=prior)
     assert abs(vote.log_f[0] - np.log(scene.K[0, 0, 0] / 1536.0)) < 0.05
 
 
-def test_pairs_share_observations_and_count_accordingly() -> None:
+def test_pairs_share_observations_and_count_accordingly():
     empty = np.zeros((0, 3, 3))
     three = PairGeometry(np.array([0, 0, 1]), np.array([1, 2, 2]), empty, empty)
-    assert independent_share(three) == 1.0
+    assert independence_factor(three) == 1.0
     i, j = np.triu_indices(10, 1)
-    assert independent_share(PairGeometry(i, j, empty, empty)) == pytest.approx(17 / 45)
+    assert independence_factor(PairGeometry(i, j, empty, empty)) == pytest.approx(17 / 45)
 
 
-def test_whitened_residuals_square_to_the_chi_square() -> None:
+def test_whitened_residuals_square_to_the_chi_square():
     scene = make_scene(views=4, sigma_px=1.0, seed=6)
     rec = projective_reconstruction(scene, seed=6)
-    frame = assumed_frame(rec, assume(scene))
-    pairs = camera_pairs(frame, rec)
+    frame = normalized_frame(rec, prior_for(scene))
+    pairs = pair_geometries(frame, rec)
     log_f = np.full(4, 0.1)
     root = kruppa_whitening(pairs, log_f, principal_std=0.01)
-    w = dual_images(square_calibrations(log_f))[None]
+    w = dual_images(square_pixel_calibrations(log_f))[None]
     g = kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j])[0]
     white = np.einsum("mab,mb->ma", root, g)
     chi = kruppa_chi_square(pairs, log_f[:1], log_f[:1], cell=0.0, principal_std=0.01)[:, 0]
     np.testing.assert_allclose(np.sum(white**2, axis=1), chi, rtol=1e-6)
 
 
-def test_fit_starts_anywhere_near_and_does_not_raise_the_cost() -> None:
+def test_fit_starts_anywhere_near_and_does_not_raise_the_cost():
     scene = make_scene(views=3, sigma_px=0.5, seed=7)
     rec = projective_reconstruction(scene, seed=7)
-    pairs = camera_pairs(assumed_frame(rec, assume(scene)), rec, refine=False)
-    fitted = camera_pairs(assumed_frame(rec, assume(scene)), rec)
+    pairs = pair_geometries(normalized_frame(rec, prior_for(scene)), rec, refine=False)
+    fitted = pair_geometries(normalized_frame(rec, prior_for(scene)), rec)
     assert (np.abs(np.linalg.det(fitted.F)) < 1e-12).all()
     assert (np.abs(np.abs(np.einsum("mab,mab->m", pairs.F, fitted.F)) - 1.0) < 1e-3).all()
     x = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 30, 2))
@@ -190,8 +188,8 @@ def test_fit_starts_anywhere_near_and_does_not_raise_the_cost() -> None:
     assert (np.linalg.eigvalsh(covariance) > -1e-6 * np.trace(covariance)).all()
 
 
-def test_the_changes_of_the_dual_conic_are_its_derivatives() -> None:
-    def dual(log_f: float, x: float, y: float) -> np.ndarray:
+def test_the_changes_of_the_dual_conic_are_its_derivatives():
+    def dual(log_f, x, y):
         K = np.array([[np.exp(log_f), 0.0, x], [0.0, np.exp(log_f), y], [0.0, 0.0, 1.0]])
         return K @ K.T
 
@@ -204,7 +202,7 @@ def test_the_changes_of_the_dual_conic_are_its_derivatives() -> None:
             np.testing.assert_allclose(one[1 + n], (up - down) / (2.0 * h), atol=1e-8)
 
 
-def test_the_kruppa_cost_is_the_square_of_small_residuals_and_linear_in_large_ones() -> None:
+def test_the_kruppa_cost_is_the_square_of_small_residuals_and_linear_in_large_ones():
     F, K1, K2 = random_pair(7)
     pairs = PairGeometry(np.array([0]), np.array([1]), F[None], np.zeros((1, 9, 9)))
     wrong = np.stack([K1 @ np.diag([1.2, 1.2, 1.0]), K2])[None]

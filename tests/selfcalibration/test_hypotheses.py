@@ -1,19 +1,16 @@
 """Self-calibration on exact and noisy scenes, shared and varying focals, and what it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
+from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
-from thesisrecon.records import SelfCalibration
-from thesisrecon.selfcalibration.candidates import conclude
-from thesisrecon.selfcalibration.focal_scan import WEIGHTS, plane_from_focals, scan_cost
-from thesisrecon.selfcalibration.frame import assumed_frame, build_frame
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.selfcalibration.candidates import select_candidate
+from thesisrecon.selfcalibration.focal_scan import SCAN_WEIGHTS, plane_from_focals, scan_cost
+from thesisrecon.selfcalibration.frame import build_frame, normalized_frame
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion
@@ -22,18 +19,16 @@ from thesisrecon.selfcalibration.stratified import Stratified
 METHODS = [HypothesesAndRefinement(), Stratified()]
 
 
-def calibrate(method: object, scene: TrueScene, *, shared: bool = True, seed: int = 0) -> SelfCalibration:
+def calibrate(method, scene, *, shared=True, seed=0):
     reconstruction = projective_reconstruction(scene, seed=seed)
-    assumed = assume(reconstruction, IntrinsicsAssumption(cameras="shared" if shared else "per-image"))
-    return method.calibrate(  # type: ignore[attr-defined]
-        reconstruction, assumed=assumed, rng=np.random.default_rng(seed)
-    )
+    prior = prior_for(reconstruction, IntrinsicsOptions(cameras="shared" if shared else "per-image"))
+    return method.calibrate(reconstruction, prior=prior, rng=np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
 @pytest.mark.parametrize("zoom", [0.0, 0.3])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_exact_cameras_give_the_exact_focal(method: object, zoom: float, seed: int) -> None:
+def test_exact_cameras_give_the_exact_focal(method, zoom, seed):
     scene = make_scene(zoom=zoom, seed=seed)
     answer = calibrate(method, scene, shared=zoom == 0.0, seed=seed)
     # The weak pull on the focal moves exact data by far less than any noise would.
@@ -41,7 +36,7 @@ def test_exact_cameras_give_the_exact_focal(method: object, zoom: float, seed: i
     assert answer.identifiable
 
 
-def test_the_upgrade_makes_every_camera_a_scaled_rotation() -> None:
+def test_the_upgrade_makes_every_camera_a_scaled_rotation():
     scene = make_scene(seed=4)
     reconstruction = projective_reconstruction(scene, seed=4)
     answer = calibrate(HypothesesAndRefinement(), scene, seed=4)
@@ -52,7 +47,7 @@ def test_the_upgrade_makes_every_camera_a_scaled_rotation() -> None:
     np.testing.assert_allclose(CC, np.tile(np.eye(3), (len(C), 1, 1)), atol=5e-3)
 
 
-def test_points_end_in_front_of_the_cameras() -> None:
+def test_points_end_in_front_of_the_cameras():
     scene = make_scene(seed=5)
     reconstruction = projective_reconstruction(scene, seed=5)
     G = calibrate(HypothesesAndRefinement(), scene, seed=5).metric_from_projective
@@ -64,7 +59,7 @@ def test_points_end_in_front_of_the_cameras() -> None:
     assert (depth > 0).all()
 
 
-def test_each_closed_form_contains_the_truth() -> None:
+def test_each_closed_form_contains_the_truth():
     scene = make_scene(seed=6)
     frame = build_frame(projective_reconstruction(scene, seed=6), np.zeros(8, dtype=np.int64))
     f = scene.K[0, 0, 0] / 1536.0
@@ -78,7 +73,7 @@ def test_each_closed_form_contains_the_truth() -> None:
     assert criterion.cost(frame, both_signs, np.repeat(log_f, 2, axis=0)).min() < 1e-12
 
 
-def test_two_cameras_are_refused() -> None:
+def test_two_cameras_are_refused():
     scene = make_scene()
     reconstruction = projective_reconstruction(scene)
     registered = np.zeros(8, dtype=bool)
@@ -86,12 +81,12 @@ def test_two_cameras_are_refused() -> None:
     with pytest.raises(StageFailure, match="at least 3"):
         HypothesesAndRefinement().calibrate(
             replace(reconstruction, registered=registered),
-            assumed=assume(reconstruction),
+            prior=prior_for(reconstruction),
             rng=np.random.default_rng(0),
         )
 
 
-def test_pure_translation_is_called_unidentifiable() -> None:
+def test_pure_translation_is_called_unidentifiable():
     scene = make_scene(seed=7)
     still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
     answer = calibrate(HypothesesAndRefinement(), still)
@@ -99,30 +94,30 @@ def test_pure_translation_is_called_unidentifiable() -> None:
     assert any("translation" in reason for reason in answer.reasons)
 
 
-def test_a_prior_pulls_an_undetermined_focal() -> None:
+def test_a_prior_pulls_an_undetermined_focal():
     scene = make_scene(seed=7)
     still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
     reconstruction = projective_reconstruction(still)
     answer = HypothesesAndRefinement().calibrate(
         reconstruction,
-        assumed=assume(reconstruction, IntrinsicsAssumption(focal_px=1500.0, focal_std_rel=0.01)),
+        prior=prior_for(reconstruction, IntrinsicsOptions(focal_px=1500.0, focal_std_rel=0.01)),
         rng=np.random.default_rng(0),
     )
     np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=0.1)
 
 
-def test_the_same_seed_gives_the_same_bytes() -> None:
+def test_the_same_seed_gives_the_same_bytes():
     scene = make_scene(seed=8, sigma_px=0.5)
     first, second = (calibrate(HypothesesAndRefinement(), scene, seed=8) for _ in range(2))
     assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()
 
 
-def test_a_focal_that_leaves_no_answer_is_named_and_not_asked_for() -> None:
+def test_a_focal_that_leaves_no_answer_is_named_and_not_asked_for():
     scene = make_scene(seed=3)
     reconstruction = projective_reconstruction(scene)
-    assumed = assume(reconstruction, IntrinsicsAssumption(focal_px=1.0, focal_std_rel=0.05))
+    prior = prior_for(reconstruction, IntrinsicsOptions(focal_px=1.0, focal_std_rel=0.05))
     with pytest.raises(StageFailure) as failure:
-        HypothesesAndRefinement().calibrate(reconstruction, assumed=assumed, rng=np.random.default_rng(0))
+        HypothesesAndRefinement().calibrate(reconstruction, prior=prior, rng=np.random.default_rng(0))
     assert "near the focal length that was given" in str(failure.value)
     assert "1 px (+- 5.0%)" in failure.value.evidence
     assert "the photographs contradict it" in failure.value.advice
@@ -132,18 +127,18 @@ def test_a_focal_that_leaves_no_answer_is_named_and_not_asked_for() -> None:
 @pytest.mark.parametrize(
     ("focals", "told"), [((900.0,), "900 px"), ((800.0, 900.0, 1000.0), "800 to 1000 px")]
 )
-def test_given_focals_that_leave_no_answer_are_named(focals: tuple[float, ...], told: str) -> None:
+def test_given_focals_that_leave_no_answer_are_named(focals, told):
     estimate = projective_reconstruction(make_scene(seed=6), seed=6)
-    assumed = assume(estimate, IntrinsicsAssumption(focal_px=900.0, focal="known", cameras="per-image"))
-    mean = assumed.mean.copy()
+    prior = prior_for(estimate, IntrinsicsOptions(focal_px=900.0, focal="known", cameras="per-image"))
+    mean = prior.mean.copy()
     mean[:, 0] = np.resize(focals, len(mean))
-    frame = assumed_frame(estimate, replace(assumed, mean=mean))
+    frame = normalized_frame(estimate, replace(prior, mean=mean))
     with pytest.raises(StageFailure, match="near the focal length that was given") as failure:
-        conclude(frame, estimate, RotationCriterion(), [], kept=3, min_positive=0.9)
+        select_candidate(frame, estimate, RotationCriterion(), [], kept=3, min_in_front_ratio=0.9)
     assert f"{told} (+-" in failure.value.evidence
 
 
-def test_the_cost_of_the_scan_is_its_formula() -> None:
+def test_the_cost_of_the_scan_is_its_formula():
     K = np.array([[[[2.0, 0.1, 0.3], [0.0, 1.6, -0.2], [0.0, 0.0, 1.0]], np.diag([0.8, 0.8, 1.0])]])
-    first = (np.array([0.1, 0.4, 0.3, 0.2]) @ WEIGHTS / 1.6) ** 2
+    first = (np.array([0.1, 0.4, 0.3, 0.2]) @ SCAN_WEIGHTS / 1.6) ** 2
     np.testing.assert_allclose(scan_cost(K), [first])

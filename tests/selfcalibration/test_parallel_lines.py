@@ -1,9 +1,6 @@
 """The plane at infinity from vanishing points: given ones, and those of segments found in photographs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,23 +8,23 @@ import pytest
 from tests.selfcalibration.stratified_scenes import (
     CENTRED,
     NOTHING_BUT_CONSTANT,
-    assume,
     make_scene,
+    prior_for,
     setup,
     true_plane,
 )
 from tests.synthetic import TrueScene, projective_reconstruction
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import read_images
 from thesisrecon.records import Tracks
 from thesisrecon.selfcalibration.line_segments import LineSegments, fit_segments
 from thesisrecon.selfcalibration.parallel_lines import (
     ParallelLines,
     VanishingPoints,
-    find_directions,
-    propose_points,
+    find_parallel_directions,
+    normalize_segments,
+    propose_vanishing_points,
     refine_plane,
-    segment_set,
     triangulate_directions,
 )
 from thesisrecon.selfcalibration.stratified import Stratified, projective_scene
@@ -37,7 +34,7 @@ TURN = np.array([[0.8, 0.36, 0.48], [-0.6, 0.48, 0.64], [0.0, -0.8, 0.6]])
 """Three directions at right angles, none of them along an axis."""
 
 
-def vanishing_points(scene: TrueScene, directions: np.ndarray, views: list[int]) -> VanishingPoints:
+def vanishing_points(scene, directions, views):
     """Exact vanishing points of directions (D, 3) in the named views."""
     M = scene.K @ scene.R
     xyh = np.concatenate([directions @ M[v].T for v in views])
@@ -46,7 +43,7 @@ def vanishing_points(scene: TrueScene, directions: np.ndarray, views: list[int])
     )
 
 
-def drawn_segments(scene: TrueScene, *, sigma_px: float, stray: int, seed: int) -> list[np.ndarray]:
+def drawn_segments(scene, *, sigma_px, stray, seed):
     """Segments of 40 lines along each of three directions seen by every camera, and ``stray`` of none."""
     rng = np.random.default_rng(seed)
     X = rng.uniform(-1.5, 1.5, (120, 3))
@@ -63,7 +60,7 @@ def drawn_segments(scene: TrueScene, *, sigma_px: float, stray: int, seed: int) 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("views", [[0, 1], [2, 5, 7]])
-def test_three_given_directions_fix_the_plane(seed: int, views: list[int]) -> None:
+def test_three_given_directions_fix_the_plane(seed, views):
     scene = make_scene(seed=seed)
     found, plane, _ = setup(scene, seed=seed)
     way = ParallelLines(vanishing_points(scene, TURN, views))
@@ -71,7 +68,7 @@ def test_three_given_directions_fix_the_plane(seed: int, views: list[int]) -> No
     np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
 
 
-def test_more_directions_and_points_at_infinity_do_no_harm() -> None:
+def test_more_directions_and_points_at_infinity_do_no_harm():
     scene = make_scene(seed=1)
     R0 = scene.R[0]
     level = np.array([R0[0], R0[1], R0[2], [0.3, -0.2, 0.9]])
@@ -82,18 +79,18 @@ def test_more_directions_and_points_at_infinity_do_no_harm() -> None:
     np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
 
 
-def test_directions_at_right_angles_give_the_calibration_too() -> None:
+def test_directions_at_right_angles_give_the_calibration_too():
     """With three views nothing but right angles and zero skew settles K of one camera."""
     scene = make_scene(seed=2, views=3, principal_shift=(50.0, -30.0), seen_share=1.0)
     way = ParallelLines(vanishing_points(scene, TURN, [0, 1]), right_angles=True)
     answer = Stratified(way, refined=False).calibrate(
-        projective_reconstruction(scene, seed=2), assumed=assume(scene, NOTHING_BUT_CONSTANT),
+        projective_reconstruction(scene, seed=2), prior=prior_for(scene, NOTHING_BUT_CONSTANT),
         rng=np.random.default_rng(0),
     )  # fmt: skip
     np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-3)
 
 
-def test_directions_in_one_plane_are_refused() -> None:
+def test_directions_in_one_plane_are_refused():
     scene = make_scene(seed=3)
     found, _, _ = setup(scene, seed=3)
     flat = np.array([TURN[0], TURN[1], TURN[0] + TURN[1]])
@@ -101,7 +98,7 @@ def test_directions_in_one_plane_are_refused() -> None:
         ParallelLines(vanishing_points(scene, flat, [0, 1])).locate(found, np.random.default_rng(0))
 
 
-def test_two_directions_are_refused_with_their_number() -> None:
+def test_two_directions_are_refused_with_their_number():
     scene = make_scene(seed=3)
     found, _, _ = setup(scene, seed=3)
     given = vanishing_points(scene, TURN, [0, 1])
@@ -111,7 +108,7 @@ def test_two_directions_are_refused_with_their_number() -> None:
         ParallelLines(one_view).locate(found, np.random.default_rng(0))
 
 
-def test_triangulated_points_are_seen_where_they_were() -> None:
+def test_triangulated_points_are_seen_where_they_were():
     scene = make_scene(seed=4)
     v = np.einsum("vij,dj->dvi", scene.K @ scene.R, TURN)
     v /= np.linalg.norm(v, axis=2, keepdims=True)
@@ -121,17 +118,19 @@ def test_triangulated_points_are_seen_where_they_were() -> None:
 
 
 @pytest.mark.parametrize(("sigma", "stray", "limit"), [(0.0, 0, 1e-8), (0.3, 60, 0.01)])
-def test_directions_are_found_among_strays(sigma: float, stray: int, limit: float) -> None:
+def test_directions_are_found_among_strays(sigma, stray, limit):
     scene = make_scene(seed=5, views=6)
     found, plane, _ = setup(scene, seed=5)
     frame = found.frame
-    segments = segment_set(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
+    segments = normalize_segments(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
     rng = np.random.default_rng(1)
     proposals = [
-        propose_points(segments.subset(segments.camera == k), keep=5, samples=300, tolerance_px=1.5, rng=rng)
+        propose_vanishing_points(
+            segments.subset(segments.camera == k), keep=5, samples=300, tolerance_px=1.5, rng=rng
+        )
         for k in range(6)
     ]
-    X, direction = find_directions(frame, segments, proposals, keep=3, tolerance_px=1.5)
+    X, direction = find_parallel_directions(frame, segments, proposals, keep=3, tolerance_px=1.5)
     truth = np.tile(np.concatenate([np.repeat([0, 1, 2], 40), np.full(stray, -1)]), 6)
     for d in range(3):
         mine = truth[direction == d]
@@ -145,7 +144,7 @@ def test_directions_are_found_among_strays(sigma: float, stray: int, limit: floa
     assert noise == pytest.approx(sigma, rel=0.5, abs=0.01)
 
 
-def test_the_detector_finds_the_sides_of_a_turned_square() -> None:
+def test_the_detector_finds_the_sides_of_a_turned_square():
     y, x = np.mgrid[0:200, 0:240].astype(np.float64)
     angle, half, centre = np.radians(17.0), 60.0, (118.3, 97.6)
     a = (x - centre[0]) * np.cos(angle) + (y - centre[1]) * np.sin(angle)
@@ -162,13 +161,13 @@ def test_the_detector_finds_the_sides_of_a_turned_square() -> None:
             assert max(abs(u), abs(w)) == pytest.approx(half, abs=0.15)
 
 
-def test_a_flat_image_has_no_segments_and_noise_has_few() -> None:
+def test_a_flat_image_has_no_segments_and_noise_has_few():
     assert LineSegments().detect(np.full((50, 60), 90.0, dtype=np.float32)).shape == (0, 4)
     noise = np.random.default_rng(0).normal(128.0, 5.0, (300, 400)).astype(np.float32)
     assert len(LineSegments().detect(noise)) < 10
 
 
-def test_fitted_segments_run_through_their_points() -> None:
+def test_fitted_segments_run_through_their_points():
     t = np.linspace(0.0, 30.0, 31)
     lines = np.column_stack([5 + 0.6 * t, 7 + 0.8 * t]), np.column_stack([t, np.full(31, 3.0)])
     xy = np.concatenate([*lines, [[1.0, 2.0]]])
@@ -178,7 +177,7 @@ def test_fitted_segments_run_through_their_points() -> None:
     np.testing.assert_allclose(segments[0], [5.0, 7.0, 23.0, 31.0], atol=1e-9)
 
 
-def courtyard(views: list[int]) -> tuple[TrueScene, list[Path]]:
+def courtyard(views):
     """The true cameras of the courtyard with points strewn over the yard."""
     told = load_fixture_scene()
     assert told.K is not None
@@ -195,32 +194,32 @@ def courtyard(views: list[int]) -> tuple[TrueScene, list[Path]]:
     return TrueScene(K, R, t, X, 0.0, tracks, sizes), [told.image_paths[v] for v in views]
 
 
-def test_parallel_lines_are_found_in_photographs() -> None:
+def test_parallel_lines_are_found_in_photographs():
     scene, paths = courtyard([0, 3, 6, 9, 12])
-    photographs = read_photographs(paths, max_size_px=1600).images
-    given, assumed = projective_reconstruction(scene), assume(scene, CENTRED)
+    photographs = read_images(paths, max_size_px=1600).images
+    given, prior = projective_reconstruction(scene), prior_for(scene, CENTRED)
     variant = Stratified(ParallelLines(), refined=False).with_images(photographs)
-    found = projective_scene(given, assumed)
+    found = projective_scene(given, prior)
     located = variant.plane.locate(found, np.random.default_rng(0))
     plane = true_plane(scene, found)
     assert np.linalg.norm(located.planes[0] - plane) < 0.02 * (1.0 + np.linalg.norm(plane))
-    answer = variant.calibrate(given, assumed=assumed, rng=np.random.default_rng(0))
+    answer = variant.calibrate(given, prior=prior, rng=np.random.default_rng(0))
     np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[0, 0, 0], rtol=0.03)
 
 
-def test_a_wall_of_nothing_is_refused_with_its_directions() -> None:
+def test_a_wall_of_nothing_is_refused_with_its_directions():
     scene, paths = courtyard([0, 6, 12])
-    photographs = read_photographs(paths, max_size_px=1600).images
+    photographs = read_images(paths, max_size_px=1600).images
     flat = [replace(image, rgb=np.full_like(image.rgb, 90)) for image in photographs]
     with pytest.raises(StageFailure, match="0 directions"):
         Stratified(ParallelLines()).with_images(flat).calibrate(
-            projective_reconstruction(scene), assumed=assume(scene), rng=np.random.default_rng(0)
+            projective_reconstruction(scene), prior=prior_for(scene), rng=np.random.default_rng(0)
         )
 
 
-def test_photographs_must_be_there() -> None:
+def test_photographs_must_be_there():
     scene = make_scene()
     with pytest.raises(ValueError, match="a photograph for each of the 8 views"):
         Stratified(ParallelLines()).calibrate(
-            projective_reconstruction(scene), assumed=assume(scene), rng=np.random.default_rng(0)
+            projective_reconstruction(scene), prior=prior_for(scene), rng=np.random.default_rng(0)
         )

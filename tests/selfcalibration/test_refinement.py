@@ -1,7 +1,5 @@
 """The criteria and their unknowns: properties that hold for all cameras, and loosely known intrinsics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.selfcalibration.test_direct_methods import adjusted, assume, at_distance, reprojected
+from tests.selfcalibration.test_direct_methods import adjusted, at_distance, prior_for, reprojected
 from tests.synthetic import make_scene, projective_reconstruction
-from thesisrecon.selfcalibration.candidates import Answer, distinct_answers, square_calibrations
+from thesisrecon.selfcalibration.candidates import Answer, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration.focal_scan import planes_for_focals
-from thesisrecon.selfcalibration.frame import assumed_frame, unknown_intrinsics
+from thesisrecon.selfcalibration.frame import normalized_frame, solver_unknowns
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.quadric import dual_image_residuals
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
@@ -23,23 +21,23 @@ FREE = RotationCriterion(focal_weight=0.0)
 
 @settings(max_examples=25, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_both_criteria_vanish_at_the_truth_in_every_frame(seed: int) -> None:
+def test_both_criteria_vanish_at_the_truth_in_every_frame(seed):
     scene = make_scene(views=4, points=40, seed=seed % 30)
-    frame = assumed_frame(projective_reconstruction(scene, seed=seed), assume(scene))
+    frame = normalized_frame(projective_reconstruction(scene, seed=seed), prior_for(scene))
     log_f = np.log(scene.K[:1, 0, 0] / 1536.0)
     plane, cost = planes_for_focals(frame, FREE, log_f)
     assert cost < 1e-20
-    K = square_calibrations(np.full((1, 4), log_f[0]))
+    K = square_pixel_calibrations(np.full((1, 4), log_f[0]))
     residuals = dual_image_residuals(frame.A, frame.a, K, K[:, 0], plane[None])
     assert np.abs(residuals).max() < 1e-9
 
 
 @settings(max_examples=15, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_refinement_never_raises_the_cost(seed: int) -> None:
+def test_refinement_never_raises_the_cost(seed):
     rng = np.random.default_rng(seed)
     scene = make_scene(views=5, points=40, zoom=0.2, seed=seed % 30)
-    frame = assumed_frame(projective_reconstruction(scene, seed=seed), assume(scene, shared=False))
+    frame = normalized_frame(projective_reconstruction(scene, seed=seed), prior_for(scene, shared=False))
     theta = rng.normal(size=(6, 8))
     before = FREE.cost(frame, theta[:, :3], theta[:, 3:])
     refined, after = refine_hypotheses(FREE, frame, theta)
@@ -47,72 +45,70 @@ def test_refinement_never_raises_the_cost(seed: int) -> None:
     np.testing.assert_allclose(FREE.cost(frame, refined[:, :3], refined[:, 3:]), after)
 
 
-def test_planes_alone_leave_the_focals() -> None:
+def test_planes_alone_leave_the_focals():
     scene = make_scene(views=5, seed=1)
-    frame = assumed_frame(projective_reconstruction(scene, seed=1), assume(scene))
+    frame = normalized_frame(projective_reconstruction(scene, seed=1), prior_for(scene))
     theta = np.random.default_rng(1).normal(size=(3, 4))
     refined, _ = refine_hypotheses(FREE, frame, theta, planes_only=True)
     np.testing.assert_array_equal(refined[:, 3:], theta[:, 3:])
 
 
-def test_unknowns_are_what_the_assumptions_leave_open() -> None:
+def test_unknowns_are_what_the_assumptions_leave_open():
     scene = make_scene(views=4, seed=2)
     rec = projective_reconstruction(scene, seed=2)
-    constant = unknown_intrinsics(assumed_frame(rec, assume(scene)), assume(scene))
+    constant = solver_unknowns(normalized_frame(rec, prior_for(scene)), prior_for(scene))
     assert len(constant.std) == 1
-    assert constant.loosest == 0.0
-    free = assume(scene, shared=False, stds=(0.1, np.inf, 30.0))
-    several = unknown_intrinsics(assumed_frame(rec, free), free)
+    assert constant.max_nonfocal_std == 0.0
+    free = prior_for(scene, shared=False, stds=(0.1, np.inf, 30.0))
+    several = solver_unknowns(normalized_frame(rec, free), free)
     assert len(several.std) == 4 + 4
-    assert several.loosest == np.inf
+    assert several.max_nonfocal_std == np.inf
     start = several.start(np.log(np.tile([1.0, 1.1, 1.2, 1.3], (1, 1))))
     np.testing.assert_allclose(np.exp(several.focals(start))[0], [1.0, 1.1, 1.2, 1.3])
     assert several.std[several.place[0, 3]] == pytest.approx(30.0 / 1536.0)
-    assert unknown_intrinsics(assumed_frame(rec, free), free, focals_only=True).place[:, 1:].max() == -1
-    known = assume(scene)
+    assert solver_unknowns(normalized_frame(rec, free), free, focals_only=True).place[:, 1:].max() == -1
+    known = prior_for(scene)
     known.mean[:, 0], known.std[:, 0] = 1500.0, 0.0
-    fixed = unknown_intrinsics(assumed_frame(rec, known), known)
+    fixed = solver_unknowns(normalized_frame(rec, known), known)
     np.testing.assert_allclose(fixed.calibrations(np.zeros((1, 0)))[0, :, 0, 0], 1500.0 / 1536.0)
 
 
-def test_a_known_focal_counts_for_its_own_camera_only() -> None:
+def test_a_known_focal_counts_for_its_own_camera_only():
     scene = make_scene(views=6, zoom=0.3, sigma_px=0.5, seed=3)
-    told = assume(scene, shared=False)
+    told = prior_for(scene, shared=False)
     told.mean[:2, 0], told.std[:2, 0] = scene.K[:2, 0, 0], 0.001
-    answer = HypothesesAndRefinement().calibrate(
-        adjusted(scene, 3), assumed=told, rng=np.random.default_rng(0)
-    )
+    answer = HypothesesAndRefinement().calibrate(adjusted(scene, 3), prior=told, rng=np.random.default_rng(0))
     np.testing.assert_allclose(answer.K[:2, 0, 0], scene.K[:2, 0, 0], rtol=5e-3)
     np.testing.assert_allclose(answer.K[2:, 0, 0], scene.K[2:, 0, 0], rtol=3e-2)
 
 
-def test_crops_with_a_principal_point_far_off_are_calibrated_when_it_is_left_open() -> None:
+def test_crops_with_a_principal_point_far_off_are_calibrated_when_it_is_left_open():
     scene = make_scene(views=9, zoom=0.3, seed=4)
     K = scene.K.copy()
     K[:, :2, 2] += np.random.default_rng(4).uniform(-150.0, 150.0, (9, 2))
     scene = replace(scene, K=K)
     scene = replace(scene, tracks=reprojected(scene))
-    own = assume(scene, shared=False, stds=(0.0, 0.0, 150.0))
+    own = prior_for(scene, shared=False, stds=(0.0, 0.0, 150.0))
     own.shared[:, 3:5] = np.arange(9)[:, None]
     answer = HypothesesAndRefinement().calibrate(
-        projective_reconstruction(scene, seed=4), assumed=own, rng=np.random.default_rng(0)
+        projective_reconstruction(scene, seed=4), prior=own, rng=np.random.default_rng(0)
     )
     np.testing.assert_allclose(answer.K, scene.K, rtol=1e-4, atol=0.5)
 
 
 @pytest.mark.parametrize("focal", [350.0, 20_000.0])
-def test_the_range_of_lenses_is_wider_than_any_maker_s(focal: float) -> None:
+def test_the_range_of_lenses_is_wider_than_any_maker_s(focal):
     scene = at_distance(make_scene(seed=5), focal)
     answer = HypothesesAndRefinement().calibrate(
-        projective_reconstruction(scene, seed=5), assumed=assume(scene), rng=np.random.default_rng(0)
+        projective_reconstruction(scene, seed=5), prior=prior_for(scene), rng=np.random.default_rng(0)
     )
     np.testing.assert_allclose(answer.K[:, 0, 0], focal, rtol=2e-2)
 
 
-def test_answers_are_told_apart_by_focals_or_plane() -> None:
+def test_answers_are_told_apart_by_focals_or_plane():
     scene = make_scene(views=4, points=40, seed=6)
-    frame = assumed_frame(projective_reconstruction(scene, seed=6), assume(scene))
-    K, plane = square_calibrations(np.zeros(4)), np.array([0.1, 0.2, 0.3])
+    frame = normalized_frame(projective_reconstruction(scene, seed=6), prior_for(scene))
+    K, plane = square_pixel_calibrations(np.zeros(4)), np.array([0.1, 0.2, 0.3])
     answers = [Answer(plane, K, 2.0, "a"), Answer(1.001 * plane, K, 1.0, "b"), Answer(-plane, K, 3.0, "c")]
-    assert [a.method for a in distinct_answers(frame, answers, 9)] == ["b", "c"]
-    assert [a.method for a in distinct_answers(frame, answers, 1)] == ["b"]
+    assert [a.method for a in distinct_candidates(frame, answers, 9)] == ["b", "c"]
+    assert [a.method for a in distinct_candidates(frame, answers, 1)] == ["b"]

@@ -1,7 +1,5 @@
 """A wall with a board in front of it, photographed from an arc: everything about it is known exactly."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,11 +31,11 @@ class Walled:
     depth: tuple[F64, ...]
 
 
-def calibration() -> F64:
+def calibration():
     return np.array([[FOCAL, 0.0, 121.0], [0.0, FOCAL, 88.0], [0.0, 0.0, 1.0]])
 
 
-def on_arc(angles_deg: tuple[float, ...], *, distance: float = 6.0) -> F64:
+def on_arc(angles_deg, *, distance=6.0):
     """Cameras (V, 3, 4) about a point on the wall."""
     cameras = []
     for k, angle in enumerate(np.radians(angles_deg)):
@@ -49,7 +47,7 @@ def on_arc(angles_deg: tuple[float, ...], *, distance: float = 6.0) -> F64:
     return np.array(cameras)
 
 
-def make_walled(P: F64, *, distortion: F64 | None = None, plain: bool = False, seed: int = 0) -> Walled:
+def make_walled(P, *, distortion=None, plain=False, seed=0):
     """Photographs by cameras P (V, 3, 4) through a lens; a ``plain`` wall and board have no texture."""
     textures = [
         np.full((900, 900), 90.0 + 60.0 * k) if plain else texture(900, 900, seed + k) for k in (0, 1)
@@ -68,7 +66,7 @@ def make_walled(P: F64, *, distortion: F64 | None = None, plain: bool = False, s
     return Walled(tuple(images), _reconstruction(P, lens, depths, seed), tuple(depths))
 
 
-def _trace(P: F64, xy: F64, textures: list[F64]) -> tuple[F64, F64]:
+def _trace(P, xy, textures):
     """Depth and grey level (N,): a board |X|, |Y| < 0.7 at Z = -0.8 before a leaning wall Z = 0.2 X."""
     M = np.linalg.inv(P[:, :3])
     centre, rays = -M @ P[:, 3], homogenize(xy) @ M.T
@@ -83,7 +81,7 @@ def _trace(P: F64, xy: F64, textures: list[F64]) -> tuple[F64, F64]:
     return depth, np.where(near, levels[1], levels[0])
 
 
-def _reconstruction(P: F64, lens: F64, depths: list[F64], seed: int) -> Reconstruction:
+def _reconstruction(P, lens, depths, seed):
     """Points on the surface seen in view 0, observed by every view that sees them."""
     rng = np.random.default_rng(seed)
     pixel = np.stack([rng.integers(4, SIZE[0] - 4, 400), rng.integers(4, SIZE[1] - 4, 400)], axis=1)

@@ -1,7 +1,5 @@
 """Plain NumPy twins of the compiled search for planes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon.stereo.plane_kernels import HELD, HIDDEN, SAME_PLANE, TEXTURE, UNKNOWN

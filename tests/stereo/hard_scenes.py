@@ -1,8 +1,5 @@
 """Scenes of rectangles that are hard to match, with exact depth: fences, tunnels, blank walls."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -11,7 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from tests.stereo.depth_scenes import Walled
 from tests.textures import texture
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera, project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import Image, Reconstruction, Tracks
@@ -31,12 +28,12 @@ class Rectangle:
 
 
 @cache
-def textured(seed: int) -> F64:
+def textured(seed):
     """Grey levels that go on by reflection."""
     return texture(300, 300, seed)
 
 
-def fence(seed: int = 0) -> list[Rectangle]:
+def fence(seed=0):
     """Slats of 0.25, as far apart as they are wide, at depth 4 before a wall at 6: occlusions everywhere."""
     places = [0.5 * k - 4.0 for k in range(16)]
     slats = [
@@ -46,7 +43,7 @@ def fence(seed: int = 0) -> list[Rectangle]:
     return [Rectangle((-6.0, -5.0, 6.0), (12.0, 0, 0), (0, 10.0, 0), textured(seed)), *slats]
 
 
-def tunnel(seed: int = 0) -> list[Rectangle]:
+def tunnel(seed=0):
     """Four walls along the way and one at its end."""
     z = (0.0, 0.0, 14.0)
     sides = [((-1.5, -1.2, -1.0), (0, 2.4, 0)), ((1.5, -1.2, -1.0), (0, 2.4, 0))]
@@ -55,36 +52,26 @@ def tunnel(seed: int = 0) -> list[Rectangle]:
     return [*walls, Rectangle((-1.5, -1.2, 13.0), (3.0, 0, 0), (0, 2.4, 0), textured(seed + 9))]
 
 
-def blank_wall(rim: float = 1.2, seed: int = 0) -> list[Rectangle]:
+def blank_wall(rim=1.2, seed=0):
     """A blank square with a textured rim of that width, leaning away, at depth 5 in its middle."""
     wall = leaning(4.0, 5.0, textured(seed))
     return [wall, leaning(4.0 - rim, 5.0 - 1e-6, 140.0)]
 
 
-def leaning(half: float, depth: float, levels: F64 | float) -> Rectangle:
+def leaning(half, depth, levels):
     """A square about the optical axis that leans away to the right."""
     slope = 0.3
     corner = (-half, -half, depth - slope * half)
     return Rectangle(corner, (2 * half, 0, 2 * slope * half), (0, 2 * half, 0), levels)
 
 
-def looking_ahead(
-    places: Sequence[Sequence[float]], *, focal: float = 200.0, size: tuple[int, int] = (200, 150)
-) -> F64:
+def looking_ahead(places, *, focal=200.0, size=(200, 150)):
     """Cameras (V, 3, 4) at places, all looking along z."""
     K = np.array([[focal, 0.0, (size[0] - 1) / 2], [0.0, focal, (size[1] - 1) / 2], [0.0, 0.0, 1.0]])
     return np.array([camera_from_centre(K, np.eye(3), np.array(place, dtype=float)) for place in places])
 
 
-def photograph_scene(
-    P: F64,
-    rectangles: Sequence[Rectangle],
-    *,
-    sizes: Sequence[tuple[int, int]] | None = None,
-    noise: float = 1.0,
-    points: int = 400,
-    seed: int = 0,
-) -> Walled:
+def photograph_scene(P, rectangles, *, sizes=None, noise=1.0, points=400, seed=0):
     """What cameras P (V, 3, 4) see, with noise of so many grey levels, and so many exact sparse points."""
     rng = np.random.default_rng(seed)
     wanted = [(200, 150)] * len(P) if sizes is None else list(sizes)
@@ -99,7 +86,7 @@ def photograph_scene(
     return Walled(tuple(images), reconstruction, tuple(depths))
 
 
-def trace(P: F64, rectangles: Sequence[Rectangle], size: tuple[int, int]) -> tuple[F64, F64]:
+def trace(P, rectangles, size):
     """Depth (inf where nothing is) and grey level (H, W)."""
     x, y = np.meshgrid(np.arange(float(size[0])), np.arange(float(size[1])))
     M = np.linalg.inv(P[:, :3])
@@ -122,12 +109,10 @@ def trace(P: F64, rectangles: Sequence[Rectangle], size: tuple[int, int]) -> tup
     return best.reshape(x.shape), level.reshape(x.shape)
 
 
-def sparse(
-    P: F64, depths: Sequence[F64], rectangles: Sequence[Rectangle], points: int, rng: np.random.Generator
-) -> Reconstruction:
+def sparse(P, depths, rectangles, points, rng):
     """Exact points on textured surfaces, from every view in turn, observed by all that see them."""
     blank = [r for r in rectangles if isinstance(r.levels, float)]
-    found: list[F64] = []
+    found = []
     for camera, depth in zip(P, depths, strict=True):
         height, width = depth.shape
         at = np.stack([rng.integers(2, width - 2, points), rng.integers(2, height - 2, points)], axis=1)
@@ -159,7 +144,7 @@ def sparse(
     return with_points(P, sizes, X, *seen)
 
 
-def with_points(P: F64, sizes: I64, X: F64, view: I64, point: I64, xy: F64) -> Reconstruction:
+def with_points(P, sizes, X, view, point, xy):
     """A metric reconstruction of points X (N, 3) with observations (K,)."""
     order = np.lexsort((view, point))
     tracks = Tracks(view[order], point[order], xy[order], len(P), len(X))

@@ -1,7 +1,5 @@
 """The compiled loops of dense matching once more, plainly, with NumPy."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pairs of cameras in every relative position, with points in front of both."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,13 +36,11 @@ class PairOfCameras:
     sizes: tuple[tuple[int, int], tuple[int, int]]
 
     @property
-    def F(self) -> F64:
+    def F(self):
         return fundamental_from_cameras(self.P[0], self.P[1])
 
 
-def make_pair(
-    motion: str, rng: np.random.Generator, *, noise_px: float = 0.0, points: int = 300
-) -> PairOfCameras:
+def make_pair(motion, rng, *, noise_px=0.0, points=300):
     """Two cameras about 8 from a cloud of points; the second one moved as ``motion`` says."""
     centre, turn = {
         "beside": ((1.5, 0.1, 0.05), (0.01, 0.03, 0.02)),
@@ -74,6 +70,6 @@ def make_pair(
     return PairOfCameras(P, X, x1 + noise[0], x2 + noise[1], X[:, 2], (SIZE, size2))
 
 
-def inside(xy: F64, size: tuple[int, int]) -> F64:
+def inside(xy, size):
     """Whether pixels (N, 2) lie in an image."""
     return ((xy >= 0.0) & (xy <= np.array(size) - 1.0)).all(axis=1)

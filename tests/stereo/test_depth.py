@@ -1,7 +1,5 @@
 """Depth maps of whole scenes against truth, and what hopeless ones give."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled loops against plain NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon.geometry.homogeneous import homogenize

@@ -1,7 +1,5 @@
 """Undistorted views, neighbours, correspondences through rectified frames, consistency: each by itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every variant on pairs whose disparity is known, and on pairs that have none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,17 +8,18 @@ from scipy.ndimage import map_coordinates
 
 from tests.textures import texture
 from thesisrecon.stereo.cost import CensusAndColour, estimate_noise, prepare_pair, row_strips
-from thesisrecon.stereo.paths import PathPenalties
-from thesisrecon.stereo.postprocessing import Finish
+from thesisrecon.stereo.postprocessing import DisparityPostprocessing
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import CohesiveScanlines, SemiGlobal, match_rectified
+from thesisrecon.stereo.semi_global import PUBLISHED, PathPenalties, SemiGlobalMatching, match_rectified
 
-VARIANTS = [CohesiveScanlines(), SemiGlobal(), MaximumLikelihoodScanline()]
+VARIANTS = [SemiGlobalMatching(), PUBLISHED, MaximumLikelihoodScanline()]
 HEIGHT, WIDTH = 120, 180
-names = pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: type(v).__name__)
+names = pytest.mark.parametrize(
+    "variant", VARIANTS, ids=lambda v: f"{type(v).__name__}-{getattr(v, 'paths', '')}"
+)
 
 
-def pair_with_truth(seed: int = 0):
+def pair_with_truth(seed=0):
     """A slanted wall behind a square: left and right image, left disparities, which pixels both see."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
@@ -104,7 +103,9 @@ def test_the_number_of_threads_changes_no_byte(variant):
     assert one.confidence.tobytes() == three.confidence.tobytes()
 
 
-@pytest.mark.parametrize("variant", VARIANTS[:2], ids=lambda v: type(v).__name__)
+@pytest.mark.parametrize(
+    "variant", VARIANTS[:2], ids=lambda v: f"{type(v).__name__}-{getattr(v, 'paths', '')}"
+)
 def test_strips_change_little(variant):
     left, right, _, _ = pair_with_truth()
     whole = variant.match(left, right, disparity_range=(0, 24))
@@ -169,7 +170,7 @@ def test_the_front_door():
     known = np.isfinite(found.disparity) & both
     assert known.mean() > 0.8
     assert np.mean(np.abs(found.disparity - truth)[known] > 1.0) < 0.02
-    thesis = match_rectified(left, right, max_disparity_px=24, config=MaximumLikelihoodScanline())
+    thesis = match_rectified(left, right, max_disparity_px=24, matcher=MaximumLikelihoodScanline())
     assert set(np.unique(thesis.disparity[np.isfinite(thesis.disparity)] % 1.0)) == {0.0}
     for wrong in (-1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="max_disparity_px"):
@@ -183,8 +184,8 @@ def test_the_front_door():
         (lambda: CensusAndColour(truncation=0.0), "truncation"),
         (lambda: PathPenalties(step=2.0), "penalties must obey"),
         (lambda: PathPenalties(edge=0.0), "edge"),
-        (lambda: Finish(radius=-1), "must not be negative"),
-        (lambda: Finish(least_confidence=1.0), "least_confidence"),
+        (lambda: DisparityPostprocessing(radius=-1), "must not be negative"),
+        (lambda: DisparityPostprocessing(least_confidence=1.0), "least_confidence"),
         (lambda: MaximumLikelihoodScanline(detection=1.0), "detection"),
         (lambda: MaximumLikelihoodScanline(radius=9), "radius"),
         (lambda: MaximumLikelihoodScanline(cohesion="both"), "cohesion"),

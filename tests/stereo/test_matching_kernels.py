@@ -1,7 +1,5 @@
 """Compiled loops against their plain twins."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -17,7 +15,13 @@ from thesisrecon.stereo.cost_kernels import (
     split_channels,
     support_masks,
 )
-from thesisrecon.stereo.paths import jump_penalties, scratch_size, sum_paths, turn_back, turn_rows
+from thesisrecon.stereo.path_kernels import (
+    adaptive_P2,
+    scratch_size,
+    sum_paths,
+    transpose_back,
+    transpose_rows,
+)
 from thesisrecon.stereo.postprocessing import (
     best_disparities,
     check_left_right,
@@ -113,10 +117,10 @@ def test_rows_turn_and_turn_back(shape):
     rows, n, width = shape
     source = np.random.default_rng(4).integers(0, 256, shape).astype(np.uint8)
     turned = np.zeros(((width + 7) // 8 * 8, n, (rows + 7) // 8 * 8), np.uint8)
-    turn_rows(source, turned)
+    transpose_rows(source, turned)
     assert (turned[:width, :, :rows] == source.transpose(2, 1, 0)).all()
     back = np.empty_like(source)
-    turn_back(turned, back)
+    transpose_back(turned, back)
     assert (back == source).all()
 
 
@@ -128,7 +132,7 @@ def test_sums_of_paths(shape, pairs):
     costs = rng.integers(0, 49, shape).astype(np.uint8)
     grey = rng.integers(0, 3000, (height, width)).astype(np.int16)
     jumps = np.empty((4, height, width), np.uint8)
-    jump_penalties(grey, np.float32(70.0), np.float32(30.0), np.float32(200.0), jumps)
+    adaptive_P2(grey, np.float32(70.0), np.float32(30.0), np.float32(200.0), jumps)
 
     def penalty(y, x, v, u):
         apart = abs(int(grey[y, x]) - int(grey[v, u]))

@@ -1,7 +1,5 @@
 """The search for slanted windows: its compiled loops against plain NumPy, and what it finds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates

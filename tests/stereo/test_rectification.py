@@ -1,7 +1,5 @@
 """Rows are epipolar lines, maps are inverse, nearer is farther left on the right, bad pairs are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,25 +1,22 @@
 """The compiled resampling against its plain twin, against what it must reproduce, and at the rim."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from tests.textures import texture
-from thesisrecon.arrays import F32, F64
 from thesisrecon.stereo.planar import PlanarRectification
 from thesisrecon.stereo.resampling import NOT_SHRUNK, STRIP_ROWS, sample_image, warp_image
 
 
-def cubic(x: F64) -> F64:
+def cubic(x):
     x = np.abs(x)
     near, far = 1.5 * x**3 - 2.5 * x**2 + 1.0, -0.5 * x**3 + 2.5 * x**2 - 4.0 * x + 2.0
     return np.where(x < 1.0, near, np.where(x < 2.0, far, 0.0))
 
 
-def sample_plainly(image: F32, xy: F64, rows: int) -> F64:
+def sample_plainly(image, xy, rows):
     """Twin of ``sample_image`` for lookups of at least two rows and columns, by one weight per pixel."""
     height, width = image.shape[:2]
     padded = np.pad(image.astype(np.float64), ((12, 12), (12, 12), (0, 0)), mode="edge")
@@ -42,7 +39,7 @@ def sample_plainly(image: F32, xy: F64, rows: int) -> F64:
     return out
 
 
-def a_map(scale: float) -> PlanarRectification:
+def a_map(scale):
     """A homography that shows the photograph ``1 / scale`` as large, turned."""
     c, s = scale * np.cos(0.3), scale * np.sin(0.3)
     H = np.linalg.inv(np.array([[c, -s, 20.0], [s, c, -4.0], [1e-4, 2e-4, 1.0]]))
@@ -106,7 +103,7 @@ class OneRow:
 
     size: tuple[int, int] = (1, 1)
 
-    def lookup(self, side: int, rows: range) -> F64:
+    def lookup(self, side, rows):
         return np.full((len(rows), 1, 2), 3.0 + side)
 
 

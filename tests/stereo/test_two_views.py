@@ -1,7 +1,5 @@
 """Dense correspondence of two photographs of which only F and some matches are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import PIL.Image
 import pytest

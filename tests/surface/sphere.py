@@ -1,10 +1,7 @@
 """Depth maps and photographs of the unit sphere."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap, PinholeView
 
@@ -12,7 +9,7 @@ K = np.array([[150.0, 0.0, 79.5], [0.0, 150.0, 59.5], [0.0, 0.0, 1.0]])
 SHAPE = (120, 160)
 
 
-def looking_at_origin(angle: float, height: float, distance: float) -> F64:
+def looking_at_origin(angle, height, distance):
     """P of a camera that looks at the origin from ``angle`` (rad) about the vertical."""
     centre = np.array([np.sin(angle) * distance, height, -np.cos(angle) * distance])
     forward = -centre / np.linalg.norm(centre)
@@ -21,14 +18,14 @@ def looking_at_origin(angle: float, height: float, distance: float) -> F64:
     return camera_from_centre(K, np.stack([right, np.cross(forward, right), forward]), centre)
 
 
-def paint(X: F64) -> F64:
+def paint(X):
     """Colours (..., 3) of points (..., 3) of the sphere."""
     waves = np.stack([np.sin(9 * X[..., 0] + 4 * X[..., 1]), np.sin(8 * X[..., 1] - 5 * X[..., 2])], axis=-1)
     third = np.cos(10 * X[..., 2] + 3 * X[..., 0])
     return 128.0 + 60.0 * np.concatenate([waves, third[..., None]], axis=-1)
 
 
-def points_of(depth_map: DepthMap) -> F64:
+def points_of(depth_map):
     """Points (H, W, 3) of the pixels, NaN where there is no depth."""
     y, x = np.indices(depth_map.depth.shape)
     M = depth_map.P[:, :3]
@@ -36,7 +33,7 @@ def points_of(depth_map: DepthMap) -> F64:
     return rays * depth_map.depth[..., None].astype(float) - np.linalg.solve(M, depth_map.P[:, 3])
 
 
-def photograph(depth_map: DepthMap, gain: float = 1.0) -> PinholeView:
+def photograph(depth_map, gain=1.0):
     """The painted sphere before black, seen where the depth map is, exposed by ``gain``."""
     color = np.nan_to_num(paint(points_of(depth_map))) * gain
     color[np.isnan(depth_map.depth)] = 0.0
@@ -44,13 +41,13 @@ def photograph(depth_map: DepthMap, gain: float = 1.0) -> PinholeView:
     return PinholeView(depth_map.view, depth_map.P, rgb, np.ones(rgb.shape[:2], dtype=bool))
 
 
-def ring_of(count: int = 8) -> list[DepthMap]:
+def ring_of(count=8):
     """Views from all round, above and below in turn."""
     turns = [looking_at_origin(2 * np.pi * k / count, 1.5 * (-1) ** k, 3.5) for k in range(count)]
     return [sphere_map(k, P) for k, P in enumerate(turns)]
 
 
-def sphere_map(view: int, P: F64, *, noise: float = 0.0, seed: int = 0) -> DepthMap:
+def sphere_map(view, P, *, noise=0.0, seed=0):
     """Depth of the unit sphere; std as the noise, at least 1e-4."""
     y, x = np.indices(SHAPE)
     M = P[:, :3]

@@ -1,7 +1,5 @@
 """Colours from all photographs of a point: shares, gains, and what contradicts the others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +7,6 @@ import pytest
 
 from tests.surface.sphere import paint, photograph, ring_of
 from tests.surface.test_texture import GAINS
-from thesisrecon.arrays import F32, F64
-from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.mesh import face_neighbours, vertex_normals
 from thesisrecon.surface.model import SurfaceModel
@@ -26,11 +22,11 @@ from thesisrecon.surface.texture_kernels import (
 
 
 @pytest.fixture(scope="module")
-def sphere() -> TexturedMesh:
+def sphere():
     return VolumetricFusion().fuse(ring_of())
 
 
-def test_gains_are_found(sphere: TexturedMesh) -> None:
+def test_gains_are_found(sphere):
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
     found = BlendedViews().prepare(sphere, views).gains
     wanted = np.exp(np.log(GAINS).mean()) / np.array(GAINS)
@@ -38,14 +34,14 @@ def test_gains_are_found(sphere: TexturedMesh) -> None:
     np.testing.assert_array_equal(BlendedViews(level=False).prepare(sphere, views).gains, 1.0)
 
 
-def test_gains_of_views_that_share_nothing_stay() -> None:
+def test_gains_of_views_that_share_nothing_stay():
     weight = np.array([[1, 1, 1, 0, 0], [1, 1, 1, 0, 0], [0, 0, 0, 1, 1]], dtype=np.float32)
     color = np.full((3, 5, 3), 100, dtype=np.float32)
     color[1] = 144.0
     np.testing.assert_allclose(equalizing_gains(weight, color)[:, 0], [1.2, 1 / 1.2, 1.0], rtol=1e-4)
 
 
-def test_what_one_photograph_contradicts_is_left_out(sphere: TexturedMesh) -> None:
+def test_what_one_photograph_contradicts_is_left_out(sphere):
     views = [photograph(m) for m in ring_of(24)]
     spoiled = views[0].rgb.copy()
     spoiled[40:80, 60:100] = [255, 0, 255]
@@ -63,14 +59,14 @@ def test_what_one_photograph_contradicts_is_left_out(sphere: TexturedMesh) -> No
     assert error[1] < 0.3 * error[0]
 
 
-def test_points_have_their_colours(sphere: TexturedMesh) -> None:
+def test_points_have_their_colours(sphere):
     prepared = BlendedViews().prepare(sphere, [photograph(m) for m in ring_of()])
     color, shown = prepared.colors(sphere.vertices, vertex_normals(sphere))
     assert shown.mean() > 0.95
     assert np.median(np.abs(color - paint(sphere.vertices))[shown]) < 3.0
 
 
-def test_a_view_is_left_out(sphere: TexturedMesh) -> None:
+def test_a_view_is_left_out(sphere):
     views = [photograph(m) for m in ring_of()]
     black = replace(views[3], rgb=np.zeros_like(views[3].rgb))
     model = SurfaceModel()
@@ -81,7 +77,7 @@ def test_a_view_is_left_out(sphere: TexturedMesh) -> None:
     np.testing.assert_array_equal(one.faces, sphere.faces)
 
 
-def test_spread_shares_matches_its_twin(sphere: TexturedMesh) -> None:
+def test_spread_shares_matches_its_twin(sphere):
     neighbours = face_neighbours(sphere.faces)
     rng = np.random.default_rng(0)
     share = rng.random((len(neighbours), 3)).astype(np.float32)
@@ -94,7 +90,7 @@ def test_spread_shares_matches_its_twin(sphere: TexturedMesh) -> None:
     np.testing.assert_allclose(out, np.where(share > 0, 0.1 * share + 0.9 * around / count, 0.0), rtol=1e-5)
 
 
-def observed(points: F64, normals: F64, P: F64, depth: F32, clear: F32, slack: float) -> F64:
+def observed(points, normals, P, depth, clear, slack):
     """Plain weights (N,) of :func:`observe_points`."""
     weight = np.zeros(len(points))
     M, height, width = P[:, :3], *depth.shape
@@ -114,7 +110,7 @@ def observed(points: F64, normals: F64, P: F64, depth: F32, clear: F32, slack: f
     return weight
 
 
-def test_observe_points_matches_its_twin(sphere: TexturedMesh) -> None:
+def test_observe_points_matches_its_twin(sphere):
     view = BlendedViews().prepare(sphere, [photograph(ring_of()[2])]).views[0]
     rng = np.random.default_rng(1)
     points = rng.normal(size=(400, 3))
@@ -135,7 +131,7 @@ def test_observe_points_matches_its_twin(sphere: TexturedMesh) -> None:
     assert np.median(np.abs(apart)) < 6.0
 
 
-def test_combine_colors_matches_its_twin() -> None:
+def test_combine_colors_matches_its_twin():
     rng = np.random.default_rng(2)
     weight = rng.random((5, 60)).astype(np.float32)
     weight[rng.random(weight.shape) < 0.4] = 0.0
@@ -155,7 +151,7 @@ def test_combine_colors_matches_its_twin() -> None:
         np.testing.assert_allclose(out[n], final @ c / final.sum(), rtol=1e-4)
 
 
-def test_grow_colors_matches_its_twin() -> None:
+def test_grow_colors_matches_its_twin():
     rng = np.random.default_rng(3)
     texture = rng.integers(0, 256, (12, 15, 3)).astype(np.uint8)
     drawn = rng.random((12, 15)) < 0.1
@@ -172,7 +168,7 @@ def test_grow_colors_matches_its_twin() -> None:
     np.testing.assert_array_equal(texture[~new], before[~new])
 
 
-def test_faces_are_continued_by_a_texel() -> None:
+def test_faces_are_continued_by_a_texel():
     corners = np.array([[[2.2, 2.1, 1.0], [8.3, 2.4, 1.0], [2.5, 8.2, 1.0]]])
     face = np.full((12, 12), -1)
     face[3:5, 3:6] = 0

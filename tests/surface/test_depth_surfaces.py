@@ -1,8 +1,5 @@
 """Surfaces of single depth maps: linear and fitted, against shapes that are known."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,18 +9,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import binary_erosion
 
 from tests.surface.sphere import looking_at_origin, sphere_map
-from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap
 from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.linear import (
-    DepthSurface,
-    LinearSurface,
-    normals,
-    resampled,
-    sampled_mesh,
-    surface_from_depth,
-)
+from thesisrecon.surface.linear import LinearSurface, normals, resampled, sampled_mesh, surface_from_depth
 from thesisrecon.surface.mesh import parts_of
 
 BOTH = pytest.mark.parametrize("surface", [LinearSurface(), BSplineSurface()], ids=["linear", "b-spline"])
@@ -33,22 +22,22 @@ P = camera_from_centre(
 )
 
 
-def map_of(rho: F64, deviation: float, *, known: B8 | None = None) -> DepthMap:
+def map_of(rho, deviation, *, known=None):
     """Depths of inverse depths with a deviation."""
     depth = np.where(True if known is None else known, 1.0 / rho, np.nan)
     std = (deviation / rho**2).astype(np.float32)
     return DepthMap(0, P, depth.astype(np.float32), std, np.ones(rho.shape, dtype=np.uint8))
 
 
-def pixels(shape: tuple[int, int] = SHAPE) -> F64:
+def pixels(shape=SHAPE):
     y, x = np.indices(shape)
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
 
 
-def polynomial(*c: float) -> Callable[[F64], tuple[F64, F64]]:
+def polynomial(*c):
     """Inverse depth c0 + c1 u + c2 v + c3 u^2 + c4 u v + c5 v^2 of u, v in long sides, and its gradient."""
 
-    def shape(xy: F64) -> tuple[F64, F64]:
+    def shape(xy):
         u, v = xy.T / 80.0 - 0.5
         a = (*c, *(0.0,) * (6 - len(c)))
         rho = a[0] + a[1] * u + a[2] * v + a[3] * u**2 + a[4] * u * v + a[5] * v**2
@@ -61,9 +50,7 @@ def polynomial(*c: float) -> Callable[[F64], tuple[F64, F64]]:
 @BOTH
 @settings(max_examples=6, deadline=None)
 @given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.integers(0, 2**31))
-def test_planes_are_exact_everywhere_with_their_normals(
-    surface: DepthSurface, a: float, b: float, seed: int
-) -> None:
+def test_planes_are_exact_everywhere_with_their_normals(surface, a, b, seed):
     plane = polynomial(0.2, a, b)
     fit = surface.fit(map_of(plane(pixels())[0].reshape(SHAPE), 1e-4))
     xy = np.random.default_rng(seed).uniform(0.0, [79.0, 59.0], (200, 2))
@@ -80,7 +67,7 @@ def test_planes_are_exact_everywhere_with_their_normals(
     assert normal[2] < 0.0
 
 
-def test_quadrics_and_their_derivatives_are_reproduced() -> None:
+def test_quadrics_and_their_derivatives_are_reproduced():
     quadric = polynomial(0.2, 0.03, -0.02, 0.05, 0.04, -0.06)
     fit = BSplineSurface().fit(map_of(quadric(pixels())[0].reshape(SHAPE), 1e-5))
     xy = np.random.default_rng(0).uniform(0.0, [79.0, 59.0], (300, 2))
@@ -94,7 +81,7 @@ def test_quadrics_and_their_derivatives_are_reproduced() -> None:
 
 
 @BOTH
-def test_the_gradient_is_the_derivative_of_the_surface(surface: DepthSurface) -> None:
+def test_the_gradient_is_the_derivative_of_the_surface(surface):
     fit = surface.fit(sphere_map(0, looking_at_origin(0.3, 0.2, 3.5), noise=0.01))
     xy = np.random.default_rng(1).uniform([60.0, 40.0], [100.0, 80.0], (200, 2))
     h = 1e-5
@@ -109,7 +96,7 @@ def test_the_gradient_is_the_derivative_of_the_surface(surface: DepthSurface) ->
 
 
 @BOTH
-def test_nothing_is_said_beyond_the_depths(surface: DepthSurface) -> None:
+def test_nothing_is_said_beyond_the_depths(surface):
     plane = polynomial(0.2, 0.05)
     hole = np.ones(SHAPE, dtype=bool)
     hole[20:40, 30:50] = False
@@ -124,13 +111,13 @@ def test_nothing_is_said_beyond_the_depths(surface: DepthSurface) -> None:
     assert len(sampled_mesh(nothing).faces) == 0
 
 
-def errors(surface: DepthSurface, noisy: DepthMap, clean: DepthMap) -> F64:
+def errors(surface, noisy, clean):
     """Relative errors of depths off the outline of the sphere, where it slopes away."""
     inner = binary_erosion(np.isfinite(clean.depth), iterations=5)
     return np.asarray(resampled(surface.fit(noisy)).depth / clean.depth - 1.0)[inner]
 
 
-def test_noise_is_averaged_where_the_surface_is_smooth() -> None:
+def test_noise_is_averaged_where_the_surface_is_smooth():
     camera = looking_at_origin(0.3, 0.2, 3.5)
     clean, noisy = sphere_map(0, camera), sphere_map(0, camera, noise=0.01)
     linear, fitted = (errors(s, noisy, clean) for s in (LinearSurface(), BSplineSurface()))
@@ -139,7 +126,7 @@ def test_noise_is_averaged_where_the_surface_is_smooth() -> None:
     assert abs(fitted.mean()) < 0.05 * rms[0]
 
 
-def test_deviations_that_are_told_too_large_or_small_change_little() -> None:
+def test_deviations_that_are_told_too_large_or_small_change_little():
     camera = looking_at_origin(0.3, 0.2, 3.5)
     clean, noisy = sphere_map(0, camera), sphere_map(0, camera, noise=0.01)
     rms = []
@@ -150,7 +137,7 @@ def test_deviations_that_are_told_too_large_or_small_change_little() -> None:
 
 
 @pytest.mark.parametrize("size", [0.03, 1.0], ids=["near", "gross"])
-def test_a_fifth_of_wrong_depths_is_outvoted(size: float) -> None:
+def test_a_fifth_of_wrong_depths_is_outvoted(size):
     camera = looking_at_origin(0.3, 0.2, 3.5)
     clean, noisy = sphere_map(0, camera), sphere_map(0, camera, noise=0.004)
     rng = np.random.default_rng(2)
@@ -165,7 +152,7 @@ def test_a_fifth_of_wrong_depths_is_outvoted(size: float) -> None:
 
 
 @pytest.mark.parametrize("slant", [0.0, 0.02])
-def test_an_edge_is_not_smeared(slant: float) -> None:
+def test_an_edge_is_not_smeared(slant):
     """Half the picture is nearer: pixels next to the edge are as exact as others."""
     near, far = polynomial(0.5, slant, 0.01), polynomial(0.2, -slant, 0.02)
     y, x = np.indices(SHAPE)
@@ -181,7 +168,7 @@ def test_an_edge_is_not_smeared(slant: float) -> None:
     assert len(np.unique(parts_of(mesh.faces, len(mesh.vertices)))) == 2
 
 
-def test_a_cut_may_end_within_the_surface() -> None:
+def test_a_cut_may_end_within_the_surface():
     """A step that fades out: apart where it is large, one surface where it ends, exact on both sides."""
     y, x = np.indices(SHAPE)
     step = np.clip((45.0 - y) / 45.0, 0.0, 1.0) * 0.1
@@ -196,7 +183,7 @@ def test_a_cut_may_end_within_the_surface() -> None:
     assert len(np.unique(parts_of(mesh.faces, len(mesh.vertices)))) == 1
 
 
-def test_small_pieces_become_the_surface_about_them_or_nothing() -> None:
+def test_small_pieces_become_the_surface_about_them_or_nothing():
     rho = np.full(SHAPE, 0.2)
     known = np.zeros(SHAPE, dtype=bool)
     known[:, :60] = True
@@ -208,7 +195,7 @@ def test_small_pieces_become_the_surface_about_them_or_nothing() -> None:
 
 
 @BOTH
-def test_any_resolution(surface: DepthSurface) -> None:
+def test_any_resolution(surface):
     fit = surface.fit(sphere_map(0, looking_at_origin(0.3, 0.2, 3.5)))
     meshes = {scale: sampled_mesh(fit, scale) for scale in (0.5, 1.0, 2.0)}
     faces = {scale: len(mesh.faces) for scale, mesh in meshes.items()}
@@ -222,7 +209,7 @@ def test_any_resolution(surface: DepthSurface) -> None:
         resampled(fit, 0.0)
 
 
-def test_the_linear_surface_is_the_triangulated_map() -> None:
+def test_the_linear_surface_is_the_triangulated_map():
     depth_map = sphere_map(0, looking_at_origin(0.3, 0.2, 3.5), noise=0.02)
     fit = LinearSurface().fit(depth_map)
     assert resampled(fit) is depth_map
@@ -237,7 +224,7 @@ def test_the_linear_surface_is_the_triangulated_map() -> None:
     np.testing.assert_allclose(rho, 1.0 / middle[:, 2], rtol=1e-6)
 
 
-def test_normals_of_a_noisy_sphere() -> None:
+def test_normals_of_a_noisy_sphere():
     camera = looking_at_origin(0.3, 0.2, 3.5)
     noisy = sphere_map(0, camera, noise=0.003)
     xy = np.random.default_rng(0).uniform([55.0, 35.0], [105.0, 85.0], (500, 2))
@@ -252,7 +239,7 @@ def test_normals_of_a_noisy_sphere() -> None:
     assert np.nanmedian(off[0]) > 5.0 * np.nanmedian(off[1])
 
 
-def test_the_same_map_gives_the_same_bytes() -> None:
+def test_the_same_map_gives_the_same_bytes():
     noisy = sphere_map(0, looking_at_origin(0.3, 0.2, 3.5), noise=0.01)
     one, two = (BSplineSurface().fit(noisy).coefficients for _ in range(2))
     assert one.tobytes() == two.tobytes()
@@ -261,9 +248,9 @@ def test_the_same_map_gives_the_same_bytes() -> None:
 @pytest.mark.parametrize(
     "wrong", [{"knot_px": 1}, {"rounds": 0}, {"window": 0}, {"grazing_deg": 0.0}, {"grazing_deg": 90.0}]
 )
-def test_wrong_parameters_are_refused(wrong: dict[str, float]) -> None:
+def test_wrong_parameters_are_refused(wrong):
     with pytest.raises(ValueError, match="needed"):
-        BSplineSurface(**wrong)  # type: ignore[arg-type]
+        BSplineSurface(**wrong)
     if "grazing_deg" in wrong:
         with pytest.raises(ValueError, match="needed"):
             LinearSurface(**wrong)

@@ -1,7 +1,5 @@
 """The compiled parts of the spline fit against plain NumPy and SciPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
@@ -9,18 +7,18 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from thesisrecon.surface.bspline import basis, energies
-from thesisrecon.surface.bspline_pieces import Domain, Pieces, evaluate_pixels, pieces_of, sum_squares
+from thesisrecon.surface.bspline_pieces import Domain, evaluate_pixels, pieces_of, sum_squares
 
 CELL = 4
 
 
-def labels(count: int, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+def labels(count, start, stop):
     graph = coo_array((np.ones(len(start)), (start, stop)), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
 @pytest.fixture
-def domain() -> Domain:
+def domain():
     rng = np.random.default_rng(0)
     held = rng.random((21, 26)) < 0.85
     right = (rng.random((21, 25)) < 0.7) & held[:, :-1] & held[:, 1:]
@@ -29,18 +27,18 @@ def domain() -> Domain:
 
 
 @pytest.fixture
-def pieces(domain: Domain) -> Pieces:
+def pieces(domain):
     return pieces_of(domain, CELL)
 
 
-def edges(domain: Domain) -> tuple[np.ndarray, np.ndarray]:
+def edges(domain):
     number = np.arange(domain.held.size).reshape(domain.held.shape)
     start = np.concatenate([number[:, :-1][domain.right], number[:-1][domain.down]])
     stop = np.concatenate([number[:, 1:][domain.right], number[1:][domain.down]])
     return start, stop
 
 
-def test_pieces_are_what_hangs_together_in_a_cell(domain: Domain, pieces: Pieces) -> None:
+def test_pieces_are_what_hangs_together_in_a_cell(domain, pieces):
     y, x = np.indices(domain.held.shape)
     cell = ((y // CELL) * pieces.shape[1] + x // CELL).ravel()
     start, stop = edges(domain)
@@ -53,7 +51,7 @@ def test_pieces_are_what_hangs_together_in_a_cell(domain: Domain, pieces: Pieces
     np.testing.assert_array_equal(pieces.cell[found[held]], cell[held])
 
 
-def test_coefficients_are_shared_by_what_hangs_together_within_reach(domain: Domain, pieces: Pieces) -> None:
+def test_coefficients_are_shared_by_what_hangs_together_within_reach(domain, pieces):
     start, stop = (pieces.piece.ravel()[k] for k in edges(domain))
     row, column = np.divmod(pieces.cell, pieces.shape[1])
     owners = set()
@@ -70,7 +68,7 @@ def test_coefficients_are_shared_by_what_hangs_together_within_reach(domain: Dom
     assert owners == set(range(pieces.count))
 
 
-def rows_of(pieces: Pieces) -> np.ndarray:
+def rows_of(pieces):
     """(pixels, coefficients) weights of the coefficients in each pixel of a piece."""
     y, x = np.nonzero(pieces.piece >= 0)
     tensor = basis((y % CELL + 0.5) / CELL)[:, :, None] * basis((x % CELL + 0.5) / CELL)[:, None, :]
@@ -81,7 +79,7 @@ def rows_of(pieces: Pieces) -> np.ndarray:
     return rows
 
 
-def test_values_and_sums_are_those_of_the_rows(pieces: Pieces) -> None:
+def test_values_and_sums_are_those_of_the_rows(pieces):
     rng = np.random.default_rng(1)
     rows, held = rows_of(pieces), pieces.piece >= 0
     c, target = rng.normal(size=pieces.count), rng.normal(size=held.shape)
@@ -104,7 +102,7 @@ def test_values_and_sums_are_those_of_the_rows(pieces: Pieces) -> None:
     np.testing.assert_allclose(total, rows.T @ (w * target[held]), atol=1e-12)
 
 
-def test_the_basis_is_that_of_cubic_splines() -> None:
+def test_the_basis_is_that_of_cubic_splines():
     u = np.linspace(0.0, 0.999, 7)
     for derivative in (0, 1, 2):
         for k in range(4):
@@ -113,7 +111,7 @@ def test_the_basis_is_that_of_cubic_splines() -> None:
             np.testing.assert_allclose(basis(u, derivative)[:, k], np.nan_to_num(expected), atol=1e-12)
 
 
-def test_energies_are_integrals() -> None:
+def test_energies_are_integrals():
     rng = np.random.default_rng(2)
     c = rng.normal(size=16)
     u = (np.arange(200) + 0.5) / 200

@@ -1,16 +1,12 @@
 """Surfaces of depth maps, one by one and fused, against shapes that are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
 from tests.surface.sphere import SHAPE, K, looking_at_origin, photograph, ring_of, sphere_map
-from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.zbuffer import rasterize
@@ -23,11 +19,11 @@ from thesisrecon.surface.model import SurfaceModel
 
 
 @pytest.fixture(scope="module")
-def ring() -> list[DepthMap]:
+def ring():
     return ring_of()
 
 
-def outward(mesh: TexturedMesh) -> F64:
+def outward(mesh):
     """Cosine between each face's normal and the direction from the origin."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
@@ -35,7 +31,7 @@ def outward(mesh: TexturedMesh) -> F64:
     return (normal * middle).sum(1) / np.linalg.norm(normal, axis=1) / np.linalg.norm(middle, axis=1)
 
 
-def test_the_fused_sphere_is_round_closed_and_outward(ring: list[DepthMap]) -> None:
+def test_the_fused_sphere_is_round_closed_and_outward(ring):
     mesh = VolumetricFusion().fuse(ring)
     footprint = 2.5 / 150.0
     radius = np.linalg.norm(mesh.vertices, axis=1)
@@ -56,7 +52,7 @@ def test_the_fused_sphere_is_round_closed_and_outward(ring: list[DepthMap]) -> N
     assert face_areas(mesh.vertices, mesh.faces).sum() == pytest.approx(4 * np.pi, rel=0.05)
 
 
-def test_fusion_averages_noise(ring: list[DepthMap]) -> None:
+def test_fusion_averages_noise(ring):
     noise = 0.01
     noisy = [sphere_map(m.view, m.P, noise=noise) for m in ring]
     mesh = VolumetricFusion().fuse(noisy)
@@ -65,33 +61,32 @@ def test_fusion_averages_noise(ring: list[DepthMap]) -> None:
     assert abs(np.mean(error)) < 0.2 * noise
 
 
-def test_threads_change_nothing(ring: list[DepthMap]) -> None:
+def test_threads_change_nothing(ring):
     one, two = (VolumetricFusion().fuse(ring[:3], threads=n) for n in (1, 2))
     np.testing.assert_array_equal(one.vertices, two.vertices)
     np.testing.assert_array_equal(one.faces, two.faces)
 
 
-def test_memory_is_kept_by_larger_voxels(ring: list[DepthMap]) -> None:
+def test_memory_is_kept_by_larger_voxels(ring):
     fine = VolumetricFusion().fuse(ring[:2])
     coarse = VolumetricFusion(max_blocks=150).fuse(ring[:2])
     assert 0 < len(coarse.faces) < 0.5 * len(fine.faces)
 
 
 @pytest.mark.parametrize(
-    "setting",
-    [{"voxel_px": 0.0}, {"truncation_voxels": np.nan}, {"max_blocks": 7}, {"grazing_deg": 90.0}],
+    "setting", [{"voxel_px": 0.0}, {"truncation_voxels": np.nan}, {"max_blocks": 7}, {"grazing_deg": 90.0}]
 )
-def test_settings_under_which_voxels_would_grow_for_ever_are_refused(setting: dict[str, Any]) -> None:
+def test_settings_under_which_voxels_would_grow_for_ever_are_refused(setting):
     with pytest.raises(ValueError, match="needed"):
         VolumetricFusion(**setting)
 
 
-def test_voxels_stop_growing_with_as_few_blocks_as_there_may_be(ring: list[DepthMap]) -> None:
+def test_voxels_stop_growing_with_as_few_blocks_as_there_may_be(ring):
     with pytest.raises(StageFailure, match="no surface"):
         VolumetricFusion(max_blocks=8).fuse(ring[:1])
 
 
-def test_what_views_look_through_is_removed(ring: list[DepthMap]) -> None:
+def test_what_views_look_through_is_removed(ring):
     """A wrong blob in one view, in empty space that the others see the sphere through."""
     depth = ring[0].depth.copy()
     depth[50:60, 70:80] -= 0.3
@@ -102,7 +97,7 @@ def test_what_views_look_through_is_removed(ring: list[DepthMap]) -> None:
     assert (np.linalg.norm(mesh.vertices, axis=1) > 1.1).mean() < 1e-3
 
 
-def test_hopeless_maps_are_refused(ring: list[DepthMap]) -> None:
+def test_hopeless_maps_are_refused(ring):
     empty = DepthMap(0, ring[0].P, np.full(SHAPE, np.nan, np.float32), ring[0].std, ring[0].views)
     with pytest.raises(StageFailure, match="no surface"):
         VolumetricFusion().fuse([empty])
@@ -111,7 +106,7 @@ def test_hopeless_maps_are_refused(ring: list[DepthMap]) -> None:
         VolumetricFusion().fuse([vague])
 
 
-def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges() -> None:
+def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges():
     P = looking_at_origin(0.3, 0.0, 3.5)
     given = sphere_map(0, P)
     behind = np.where(np.isnan(given.depth), np.float32(6.0), given.depth)
@@ -130,7 +125,7 @@ def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges() -> None:
     assert len(np.unique(part)) == 2
 
 
-def test_holes_stay_holes_and_steps_thin_out() -> None:
+def test_holes_stay_holes_and_steps_thin_out():
     P = looking_at_origin(0.0, 0.0, 3.5)
     given = sphere_map(0, P)
     full, coarse = surface_from_depth(given), surface_from_depth(given, step=3)
@@ -143,7 +138,7 @@ def test_holes_stay_holes_and_steps_thin_out() -> None:
         surface_from_depth(given, step=0)
 
 
-def test_crumbs_are_dropped() -> None:
+def test_crumbs_are_dropped():
     grid = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     vertices = np.concatenate([grid, 0.01 * grid + 5.0])
     faces = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6]])
@@ -156,7 +151,7 @@ def test_crumbs_are_dropped() -> None:
     assert keep_large_parts(empty) is empty
 
 
-def test_sheets_show_each_place_once(ring: list[DepthMap]) -> None:
+def test_sheets_show_each_place_once(ring):
     mesh = DepthSheets(step=1).fuse(ring)
     radius = np.linalg.norm(mesh.vertices, axis=1)
     assert np.abs(radius - 1.0).max() < 1e-3
@@ -168,17 +163,17 @@ def test_sheets_show_each_place_once(ring: list[DepthMap]) -> None:
     assert len(one.faces) == pytest.approx(len(mesh.faces) / 9, rel=0.25)
 
 
-def test_hopeless_sheets_are_refused(ring: list[DepthMap]) -> None:
+def test_hopeless_sheets_are_refused(ring):
     empty = DepthMap(0, ring[0].P, np.full(SHAPE, np.nan, np.float32), ring[0].std, ring[0].views)
     for maps in ([], [empty], [empty, empty]):
         with pytest.raises(StageFailure, match="no surface"):
             DepthSheets().fuse(maps)
     for wrong in ({"step": 0}, {"same": -1.0}, {"grazing_deg": 90.0}):
         with pytest.raises(ValueError, match="needed"):
-            DepthSheets(**wrong)  # type: ignore[arg-type]
+            DepthSheets(**wrong)
 
 
-def test_the_model_is_made_of_fitted_surfaces_where_asked() -> None:
+def test_the_model_is_made_of_fitted_surfaces_where_asked():
     noise = 0.01
     noisy = [sphere_map(m.view, m.P, noise=noise) for m in ring_of()[:3]]
     views = [photograph(m) for m in ring_of()[:3]]
@@ -191,7 +186,7 @@ def test_the_model_is_made_of_fitted_surfaces_where_asked() -> None:
     assert off[1] < off[0] / 2.5
 
 
-def slanted(degrees: float) -> DepthMap:
+def slanted(degrees):
     """A plane that rays in the middle of the picture meet at this angle."""
     y = np.indices(SHAPE)[0]
     rise = (y - K[1, 2]) / K[1, 1]
@@ -202,7 +197,7 @@ def slanted(degrees: float) -> DepthMap:
 
 
 @pytest.mark.parametrize("degrees", [90.0, 40.0, 15.0])
-def test_how_far_rays_come_off_a_plane(degrees: float) -> None:
+def test_how_far_rays_come_off_a_plane(degrees):
     depth = slanted(degrees).depth if degrees < 90.0 else np.ones(SHAPE, np.float32)
     found = leaning(depth, K)
     normal = np.array([0.0, np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
@@ -213,7 +208,7 @@ def test_how_far_rays_come_off_a_plane(degrees: float) -> None:
     np.testing.assert_allclose(found[inner], (rays @ normal)[inner], rtol=2e-3)
 
 
-def test_ground_seen_at_a_slant_has_no_holes() -> None:
+def test_ground_seen_at_a_slant_has_no_holes():
     ground = slanted(8.0)
     mesh = VolumetricFusion().fuse([ground])
     camera = Camera.from_matrix(ground.P, (SHAPE[1], SHAPE[0]))
@@ -225,7 +220,7 @@ def test_ground_seen_at_a_slant_has_no_holes() -> None:
     assert np.median(np.abs(seen / ground.depth - 1.0)[inner]) < 0.004
 
 
-def test_holes_of_a_sheet_are_closed_by_another() -> None:
+def test_holes_of_a_sheet_are_closed_by_another():
     first, second = (sphere_map(k, looking_at_origin(0.2 * k, 0.3, 3.5)) for k in (0, 1))
     depth = first.depth.copy()
     depth[60, 80] = np.nan  # four squares of the sheet, one pixel of the map

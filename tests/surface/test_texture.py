@@ -1,19 +1,14 @@
 """Texture from photographs: what is seen, which photograph is taken, seams, and what nobody sees."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
-from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.color_correction import SingleView
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.mesh import face_neighbours
@@ -26,11 +21,11 @@ GAINS = (1.0, 0.85, 1.1, 0.95, 1.05, 0.9, 1.0, 1.1)
 
 
 @pytest.fixture(scope="module")
-def sphere() -> TexturedMesh:
+def sphere():
     return VolumetricFusion().fuse(ring_of())
 
 
-def difference(mesh: TexturedMesh) -> F64:
+def difference(mesh):
     """Rendered less painted colours (N, 3) of the sphere from where no photograph was taken, off its rim."""
     truth = sphere_map(0, looking_at_origin(0.4, 0.3, 3.2))
     seen = render(mesh, Camera.from_matrix(truth.P, (160, 120)))
@@ -41,7 +36,7 @@ def difference(mesh: TexturedMesh) -> F64:
     return seen.color[where] - paint(points)[where]
 
 
-def test_a_new_view_shows_the_painted_sphere(sphere: TexturedMesh) -> None:
+def test_a_new_view_shows_the_painted_sphere(sphere):
     mesh = TextureAtlas().texture(sphere, [photograph(m) for m in ring_of()])
     assert mesh.uv is not None
     assert mesh.texture is not None
@@ -53,7 +48,7 @@ def test_a_new_view_shows_the_painted_sphere(sphere: TexturedMesh) -> None:
 
 
 @pytest.mark.parametrize("kind", [SingleView, BlendedViews])
-def test_exposures_are_levelled(sphere: TexturedMesh, kind: type[SingleView] | type[BlendedViews]) -> None:
+def test_exposures_are_levelled(sphere, kind):
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
     rough = TextureAtlas(painter=SingleView(level=False)).texture(sphere, views)
     level = TextureAtlas(painter=kind(level=True)).texture(sphere, views)
@@ -62,14 +57,14 @@ def test_exposures_are_levelled(sphere: TexturedMesh, kind: type[SingleView] | t
     assert np.median(jump[1]) < 0.3 * np.median(jump[0])
 
 
-def seam_jumps(mesh: TexturedMesh) -> F64:
+def seam_jumps(mesh):
     """Difference of colour across every side of the mesh whose faces are not of one chart."""
     assert mesh.uv is not None
     assert mesh.texture is not None
     neighbours = face_neighbours(mesh.faces)
     face, side = np.nonzero(neighbours >= 0)
     other = neighbours[face, side]
-    textured = ~mesh.untextured[face] & ~mesh.untextured[other]  # type: ignore[index]
+    textured = ~mesh.untextured[face] & ~mesh.untextured[other]
     face, side, other = face[textured], side[textured], other[textured]
     vertex = mesh.faces[face, side]
     at = np.argmax(mesh.faces[other] == vertex[:, None], axis=1)
@@ -83,7 +78,7 @@ def seam_jumps(mesh: TexturedMesh) -> F64:
     return np.abs(a - b).mean(axis=1)
 
 
-def test_what_is_hidden_or_cut_off_is_not_seen(sphere: TexturedMesh) -> None:
+def test_what_is_hidden_or_cut_off_is_not_seen(sphere):
     view = photograph(ring_of()[0])
     quality = face_quality(sphere, [view])[:, 0]
     middle = sphere.vertices[sphere.faces].mean(axis=1)
@@ -97,7 +92,7 @@ def test_what_is_hidden_or_cut_off_is_not_seen(sphere: TexturedMesh) -> None:
     assert face_quality(sphere, [half])[right, 0].max() == 0.0
 
 
-def test_charts_are_large_and_take_what_sees_them(sphere: TexturedMesh) -> None:
+def test_charts_are_large_and_take_what_sees_them(sphere):
     views = [photograph(m) for m in ring_of()]
     quality = face_quality(sphere, views)
     neighbours = face_neighbours(sphere.faces)
@@ -112,7 +107,7 @@ def test_charts_are_large_and_take_what_sees_them(sphere: TexturedMesh) -> None:
     assert charts < 40
 
 
-def test_rectangles_do_not_overlap() -> None:
+def test_rectangles_do_not_overlap():
     sizes = np.random.default_rng(0).integers(0, 40, (200, 2))
     places, (width, height) = pack_rectangles(sizes)
     taken = np.zeros((height, width), dtype=int)
@@ -124,7 +119,7 @@ def test_rectangles_do_not_overlap() -> None:
     assert width * height < 1.5 * sizes.prod(axis=1).sum()
 
 
-def test_the_atlas_is_no_larger_than_allowed_and_the_same_for_any_threads(sphere: TexturedMesh) -> None:
+def test_the_atlas_is_no_larger_than_allowed_and_the_same_for_any_threads(sphere):
     views = [photograph(m) for m in ring_of()]
     one, two = (TextureAtlas(max_texels=20_000).texture(sphere, views, threads=n) for n in (1, 2))
     assert one.texture is not None
@@ -134,7 +129,7 @@ def test_the_atlas_is_no_larger_than_allowed_and_the_same_for_any_threads(sphere
     assert np.sqrt(np.mean(difference(one) ** 2)) < 20.0
 
 
-def test_an_atlas_that_cannot_be_as_small_as_asked_is_refused(sphere: TexturedMesh) -> None:
+def test_an_atlas_that_cannot_be_as_small_as_asked_is_refused(sphere):
     views = [photograph(m) for m in ring_of()]
     with pytest.raises(StageFailure, match=r"too large; \d+ pieces take \d+ texels, allowed are 40"):
         TextureAtlas(max_texels=40).texture(sphere, views)
@@ -143,12 +138,12 @@ def test_an_atlas_that_cannot_be_as_small_as_asked_is_refused(sphere: TexturedMe
 
 
 @pytest.mark.parametrize("setting", [{"power": -1.0}, {"scatter": 0.0}, {"feather_px": 0.0}])
-def test_blending_settings_without_a_meaning_are_refused(setting: dict[str, Any]) -> None:
+def test_blending_settings_without_a_meaning_are_refused(setting):
     with pytest.raises(ValueError, match="needed"):
         BlendedViews(**setting)
 
 
-def test_unseen_faces_take_the_colour_of_their_surroundings(sphere: TexturedMesh) -> None:
+def test_unseen_faces_take_the_colour_of_their_surroundings(sphere):
     red = [replace(v, rgb=np.full_like(v.rgb, [200, 30, 20])) for v in map(photograph, ring_of()[:3])]
     mesh = TextureAtlas().texture(sphere, red)
     assert mesh.untextured is not None
@@ -159,7 +154,7 @@ def test_unseen_faces_take_the_colour_of_their_surroundings(sphere: TexturedMesh
     )
 
 
-def test_a_surface_that_nobody_sees_is_refused(sphere: TexturedMesh) -> None:
+def test_a_surface_that_nobody_sees_is_refused(sphere):
     away = photograph(ring_of()[0])
     away = replace(away, seen=np.zeros_like(away.seen))
     with pytest.raises(StageFailure, match="no texture"):

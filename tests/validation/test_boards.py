@@ -1,7 +1,5 @@
 """Photographs of a board, and what OpenCV makes of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ except NoReference as missing:
 VIEWS = 5
 
 
-def test_boards_are_seen_whole_and_from_all_sides() -> None:
+def test_boards_are_seen_whole_and_from_all_sides():
     for views in (VIEWS, 12, 16):
         places = make_board(LENS, views).projections()
         assert places.min() > 15.0
@@ -29,7 +27,7 @@ def test_boards_are_seen_whole_and_from_all_sides() -> None:
 
 
 @pytest.mark.parametrize("way", [RENDERED, LENS])
-def test_a_calibration_finds_the_camera_that_photographed(way: str) -> None:
+def test_a_calibration_finds_the_camera_that_photographed(way):
     board = make_board(way, VIEWS)
     corners = np.array([board_corners(picture, CORNERS) for picture in photographs(way, board)])
     found = calibrate_from_corners(board.X, list(corners), SIZE)

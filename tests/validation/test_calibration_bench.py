@@ -1,7 +1,5 @@
 """The tables of self-calibration on photographs: rows of several methods, some of which failed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,26 +7,24 @@ import pytest
 
 from tests.validation.test_cameras import _reconstruction, _truth
 from thesisrecon.config import PipelineConfig
-from thesisrecon.records import Reconstruction
+from validation.metrics.intervals import IntervalScores, holding_std
+from validation.scenes.real import Scene
 from validation.studies.calibration_bench import Rows
 from validation.studies.calibration_parts import keep_observations, one_camera
 from validation.studies.calibration_real import _change_pct, _pooled, _told
 from validation.studies.reconstruction import COLMAP, OURS
-from validation.metrics.intervals import IntervalScores, holding_std
-from validation.metrics.record import Metric
-from validation.scenes.real import Scene
 
 
-def rows_of(models: dict[str, Reconstruction | None]) -> Rows:
+def rows_of(models):
     truth = _truth()
     return Rows("a set", Scene("a set", (), truth.K, truth.R, truth.C), models)
 
 
-def value(rows: list[Metric], name: str, method: str = OURS) -> float | None:
+def value(rows, name, method=OURS):
     return next(row for row in rows if row.name == name).values[method]
 
 
-def one_off() -> Reconstruction:
+def one_off():
     """The truth but for a focal that is 1 % too long."""
     model = _reconstruction(_truth())
     assert model.K is not None
@@ -37,7 +33,7 @@ def one_off() -> Reconstruction:
     return replace(model, K=K)
 
 
-def test_a_method_that_failed_has_no_camera_and_no_error() -> None:
+def test_a_method_that_failed_has_no_camera_and_no_error():
     rows = rows_of({OURS: one_off(), COLMAP: None})
     rows.registered()
     rows.focals(0.2, 0.5)
@@ -52,7 +48,7 @@ def test_a_method_that_failed_has_no_camera_and_no_error() -> None:
     assert np.isinf(rows.all_focals(None)).all()
 
 
-def test_cameras_that_are_missing_count_in_what_is_pooled_over_seeds() -> None:
+def test_cameras_that_are_missing_count_in_what_is_pooled_over_seeds():
     errors = {OURS: [np.array([0.1, 0.3]), np.array([0.2, np.inf])]}
     registered, median, worst = _pooled("all", errors)
     assert registered.values[OURS] == 3.0
@@ -61,7 +57,7 @@ def test_cameras_that_are_missing_count_in_what_is_pooled_over_seeds() -> None:
     assert worst.values[OURS] == pytest.approx(0.3)
 
 
-def test_a_change_is_relative_and_unknown_without_a_focal() -> None:
+def test_a_change_is_relative_and_unknown_without_a_focal():
     assert _change_pct(1010.0, 1000.0) == pytest.approx(1.0)
     assert _change_pct(None, 1000.0) is None
     told = _told(5000.0)(PipelineConfig()).intrinsics
@@ -69,14 +65,14 @@ def test_a_change_is_relative_and_unknown_without_a_focal() -> None:
     assert told.focal_std_rel == pytest.approx(np.log(5.0))
 
 
-def test_a_value_that_all_views_share_counts_once() -> None:
+def test_a_value_that_all_views_share_counts_once():
     scores = IntervalScores(np.array([[np.nan] * 3, [1.0] * 3, [1.0] * 3]), np.array([np.nan, 0.1, 0.1]))
     assert one_camera(scores, "shared").z.shape == (1, 3)
     assert one_camera(scores, "per-image") is scores
 
 
-def test_cameras_that_err_together_make_a_share_as_unsure_as_scenes_do() -> None:
-    def scene(z: float, cameras: int) -> IntervalScores:
+def test_cameras_that_err_together_make_a_share_as_unsure_as_scenes_do():
+    def scene(z, cameras):
         return IntervalScores(np.full((cameras, 3), z), np.full(cameras, 0.1))
 
     alone = [scene(5.0 if n % 10 == 0 else 0.0, 1) for n in range(100)]
@@ -85,7 +81,7 @@ def test_cameras_that_err_together_make_a_share_as_unsure_as_scenes_do() -> None
     assert holding_std(together, (0,)) == pytest.approx(holding_std(alone, (0,)))
 
 
-def test_points_that_one_photograph_sees_go_with_the_observations_taken() -> None:
+def test_points_that_one_photograph_sees_go_with_the_observations_taken():
     tracks = _reconstruction(_truth()).tracks
     kept = (tracks.view_index < 2) & ~((tracks.view_index == 0) & (tracks.point_index == 4))
     less = keep_observations(tracks, kept)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -8,24 +6,19 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.records import Reconstruction, Tracks
-from validation.metrics.cameras import (
-    TrueCameras,
-    measure_cameras,
-    measure_reprojection,
-    rotation_errors_deg,
-)
+from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection, rotation_errors_deg
 
 V, N = 6, 30
 
 
-def _truth() -> TrueCameras:
+def _truth():
     rng = np.random.default_rng(2)
     K = np.broadcast_to([[1000.0, 0, 510.0], [0, 1002.0, 390.0], [0, 0, 1]], (V, 3, 3)).copy()
     R = Rotation.from_rotvec(rng.normal(0, 0.3, (V, 3))).as_matrix()
     return TrueCameras(K, R, rng.normal(0, 1, (V, 3)) - [0, 0, 6])
 
 
-def _reconstruction(truth: TrueCameras, *, k1: float = 0.0) -> Reconstruction:
+def _reconstruction(truth, *, k1=0.0):
     """The truth seen in another world frame: turned, shrunk and moved."""
     rng = np.random.default_rng(3)
     turn, shrink, move = Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix(), 0.1, np.array([3.0, 2.0, 1.0])
@@ -56,7 +49,7 @@ def _reconstruction(truth: TrueCameras, *, k1: float = 0.0) -> Reconstruction:
     )
 
 
-def test_the_truth_in_another_frame_has_no_error() -> None:
+def test_the_truth_in_another_frame_has_no_error():
     truth = _truth()
     errors = measure_cameras(_reconstruction(truth, k1=-0.1), truth)
     assert errors.focal_error_pct < 1e-12
@@ -66,7 +59,7 @@ def test_the_truth_in_another_frame_has_no_error() -> None:
     assert measure_reprojection(_reconstruction(truth, k1=-0.1)).rms_px < 1e-9
 
 
-def test_known_errors_are_measured_in_their_units() -> None:
+def test_known_errors_are_measured_in_their_units():
     truth = _truth()
     K = truth.K.copy()
     K[:, [0, 1], [0, 1]] *= 1.004
@@ -89,7 +82,7 @@ def test_known_errors_are_measured_in_their_units() -> None:
     assert 0.004 < centre < 0.02
 
 
-def test_only_registered_views_count() -> None:
+def test_only_registered_views_count():
     truth = _truth()
     registered = np.arange(V) != 2
     ours = _reconstruction(truth)
@@ -107,7 +100,7 @@ def test_only_registered_views_count() -> None:
         measure_cameras(partial, replace(truth, K=truth.K[1:]))
 
 
-def test_reprojection_is_recomputed_from_inliers_alone() -> None:
+def test_reprojection_is_recomputed_from_inliers_alone():
     ours = _reconstruction(_truth())
     xy = ours.tracks.xy.copy()
     xy[:, 0] += 0.5
@@ -121,7 +114,7 @@ def test_reprojection_is_recomputed_from_inliers_alone() -> None:
         measure_reprojection(replace(ours, inlier=np.zeros(V * N, bool)))
 
 
-def test_large_rotation_errors_are_angles_too() -> None:
+def test_large_rotation_errors_are_angles_too():
     R = np.broadcast_to(np.eye(3), (5, 3, 3)).copy()
     R[0] = Rotation.from_rotvec([0, np.radians(120.0), 0]).as_matrix()
     angles = rotation_errors_deg(R, np.broadcast_to(np.eye(3), (5, 3, 3)))

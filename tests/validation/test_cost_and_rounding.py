@@ -1,7 +1,5 @@
 """The checks of growing cost, of workers and of rounding: what they compute of what they measure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +7,12 @@ import pytest
 
 from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import MetricResult
+from validation.scenes.many_views import walk
 from validation.studies import growth_of_cost, parallel, perturbation
 from validation.studies.growth_of_cost import Cost, Meter
-from validation.scenes.many_views import walk
 
 
-def test_a_longer_walk_begins_with_the_shorter_and_looks_at_the_yard() -> None:
+def test_a_longer_walk_begins_with_the_shorter_and_looks_at_the_yard():
     few, many = walk(5, (480, 360)), walk(40, (480, 360))
     for a, b in zip(few, many, strict=False):
         np.testing.assert_array_equal(a.R, b.R)
@@ -27,7 +24,7 @@ def test_a_longer_walk_begins_with_the_shorter_and_looks_at_the_yard() -> None:
     assert (middle[:, 2] > 4.0).all()
 
 
-def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_path) -> None:
+def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_path):
     CALLS.clear()
     meter = Meter()
     reconstruct(photographs(4), tmp_path, config=fake_config(), until="metric", progress=meter.hear)
@@ -46,7 +43,7 @@ def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_
     assert next(row for row in rows if row.startswith("| points")).endswith("| 2.00 |")
 
 
-def test_the_efficiency_is_that_of_two_workers() -> None:
+def test_the_efficiency_is_that_of_two_workers():
     found = {"one thread": [(10.0, 10.0)], "two processes": [(6.25, 12.5)]}
     rows = {row.name: row for row in parallel.rows("a set", found)}
     assert rows["efficiency by the clock"].values == {"two processes": 0.8}
@@ -54,7 +51,7 @@ def test_the_efficiency_is_that_of_two_workers() -> None:
     assert rows["efficiency by work"].verdict == "missed"
 
 
-def test_shaken_numbers_are_moved_by_their_rounding() -> None:
+def test_shaken_numbers_are_moved_by_their_rounding():
     rng = np.random.default_rng(0)
     for kind, rel in ((np.float64, 1e-12), (np.float32, 1.3e-7)):
         values = np.linspace(1.0, 500.0, 1000).astype(kind)
@@ -64,7 +61,7 @@ def test_shaken_numbers_are_moved_by_their_rounding() -> None:
 
 
 @pytest.mark.parametrize("stage", perturbation.STAGES)
-def test_a_shaken_run_lies_beside_the_still_one(stage: str, tmp_path) -> None:
+def test_a_shaken_run_lies_beside_the_still_one(stage, tmp_path):
     """Fakes that know the truth: what is shaken is the stage that was asked for, and nothing comes of it."""
     config = fake_config()
     still = reconstruct(photographs(4), tmp_path, config=config, until="metric").metric
@@ -80,7 +77,7 @@ def test_a_shaken_run_lies_beside_the_still_one(stage: str, tmp_path) -> None:
     assert moved.registered == 0
 
 
-def test_what_moved_is_told_in_standard_deviations() -> None:
+def test_what_moved_is_told_in_standard_deviations():
     still = _result()
     further = replace(still.intrinsics[0]["focal_px"], value=100.5)
     other = replace(still, intrinsics=({**still.intrinsics[0], "focal_px": further}, *still.intrinsics[1:]))
@@ -93,7 +90,7 @@ def test_what_moved_is_told_in_standard_deviations() -> None:
     assert perturbation.rows("a set", {"corners": [moved]})[0].verdict == "reached"
 
 
-def _result() -> MetricResult:
+def _result():
     from tests.fake_stages import FakeCalibrator, FakeMetric, FakeProjective, FakeTracks
 
     features = [FakeDetector().detect(image) for image in photographs(4)]
@@ -104,5 +101,5 @@ def _result() -> MetricResult:
     class Assumed:
         mean, focal_known = np.zeros(4), np.zeros(4, dtype=bool)
 
-    calibration = FakeCalibrator().calibrate(projective, assumed=Assumed(), rng=rng)
-    return FakeMetric().refine(projective, calibration, assumed=Assumed(), rng=rng)
+    calibration = FakeCalibrator().calibrate(projective, prior=Assumed(), rng=rng)
+    return FakeMetric().refine(projective, calibration, prior=Assumed(), rng=rng)

@@ -5,19 +5,15 @@ luck; sampling without refinement (OpenCV's FM_RANSAC) is beyond most of them. H
 themselves good to half a pixel or so, which is why their limits differ from pair to pair.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from validation.metrics.epipolar import precision_recall, rms_epipolar_distance
 from validation.scenes.real import load_real_scene
-from validation.scenes.real_pairs import RealPair, adelaide_pairs, camera_pairs, kusvod2_pairs
+from validation.scenes.real_pairs import adelaide_pairs, camera_pairs, kusvod2_pairs
 
 SEEDS = (0, 1, 2)
 ORDERS = (0, 1, 2, 3, 4)
@@ -30,11 +26,11 @@ pytestmark = pytest.mark.real
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("matches")
 
 
-def pairs_or_skip(pairs: Iterator[RealPair]) -> list[RealPair]:
+def pairs_or_skip(pairs):
     found = list(pairs)
     if not found:
         pytest.skip("the real photographs are not on this machine (THESISRECON_DATA)")
@@ -42,7 +38,7 @@ def pairs_or_skip(pairs: Iterator[RealPair]) -> list[RealPair]:
 
 
 @pytest.mark.parametrize("name", HAND_MADE_PX)
-def test_hand_made_correspondences_lie_on_their_lines(name: str, cache: Path) -> None:
+def test_hand_made_correspondences_lie_on_their_lines(name, cache):
     (pair,) = pairs_or_skip(kusvod2_pairs(cache, (name,)))
     fits = (estimate_fundamental(pair.xy1, pair.xy2, seed=seed) for seed in ORDERS)
     errors = np.array([rms_epipolar_distance(fit.F, pair.truth) for fit in fits])
@@ -51,7 +47,7 @@ def test_hand_made_correspondences_lie_on_their_lines(name: str, cache: Path) ->
 
 
 @pytest.mark.parametrize("name", CAMERAS_PX)
-def test_correspondences_of_the_true_cameras_lie_on_their_lines(name: str, cache: Path) -> None:
+def test_correspondences_of_the_true_cameras_lie_on_their_lines(name, cache):
     for pair in pairs_or_skip(islice(camera_pairs(load_real_scene(name), cache), 2)):
         assert len(pair.truth) > 300
         assert rms_epipolar_distance(pair.F, pair.truth) < 1e-6
@@ -61,7 +57,7 @@ def test_correspondences_of_the_true_cameras_lie_on_their_lines(name: str, cache
 
 
 @pytest.mark.parametrize("name", LABELLED)
-def test_inliers_are_the_matches_labelled_right(name: str) -> None:
+def test_inliers_are_the_matches_labelled_right(name):
     (pair,) = [p for p in pairs_or_skip(adelaide_pairs()) if p.name == name]
     for seed in SEEDS:
         fit = estimate_fundamental(pair.xy1, pair.xy2, seed=seed)

@@ -1,7 +1,5 @@
 """The counts of the certainty check, on a few facades."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 from thesisrecon.epipolar.configuration import Configuration

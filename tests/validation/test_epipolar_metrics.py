@@ -1,24 +1,17 @@
 """The pure parts of the comparison of F on photographs: errors, shares, truth from cameras, and the seeds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.geometry.two_view import symmetric_residuals
-from validation.studies.epipolar_real import called_sure, check_cameras, least
-from validation.metrics.epipolar import (
-    NONE_PX,
-    precision_recall,
-    rms_epipolar_distance,
-    rms_sampson_distance,
-)
+from validation.metrics.epipolar import NONE_PX, precision_recall, rms_epipolar_distance, rms_sampson_distance
 from validation.references.fundamental import MINIMAL, OURS, SOLVERS, Estimate, estimate_with
 from validation.scenes.real_pairs import RealPair, exact_correspondences
+from validation.studies.epipolar_real import called_sure, check_cameras, least
 
 
-def test_errors_of_a_shifted_rectified_pair() -> None:
+def test_errors_of_a_shifted_rectified_pair():
     # The lines of a rectified pair are its rows: a step of 3 px down is 3 px off in either image.
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     xy = np.random.default_rng(0).uniform(0.0, 500.0, (20, 2))
@@ -27,20 +20,20 @@ def test_errors_of_a_shifted_rectified_pair() -> None:
     assert rms_sampson_distance(F, truth) == pytest.approx(3.0 / np.sqrt(2.0))
 
 
-def test_no_matrix_has_the_largest_error() -> None:
+def test_no_matrix_has_the_largest_error():
     truth = np.array([[0.0, 0.0, 0.0, 1e6]])
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     for error in (rms_epipolar_distance, rms_sampson_distance):
         assert error(None, truth) == error(F, truth) == NONE_PX
 
 
-def test_precision_and_recall_by_hand() -> None:
+def test_precision_and_recall_by_hand():
     right = np.array([True, True, True, False])
     assert precision_recall(np.array([True, False, False, True]), right) == pytest.approx((0.5, 1.0 / 3.0))
     assert precision_recall(np.zeros(4, dtype=bool), right) == (0.0, 0.0)
 
 
-def test_correspondences_of_cameras_are_exact_and_leave_out_wrong_matches() -> None:
+def test_correspondences_of_cameras_are_exact_and_leave_out_wrong_matches():
     rng = np.random.default_rng(1)
     pair = make_pair(200, rng)
     xy1, xy2, wrong = spoil(pair, rng, sigma=0.3, outliers=0.3)
@@ -51,7 +44,7 @@ def test_correspondences_of_cameras_are_exact_and_leave_out_wrong_matches() -> N
 
 
 @pytest.mark.parametrize("method", [m for m in SOLVERS if m != MINIMAL])
-def test_every_method_keeps_the_order_of_the_matches(method: str) -> None:
+def test_every_method_keeps_the_order_of_the_matches(method):
     rng = np.random.default_rng(2)
     pair = make_pair(300, rng)
     xy1, xy2, wrong = spoil(pair, rng, sigma=0.1, outliers=0.2)
@@ -63,7 +56,7 @@ def test_every_method_keeps_the_order_of_the_matches(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", [m for m in SOLVERS if "default" not in m and "long" not in m])
-def test_seeds_differ_and_repeat(method: str) -> None:
+def test_seeds_differ_and_repeat(method):
     rng = np.random.default_rng(4)
     pair = make_pair(60, rng)
     xy1, xy2, _ = spoil(pair, rng, sigma=1.5, outliers=0.4)
@@ -74,7 +67,7 @@ def test_seeds_differ_and_repeat(method: str) -> None:
     assert len(set(errors)) > 1
 
 
-def test_hopeless_matches_give_no_matrix_and_no_exception() -> None:
+def test_hopeless_matches_give_no_matrix_and_no_exception():
     same = np.zeros((30, 2))
     for method in SOLVERS:
         found = estimate_with(method, same, same, threshold_px=1.0, seed=0)
@@ -82,13 +75,13 @@ def test_hopeless_matches_give_no_matrix_and_no_exception() -> None:
         assert found.inliers.shape == (30,)
 
 
-def test_the_target_is_the_best_rival() -> None:
+def test_the_target_is_the_best_rival():
     values = {OURS: 0.1, "PoseLib": 0.4, "PoseLib long": 0.3, "FM_RANSAC": 0.2}
     assert least(values, ("PoseLib",)) == 0.3
     assert least({OURS: 0.1}, ("PoseLib",)) is None
 
 
-def test_a_wrong_matrix_is_called_sure_only_where_its_matches_are_said_to_determine_it() -> None:
+def test_a_wrong_matrix_is_called_sure_only_where_its_matches_are_said_to_determine_it():
     rng = np.random.default_rng(0)
     X = rng.uniform(-1.0, 1.0, (200, 3)) + np.array([0.0, 0.0, 5.0])
     xy1 = 1000.0 * X[:, :2] / X[:, 2:]
@@ -105,7 +98,7 @@ def test_a_wrong_matrix_is_called_sure_only_where_its_matches_are_said_to_determ
     assert not called_sure(found, RealPair("plane", plane1, plane2, truth=other), 0.0)
 
 
-def test_rows_of_a_scene_judge_ours_against_poselib() -> None:
+def test_rows_of_a_scene_judge_ours_against_poselib():
     rng = np.random.default_rng(5)
     pairs = []
     for k in range(2):

@@ -5,21 +5,18 @@ are stricter than what is promised (1.05, 1.4 and 1.7 times SIFT's verified matc
 and (i, i+3); 0.6, 0.7 and 0.75 of its sigma).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project_camera
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import read_images
 from thesisrecon.records import Features, Image, Reconstruction, Tracks, TwoView
+from validation.scenes.real import load_real_scene
 from validation.studies.front_end_invariance import Copy, make_copies, repeatability, score_copy
 from validation.studies.front_end_kermit import CONTRADICTS_PX, disagreement, judge
 from validation.studies.front_end_pairs import OURS, SIFT, check_pairs, front_ends, measure_pairs
-from validation.scenes.real import load_real_scene
 
 # (scene, gap): pairs measured, least ratio of verified matches and largest of sigma, and error of F in px.
 LIMITS = {
@@ -33,7 +30,7 @@ COPIES = {"turned by 45 degrees": 800, "scaled by 0.5": 3000, "times 0.25": 3500
 
 @pytest.mark.real
 @pytest.mark.parametrize(("scene", "gap"), LIMITS)
-def test_pairs_have_more_and_finer_verified_matches_than_sift(scene: str, gap: int, tmp_path: Path) -> None:
+def test_pairs_have_more_and_finer_verified_matches_than_sift(scene, gap, tmp_path):
     most, verified, sigma, error_px = LIMITS[scene, gap]
     pairs = list(measure_pairs(scene, (gap,), tmp_path, names=(OURS, SIFT), most=most))
     if not pairs:
@@ -47,11 +44,11 @@ def test_pairs_have_more_and_finer_verified_matches_than_sift(scene: str, gap: i
 
 
 @pytest.mark.real
-def test_copies_of_a_photograph_match_it_where_they_should() -> None:
+def test_copies_of_a_photograph_match_it_where_they_should():
     scene = load_real_scene("fountain-P11")
     if scene is None:
         pytest.skip("the real photographs are not on this machine (THESISRECON_DATA)")
-    image = read_photographs(scene.image_paths[5:6], max_size_px=1536).images[0]
+    image = read_images(scene.image_paths[5:6], max_size_px=1536).images[0]
     copies = {copy.name: copy for copy in make_copies(image.rgb)}
     for name, least in COPIES.items():
         score = score_copy(front_ends()[OURS], image, copies[name])
@@ -60,14 +57,14 @@ def test_copies_of_a_photograph_match_it_where_they_should() -> None:
 
 
 @pytest.fixture
-def smooth_picture() -> Image:
+def smooth_picture():
     y, x = np.mgrid[:90, :140]
     wave = 100.0 + 60.0 * np.sin(x / 11.0) * np.cos(y / 9.0) + 0.3 * x
     rgb = np.repeat(np.rint(wave).astype(np.uint8)[..., None], 3, axis=2)
     return Image("waves", rgb, (140, 90))
 
 
-def test_the_maps_of_copies_tell_where_each_pixel_went(smooth_picture: Image) -> None:
+def test_the_maps_of_copies_tell_where_each_pixel_went(smooth_picture):
     names = []
     for copy in make_copies(smooth_picture.rgb):
         names.append(copy.name)
@@ -81,12 +78,12 @@ def test_the_maps_of_copies_tell_where_each_pixel_went(smooth_picture: Image) ->
     assert len(names) == 7
 
 
-def test_repeatability_counts_each_corner_once() -> None:
+def test_repeatability_counts_each_corner_once():
     xy = np.array([[10.0, 10.0], [30.0, 10.0], [50.0, 40.0], [90.0, 10.0]])
     shift = np.array([[1.0, 0.0, -5.0], [0.0, 1.0, 0.0]])
     copy = Copy("moved", np.zeros((60, 80, 3), np.uint8), shift)
 
-    def at(places: np.ndarray) -> Features:
+    def at(places):
         ones = np.ones(len(places), np.float32)
         return Features(places, ones, ones)
 
@@ -97,7 +94,7 @@ def test_repeatability_counts_each_corner_once() -> None:
     assert share == pytest.approx(2.0 / 3.0)
 
 
-def _model_and_pair(k1: float, moved: float) -> tuple[Reconstruction, TwoView]:
+def _model_and_pair(k1, moved):
     """Two cameras with distortion that saw 50 points; the model has the second one ``moved`` up."""
     rng = np.random.default_rng(0)
     X = rng.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 5.0], (50, 3))
@@ -129,7 +126,7 @@ def _model_and_pair(k1: float, moved: float) -> tuple[Reconstruction, TwoView]:
     return model, pair
 
 
-def test_a_pair_agrees_with_the_cameras_that_saw_it_and_contradicts_others() -> None:
+def test_a_pair_agrees_with_the_cameras_that_saw_it_and_contradicts_others():
     model, pair = _model_and_pair(k1=-0.12, moved=0.0)
     assert disagreement(pair, model) < 1e-6
     assert not judge(pair, {"a model": model}).contradicts("a model")
@@ -138,7 +135,7 @@ def test_a_pair_agrees_with_the_cameras_that_saw_it_and_contradicts_others() -> 
     assert judge(pair, {"a model": model}).contradicts("a model")
 
 
-def test_a_pair_whose_view_is_not_in_the_model_cannot_contradict_it() -> None:
+def test_a_pair_whose_view_is_not_in_the_model_cannot_contradict_it():
     model, pair = _model_and_pair(k1=0.0, moved=0.1)
     partial = replace(model, registered=np.array([True, False]))
     assert np.isnan(disagreement(pair, partial))

@@ -1,17 +1,11 @@
 """The fuzzing of COLMAP's binary files: its good inputs are good, and what the reader does wrong is found."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
-import pytest
-
 from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.io.colmap_model import MODEL_NUMBERS, inconsistency
 from validation.studies import fuzz_colmap
 
 
-def test_good_inputs_are_models(tmp_path: Path) -> None:
+def test_good_inputs_are_models(tmp_path):
     inputs = fuzz_colmap.corpus()
     assert len(inputs) == len(MODEL_NUMBERS) + 6
     assert max(map(len, inputs)) <= fuzz_colmap.LARGEST_INPUT
@@ -28,13 +22,11 @@ def test_good_inputs_are_models(tmp_path: Path) -> None:
         assert inconsistency(read_colmap_model(tmp_path)) == ""
 
 
-def test_nothing_is_found_and_a_fault_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_is_found_and_a_fault_is(monkeypatch, capsys):
     assert fuzz_colmap.main(["--plain", "--seconds", "1"]) == 0
     assert "nothing found" in capsys.readouterr().out
 
-    def careless(data: bytes, _: Path) -> int:
+    def careless(data, _):
         return data[100_000]
 
     monkeypatch.setattr(fuzz_colmap, "read_cameras", careless)

@@ -4,17 +4,14 @@ All numbers come from the harness, which runs each stage as a process of its own
 Gates of scenes whose photographs are not on this machine are skipped.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import cache
 
 import pytest
 
-from validation.harness.gates import Gate, read_gates
+from validation.harness.gates import read_gates
 from validation.harness.process import own_cores
 from validation.harness.records import Wishes
-from validation.harness.results import Results, collect
+from validation.harness.results import collect
 from validation.harness.scenes import PHOTOGRAPHS, available_scenes
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES
@@ -28,16 +25,16 @@ LIMIT_S = 900.0
 """A machine with much other work is no broken gate."""
 
 
-def scene_of(gate: Gate) -> str:
+def scene_of(gate):
     return gate.key.split("/")[1]
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[[bool], Results]:
+def results(tmp_path_factory):
     """The numbers of the scenes that are always there, and of the others."""
 
     @cache
-    def run(always: bool) -> Results:
+    def run(always):
         here = [s for s in HERE if (s in ALWAYS) == always]
         wanted = {tuple(key.split("/")[:2]) for key in GATES}
         scenes = tuple(s for s in here if any(scene == s for _, scene in wanted))
@@ -58,7 +55,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[[bool], Result
         for key, gate in GATES.items()
     ],
 )
-def test_a_promise_is_kept(gate: Gate, results: Callable[[bool], Results]) -> None:
+def test_a_promise_is_kept(gate, results):
     scene = scene_of(gate)
     if scene not in HERE:
         pytest.skip(f"{scene} is not on this machine (THESISRECON_DATA)")
@@ -68,5 +65,5 @@ def test_a_promise_is_kept(gate: Gate, results: Callable[[bool], Results]) -> No
     assert gate.holds(found[0].value), f"{found[0].value} {found[0].unit}, {gate.reason}"
 
 
-def test_every_set_of_photographs_has_its_gates() -> None:
+def test_every_set_of_photographs_has_its_gates():
     assert {scene_of(gate) for gate in GATES.values()} >= {*PHOTOGRAPHS, *ALWAYS}

@@ -1,7 +1,5 @@
 """The measurement of the growth: its exponents, shares and table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -14,16 +12,16 @@ ROW = Growth(
 )
 
 
-def test_the_exponent_is_that_of_a_power() -> None:
+def test_the_exponent_is_that_of_a_power():
     assert exponent([10, 30, 100], [3 * n**1.5 for n in (10, 30, 100)]) == pytest.approx(1.5)
 
 
-def test_recall_counts_the_accepted_pairs_alone() -> None:
+def test_recall_counts_the_accepted_pairs_alone():
     assert recall_of(replace(ROW, pair_list=((0, 1, True), (0, 2, False))), ROW) == 0.5
     assert recall_of(ROW, ROW) == 1.0
 
 
-def test_the_table_names_shares_and_exponents() -> None:
+def test_the_table_names_shares_and_exponents():
     more = replace(
         ROW, photographs=20, possible=190, tried=95, cpu_s=40.0, recall=0.985, overlapping_tried=1.0
     )
@@ -33,7 +31,7 @@ def test_the_table_names_shares_and_exponents() -> None:
     assert "processor time 2.00" in text
 
 
-def test_missed_pairs_are_told_and_judged() -> None:
+def test_missed_pairs_are_told_and_judged():
     good, bad = (Choice("a", 100, 30, 20, missed) for missed in ((), (41,)))
     assert [metric.verdict for metric in to_metrics(good)] == ["reported", "reported", "reached"]
     row = to_metrics(bad)[-1]

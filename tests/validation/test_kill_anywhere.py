@@ -1,7 +1,5 @@
 """What the check of killed runs compares, and that a torn write is one."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
@@ -11,7 +9,7 @@ from pathlib import Path
 from validation.studies.kill_anywhere import TORN, Kill, different, outputs, table
 
 
-def write(folder: Path, seconds: float, focal: float) -> None:
+def write(folder, seconds, focal):
     folder.mkdir()
     summary = {"seconds": {"total": seconds}, "cameras": [{"focal_px": focal}]}
     (folder / "summary.json").write_text(json.dumps(summary))
@@ -19,7 +17,7 @@ def write(folder: Path, seconds: float, focal: float) -> None:
     (folder / "report.html").write_text(f"{seconds} s")
 
 
-def test_times_are_no_difference_and_numbers_and_missing_files_are(tmp_path: Path) -> None:
+def test_times_are_no_difference_and_numbers_and_missing_files_are(tmp_path):
     for name, seconds, focal in (("a", 1.0, 900.0), ("b", 2.0, 900.0), ("c", 1.0, 900.5)):
         write(tmp_path / name, seconds, focal)
     a, b, c = (outputs(tmp_path / name) for name in "abc")
@@ -37,7 +35,7 @@ def test_times_are_no_difference_and_numbers_and_missing_files_are(tmp_path: Pat
     ]
 
 
-def test_a_torn_write_leaves_no_half_file_under_its_name(tmp_path: Path) -> None:
+def test_a_torn_write_leaves_no_half_file_under_its_name(tmp_path):
     images = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
     options = ["reconstruct", str(images), "-o", str(tmp_path / "out"), "--max-size", "128"]
     program = [sys.executable, "-c", TORN, "2", *options, "--until", "features", "--threads", "1"]

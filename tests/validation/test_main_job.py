@@ -1,8 +1,5 @@
-from __future__ import annotations
-
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,18 +11,18 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import colmap_from_reconstruction
 from thesisrecon.io.colmap_files import write_colmap_model
 from validation import main_job
-from validation.studies.reconstruction import COLMAP, OURS
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric
 from validation.references.colmap_mapping import read_run
 from validation.references.colmap_run import reconstruct_with_pycolmap
 from validation.scenes.real import Scene, load_fixture_scene
+from validation.studies.reconstruction import COLMAP, OURS
 
 from .test_cameras import N, V, _reconstruction, _truth
 
 
-def test_a_process_is_measured_whole(tmp_path: Path) -> None:
+def test_a_process_is_measured_whole(tmp_path):
     program = "import os, sys; b = bytearray(200_000_000); print(len(os.sched_getaffinity(0))); sys.exit(3)"
     log = tmp_path / "log" / "out.txt"
     done = run_process([sys.executable, "-c", program], log=log, cores=own_cores()[:1], environment={})
@@ -35,7 +32,7 @@ def test_a_process_is_measured_whole(tmp_path: Path) -> None:
     assert log.read_text().strip() == "1"
 
 
-def _fake_scene(folder: Path) -> Scene:
+def _fake_scene(folder):
     images = folder / "images"
     images.mkdir()
     paths = tuple(images / f"{i}.jpg" for i in range(V))
@@ -45,7 +42,7 @@ def _fake_scene(folder: Path) -> Scene:
     return Scene("fountain-P11", paths, truth.K, truth.R, truth.C)
 
 
-def _save_run(out: Path, scene: Scene) -> None:
+def _save_run(out, scene):
     model = colmap_from_reconstruction(
         _reconstruction(_truth()),
         [path.name for path in scene.image_paths],
@@ -58,14 +55,12 @@ def _save_run(out: Path, scene: Scene) -> None:
     (out / "seconds.json").write_text(json.dumps({"extract": 3.0, "match": 1.0, "map": 2.0}))
 
 
-def test_the_table_is_made_from_what_the_methods_saved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_table_is_made_from_what_the_methods_saved(tmp_path, monkeypatch, capsys):
     scene, saved = _fake_scene(tmp_path), tmp_path / "saved"
     _save_run(saved, scene)
     copy = "import shutil, sys; shutil.copytree(sys.argv[1], sys.argv[2])"
 
-    def pretend(method: str, _images: Path, out: Path, _threads: int) -> list[str]:
+    def pretend(method, _images, out, _threads):
         source = saved if method in (OURS, COLMAP) else tmp_path / "nothing"
         return [sys.executable, "-c", copy, str(source), str(out)]
 
@@ -84,7 +79,7 @@ def test_the_table_is_made_from_what_the_methods_saved(
     assert text in capsys.readouterr().out
 
 
-def test_pycolmap_on_small_photographs_comes_back_in_our_types(tmp_path: Path) -> None:
+def test_pycolmap_on_small_photographs_comes_back_in_our_types(tmp_path):
     scene = load_fixture_scene()
     images = tmp_path / "images"
     images.mkdir()
@@ -111,13 +106,13 @@ def test_pycolmap_on_small_photographs_comes_back_in_our_types(tmp_path: Path) -
     np.testing.assert_array_equal(again.reconstruction.P, run.reconstruction.P)
 
 
-def test_no_model_is_a_failure_with_a_sentence(tmp_path: Path) -> None:
+def test_no_model_is_a_failure_with_a_sentence(tmp_path):
     (tmp_path / "sparse").mkdir()
     with pytest.raises(StageFailure, match="made no model"):
         read_run(tmp_path, tmp_path)
 
 
-def test_the_readme_gets_the_rows_between_its_markers(tmp_path: Path) -> None:
+def test_the_readme_gets_the_rows_between_its_markers(tmp_path):
     readme = tmp_path / "README.md"
     readme.write_text(
         f"before\n{main_job.README_BEGIN}\nold\n{main_job.README_END}\nafter\n", encoding="utf-8"

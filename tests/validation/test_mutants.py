@@ -1,9 +1,6 @@
 """Small faults of the library, found and told; that tests catch them takes its time and is run by hand."""
 
-from __future__ import annotations
-
 import ast
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -28,7 +25,7 @@ def distance(a: float, b: float = 2.0, *, whole: bool = True) -> float:
 '''
 
 
-def faults(root: Path) -> list[str]:
+def faults(root):
     """The lines that the faults of a small module change, as they become."""
     folder = root / "thesisrecon" / "geometry"
     folder.mkdir(parents=True)
@@ -42,7 +39,7 @@ def faults(root: Path) -> list[str]:
     return found
 
 
-def test_one_thing_changes_in_functions_and_nothing_in_settings_or_words(tmp_path: Path) -> None:
+def test_one_thing_changes_in_functions_and_nothing_in_settings_or_words(tmp_path):
     assert sorted(faults(tmp_path)) == sorted(
         [
             "if (not (len([a]) < 2 and not whole)):",
@@ -60,7 +57,7 @@ def test_one_thing_changes_in_functions_and_nothing_in_settings_or_words(tmp_pat
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_what_is_drawn_is_python_and_the_same_every_time(package: str) -> None:
+def test_what_is_drawn_is_python_and_the_same_every_time(package):
     drawn = draw(ROOT, package, 30, seed=1)
     assert len(drawn) == 30
     assert drawn == draw(ROOT, package, 30, seed=1) != draw(ROOT, package, 30, seed=2)
@@ -71,7 +68,7 @@ def test_what_is_drawn_is_python_and_the_same_every_time(package: str) -> None:
         ast.parse(faulty)
 
 
-def test_tests_of_the_module_come_first_and_then_those_of_its_users(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tests_of_the_module_come_first_and_then_those_of_its_users(monkeypatch):
     monkeypatch.setattr(Bench, "tree", ROOT)
     own, others = Bench(Path("nowhere")).judges("thesisrecon/geometry/three_view.py")
     assert "thesisrecon.geometry.three_view" in imports_of(ROOT / own[0])
@@ -80,7 +77,7 @@ def test_tests_of_the_module_come_first_and_then_those_of_its_users(monkeypatch:
     assert not any(file.startswith(("tests/geometry/", "tests/validation/")) for file in others)
 
 
-def test_the_table_has_the_score_of_each_package_and_every_fault() -> None:
+def test_the_table_has_the_score_of_each_package_and_every_fault():
     fault = Mutant("thesisrecon/geometry/a.py", 3, "a | b", "a & b", 0, 5)
     verdicts = [Verdict(fault, "tests/geometry/test_a.py::test", 1.0), Verdict(fault, "", 2.0)]
     text = table(verdicts)
@@ -88,12 +85,10 @@ def test_the_table_has_the_score_of_each_package_and_every_fault() -> None:
     assert "| thesisrecon/geometry/a.py | 3 | `a \\| b` | `a & b` | **nobody** |" in text
 
 
-def test_what_nobody_caught_is_judged_again_and_the_rest_is_kept(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    judged: list[int] = []
+def test_what_nobody_caught_is_judged_again_and_the_rest_is_kept(monkeypatch, tmp_path, capsys):
+    judged = []
 
-    def judge_all(bench: object, chosen: Sequence[Mutant], *, warm: bool) -> Iterator[Verdict]:
+    def judge_all(bench, chosen, *, warm):
         del bench, warm
         judged.append(len(chosen))
         for number, mutant in enumerate(chosen):
@@ -109,7 +104,7 @@ def test_what_nobody_caught_is_judged_again_and_the_rest_is_kept(
     assert len(mutants.read_verdicts(tmp_path / "mutants.json")) == 4
 
 
-def test_a_bad_wish_ends_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bad_wish_ends_in_a_sentence(capsys):
     with pytest.raises(SystemExit):
         mutants.main(["--packages", "nothing"])
     assert "invalid choice" in capsys.readouterr().err

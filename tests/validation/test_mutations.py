@@ -1,9 +1,6 @@
 """The list of planted faults, and the bench that plants them; the faults themselves take their time."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import pytest
 
@@ -11,16 +8,7 @@ from validation.harness.gates import Gate
 from validation.harness.planting import compiled_from, importers
 from validation.harness.results import Results, Row
 from validation.harness.stages import STAGES
-from validation.mutations import (
-    Bench,
-    Checked,
-    Fate,
-    Mutation,
-    main,
-    read_mutations,
-    table,
-    write_fates,
-)
+from validation.mutations import Bench, Checked, Fate, Mutation, main, read_mutations, table, write_fates
 from validation.scenes.real import ROOT
 
 MUTATIONS = read_mutations()
@@ -41,7 +29,7 @@ FOLDERS = {
 """Parts of the library that have faults of their own."""
 
 
-def test_every_fault_can_be_planted_and_is_python() -> None:
+def test_every_fault_can_be_planted_and_is_python():
     problems = []
     for mutation in MUTATIONS:
         try:
@@ -53,7 +41,7 @@ def test_every_fault_can_be_planted_and_is_python() -> None:
     assert problems == []
 
 
-def test_the_faults_are_many_and_everywhere() -> None:
+def test_the_faults_are_many_and_everywhere():
     assert len(MUTATIONS) >= LEAST
     assert {m.file.split("/")[1] for m in MUTATIONS} >= FOLDERS
     assert {stage for m in MUTATIONS for stage in m.stages} >= {
@@ -69,14 +57,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("entry", WRONG)
-def test_a_wrong_entry_is_refused_in_a_sentence(entry: str, tmp_path: Path) -> None:
+def test_a_wrong_entry_is_refused_in_a_sentence(entry, tmp_path):
     listed = tmp_path / "list.toml"
     listed.write_text(f"[[mutation]]\n{entry}\n", encoding="utf-8")
     with pytest.raises(ValueError, match=re.escape(WRONG[entry])):
         read_mutations(listed)
 
 
-def test_a_name_twice_is_refused(tmp_path: Path) -> None:
+def test_a_name_twice_is_refused(tmp_path):
     entry = '[[mutation]]\nname = "n"\nfile = "a.py"\nold = "a"\nnew = "b"\ncheck = ["bundle/street"]\n'
     (tmp_path / "list.toml").write_text(2 * entry, encoding="utf-8")
     with pytest.raises(ValueError, match="two mutations are called"):
@@ -84,14 +72,14 @@ def test_a_name_twice_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "a = 1\n", "x = 1\nx = 1\n"])
-def test_an_old_text_that_does_not_stand_there_once_is_refused(text: str, tmp_path: Path) -> None:
+def test_an_old_text_that_does_not_stand_there_once_is_refused(text, tmp_path):
     if text:
         (tmp_path / "a.py").write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=r"must stand in a\.py once, it stands there [02] times"):
         Mutation("n", "a.py", "x = 1", "x = 2", ("bundle/street",)).apply(tmp_path)
 
 
-def small_tree(root: Path) -> Path:
+def small_tree(root):
     """inner.py, which the kernels of middle.py import, which outer.py does, which plain python.py does;
     alone.py has nothing to do with them."""
     package = root / "package"
@@ -107,7 +95,7 @@ def small_tree(root: Path) -> Path:
     return package
 
 
-def test_all_that_imports_a_fault_counts_as_newer_while_it_is_planted(tmp_path: Path) -> None:
+def test_all_that_imports_a_fault_counts_as_newer_while_it_is_planted(tmp_path):
     bench = Bench(tmp_path)
     package = small_tree(bench.tree)
     compiled = bench.kernels / "package_0a1b"
@@ -129,15 +117,15 @@ def test_all_that_imports_a_fault_counts_as_newer_while_it_is_planted(tmp_path: 
     assert list(bench.kernels.iterdir()) == [compiled]
 
 
-def test_importers_of_the_library_go_through_packages() -> None:
+def test_importers_of_the_library_go_through_packages():
     found = {path.relative_to(ROOT).as_posix() for path in importers(ROOT, "thesisrecon/numerics/noise.py")}
-    assert {"thesisrecon/numerics/noise.py", "thesisrecon/epipolar/search.py"} <= found
+    assert {"thesisrecon/numerics/noise.py", "thesisrecon/epipolar/sampling.py"} <= found
     assert "thesisrecon/errors.py" not in found
     kernels = {p.relative_to(ROOT).as_posix() for p in compiled_from(ROOT, "thesisrecon/numerics/noise.py")}
-    assert "thesisrecon/epipolar/search.py" in kernels < found
+    assert "thesisrecon/epipolar/sampling.py" in kernels < found
 
 
-def test_gates_are_broken_by_numbers_beyond_them_and_by_none() -> None:
+def test_gates_are_broken_by_numbers_beyond_them_and_by_none():
     gates = {
         key: Gate(key, 1.0, True, "a reason") for key in ("a/s/far", "a/s/near", "a/s/untold", "b/s/other")
     }
@@ -149,7 +137,7 @@ def test_gates_are_broken_by_numbers_beyond_them_and_by_none() -> None:
     assert found.broken(gates) == ("a/s/far", "a/s/untold")
 
 
-def test_the_table_says_what_caught_a_fault_and_what_survived(tmp_path: Path) -> None:
+def test_the_table_says_what_caught_a_fault_and_what_survived(tmp_path):
     fates = [
         Fate("one", "a.py", ("a/s/far", "a/s/untold"), 1.2),
         Fate("two", "b.py", (), 3.0),
@@ -166,6 +154,6 @@ def test_the_table_says_what_caught_a_fault_and_what_survived(tmp_path: Path) ->
     assert (tmp_path / "mutations.md").read_text(encoding="utf-8") == "\n".join(lines) + "\n"
 
 
-def test_an_unknown_name_ends_the_command_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_name_ends_the_command_in_a_sentence(capsys):
     assert main(["--only", "no such fault"]) == 2
     assert 'no mutation is called "no such fault"' in capsys.readouterr().err

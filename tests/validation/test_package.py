@@ -1,7 +1,5 @@
 """The package as it is built and installed: what can be told without building it, and where a run writes."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import tomllib
@@ -9,33 +7,33 @@ from pathlib import Path
 
 import pytest
 
-from thesisrecon.io.lists import COUNT, demo_photographs
+from thesisrecon.io.pair_list import COUNT, demo_images
+from validation.scenes.real import ROOT
 from validation.studies.package.built import NEEDED, wheel_faults
 from validation.studies.package.environments import dependencies, lowest_versions
 from validation.studies.package.quiet import Watched, trespasses, watch
 from validation.studies.package.suite import Part, counted, quick_parts, run_part, suite_faults
-from validation.scenes.real import ROOT
 
 
-def test_the_wheel_carries_the_photographs_of_the_demo() -> None:
+def test_the_wheel_carries_the_photographs_of_the_demo():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     laid_in = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     for source, target in laid_in.items():
         assert target == source.replace("fixtures/", "thesisrecon/")
         assert (ROOT / source).is_file()
     photographs = [ROOT / source for source in laid_in if source.endswith(".jpg")]
-    assert sorted(photographs) == demo_photographs()
+    assert sorted(photographs) == demo_images()
     assert len(photographs) == COUNT
 
 
-def test_lowest_versions_are_those_of_the_project_and_need_a_bound() -> None:
+def test_lowest_versions_are_those_of_the_project_and_need_a_bound():
     assert lowest_versions(["numpy>=1.26", "typer >= 0.18"]) == ["numpy==1.26", "typer==0.18"]
     assert len(lowest_versions(dependencies())) == len(dependencies())
     with pytest.raises(ValueError, match="NAME>=VERSION; got 'scipy'"):
         lowest_versions(["scipy"])
 
 
-def test_every_test_but_those_of_validation_is_in_one_part_of_the_quick_suite() -> None:
+def test_every_test_but_those_of_validation_is_in_one_part_of_the_quick_suite():
     asked = [Path(word) for words in quick_parts().values() for word in words if word.startswith("/")]
     found = [file for path in asked for file in ([path] if path.is_file() else path.rglob("test_*.py"))]
     tests = ROOT / "tests"
@@ -44,7 +42,7 @@ def test_every_test_but_those_of_validation_is_in_one_part_of_the_quick_suite() 
     )
 
 
-def test_a_part_is_run_by_the_interpreter_of_its_folder_and_counted(tmp_path: Path) -> None:
+def test_a_part_is_run_by_the_interpreter_of_its_folder_and_counted(tmp_path):
     interpreter = tmp_path / "bin" / "python"
     interpreter.parent.mkdir()
     interpreter.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n', encoding="utf-8")
@@ -57,7 +55,7 @@ def test_a_part_is_run_by_the_interpreter_of_its_folder_and_counted(tmp_path: Pa
     assert suite_faults([part]) == ["some/part ended with code 1"]
 
 
-def test_a_suite_is_well_where_something_passed_and_nothing_broke() -> None:
+def test_a_suite_is_well_where_something_passed_and_nothing_broke():
     well = Part("a", counted(["7 passed, 2 skipped, 1 deselected in 3.2s"]), 0, 3.0)
     assert well.counts == {"passed": 7, "skipped": 2}
     empty, crashed = Part("b", {}, 5, 1.0), Part("c", counted(["Segmentation fault"]), -11, 1.0)
@@ -66,7 +64,7 @@ def test_a_suite_is_well_where_something_passed_and_nothing_broke() -> None:
     assert suite_faults([well, crashed]) == ["c ended with code -11"]
 
 
-def test_what_is_missing_or_does_not_belong_in_a_wheel_is_told() -> None:
+def test_what_is_missing_or_does_not_belong_in_a_wheel_is_told():
     photographs = [f"thesisrecon/courtyard/images/{i:04d}.jpg" for i in range(COUNT)]
     good = [*NEEDED, *photographs, "thesisrecon/cli/main.py", "thesisrecon-0.1.0.dist-info/METADATA"]
     assert wheel_faults(good, 1_000_000) == []
@@ -78,10 +76,10 @@ def test_what_is_missing_or_does_not_belong_in_a_wheel_is_told() -> None:
     assert wheel_faults(good[: len(NEEDED)], 1) == [f"0 photographs instead of {COUNT}"]
 
 
-def test_a_run_writes_into_its_folder_alone_and_speaks_to_nobody(tmp_path: Path) -> None:
+def test_a_run_writes_into_its_folder_alone_and_speaks_to_nobody(tmp_path):
     photographs, result = tmp_path / "photographs", tmp_path / "result"
     photographs.mkdir()
-    for path in demo_photographs()[:3]:
+    for path in demo_images()[:3]:
         shutil.copy(path, photographs)
     command = ["reconstruct", str(photographs), "-o", str(result), "--max-size", "400"]
     command += ["--set", "dense.max_side=160", "--set", "dense.match_side=160"]
@@ -93,7 +91,7 @@ def test_a_run_writes_into_its_folder_alone_and_speaks_to_nobody(tmp_path: Path)
     assert len(run.outside(tmp_path / "elsewhere")) > 10
 
 
-def test_what_a_run_should_not_have_done_is_told(tmp_path: Path) -> None:
+def test_what_a_run_should_not_have_done_is_told(tmp_path):
     wrong = Watched(
         3, frozenset([tmp_path / "a", tmp_path / "out" / "b"]), ("socket.connect",), ("ls",), (), "no"
     )

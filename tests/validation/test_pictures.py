@@ -1,7 +1,5 @@
 """What measures pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -3,16 +3,12 @@
 All other promises stand in ``validation/gates.toml``.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import thesisrecon
 from thesisrecon.config import PipelineConfig
-from thesisrecon.intrinsics import IntrinsicsAssumption
+from thesisrecon.intrinsics import IntrinsicsOptions
 from validation.metrics.intervals import focal_errors_pct, interval_scores
 from validation.scenes.real import load_real_scene
 from validation.scenes.zoomed import rezoom_scene
@@ -21,12 +17,12 @@ ZOOM_MEDIAN_PCT, ZOOM_WORST_PCT = 0.5, 3.0
 
 
 @pytest.mark.real
-def test_zoomed_and_cropped_photographs_are_calibrated_each_for_itself(tmp_path: Path) -> None:
+def test_zoomed_and_cropped_photographs_are_calibrated_each_for_itself(tmp_path):
     whole = load_real_scene("Herz-Jesus-P8")
     if whole is None:
         pytest.skip("the photographs of Herz-Jesus-P8 are not on this machine (THESISRECON_DATA)")
     scene = rezoom_scene(whole, tmp_path / "images", seed=0)
-    config = PipelineConfig(intrinsics=IntrinsicsAssumption(cameras="per-image"))
+    config = PipelineConfig(intrinsics=IntrinsicsOptions(cameras="per-image"))
     result = thesisrecon.reconstruct(
         list(scene.image_paths), tmp_path / "out", config=config, seed=0, until="metric"
     )

@@ -1,7 +1,5 @@
 """The check on random subsets: what is taken of a set, and what its numbers mean."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +8,12 @@ from tests.synthetic import make_scene, true_pairs
 from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
 
 
-def matched_scene() -> Matched:
+def matched_scene():
     scene = make_scene(views=9, points=400, sigma_px=0.3, seed=4)
     return Matched("synthetic", scene.tracks, true_pairs(scene), scene.sizes, scene.K[:, 0, 0])
 
 
-def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_see() -> None:
+def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_see():
     whole, views = matched_scene(), np.array([1, 4, 7])
     kept = np.arange(400) < 250
     part = take_views(whole, views, kept)
@@ -31,7 +29,7 @@ def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_se
     assert all((np.abs(theirs - xy).max(axis=1) == 0.0).any() for xy in mine)
 
 
-def test_a_trial_finds_the_focal_length_and_is_the_same_twice() -> None:
+def test_a_trial_finds_the_focal_length_and_is_the_same_twice():
     first, again = (run_trial(matched_scene(), "shared", 3) for _ in range(2))
     assert first.right
     assert not first.failed_checks
@@ -39,7 +37,7 @@ def test_a_trial_finds_the_focal_length_and_is_the_same_twice() -> None:
     assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
 
 
-def test_what_came_of_a_trial_is_told_apart() -> None:
+def test_what_came_of_a_trial_is_told_apart():
     wrong = Trial(0, (0, 1), 2, 10.0, 12.0, (), 1, 1.0)
     shifted = replace(wrong, median_pct=np.nan, reasons=("pure translation",))
     trials = {

@@ -1,7 +1,5 @@
 """How like two pictures are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from thesisrecon.records import RenderedView
 from thesisrecon.views.image_similarity import GREY, exposed_alike, psnr_db, ssim, ssim_map, whole_pixels
 
 
-def pictures() -> tuple[np.ndarray, np.ndarray]:
+def pictures():
     rng = np.random.default_rng(0)
     y, x = np.indices((40, 50))
     clean = 128 + 60 * np.sin(x / 4.0) * np.cos(y / 5.0)
@@ -17,7 +15,7 @@ def pictures() -> tuple[np.ndarray, np.ndarray]:
     return real.round().astype(np.uint8), (real + rng.normal(0, 12, real.shape)).round().astype(np.uint8)
 
 
-def test_psnr_is_that_of_its_formula() -> None:
+def test_psnr_is_that_of_its_formula():
     real, noisy = pictures()
     mask = np.zeros((40, 50), bool)
     mask[5:20, 3:40] = True
@@ -26,7 +24,7 @@ def test_psnr_is_that_of_its_formula() -> None:
     assert psnr_db(real, real, mask) == float("inf")
 
 
-def test_ssim_is_that_of_its_windows() -> None:
+def test_ssim_is_that_of_its_windows():
     real, noisy = pictures()
     a, b = real @ GREY, noisy @ GREY
     y, x = 17, 21
@@ -45,21 +43,21 @@ def test_ssim_is_that_of_its_windows() -> None:
     assert 0.3 < ssim(real, noisy, everything) < 0.95
 
 
-def test_what_is_not_compared_takes_no_part() -> None:
+def test_what_is_not_compared_takes_no_part():
     real, noisy = pictures()
     mask = np.hypot(*(np.indices((40, 50)) - np.array([17, 21])[:, None, None])) < 9
     spoiled = np.where(mask[..., None], noisy, 0).astype(np.uint8)
     assert ssim(real, spoiled, mask) == pytest.approx(ssim(real, noisy, mask))
 
 
-def test_exposure_is_made_alike() -> None:
+def test_exposure_is_made_alike():
     real, _ = pictures()
     darker = np.rint(real * [0.5, 0.8, 1.0]).astype(np.uint8)
     mask = np.ones(real.shape[:2], bool)
     assert psnr_db(real, exposed_alike(real, darker, mask), mask) > 45.0
 
 
-def test_pixels_at_the_rim_are_not_whole() -> None:
+def test_pixels_at_the_rim_are_not_whole():
     valid = np.zeros((6, 7), bool)
     valid[1:5, 2:6] = True
     rendered = RenderedView(np.zeros((6, 7, 3), np.uint8), np.zeros((6, 7), np.float32), valid)
@@ -69,7 +67,7 @@ def test_pixels_at_the_rim_are_not_whole() -> None:
 
 
 @pytest.mark.parametrize("compare", [psnr_db, ssim, exposed_alike])
-def test_pictures_that_do_not_belong_together_are_refused(compare) -> None:
+def test_pictures_that_do_not_belong_together_are_refused(compare):
     real, noisy = pictures()
     with pytest.raises(ValueError, match="one size"):
         compare(real, noisy[:-1], np.ones((40, 50), bool))

@@ -1,16 +1,12 @@
 """Views between two photographs: where points lie, and what is seen."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from tests.textures import texture
-from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera, project
-from thesisrecon.records import DisparityMap
 from thesisrecon.views.interpolation import (
     FrameBetween,
     InterpolatedPair,
@@ -24,17 +20,17 @@ SIZE = (160, 120)
 SHIFTS = np.linspace(0.0, 1.0, 7)
 
 
-def cloud(rng: np.random.Generator) -> F64:
+def cloud(rng):
     return rng.uniform([-2, -2, 4], [2, 2, 9], (200, 3))
 
 
-def calibration(focal: float, rng: np.random.Generator) -> F64:
+def calibration(focal, rng):
     x, y = rng.uniform(60, 90), rng.uniform(50, 70)
     return np.array([[focal, rng.normal(), x], [0.0, 1.03 * focal, y], [0.0, 0.0, 1.0]])
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_interpolation_along_the_baseline_is_the_projection_of_a_parallel_camera(seed: int) -> None:
+def test_interpolation_along_the_baseline_is_the_projection_of_a_parallel_camera(seed):
     """P_s = (1 - s) P_0 + s P_1: the centre on the baseline, the focal length in between (Seitz and Dyer)."""
     rng = np.random.default_rng(seed)
     X, R = cloud(rng), Rotation.from_rotvec(rng.normal(0, 0.2, 3)).as_matrix()
@@ -54,7 +50,7 @@ def test_interpolation_along_the_baseline_is_the_projection_of_a_parallel_camera
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_cameras_of_one_focal_length_move_along_the_baseline(seed: int) -> None:
+def test_cameras_of_one_focal_length_move_along_the_baseline(seed):
     rng = np.random.default_rng(100 + seed)
     X, R, K = cloud(rng), Rotation.from_rotvec(rng.normal(0, 0.2, 3)).as_matrix(), calibration(320.0, rng)
     first, step = rng.normal(0, 0.5, 3), R[0] * 0.7 + R[1] * 0.2
@@ -66,9 +62,7 @@ def test_cameras_of_one_focal_length_move_along_the_baseline(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_turned_cameras_are_seen_from_the_baseline_up_to_a_homography_and_exactly_at_the_ends(
-    seed: int,
-) -> None:
+def test_turned_cameras_are_seen_from_the_baseline_up_to_a_homography_and_exactly_at_the_ends(seed):
     rng = np.random.default_rng(200 + seed)
     X, K = cloud(rng), calibration(320.0, rng)
     centres = np.array([[-0.5, 0.1, 0.0], [0.5, -0.1, 0.1]])
@@ -90,7 +84,7 @@ def test_turned_cameras_are_seen_from_the_baseline_up_to_a_homography_and_exactl
         np.testing.assert_allclose(frame.points(xy[0], xy[1], float(k)), xy[k], atol=1e-9)
 
 
-def test_corners_behind_a_camera_are_left_out_of_the_frame() -> None:
+def test_corners_behind_a_camera_are_left_out_of_the_frame():
     H = np.eye(3)
     H[2, 0] = -1.0 / 100.0
     frame = FrameBetween(np.stack([H, np.eye(3)]), SIZE)
@@ -104,11 +98,11 @@ def test_corners_behind_a_camera_are_left_out_of_the_frame() -> None:
 class Stage:
     """A box in front of a slanted wall, both textured, seen by parallel cameras at s."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         layers = [gaussian_filter(texture(200, 320, seed), 1.0) for seed in range(6)]
         self.wall, self.box = np.stack(layers[:3], axis=-1), np.stack(layers[3:], axis=-1)
 
-    def at(self, s: float) -> tuple[F64, F64]:
+    def at(self, s):
         """Colours (120, 160, 3) and disparities of the view at s."""
         width, height = SIZE
         y, x = np.mgrid[0:height, 0:width].astype(float)
@@ -122,7 +116,7 @@ class Stage:
         return color, d
 
 
-def _sampled(texture: F64, x: F64, y: F64) -> F64:
+def _sampled(texture, x, y):
     x0, y0 = x.astype(int), y.astype(int)
     s, t = (x - x0)[..., None], (y - y0)[..., None]
     top = (1 - s) * texture[y0, x0] + s * texture[y0, x0 + 1]
@@ -130,11 +124,11 @@ def _sampled(texture: F64, x: F64, y: F64) -> F64:
 
 
 @pytest.fixture(scope="module")
-def stage() -> Stage:
+def stage():
     return Stage()
 
 
-def disparities(stage: Stage) -> tuple[DisparityMap, DisparityMap]:
+def disparities(stage):
     """Of both photographs, NaN where the other one does not see the pixel."""
     found = []
     (_, d0), (_, d1) = stage.at(0.0), stage.at(1.0)
@@ -148,16 +142,16 @@ def disparities(stage: Stage) -> tuple[DisparityMap, DisparityMap]:
     return found[0], found[1]
 
 
-def photographs(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+def photographs(stage):
     left, right = (np.clip(np.rint(stage.at(s)[0]), 0, 255).astype(np.uint8) for s in (0.0, 1.0))
     return left, right
 
 
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
+def psnr(a, b):
     return float(10 * np.log10(255.0**2 / np.mean((a.astype(float) - b) ** 2)))
 
 
-def test_views_between_are_those_of_the_scene(stage: Stage) -> None:
+def test_views_between_are_those_of_the_scene(stage):
     left, right = photographs(stage)
     pair = pair_of_rectified(left, right, disparities(stage))
     for s in (0.25, 0.5, 0.8):
@@ -179,7 +173,7 @@ def test_views_between_are_those_of_the_scene(stage: Stage) -> None:
     np.testing.assert_array_equal(pair.view(1), right)
 
 
-def test_rectified_and_turned_photographs_give_the_view_of_a_turned_camera(stage: Stage) -> None:
+def test_rectified_and_turned_photographs_give_the_view_of_a_turned_camera(stage):
     """The same pair, its second photograph seen through a homography: between them the frame is halfway."""
     left, right = photographs(stage)
     maps = disparities(stage)
@@ -203,7 +197,7 @@ def test_rectified_and_turned_photographs_give_the_view_of_a_turned_camera(stage
     np.testing.assert_array_equal(pair.view(1.0), turned)
 
 
-def test_a_turned_view_is_the_view_through_a_homography(stage: Stage) -> None:
+def test_a_turned_view_is_the_view_through_a_homography(stage):
     left, right = photographs(stage)
     pair = pair_of_rectified(left, right, disparities(stage))
     shift = np.array([[1.0, 0.0, 7.0], [0.0, 1.0, -3.0], [0.0, 0.0, 1.0]])
@@ -213,7 +207,7 @@ def test_a_turned_view_is_the_view_through_a_homography(stage: Stage) -> None:
         np.testing.assert_array_equal(pair.view(s, turn=-2.0 * shift), pair.view(s, turn=shift))
 
 
-def test_exposures_are_interpolated_too(stage: Stage) -> None:
+def test_exposures_are_interpolated_too(stage):
     left, right = photographs(stage)
     factor = np.array([0.8, 0.7, 0.75])
     darker = np.rint(right * factor).astype(np.uint8)
@@ -224,7 +218,7 @@ def test_exposures_are_interpolated_too(stage: Stage) -> None:
     assert np.quantile(off, 0.85) < 4.0
 
 
-def test_monotonicity_fails_with_a_thin_thing_in_front(stage: Stage) -> None:
+def test_monotonicity_fails_with_a_thin_thing_in_front(stage):
     wall = check_monotonicity(np.full((20, 50), 3.0, np.float32))
     assert wall.holds
     assert wall.known == 1.0
@@ -244,7 +238,7 @@ def test_monotonicity_fails_with_a_thin_thing_in_front(stage: Stage) -> None:
         check_monotonicity(np.zeros(4, np.float32))
 
 
-def test_the_right_side_follows_from_the_left(stage: Stage) -> None:
+def test_the_right_side_follows_from_the_left(stage):
     both = disparities(stage)
     implied = other_side(both[0]).disparity
     known = np.isfinite(implied) & np.isfinite(both[1].disparity)
@@ -252,7 +246,7 @@ def test_the_right_side_follows_from_the_left(stage: Stage) -> None:
     assert np.quantile(np.abs(implied - both[1].disparity)[known], 0.98) < 0.6
 
 
-def test_a_pair_of_which_nothing_is_known_dissolves() -> None:
+def test_a_pair_of_which_nothing_is_known_dissolves():
     rng = np.random.default_rng(0)
     left, right = (rng.integers(0, 256, (20, 30, 3), dtype=np.uint8) for _ in range(2))
     nothing = unsure(np.full((20, 30), np.nan, np.float32))
@@ -260,7 +254,7 @@ def test_a_pair_of_which_nothing_is_known_dissolves() -> None:
     np.testing.assert_allclose(view, 0.75 * left + 0.25 * right, atol=0.6)
 
 
-def test_wrong_calls_are_refused() -> None:
+def test_wrong_calls_are_refused():
     image, nothing = np.zeros((20, 30, 3), np.uint8), unsure(np.zeros((20, 30), np.float32))
     pair = pair_of_rectified(image, image, (nothing, nothing))
     for s in (-0.1, 1.01, np.nan):

@@ -1,11 +1,8 @@
 """The compiled loops of interpolation beside plain NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from thesisrecon.arrays import F32
 from thesisrecon.views.interpolation_kernels import (
     NEAR,
     ONE_SURFACE_PX,
@@ -22,7 +19,7 @@ from thesisrecon.views.interpolation_kernels import (
 )
 
 
-def field(seed: int, shape: tuple[int, int] = (14, 23), holes: float = 0.1) -> F32:
+def field(seed, shape=(14, 23), holes=0.1):
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
     d = 4.0 + np.sin(x / 6.0) + 0.3 * y
@@ -32,7 +29,7 @@ def field(seed: int, shape: tuple[int, int] = (14, 23), holes: float = 0.1) -> F
 
 
 @pytest.mark.parametrize("slack", [0.0, 0.5])
-def test_crossings_are_those_of_all_pairs(slack: float) -> None:
+def test_crossings_are_those_of_all_pairs(slack):
     d = field(0)
     found = np.ones(d.shape, dtype=bool)
     mark_crossings(d, slack, found)
@@ -47,7 +44,7 @@ def test_crossings_are_those_of_all_pairs(slack: float) -> None:
     assert 0 < plain.sum() < plain.size
 
 
-def test_empty_rows_take_the_nearest() -> None:
+def test_empty_rows_take_the_nearest():
     d = np.arange(8.0, dtype=np.float32)[:, None] * np.ones((1, 5), np.float32)
     d[[0, 3, 4, 7]] = np.nan
     fill_empty_rows(d)
@@ -57,7 +54,7 @@ def test_empty_rows_take_the_nearest() -> None:
     assert np.isnan(nothing).all()
 
 
-def test_disparities_are_taken_back_as_interpolation_says() -> None:
+def test_disparities_are_taken_back_as_interpolation_says():
     whole, sure = field(1, holes=0.0), np.random.default_rng(1).random((14, 23)).astype(np.float32)
     H = np.array([[1.1, 0.05, -2.0], [-0.03, 0.9, 1.2], [1e-3, -2e-3, 1.0]])
     shape = (16, 20)
@@ -85,7 +82,7 @@ def test_disparities_are_taken_back_as_interpolation_says() -> None:
     assert np.isfinite(d[:, :10]).all()
 
 
-def test_pixels_lie_between_as_the_homography_says() -> None:
+def test_pixels_lie_between_as_the_homography_says():
     rng = np.random.default_rng(2)
     places, d = rng.uniform(0, 30, (5, 7, 2)), field(3, (5, 7))
     G = np.array([[0.9, 0.1, 3.0], [-0.1, 1.1, -2.0], [4e-3, -0.05, 1.0]])
@@ -98,7 +95,7 @@ def test_pixels_lie_between_as_the_homography_says() -> None:
     assert 0 < np.isnan(plain).sum() < plain.size
 
 
-def test_guesses_become_medians_of_pixels_of_their_colour() -> None:
+def test_guesses_become_medians_of_pixels_of_their_colour():
     rng = np.random.default_rng(6)
     shape = (20, 31)
     d = np.where(np.arange(31) < 15, 4.0, 12.0) + rng.uniform(0, 0.3, shape)
@@ -133,7 +130,7 @@ def test_guesses_become_medians_of_pixels_of_their_colour() -> None:
     assert np.median(out[:, 15:18][guessed & np.isfinite(d[:, 15:18])]) < 5.0
 
 
-def test_a_guess_alone_goes_with_those_around() -> None:
+def test_a_guess_alone_goes_with_those_around():
     d = field(7)
     rng = np.random.default_rng(7)
     d[rng.random(d.shape) < 0.15] += 9.0
@@ -151,7 +148,7 @@ def test_a_guess_alone_goes_with_those_around() -> None:
     assert (out != d).sum() > 20
 
 
-def test_weights_are_confidences_but_at_rims() -> None:
+def test_weights_are_confidences_but_at_rims():
     d = field(4, holes=0.0)
     sure = np.random.default_rng(4).random(d.shape).astype(np.float32)
     sure[3:6] = 0.0
@@ -165,7 +162,7 @@ def test_weights_are_confidences_but_at_rims() -> None:
     np.testing.assert_allclose(out, plain, rtol=1e-6)
 
 
-def test_two_pictures_become_one_by_the_rules() -> None:
+def test_two_pictures_become_one_by_the_rules():
     rng = np.random.default_rng(5)
     shape, s = (12, 15), 0.3
     colors = tuple(rng.uniform(0, 255, (*shape, 3)).astype(np.float32) for _ in range(2))

@@ -1,22 +1,19 @@
 """The compiled loops of rendering beside plain NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from thesisrecon.arrays import F32, F64
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.zbuffer import rasterize, sample_texture
 from thesisrecon.records import TexturedMesh
 from thesisrecon.views.render import Light, Shading, average_blocks, shade_points, vertex_normals
 
 
-def unit(vectors: F64) -> F64:
+def unit(vectors):
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)
 
 
-def shaded(color: F64, points: F64, normals: F64, eye: F64, shading: Shading) -> F64:
+def shaded(color, points, normals, eye, shading):
     """The plain twin of ``shade_points``: Lambert's law and Blinn's highlight."""
     normals, to_eye = unit(normals), unit(eye - points)
     normals = normals * np.where((normals * to_eye).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
@@ -34,7 +31,7 @@ def shaded(color: F64, points: F64, normals: F64, eye: F64, shading: Shading) ->
 
 
 @pytest.mark.parametrize("specular", [0.0, 0.4])
-def test_light_is_that_of_the_formulas(specular: float) -> None:
+def test_light_is_that_of_the_formulas(specular):
     rng = np.random.default_rng(0)
     color, points, normals = (
         rng.uniform(0, 255, (500, 3)),
@@ -51,7 +48,7 @@ def test_light_is_that_of_the_formulas(specular: float) -> None:
         np.testing.assert_allclose(seen, shaded(color, points, normals, eye, shading), atol=0.02)
 
 
-def test_normals_are_means_by_area() -> None:
+def test_normals_are_means_by_area():
     rng = np.random.default_rng(1)
     vertices, faces = rng.normal(size=(40, 3)), rng.integers(0, 40, (90, 3))
     corners = vertices[faces]
@@ -64,9 +61,9 @@ def test_normals_are_means_by_area() -> None:
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
-def test_blocks_are_means_before_the_background(samples: int) -> None:
+def test_blocks_are_means_before_the_background(samples):
     rng = np.random.default_rng(2)
-    color: F32 = rng.uniform(-20, 300, (6 * samples, 8 * samples, 3)).astype(np.float32)
+    color = rng.uniform(-20, 300, (6 * samples, 8 * samples, 3)).astype(np.float32)
     drawn = rng.integers(-1, 2, color.shape[:2])
     behind = np.array([10, 200, 30], dtype=np.float32)
     out = np.empty((6, 8, 3), dtype=np.uint8)
@@ -75,7 +72,7 @@ def test_blocks_are_means_before_the_background(samples: int) -> None:
     assert np.abs(out - np.clip(np.rint(plain), 0, 255)).max() <= 1
 
 
-def test_values_of_vertices_and_corners_are_interpolated_alike() -> None:
+def test_values_of_vertices_and_corners_are_interpolated_alike():
     rng = np.random.default_rng(3)
     vertices, faces = rng.uniform([-2, -2, 3], [2, 2, 6], (30, 3)), rng.integers(0, 30, (20, 3))
     K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
@@ -89,7 +86,7 @@ def test_values_of_vertices_and_corners_are_interpolated_alike() -> None:
     np.testing.assert_array_equal(part.interpolate(values[faces]), raster.interpolate(values[faces])[10:20])
 
 
-def test_bytes_and_floats_of_a_texture_are_sampled_alike() -> None:
+def test_bytes_and_floats_of_a_texture_are_sampled_alike():
     rng = np.random.default_rng(4)
     texture = rng.integers(0, 256, (9, 7, 3), dtype=np.uint8)
     uv = rng.uniform(-2, 10, (20, 30, 2)).astype(np.float32)
@@ -107,7 +104,7 @@ def test_bytes_and_floats_of_a_texture_are_sampled_alike() -> None:
     np.testing.assert_allclose(seen[0], np.where(drawn[..., None] < 0, 0.0, plain), atol=1e-2)
 
 
-def test_a_colour_without_lamps_is_dimmed_alone() -> None:
+def test_a_colour_without_lamps_is_dimmed_alone():
     color = np.full((2, 3), 100, dtype=np.float32)
     points, normals = np.zeros((2, 3), dtype=np.float32), np.ones((2, 3), dtype=np.float32)
     shade_points(color, points, normals, np.array([0.0, 0, -1]), np.zeros((0, 7)), (0.5, 0.0, 1.0))

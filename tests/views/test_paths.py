@@ -1,7 +1,5 @@
 """Ways of a camera: even, upright, clear of the model, and right at their ends."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +10,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tests.surface.sphere import K, looking_at_origin
-from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.views.paths import fitted, geometric_median, interpolate, orbit, surface_points, upward
@@ -21,32 +18,32 @@ SIZE = (160, 120)
 UP = np.array([0.0, -1.0, 0.0])  # of cameras whose y axis points down
 
 
-def ring(angles: F64, height: float = -1.0, distance: float = 3.5) -> list[Camera]:
+def ring(angles, height=-1.0, distance=3.5):
     """Upright cameras about the origin."""
     return [Camera.from_matrix(looking_at_origin(a, height, distance), SIZE) for a in angles]
 
 
-def ball(count: int = 2000, seed: int = 0) -> F64:
+def ball(count=2000, seed=0):
     """Points on the unit sphere."""
     X = np.random.default_rng(seed).normal(size=(count, 3))
     return X / np.linalg.norm(X, axis=1, keepdims=True)
 
 
-def moved(cameras: list[Camera], turn: F64, shift: F64) -> list[Camera]:
+def moved(cameras, turn, shift):
     """The same cameras in a world that is turned and shifted."""
     return [Camera(c.K, c.R @ turn.T, c.t - c.R @ turn.T @ shift, c.size) for c in cameras]
 
 
-def centres_of(path: list[Camera]) -> F64:
+def centres_of(path):
     return np.array([camera.centre for camera in path])
 
 
-def project(camera: Camera, X: F64) -> F64:
+def project(camera, X):
     x = camera.K @ (camera.R @ X + camera.t)
     return np.asarray(x[:2] / x[2])
 
 
-def test_all_round_the_scene_the_orbit_is_a_circle_at_constant_speed() -> None:
+def test_all_round_the_scene_the_orbit_is_a_circle_at_constant_speed():
     cameras = ring(np.linspace(0, 2 * np.pi, 10)[:-1])
     path = orbit(cameras, ball(), 40)
     centres = centres_of(path)
@@ -59,7 +56,7 @@ def test_all_round_the_scene_the_orbit_is_a_circle_at_constant_speed() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed: int) -> None:
+def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed):
     rng = np.random.default_rng(seed)
     arc = rng.uniform(0.3, 2 * np.pi)
     cameras = ring(np.sort(rng.uniform(0, arc, 8)), rng.uniform(-1.2, 0.5), rng.uniform(3.0, 5.0))
@@ -77,7 +74,7 @@ def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed: in
     np.testing.assert_allclose((centres_of(path) - shift) @ turn, centres_of(same), atol=1e-6)
 
 
-def test_an_orbit_of_one_side_stays_on_that_side_and_closes() -> None:
+def test_an_orbit_of_one_side_stays_on_that_side_and_closes():
     angles = np.radians([-50.0, -20.0, 5.0, 45.0])
     path = orbit(ring(angles), ball(), 61)
     centres = centres_of(path)
@@ -88,7 +85,7 @@ def test_an_orbit_of_one_side_stays_on_that_side_and_closes() -> None:
     assert steps[-1] < 1.1 * steps.max()
 
 
-def test_an_orbit_goes_round_what_is_in_its_way_and_shows_the_model() -> None:
+def test_an_orbit_goes_round_what_is_in_its_way_and_shows_the_model():
     """A long wall: at its ends the cameras' median distance would lead through it."""
     wall = np.random.default_rng(0).uniform([-6, -1, -0.2], [6, 1, 0.2], (3000, 3))
     cameras = ring(np.radians(np.arange(0, 360, 30.0)), -0.5, 5.0)
@@ -100,14 +97,14 @@ def test_an_orbit_goes_round_what_is_in_its_way_and_shows_the_model() -> None:
         assert shown.mean() > 0.4
 
 
-def test_far_points_and_points_without_a_number_do_not_move_the_middle() -> None:
+def test_far_points_and_points_without_a_number_do_not_move_the_middle():
     X = np.vstack([ball(), np.full((300, 3), 500.0), np.full((5, 3), np.nan)])
     path = orbit(ring(np.linspace(0, 6, 9)), X, 5)
     assert max(np.abs(project(camera, np.zeros(3)) - [79.5, 59.5]).max() for camera in path) < 25
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7])
-def test_one_camera_swings_a_little(frames: int) -> None:
+def test_one_camera_swings_a_little(frames):
     (camera,) = ring(np.array([0.4]))
     path = orbit([camera], ball(), frames)
     assert len(path) == frames
@@ -117,7 +114,7 @@ def test_one_camera_swings_a_little(frames: int) -> None:
         assert 1.0 < spread < 3.0
 
 
-def test_cameras_in_the_middle_that_look_away_see_their_surroundings() -> None:
+def test_cameras_in_the_middle_that_look_away_see_their_surroundings():
     """Photographs from the middle of a room, outwards."""
     room = 5.0 * ball()
     away = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 5, 7), 0.0)]
@@ -134,7 +131,7 @@ def test_cameras_in_the_middle_that_look_away_see_their_surroundings() -> None:
         )
 
 
-def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled() -> None:
+def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled():
     rng = np.random.default_rng(1)
     cameras = []
     for camera in ring(np.linspace(-1, 1, 12), -6.0):
@@ -145,7 +142,7 @@ def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled() -> None:
     np.testing.assert_allclose(upward([one]), -one.R[1], atol=1e-9)
 
 
-def test_of_cameras_that_look_straight_down_up_is_behind_them() -> None:
+def test_of_cameras_that_look_straight_down_up_is_behind_them():
     down = []
     for k in range(8):
         a = 2 * np.pi * k / 8
@@ -155,7 +152,7 @@ def test_of_cameras_that_look_straight_down_up_is_behind_them() -> None:
     assert all(camera.centre[1] < -3.0 for camera in orbit(down, ball(), 6))
 
 
-def test_interpolation_ends_at_the_real_cameras_and_passes_all() -> None:
+def test_interpolation_ends_at_the_real_cameras_and_passes_all():
     cameras = ring(np.array([0.0, 0.3, 0.5, 1.1, 1.3]), -1.0)
     cameras[2] = Camera(1.2 * K * [[1], [1], [1 / 1.2]], cameras[2].R, cameras[2].t, SIZE)
     path = interpolate(cameras, 400)
@@ -169,7 +166,7 @@ def test_interpolation_ends_at_the_real_cameras_and_passes_all() -> None:
         np.testing.assert_allclose(path[nearest].K, camera.K, rtol=0.02, atol=1e-9)
 
 
-def test_interpolation_has_a_constant_speed_whatever_the_spacing() -> None:
+def test_interpolation_has_a_constant_speed_whatever_the_spacing():
     path = interpolate(ring(np.array([0.0, 0.05, 0.5, 0.6, 2.0])), 200)
     steps = np.linalg.norm(np.diff(centres_of(path), axis=0), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=0.02)
@@ -177,7 +174,7 @@ def test_interpolation_has_a_constant_speed_whatever_the_spacing() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed: int) -> None:
+def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed):
     angles = np.cumsum(np.random.default_rng(seed).uniform(0.02, 0.8, 6))
     for camera in interpolate(ring(angles, 0.0), 30):
         np.testing.assert_allclose(camera.R[1], -UP, atol=1e-9)
@@ -185,7 +182,7 @@ def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed: int)
         assert np.linalg.det(camera.R) == pytest.approx(1.0)
 
 
-def test_turning_on_the_spot_takes_its_time() -> None:
+def test_turning_on_the_spot_takes_its_time():
     still = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 1, 4), 0.0)]
     path = interpolate(still, 31)
     turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
@@ -193,14 +190,13 @@ def test_turning_on_the_spot_takes_its_time() -> None:
     # Half a turn at one place of a way: no frame jumps.
     far = [Camera(K, c.R, -c.R @ np.array([3.0 * k, 0, 0]), SIZE) for k, c in enumerate(still)]
     path = interpolate(
-        [*far[:2], Camera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE), *far[2:]],
-        100,
+        [*far[:2], Camera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE), *far[2:]], 100
     )
     turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
     assert max(turns) < 0.25
 
 
-def test_coincident_cameras_and_one_camera_stand_still() -> None:
+def test_coincident_cameras_and_one_camera_stand_still():
     camera = ring(np.array([0.3]))[0]
     for cameras in ([camera], [camera] * 3):
         path = interpolate(cameras, 5)
@@ -212,7 +208,7 @@ def test_coincident_cameras_and_one_camera_stand_still() -> None:
     np.testing.assert_allclose(steps, steps.mean(), rtol=0.05)
 
 
-def test_other_shapes_of_pictures_show_all_that_the_camera_saw() -> None:
+def test_other_shapes_of_pictures_show_all_that_the_camera_saw():
     camera = ring(np.array([0.3]))[0]
     for size in ((320, 240), (400, 100), (30, 90)):
         other = fitted(camera, size)
@@ -229,7 +225,7 @@ def test_other_shapes_of_pictures_show_all_that_the_camera_saw() -> None:
     assert {frame.size for frame in orbit([camera, turned], ball(), 5, size=(70, 50))} == {(70, 50)}
 
 
-def test_points_lie_on_the_surface_by_its_area() -> None:
+def test_points_lie_on_the_surface_by_its_area():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [5, 3, 0], [8, 0, 0]])
     mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [3, 4, 5], [0, 0, 1]]))
     X = surface_points(mesh, 1000)
@@ -240,7 +236,7 @@ def test_points_lie_on_the_surface_by_its_area() -> None:
     assert len(surface_points(TexturedMesh(vertices, np.array([[0, 0, 1]])))) == 0
 
 
-def test_wrong_calls_are_refused() -> None:
+def test_wrong_calls_are_refused():
     cameras = ring(np.array([0.0]))
     for path in (lambda c, n: orbit(c, ball(), n), interpolate):
         with pytest.raises(ValueError, match="at least one camera"):

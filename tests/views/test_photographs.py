@@ -1,8 +1,6 @@
 """A model made of a photograph and its true depth, rendered from where the photograph was taken, is the
 photograph."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +10,6 @@ from hypothesis import strategies as st
 
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, sphere_map
 from thesisrecon.camera import Camera
-from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface.linear import surface_from_depth
 from thesisrecon.surface.texture_atlas import TextureAtlas
 from thesisrecon.surface.texture_views import color_vertices
@@ -21,7 +18,7 @@ from thesisrecon.views.render import render
 SIZE = (160, 120)
 
 
-def textured(depth_map: DepthMap) -> TexturedMesh:
+def textured(depth_map):
     """The surface of a depth map with each pixel's place in the photograph as its place in the texture."""
     mesh = surface_from_depth(depth_map)
     xyz = np.column_stack([mesh.vertices, np.ones(len(mesh.vertices))]) @ depth_map.P.T
@@ -30,9 +27,7 @@ def textured(depth_map: DepthMap) -> TexturedMesh:
 
 @settings(max_examples=15, deadline=None)
 @given(angle=st.floats(-3.1, 3.1), height=st.floats(-2.0, 2.0), distance=st.floats(2.8, 5.0))
-def test_from_its_own_camera_the_surface_shows_the_photograph_and_its_depth(
-    angle: float, height: float, distance: float
-) -> None:
+def test_from_its_own_camera_the_surface_shows_the_photograph_and_its_depth(angle, height, distance):
     depth_map = sphere_map(0, looking_at_origin(angle, height, distance))
     seen = render(textured(depth_map), Camera.from_matrix(depth_map.P, SIZE), samples=1)
     known = np.isfinite(depth_map.depth)
@@ -43,7 +38,7 @@ def test_from_its_own_camera_the_surface_shows_the_photograph_and_its_depth(
     assert apart.max() <= 1
 
 
-def test_averaged_pixels_are_those_of_the_photograph_but_for_its_finest_detail() -> None:
+def test_averaged_pixels_are_those_of_the_photograph_but_for_its_finest_detail():
     depth_map = sphere_map(0, looking_at_origin(0.3, -1.0, 3.5))
     seen = render(textured(depth_map), Camera.from_matrix(depth_map.P, SIZE), samples=2)
     inside = np.isfinite(depth_map.depth)
@@ -54,7 +49,7 @@ def test_averaged_pixels_are_those_of_the_photograph_but_for_its_finest_detail()
 
 
 @pytest.mark.parametrize("kind", ["texture", "vertex colours"])
-def test_from_between_two_photographs_the_model_has_the_colours_of_the_scene(kind: str) -> None:
+def test_from_between_two_photographs_the_model_has_the_colours_of_the_scene(kind):
     maps = [sphere_map(k, looking_at_origin(a, -1.0, 3.5)) for k, a in enumerate((-0.2, 0.2))]
     views = [photograph(m) for m in maps]
     mesh = surface_from_depth(maps[0])

@@ -1,11 +1,8 @@
 """What a rendered picture must show."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import TexturedMesh
@@ -15,14 +12,14 @@ K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])
 SIZE = (64, 48)
 
 
-def wall(**more: object) -> TexturedMesh:
+def wall(**more):
     """A wall at depth 2 that fills the picture, its corners at the picture's."""
     corners = homogenize(np.array([[-0.5, -0.5], [63.5, -0.5], [63.5, 47.5], [-0.5, 47.5]]))
     vertices = 2.0 * corners @ np.linalg.inv(K).T
-    return TexturedMesh(vertices, np.array([[0, 2, 1], [0, 3, 2]]), **more)  # type: ignore[arg-type]
+    return TexturedMesh(vertices, np.array([[0, 2, 1], [0, 3, 2]]), **more)
 
 
-def test_a_texture_is_shown_texel_for_pixel() -> None:
+def test_a_texture_is_shown_texel_for_pixel():
     texture = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     corner = np.array([[-0.5, -0.5], [63.5, -0.5], [63.5, 47.5], [-0.5, 47.5]])
     mesh = wall(texture=texture, uv=corner[np.array([[0, 2, 1], [0, 3, 2]])])
@@ -32,7 +29,7 @@ def test_a_texture_is_shown_texel_for_pixel() -> None:
     assert np.abs(seen.color.astype(int) - texture).max() <= 1
 
 
-def test_a_finer_picture_is_averaged() -> None:
+def test_a_finer_picture_is_averaged():
     board = (np.indices((96, 128)).sum(axis=0) % 2 * 255).astype(np.uint8)
     corner = np.array([[-0.5, -0.5], [127.5, -0.5], [127.5, 95.5], [-0.5, 95.5]])
     mesh = wall(texture=np.repeat(board[..., None], 3, axis=2), uv=corner[np.array([[0, 2, 1], [0, 3, 2]])])
@@ -40,7 +37,7 @@ def test_a_finer_picture_is_averaged() -> None:
     assert np.abs(seen.color.astype(int) - 128).max() <= 2
 
 
-def test_vertex_colours_run_from_corner_to_corner() -> None:
+def test_vertex_colours_run_from_corner_to_corner():
     colors = np.array([[0, 0, 0], [255, 0, 0], [255, 255, 0], [0, 255, 0]], dtype=np.uint8)
     seen = render(wall(colors=colors), Camera(K, np.eye(3), np.zeros(3), SIZE)).color.astype(float)
     x = (np.arange(64) + 0.5) / 64 * 255
@@ -48,11 +45,11 @@ def test_vertex_colours_run_from_corner_to_corner() -> None:
     assert (seen[..., 2] == 0).all()
 
 
-def test_light_falls_by_the_cosine_and_shines_towards_the_eye() -> None:
+def test_light_falls_by_the_cosine_and_shines_towards_the_eye():
     camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
 
-    def brightness(**shading: object) -> F64:
-        return render(wall(), camera, shading=Shading(**shading)).color[:, :, 0].astype(float)  # type: ignore[arg-type]
+    def brightness(**shading):
+        return render(wall(), camera, shading=Shading(**shading)).color[:, :, 0].astype(float)
 
     assert np.abs(brightness(ambient=0.5) - 100).max() <= 1
     slanted = Light(direction=(0.0, np.sqrt(3.0), -1.0))
@@ -64,7 +61,7 @@ def test_light_falls_by_the_cosine_and_shines_towards_the_eye() -> None:
     assert lamp[0, 0] < 200
 
 
-def test_nothing_is_seen_where_nothing_is() -> None:
+def test_nothing_is_seen_where_nothing_is():
     empty = TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
     seen = render(empty, camera, background=(1, 2, 3))
@@ -77,13 +74,13 @@ def test_nothing_is_seen_where_nothing_is() -> None:
     assert render(needle, camera).valid.sum() <= 64
 
 
-def test_a_shape_alone_has_no_colours() -> None:
+def test_a_shape_alone_has_no_colours():
     mesh = wall(colors=np.zeros((4, 3), dtype=np.uint8))
     assert bare(mesh).colors is None
     assert (render(bare(mesh), Camera(K, np.eye(3), np.zeros(3), SIZE)).color == 200).all()
 
 
-def test_wrong_calls_are_refused() -> None:
+def test_wrong_calls_are_refused():
     camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
     with pytest.raises(ValueError, match="at least one sample"):
         render(wall(), camera, samples=0)

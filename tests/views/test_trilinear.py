@@ -1,7 +1,5 @@
 """The tensor of a virtual camera is that of the scene seen again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

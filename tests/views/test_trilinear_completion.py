@@ -1,7 +1,5 @@
 """What only one of two photographs shows is hidden behind what the other one shows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

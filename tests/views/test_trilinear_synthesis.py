@@ -1,7 +1,5 @@
 """Pictures of virtual cameras beside those of a scene that is known everywhere."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

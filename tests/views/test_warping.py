@@ -1,17 +1,14 @@
 """Forward warping beside plain NumPy, and what it promises."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from thesisrecon.arrays import F32, F64
 from thesisrecon.views.warping import DIRECTIONS, STRETCH, fill_holes, forward_map, forward_warp, sample
 
 SIZE = (31, 23)
 
 
-def rough(seed: int, shape: tuple[int, int] = (19, 27)) -> tuple[F64, F32]:
+def rough(seed, shape=(19, 27)):
     """A surface with jumps, missing pixels, stretched and folded places."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
@@ -23,13 +20,13 @@ def rough(seed: int, shape: tuple[int, int] = (19, 27)) -> tuple[F64, F32]:
     return target, near.astype(np.float32)
 
 
-def joined(target: F64, near: F32, a: tuple[int, int], b: tuple[int, int], step: float) -> bool:
+def joined(target, near, a, b, step):
     if not (0 <= b[0] < near.shape[0] and 0 <= b[1] < near.shape[1]):
         return False
     return bool(abs(near[a] - near[b]) <= step and np.abs(target[a] - target[b]).max() <= STRETCH)
 
 
-def pieces(target: F64, near: F32, step: float) -> list[tuple[F64, F64]]:
+def pieces(target, near, step):
     """Every triangle and footprint as an affine map (2, 3) from the picture to the photograph's offsets, and
     the corner of those; in the order in which they are drawn."""
     found = []
@@ -54,14 +51,14 @@ def pieces(target: F64, near: F32, step: float) -> list[tuple[F64, F64]]:
     return found
 
 
-def slope(target: F64, near: F32, a: tuple[int, int], step: tuple[int, int], has: list[bool]) -> F64 | None:
+def slope(target, near, a, step, has):
     values = np.concatenate([target, near[..., None]], axis=2)
     forward = values[a[0] + step[0], a[1] + step[1]] if has[0] else values[a]
     backward = values[a[0] - step[0], a[1] - step[1]] if has[1] else values[a]
     return (forward - backward) / sum(has) if any(has) else None
 
 
-def plain_map(target: F64, near: F32, step: float) -> tuple[F64, F64]:
+def plain_map(target, near, step):
     """The plain twin of ``draw_surface``: every piece against all pixels."""
     height, width = SIZE[1], SIZE[0]
     gy, gx = np.mgrid[0:height, 0:width].astype(float)
@@ -102,7 +99,7 @@ def plain_map(target: F64, near: F32, step: float) -> tuple[F64, F64]:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_compiled_map_is_the_plain_one(seed: int) -> None:
+def test_the_compiled_map_is_the_plain_one(seed):
     target, near = rough(seed)
     source, front = forward_map(target, near, size=SIZE, step=0.8)
     plain_source, plain_front = plain_map(target, near, 0.8)
@@ -116,7 +113,7 @@ def test_the_compiled_map_is_the_plain_one(seed: int) -> None:
         np.testing.assert_array_equal(again[1], front)
 
 
-def test_strips_hold_what_reaches_into_them_from_pixels_far_above() -> None:
+def test_strips_hold_what_reaches_into_them_from_pixels_far_above():
     y, x = np.mgrid[0:14, 0:14].astype(float)
     target = np.stack([1.4 * x, 2.8 * y], axis=-1)
     # Every third pixel is elsewhere, so that the triangle opposite to it stands alone.
@@ -130,7 +127,7 @@ def test_strips_hold_what_reaches_into_them_from_pixels_far_above() -> None:
             np.testing.assert_array_equal(again, part)
 
 
-def test_a_linear_photograph_is_moved_exactly() -> None:
+def test_a_linear_photograph_is_moved_exactly():
     y, x = np.mgrid[0:20, 0:30].astype(float)
     image = np.stack([3.0 * x + 2.0 * y, 255.0 - 5.0 * x, x * 0 + 7.0], axis=-1)
     angle = 0.1
@@ -152,7 +149,7 @@ def test_a_linear_photograph_is_moved_exactly() -> None:
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_nearer_wins_whatever_the_order(order: int) -> None:
+def test_nearer_wins_whatever_the_order(order):
     """A square in front of a wall; the photograph is also walked through from its other end."""
     y, x = np.mgrid[0:24, 0:40].astype(float)
     front = (np.abs(x - 20) <= 5) & (np.abs(y - 12) <= 6)
@@ -175,7 +172,7 @@ def test_nearer_wins_whatever_the_order(order: int) -> None:
     assert np.isfinite(filled).all()
 
 
-def test_holes_take_the_mean_of_what_is_behind() -> None:
+def test_holes_take_the_mean_of_what_is_behind():
     rng = np.random.default_rng(3)
     near = rng.choice([1.0, 1.2, 2.4, 3.0, 5.0, np.nan, np.nan], (14, 17)).astype(np.float32)
     rgb = rng.uniform(0, 255, (14, 17, 3)).astype(np.float32)
@@ -204,7 +201,7 @@ def test_holes_take_the_mean_of_what_is_behind() -> None:
             np.testing.assert_allclose(filled[y, x], mean, rtol=1e-5)
 
 
-def test_samples_are_cubic_within_and_linear_at_the_border() -> None:
+def test_samples_are_cubic_within_and_linear_at_the_border():
     rng = np.random.default_rng(4)
     y, x = np.mgrid[0:12, 0:15].astype(float)
     image = np.stack([x * x - x * y, rng.uniform(0, 255, x.shape)], axis=-1).astype(np.float32)
@@ -228,7 +225,7 @@ def test_samples_are_cubic_within_and_linear_at_the_border() -> None:
     assert np.isfinite(holed[2])
 
 
-def test_a_single_pixel_and_nothing_at_all() -> None:
+def test_a_single_pixel_and_nothing_at_all():
     near = np.array([[1.0]])
     rgb, seen = forward_warp(np.full((1, 1, 3), 9.0), np.array([[[2.2, 1.1]]]), near, size=(4, 3))
     assert np.isfinite(seen).sum() == 1
@@ -238,7 +235,7 @@ def test_a_single_pixel_and_nothing_at_all() -> None:
     assert np.isnan(fill_holes(rgb, seen)).all()
 
 
-def test_wrong_calls_are_refused() -> None:
+def test_wrong_calls_are_refused():
     image, xy, near = np.zeros((4, 5, 3)), np.zeros((4, 5, 2)), np.zeros((4, 5))
     with pytest.raises(ValueError, match="inverse_depth"):
         forward_warp(image, xy, near[:3], size=(4, 4))

@@ -1,24 +1,20 @@
 """What is said of rows: planted effects are found, others are not, failures are counted."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.validation.ablation.toy import Darts
 from validation.ablation import Measure, Study, analyse
-from validation.ablation.analysis import Comparison, as_told
-from validation.ablation.plan import Plan, PlannedRow, plan_study
+from validation.ablation.analysis import as_told
+from validation.ablation.plan import Plan, plan_study
 from validation.ablation.run import Row, Rows
 from validation.ablation.tables import write_tables
 
 
-def rows_of(study: Study | Plan, value: Any) -> Rows:
+def rows_of(study, value):
     """Rows without running: ``value(planned row)`` is a number, or the reason why there is none."""
     plan, rows = study if isinstance(study, Plan) else plan_study(study), []
     for p in plan.rows:
@@ -31,17 +27,17 @@ def rows_of(study: Study | Plan, value: Any) -> Rows:
     return Rows(plan, tuple(rows))
 
 
-def darts(**more: Any) -> Study:
-    told: dict[str, Any] = {"scenes": ["a"], "seeds": 20, "task": Darts()}
+def darts(**more):
+    told = {"scenes": ["a"], "seeds": 20, "task": Darts()}
     return Study({"task.aim": [1.0, 2.0]}, **{**told, **more})
 
 
-def compared(rows: Rows, variant: str, measure: str = "miss") -> Comparison:
+def compared(rows, variant, measure="miss"):
     found = analyse(rows).comparisons
     return next(c for c in found if (c.variant, c.measure.name) == (variant, measure))
 
 
-def test_a_planted_effect_of_one_deviation_is_found_and_nothing_else() -> None:
+def test_a_planted_effect_of_one_deviation_is_found_and_nothing_else():
     found, false, trials = 0, 0, 100
     plan = plan_study(darts(metrics=["miss"]))
     for trial in range(trials):
@@ -49,7 +45,7 @@ def test_a_planted_effect_of_one_deviation_is_found_and_nothing_else() -> None:
         level = 10.0 * rng.normal(size=20)
         noise = {(p.variant, p.seed): rng.normal() for p in plan.rows}
 
-        def value(p: PlannedRow, level: Any = level, noise: Any = noise) -> float:
+        def value(p, level=level, noise=noise):
             # The deviation of a difference of two draws is sqrt 2.
             planted = np.sqrt(2.0) * (p.variant == "aim = 2")
             return float(level[p.seed] + noise[p.variant, p.seed] + planted)
@@ -61,7 +57,7 @@ def test_a_planted_effect_of_one_deviation_is_found_and_nothing_else() -> None:
     assert false <= 0.05 * trials + 2
 
 
-def test_among_many_variants_none_of_which_does_anything_none_is_reported() -> None:
+def test_among_many_variants_none_of_which_does_anything_none_is_reported():
     reported, trials = 0, 60
     axes = {"task.aim": [float(n) for n in range(1, 11)]}
     plan = plan_study(replace(darts(metrics=["miss"], seeds=10), axes=axes))
@@ -72,7 +68,7 @@ def test_among_many_variants_none_of_which_does_anything_none_is_reported() -> N
     assert reported <= 0.05 * trials + 2
 
 
-def test_better_is_on_the_side_that_the_measure_says() -> None:
+def test_better_is_on_the_side_that_the_measure_says():
     rows = rows_of(
         darts(), lambda p: p.seed % 5 + 3.0 * (p.variant == "aim = 1") - 0.01 * p.seed * len(p.variant)
     )
@@ -81,7 +77,7 @@ def test_better_is_on_the_side_that_the_measure_says() -> None:
     assert compared(rows, "aim = 1").interval.mean == -compared(rows, "aim = 1", "score").interval.mean
 
 
-def test_quotients_where_all_values_allow_them() -> None:
+def test_quotients_where_all_values_allow_them():
     ratio = darts(metrics=[Measure("miss", ratio=True)])
     rows = rows_of(ratio, lambda p: (1.0 + p.seed) * (2.0 if p.variant == "aim = 1" else 1.0))
     found = compared(rows, "aim = 1")
@@ -92,7 +88,7 @@ def test_quotients_where_all_values_allow_them() -> None:
     assert compared(with_zero, "aim = 1").interval.mean == 1.0
 
 
-def test_only_pairs_count_and_failures_are_told() -> None:
+def test_only_pairs_count_and_failures_are_told():
     rows = rows_of(darts(), lambda p: "no luck" if p.variant == "aim = 1" and p.seed < 15 else float(p.seed))
     analysis = analyse(rows)
     cell = next(c for c in analysis.cells if (c.variant, c.measure.name) == ("aim = 1", "miss"))
@@ -105,7 +101,7 @@ def test_only_pairs_count_and_failures_are_told() -> None:
     assert "17 (15 of 20 failed)" in str(analysis)
 
 
-def test_each_step_of_a_ladder_is_also_compared_with_the_one_before() -> None:
+def test_each_step_of_a_ladder_is_also_compared_with_the_one_before():
     ladder = darts(mode="ladder", start="bottom")
     height = {"bottom": 5.0, "aim = 1": 3.0, "aim = 2": 2.5}
     analysis = analyse(rows_of(ladder, lambda p: height[p.variant] + 0.1 * np.sin(p.seed * len(p.variant))))
@@ -116,14 +112,14 @@ def test_each_step_of_a_ladder_is_also_compared_with_the_one_before() -> None:
     assert against["aim = 2"].interval.mean == pytest.approx(-2.5, abs=0.1)
 
 
-def test_a_study_that_was_stopped_is_told_to_be_so() -> None:
+def test_a_study_that_was_stopped_is_told_to_be_so():
     rows = rows_of(darts(), lambda p: float(p.seed))
     some = Rows(rows.plan, rows.rows[:-5])
     assert analyse(some).warnings == ("5 of 60 rows have not been computed",)
     assert str(analyse(Rows(rows.plan, ()))).startswith("warning: 60 of 60 rows")
 
 
-def test_tables_hold_every_row_and_comparison(tmp_path: Path) -> None:
+def test_tables_hold_every_row_and_comparison(tmp_path):
     rows = rows_of(
         darts(conditions={"task.spread": [1.0, 2.0]}), lambda p: "gone" if p.seed == 3 else float(p.seed)
     )

@@ -1,14 +1,10 @@
 """The command, and the page it leaves."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,9 +13,9 @@ from tests.validation.ablation.toy import Darts, marks
 from validation.ablation import Measure, Study, ablate, analyse, write_analysis
 from validation.ablation.progress import duration, words_of
 from validation.ablation.run import State
-from validation.studies.stop_anywhere import stopped
 from validation.command import main
 from validation.scenes.real import ROOT
+from validation.studies.stop_anywhere import stopped
 
 EVIL = "<img src=x onerror=alert(1)>"
 STUDY = """
@@ -33,16 +29,14 @@ seeds = 3
 """
 
 
-def write_study(folder: Path, scene: str = "bb") -> Path:
+def write_study(folder, scene="bb"):
     path = folder / "study.toml"
     toy = Path(__file__).with_name("toy.py")
     path.write_text(STUDY.format(toy=toy, scene=scene), encoding="utf-8")
     return path
 
 
-def test_a_study_of_a_file_leaves_a_page_and_tables(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_study_of_a_file_leaves_a_page_and_tables(tmp_path, capsys):
     wish = ["ablate", str(write_study(tmp_path)), "-o", str(tmp_path / "out"), "--executor", "local"]
     assert main([*wish, "--plan"]) == 0
     assert "3 variants: unchanged; aim = 1; aim = 4" in capsys.readouterr().out
@@ -58,7 +52,7 @@ def test_a_study_of_a_file_leaves_a_page_and_tables(
     assert main([*wish, "--read"]) == 0
 
 
-def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path: Path) -> None:
+def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path):
     file = write_study(tmp_path)
     file.write_text(file.read_text().replace(":Darts", f':Darts", pause_s = 600, log = "{tmp_path / "log"}'))
     wish = ["ablate", str(file), "-o", str(tmp_path / "out"), "--threads", "2"]
@@ -72,10 +66,8 @@ def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path: Path) -> None
     assert (stop.code, stop.said, stop.left) == (130, f"validation: interrupted; {kept}\n", 0)
 
 
-def test_an_interrupt_in_a_program_is_told_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupt(*_: Any, **__: Any) -> None:
+def test_an_interrupt_in_a_program_is_told_too(tmp_path, monkeypatch, capsys):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("validation.ablation.command.ablate", interrupt)
@@ -83,9 +75,7 @@ def test_an_interrupt_in_a_program_is_told_too(
     assert capsys.readouterr().err.startswith("ablate: interrupted; the same command goes on from the rows")
 
 
-def test_rows_that_all_fail_and_wrong_wishes_end_otherwise(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_that_all_fail_and_wrong_wishes_end_otherwise(tmp_path, capsys):
     out = ["-o", str(tmp_path / "out"), "--executor", "local", "--threads", "1"]
     some = write_study(tmp_path, "refuses")
     assert main(["ablate", str(some), *out]) == 0
@@ -98,7 +88,7 @@ def test_rows_that_all_fail_and_wrong_wishes_end_otherwise(
     assert "there is no scene 'nowhere'" in capsys.readouterr().err
 
 
-def test_the_view_says_what_the_bar_does_not() -> None:
+def test_the_view_says_what_the_bar_does_not():
     state = State(10, kept=2, width=1, steps=3)
     assert words_of(state) == "0 of 3 shared steps"
     state.steps_done, state.done, state.failed = 3, 4, 1
@@ -109,7 +99,7 @@ def test_the_view_says_what_the_bar_does_not() -> None:
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page(tmp_path_factory):
     out = tmp_path_factory.mktemp("page")
     study = Study(
         {"task.aim": [1.0, 4.0], EVIL: {EVIL: {"task.spread": 3.0}}},
@@ -128,7 +118,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module", params=[("two", 1300), ("one", 420)], ids=["desktop", "narrow"])
-def opened(request: pytest.FixtureRequest, browser: Any, page: Path) -> Iterator[Witness]:
+def opened(request, browser, page):
     folder, width = request.param
     drawn = ("plot-miss-forest", "plot-miss-over" if folder == "two" else "plot-miss-cost")
     witness = Witness(browser, page / folder / "index.html", width, drawn=drawn)
@@ -137,7 +127,7 @@ def opened(request: pytest.FixtureRequest, browser: Any, page: Path) -> Iterator
 
 
 @pytest.mark.browser
-def test_the_page_draws_complains_of_nothing_and_reaches_out_nowhere(opened: Witness) -> None:
+def test_the_page_draws_complains_of_nothing_and_reaches_out_nowhere(opened):
     assert opened.errors == []
     assert all(r.startswith(("file:", "data:", "blob:")) for r in opened.requests)
     assert opened.page.locator("img[onerror]").count() == 0
@@ -145,7 +135,7 @@ def test_the_page_draws_complains_of_nothing_and_reaches_out_nowhere(opened: Wit
 
 
 @pytest.mark.browser
-def test_the_page_tells_differences_and_failures(opened: Witness) -> None:
+def test_the_page_tells_differences_and_failures(opened):
     assert opened.page.locator("td.bad").count() >= 2
     text = opened.page.locator("main").inner_text()
     assert "aim = 4" in text

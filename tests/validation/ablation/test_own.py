@@ -1,7 +1,5 @@
 """A variant of the user's own, as the documentation shows it, and all that can be wrong with one."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +19,7 @@ from validation.ablation.toml import read_study, study_from_table
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "ablation.md"
 
 
-def write_examples(folder: Path) -> Path:
+def write_examples(folder):
     """The files of the documentation; the study among them."""
     blocks = re.findall(r"<!-- example: (\S+) -->\n```\w+\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.S)
     for name, text in blocks:
@@ -29,7 +27,7 @@ def write_examples(folder: Path) -> Path:
     return folder / "study.toml"
 
 
-def test_the_example_of_the_documentation_runs_and_says_what_it_should(tmp_path: Path) -> None:
+def test_the_example_of_the_documentation_runs_and_says_what_it_should(tmp_path):
     rows = ablate(read_study(write_examples(tmp_path)), tmp_path / "out", executor="local", threads=1)
     assert not [r.failure for r in rows if r.failure]
     verdicts = {(c.variant, c.condition): c.verdict for c in analyse(rows).comparisons}
@@ -38,7 +36,7 @@ def test_the_example_of_the_documentation_runs_and_says_what_it_should(tmp_path:
     assert verdicts["EveryMatch, normalized = no", "outliers = 0.3"] == "worse"
 
 
-def test_an_edited_variant_has_new_rows(tmp_path: Path) -> None:
+def test_an_edited_variant_has_new_rows(tmp_path):
     path = write_examples(tmp_path)
     before = {r.variant: r.key for r in plan_study(read_study(path)).rows}
     file = tmp_path / "every_match.py"
@@ -48,7 +46,7 @@ def test_an_edited_variant_has_new_rows(tmp_path: Path) -> None:
     assert before["EveryMatch"] != after["EveryMatch"]
 
 
-def test_the_source_of_a_variant_travels_with_its_rows(tmp_path: Path) -> None:
+def test_the_source_of_a_variant_travels_with_its_rows(tmp_path):
     plan = plan_study(read_study(write_examples(tmp_path)))
     own = next(r for r in plan.rows if r.variant == "EveryMatch")
     _, sources = pack(own.setting)
@@ -61,12 +59,12 @@ def test_the_source_of_a_variant_travels_with_its_rows(tmp_path: Path) -> None:
 class Blind:
     """An estimator that looks at nothing."""
 
-    def estimate(self, xy1: np.ndarray, *_: object) -> FundamentalFit:
+    def estimate(self, xy1, *_):
         F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
         return FundamentalFit(F / np.sqrt(2), np.ones(len(xy1), bool), 1.0, np.eye(9))
 
 
-def test_an_object_of_a_script_enters_a_study_in_python(tmp_path: Path) -> None:
+def test_an_object_of_a_script_enters_a_study_in_python(tmp_path):
     study = Study({"epipolar": [Blind()]}, ["a"], seeds=1, task=Darts())
     rows = ablate(study, tmp_path, executor="processes", threads=1)
     assert [r.variant for r in rows] == ["unchanged", "Blind"]
@@ -87,16 +85,14 @@ def test_an_object_of_a_script_enters_a_study_in_python(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_is_wrong_with_a_variant_is_told_before_the_run(
-    tmp_path: Path, text: str, word: str, words: str
-) -> None:
+def test_what_is_wrong_with_a_variant_is_told_before_the_run(tmp_path, text, word, words):
     (tmp_path / "mine.py").write_text(text, encoding="utf-8")
     table = {"scenes": ["cube"], "task": "fundamental", "axes": {"epipolar": [word]}}
     with pytest.raises(UsageError, match=words):
         plan_study(study_from_table(table, tmp_path))
 
 
-def test_a_task_of_a_file(tmp_path: Path) -> None:
+def test_a_task_of_a_file(tmp_path):
     text = "def weigh(config, scene, seed):\n    return {'grams': config.images.max_size_px + seed}\n"
     (tmp_path / "mine.py").write_text(text, encoding="utf-8")
     table = {

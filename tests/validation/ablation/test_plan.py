@@ -1,10 +1,6 @@
 """What a study says of itself before anything runs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,15 +17,15 @@ from validation.ablation.run import parts_of
 from validation.ablation.toml import read_study, study_from_table
 
 
-def darts(axes: dict[str, Any], **more: Any) -> Study:
+def darts(axes, **more):
     return Study(axes, **{"scenes": ["a", "b"], "seeds": 2, "task": Darts(), **more})
 
 
-def names(study: Study) -> list[str]:
+def names(study):
     return [v.name for v in plan_study(study).variants]
 
 
-def test_one_thing_changes_at_a_time() -> None:
+def test_one_thing_changes_at_a_time():
     plan = plan_study(darts({"task.aim": [1.0, 2.0], "epipolar": ["thesis-ransac"]}, start="as it is"))
     assert [v.name for v in plan.variants] == ["as it is", "aim = 1", "aim = 2", "thesis-ransac"]
     settings = {r.variant: r.setting for r in plan.rows}
@@ -40,11 +36,11 @@ def test_one_thing_changes_at_a_time() -> None:
     assert plan.baseline == "as it is"
 
 
-def test_a_value_that_changes_nothing_is_no_second_variant() -> None:
+def test_a_value_that_changes_nothing_is_no_second_variant():
     assert names(darts({"task.aim": [0.0, 1.0]})) == ["unchanged", "aim = 1"]
 
 
-def test_a_grid_takes_every_combination_and_no_start() -> None:
+def test_a_grid_takes_every_combination_and_no_start():
     study = darts(
         {"task.aim": [0.0, 1.0], "task.spread": [1.0, 2.0]}, mode="grid", baseline="aim = 1, spread = 2"
     )
@@ -52,7 +48,7 @@ def test_a_grid_takes_every_combination_and_no_start() -> None:
     assert plan_study(study).variants[3].levels == {"task.aim": "aim = 1", "task.spread": "spread = 2"}
 
 
-def test_a_ladder_keeps_its_steps_and_a_whole_stage_replaces_what_was_set_in_it() -> None:
+def test_a_ladder_keeps_its_steps_and_a_whole_stage_replaces_what_was_set_in_it():
     steps = {
         "wide": {"epipolar.threshold_px": 3.0},
         "high": {"task.aim": 2.0},
@@ -61,12 +57,12 @@ def test_a_ladder_keeps_its_steps_and_a_whole_stage_replaces_what_was_set_in_it(
     plan = plan_study(darts({"steps": steps}, mode="ladder", start="bottom"))
     assert [v.name for v in plan.variants] == ["bottom", "wide", "high", "new"]
     found = {r.variant: r.setting for r in plan.rows}
-    assert found["high"].config.epipolar.threshold_px == 3.0  # type: ignore[attr-defined]
+    assert found["high"].config.epipolar.threshold_px == 3.0
     assert found["new"].config.epipolar == ThesisRansac()
     assert found["new"].task.aim == 2.0
 
 
-def test_conditions_multiply_rows_but_not_variants() -> None:
+def test_conditions_multiply_rows_but_not_variants():
     plan = plan_study(darts({"task.aim": [1.0]}, conditions={"task.spread": [0.5, 2.0, 4.0]}))
     assert len(plan.variants) == 2
     assert [c.name for c in plan.conditions] == ["spread = 0.5", "spread = 2", "spread = 4"]
@@ -75,7 +71,7 @@ def test_conditions_multiply_rows_but_not_variants() -> None:
     assert [r.seed for r in plan.rows] == sorted(r.seed for r in plan.rows), "a stopped study has whole seeds"
 
 
-def test_values_may_be_objects_tables_words_or_what_a_preset_has() -> None:
+def test_values_may_be_objects_tables_words_or_what_a_preset_has():
     values = [
         HarrisCorners(max_corners=77),
         {"kind": "harris-corners", "max_corners": 88},
@@ -94,16 +90,17 @@ def test_values_may_be_objects_tables_words_or_what_a_preset_has() -> None:
     assert rows[1].setting.config.features == preset("thesis").features
 
 
-def test_an_object_may_stand_deep_in_a_stage() -> None:
-    from thesisrecon.stereo.semi_global import SemiGlobal
+def test_an_object_may_stand_deep_in_a_stage():
+    from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
+    from thesisrecon.stereo.semi_global import SemiGlobalMatching
 
-    rows = plan_study(darts({"dense.pairs.matcher": [SemiGlobal(memory_mb=99.0)]})).rows
-    assert rows[1].setting.config.dense.pairs.matcher == SemiGlobal(memory_mb=99.0)  # type: ignore[attr-defined]
-    words = plan_study(darts({"dense.pairs.matcher": ["semi-global"]})).rows
-    assert words[1].setting.config.dense.pairs.matcher == SemiGlobal()  # type: ignore[attr-defined]
+    rows = plan_study(darts({"dense.pairs.matcher": [SemiGlobalMatching(memory_mb=99.0)]})).rows
+    assert rows[1].setting.config.dense.pairs.matcher == SemiGlobalMatching(memory_mb=99.0)
+    words = plan_study(darts({"dense.pairs.matcher": ["maximum-likelihood-scanline"]})).rows
+    assert words[1].setting.config.dense.pairs.matcher == MaximumLikelihoodScanline()
 
 
-def test_rows_are_named_by_setting_scene_seed_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_named_by_setting_scene_seed_and_versions(monkeypatch):
     study = darts({"task.aim": [1.0]})
     keys = {(r.variant, r.scene, r.seed): r.key for r in plan_study(study).rows}
     again = plan_study(replace(study, seeds=[1, 5], scenes=["b"], axes={"task.aim": [1.0, 3.0]}))
@@ -113,7 +110,7 @@ def test_rows_are_named_by_setting_scene_seed_and_versions(monkeypatch: pytest.M
     assert not {r.key for r in plan_study(study).rows} & set(keys.values())
 
 
-def test_a_function_is_a_task_when_it_says_what_it_tells() -> None:
+def test_a_function_is_a_task_when_it_says_what_it_tells():
     study = Study(
         {"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", Measure("scene_length")]
     )
@@ -124,7 +121,7 @@ def test_a_function_is_a_task_when_it_says_what_it_tells() -> None:
         plan_study(replace(study, axes={"task.aim": [1]}))
 
 
-def test_only_steps_after_which_rows_part_are_parts_of_their_own() -> None:
+def test_only_steps_after_which_rows_part_are_parts_of_their_own():
     axes = {"epipolar.threshold_px": [2.0], "dense.max_side": [512], "images.max_size_px": [800]}
     plan = plan_study(Study(axes, ["a"], seeds=2, task=Steps()))
     parts = parts_of(plan.rows)
@@ -173,13 +170,13 @@ TABLE = {"scenes": ["a"], "axes": {"epipolar.threshold_px": [2.0]}, "task": "rec
         ({"axes": {"features": ["mine.py:Corners"]}}, r"there is no file .*mine\.py to read Corners from"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_told_before_the_run(change: dict[str, Any], words: str) -> None:
+def test_what_does_not_fit_is_told_before_the_run(change, words):
     scenes = {"scenes": ["courtyard"]} if change.get("task", "") != {"kind": "stereo", "unti": 1} else {}
     with pytest.raises(UsageError, match=words):
         plan_study(study_from_table({**TABLE, **scenes, **change}))
 
 
-def test_a_file_that_is_no_study_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_no_study_is_told(tmp_path):
     with pytest.raises(UsageError, match=r"gone\.toml cannot be read"):
         read_study(tmp_path / "gone.toml")
     (tmp_path / "broken.toml").write_text("scenes = [", encoding="utf-8")
@@ -194,7 +191,7 @@ SHIPPED = sorted(STUDIES.glob("*.toml"))
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
-def test_every_study_that_is_shipped_can_be_planned(path: Path) -> None:
+def test_every_study_that_is_shipped_can_be_planned(path):
     try:
         plan = plan_study(read_study(path))
     except UsageError as error:
@@ -206,7 +203,7 @@ def test_every_study_that_is_shipped_can_be_planned(path: Path) -> None:
     assert plan.study.words
 
 
-def test_the_ladder_leads_from_the_thesis_to_the_default() -> None:
+def test_the_ladder_leads_from_the_thesis_to_the_default():
     study = replace(read_study(STUDIES / "thesis-to-default.toml"), scenes=["courtyard"], seeds=1)
     rows = plan_study(study).rows
     configs = [replace(r.setting.config, images=PipelineConfig().images) for r in rows]

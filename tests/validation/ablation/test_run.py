@@ -1,7 +1,5 @@
 """Rows: kept as they end, computed once, whatever fails or is killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -11,7 +9,6 @@ import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,12 +23,12 @@ from validation.ablation.workers import crew_of
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def study(log: Path, **more: Any) -> Study:
-    told: dict[str, Any] = {"scenes": ["a", "bb"], "seeds": 2, "task": Darts(log=str(log))}
+def study(log, **more):
+    told = {"scenes": ["a", "bb"], "seeds": 2, "task": Darts(log=str(log))}
     return Study({"task.aim": [1.0, 2.0]}, **{**told, **more})
 
 
-def test_every_row_is_computed_once_and_told_in_the_order_of_the_plan(tmp_path: Path) -> None:
+def test_every_row_is_computed_once_and_told_in_the_order_of_the_plan(tmp_path):
     log, out = tmp_path / "log", tmp_path / "out"
     rows = ablate(study(log), out, executor="local", threads=1)
     assert len(rows) == 3 * 2 * 2 == len(marks(log))
@@ -51,7 +48,7 @@ def test_every_row_is_computed_once_and_told_in_the_order_of_the_plan(tmp_path: 
     assert len(marks(log)) == 18
 
 
-def test_a_row_on_disk_stands_on_its_own(tmp_path: Path) -> None:
+def test_a_row_on_disk_stands_on_its_own(tmp_path):
     rows = ablate(study(tmp_path / "log", seeds=1), tmp_path / "out", executor="local")
     told = json.loads((tmp_path / "out" / "rows" / f"{rows[1].key}.json").read_text())
     assert told["variant"] == "aim = 1"
@@ -62,7 +59,7 @@ def test_a_row_on_disk_stands_on_its_own(tmp_path: Path) -> None:
     assert told["seconds"] > 0.0
 
 
-def test_a_damaged_row_is_computed_again(tmp_path: Path) -> None:
+def test_a_damaged_row_is_computed_again(tmp_path):
     log, out = tmp_path / "log", tmp_path / "out"
     rows = ablate(study(log, seeds=1), out, executor="local")
     (out / "rows" / f"{rows[0].key}.json").write_text("{", encoding="utf-8")
@@ -71,7 +68,7 @@ def test_a_damaged_row_is_computed_again(tmp_path: Path) -> None:
     assert len(marks(log)) == 7
 
 
-def test_what_fails_is_kept_with_its_reason_and_not_tried_again(tmp_path: Path) -> None:
+def test_what_fails_is_kept_with_its_reason_and_not_tried_again(tmp_path):
     log = tmp_path / "log"
     failing = study(log, scenes=["a", "refuses", "breaks", "empty"], seeds=1)
     rows = ablate(failing, tmp_path / "out", executor="local")
@@ -88,7 +85,7 @@ def test_what_fails_is_kept_with_its_reason_and_not_tried_again(tmp_path: Path) 
     assert any("every row of refuses failed, so that it says nothing: no board" in w for w in warnings)
 
 
-def test_a_metric_that_nobody_tells_is_named(tmp_path: Path) -> None:
+def test_a_metric_that_nobody_tells_is_named(tmp_path):
     wish = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
     rows = ablate(wish, tmp_path, executor="local")
     assert {r.failure for r in rows} == {"the task tells no wieght"}
@@ -96,7 +93,7 @@ def test_a_metric_that_nobody_tells_is_named(tmp_path: Path) -> None:
     assert "no row tells wieght" in analyse(rows).warnings
 
 
-def test_what_rows_begin_with_is_computed_once(tmp_path: Path) -> None:
+def test_what_rows_begin_with_is_computed_once(tmp_path):
     log = tmp_path / "log"
     axes = {"epipolar.threshold_px": [2.0], "dense.max_side": [512], "images.max_size_px": [800]}
     shared = Study(axes, ["a", "b"], seeds=2, task=Steps(log=str(log)))
@@ -113,9 +110,9 @@ def test_what_rows_begin_with_is_computed_once(tmp_path: Path) -> None:
     assert sum(bool(told["steps"]) for told in own.values()) == len(rows)
 
 
-def test_the_same_rows_whoever_carries_them_out(tmp_path: Path) -> None:
+def test_the_same_rows_whoever_carries_them_out(tmp_path):
     wish = study(tmp_path / "log", scenes=["a"], seeds=1)
-    kinds: dict[str, Any] = {"one": ("local", 1), "threads": ("local", 2), "processes": ("processes", 1)}
+    kinds = {"one": ("local", 1), "threads": ("local", 2), "processes": ("processes", 1)}
     found = {
         name: [(r.key, r.metrics) for r in ablate(wish, tmp_path / name, executor=kind, threads=threads)]
         for name, (kind, threads) in kinds.items()
@@ -123,7 +120,7 @@ def test_the_same_rows_whoever_carries_them_out(tmp_path: Path) -> None:
     assert found["one"] == found["threads"] == found["processes"]
 
 
-def test_a_wrong_executor_or_folder_is_told(tmp_path: Path) -> None:
+def test_a_wrong_executor_or_folder_is_told(tmp_path):
     wish = study(tmp_path / "log", seeds=1)
     with pytest.raises(UsageError, match="unknown executor 'prozesses'; did you mean processes"):
         ablate(wish, tmp_path / "out", executor="prozesses")
@@ -138,13 +135,13 @@ def test_a_wrong_executor_or_folder_is_told(tmp_path: Path) -> None:
 class Deadly(Darts):
     """Kills its process where the aim is 2."""
 
-    def run(self, *wish: Any) -> Any:
+    def run(self, *wish):
         if self.aim == 2.0:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().run(*wish)
 
 
-def test_a_row_that_kills_its_process_is_lost_alone_and_tried_again_next_time(tmp_path: Path) -> None:
+def test_a_row_that_kills_its_process_is_lost_alone_and_tried_again_next_time(tmp_path):
     wish = study(tmp_path / "log", scenes=["a"], seeds=1, task=Deadly(log=str(tmp_path / "log")))
     rows = ablate(wish, tmp_path / "out", executor="processes", threads=2)
     assert [bool(r.failure) for r in rows] == [False, False, True]
@@ -162,11 +159,11 @@ if __name__ == "__main__":
 """
 
 
-def slow(folder: Path) -> Study:
+def slow(folder):
     return study(folder / "log", seeds=8, task=Darts(pause_s=0.05, log=str(folder / "log")))
 
 
-def test_a_killed_study_loses_no_more_than_the_rows_in_flight(tmp_path: Path) -> None:
+def test_a_killed_study_loses_no_more_than_the_rows_in_flight(tmp_path):
     script = tmp_path / "killed.py"
     script.write_text(KILLED, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -188,7 +185,7 @@ def test_a_killed_study_loses_no_more_than_the_rows_in_flight(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("executor", ["local", "processes"])
-def test_a_row_on_a_full_disk_has_not_failed(executor: str, tmp_path: Path) -> None:
+def test_a_row_on_a_full_disk_has_not_failed(executor, tmp_path):
     log, out = tmp_path / "log", tmp_path / "out"
     crowded = study(log, scenes=["full"], seeds=1)
     with pytest.raises(OutputError, match=r"throws\.txt cannot be written: .* make room there"):
@@ -199,7 +196,7 @@ def test_a_row_on_a_full_disk_has_not_failed(executor: str, tmp_path: Path) -> N
     assert [r.failure for r in rows] == [""] * 3
 
 
-def test_the_time_left_is_that_of_rows_of_the_same_variant() -> None:
+def test_the_time_left_is_that_of_rows_of_the_same_variant():
     state = State(10, width=2)
     assert state.left_s is None
     state.spent = {"quick": [1.0, 3.0], "slow": [10.0]}
@@ -208,21 +205,21 @@ def test_the_time_left_is_that_of_rows_of_the_same_variant() -> None:
     assert state.left_s == pytest.approx((6.0 + 20.0 + 14.0 / 3.0) / 2.0)
 
 
-def test_an_executor_of_the_caller_stays_open() -> None:
+def test_an_executor_of_the_caller_stays_open():
     with ThreadPoolExecutor(3) as pool:
         with crew_of(pool, None) as crew:
             assert crew.width == 3
         assert pool.submit(len, "abc").result() == 3
 
 
-def test_progress_hears_of_every_row(tmp_path: Path) -> None:
-    heard: list[int] = []
+def test_progress_hears_of_every_row(tmp_path):
+    heard = []
     ablate(study(tmp_path / "log"), tmp_path / "out", executor="local", heard=lambda s: heard.append(s.done))
     assert heard[0] == 0
     assert heard[-1] == 12
 
 
-def test_a_dask_cluster_finds_the_same_and_is_missed_when_gone(tmp_path: Path) -> None:
+def test_a_dask_cluster_finds_the_same_and_is_missed_when_gone(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
     wish = study(tmp_path / "log", scenes=["a"], seeds=2)
     here = ablate(wish, tmp_path / "here", executor="local", threads=1)
@@ -242,7 +239,7 @@ def test_a_dask_cluster_finds_the_same_and_is_missed_when_gone(tmp_path: Path) -
 class DeadlyOnce(Darts):
     """Kills its process where the aim is 2, unless somebody has done so before."""
 
-    def run(self, *wish: Any) -> Any:
+    def run(self, *wish):
         if self.aim == 2.0:
             try:
                 os.close(os.open(f"{self.log}.killed", os.O_CREAT | os.O_EXCL))
@@ -253,7 +250,7 @@ class DeadlyOnce(Darts):
         return super().run(*wish)
 
 
-def test_a_worker_of_a_cluster_that_is_killed_loses_no_row(dask_cluster: Any, tmp_path: Path) -> None:
+def test_a_worker_of_a_cluster_that_is_killed_loses_no_row(dask_cluster, tmp_path):
     log = tmp_path / "log"
     wish = study(log, scenes=["a"], seeds=4, task=DeadlyOnce(log=str(log)))
     rows = ablate(wish, tmp_path / "out", executor=address(dask_cluster))
@@ -267,11 +264,11 @@ def test_a_worker_of_a_cluster_that_is_killed_loses_no_row(dask_cluster: Any, tm
 class Vanishing(Executor):
     """An executor whose cluster goes away after the first row."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.done = 0
 
-    def submit(self, fn: Any, /, *args: Any, **_: Any) -> Future[Any]:
-        future: Future[Any] = Future()
+    def submit(self, fn, /, *args, **_):
+        future = Future()
         if self.done:
             future.cancel()
             future.set_running_or_notify_cancel()
@@ -281,7 +278,7 @@ class Vanishing(Executor):
         return future
 
 
-def test_workers_that_vanish_are_a_sentence_and_lose_nothing_that_ended(tmp_path: Path) -> None:
+def test_workers_that_vanish_are_a_sentence_and_lose_nothing_that_ended(tmp_path):
     wish = study(tmp_path / "log", seeds=1)
     with pytest.raises(UsageError, match="the workers are gone; the rows that ended are kept"):
         ablate(wish, tmp_path / "out", executor=Vanishing(), threads=1)

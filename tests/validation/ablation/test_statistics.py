@@ -1,7 +1,5 @@
 """Intervals, p-values and effect sizes against a hand, SciPy and simulations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -16,7 +14,7 @@ from validation.ablation.statistics import (
 )
 
 
-def test_five_differences_by_hand() -> None:
+def test_five_differences_by_hand():
     # 1 2 3 4 5: mean 3, variance 2.5, standard error sqrt(2.5 / 5), t = 4.2426 with 4 degrees of freedom,
     # whose 97.5 % quantile is 2.7764; Hedges' factor 1 - 3 / 15.
     found = paired_interval([np.arange(1.0, 6.0)])
@@ -28,7 +26,7 @@ def test_five_differences_by_hand() -> None:
     assert (found.pairs, found.unit) == (5, "seeds")
 
 
-def test_few_differences_are_a_paired_t_test() -> None:
+def test_few_differences_are_a_paired_t_test():
     rng = np.random.default_rng(1)
     one, two = rng.normal(size=(2, STUDENTISED_FROM - 1))
     found, known = paired_interval([one - two]), stats.ttest_rel(one, two)
@@ -37,7 +35,7 @@ def test_few_differences_are_a_paired_t_test() -> None:
     assert (found.low, found.high) == pytest.approx((low, high))
 
 
-def test_two_scenes_are_welch() -> None:
+def test_two_scenes_are_welch():
     # The mean of two means has the standard error and the freedom of Welch's test of their difference.
     rng = np.random.default_rng(2)
     a, b = rng.normal(1.0, 1.0, 5), rng.normal(2.0, 3.0, 7)
@@ -48,11 +46,11 @@ def test_two_scenes_are_welch() -> None:
     assert (2.0 * found.low, 2.0 * found.high) == pytest.approx((low, high))
 
 
-def test_the_studentised_bootstrap_is_that_of_scipy() -> None:
+def test_the_studentised_bootstrap_is_that_of_scipy():
     d = np.random.default_rng(3).exponential(size=STUDENTISED_FROM)
     t = resampled_t([d], resamples=20000)
 
-    def statistic(x: np.ndarray, axis: int = -1) -> np.ndarray:
+    def statistic(x, axis=-1):
         return (x.mean(axis=axis) - d.mean()) / (x.std(axis=axis, ddof=1) / np.sqrt(x.shape[axis]))
 
     known = stats.bootstrap(
@@ -64,7 +62,7 @@ def test_the_studentised_bootstrap_is_that_of_scipy() -> None:
         )
 
 
-def test_many_scenes_are_the_sample_and_few_are_not() -> None:
+def test_many_scenes_are_the_sample_and_few_are_not():
     rng = np.random.default_rng(5)
     groups = [rng.normal(mean, 0.1, 5) for mean in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
     many, few = paired_interval(groups), paired_interval(groups[:2])
@@ -75,7 +73,7 @@ def test_many_scenes_are_the_sample_and_few_are_not() -> None:
     assert many.pairs == 30
 
 
-def test_what_no_seed_changes_is_judged_by_scenes_or_told_exactly() -> None:
+def test_what_no_seed_changes_is_judged_by_scenes_or_told_exactly():
     same = [np.full(3, v) for v in (1.0, 2.0, 4.0)]
     assert paired_interval(same).unit == "scenes"
     assert paired_interval(same).p == pytest.approx(stats.ttest_1samp([1.0, 2.0, 4.0], 0.0).pvalue)
@@ -85,7 +83,7 @@ def test_what_no_seed_changes_is_judged_by_scenes_or_told_exactly() -> None:
     assert (nothing.mean, nothing.low, nothing.high, nothing.p, nothing.effect) == (0.0, 0.0, 0.0, 1.0, 0.0)
 
 
-def test_one_difference_says_nothing_of_its_uncertainty() -> None:
+def test_one_difference_says_nothing_of_its_uncertainty():
     alone = paired_interval([np.array([2.0])])
     assert alone.mean == 2.0
     assert np.isnan([alone.low, alone.high, alone.p]).all()
@@ -103,7 +101,7 @@ DRAWS = {
 
 @pytest.mark.parametrize("count", [5, 10, 20])
 @pytest.mark.parametrize("kind", DRAWS)
-def test_no_effect_is_told_as_one_in_at_most_five_of_a_hundred(kind: str, count: int) -> None:
+def test_no_effect_is_told_as_one_in_at_most_five_of_a_hundred(kind, count):
     draw, mean = DRAWS[kind]
     rng = np.random.default_rng(7)
     trials = 400
@@ -114,7 +112,7 @@ def test_no_effect_is_told_as_one_in_at_most_five_of_a_hundred(kind: str, count:
     assert sum(f.p > 0.05 for f in found) == pytest.approx(held, abs=2)
 
 
-def test_skewed_differences_are_held_more_often_than_by_student() -> None:
+def test_skewed_differences_are_held_more_often_than_by_student():
     rng = np.random.default_rng(8)
     ours = theirs = 0
     for _ in range(400):
@@ -126,25 +124,25 @@ def test_skewed_differences_are_held_more_often_than_by_student() -> None:
     assert ours >= 0.9 * 400
 
 
-def test_an_effect_of_one_deviation_is_found() -> None:
+def test_an_effect_of_one_deviation_is_found():
     rng = np.random.default_rng(9)
     found = [paired_interval([rng.normal(1.0, 1.0, 20)]) for _ in range(200)]
     assert np.mean([f.p <= 0.05 and f.low > 0.0 for f in found]) >= 0.95
     assert np.mean([f.effect for f in found]) == pytest.approx(1.0, abs=0.05)
 
 
-def test_holm_by_hand() -> None:
+def test_holm_by_hand():
     assert holm([0.01, 0.04, 0.03, float("nan")])[:3] == pytest.approx([0.03, 0.06, 0.06])
     assert np.isnan(holm([0.01, float("nan")])[1])
     assert holm([0.6, 0.7]) == pytest.approx([1.0, 1.0])
     assert holm([]) == []
 
 
-def test_ranks_share_places_and_put_failures_last() -> None:
+def test_ranks_share_places_and_put_failures_last():
     blocks = np.array([[1.0, 2.0, 2.0], [3.0, np.nan, 1.0]])
     assert mean_ranks(blocks) == pytest.approx([1.5, 2.75, 1.75])
 
 
-def test_the_front_is_what_nothing_beats_in_both() -> None:
+def test_the_front_is_what_nothing_beats_in_both():
     cost, loss = np.array([1.0, 2.0, 3.0, 2.0, np.nan]), np.array([5.0, 3.0, 4.0, 3.0, 0.0])
     assert on_front(cost, loss).tolist() == [True, True, False, True, False]

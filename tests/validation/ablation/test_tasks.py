@@ -1,12 +1,9 @@
 """What the rows of our studies run: known answers, and the same as calling the stages."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +26,7 @@ CONFIG = PipelineConfig()
 NOWHERE = Place(Path(), Path())
 
 
-def test_exact_points_have_an_exact_fundamental_matrix() -> None:
+def test_exact_points_have_an_exact_fundamental_matrix():
     for method in ("eight-point, normalised", "epipolar of the configuration"):
         task = FundamentalOfCube(method=method, noise_px=0.0, pairs=3)
         found = task.run(CONFIG, "cube", 0, NOWHERE)
@@ -38,7 +35,7 @@ def test_exact_points_have_an_exact_fundamental_matrix() -> None:
         assert "over_bound" not in found, "without noise there is no bound"
 
 
-def test_wrong_matches_hurt_who_believes_them() -> None:
+def test_wrong_matches_hurt_who_believes_them():
     believing, doubting = (
         FundamentalOfCube(method=method, noise_px=0.5, outliers=0.3, pairs=3).run(CONFIG, "cube", 1, NOWHERE)
         for method in ("eight-point, normalised", "default")
@@ -47,7 +44,7 @@ def test_wrong_matches_hurt_who_believes_them() -> None:
     assert believing["distance_px"] > 5.0
 
 
-def test_the_polynomial_method_does_not_care_in_which_frame_it_works() -> None:
+def test_the_polynomial_method_does_not_care_in_which_frame_it_works():
     found = [
         TriangulationOverNoise(frame=frame, points=60).run(CONFIG, "two views beside each other", 3, NOWHERE)
         for frame in ("metric", "projective")
@@ -57,7 +54,7 @@ def test_the_polynomial_method_does_not_care_in_which_frame_it_works() -> None:
         TriangulationOverNoise().run(CONFIG, "five views", 0, NOWHERE)
 
 
-def test_exact_views_are_calibrated_exactly() -> None:
+def test_exact_views_are_calibrated_exactly():
     config = replace(CONFIG, selfcalibration=Stratified())
     found = CalibrationOverNoise(noise_px=0.0, views=5).run(config, "cloud", 0, NOWHERE)
     # What is told of the principal point is not exactly so.
@@ -77,7 +74,7 @@ def test_exact_views_are_calibrated_exactly() -> None:
         (Reconstruction(), str(ROOT / "docs"), "there are no photographs in"),
     ],
 )
-def test_a_scene_that_is_not_there_is_told(task: Any, scene: str, words: str) -> None:
+def test_a_scene_that_is_not_there_is_told(task, scene, words):
     with pytest.raises(UsageError, match=words):
         task.check(scene)
 
@@ -93,21 +90,21 @@ def test_a_scene_that_is_not_there_is_told(task: Any, scene: str, words: str) ->
         ("reconstruction", {"until": "never"}),
     ],
 )
-def test_parameters_that_make_no_sense_are_refused(kind: str, fields: dict[str, Any]) -> None:
+def test_parameters_that_make_no_sense_are_refused(kind, fields):
     with pytest.raises(ValueError, match=r"unknown|at least|between"):
         TASKS[kind](**fields)
 
 
 @pytest.mark.real
 @pytest.mark.skipif(data_root() is None, reason="the photographs are not on this machine (THESISRECON_DATA)")
-def test_a_rectified_pair_has_few_bad_pixels() -> None:
+def test_a_rectified_pair_has_few_bad_pixels():
     found = RectifiedPairs().run(CONFIG, "Tsukuba", 0, NOWHERE)
     assert found["bad1_pct"] < 5.0
     assert found["bad2_pct"] < found["bad1_pct"]
 
 
 @pytest.fixture(scope="module")
-def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def yard(tmp_path_factory):
     """Three photographs of the courtyard, with their cameras."""
     folder, source = tmp_path_factory.mktemp("yard"), ROOT / "fixtures" / "courtyard"
     (folder / "images").mkdir()
@@ -120,9 +117,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_a_scene_cannot_tell_is_not_missed_but_refused_where_asked_for(
-    yard: Path, tmp_path: Path
-) -> None:
+def test_what_a_scene_cannot_tell_is_not_missed_but_refused_where_asked_for(yard, tmp_path):
     bare = tmp_path / "bare"
     shutil.copytree(yard / "images", bare / "images")
     study = Study({"epipolar": ["thesis-ransac"]}, [str(bare)], seeds=1)
@@ -139,7 +134,7 @@ def test_what_a_scene_cannot_tell_is_not_missed_but_refused_where_asked_for(
     }
 
 
-def test_a_reconstruction_in_a_study_is_the_one_outside(yard: Path, tmp_path: Path) -> None:
+def test_a_reconstruction_in_a_study_is_the_one_outside(yard, tmp_path):
     config = replace(preset("thesis"), images=replace(CONFIG.images, max_size_px=400))
     study = Study(
         {"selfcalibration": ["focal-scan"]},

@@ -1,19 +1,16 @@
 """Tasks and variants that take no time, for the tests of studies."""
 
-from __future__ import annotations
-
 import errno
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
-from validation.ablation.study import Measure, Place
+from validation.ablation.study import Measure
 
 
 @dataclass(frozen=True)
@@ -34,20 +31,20 @@ class Darts:
         Measure("score", "", "more", False, "its points"),
     )
 
-    def check(self, scene: str) -> None:
+    def check(self, scene):
         if scene == "nowhere":
             raise UsageError("there is no scene 'nowhere'")
 
-    def scene_key(self, scene: str) -> str:
+    def scene_key(self, scene):
         return scene
 
     def run(
         self,
-        config: PipelineConfig,
-        scene: str,
-        seed: int,
-        place: Place,  # noqa: ARG002 (a dart needs no folder)
-    ) -> Mapping[str, float]:
+        config,
+        scene,
+        seed,
+        place,  # noqa: ARG002 (a dart needs no folder)
+    ):
         mark(self.log, f"row {scene} {seed} {self.aim:g}")
         time.sleep(self.pause_s)
         if scene == "refuses":
@@ -70,17 +67,17 @@ class Steps:
 
     measures: ClassVar[Sequence[Measure]] = (Measure("miss"),)
 
-    def check(self, scene: str) -> None:
+    def check(self, scene):
         pass
 
-    def scene_key(self, scene: str) -> str:
+    def scene_key(self, scene):
         return scene
 
-    def steps(self, config: PipelineConfig, scene: str, seed: int) -> list[tuple[str, str]]:
+    def steps(self, config, scene, seed):
         first = f"first-{scene}-{config.images.max_size_px}"
         return [("first", first), ("second", f"second-{first}-{seed}-{config.epipolar}".replace(" ", ""))]
 
-    def prepare(self, config: PipelineConfig, scene: str, seed: int, place: Place, *, step: str) -> None:
+    def prepare(self, config, scene, seed, place, *, step):
         for name, key in self.steps(config, scene, seed):
             kept = place.shared / f"{hash_of(key)}.txt"
             if not kept.is_file():
@@ -89,28 +86,28 @@ class Steps:
             if name == step:
                 return
 
-    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
+    def run(self, config, scene, seed, place):
         self.prepare(config, scene, seed, place, step="second")
         return {"miss": float(seed)}
 
 
-def hash_of(key: str) -> str:
+def hash_of(key):
     import hashlib
 
     return hashlib.sha256(key.encode()).hexdigest()[:16]
 
 
-def mark(log: str, word: str) -> None:
+def mark(log, word):
     """Add a line to the log; short lines are written whole, whoever writes beside."""
     if log:
         with Path(log).open("a", encoding="utf-8") as file:
             file.write(f"{word}\n")
 
 
-def marks(log: Path) -> list[str]:
+def marks(log):
     return log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
 
 
-def area(config: PipelineConfig, scene: str, seed: int) -> dict[str, float]:
+def area(config, scene, seed):
     """A task as a plain function."""
     return {"size": float(config.images.max_size_px + seed), "scene_length": float(len(scene))}

@@ -2,14 +2,10 @@
 
 # ruff: noqa: ARG002 (the stage takes what a stage takes, and ignores most of it)
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-
 import numpy as np
 
 from thesisrecon.records import TexturedMesh
-from validation.harness.records import Judgement, Outcome, Task, Wishes
+from validation.harness.records import Judgement
 from validation.metrics.record import Metric
 from validation.references.fundamental import estimate_with
 from validation.references.open3d_meshes import Nearest
@@ -25,16 +21,16 @@ class ReferenceStage:
     title = "References"
     definition = "Whether each answers."
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
+    def takes(self, scene, wishes):
         return True
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
+    def methods(self, scene, wishes):
         return tuple(scene.split("-"))
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+    def needs(self, method):
         return ()
 
-    def run(self, task: Task, wishes: Wishes) -> None:
+    def run(self, task, wishes):
         rng = np.random.default_rng(0)
         P = np.stack([np.eye(3, 4), np.eye(3, 4)])
         P[1, 0, 3] = -1.0
@@ -49,8 +45,8 @@ class ReferenceStage:
         if task.method == "open3d":
             Nearest(TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))).distances(X)
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        values: dict[str, float | None] = {name: 1.0 if o.ok else None for name, o in outcomes.items()}
+    def judge(self, scene, outcomes, wishes):
+        values = {name: 1.0 if o.ok else None for name, o in outcomes.items()}
         return Judgement([Metric(scene, "answers", "", values, next(iter(values)))])
 
 

@@ -1,11 +1,5 @@
 """The pages of a report as a browser shows them."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -23,11 +17,11 @@ EVIL = "<img src=x onerror=alert(1)>"
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pages(tmp_path_factory):
     """A report of two numbers, one of which breaks its gate, with a flat and a solid plot."""
     out = tmp_path_factory.mktemp("pages")
     wishes = Wishes(out, ("yard",), ("toy",))
-    values: dict[str, float | None] = dict.fromkeys(WAYS, 1.5)
+    values = dict.fromkeys(WAYS, 1.5)
     metrics = [
         Metric("yard", "wheels, lost", "px", values, "ours", definition=EVIL),
         Metric("yard", EVIL, "%", {"ours": 3.0}, "ours"),
@@ -50,41 +44,41 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module", params=[1300, 420], ids=["desktop", "narrow"])
-def scene(request: pytest.FixtureRequest, browser: Any, pages: Path) -> Iterator[Witness]:
+def scene(request, browser, pages):
     opened = Witness(browser, pages / "scene-yard.html", request.param, drawn=("plot-toy-0", "plot-toy-1"))
     yield opened
     opened.context.close()
 
 
-def test_nothing_complains_runs_or_reaches_out(scene: Witness) -> None:
+def test_nothing_complains_runs_or_reaches_out(scene):
     assert scene.errors == []
     assert all(url.startswith(("file:", "data:", "blob:")) for url in scene.requests)
 
 
-def test_the_verdict_comes_first_and_is_broken(scene: Witness) -> None:
+def test_the_verdict_comes_first_and_is_broken(scene):
     first = scene.page.locator("main > section").first
     assert "Broken" in first.inner_text()
     assert "toy/yard/wheels-lost: 1.5 px, at most 1" in first.inner_text()
     assert scene.page.locator("tr.missed").count() == 1
 
 
-def test_what_it_is_told_is_shown_as_it_is(scene: Witness) -> None:
+def test_what_it_is_told_is_shown_as_it_is(scene):
     assert scene.page.locator("img[src='x']").count() == 0
     assert EVIL in scene.page.locator("tbody").first.inner_text()
     assert EVIL in scene.page.locator("#failures").inner_text()
 
 
-def test_the_page_is_no_wider_than_the_screen(scene: Witness) -> None:
+def test_the_page_is_no_wider_than_the_screen(scene):
     assert scene.page.evaluate("document.documentElement.scrollWidth") <= scene.page.viewport_size["width"]
 
 
-def test_the_plots_are_drawn(scene: Witness) -> None:
+def test_the_plots_are_drawn(scene):
     pixels = scene.pixels("#plot-toy-0").astype(int)
     red = (pixels[..., 0] > 180) & (pixels[..., 1] < 90) & (pixels[..., 2] < 90)
     assert red.sum() > 200
 
 
-def test_the_whole_leads_to_the_scene(browser: Any, pages: Path) -> None:
+def test_the_whole_leads_to_the_scene(browser, pages):
     whole = Witness(browser, pages / "index.html", 1300, drawn=())
     whole.page.get_by_role("link", name="yard").click()
     assert whole.page.locator("h1").inner_text() == "yard"

@@ -1,9 +1,6 @@
 """Points of two models brought together: those that are one, and how far apart they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +11,7 @@ from validation.harness.stages.clouds import _common_frame, _icp_metrics, _same_
 from validation.scenes.real import Scene
 
 
-def test_points_seen_at_one_place_are_one_whatever_their_order() -> None:
+def test_points_seen_at_one_place_are_one_whatever_their_order():
     ours = _reconstruction(_truth())
     order = np.random.default_rng(0).permutation(N)
     tracks = ours.tracks
@@ -25,7 +22,7 @@ def test_points_seen_at_one_place_are_one_whatever_their_order() -> None:
     np.testing.assert_array_equal(order[pairs[:, 1]], pairs[:, 0])
 
 
-def test_a_shift_of_the_points_is_told_in_per_cent_of_their_distance() -> None:
+def test_a_shift_of_the_points_is_told_in_per_cent_of_their_distance():
     truth = _truth()
     ours = _reconstruction(truth)
     scene = Scene("made up", (), truth.K, truth.R, truth.C)
@@ -38,7 +35,7 @@ def test_a_shift_of_the_points_is_told_in_per_cent_of_their_distance() -> None:
     assert rows[0].values["ours"] == N
 
 
-def test_what_icp_moves_is_told_of_its_matrix_alone(tmp_path: Path) -> None:
+def test_what_icp_moves_is_told_of_its_matrix_alone(tmp_path):
     rng = np.random.default_rng(1)
     mine = rng.normal(size=(200, 3))
     c, s = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))

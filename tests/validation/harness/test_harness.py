@@ -1,7 +1,5 @@
 """The harness around its stages: tasks in processes, references that fail, gates, tables, pages, two runs."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json
@@ -29,7 +27,7 @@ GATES = {
 Judged = dict[tuple[str, str], tuple[Judgement, dict[str, Outcome]]]
 
 
-def toy_wishes(out: Path, *, quick: bool) -> Wishes:
+def toy_wishes(out, *, quick):
     return Wishes(
         out,
         ("yard", "elsewhere"),
@@ -41,12 +39,12 @@ def toy_wishes(out: Path, *, quick: bool) -> Wishes:
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Wishes, Judged, list[str]]:
+def ran(tmp_path_factory):
     wishes, told = toy_wishes(tmp_path_factory.mktemp("harness"), quick=False), list[str]()
     return wishes, run_tasks(wishes, STAGES, told.append), told
 
 
-def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran: tuple[Wishes, Judged, list[str]]) -> None:
+def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
     _, judged, told = ran
     assert list(judged) == [("toy", "yard")]
     judgement, outcomes = judged["toy", "yard"]
@@ -63,9 +61,7 @@ def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran: tuple[Wishes,
     assert len(told) == 8
 
 
-def test_gates_judge_numbers_and_a_number_nobody_told_breaks_its_gate(
-    ran: tuple[Wishes, Judged, list[str]],
-) -> None:
+def test_gates_judge_numbers_and_a_number_nobody_told_breaks_its_gate(ran):
     wishes, judged, _ = ran
     results = collect(wishes, judged, GATES)
     row = results.rows[0]
@@ -83,14 +79,14 @@ def test_gates_judge_numbers_and_a_number_nobody_told_breaks_its_gate(
     assert collect(wishes, judged, strict).broken[0].key == row.key
 
 
-def test_tasks_that_many_wait_for_come_first() -> None:
+def test_tasks_that_many_wait_for_come_first():
     tasks = tasks_of(toy_wishes(Path("nowhere"), quick=False), STAGES)
     behind = tasks_behind(tasks, STAGES)
     assert [behind[Task("toy", "yard", method)] for method in ("good", "after", "ours", "")] == [2, 1, 1, 0]
 
 
 @pytest.mark.parametrize("name", REPORTED)
-def test_a_quick_report_leaves_out_nothing_that_a_gate_asks_for(name: str, tmp_path: Path) -> None:
+def test_a_quick_report_leaves_out_nothing_that_a_gate_asks_for(name, tmp_path):
     quick = Wishes(tmp_path, ("courtyard",), (name,), quick=True)
     asked = dataclasses.replace(quick, gates_only=True)
     stage = REPORTED[name]
@@ -104,13 +100,13 @@ def test_a_quick_report_leaves_out_nothing_that_a_gate_asks_for(name: str, tmp_p
 @pytest.mark.parametrize(
     ("value", "held"), [(1.0, True), (1.01, False), (None, False), (float("nan"), False)]
 )
-def test_a_gate_holds_up_to_its_limit(value: float | None, held: bool) -> None:
+def test_a_gate_holds_up_to_its_limit(value, held):
     assert Gate("a/b/c", 1.0, True, "").holds(value) == held
     mirrored = None if value is None else -value
     assert Gate("a/b/c", -1.0, False, "").holds(mirrored) == held
 
 
-def test_results_are_written_read_and_compared(ran: tuple[Wishes, Judged, list[str]], tmp_path: Path) -> None:
+def test_results_are_written_read_and_compared(ran, tmp_path):
     wishes, judged, _ = ran
     results = collect(wishes, judged, GATES)
     write_results(tmp_path, results)
@@ -131,9 +127,7 @@ def test_results_are_written_read_and_compared(ran: tuple[Wishes, Judged, list[s
     ]
 
 
-def test_two_runs_tell_the_same_numbers_but_for_times(
-    ran: tuple[Wishes, Judged, list[str]], tmp_path: Path
-) -> None:
+def test_two_runs_tell_the_same_numbers_but_for_times(ran, tmp_path):
     wishes, judged, _ = ran
     quick = toy_wishes(tmp_path, quick=True)
     first, second = (collect(quick, run_tasks(quick, STAGES, lambda _: None), GATES) for _ in range(2))
@@ -141,7 +135,7 @@ def test_two_runs_tell_the_same_numbers_but_for_times(
     assert first.rows[0].value == collect(wishes, judged, GATES).rows[0].value
 
 
-def test_the_pages_escape_what_they_are_told(ran: tuple[Wishes, Judged, list[str]]) -> None:
+def test_the_pages_escape_what_they_are_told(ran):
     wishes, judged, _ = ran
     results = collect(wishes, judged, GATES)
     index = write_pages(wishes, STAGES, judged, results, compare(results, results))
@@ -158,7 +152,7 @@ def test_the_pages_escape_what_they_are_told(ran: tuple[Wishes, Judged, list[str
     assert not re.search(r'(?:src|href)="(?!data:|#|scene-|index)', text + page.split("<script>")[0])
 
 
-def test_no_gate_without_its_reason(tmp_path: Path) -> None:
+def test_no_gate_without_its_reason(tmp_path):
     gates = read_gates()
     assert gates
     for words in ("at_most = 1.0", 'at_most = 1.0\nat_least = 0.0\nreason = "r"', 'reason = "r"'):
@@ -174,33 +168,31 @@ def test_no_gate_without_its_reason(tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (["report", "-o", "OUT", "--scenes", "nowhere"], "no scene is called nowhere"),
-        (["report", "-o", "OUT", "--images", "nowhere"], "there is no folder of photographs nowhere"),
+        (["report", "-o", "OUT", "--images", "nowhere"], "the folder of images nowhere does not exist"),
         (["report", "-o", "OUT", "--against", "nowhere"], "nowhere holds no report to compare with"),
         (["check", "-o", "OUT", "--threads", "0"], "more than zero"),
         (["report", "-o", "OUT", "--max-side", "10"], "--max-side is at least 64 px"),
     ],
 )
-def test_wrong_wishes_are_named(
-    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_wishes_are_named(arguments, words, tmp_path, capsys):
     assert main([str(tmp_path / "out") if a == "OUT" else a for a in arguments]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_names_for_files() -> None:
+def test_names_for_files():
     assert slug("COLMAP, pp refined") == "COLMAP-pp-refined"
     assert json.loads(json.dumps(Wishes(Path("a"), (), ()).to_json()))["out"] == "a"
     assert Wishes.from_json(Wishes(Path("a"), ("s",), ()).to_json()) == Wishes(Path("a"), ("s",), ())
     assert Results([], [], {}, {}, {}).broken == []
 
 
-def test_a_run_starts_from_the_references_of_a_like_one(tmp_path: Path) -> None:
+def test_a_run_starts_from_the_references_of_a_like_one(tmp_path):
     first = toy_wishes(tmp_path / "first", quick=True)
     run_tasks(first, STAGES, lambda _: None)
     # Of ours nothing is taken but the folders of a run; a reference stands as it is.
     (first.place("toy", "yard", "good") / "value.json").write_text("7.0", encoding="utf-8")
-    told: list[str] = []
+    told = []
     second = dataclasses.replace(toy_wishes(tmp_path / "second", quick=True), resume=str(first.out))
     judgement, outcomes = run_tasks(second, STAGES, told.append)["toy", "yard"]
     assert judgement.metrics[0].values == {"ours": 0.5, "good": 7.0}
@@ -209,10 +201,10 @@ def test_a_run_starts_from_the_references_of_a_like_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"quick": True}, None])
-def test_a_run_starts_from_no_unlike_one(change: dict[str, object] | None, tmp_path: Path) -> None:
+def test_a_run_starts_from_no_unlike_one(change, tmp_path):
     wishes = dataclasses.replace(toy_wishes(tmp_path / "now", quick=False), resume=str(tmp_path / "before"))
     if change is not None:
-        before = dataclasses.replace(wishes, **change)  # type: ignore[arg-type]
+        before = dataclasses.replace(wishes, **change)
         (tmp_path / "before").mkdir()
         (tmp_path / "before" / "wishes.json").write_text(json.dumps(before.to_json()), encoding="utf-8")
     with pytest.raises(ValueError, match="start from a like one" if change else "holds no run"):

@@ -1,7 +1,5 @@
 """A reference that is missing, changed, crashes or hangs leaves rows that say so; the report stands."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os
@@ -33,12 +31,12 @@ def estimate_fundamental(xy1, xy2, settings, options):
 """
 
 
-def not_installed(library: str) -> str:
+def not_installed(library):
     return f"{NAMES[library]} is not installed: pip install {PACKAGES[library]}"
 
 
 @pytest.fixture
-def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def stub(tmp_path, monkeypatch):
     """A folder whose modules come before those that are installed, in every process started from here."""
     folder = tmp_path / "stubs"
     folder.mkdir()
@@ -46,7 +44,7 @@ def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def wishes_for(out: Path, scene: str, limit_s: float = 60.0) -> Wishes:
+def wishes_for(out, scene, limit_s=60.0):
     return Wishes(
         out,
         (scene,),
@@ -58,7 +56,7 @@ def wishes_for(out: Path, scene: str, limit_s: float = 60.0) -> Wishes:
 
 
 @pytest.mark.parametrize("library", METHODS)
-def test_one_that_is_missing_leaves_the_others(library: str, stub: Path, tmp_path: Path) -> None:
+def test_one_that_is_missing_leaves_the_others(library, stub, tmp_path):
     (stub / f"{library}.py").write_text(MISSING.format(library))
     other = "cv2" if library == "poselib" else "poselib"
     wishes = wishes_for(tmp_path / "out", f"{library}-{other}")
@@ -67,9 +65,7 @@ def test_one_that_is_missing_leaves_the_others(library: str, stub: Path, tmp_pat
     assert judged[0].metrics[0].values == {library: None, other: 1.0}
 
 
-def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(
-    stub: Path, tmp_path: Path
-) -> None:
+def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(stub, tmp_path):
     stubs = {"poselib": TRANSPOSED, "cv2": CRASHING, "pycolmap": HANGING, "open3d": MISSING.format("open3d")}
     for library, text in stubs.items():
         (stub / f"{library}.py").write_text(text)
@@ -94,7 +90,7 @@ def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(
     assert "Not asked: OpenCV crashed" in results.environment[PACKAGES["cv2"]]
 
 
-def test_report_and_check_run_without_any(stub: Path, tmp_path: Path) -> None:
+def test_report_and_check_run_without_any(stub, tmp_path):
     for library in METHODS:
         (stub / f"{library}.py").write_text(MISSING.format(library))
     command = [sys.executable, "-m", "validation", "check", "--quick", "--scenes", "street"]
@@ -117,7 +113,7 @@ def test_report_and_check_run_without_any(stub: Path, tmp_path: Path) -> None:
     assert not_installed("pycolmap") in page
 
 
-def test_only_the_libraries_module_imports_them() -> None:
+def test_only_the_libraries_module_imports_them():
     """Else one that is missing would stop what does not need it."""
     for path in [*(ROOT / "validation").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]:
         if path.name == "libraries.py":
@@ -128,7 +124,7 @@ def test_only_the_libraries_module_imports_them() -> None:
             assert not {name.split(".")[0] for name in names} & set(NAMES), path
 
 
-def test_one_that_does_not_load_says_why(stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_does_not_load_says_why(stub, monkeypatch):
     (stub / "open3d.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')")
     monkeypatch.syspath_prepend(str(stub))
     monkeypatch.delitem(sys.modules, "open3d", raising=False)
@@ -136,7 +132,7 @@ def test_one_that_does_not_load_says_why(stub: Path, monkeypatch: pytest.MonkeyP
         load("open3d")
 
 
-def test_refused_ones_are_not_asked() -> None:
+def test_refused_ones_are_not_asked():
     try:
         refuse({"poselib": "PoseLib is odd today"})
         with pytest.raises(NoReference, match="odd today"):
@@ -145,6 +141,6 @@ def test_refused_ones_are_not_asked() -> None:
         refuse({})
 
 
-def test_wrong_wishes_ask_nobody(tmp_path: Path) -> None:
+def test_wrong_wishes_ask_nobody(tmp_path):
     assert main(["check", "-o", str(tmp_path / "out"), "--scenes", "nowhere"]) == 2
     assert not (tmp_path / "out").exists()

@@ -1,24 +1,20 @@
 """A report that is told to stop leaves no task behind."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from tests.runtime.test_signals import is_alive
 from tests.validation.harness.test_harness import toy_wishes
 from tests.validation.harness.toy_stages import ToyStage
-from validation.studies.stop_anywhere import stopped
-from validation.harness.records import Wishes
 from validation.harness.schedule import run_tasks
 from validation.scenes.real import ROOT
+from validation.studies.stop_anywhere import stopped
 
 PROGRAM = """
 import sys
@@ -36,21 +32,21 @@ with advised("begin again"):
 class HangingStage(ToyStage):
     """All its methods hang."""
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002
+    def methods(self, scene, wishes):  # noqa: ARG002
         return ("hanging",)
 
 
-def hanging_stages() -> dict[str, HangingStage]:
+def hanging_stages():
     return {"toy": HangingStage()}
 
 
-def process_of(out: Path) -> int:
+def process_of(out):
     """The process of the task that hangs, 0 where it is not there yet."""
     told = list(out.rglob("hanging/process"))
     return int(told[0].read_text() or 0) if told else 0
 
 
-def is_gone(number: int) -> bool:
+def is_gone(number):
     """Whether the process ends soon: it is told by the end of its parent."""
     end = time.monotonic() + 10.0
     while is_alive(number) and time.monotonic() < end:
@@ -59,7 +55,7 @@ def is_gone(number: int) -> bool:
 
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGKILL])
-def test_a_report_that_is_ended_takes_its_tasks_along(asked: signal.Signals, tmp_path: Path) -> None:
+def test_a_report_that_is_ended_takes_its_tasks_along(asked, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     program = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     stop = stopped(program, lambda: process_of(tmp_path) > 0, asked, environment=environment)
@@ -68,10 +64,10 @@ def test_a_report_that_is_ended_takes_its_tasks_along(asked: signal.Signals, tmp
         assert (stop.code, stop.said, stop.left) == (130, "toy: interrupted; begin again\n", 0)
 
 
-def test_an_interrupt_in_a_program_ends_the_tasks(tmp_path: Path) -> None:
+def test_an_interrupt_in_a_program_ends_the_tasks(tmp_path):
     wishes = replace(toy_wishes(tmp_path, quick=False), limit_s=120.0)
 
-    def interrupt() -> None:
+    def interrupt():
         while not process_of(tmp_path):
             time.sleep(0.02)
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)

@@ -2,19 +2,16 @@
 
 # ruff: noqa: ARG002 (a toy takes what a stage takes, and ignores most of it)
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import signal
 import time
-from collections.abc import Mapping
 
 import PIL.Image
 
 from thesisrecon.errors import StageFailure
-from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes
+from validation.harness.records import Judgement, Picture, Plot
 from validation.metrics.record import Metric
 
 VALUES = {"ours": 0.5, "good": 2.0, "after": 4.0}
@@ -26,19 +23,19 @@ class ToyStage:
     title = "A <b>toy</b>"
     definition = "Numbers that were saved."
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
+    def takes(self, scene, wishes):
         return scene == "yard"
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
+    def methods(self, scene, wishes):
         return ("ours", "good") if wishes.quick else ("after", *WAYS)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+    def needs(self, method):
         return (("toy", "good"),) if method == "after" else ()
 
-    def run(self, task: Task, wishes: Wishes) -> None:
+    def run(self, task, wishes):
         place = wishes.place(task.stage, task.scene, task.method)
         if task.method == "missing":
-            import no_such_library  # type: ignore[import-not-found]  # noqa: F401
+            import no_such_library  # noqa: F401
         if task.method == "failing":
             shutil.rmtree(place)  # as one that starts with an empty folder does
             raise StageFailure("the toy is broken", "it has 1 wheel", "buy another")
@@ -52,8 +49,8 @@ class ToyStage:
             value *= json.loads((wishes.place("toy", task.scene, "good") / "value.json").read_text())
         (place / "value.json").write_text(json.dumps(value))
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        values: dict[str, float | None] = {
+    def judge(self, scene, outcomes, wishes):
+        values = {
             name: json.loads((o.place / "value.json").read_text()) if o.ok else None
             for name, o in outcomes.items()
         }

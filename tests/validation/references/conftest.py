@@ -1,7 +1,5 @@
 """A pair of cameras that nothing is symmetric in, as both libraries and ours should see it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +10,7 @@ from thesisrecon.arrays import F64
 from validation.references.libraries import NoReference, load
 
 
-def skip_without(*libraries: str) -> None:
+def skip_without(*libraries):
     """Skip a module of tests where one of these reference libraries cannot be had."""
     for library in libraries:
         try:
@@ -31,22 +29,22 @@ class Looked:
     X: F64
 
     @property
-    def P_normalised(self) -> F64:
+    def P_normalised(self):
         """[R t]."""
         return np.concatenate([self.R, self.t[:, :, None]], axis=2)
 
     @property
-    def P(self) -> F64:
+    def P(self):
         return np.asarray(self.K @ self.P_normalised)
 
     @property
-    def xy(self) -> F64:
+    def xy(self):
         x = np.einsum("vab,nb->vna", self.P, np.column_stack([self.X, np.ones(len(self.X))]))
         return np.asarray(x[..., :2] / x[..., 2:])
 
 
 @pytest.fixture(scope="session")
-def looked() -> Looked:
+def looked():
     """The second camera is turned, moved in all directions, and has another focal length."""
     rng = np.random.default_rng(5)
     K = np.array([[[700.0, 0, 300], [0, 700, 260], [0, 0, 1]], [[640.0, 0, 340], [0, 640, 220], [0, 0, 1]]])

@@ -1,7 +1,5 @@
 """The questions to the reference libraries: answered as expected by those that are here, and by no others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,7 @@ from validation.references.libraries import NAMES, NoReference, load
 
 
 @pytest.fixture(params=list(NAMES))
-def library(request: pytest.FixtureRequest) -> str:
+def library(request):
     try:
         load(request.param)
     except NoReference as missing:
@@ -21,11 +19,11 @@ def library(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def test_the_library_keeps_its_ways(library: str) -> None:
+def test_the_library_keeps_its_ways(library):
     ask_canary(library)
 
 
-def test_every_other_answer_is_told(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_other_answer_is_told(library, monkeypatch):
     for question in QUESTIONS[library]:
         other = replace(question, answer=np.asarray(question.answer) + max(2.0 * question.tolerance, 1e-3))
         monkeypatch.setitem(canary.QUESTIONS, library, (other,))
@@ -36,16 +34,14 @@ def test_every_other_answer_is_told(library: str, monkeypatch: pytest.MonkeyPatc
         assert "; this harness expects " in str(told.value)
 
 
-def test_a_function_that_is_gone_is_told(
-    library: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_function_that_is_gone_is_told(library, monkeypatch, capsys):
     gone = replace(QUESTIONS[library][0], ask=lambda: getattr(load(library), "no_such_function"))  # noqa: B009
     monkeypatch.setitem(canary.QUESTIONS, library, (gone,))
     assert main([library]) == 3
     assert f"does not tell {gone.words}, which this harness needs" in capsys.readouterr().err
 
 
-def test_quaternions_in_another_order_would_be_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quaternions_in_another_order_would_be_told(monkeypatch):
     pycolmap = pytest.importorskip("pycolmap")
     turned = pycolmap.Rotation3d
     monkeypatch.setattr(pycolmap, "Rotation3d", lambda wxyz: turned(np.roll(wxyz, -1)))
@@ -53,7 +49,7 @@ def test_quaternions_in_another_order_would_be_told(monkeypatch: pytest.MonkeyPa
         ask_canary("pycolmap")
 
 
-def test_a_disparity_in_pixels_would_be_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disparity_in_pixels_would_be_told(monkeypatch):
     pytest.importorskip("cv2")
     monkeypatch.setattr(canary, "_opencv_disparity", lambda: 4.0)
     asked = [q for q in QUESTIONS["cv2"] if "disparity" in q.words]

@@ -1,15 +1,10 @@
 """Conventions between our records and COLMAP's, at their border: half pixels, quaternions, poses, indices."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import PIL.Image
 import pytest
 
-from tests.validation.references.conftest import Looked, skip_without
-from thesisrecon.arrays import F64
+from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_files import read_colmap_model
@@ -27,7 +22,7 @@ SIZE = (640, 480)
 K1 = (-0.12, 0.07)
 
 
-def problem(looked: Looked) -> tuple[MetricCameras, Observations]:
+def problem(looked):
     """Both cameras with radial distortion; each point seen by both, in an order of nobody's."""
     rows = [[K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], k1] for K, k1 in zip(looked.K, K1, strict=True)]
     cameras = MetricCameras(looked.R, looked.t, np.array(rows), np.arange(2))
@@ -36,7 +31,7 @@ def problem(looked: Looked) -> tuple[MetricCameras, Observations]:
     return cameras, Observations(view, point, distorted(looked)[view, point])
 
 
-def distorted(looked: Looked) -> F64:
+def distorted(looked):
     """Pixels (2, N, 2) by the formula: x (1 + k1 r^2) with r in the plane at distance 1."""
     x = np.einsum("vab,nb->vna", looked.R, looked.X) + looked.t[:, None]
     u = x[..., :2] / x[..., 2:]
@@ -44,7 +39,7 @@ def distorted(looked: Looked) -> F64:
     return np.asarray(u * looked.K[:, None, 0, :1] + looked.K[:, None, :2, 2])
 
 
-def test_colmap_sees_our_points_half_a_pixel_farther(looked: Looked) -> None:
+def test_colmap_sees_our_points_half_a_pixel_farther(looked):
     cameras, seen = problem(looked)
     model = colmap_model(cameras, looked.X, seen, SIZE)
     for v, xy in enumerate(distorted(looked)):
@@ -59,7 +54,7 @@ def test_colmap_sees_our_points_half_a_pixel_farther(looked: Looked) -> None:
         np.testing.assert_array_equal(model.points3D[j + 1].xyz, looked.X[j])
 
 
-def test_what_goes_in_comes_out(looked: Looked) -> None:
+def test_what_goes_in_comes_out(looked):
     cameras, seen = problem(looked)
     back, X = cameras_from_colmap(colmap_model(cameras, looked.X, seen, SIZE), cameras)
     np.testing.assert_allclose(back.R, cameras.R, atol=1e-12)
@@ -69,7 +64,7 @@ def test_what_goes_in_comes_out(looked: Looked) -> None:
 
 
 @pytest.mark.parametrize("text", [True, False])
-def test_files_that_colmap_writes_mean_the_same_to_us(looked: Looked, tmp_path: Path, text: bool) -> None:
+def test_files_that_colmap_writes_mean_the_same_to_us(looked, tmp_path, text):
     cameras, seen = problem(looked)
     model = colmap_model(cameras, looked.X, seen, SIZE)
     (model.write_text if text else model.write_binary)(tmp_path)
@@ -88,7 +83,7 @@ def test_files_that_colmap_writes_mean_the_same_to_us(looked: Looked, tmp_path: 
     np.testing.assert_allclose(dehomogenize(read.X), looked.X, atol=1e-9)
 
 
-def test_quaternions_are_xyzw_in_memory_and_wxyz_in_text(looked: Looked, tmp_path: Path) -> None:
+def test_quaternions_are_xyzw_in_memory_and_wxyz_in_text(looked, tmp_path):
     cameras, seen = problem(looked)
     model = colmap_model(cameras, looked.X, seen, SIZE)
     model.write_text(tmp_path)
@@ -102,7 +97,7 @@ def test_quaternions_are_xyzw_in_memory_and_wxyz_in_text(looked: Looked, tmp_pat
     np.testing.assert_allclose(wxyz[1:] / np.sin(angle / 2.0), np.array([0.1, -0.3, 0.5]) / angle, atol=1e-9)
 
 
-def test_what_it_finds_in_a_photograph_is_half_a_pixel_farther(tmp_path: Path) -> None:
+def test_what_it_finds_in_a_photograph_is_half_a_pixel_farther(tmp_path):
     images = tmp_path / "images"
     images.mkdir()
     y, x = np.indices((96, 128))
@@ -125,7 +120,7 @@ def test_what_it_finds_in_a_photograph_is_half_a_pixel_farther(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("views", [2, 3])
-def test_points_of_world_to_camera_matrices_are_where_they_were(views: int, looked: Looked) -> None:
+def test_points_of_world_to_camera_matrices_are_where_they_were(views, looked):
     P, xy = looked.P, looked.xy
     if views == 3:
         third = looked.P[1].copy()

@@ -1,11 +1,9 @@
 """The direction of F: x2' F x1 = 0 in every library, whoever estimates it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from tests.validation.references.conftest import Looked, skip_without
+from tests.validation.references.conftest import skip_without
 from validation.metrics.epipolar import rms_epipolar_distance
 from validation.references.fundamental import SOLVERS, estimate_with, opencv_eight_point
 
@@ -13,7 +11,7 @@ skip_without("cv2", "pycolmap", "poselib")
 
 
 @pytest.mark.parametrize("method", SOLVERS)
-def test_lines_in_the_second_photograph_are_f_times_points_of_the_first(method: str, looked: Looked) -> None:
+def test_lines_in_the_second_photograph_are_f_times_points_of_the_first(method, looked):
     xy1, xy2 = looked.xy
     F = estimate_with(method, xy1, xy2, threshold_px=1.0, seed=0).F
     assert F is not None
@@ -23,6 +21,6 @@ def test_lines_in_the_second_photograph_are_f_times_points_of_the_first(method: 
     assert rms_epipolar_distance(F.T, np.hstack([xy1, xy2])) > 5.0
 
 
-def test_so_are_those_of_the_eight_point_method(looked: Looked) -> None:
+def test_so_are_those_of_the_eight_point_method(looked):
     F = opencv_eight_point(*looked.xy)
     assert rms_epipolar_distance(F, np.hstack([*looked.xy])) < 1e-4

@@ -1,18 +1,13 @@
 """Conventions between our records and Open3D's, at their border."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from tests.surface.sphere import SHAPE, K, paint, photograph, ring_of
-from tests.validation.references.conftest import Looked, skip_without
-from thesisrecon.arrays import F64
+from tests.validation.references.conftest import skip_without
 from thesisrecon.camera import Camera
 from thesisrecon.io.meshes import read_mesh, write_mesh
-from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
+from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
@@ -25,7 +20,7 @@ skip_without("open3d")
 NORMAL = np.array([0.3, 0.2, 1.0])
 
 
-def slanted() -> tuple[DepthMap, PinholeView]:
+def slanted():
     """A slanted plane NORMAL . X = 2.3 and a photograph whose colours are its pixels' coordinates."""
     y, x = np.indices(SHAPE)
     rays = np.stack([x, y, np.ones(SHAPE)], axis=-1) @ np.linalg.inv(K).T
@@ -38,7 +33,7 @@ def slanted() -> tuple[DepthMap, PinholeView]:
     )
 
 
-def test_a_pixel_is_the_same_pixel_in_its_grid() -> None:
+def test_a_pixel_is_the_same_pixel_in_its_grid():
     depth_map, view = slanted()
     mesh = open3d_surfaces.OpenTsdf(voxel_px=0.5).fuse([depth_map], [view])
     assert mesh.colors is not None
@@ -50,7 +45,7 @@ def test_a_pixel_is_the_same_pixel_in_its_grid() -> None:
     np.testing.assert_allclose(np.median(shift, axis=0), 0.0, atol=0.05)
 
 
-def test_meshes_lie_on_the_sphere_and_distances_are_right() -> None:
+def test_meshes_lie_on_the_sphere_and_distances_are_right():
     maps = ring_of()
     views = [photograph(m) for m in maps]
     fused = open3d_surfaces.OpenTsdf().fuse(maps, views)
@@ -62,7 +57,7 @@ def test_meshes_lie_on_the_sphere_and_distances_are_right() -> None:
     assert np.median(np.abs(fused.colors - paint(fused.vertices))) < 12.0
 
 
-def test_skew_is_refused() -> None:
+def test_skew_is_refused():
     skew = K.copy()
     skew[0, 1] = 1.0
     with pytest.raises(ValueError, match="skew"):
@@ -70,12 +65,12 @@ def test_skew_is_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def model() -> TexturedMesh:
+def model():
     surface = VolumetricFusion().fuse(ring_of())
     return SurfaceModel().color(surface, [photograph(m) for m in ring_of()])
 
 
-def colors_at(points: F64, vertices: F64, faces: F64, uv: F64, texture: np.ndarray) -> np.ndarray:
+def colors_at(points, vertices, faces, uv, texture):
     """Colours (N, 3) in the middle of the face whose middle is nearest to each point; v runs up."""
     middle = vertices[faces].mean(axis=1)
     nearest = np.argmin(((points[:, None] - middle[None]) ** 2).sum(axis=-1), axis=1)
@@ -85,13 +80,13 @@ def colors_at(points: F64, vertices: F64, faces: F64, uv: F64, texture: np.ndarr
     return texture[y, x].astype(float)
 
 
-def places() -> F64:
+def places():
     """Points of the sphere that photographs see well."""
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     return np.stack([np.sin(angle), 0.3 * np.cos(5 * angle), -np.cos(angle)], axis=1)
 
 
-def test_a_glb_opens_in_open3d_with_its_texture(model: TexturedMesh, tmp_path: Path) -> None:
+def test_a_glb_opens_in_open3d_with_its_texture(model, tmp_path):
     write_mesh(tmp_path / "model.glb", model)
     vertices, faces, uv, texture = open3d_meshes.read_glb(tmp_path / "model.glb")
     assert len(faces) == len(model.faces)
@@ -104,7 +99,7 @@ def test_a_glb_opens_in_open3d_with_its_texture(model: TexturedMesh, tmp_path: P
     assert np.quantile(np.abs(found - paint(points)), 0.9) < 20.0
 
 
-def test_a_glb_opens_in_trimesh_with_its_texture(model: TexturedMesh, tmp_path: Path) -> None:
+def test_a_glb_opens_in_trimesh_with_its_texture(model, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     write_mesh(tmp_path / "model.glb", model)
     loaded = trimesh.load(tmp_path / "model.glb", process=False, force="mesh")
@@ -121,7 +116,7 @@ def test_a_glb_opens_in_trimesh_with_its_texture(model: TexturedMesh, tmp_path: 
     assert np.sqrt(np.mean(apart**2)) < 4.0
 
 
-def test_its_own_pictures_agree_with_ours() -> None:
+def test_its_own_pictures_agree_with_ours():
     maps = ring_of()
     mesh = open3d_surfaces.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
     camera = Camera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).resized(2)
@@ -140,7 +135,7 @@ def test_its_own_pictures_agree_with_ours() -> None:
     assert best[0, 0] < 8.0
 
 
-def test_the_matrix_of_a_camera_takes_the_world_to_it(looked: Looked) -> None:
+def test_the_matrix_of_a_camera_takes_the_world_to_it(looked):
     for P, true_K, Rt in zip(looked.P, looked.K, looked.P_normalised, strict=True):
         found, world = open3d_cameras.camera_of(P, shift=0.5)
         np.testing.assert_allclose(world[:3], Rt, atol=1e-9)
@@ -148,7 +143,7 @@ def test_the_matrix_of_a_camera_takes_the_world_to_it(looked: Looked) -> None:
         np.testing.assert_allclose(found[0, 0], true_K[0, 0], atol=1e-6)
 
 
-def test_icp_moves_the_first_cloud_onto_the_second(looked: Looked) -> None:
+def test_icp_moves_the_first_cloud_onto_the_second(looked):
     shift = np.array([0.02, -0.01, 0.03])
     found = refine_by_icp(looked.X, looked.X + shift, 0.2)
     np.testing.assert_allclose(found[:3, 3], shift, atol=1e-6)

@@ -1,7 +1,5 @@
 """Conventions between our arrays and OpenCV's, at their border."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -20,7 +18,7 @@ skip_without("cv2")
 AT = np.array([33.0, 28.0])
 
 
-def spot(sigma: float) -> np.ndarray:
+def spot(sigma):
     """A picture (64, 72, 3) of a round spot in the centre of the pixel ``AT``."""
     y, x = np.indices((64, 72))
     grey = 255.0 * np.exp(-((x - AT[0]) ** 2 + (y - AT[1]) ** 2) / (2.0 * sigma**2))
@@ -28,12 +26,12 @@ def spot(sigma: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("solve", [opencv_linear, opencv_polynomial])
-def test_points_of_world_to_camera_matrices_are_where_they_were(solve: object, looked: Looked) -> None:
+def test_points_of_world_to_camera_matrices_are_where_they_were(solve, looked):
     assert callable(solve)
     np.testing.assert_allclose(dehomogenize(solve(looked.P, looked.xy)), looked.X, atol=1e-6)
 
 
-def test_the_middle_of_a_pixel_is_a_whole_number() -> None:
+def test_the_middle_of_a_pixel_is_a_whole_number():
     image = Image("spot", spot(4.0), (72, 64))
     np.testing.assert_allclose(sift_corners(image, 1)[0], AT, atol=0.01)
     # A corner of four fields: the edges lie between pixels 31 and 32, 27 and 28.
@@ -43,7 +41,7 @@ def test_the_middle_of_a_pixel_is_a_whole_number() -> None:
     np.testing.assert_allclose(found[np.argmin(np.abs(found - 30).sum(axis=1))], [31.5, 27.5], atol=0.1)
 
 
-def test_pictures_move_the_way_their_maps_say() -> None:
+def test_pictures_move_the_way_their_maps_say():
     picture = spot(2.0)
     A = np.array([[1.0, 0.0, 5.0], [0.0, 1.0, -3.0]])
     moved = warp_affine(picture, A, (72, 64))
@@ -55,7 +53,7 @@ def test_pictures_move_the_way_their_maps_say() -> None:
     np.testing.assert_allclose(ours[inner], theirs[inner], atol=1e-2)
 
 
-def test_a_smaller_picture_is_aligned_at_its_outer_edges() -> None:
+def test_a_smaller_picture_is_aligned_at_its_outer_edges():
     small = shrink(spot(6.0), (36, 32))[..., 0].astype(np.float64)
     y, x = np.indices(small.shape)
     middle = np.array([(small * x).sum(), (small * y).sum()]) / small.sum()
@@ -64,7 +62,7 @@ def test_a_smaller_picture_is_aligned_at_its_outer_edges() -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("widened", [False, True])
-def test_a_disparity_is_how_far_left_the_right_photograph_has_it_in_pixels(mode: str, widened: bool) -> None:
+def test_a_disparity_is_how_far_left_the_right_photograph_has_it_in_pixels(mode, widened):
     left = np.random.default_rng(0).integers(0, 256, (48, 160, 3)).astype(np.uint8)
     right = np.roll(left, -7, axis=1)
     found = OpenCVSemiGlobal(mode, widened=widened).match(left, right, 32)
@@ -76,7 +74,7 @@ def test_a_disparity_is_how_far_left_the_right_photograph_has_it_in_pixels(mode:
     assert not (found < 0.0).any()
 
 
-def test_rows_of_rectified_cameras_agree(looked: Looked) -> None:
+def test_rows_of_rectified_cameras_agree(looked):
     same = looked.K[:1].repeat(2, axis=0)
     pair = Looked(same, looked.R, looked.t, looked.X)
     found = opencv_calibrated(*pair.P, (640, 480))

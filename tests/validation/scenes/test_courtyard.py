@@ -1,7 +1,5 @@
 """The courtyard: its files are what the code makes, and depth, cameras and colours agree between views."""
 
-from __future__ import annotations
-
 import io
 import json
 
@@ -11,21 +9,21 @@ from PIL import Image
 
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import SIZE, courtyard_poses, encode_depth, render_photograph, versions
-from validation.scenes.real import ROOT, Scene, load_fixture_depth, load_fixture_scene
+from validation.scenes.real import ROOT, load_fixture_depth, load_fixture_scene
 
 FOLDER = ROOT / "fixtures" / "courtyard"
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     return load_fixture_scene("courtyard")
 
 
-def grey(scene: Scene, view: int) -> np.ndarray:
+def grey(scene, view):
     return np.asarray(Image.open(scene.image_paths[view]).convert("L"), dtype=float)
 
 
-def lift(scene: Scene, view: int) -> tuple[np.ndarray, np.ndarray]:
+def lift(scene, view):
     """Pixels (N, 2) and space points (N, 3) of the true depth of a view."""
     depth, stride = load_fixture_depth(view)
     row, col = np.nonzero(~np.isnan(depth))
@@ -34,7 +32,7 @@ def lift(scene: Scene, view: int) -> tuple[np.ndarray, np.ndarray]:
     return xy, (rays * depth[row, col, None]) @ scene.R[view] + scene.C[view]
 
 
-def look_up(a: np.ndarray, xy: np.ndarray) -> np.ndarray:
+def look_up(a, xy):
     """Bilinear samples of a at xy, all inside."""
     c, r = np.floor(xy[:, 0]).astype(int), np.floor(xy[:, 1]).astype(int)
     fx, fy = xy[:, 0] - c, xy[:, 1] - r
@@ -42,7 +40,7 @@ def look_up(a: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return top * (1 - fy) + (a[r + 1, c] * (1 - fx) + a[r + 1, c + 1] * fx) * fy
 
 
-def seen_in(scene: Scene, X: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def seen_in(scene, X, view):
     """Pixels and depth of X in a view, and which lie inside its image by a pixel or two."""
     x = (X - scene.C[view]) @ scene.R[view].T @ scene.K[view].T
     xy = x[:, :2] / x[:, 2:]
@@ -50,7 +48,7 @@ def seen_in(scene: Scene, X: np.ndarray, view: int) -> tuple[np.ndarray, np.ndar
     return xy, x[:, 2], inside
 
 
-def test_the_set_is_what_was_promised(scene: Scene) -> None:
+def test_the_set_is_what_was_promised(scene):
     assert len(scene.image_paths) >= 12
     assert sum(p.stat().st_size for p in FOLDER.rglob("*") if p.is_file()) < 8e6
     assert max(SIZE) == 1024
@@ -64,7 +62,7 @@ def test_the_set_is_what_was_promised(scene: Scene) -> None:
     assert scene.K[0, 0, 0] == scene.K[0, 1, 1]
 
 
-def test_cameras_are_those_of_the_code(scene: Scene) -> None:
+def test_cameras_are_those_of_the_code(scene):
     poses = courtyard_poses()
     for field, values in (("K", scene.K), ("R", scene.R), ("C", scene.C)):
         np.testing.assert_allclose(values, [getattr(p, field) for p in poses], atol=1e-12)
@@ -73,7 +71,7 @@ def test_cameras_are_those_of_the_code(scene: Scene) -> None:
     )
 
 
-def test_the_motion_is_general(scene: Scene) -> None:
+def test_the_motion_is_general(scene):
     turns = [b @ a.T for a, b in zip(scene.R[:-1], scene.R[1:], strict=True)]
     degrees = np.degrees([np.arccos((np.trace(T) - 1) / 2) for T in turns])
     assert degrees.min() > 7
@@ -86,7 +84,7 @@ def test_the_motion_is_general(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(("i", "j"), [(0, 1), (3, 5), (8, 6), (12, 13)])
-def test_depth_of_one_view_agrees_with_that_of_another(scene: Scene, i: int, j: int) -> None:
+def test_depth_of_one_view_agrees_with_that_of_another(scene, i, j):
     X = lift(scene, i)[1]
     depth, stride = load_fixture_depth(j)
     xy, z, inside = seen_in(scene, X, j)
@@ -105,7 +103,7 @@ def test_depth_of_one_view_agrees_with_that_of_another(scene: Scene, i: int, j: 
 
 
 @pytest.mark.parametrize(("i", "j"), [(2, 3), (6, 7), (10, 11)])
-def test_a_visible_point_has_one_colour(scene: Scene, i: int, j: int) -> None:
+def test_a_visible_point_has_one_colour(scene, i, j):
     xy1, X = lift(scene, i)
     depth, stride = load_fixture_depth(j)
     xy2, z, inside = seen_in(scene, X, j)
@@ -113,7 +111,7 @@ def test_a_visible_point_has_one_colour(scene: Scene, i: int, j: int) -> None:
     same &= (xy1 > 2).all(axis=1) & (xy1 < np.array(SIZE) - 4).all(axis=1)
     first, second = grey(scene, i), grey(scene, j)
 
-    def correlation(shift: float) -> float:
+    def correlation(shift):
         return float(np.corrcoef(look_up(first, xy1[same]), look_up(second, xy2[same] + [shift, 0.0]))[0, 1])
 
     assert correlation(0.0) > 0.95
@@ -124,7 +122,7 @@ def test_a_visible_point_has_one_colour(scene: Scene, i: int, j: int) -> None:
     assert abs(best) < 0.06
 
 
-def test_a_view_is_made_again_byte_for_byte() -> None:
+def test_a_view_is_made_again_byte_for_byte():
     view = 4
     jpeg, depth = render_photograph(build_courtyard(), courtyard_poses()[view], view)
     kept = (FOLDER / "images" / f"{view:04d}.jpg").read_bytes()

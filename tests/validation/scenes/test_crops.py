@@ -1,7 +1,5 @@
 """Parts of photographs: the same each time, of the right size, and their overlap known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,13 +9,13 @@ from validation.scenes.real import load_fixture_scene
 PHOTOGRAPHS = load_fixture_scene().image_paths[:3]
 
 
-def crops_of(count: int, seed: int = 0) -> list[Crop]:
+def crops_of(count, seed=0):
     return make_crops(
         [PHOTOGRAPHS[:2], PHOTOGRAPHS[2:]], count, long_side=96, rng=np.random.default_rng(seed)
     )
 
 
-def test_parts_are_the_same_each_time_and_their_sources_take_turns() -> None:
+def test_parts_are_the_same_each_time_and_their_sources_take_turns():
     crops, again = crops_of(6), crops_of(6)
     assert all(np.array_equal(a.image.rgb, b.image.rgb) for a, b in zip(crops, again, strict=True))
     assert [crop.image.name for crop in crops] == [f"{k:04d}.png" for k in range(6)]
@@ -27,7 +25,7 @@ def test_parts_are_the_same_each_time_and_their_sources_take_turns() -> None:
     assert all(crop.box.min() >= 0.0 and crop.box.max() <= 1.0 for crop in crops)
 
 
-def test_the_shared_area_is_that_of_the_boxes() -> None:
+def test_the_shared_area_is_that_of_the_boxes():
     crop = crops_of(1)[0]
     a = Crop(crop.image, 0, 0, np.array([0.0, 0.0, 0.5, 0.5]))
     b = Crop(crop.image, 0, 0, np.array([0.25, 0.0, 1.0, 0.75]))
@@ -38,7 +36,7 @@ def test_the_shared_area_is_that_of_the_boxes() -> None:
     assert shared_area(a, apart) == shared_area(a, other) == 0.0
 
 
-def test_separate_scenes_share_nothing_and_come_again_changed() -> None:
+def test_separate_scenes_share_nothing_and_come_again_changed():
     rng = np.random.default_rng(0)
     crops = make_separate_crops([PHOTOGRAPHS[:1]], 8, long_side=64, rng=rng, per_scene=2)
     assert [crop.scene for crop in crops] == [0, 0, 1, 1, 2, 2, 3, 3]

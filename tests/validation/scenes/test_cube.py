@@ -1,9 +1,5 @@
 """The cube sequence: its file is what the code makes, and its numbers are perfect projections."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 from thesisrecon.geometry.camera_matrix import compose_camera, project
@@ -12,12 +8,12 @@ from validation.scenes.fixtures import write_cube
 from validation.scenes.real import ROOT
 
 
-def test_the_file_is_made_again_byte_for_byte(tmp_path: Path) -> None:
+def test_the_file_is_made_again_byte_for_byte(tmp_path):
     write_cube(tmp_path)
     assert (tmp_path / "cube.npz").read_bytes() == (ROOT / "fixtures" / "cube" / "cube.npz").read_bytes()
 
 
-def test_every_seen_point_is_projected_perfectly() -> None:
+def test_every_seen_point_is_projected_perfectly():
     cube = make_cube()
     assert cube.R.shape == (27, 3, 3)
     for R, C, xy, seen in zip(cube.R, cube.C, cube.xy, cube.visible, strict=True):
@@ -30,7 +26,7 @@ def test_every_seen_point_is_projected_perfectly() -> None:
         assert ((C - cube.X[seen]) @ R[2] < 0).all()
 
 
-def test_six_cameras_see_a_single_plane_and_every_point_is_seen_often() -> None:
+def test_six_cameras_see_a_single_plane_and_every_point_is_seen_often():
     cube = make_cube()
     assert np.bincount(cube.faces_seen()).tolist() == [0, 6, 15, 6]
     assert cube.visible.sum(axis=0).min() >= 10

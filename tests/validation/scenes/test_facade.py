@@ -1,7 +1,5 @@
 """Exact matches of a facade agree with its F, and shifted ones do not; a flat one is a plane."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

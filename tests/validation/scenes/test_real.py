@@ -1,9 +1,6 @@
 """Scenes are found by name, with their truth, and absent ones are said to be absent."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ SIZES = {"fountain-P11": 11, "Herz-Jesus-P8": 8, "kermit": 11}
 
 @pytest.mark.real
 @pytest.mark.parametrize("name", REAL_SCENES)
-def test_real_scenes(name: str) -> None:
+def test_real_scenes(name):
     scene = load_real_scene(name)
     if scene is None:
         pytest.skip("the real photographs are not on this machine")
@@ -27,21 +24,21 @@ def test_real_scenes(name: str) -> None:
         assert scene.K.shape == (SIZES[name], 3, 3)
 
 
-def test_absent_photographs_are_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_absent_photographs_are_none(monkeypatch, tmp_path):
     monkeypatch.setenv("THESISRECON_DATA", str(tmp_path))
     assert load_real_scene("kermit") is None
     monkeypatch.setenv("THESISRECON_DATA", str(tmp_path / "nowhere"))
     assert load_real_scene("kermit") is None
 
 
-def test_unknown_names_are_refused() -> None:
+def test_unknown_names_are_refused():
     with pytest.raises(ValueError, match="a real scene is one of"):
         load_real_scene("atlantis")
     with pytest.raises(ValueError, match="has none"):
         load_fixture_scene("atlantis")
 
 
-def test_a_photograph_without_its_truth_is_named(tmp_path: Path) -> None:
+def test_a_photograph_without_its_truth_is_named(tmp_path):
     (tmp_path / "images").mkdir()
     for name in ("a.jpg", "b.JPG", "notes.txt"):
         (tmp_path / "images" / name).touch()

@@ -1,9 +1,5 @@
 """Photographs taken anew: the pixels go where the new calibration says."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from PIL import Image as PillowImage
@@ -17,7 +13,7 @@ X = np.array([[0.05, -0.03, 1.0], [-0.1, 0.08, 1.0]])
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Scene:
+def scene(tmp_path):
     """Two photographs of two white spots that stand where K sees the points X."""
     y, x = np.mgrid[: SIZE[1], : SIZE[0]]
     gray = np.zeros(SIZE[::-1])
@@ -29,12 +25,12 @@ def scene(tmp_path: Path) -> Scene:
     return Scene("spots", paths, np.array([K, K]), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
 
 
-def spots(calibration: np.ndarray) -> np.ndarray:
+def spots(calibration):
     seen = X @ calibration.T
     return seen[:, :2] / seen[:, 2:]
 
 
-def found_spot(path: Path, near: np.ndarray) -> np.ndarray:
+def found_spot(path, near):
     """Centre of gravity around a place."""
     with PillowImage.open(path) as picture:
         gray = np.asarray(picture, dtype=np.float64)[..., 0]
@@ -43,9 +39,7 @@ def found_spot(path: Path, near: np.ndarray) -> np.ndarray:
     return np.array([np.sum(weight * x), np.sum(weight * y)]) / weight.sum()
 
 
-def test_spots_of_zoomed_photographs_are_where_their_calibration_sees_them(
-    scene: Scene, tmp_path: Path
-) -> None:
+def test_spots_of_zoomed_photographs_are_where_their_calibration_sees_them(scene, tmp_path):
     for new in (
         rezoom_scene(scene, tmp_path / "zoom", seed=3, how=Rezoom(0.3, 0.05)),
         central_scene(scene, tmp_path / "centre", share=0.7, zoom=1.3),
@@ -56,7 +50,7 @@ def test_spots_of_zoomed_photographs_are_where_their_calibration_sees_them(
                 assert found_spot(path, place) == pytest.approx(place, abs=0.05)
 
 
-def test_zoomed_frames_stay_inside_their_photograph_and_move_the_principal_point() -> None:
+def test_zoomed_frames_stay_inside_their_photograph_and_move_the_principal_point():
     rng = np.random.default_rng(0)
     shares = []
     for _ in range(50):
@@ -72,7 +66,7 @@ def test_zoomed_frames_stay_inside_their_photograph_and_move_the_principal_point
     assert np.abs(shares).max() > 0.08
 
 
-def test_a_frame_of_the_whole_photograph_changes_nothing() -> None:
+def test_a_frame_of_the_whole_photograph_changes_nothing():
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 256, (12, 18, 3), dtype=np.uint8)
     frame = Frame(1.0, 0.0, 0.0, (18, 12))
@@ -80,7 +74,7 @@ def test_a_frame_of_the_whole_photograph_changes_nothing() -> None:
     assert frame.calibration(K) == pytest.approx(K)
 
 
-def test_a_windowed_photograph_keeps_its_window_and_its_camera(scene: Scene, tmp_path: Path) -> None:
+def test_a_windowed_photograph_keeps_its_window_and_its_camera(scene, tmp_path):
     new = windowed_scene(scene, tmp_path / "windows", {1: np.array([0.0, 0.0, 0.4, 1.0])})
     with PillowImage.open(new.image_paths[1]) as picture, PillowImage.open(scene.image_paths[1]) as old:
         after, before = np.asarray(picture), np.asarray(old)
@@ -91,6 +85,6 @@ def test_a_windowed_photograph_keeps_its_window_and_its_camera(scene: Scene, tmp
     assert new.K is scene.K
 
 
-def test_photographs_without_calibration_are_not_taken_anew(scene: Scene, tmp_path: Path) -> None:
+def test_photographs_without_calibration_are_not_taken_anew(scene, tmp_path):
     with pytest.raises(ValueError, match="need the calibration"):
         rezoom_scene(Scene("bare", scene.image_paths), tmp_path, seed=0)
