@@ -182,7 +182,7 @@ def test_the_front_door():
     [
         (lambda: CensusAndColour(census_share=1.2), "census_share"),
         (lambda: CensusAndColour(truncation=0.0), "truncation"),
-        (lambda: PathPenalties(step=2.0), "penalties must obey"),
+        (lambda: PathPenalties(P1=2.0), "penalties must obey"),
         (lambda: PathPenalties(edge=0.0), "edge"),
         (lambda: DisparityPostprocessing(radius=-1), "must not be negative"),
         (lambda: DisparityPostprocessing(least_confidence=1.0), "least_confidence"),

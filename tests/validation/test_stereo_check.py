@@ -7,9 +7,9 @@ import pytest
 
 from tests.textures import texture
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import CohesiveScanlines
-from validation.studies.stereo import DEFAULT, THESIS, bad_pixels, check_pair
+from thesisrecon.stereo.semi_global import SemiGlobalMatching
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
+from validation.studies.stereo import DEFAULT, THESIS, bad_pixels, check_pair
 
 LIMITS_PCT = {
     "Tsukuba": (3.13, 4.1),
@@ -34,7 +34,7 @@ def test_real_pairs_are_matched_as_well_as_the_references_do(name: str) -> None:
     pair = pair_or_skip(name)
     limits = (0, pair.disparities - 1)
     for variant, limit in zip(
-        (CohesiveScanlines(), MaximumLikelihoodScanline()), LIMITS_PCT[name], strict=True
+        (SemiGlobalMatching(), MaximumLikelihoodScanline()), LIMITS_PCT[name], strict=True
     ):
         found = variant.match(pair.left, pair.right, disparity_range=limits)
         assert bad_pixels(found.disparity, pair, 1.0) <= limit

@@ -6,6 +6,7 @@ Section 2.5 for two photographs alone: rectified from F, matched from either sid
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import canonical_cameras
 from thesisrecon.records import DisparityMap, PinholeView
-from thesisrecon.stereo.cost import LARGEST
+from thesisrecon.stereo.cost import MAX_DISPARITIES
 from thesisrecon.stereo.epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo.planar_methods import Hartley, LeastDistortion, LoopZhang
 from thesisrecon.stereo.rectification import (
@@ -25,7 +26,7 @@ from thesisrecon.stereo.rectification import (
 )
 from thesisrecon.stereo.resampling import require_side
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import CohesiveScanlines, SemiGlobal
+from thesisrecon.stereo.semi_global import SemiGlobalMatching, match_both_sides
 
 Size = tuple[int, int]
 """Width and height, px."""
@@ -64,9 +65,7 @@ class PairMatching:
     rectified frame, and larger where its confidence is low; below ``least_confidence`` there are none.
     """
 
-    matcher: CohesiveScanlines | SemiGlobal | MaximumLikelihoodScanline = field(
-        default_factory=CohesiveScanlines
-    )
+    matcher: SemiGlobalMatching | MaximumLikelihoodScanline = field(default_factory=SemiGlobalMatching)
     range_margin: float = 0.25
     least_sigma_px: float = 0.2
     least_confidence: float = 0.0
@@ -139,7 +138,7 @@ def searched(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int
     """What of a range can be inside the frame; ``StageFailure`` where that is nothing or too much."""
     reach = frame.size[0] - 1
     first, last = max(wanted[0], -reach), min(wanted[1], reach)
-    if not 0 <= last - first < LARGEST:
+    if not 0 <= last - first < MAX_DISPARITIES:
         raise StageFailure(
             "the disparities of the pair cannot be searched",
             f"they run from {first} to {last} px",
@@ -281,8 +280,5 @@ def match_two_views(
     gain = brightness_gain(views[0], views[1], xy1, xy2)
     left = frame.warp(rgb1.astype(np.float32), 0)
     right = frame.warp(rgb2.astype(np.float32) * gain, 1)
-    found = pairs.matcher.match(left, right, disparity_range=wanted)
-    # Seen in a mirror, the right image is the left one.
-    mirrored = pairs.matcher.match(right[:, ::-1], left[:, ::-1], disparity_range=wanted)
-    back = replace(mirrored, disparity=mirrored.disparity[:, ::-1], confidence=mirrored.confidence[:, ::-1])
-    return RectifiedPair(frame, (left, right), gain, found, back)
+    match = partial(pairs.matcher.match, disparity_range=wanted)
+    return RectifiedPair(frame, (left, right), gain, *match_both_sides(match, left, right))

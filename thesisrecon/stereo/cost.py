@@ -1,10 +1,6 @@
-"""The range of disparities that is searched.
+"""Matching costs of rectified pairs: image channels, noise, census and truncated colour differences.
 
-Strips of rows, so that the memory of a pair is bounded and threads have something to share.
-
-What every matcher needs of a rectified pair: whole-numbered channels, which pixels exist, the noise.
-
-Matching costs of a strip of rows as bytes: census and truncated colour difference.
+Costs are computed strip by strip, which bounds the memory and gives the threads independent work.
 """
 
 from __future__ import annotations
@@ -31,45 +27,91 @@ from thesisrecon.stereo.cost_kernels import (
     support_masks,
 )
 
-LARGEST = 4096
-"""Disparities in a range, at most."""
+MAX_DISPARITIES = 4096
+"""Upper limit of the number of disparities searched."""
 
 
 def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
-    """First and last disparity, both included; ``ValueError`` where they are no range."""
+    """Check a disparity range.
+
+    Parameters
+    ----------
+    disparity_range : tuple of int
+        First and last disparity, both included.
+
+    Returns
+    -------
+    tuple of int
+        The range.
+
+    Raises
+    ------
+    ValueError
+        If the range is empty or too large.
+    """
     first, last = (int(d) for d in disparity_range)
-    if not 0 <= last - first < LARGEST:
-        raise ValueError(f"a disparity range needs first <= last < first + {LARGEST}; got {disparity_range}")
+    if not 0 <= last - first < MAX_DISPARITIES:
+        raise ValueError(
+            f"a disparity range needs first <= last < first + {MAX_DISPARITIES}; got {disparity_range}"
+        )
     return first, last
 
 
 Result = TypeVar("Result")
 Strip = tuple[int, int, int, int]
 
-MARGIN = 24
-"""Rows above and below that a strip also looks at: what is farther off hardly changes a path."""
-LEAST = 32
+STRIP_MARGIN = 24
+"""Additional rows above and below a strip: pixels farther away hardly change a path cost."""
+MIN_STRIP_ROWS = 32
 
 
 def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[Strip]:
-    """(first, last, from, to) of strips: rows [first, last) are its own, [from, to) it looks at.
+    """Divide the rows of an image into the fewest strips that fit the memory.
 
-    The fewest whose rows, margins included, fit the memory, but with at least ``LEAST`` rows of their own.
-    They depend on the sizes alone, never on the number of threads.
+    Parameters
+    ----------
+    height : int
+        Rows of the image.
+    bytes_per_row : int
+        Memory of one row.
+    memory_bytes : float
+        Memory of one strip, margins included.
+
+    Returns
+    -------
+    list of Strip
+        (first, last, from, to): rows [first, last) are computed from rows [from, to). They do not depend on
+        the number of threads.
     """
     fitting = int(memory_bytes // max(bytes_per_row, 1))
     if height <= fitting:
         return [(0, height, 0, height)]
-    own = max(fitting - 2 * MARGIN, LEAST)
+    own = max(fitting - 2 * STRIP_MARGIN, MIN_STRIP_ROWS)
     count = -(-height // own)
     edges = [height * k // count for k in range(count + 1)]
     return [
-        (first, last, max(first - MARGIN, 0), min(last + MARGIN, height)) for first, last in pairwise(edges)
+        (first, last, max(first - STRIP_MARGIN, 0), min(last + STRIP_MARGIN, height))
+        for first, last in pairwise(edges)
     ]
 
 
 def run_strips(work: Callable[[Strip], Result], strips: Sequence[Strip], threads: int) -> list[Result]:
-    """``work`` of every strip, in order, on so many threads."""
+    """Call ``work`` for every strip.
+
+    Parameters
+    ----------
+    work : callable
+        Function of a strip.
+    strips : sequence of Strip
+        The strips.
+    threads : int
+        Number of threads.
+
+    Returns
+    -------
+    list
+        Results in the order of the strips.
+    """
     if threads < 2 or len(strips) < 2:
         return [work(strip) for strip in strips]
     with ThreadPoolExecutor(min(threads, len(strips))) as pool:
@@ -77,26 +119,45 @@ def run_strips(work: Callable[[Strip], Result], strips: Sequence[Strip], threads
 
 
 ROWS_FOR_NOISE = 24
-"""About as many rows, evenly spread, suffice for a median."""
+"""Number of evenly spaced rows used for the median."""
 
 
 @dataclass(frozen=True)
-class Side:
-    """One image of the pair: ``channels`` (K, H, W) in quarters of a grey level, ``valid`` (H, W) 255 where
-    there is a pixel and 0 elsewhere, where the channels are 0; ``grey`` (H, W) their sum."""
+class StereoImage:
+    """One image of a rectified pair.
+
+    Attributes
+    ----------
+    channels : ndarray (K, H, W) int16
+        Channels in quarters of a grey level, 0 where there is no pixel.
+    grey : ndarray (H, W) int16
+        Sum of the channels.
+    valid : ndarray (H, W) uint8
+        255 where there is a pixel, else 0.
+    """
 
     channels: I16
     grey: I16
     valid: U8
 
 
-def prepare_pair(left: ArrayLike, right: ArrayLike) -> tuple[Side, Side]:
-    """Both sides of a rectified pair, (H, W) or (H, W, K <= 4) grey levels 0 .. 255, NaN = no pixel.
+def prepare_pair(left: ArrayLike, right: ArrayLike) -> tuple[StereoImage, StereoImage]:
+    """Convert both images of a rectified pair to integer channels.
+
+    Parameters
+    ----------
+    left, right : array_like (H, W) or (H, W, K <= 4)
+        Grey levels 0 .. 255, NaN = no pixel.
+
+    Returns
+    -------
+    tuple of StereoImage
+        Left and right image.
 
     Raises
     ------
     ValueError
-        Where the images are of no such shape, or not of the same number of rows, columns and channels.
+        If a shape is invalid or the shapes differ.
     """
     sides = tuple(_side(np.asarray(image)) for image in (left, right))
     if sides[0].channels.shape != sides[1].channels.shape:
@@ -106,7 +167,7 @@ def prepare_pair(left: ArrayLike, right: ArrayLike) -> tuple[Side, Side]:
     return sides[0], sides[1]
 
 
-def _side(image: NDArray[np.generic]) -> Side:
+def _side(image: NDArray[np.generic]) -> StereoImage:
     if image.ndim not in (2, 3) or 0 in image.shape or (image.ndim == 3 and image.shape[2] > 4):
         raise ValueError(f"an image must be (H, W) or (H, W, K) with K <= 4; got {image.shape}")
     height, width, n = (*image.shape, 1)[:3]
@@ -117,29 +178,38 @@ def _side(image: NDArray[np.generic]) -> Side:
     else:
         levels = np.ascontiguousarray(image.reshape(height, width, n), dtype=np.float32)
         split_channels(levels, channels, grey, valid)
-    return Side(channels, grey, valid)
+    return StereoImage(channels, grey, valid)
 
 
-def estimate_noise(side: Side) -> float:
-    """Standard deviation of the noise of one channel, grey levels.
+def estimate_noise(image: StereoImage) -> float:
+    """Estimate the standard deviation of the image noise of one channel.
 
-    The median absolute response to the difference of two Laplacians, which no linear or quadratic shading
-    moves (Immerkaer 1996; the median instead of the mean, for texture is no noise). 0 where fewer than 3 x 3
-    pixels exist.
+    The median absolute response to the difference of two Laplacians, which is insensitive to linear and
+    quadratic shading (Immerkaer 1996, with the median instead of the mean because texture is not noise).
+
+    Parameters
+    ----------
+    image : StereoImage
+        The image.
+
+    Returns
+    -------
+    float
+        Standard deviation in grey levels; 0 if fewer than 3 x 3 pixels exist.
     """
-    if min(side.valid.shape) < 3:
+    if min(image.valid.shape) < 3:
         return 0.0
-    step = max(side.valid.shape[0] // ROWS_FOR_NOISE, 1)
-    top = np.arange(0, side.valid.shape[0] - 2, step)
-    rows = [side.channels[:, top + k].copy() for k in range(3)]
+    step = max(image.valid.shape[0] // ROWS_FOR_NOISE, 1)
+    top = np.arange(0, image.valid.shape[0] - 2, step)
+    rows = [image.channels[:, top + k].copy() for k in range(3)]
     mixed = rows[0] - 2 * rows[1] + rows[2]
     response = mixed[..., :-2] - 2 * mixed[..., 1:-1] + mixed[..., 2:]
-    whole = np.minimum(np.minimum(side.valid[top], side.valid[top + 1]), side.valid[top + 2]) > 0
-    inside = whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:]
-    if not inside.any():
+    whole = np.minimum(np.minimum(image.valid[top], image.valid[top + 1]), image.valid[top + 2]) > 0
+    inimage = whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:]
+    if not inimage.any():
         return 0.0
     # A median of whole numbers by counting them. The mask has the squares 1, 4, 1, 4, 16, 4, 1, 4, 1: 36.
-    below = np.cumsum(np.bincount(np.abs(response[:, inside]).ravel()))
+    below = np.cumsum(np.bincount(np.abs(response[:, inimage]).ravel()))
     median = int(np.searchsorted(below, 0.5 * below[-1]))
     return 1.4826 * median / 6.0 / LEVELS
 
@@ -148,9 +218,20 @@ CENSUS_BITS = 24
 
 
 @dataclass(frozen=True)
-class CostedSide:
-    """What costs are made of: ``bits`` (H, W) the census, ``channels`` (K, H, W), their bounds ``low`` and
-    ``high`` within half a pixel (the channels themselves where not asked for), ``valid`` (H, W)."""
+class CostFeatures:
+    """Image features from which matching costs are computed.
+
+    Attributes
+    ----------
+    bits : ndarray (H, W) int32
+        Census transform.
+    channels : ndarray (K, H, W) int16
+        Channels in quarters of a grey level.
+    low, high : ndarray (K, H, W) int16
+        Bounds of the channels within half a pixel, or the channels themselves.
+    valid : ndarray (H, W) uint8
+        255 where there is a pixel, else 0.
+    """
 
     bits: I32
     channels: I16
@@ -159,7 +240,18 @@ class CostedSide:
     valid: U8
 
     def rows(self, start: int, stop: int) -> tuple[I32, I16, I16, I16, U8]:
-        """The arrays of rows ``start`` to ``stop``, each in one piece."""
+        """Return contiguous arrays of some rows.
+
+        Parameters
+        ----------
+        start, stop : int
+            First row, and the row after the last.
+
+        Returns
+        -------
+        tuple of ndarray
+            (bits, channels, low, high, valid) of the rows.
+        """
         part = slice(start, stop)
         whole = np.ascontiguousarray
         return (
@@ -171,28 +263,28 @@ class CostedSide:
         )
 
 
-def costed_side(side: Side, *, bounds: bool) -> CostedSide:
-    """Census and, if asked for, bounds of one image."""
-    bits = np.empty(side.valid.shape, np.int32)
-    census(side.grey, bits)
-    if not bounds:
-        return CostedSide(bits, side.channels, side.channels, side.channels, side.valid)
-    low, high = np.empty_like(side.channels), np.empty_like(side.channels)
-    sampled_bounds(side.channels, low, high)
-    return CostedSide(bits, side.channels, low, high, side.valid)
-
-
 @dataclass(frozen=True)
 class CensusAndColour:
-    """Hamming distance of 5 x 5 census transforms plus the absolute difference of the channels, truncated.
+    """Hamming distance of census transforms plus truncated absolute colour difference.
 
-    The census (Zabih and Woodfill 1994) stands changes of exposure, the colours tell apart what has the same
-    pattern. ``census_share`` of the dearest cost is the census', the rest the colours'. These are truncated
-    at ``truncation`` times the noise, for beyond it a difference only says "another thing". With ``support``
-    the costs are averaged over the pixels within two of this one along its row and column, and then theirs,
-    up to the first that differs by more than ``tolerance`` times the noise (Zhang, Lu and Lafruit 2009). With
-    ``sampling_insensitive`` the colours are those of Birchfield and Tomasi (1998). ``outside`` is the cost of
-    a partner beyond the image, as a share of the dearest.
+    The 5 x 5 census transform (Zabih and Woodfill 1994) is invariant to exposure; the colours distinguish
+    regions of equal pattern. Truncation limits the influence of occlusions and outliers.
+
+    Parameters
+    ----------
+    census_share : float
+        Share of the census in the maximal cost; the colours have the rest.
+    truncation : float
+        Truncation of the colour difference, in standard deviations of the noise.
+    support : bool
+        Average the costs over cross-shaped support regions (Zhang, Lu and Lafruit 2009) with arms of 2
+        pixels.
+    tolerance : float
+        Colour difference at which an arm ends, in standard deviations of the noise.
+    sampling_insensitive : bool
+        Use the sampling-insensitive difference of Birchfield and Tomasi (1998).
+    outside : float
+        Cost of a partner outside the image, as a share of the maximal cost.
     """
 
     census_share: float = 0.56
@@ -210,35 +302,79 @@ class CensusAndColour:
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be above 0; got {getattr(self, name)}")
 
-    def side(self, side: Side) -> CostedSide:
-        """What the costs need of one image."""
-        return costed_side(side, bounds=self.sampling_insensitive)
+    def features(self, image: StereoImage) -> CostFeatures:
+        """Compute the features of one image.
 
-    def support_of(self, side: Side, noise: float) -> U8:
-        """(4, 0 | ARM, H, W) arms of the support of every pixel."""
-        height, width = side.valid.shape
+        Parameters
+        ----------
+        image : StereoImage
+            The image.
+
+        Returns
+        -------
+        CostFeatures
+            Census transform and channel bounds.
+        """
+        bits = np.empty(image.valid.shape, np.int32)
+        census(image.grey, bits)
+        low, high = image.channels, image.channels
+        if self.sampling_insensitive:
+            low, high = np.empty_like(low), np.empty_like(high)
+            sampled_bounds(image.channels, low, high)
+        return CostFeatures(bits, image.channels, low, high, image.valid)
+
+    def support_arms(self, image: StereoImage, noise: float) -> U8:
+        """Compute the arms of the support region of every pixel.
+
+        Parameters
+        ----------
+        image : StereoImage
+            The left image.
+        noise : float
+            Standard deviation of its noise in grey levels.
+
+        Returns
+        -------
+        ndarray (4, ARM, H, W) uint8
+            Arms to the left, right, top and bottom; the second axis is empty without ``support``.
+        """
+        height, width = image.valid.shape
         masks = np.empty((4, ARM if self.support else 0, height, width), np.uint8)
         if self.support:
             tolerance = np.int16(min(round(self.tolerance * noise * LEVELS), 255 * LEVELS))
-            support_masks(side.channels, side.valid, tolerance, masks)
+            support_masks(image.channels, image.valid, tolerance, masks)
         return masks
 
-    def fill(
+    def fill_volume(
         self,
         out: U8,
-        left: CostedSide,
-        right: CostedSide,
+        left: CostFeatures,
+        right: CostFeatures,
         support: U8,
         *,
         rows: tuple[int, int],
         first: int,
         noise: float,
-        dearest: int,
+        max_cost: int,
     ) -> None:
-        """Costs of the rows [a, b) at D disparities from ``first`` on, ``out`` (rows, D, W).
+        """Compute the cost volume of some rows.
 
-        ``support`` is that of the whole left image, ``noise`` the standard deviation of a grey level,
-        ``dearest`` the cost of a match that could not be worse.
+        Parameters
+        ----------
+        out : ndarray (rows, D, W) uint8
+            Receives the costs.
+        left, right : CostFeatures
+            Features of both images.
+        support : ndarray (4, ARM, H, W) uint8
+            Support arms of the whole left image.
+        rows : tuple of int
+            First row, and the row after the last.
+        first : int
+            First disparity.
+        noise : float
+            Standard deviation of the noise in grey levels.
+        max_cost : int
+            Cost of the worst match.
         """
         start, stop = rows
         cost_volume(
@@ -246,13 +382,13 @@ class CensusAndColour:
             right.rows(start, stop),
             np.ascontiguousarray(support[:, :, start:stop]),
             first,
-            self._weights(len(left.channels), noise, dearest),
-            np.uint8(round(self.outside * dearest)),
+            self._weights(len(left.channels), noise, max_cost),
+            np.uint8(round(self.outside * max_cost)),
             out,
         )
 
-    def _weights(self, channels: int, noise: float, dearest: int) -> I16:
-        one = dearest << WEIGHT_SHIFT
+    def _weights(self, channels: int, noise: float, max_cost: int) -> I16:
+        one = max_cost << WEIGHT_SHIFT
         cap = min(max(round(self.truncation * noise * LEVELS * channels), channels), 255 * LEVELS * channels)
         of_bit = round(self.census_share * one / CENSUS_BITS)
         of_level = max(round((1.0 - self.census_share) * one / cap), int(self.census_share < 1.0))

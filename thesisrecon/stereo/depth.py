@@ -84,7 +84,7 @@ class MultiViewStereo:
 
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
         """Disparities of a rectified pair of arrays by the matcher of ``pairs``."""
-        return match_rectified(left, right, max_disparity_px=max_disparity_px, config=self.pairs.matcher)
+        return match_rectified(left, right, max_disparity_px=max_disparity_px, matcher=self.pairs.matcher)
 
     def match_two_views(
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False

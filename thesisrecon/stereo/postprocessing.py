@@ -12,7 +12,7 @@ from numba import njit
 
 from thesisrecon.arrays import B8, F32, I16, I32, U8, U16
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo.cost import Side
+from thesisrecon.stereo.cost import StereoImage
 from thesisrecon.stereo.cost_kernels import LEVELS
 
 NONE = np.uint16(65535)
@@ -288,7 +288,7 @@ SURROUNDED = 5
 
 
 @dataclass(frozen=True)
-class Finish:
+class DisparityPostprocessing:
     """What is believed of the best disparities.
 
     ``left_right_px``: the partner's own best disparity may differ by as much. ``smallest_piece``: connected
@@ -327,7 +327,7 @@ class Finish:
         return DisparityMap(smooth, confidence, _noise(closed, smooth))
 
 
-def texture_of(side: Side, noise: float) -> F32:
+def texture_of(side: StereoImage, noise: float) -> F32:
     """(H, W) squared horizontal gradient about each pixel in units of what noise alone, of a standard
     deviation of so many grey levels, makes of it: 1 where there is nothing to match. NaN = no pixel."""
     out = np.empty(side.valid.shape, np.float32)

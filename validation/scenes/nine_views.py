@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from PIL import Image
 
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo.semi_global import CohesiveScanlines
+from thesisrecon.stereo.semi_global import SemiGlobalMatching, match_both_sides
 from thesisrecon.views.trilinear_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
 from thesisrecon.views.virtual_camera import CalibratedPair, guessed_intrinsics
 from validation.scenes.real import data_root
@@ -66,10 +67,8 @@ def both_ways(match: Callable[[U8, U8], F32], left: U8, right: U8) -> tuple[F32,
 
 def our_disparities(left: U8, right: U8) -> tuple[DisparityMap, DisparityMap]:
     """The maps of both photographs by the library's default matcher, with its confidences."""
-    matcher, limits = CohesiveScanlines(), (0, DISPARITIES - 1)
-    back = matcher.match(mirrored(right), mirrored(left), disparity_range=limits)
-    turned, sure = (np.ascontiguousarray(part[:, ::-1]) for part in (back.disparity, back.confidence))
-    return matcher.match(left, right, disparity_range=limits), DisparityMap(turned, sure, back.sigma_px)
+    match = partial(SemiGlobalMatching().match, disparity_range=(0, DISPARITIES - 1))
+    return match_both_sides(match, left, right)
 
 
 def synthesis_of_disparities(

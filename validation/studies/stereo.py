@@ -24,7 +24,7 @@ from thesisrecon.arrays import F32, U8
 from thesisrecon.io.files import write_text
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import CohesiveScanlines, PairMatcher, SemiGlobal
+from thesisrecon.stereo.semi_global import PUBLISHED, PairMatcher, SemiGlobalMatching
 from validation.metrics.record import Metric, markdown_table, summary_table
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
@@ -32,10 +32,10 @@ from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 DEFAULT, THESIS, LETTER, SEMI_GLOBAL = "default", "thesis", "thesis, to the letter", "semi-global"
 OURS: dict[str, PairMatcher] = {
-    DEFAULT: CohesiveScanlines(),
+    DEFAULT: SemiGlobalMatching(),
     THESIS: MaximumLikelihoodScanline(),
     LETTER: MaximumLikelihoodScanline(radius=0, out_of_view=False),
-    SEMI_GLOBAL: SemiGlobal(),
+    SEMI_GLOBAL: PUBLISHED,
 }
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
 THEIRS = {

@@ -11,19 +11,19 @@ import PIL.Image
 
 from thesisrecon.arrays import F32
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import CohesiveScanlines, PairMatcher, SemiGlobal
-from validation.studies.stereo import bad_pixels, picture
+from thesisrecon.stereo.semi_global import PUBLISHED, PairMatcher, SemiGlobalMatching
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
+from validation.studies.stereo import bad_pixels, picture
 
 OURS, THESIS, SEMI_GLOBAL = "ours", "ours (thesis)", "ours (semi-global)"
 MATCHERS: dict[str, PairMatcher] = {
-    OURS: CohesiveScanlines(),
+    OURS: SemiGlobalMatching(),
     THESIS: MaximumLikelihoodScanline(),
-    SEMI_GLOBAL: SemiGlobal(),
+    SEMI_GLOBAL: PUBLISHED,
 }
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
 BAD, KNOWN = "off by more than 1 px", "share before holes are filled"

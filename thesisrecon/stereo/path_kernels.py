@@ -1,0 +1,343 @@
+"""Compiled path costs of semi-global matching (Hirschmüller 2008).
+
+All inner loops run over pixels of a row so that the compiler vectorises them. Horizontal paths are computed
+on transposed blocks.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from thesisrecon.arrays import I16, U8, U64
+
+Word8 = tuple[np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64]
+
+TOP = 127
+"""Upper limit of matching cost plus penalty: the sum of two opposite path costs then fits one byte."""
+BLOCK = 192
+"""Rows transposed together for the horizontal paths; a multiple of 8."""
+TILE = 64
+"""Columns transposed together; a multiple of 8."""
+ODD = np.uint64(0x00FF00FF00FF00FF)
+ODD_PAIRS = np.uint64(0x0000FFFF0000FFFF)
+ODD_FOURS = np.uint64(0x00000000FFFFFFFF)
+
+
+@njit(cache=True, nogil=True)
+def _adapt_P2(a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
+    for x in range(len(out)):
+        apart = np.float32(a[x]) - np.float32(b[x])
+        apart = -apart if apart < 0 else apart
+        p2 = largest * scale / (scale + apart)
+        out[x] = np.uint8(least if p2 < least else p2)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
+    """Compute the penalty P2 between neighbouring pixels.
+
+    It decreases with the intensity step, ``largest`` / (1 + step / ``scale``), at least ``least``
+    (Hirschmüller 2008, section 2.2).
+
+    Parameters
+    ----------
+    grey : ndarray (H, W) int16
+        Intensities.
+    largest, least : float
+        Limits of the penalty.
+    scale : float
+        Intensity step that halves the penalty.
+    out : ndarray (4, H, W) uint8
+        Receives the penalties from the left, upper, upper left and upper right neighbour.
+    """
+    height, width = grey.shape
+    out[:] = np.uint8(largest)
+    for y in range(height):
+        _adapt_P2(grey[y, 1:], grey[y, : width - 1], largest, least, scale, out[0, y, 1:])
+        if y > 0:
+            above = grey[y - 1]
+            _adapt_P2(grey[y], above, largest, least, scale, out[1, y])
+            _adapt_P2(grey[y, 1:], above[: width - 1], largest, least, scale, out[2, y, 1:])
+            _adapt_P2(grey[y, : width - 1], above[1:], largest, least, scale, out[3, y, : width - 1])
+
+
+@njit(cache=True, nogil=True)
+def _extend(
+    cost: U8,
+    before: tuple[U8, U8, U8],
+    base: U8,
+    p2: U8,
+    P1: np.uint8,
+    path: U8,
+    least: U8,
+) -> None:
+    """Path costs of one disparity: L = C + min(L'(d), L'(d +- 1) + P1, min L' + P2) - min L'.
+
+    ``before`` are the rows L'(d - 1), L'(d), L'(d + 1) of the previous pixels, ``base`` their minimum over d;
+    ``least`` is updated with the minimum of this row.
+    """
+    below, same, above = before
+    for x in range(len(cost)):
+        # Read before the choices: a read inside of one would be a branch, and no vector instruction.
+        near, other, value, floor = below[x], above[x], same[x], base[x]
+        near = other if other < near else near
+        near = np.uint8(near + P1)
+        value = near if near < value else value
+        far = np.uint8(floor + p2[x])
+        value = far if far < value else value
+        value = np.uint8(np.uint8(value - floor) + cost[x])
+        path[x] = value
+        so_far = least[x]
+        least[x] = value if value < so_far else so_far
+
+
+@njit(cache=True, nogil=True)
+def _extend_row(
+    cost: U8, before: U8, base: U8, p2: U8, settings: tuple[np.uint8, int, U8], path: U8, least: U8
+) -> None:
+    """Path costs (D, W) of a row of pixels from those of the previous row, ``shift`` columns aside.
+
+    ``p2`` (W,) belongs to the previous pixel. ``settings`` are P1, the shift, and a row of unreachable costs.
+    """
+    P1, shift, unreachable = settings
+    n, width = cost.shape
+    a, b = max(0, -shift), width - max(0, shift)
+    c, d = a + shift, b + shift
+    least[:] = 255
+    for q in range(n):
+        if b > a:
+            below = before[q - 1, c:d] if q > 0 else unreachable[c:d]
+            above = before[q + 1, c:d] if q < n - 1 else unreachable[c:d]
+            _extend(
+                cost[q, a:b],
+                (below, before[q, c:d], above),
+                base[c:d],
+                p2[c:d],
+                P1,
+                path[q, a:b],
+                least[a:b],
+            )
+        for x in range(a):
+            path[q, x] = cost[q, x]
+            least[x] = min(least[x], cost[q, x])
+        for x in range(b, width):
+            path[q, x] = cost[q, x]
+            least[x] = min(least[x], cost[q, x])
+
+
+@njit(cache=True, nogil=True)
+def _start_row(cost: U8, path: U8, least: U8) -> None:
+    least[:] = 255
+    for q in range(len(cost)):
+        for x in range(len(least)):
+            value = cost[q, x]
+            path[q, x] = value
+            least[x] = min(least[x], value)
+
+
+@njit(cache=True, nogil=True)
+def _add(values: U8, total: U8) -> None:
+    for x in range(len(total)):
+        total[x] = np.uint8(total[x] + values[x])
+
+
+@njit(cache=True, nogil=True)
+def _copy(source: U8, out: U8) -> None:
+    for x in range(len(out)):
+        out[x] = source[x]
+
+
+@njit(cache=True, nogil=True)
+def _shifted(p2: U8, shift: int, out: U8) -> None:
+    """Shift a row of penalties by ``shift`` columns, zeros outside."""
+    width = len(p2)
+    a, b = min(max(0, shift), width), max(width + min(0, shift), 0)
+    out[:a], out[b:] = 0, 0
+    if b > a:
+        _copy(p2[a - shift : b - shift], out[a:b])
+
+
+@njit(cache=True, nogil=True)
+def sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> None:
+    """Sum the costs of two opposite paths through the rows.
+
+    Parameters
+    ----------
+    costs : ndarray (N, D, W) uint8
+        Matching costs.
+    P2 : ndarray (N, W) uint8
+        Penalty between a pixel and the one above it.
+    P1 : uint8
+        Penalty of a disparity change of 1.
+    shift : int
+        Columns between a pixel and its predecessor from above.
+    total : ndarray (N, D, W) uint8
+        Receives the sums.
+    """
+    rows, n, width = costs.shape
+    unreachable = np.full(width, np.uint8(255 - P1), np.uint8)
+    least, p2 = np.empty((2, width), np.uint8), np.empty(width, np.uint8)
+    _start_row(costs[0], total[0], least[0])
+    for y in range(1, rows):
+        # The sum is still the path from above alone, so it is where the next one starts.
+        _shifted(P2[y], shift, p2)
+        settings = (P1, shift, unreachable)
+        old, new = least[(y - 1) & 1], least[y & 1]
+        _extend_row(costs[y], total[y - 1], old, p2, settings, total[y], new)
+    paths = np.empty((2, n, width), np.uint8)
+    _start_row(costs[rows - 1], paths[(rows - 1) & 1], least[(rows - 1) & 1])
+    for y in range(rows - 1, -1, -1):
+        path = paths[y & 1]
+        if y < rows - 1:
+            settings = (P1, -shift, unreachable)
+            old = least[(y + 1) & 1]
+            _extend_row(costs[y], paths[(y + 1) & 1], old, P2[y + 1], settings, path, least[y & 1])
+        for q in range(n):
+            _add(path[q], total[y, q])
+
+
+@njit(cache=True, nogil=True)
+def _swap(a: np.uint64, b: np.uint64, shift: np.uint64, mask: np.uint64) -> tuple[np.uint64, np.uint64]:
+    apart = ((a >> shift) ^ b) & mask
+    return a ^ (apart << shift), b ^ apart
+
+
+@njit(cache=True, nogil=True)
+def _transposed(rows: Word8) -> Word8:
+    """Transpose 8 x 8 bytes, one row per word: swap bytes, then pairs, then groups of four."""
+    one, two, four = np.uint64(8), np.uint64(16), np.uint64(32)
+    a, b, c, d, e, f, g, h = rows
+    a, b = _swap(a, b, one, ODD)
+    c, d = _swap(c, d, one, ODD)
+    e, f = _swap(e, f, one, ODD)
+    g, h = _swap(g, h, one, ODD)
+    a, c = _swap(a, c, two, ODD_PAIRS)
+    b, d = _swap(b, d, two, ODD_PAIRS)
+    e, g = _swap(e, g, two, ODD_PAIRS)
+    f, h = _swap(f, h, two, ODD_PAIRS)
+    a, e = _swap(a, e, four, ODD_FOURS)
+    b, f = _swap(b, f, four, ODD_FOURS)
+    c, g = _swap(c, g, four, ODD_FOURS)
+    d, h = _swap(d, h, four, ODD_FOURS)
+    return a, b, c, d, e, f, g, h
+
+
+@njit(cache=True, nogil=True)
+def _load(words: U64, first: int, column: int) -> Word8:
+    """Words of eight rows from ``first`` on."""
+    part = words[first : first + 8, column]
+    return part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7]
+
+
+@njit(cache=True, nogil=True)
+def _store(square: Word8, words: U64, first: int, column: int) -> None:
+    part = words[first : first + 8, column]
+    part[0], part[1], part[2], part[3] = square[0], square[1], square[2], square[3]
+    part[4], part[5], part[6], part[7] = square[4], square[5], square[6], square[7]
+
+
+@njit(cache=True, nogil=True)
+def transpose_rows(source: U8, out: U8) -> None:
+    """Transpose rows and columns, (N, D, W) to (W', D, N') with N <= BLOCK.
+
+    W' and N' are the next multiples of 8; the additional entries are arbitrary. Tiles avoid cache conflicts
+    of row lengths that are multiples of a large power of two.
+
+    Parameters
+    ----------
+    source : ndarray (N, D, W) uint8
+        Rows.
+    out : ndarray (W', D, N') uint8
+        Receives the columns.
+    """
+    rows, n, width = source.shape
+    words = out.view(np.uint64)
+    tile = np.zeros((BLOCK, TILE // 8 + 1), np.uint64)
+    bytes_of = tile.view(np.uint8)
+    for q in range(n):
+        plane = words[:, q]
+        for start in range(0, width, TILE):
+            size = min(TILE, width - start)
+            for y in range(rows):
+                _copy(source[y, q, start : start + size], bytes_of[y, :size])
+            for x in range(0, size, 8):
+                for y in range(0, rows, 8):
+                    _store(_transposed(_load(tile, y, x >> 3)), plane, start + x, y >> 3)
+
+
+@njit(cache=True, nogil=True)
+def transpose_back(source: U8, out: U8) -> None:
+    """Invert :func:`transpose_rows`.
+
+    Parameters
+    ----------
+    source : ndarray (W', D, N') uint8
+        Columns.
+    out : ndarray (N, D, W) uint8
+        Receives the rows.
+    """
+    rows, n, width = out.shape
+    words = source.view(np.uint64)
+    tile = np.zeros((BLOCK, TILE // 8 + 1), np.uint64)
+    bytes_of = tile.view(np.uint8)
+    for q in range(n):
+        plane = words[:, q]
+        for start in range(0, width, TILE):
+            size = min(TILE, width - start)
+            for x in range(0, size, 8):
+                for y in range(0, rows, 8):
+                    _store(_transposed(_load(plane, start + x, y >> 3)), tile, y, x >> 3)
+            for y in range(rows):
+                _copy(bytes_of[y, :size], out[y, q, start : start + size])
+
+
+def scratch_size(height: int, disparities: int, width: int) -> int:
+    """Return the size of a block of transposed costs.
+
+    Parameters
+    ----------
+    height, disparities, width : int
+        Shape of the cost volume.
+
+    Returns
+    -------
+    int
+        Bytes.
+    """
+    return (width + 7) // 8 * 8 * disparities * ((min(height, BLOCK) + 7) // 8 * 8)
+
+
+@njit(cache=True, nogil=True)
+def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
+    """Sum the minimal costs of all paths that end in a pixel, two opposite paths at a time.
+
+    Parameters
+    ----------
+    costs : ndarray (H, D, W) uint8
+        Matching costs.
+    P2 : ndarray (4, H, W) uint8
+        Penalties of :func:`adaptive_P2`.
+    P1 : uint8
+        Penalty of a disparity change of 1.
+    total : ndarray (P, H, D, W) uint8
+        Receives the sums: P = 2 for rows and columns, P = 4 with the diagonals.
+    scratch : ndarray (2, scratch_size) uint8
+        Work space.
+    """
+    height, n, width = costs.shape
+    # Along a row every pixel waits for the one before: many rows together, transposed, fill the vectors.
+    for start in range(0, height, BLOCK):
+        rows = min(BLOCK, height - start)
+        wide, high = (width + 7) // 8 * 8, (rows + 7) // 8 * 8
+        transposed = scratch[0, : wide * n * high].reshape((wide, n, high))
+        summed = scratch[1, : wide * n * high].reshape((wide, n, high))
+        transpose_rows(costs[start : start + rows], transposed)
+        p2 = np.zeros((width, high), np.uint8)
+        p2[:, :rows] = P2[0, start : start + rows].T
+        sum_opposite(transposed[:width], p2, P1, 0, summed[:width])
+        transpose_back(summed, total[0, start : start + rows])
+    sum_opposite(costs, P2[1], P1, 0, total[1])
+    if len(total) == 4:
+        sum_opposite(costs, P2[2], P1, -1, total[2])
+        sum_opposite(costs, P2[3], P1, 1, total[3])
