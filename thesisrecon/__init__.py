@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from thesisrecon.api import match_pair, match_rectified, self_calibrate
     from thesisrecon.camera import Camera
     from thesisrecon.config import PipelineConfig
-    from thesisrecon.epipolar.estimation import estimate_fundamental
+    from thesisrecon.epipolar.locally_optimised import estimate_fundamental
     from thesisrecon.geometry.triangulation import triangulate
     from thesisrecon.pipeline.outputs import upgrade_affine
     from thesisrecon.pipeline.reconstruction import reconstruct
@@ -27,7 +27,7 @@ __version__ = "0.1.0"
 _HOME_OF = {
     "Camera": "camera",
     "PipelineConfig": "config",
-    "estimate_fundamental": "epipolar.estimation",
+    "estimate_fundamental": "epipolar.locally_optimised",
     "interpolate_view": "view_interpolation",
     "match_pair": "api",
     "match_rectified": "api",

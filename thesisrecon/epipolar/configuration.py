@@ -19,15 +19,14 @@ import scipy
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar.degeneracy import (
     chance_of_agreement,
-    find_dominant_plane,
+    geometries_of_plane,
     log10_false_alarms,
     multiplicity_weights,
-    plane_covariance,
 )
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar.plane_kernels import geometries_of_plane, refine_plane
+from thesisrecon.epipolar.planes import find_dominant_plane, plane_covariance, refine_plane
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
-from thesisrecon.epipolar.search import sampson_distances
+from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.geometry.two_view import homography_distances
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals

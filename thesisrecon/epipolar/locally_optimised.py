@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
+from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.epipolar.refinement import SAMPSON, refine
-from thesisrecon.epipolar.search import sampson_distances, search, truncated_score
+from thesisrecon.epipolar.sampling import sampson_distances, search, truncated_score
 from thesisrecon.errors import StageFailure
 from thesisrecon.numerics.noise import (
     NoiseMixture,
@@ -278,3 +280,23 @@ def _goes_on(r: F64, noise: NoiseMixture, gate: float) -> bool:
     expected = float(np.sqrt(2.0 / np.pi)) * beyond * RING * gate / SPREAD
     needed = inside * max(0.05, EXCESS * (1.0 - 3.0 * PARAMETERS / max(inside, 1)))
     return ring - expected > max(2.0 * float(np.sqrt(expected)), needed)
+
+
+def estimate_fundamental(
+    xy1: NDArray[np.float64],
+    xy2: NDArray[np.float64],
+    *,
+    threshold_px: float = 1.0,
+    seed: int = 0,
+    judge: bool = False,
+) -> FundamentalFit:
+    """Robust F of matches xy1, xy2 (N >= 8, 2) px, x2' F x1 = 0, by :class:`LocallyOptimisedRansac`.
+
+    With ``judge`` the fit says whether the matches determine it, by
+    :func:`~thesisrecon.epipolar.degeneracy.assess_degeneracy`: many inliers alone do not.
+    The same seed gives the same answer. Raises ``ValueError`` for a wrong call and
+    :class:`~thesisrecon.errors.StageFailure` for matches that determine no F.
+    """
+    rng = np.random.default_rng(seed)
+    fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
+    return replace(fit, degeneracy=assess_degeneracy(fit, xy1, xy2, rng=rng)) if judge else fit

@@ -15,13 +15,14 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar.frame import PairFrame, as_matches, check_matches
+from thesisrecon.epipolar.linear import seven_point
 from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_sampson
-from thesisrecon.epipolar.search import sampson_distances, seven_point
+from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import epipolar_distances, sampson_residuals, symmetric_residuals
-from thesisrecon.numerics.noise import draw_sample, noise_scale
-from thesisrecon.numerics.ransac import SampleConsensus
+from thesisrecon.numerics.noise import noise_scale
+from thesisrecon.numerics.ransac import SampleConsensus, draw_sample
 from thesisrecon.records import FundamentalFit
 
 CHI2_1_95, CHI2_2_95 = 3.841458820694124, 5.991464547107979

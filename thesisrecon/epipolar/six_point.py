@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.epipolar.search import singular_members
-from thesisrecon.numerics.noise import draw_sample
+from thesisrecon.epipolar.linear import singular_members
+from thesisrecon.numerics.ransac import draw_sample
 
 SAMPLE = 6
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))

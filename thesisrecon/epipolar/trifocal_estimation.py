@@ -33,12 +33,12 @@ from thesisrecon.geometry.three_view import (
 )
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.numerics.levenberg_marquardt import (
-    LOSSES,
     floored_diagonal,
     minimize_residuals,
     run_levenberg_marquardt,
     solve_positive,
 )
+from thesisrecon.numerics.losses import LOSSES
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
 from thesisrecon.geometry.three_view import check_triplets, tensor_equations, tensor_from_cameras
 from thesisrecon.geometry.two_view import estimate_homography, homography_residuals
-from thesisrecon.numerics.noise import required_samples
+from thesisrecon.numerics.ransac import required_samples
 
 CHUNK, COMPLETIONS = 200, 1000
 REFINEMENTS, SHORT = 3, 4
