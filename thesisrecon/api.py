@@ -9,8 +9,8 @@ import numpy as np
 
 from thesisrecon.config import PipelineConfig, with_images
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import assume
-from thesisrecon.io.images import read_photograph
+from thesisrecon.intrinsics import prior_for
+from thesisrecon.io.images import read_image
 from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
 from thesisrecon.records import DisparityMap, Image, Reconstruction, SelfCalibration, TwoView
 from thesisrecon.runtime.run import stream
@@ -23,7 +23,7 @@ def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None
     """
     config = config or PipelineConfig()
     photographs = [
-        read_photograph(image, max_size_px=config.images.max_size_px).images[0] for image in (image1, image2)
+        read_image(image, max_size_px=config.images.max_size_px).images[0] for image in (image1, image2)
     ]
     views = [config.matching.prepare(image, detect_features(config, image)) for image in photographs]
     pair = match_views(config, views[0], views[1], (0, 1), seed)
@@ -48,7 +48,7 @@ def match_rectified(
 
 
 def _full_size(path: Any) -> Any:
-    return read_photograph(path, max_size_px=np.iinfo(np.int32).max).images[0].rgb
+    return read_image(path, max_size_px=np.iinfo(np.int32).max).images[0].rgb
 
 
 def self_calibrate(
@@ -69,5 +69,5 @@ def self_calibrate(
         raise ValueError(f"self_calibrate takes a projective reconstruction; got {reconstruction.stratum}")
     config = config or PipelineConfig()
     variant = with_images(config.selfcalibration, photographs) if photographs else config.selfcalibration
-    assumed = assume(reconstruction, config.intrinsics)
-    return variant.calibrate(reconstruction, assumed=assumed, rng=stream(seed, "selfcalibration"))
+    prior = prior_for(reconstruction, config.intrinsics)
+    return variant.calibrate(reconstruction, prior=prior, rng=stream(seed, "selfcalibration"))

@@ -22,7 +22,7 @@ from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.intrinsics import IntrinsicsAssumption
+from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.overlap import MapAll
 from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
@@ -30,10 +30,9 @@ from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.projective.factorization import Factorization
-from thesisrecon.projective.incremental import GatedIncremental
+from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.projective.sequential import SequentialProjective
 from thesisrecon.records import (
-    Assumptions,
     DepthMap,
     DisparityMap,
     Features,
@@ -160,7 +159,7 @@ class SelfCalibrator(Protocol):
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> SelfCalibration: ...
 
@@ -179,7 +178,7 @@ class MetricRefiner(Protocol):
         reconstruction: Reconstruction,
         calibration: SelfCalibration,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> MetricResult: ...
 
@@ -243,14 +242,14 @@ class PipelineConfig:
     """The whole pipeline as values; the defaults are the preset ``default``."""
 
     images: ImageOptions = ImageOptions()
-    intrinsics: IntrinsicsAssumption = field(default_factory=IntrinsicsAssumption)
+    intrinsics: IntrinsicsOptions = field(default_factory=IntrinsicsOptions)
     features: Detector = field(default_factory=MultiScaleCorners)
     pairs: PairSelector = field(default_factory=OverlapEstimate)
     matching: Matcher = field(default_factory=SeedsAndGrowth)
     epipolar: FundamentalEstimator = field(default_factory=_precise_ransac)
     verification: Verifier = field(default_factory=PairVerification)
     tracks: TrackBuilder = field(default_factory=AlignedTracks)
-    projective: ProjectiveReconstructor = field(default_factory=GatedIncremental)
+    projective: ProjectiveReconstructor = field(default_factory=IncrementalProjective)
     selfcalibration: SelfCalibrator = field(default_factory=HypothesesAndRefinement)
     metric: MetricRefiner = field(default_factory=MetricRefinement)
     dense: DepthEstimator = field(default_factory=MultiViewStereo)
@@ -271,7 +270,7 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
     "verification": {"pair-verification": PairVerification},
     "tracks": {"aligned-tracks": AlignedTracks, "plain-tracks": PlainTracks},
     "projective": {
-        "gated-incremental": GatedIncremental,
+        "incremental-projective": IncrementalProjective,
         "sequential-projective": SequentialProjective,
         "factorization": Factorization,
     },
@@ -310,7 +309,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
         # "By fitting parametric surfaces through the points ... sampled in a fine scale triangular pattern".
         model=SurfaceModel(surface=BSplineSurface(), fusion=DepthSheets()),
         # The thesis knows no distortion, and its self-calibration keeps the principal point in the centre.
-        intrinsics=IntrinsicsAssumption(principal_point="known", k1="known"),
+        intrinsics=IntrinsicsOptions(principal_point="known", k1="known"),
     ),
 }
 

@@ -1,4 +1,8 @@
-"""What the user lets the pipeline assume of the cameras: the wish in words, and as the stages take it."""
+"""Prior knowledge of the intrinsics: the user's options and the per-view table that every stage reads.
+
+:class:`IntrinsicsOptions` (settings) -> :func:`prior_from_options` -> :class:`IntrinsicsPrior` (one row per view
+or camera). Self-calibration and bundle adjustment derive their unknowns from the latter.
+"""
 
 from __future__ import annotations
 
@@ -9,55 +13,113 @@ from typing import Literal
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import UsageError, counted
-from thesisrecon.records import INTRINSICS, Assumptions, Reconstruction
+from thesisrecon.records import Reconstruction
 
 Mode = Literal["known", "constant", "free"]
-"""``known``: has the given value; ``constant``: one unknown value per camera; ``free``: another in every
-photograph."""
+"""``known``: the value is given; ``constant``: one unknown value per camera; ``free``: one per image."""
 
-FARTHEST_CENTRE = 1.0
-"""No principal point lies farther outside of its picture than this many long sides: a crop has its own, but
-of a picture that far off the axis nothing would be left sharp."""
-_DEVIATIONS = {
+INTRINSICS = ("focal", "aspect", "skew", "principal_x", "principal_y", "k1")
+"""Columns of every per-view table of intrinsics."""
+
+MAX_CENTRE_OFFSET = 1.0
+"""Largest distance of a principal point from the image border, in long sides (crops may exclude it)."""
+_STD_SETTINGS = {
     "focal_std_rel": "focal",
     "aspect_std": "aspect",
     "skew_std_px": "skew",
     "principal_point_std_rel": "principal_point",
     "k1_std": "k1",
 }
-"""The setting of each standard deviation, and that of the mode it belongs to."""
+"""Setting of each standard deviation -> its intrinsic."""
 
 
 @dataclass(frozen=True)
-class IntrinsicsAssumption:
-    """What is assumed of the intrinsics. By default nothing of the focal length; square pixels without skew;
-    a principal point within about a hundredth of the long side of the image's middle; a moderate radial
-    distortion.
+class IntrinsicsPrior:
+    """Gaussian prior of the intrinsics of V views or cameras.
 
-    Every intrinsic has a mode (:data:`Mode`), a value and, where it is not known exactly, the value's
-    standard deviation; ``none`` for the deviation: the value is only a place to start.
+    Attributes
+    ----------
+    mean, std : ndarray (V, C)
+        C = 6 columns as in :data:`INTRINSICS`, or 8 with k2 and k3. Pixels at working size for focal, skew and
+        principal point; the focal's std is relative (the prior acts on log f). std 0: known, the value does not
+        move; std inf: unknown, and the mean is only a starting value (NaN for a focal without one).
+    shared : ndarray (V, C) of int
+        Rows with equal numbers in a column have one value there. Bundle adjustment takes the sharing from its
+        cameras instead.
+    kind : ndarray (V,) of int
+        Rows of equal number are cameras of one kind (the same lens model); -1 for none.
+    spread : ndarray (C,) or (V, C), optional
+        Hierarchical prior: standard deviation of the values of one kind about their unknown common mean
+        (relative for the focal, inf = no such prior; the first row of a kind counts). None before it is
+        measured.
+    """
+
+    mean: F64
+    std: F64
+    shared: I64
+    kind: I64
+    spread: F64 | None = None
+
+    @classmethod
+    def unshared(
+        cls, mean: F64, std: F64, *, kind: I64 | None = None, spread: F64 | None = None
+    ) -> IntrinsicsPrior:
+        """Return a prior whose rows share no value, by default without kinds."""
+        shared = np.repeat(np.arange(len(mean))[:, None], mean.shape[1], axis=1)
+        return cls(mean, std, shared, np.full(len(mean), -1) if kind is None else kind, spread)
+
+    @property
+    def group(self) -> I64:
+        """(V,) camera number of each view by its focal, 0-based and dense."""
+        return np.unique(self.shared[:, 0], return_inverse=True)[1].astype(np.int64)
+
+    @property
+    def focal_known(self) -> B8:
+        """(V,) whether a focal length is given, exactly or with a standard deviation."""
+        return np.isfinite(self.std[:, 0]) & np.isfinite(self.mean[:, 0])
+
+
+@dataclass(frozen=True)
+class IntrinsicsOptions:
+    """Prior knowledge of the cameras as the user sets it.
+
+    Each intrinsic has a mode (:data:`Mode`), a value and, unless it is known, the standard deviation of the
+    value (None: the value is only a starting value). The defaults: unknown focal length, square pixels, no skew,
+    a principal point within about 1 % of the long side of the image centre, moderate radial distortion.
 
     Parameters
     ----------
-    cameras : "shared": all photographs of one size come from one camera; "per-image": each has its own, and
-        what is constant in a camera varies from photograph to photograph.
-    alike : photographs of one size come from cameras of one kind: where they do not share a value, their
-        values are taken to scatter about a common one. How much they scatter is measured.
-    focal, focal_px, focal_std_rel : the focal length in pixels of the original photographs and its relative
-        standard deviation, which must be given with it (unless the mode is known).
-    exif : take the focal length of the EXIF header (35 mm equivalent) where there is one and ``focal_px`` is
-        not given. Where a known focal is to come from a header that is silent, it is constant instead.
-    aspect, aspect_ratio, aspect_std : height over width of a pixel, fy / fx.
-    skew, skew_px, skew_std_px : in pixels of the original photographs.
-    principal_point, principal_point_px, principal_point_std_rel : in pixels of the original photographs
-        (None: the middle of the image); the deviation is a share of the long side.
-    k1, k1_value, k1_std : radial distortion, a pure number.
+    cameras : {"shared", "per-image"}
+        "shared": images of one size come from one camera; "per-image": each image has its own camera.
+    common_prior : bool
+        Images of one size come from cameras of one kind: values that are not shared scatter about a common
+        mean (hierarchical prior; the scatter is estimated).
+    focal : {"known", "constant", "free"}
+        Mode of the focal length.
+    focal_px, focal_std_rel : float, optional
+        Focal length in pixels of the original images and its relative standard deviation.
+    exif : bool
+        Read the focal length from EXIF (35 mm equivalent) if ``focal_px`` is not given. A known focal length
+        that is missing in EXIF is estimated as constant.
+    aspect, aspect_ratio, aspect_std : Mode, float, float
+        Pixel height over width, fy / fx.
+    skew, skew_px, skew_std_px : Mode, float, float
+        Skew in pixels of the original images.
+    principal_point, principal_point_px, principal_point_std_rel : Mode, (float, float), float
+        Principal point in pixels of the original images (None: image centre); std relative to the long side.
+    k1, k1_value, k1_std : Mode, float, float
+        First radial distortion coefficient.
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite or out of range, or two settings contradict each other.
     """
 
     cameras: Literal["shared", "per-image"] = "shared"
-    alike: bool = True
+    common_prior: bool = True
     focal: Mode = "constant"
     focal_px: float | None = None
     focal_std_rel: float | None = None
@@ -76,12 +138,10 @@ class IntrinsicsAssumption:
     k1_std: float | None = 0.05
 
     def __post_init__(self) -> None:
-        wanted = self.exif or self.focal_px is not None
-        if wanted and self.focal != "known" and self.focal_std_rel is None:
-            raise ValueError(
-                "a focal prior needs its weight: set focal_std_rel (0.1 means 'within about 10 %')"
-            )
-        if self.focal == "known" and not wanted:
+        given = self.exif or self.focal_px is not None
+        if given and self.focal != "known" and self.focal_std_rel is None:
+            raise ValueError("a focal prior needs focal_std_rel (0.1 means 'within about 10 %')")
+        if self.focal == "known" and not given:
             raise ValueError("a known focal needs its value: set focal_px, or exif = true")
         for name in ("focal_px", "aspect_ratio"):
             value = getattr(self, name)
@@ -92,26 +152,24 @@ class IntrinsicsAssumption:
                 raise ValueError(f"{name} must be a number; got {getattr(self, name)}")
         if not all(math.isfinite(value) for value in self.principal_point_px or ()):
             raise ValueError(f"principal_point_px must be two numbers; got {self.principal_point_px}")
-        self._check_deviations(wanted)
+        self._check_stds(given)
 
-    def _check_deviations(self, focal_wanted: bool) -> None:
-        """Refuse deviations that are no number, and those that would say nothing."""
-        for name, intrinsic in _DEVIATIONS.items():
+    def _check_stds(self, focal_given: bool) -> None:
+        """Refuse standard deviations that are no positive number or have no effect."""
+        for name, intrinsic in _STD_SETTINGS.items():
             value = getattr(self, name)
             if value is None:
                 continue
             if not value > 0:
-                raise ValueError(
-                    f"{name} must be above 0; got {value} (what is known exactly has the mode known)"
-                )
+                raise ValueError(f"{name} must be above 0; got {value} (for an exact value use mode known)")
             if math.isinf(value):
-                raise ValueError(f"{name} must be finite; got {value} (none means that nothing is known)")
-            # A default that the mode makes idle was not asked for by anybody.
+                raise ValueError(f"{name} must be finite; got {value} (none means unknown)")
+            # A default that the mode makes idle was not set by the user.
             if getattr(self, intrinsic) == "known" and value != type(self).__dataclass_fields__[name].default:
-                raise ValueError(f"{name} = {value} says nothing where {intrinsic} is known: leave one out")
-        if self.focal_std_rel is not None and not focal_wanted:
+                raise ValueError(f"{name} = {value} has no effect with {intrinsic} = known: leave one out")
+        if self.focal_std_rel is not None and not focal_given:
             raise ValueError(
-                f"focal_std_rel = {self.focal_std_rel} says nothing without a focal length: set focal_px, or "
+                f"focal_std_rel = {self.focal_std_rel} has no effect without a focal length: set focal_px, or "
                 "exif = true"
             )
 
@@ -122,8 +180,19 @@ class IntrinsicsAssumption:
 
 
 def camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I64:
-    """(V,) camera numbers: one per distinct size of the originals ("shared"), or one per image
-    ("per-image").
+    """Return the camera number (V,) of each image.
+
+    Parameters
+    ----------
+    original_sizes : sequence of (width, height)
+        Sizes of the V original images.
+    cameras : {"shared", "per-image"}
+        One number per distinct size, or one per image.
+
+    Returns
+    -------
+    ndarray (V,) of int
+        Camera numbers in order of first appearance.
     """
     if cameras == "per-image":
         return np.arange(len(original_sizes), dtype=np.int64)
@@ -132,116 +201,178 @@ def camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I6
 
 
 def camera_numbers(
-    original_sizes: Sequence[tuple[int, int]], wish: IntrinsicsAssumption, exif_focal_px: F64 | None = None
+    original_sizes: Sequence[tuple[int, int]], options: IntrinsicsOptions, exif_focal_px: F64 | None = None
 ) -> I64:
-    """(V,) numbers of the cameras, 0-based in the order of the views: views of one number agree in all
-    intrinsics, by being tied or by being known to be the same.
+    """Number the cameras so that views of one number agree in all intrinsics.
 
-    exif_focal_px (V,) as for :func:`assumptions_of_views`; None where no header is there.
+    Parameters
+    ----------
+    original_sizes, options, exif_focal_px
+        As for :func:`prior_from_options`; ``exif_focal_px`` None: no EXIF data.
+
+    Returns
+    -------
+    ndarray (V,) of int
+        0-based numbers in the order of the views. Views agree by sharing a value or by a known one.
     """
     n = len(original_sizes)
     exif = np.full(n, np.nan) if exif_focal_px is None else exif_focal_px
-    assumed = assumptions_of_views(wish, original_sizes, exif, np.ones(n))
-    known = assumed.std == 0.0
-    tied = np.where(known, -1, assumed.shared).tolist()
-    values = np.where(known, assumed.mean, 0.0).tolist()
-    group = camera_groups(original_sizes, wish.cameras).tolist()
+    prior = prior_from_options(options, original_sizes, exif, np.ones(n))
+    known = prior.std == 0.0
+    tied = np.where(known, -1, prior.shared).tolist()
+    values = np.where(known, prior.mean, 0.0).tolist()
+    group = camera_groups(original_sizes, options.cameras).tolist()
     keys = [(g, *t, *v) for g, t, v in zip(group, tied, values, strict=True)]
     distinct = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return np.array([distinct[key] for key in keys], dtype=np.int64)
 
 
-def assumptions_of_views(
-    wish: IntrinsicsAssumption, original_sizes: Sequence[tuple[int, int]], exif_focal_px: F64, scales: F64
-) -> Assumptions:
-    """The wish as the stages take it, in pixels at working size.
+def prior_from_options(
+    options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]], exif_focal_px: F64, scales: F64
+) -> IntrinsicsPrior:
+    """Return the prior of V views in pixels at working size.
 
-    original_sizes: V pairs (width, height); exif_focal_px (V,) original px, NaN = not said; scales (V,)
-    working over original size. Raises :class:`UsageError` for a principal point far outside of a picture.
+    Parameters
+    ----------
+    options : IntrinsicsOptions
+        The user's settings.
+    original_sizes : sequence of (width, height)
+        Sizes of the original images.
+    exif_focal_px : ndarray (V,)
+        Focal lengths from EXIF in original pixels, NaN if missing.
+    scales : ndarray (V,)
+        Working size over original size.
+
+    Returns
+    -------
+    IntrinsicsPrior
+        One row per view.
+
+    Raises
+    ------
+    UsageError
+        If the given principal point lies far outside an image.
     """
     n = len(original_sizes)
-    check_sizes(wish, original_sizes)
-    group, own = camera_groups(original_sizes, wish.cameras), np.arange(n, dtype=np.int64)
-    # A known value is known for every view by itself: nothing is gained by tying it.
-    shared = np.stack([group if mode == "constant" else own for mode in wish.modes], axis=1)
-    alike = camera_groups(original_sizes, "shared") if wish.alike else own
-    mean, std = _values(wish, np.array(original_sizes, dtype=np.float64).reshape(n, 2), exif_focal_px)
+    check_sizes(options, original_sizes)
+    group, own = camera_groups(original_sizes, options.cameras), np.arange(n, dtype=np.int64)
+    # A known value is known for every view: sharing it would add nothing.
+    shared = np.stack([group if mode == "constant" else own for mode in options.modes], axis=1)
+    kind = camera_groups(original_sizes, "shared") if options.common_prior else own
+    mean, std = _values(options, np.array(original_sizes, dtype=np.float64).reshape(n, 2), exif_focal_px)
     for column, name in enumerate(INTRINSICS):
-        if wish.modes[column] == "known":
+        if options.modes[column] == "known":
             std[:, column] = 0.0
         if name in ("principal_x", "principal_y"):
-            # Pixel (0, 0) is the centre of the first one: half a pixel stays where it is.
+            # (0, 0) is the centre of the first pixel: x goes to (x + 0.5) s - 0.5.
             mean[:, column] = (mean[:, column] + 0.5) * scales - 0.5
         elif name in ("focal", "skew"):
             mean[:, column] *= scales
         if name in ("skew", "principal_x", "principal_y"):
             std[:, column] *= scales
-    silent = ~np.isfinite(mean[:, 0])
-    std[silent, 0] = np.inf
-    if wish.focal == "known":
-        # What its header was to say and does not is constant: one number for the silent views of a camera.
-        first = {g: i for i, g in reversed(list(enumerate(group.tolist()))) if silent[i]}
-        shared[silent, 0] = [first[g] for g in group[silent].tolist()]
-    return Assumptions(shared, mean, std, alike)
+    missing = ~np.isfinite(mean[:, 0])
+    std[missing, 0] = np.inf
+    if options.focal == "known":
+        # A known focal that EXIF lacks becomes constant: one number for such views of a camera.
+        first = {g: i for i, g in reversed(list(enumerate(group.tolist()))) if missing[i]}
+        shared[missing, 0] = [first[g] for g in group[missing].tolist()]
+    return IntrinsicsPrior(mean, std, shared, kind)
 
 
-def check_sizes(wish: IntrinsicsAssumption, original_sizes: Sequence[tuple[int, int]]) -> None:
-    """:class:`UsageError` where the principal point that is given lies far outside of a picture."""
-    if wish.principal_point_px is None:
+def prior_for(reconstruction: Reconstruction, options: IntrinsicsOptions | None = None) -> IntrinsicsPrior:
+    """Return the prior of the views of a reconstruction, in its own pixels and without EXIF.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Its ``sizes`` are taken for the original sizes.
+    options : IntrinsicsOptions, optional
+        The user's settings; None: the defaults.
+
+    Returns
+    -------
+    IntrinsicsPrior
+        One row per view.
+    """
+    sizes = [(int(width), int(height)) for width, height in reconstruction.sizes]
+    missing, same = np.full(len(sizes), np.nan), np.ones(len(sizes))
+    return prior_from_options(options or IntrinsicsOptions(), sizes, missing, same)
+
+
+def check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]]) -> None:
+    """Check that the given principal point is possible for all image sizes.
+
+    Parameters
+    ----------
+    options : IntrinsicsOptions
+        The user's settings.
+    original_sizes : sequence of (width, height)
+        Sizes of the original images.
+
+    Raises
+    ------
+    UsageError
+        If it lies more than one long side outside an image.
+    """
+    if options.principal_point_px is None:
         return
-    x, y = wish.principal_point_px
+    x, y = options.principal_point_px
     for width, height in dict.fromkeys(original_sizes):
         outside = max(-x, x - width, -y, y - height)
-        if outside > FARTHEST_CENTRE * max(width, height):
+        if outside > MAX_CENTRE_OFFSET * max(width, height):
             raise UsageError(
-                f"principal_point_px = ({x:g}, {y:g}) is {outside:.0f} px outside of a picture of "
-                f"{width} x {height} px, more than its long side: it is meant in pixels of the original "
-                "photographs"
+                f"principal_point_px = ({x:g}, {y:g}) is {outside:.0f} px outside an image of "
+                f"{width} x {height} px, more than its long side. Give it in pixels of the original images"
             )
 
 
-def assume(reconstruction: Reconstruction, wish: IntrinsicsAssumption | None = None) -> Assumptions:
-    """The wish (the default where None) for a reconstruction, which knows one size and no header: all that is
-    in pixels is meant in its own."""
-    sizes = [(int(width), int(height)) for width, height in reconstruction.sizes]
-    silent, same = np.full(len(sizes), np.nan), np.ones(len(sizes))
-    return assumptions_of_views(wish or IntrinsicsAssumption(), sizes, silent, same)
-
-
-def _values(wish: IntrinsicsAssumption, sizes: F64, exif_focal_px: F64) -> tuple[F64, F64]:
-    """Means and standard deviations (V, 6) in original pixels; the modes are not yet looked at."""
+def _values(options: IntrinsicsOptions, sizes: F64, exif_focal_px: F64) -> tuple[F64, F64]:
+    """Means and standard deviations (V, 6) in original pixels, modes ignored."""
     n = len(sizes)
     focal = np.full(n, np.nan)
-    if wish.focal_px is not None:
-        focal[:] = wish.focal_px
-    elif wish.exif:
+    if options.focal_px is not None:
+        focal[:] = options.focal_px
+    elif options.exif:
         focal = exif_focal_px.astype(np.float64)
-    centre = (
-        (sizes - 1.0) / 2.0 if wish.principal_point_px is None else np.tile(wish.principal_point_px, (n, 1))
-    )
+    given = options.principal_point_px
+    centre = (sizes - 1.0) / 2.0 if given is None else np.tile(given, (n, 1))
     one = np.ones(n)
-    mean = np.column_stack([focal, wish.aspect_ratio * one, wish.skew_px * one, centre, wish.k1_value * one])
-    deviations = (
-        wish.focal_std_rel, wish.aspect_std, wish.skew_std_px, wish.principal_point_std_rel,
-        wish.principal_point_std_rel, wish.k1_std,
+    mean = np.column_stack(
+        [focal, options.aspect_ratio * one, options.skew_px * one, centre, options.k1_value * one]
+    )
+    stds = (
+        options.focal_std_rel, options.aspect_std, options.skew_std_px, options.principal_point_std_rel,
+        options.principal_point_std_rel, options.k1_std,
     )  # fmt: skip
-    std = np.tile([np.inf if value is None else value for value in deviations], (n, 1))
+    std = np.tile([np.inf if value is None else value for value in stds], (n, 1))
     std[:, 3:5] *= sizes.max(axis=1, keepdims=True)
     return mean, std
 
 
-def prior_warnings(wish: IntrinsicsAssumption, exif_focal_px: F64) -> list[str]:
-    """What the user must hear of a wish for EXIF focal lengths (V,) that the photographs cannot grant."""
-    if not wish.exif or wish.focal_px is not None or not len(exif_focal_px):
+def prior_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
+    """Return warnings about requested EXIF focal lengths that are missing.
+
+    Parameters
+    ----------
+    options : IntrinsicsOptions
+        The user's settings.
+    exif_focal_px : ndarray (V,)
+        Focal lengths from EXIF, NaN if missing.
+
+    Returns
+    -------
+    list of str
+        One sentence, or none.
+    """
+    if not options.exif or options.focal_px is not None or not len(exif_focal_px):
         return []
-    silent, total = int((~np.isfinite(exif_focal_px)).sum()), len(exif_focal_px)
-    if not silent:
+    missing, total = int((~np.isfinite(exif_focal_px)).sum()), len(exif_focal_px)
+    if not missing:
         return []
-    # A focal that was to be known is estimated instead: that is another wish, and must be said.
-    instead = ", so it is not known: it is taken to be one value per camera (constant), and estimated"
-    rest = instead if wish.focal == "known" else ""
-    if silent == total:
-        none = f"none of the {counted(total, 'photograph')} names its focal length"
-        return [f"{none}{rest or '; no prior was used'}"]
-    name = "names" if silent == 1 else "name"
-    return [f"{silent} of the {total} photographs {name} no focal length{rest or ' and have no prior'}"]
+    # A known focal that is estimated instead must be reported.
+    instead = ": it is estimated instead, one value per camera (constant)"
+    rest = instead if options.focal == "known" else ""
+    if missing == total:
+        none = f"No EXIF focal length was found in {counted(total, 'image')}"
+        return [f"{none}{rest or ': no focal prior is used'}"]
+    return [f"{missing} of the {total} images have no EXIF focal length{rest or ' and no focal prior'}"]

@@ -183,10 +183,6 @@ class TwoView:
         return self.degeneracy is not None and not self.degeneracy.determined
 
 
-INTRINSICS = ("focal", "aspect", "skew", "principal_x", "principal_y", "k1")
-"""The intrinsics of a view in the order of every array that has a column for each."""
-
-
 @dataclass(frozen=True)
 class Tracks:
     """Observations of scene points: K of them, sorted by (point, view).
@@ -265,7 +261,7 @@ class SelfCalibration:
 
     ``K_std`` (V, 3, 3) standard deviations of the entries of K by the method's own residuals: 0 where an
     entry is known, that of the assumption where the method left it as assumed, NaN where nothing is known of
-    it. ``identifiable`` False where the motion does not determine the answer, with ``reasons``; ``verdict``
+    it. ``identifiable`` False where the motion does not determine the answer, with ``reasons``; ``identifiability``
     is the evidence for that, None where none was gathered.
     """
 
@@ -275,7 +271,7 @@ class SelfCalibration:
     identifiable: bool
     reasons: tuple[str, ...]
     candidates: tuple[Upgrade, ...] = ()
-    verdict: IdentifiabilityReport | None = None
+    identifiability: IdentifiabilityReport | None = None
 
     @property
     def plane_at_infinity(self) -> F64:
@@ -311,34 +307,6 @@ class MetricResult:
     trusted: bool
     failed_checks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Assumptions:
-    """What is assumed of the intrinsics of V views, a column for each of :data:`INTRINSICS`.
-
-    ``shared`` (V, 6): views with equal numbers in a column have the same value (one camera, constant); every
-    number of its own means the value is free to vary. ``mean, std`` (V, 6): what is known beforehand, in px
-    at working size where the intrinsic has that unit; the focal's std is relative (it acts on log f). std 0 =
-    known to be the mean, inf = nothing is known and the mean is only a place to start (NaN for the focal,
-    which has none). ``alike`` (V,): views of equal number have cameras of one kind, whose values scatter
-    about a common one where they are not shared; all different = nothing of the sort is assumed.
-    """
-
-    shared: I64
-    mean: F64
-    std: F64
-    alike: I64
-
-    @property
-    def group(self) -> I64:
-        """(V,) number of the camera whose focal a view has, 0-based and dense."""
-        return np.unique(self.shared[:, 0], return_inverse=True)[1].astype(np.int64)
-
-    @property
-    def focal_known(self) -> B8:
-        """(V,) whether anything is known of a view's focal beforehand."""
-        return np.isfinite(self.std[:, 0]) & np.isfinite(self.mean[:, 0])
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Views between, beside and beyond two photographs, by the trilinear tensor (thesis, section 1.3)."""
+"""Views of virtual cameras from two images by the trilinear tensor (thesis, section 1.3)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,33 @@ from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import calibration_matrix
-from thesisrecon.intrinsics import assumptions_of_views
+from thesisrecon.intrinsics import prior_from_options
+from thesisrecon.io.images import read_image
 from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.correspondence import RectifiedPair
-from thesisrecon.view_interpolation import Film, named_photograph
+from thesisrecon.view_interpolation import ViewSequence
 from thesisrecon.views.trilinear_synthesis import TensorSynthesis, prepare_synthesis
 from thesisrecon.views.virtual_camera import VirtualCamera, guessed_intrinsics, pair_from_fundamental
 
-BEYOND = 0.5
-"""How many baselines a film goes on beyond either photograph."""
+_BEYOND = 0.5
+"""Baselines by which a sequence extends beyond either camera."""
 
 
 @dataclass(frozen=True)
-class MatchedPhotographs:
-    """Two photographs at working size, ``images``, their verified matches and F, ``pair``, and their dense
-    correspondence; ``exif_focal_px`` (2,) of the originals, NaN = not said."""
+class MatchedImages:
+    """Two images with their sparse and dense correspondences.
+
+    Parameters
+    ----------
+    images : tuple of Image
+        At working size.
+    pair : TwoView
+        Verified matches and F.
+    dense : RectifiedPair
+        Dense correspondences.
+    exif_focal_px : ndarray (2,)
+        Focal lengths of the originals from EXIF, NaN = unknown.
+    """
 
     images: tuple[Image, Image]
     pair: TwoView
@@ -36,35 +48,66 @@ class MatchedPhotographs:
     exif_focal_px: F64 = field(default_factory=lambda: np.full(2, np.nan))
 
 
-def match_photographs(
+def match_images(
     image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0
-) -> MatchedPhotographs:
-    """Sparse and dense correspondence of two photographs: files, uint8 arrays or :class:`Image` records.
+) -> MatchedImages:
+    """Match two images sparsely and densely.
 
-    Raises :class:`UsageError` where there is no such file, :class:`StageFailure` where one of them cannot be
-    read, they do not match, or show no parallax.
+    Parameters
+    ----------
+    image1, image2 : str, Path, ndarray (H, W, 3) uint8 or Image
+        The images.
+    config : PipelineConfig, optional
+        The default configuration if None.
+    seed : int
+        Random seed.
+
+    Returns
+    -------
+    MatchedImages
+        Input of :func:`prepare_trilinear_views`.
+
+    Raises
+    ------
+    UsageError
+        If a file does not exist.
+    StageFailure
+        If the images cannot be read, do not match or show no parallax.
     """
     config = config or PipelineConfig()
-    images, focals = [], []
-    for source in (image1, image2):
-        found = named_photograph(source, max_size_px=config.images.max_size_px)
-        images.append(found.images[0])
-        focals.append(float(found.exif_focal_px[0]))
-    first, second = images
+    read = [read_image(source, max_size_px=config.images.max_size_px) for source in (image1, image2)]
+    first, second = (found.images[0] for found in read)
     pair = match_pair(first, second, config=config, seed=seed)
     dense = config.dense.match_two_views(first, second, pair.F, pair.xy1, pair.xy2)
-    return MatchedPhotographs((first, second), pair, dense, np.array(focals))
+    focals = np.array([float(found.exif_focal_px[0]) for found in read])
+    return MatchedImages((first, second), pair, dense, focals)
 
 
-def tensor_views(
-    found: MatchedPhotographs, *, K: ArrayLike | None = None, config: PipelineConfig | None = None
+def prepare_trilinear_views(
+    found: MatchedImages, *, K: ArrayLike | None = None, config: PipelineConfig | None = None
 ) -> TensorSynthesis:
-    """Two matched photographs ready for views of any camera by the trilinear tensor (section 1.3).
+    """Prepare two matched images for views of any camera by the trilinear tensor (section 1.3).
 
-    ``K`` (3, 3) of both or (2, 3, 3), in pixels of the photographs as they were given: calibrated by whatever
-    means. Without it what ``config.intrinsics`` says of the focal length, and where that is silent a usual
-    one: the new views are then right but for a projective transform of space. Raises
-    :class:`StageFailure` where the matches contradict F or the scene would not be in front.
+    Parameters
+    ----------
+    found : MatchedImages
+        Of :func:`match_images`.
+    K : array_like (3, 3) or (2, 3, 3), optional
+        Intrinsics of both images, in pixels of the given images. If None, the prior of ``config.intrinsics``;
+        without a focal length there, a typical one: the views are then correct up to a projective
+        transformation of space.
+    config : PipelineConfig, optional
+        The default configuration if None.
+
+    Returns
+    -------
+    TensorSynthesis
+        Its ``render(camera)`` computes a view.
+
+    Raises
+    ------
+    StageFailure
+        If the matches contradict F, or no solution has the scene in front of both cameras.
     """
     config = config or PipelineConfig()
     K1, K2 = _intrinsics(found, K, config)
@@ -83,77 +126,113 @@ def synthesize_view(
     K: ArrayLike | None = None,
     config: PipelineConfig | None = None,
 ) -> U8:
-    """The picture of a camera that nobody had, from two photographs and the trilinear tensor (section 1.3).
+    """Compute the view of a virtual camera from two images by the trilinear tensor (section 1.3).
 
     Parameters
     ----------
-    image1, image2
-        Files or uint8 arrays.
-    rotation, translation
-        R (3, 3) and t (3,): the motion from the second camera to the new one, X_new = R X_2 + t with x right,
-        y down, z ahead. The unit of t is the distance of the two cameras. R = I and t = 0 show the second
-        photograph again.
-    K
-        As in :func:`tensor_views`.
+    image1, image2 : str, Path or ndarray (H, W, 3) uint8
+        The images.
+    rotation, translation : array_like (3, 3) and (3,)
+        Motion from the second camera to the virtual one, X_new = R X_2 + t (x right, y down, z forwards), in
+        units of the distance between the two cameras. R = I and t = 0 reproduce the second image.
+    K : array_like (3, 3) or (2, 3, 3), optional
+        Intrinsics, as in :func:`prepare_trilinear_views`.
+    config : PipelineConfig, optional
+        The default configuration if None.
 
     Returns
     -------
-    (H, W, 3) uint8 of the second photograph's working size and K. For many views of the same photographs call
-    :func:`match_photographs` and :func:`tensor_views` once.
+    ndarray (H, W, 3) uint8
+        The view, with the working size and K of the second image.
 
     Raises
     ------
     ValueError
-        What is no rotation, translation or K.
+        If the rotation, translation or K is invalid.
     StageFailure
-        Photographs that cannot be read, do not match or show no parallax; a camera that sees nothing of the
-        scene.
+        If the images cannot be read, do not match or show no parallax, or the camera does not see the scene.
+
+    Notes
+    -----
+    For many views of one pair call :func:`match_images` and :func:`prepare_trilinear_views` once.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import thesisrecon
+    >>> scaling = 2.0 * np.eye(3)
+    >>> thesisrecon.synthesize_view("a.jpg", "b.jpg", scaling, np.zeros(3))  # doctest: +IGNORE_EXCEPTION_DETAIL
+    Traceback (most recent call last):
+        ...
+    ValueError: the rotation is not orthogonal
     """
-    # Before minutes of work.
+    # Checked before minutes of matching.
     rotation, translation = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
     _given_intrinsics(K)
     VirtualCamera(rotation, translation, np.eye(3), (1, 1))
-    views = tensor_views(match_photographs(image1, image2, config=config), K=K, config=config)
+    views = prepare_trilinear_views(match_images(image1, image2, config=config), K=K, config=config)
     return views.render(VirtualCamera(rotation, translation, views.pair.K2, views.sizes[1]))
 
 
-def tensor_film(
-    photographs: Sequence[Image], frames: int, *, config: PipelineConfig | None = None, seed: int = 0
-) -> Film:
-    """Views on the line through both cameras, from half a baseline before the first to as far beyond the
-    second.
+def trilinear_sequence(
+    images: Sequence[Image], frames: int, *, config: PipelineConfig | None = None, seed: int = 0
+) -> ViewSequence:
+    """Compute views on the line through both cameras, from half a baseline before to half beyond.
 
-    Raises :class:`UsageError` for another number of photographs, :class:`StageFailure` as
-    :func:`match_photographs` and :func:`tensor_views`, ``ValueError`` for less than one frame.
+    Parameters
+    ----------
+    images : sequence of Image
+        Two images.
+    frames : int
+        Number of views.
+    config : PipelineConfig, optional
+        The default configuration if None.
+    seed : int
+        Random seed.
+
+    Returns
+    -------
+    ViewSequence
+        The views.
+
+    Raises
+    ------
+    UsageError
+        For another number of images, or the same image twice.
+    StageFailure
+        As :func:`match_images` and :func:`prepare_trilinear_views`.
+    ValueError
+        For fewer than one frame.
     """
-    if len(photographs) != 2:
-        raise UsageError(f"the trilinear tensor makes views of 2 photographs; got {len(photographs)}")
-    first, second = photographs
+    if len(images) != 2:
+        raise UsageError(f"the trilinear tensor takes 2 images; got {len(images)}")
+    first, second = images
     if np.array_equal(first.rgb, second.rgb):
-        raise UsageError(f"{first.name} and {second.name} are the same photograph; give different ones")
-    views = tensor_views(match_photographs(first, second, config=config, seed=seed), config=config)
-    path = views.along(frames, beyond=BEYOND)
-    ways = np.linspace(-BEYOND, 1.0 + BEYOND, frames).tolist() if frames > 1 else [0.5]
+        raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
+    matched = match_images(first, second, config=config, seed=seed)
+    views = prepare_trilinear_views(matched, config=config)
+    path = views.along(frames, beyond=_BEYOND)
+    positions = np.linspace(-_BEYOND, 1.0 + _BEYOND, frames).tolist() if frames > 1 else [0.5]
 
     def draw(k: int, threads: int) -> U8:
         return views.render(path[k], threads=threads)
 
     K = views.pair.K1, views.pair.K2
-    told = {
-        "photographs": [first.name, second.name],
+    metadata = {
+        "images": [first.name, second.name],
         "K": list(K),
         "second_from_first": {"R": views.pair.R, "t": views.pair.t},
     }
-    places = tuple(
+    frame_metadata = tuple(
         {"baselines": s, "R": camera.rotation, "t": camera.translation, "K": camera.K}
-        for s, camera in zip(ways, path, strict=True)
+        for s, camera in zip(positions, path, strict=True)
     )
-    captions = tuple(_caption(s, first.name, second.name) for s in ways)
+    captions = tuple(_caption(s, first.name, second.name) for s in positions)
     note = (
-        f"the focal lengths are taken for {K[0][0, 0]:.0f} and {K[1][0, 0]:.0f} px; lengths are in units of "
-        "the distance between the two cameras"
+        f"the focal lengths are assumed to be {K[0][0, 0]:.0f} and {K[1][0, 0]:.0f} px; lengths are in units "
+        "of the distance between the two cameras"
     )
-    return Film(captions, draw, (note,), told, places)
+    return ViewSequence(captions, draw, (note,), metadata, frame_metadata)
 
 
 def _caption(s: float, first: str, second: str) -> str:
@@ -165,17 +244,17 @@ def _caption(s: float, first: str, second: str) -> str:
 
 
 def _given_intrinsics(K: ArrayLike | None) -> F64 | None:
-    """K as (2, 3, 3), None where not given; ``ValueError`` for other shapes."""
+    """Return K as (2, 3, 3), None if not given."""
     if K is None:
         return None
     given = np.asarray(K, dtype=np.float64)
     if given.shape not in ((3, 3), (2, 3, 3)):
-        raise ValueError(f"K is (3, 3) for both photographs or (2, 3, 3); got {given.shape}")
+        raise ValueError(f"K must be (3, 3) for both images or (2, 3, 3); got {given.shape}")
     return np.broadcast_to(given, (2, 3, 3))
 
 
-def _intrinsics(found: MatchedPhotographs, K: ArrayLike | None, config: PipelineConfig) -> tuple[F64, F64]:
-    """K of both in pixels at working size: given, assumed, or guessed."""
+def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfig) -> tuple[F64, F64]:
+    """K of both images in pixels at working size: given, from the prior, or typical."""
     scales = np.array([image.scale for image in found.images])
     given = _given_intrinsics(K)
     if given is not None:
@@ -185,9 +264,9 @@ def _intrinsics(found: MatchedPhotographs, K: ArrayLike | None, config: Pipeline
         working[:, :2, 2] += 0.5 * (scales[:, None] - 1.0)
         return working[0], working[1]
     sizes = [image.original_size for image in found.images]
-    told = assumptions_of_views(config.intrinsics, sizes, found.exif_focal_px, scales).mean
+    prior = prior_from_options(config.intrinsics, sizes, found.exif_focal_px, scales).mean
     both = []
-    for image, (f, aspect, skew, u, v, _) in zip(found.images, told.tolist(), strict=True):
+    for image, (f, aspect, skew, u, v, _) in zip(found.images, prior.tolist(), strict=True):
         f = f if np.isfinite(f) else float(guessed_intrinsics(image.size)[0, 0])
         both.append(calibration_matrix(f, aspect * f, u, v, skew=skew))
     return both[0], both[1]

@@ -114,7 +114,7 @@ def record_tracks(name: str, preset_name: str) -> dict[str, Any]:
     from thesisrecon import self_calibrate
     from thesisrecon.config import preset
     from thesisrecon.errors import StageFailure
-    from thesisrecon.intrinsics import assume
+    from thesisrecon.intrinsics import prior_for
     from thesisrecon.records import Tracks
     from thesisrecon.runtime.run import stream
     from validation.scenes.dinosaur import load_dinosaur, pairs_from_tracks
@@ -144,7 +144,7 @@ def record_tracks(name: str, preset_name: str) -> dict[str, Any]:
             [calibration.metric_from_projective, calibration.K, calibration.K_std]
         )
         metric = config.metric.refine(
-            projective, calibration, assumed=assume(projective, config.intrinsics), rng=stream(0, "metric", 0)
+            projective, calibration, prior=prior_for(projective, config.intrinsics), rng=stream(0, "metric", 0)
         )
         r = metric.reconstruction
         digests["metric"] = arrays_of([r.P, r.X, r.K, r.inlier, r.registered])

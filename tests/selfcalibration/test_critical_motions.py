@@ -44,7 +44,7 @@ def report_at_the_truth(scene, cameras="shared"):
     estimate = projective_estimate(scene, rng)
     known = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
     prior = prior_for(estimate, known)
-    answer = HypothesesAndRefinement(search=None, subsets=0, focal_steps=17).calibrate(
+    answer = HypothesesAndRefinement(search=None, camera_subsets=0, focal_steps=17).calibrate(
         estimate, prior=prior, rng=rng
     )
     assert answer.identifiability is not None

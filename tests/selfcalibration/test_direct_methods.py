@@ -31,7 +31,7 @@ EXACT = [
     ScannedQuadric(criterion=FREE),
     NonlinearQuadric(criterion=FREE),
     KruppaEquations(criterion=FREE),
-    FocalsFromFundamental(criterion=FREE, min_principal_std=1e-9),
+    FocalsFromFundamental(criterion=FREE, min_principal_point_std=1e-9),
     FocalScan(criterion=FREE),
 ]
 ALONE = [LinearQuadric(), *EXACT]
@@ -159,7 +159,7 @@ def test_a_bias_is_no_deviation():
 
 def test_a_principal_point_of_a_closed_form_has_no_deviation():
     scene = make_scene(sigma_px=0.3, seed=1)
-    answer = calibrate(Stratified(refined=False), scene, prior_for(scene, stds=(0.0, 0.0, 30.0)), seed=1)
+    answer = calibrate(Stratified(refine=False), scene, prior_for(scene, stds=(0.0, 0.0, 30.0)), seed=1)
     assert np.abs(answer.K[:, :2, 2] - scene.K[:, :2, 2]).max() > 1e-6
     assert np.isnan(answer.K_std[:, :2, 2]).all()
     refined = calibrate(Stratified(), scene, prior_for(scene, stds=(0.0, 0.0, 30.0)), seed=1)

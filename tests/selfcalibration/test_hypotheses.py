@@ -134,7 +134,7 @@ def test_given_focals_that_leave_no_answer_are_named(focals, told):
     mean[:, 0] = np.resize(focals, len(mean))
     frame = normalized_frame(estimate, replace(prior, mean=mean))
     with pytest.raises(StageFailure, match="near the focal length that was given") as failure:
-        select_candidate(frame, estimate, RotationCriterion(), [], kept=3, min_in_front_ratio=0.9)
+        select_candidate(frame, estimate, RotationCriterion(), [], max_candidates=3, min_in_front_ratio=0.9)
     assert f"{told} (+-" in failure.value.evidence
 
 

@@ -19,10 +19,10 @@ from thesisrecon.selfcalibration.hartley import (
     LinearAbsoluteConic,
     dual_conic_of_constant_camera,
     infinite_homographies,
+    largest_rotation,
     solve_conic,
     solve_conic_batch,
     square_pixel_constraints,
-    turns,
 )
 
 WAYS = [LinearAbsoluteConic(), FixedPlaneQuadric()]
@@ -108,7 +108,7 @@ def test_turns_measures_the_rotation_and_its_axis():
     scene = turned_about_one_axis(make_scene(seed=0), np.linspace(-20.0, 20.0, 8))
     K, R = scene.K[0], scene.R
     H = K @ R @ R[0].T @ np.linalg.inv(K)
-    angle, axis = turns(H)
+    angle, axis = largest_rotation(H)
     assert angle == pytest.approx(40.0)
     seen = K @ R[0] @ [0.0, 1.0, 0.0]
     assert np.linalg.norm(np.cross(axis, seen / np.linalg.norm(seen))) < 1e-9

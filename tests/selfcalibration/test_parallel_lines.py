@@ -82,8 +82,8 @@ def test_more_directions_and_points_at_infinity_do_no_harm():
 def test_directions_at_right_angles_give_the_calibration_too():
     """With three views nothing but right angles and zero skew settles K of one camera."""
     scene = make_scene(seed=2, views=3, principal_shift=(50.0, -30.0), seen_share=1.0)
-    way = ParallelLines(vanishing_points(scene, TURN, [0, 1]), right_angles=True)
-    answer = Stratified(way, refined=False).calibrate(
+    way = ParallelLines(vanishing_points(scene, TURN, [0, 1]), orthogonal_directions=True)
+    answer = Stratified(way, refine=False).calibrate(
         projective_reconstruction(scene, seed=2), prior=prior_for(scene, NOTHING_BUT_CONSTANT),
         rng=np.random.default_rng(0),
     )  # fmt: skip
@@ -198,7 +198,7 @@ def test_parallel_lines_are_found_in_photographs():
     scene, paths = courtyard([0, 3, 6, 9, 12])
     photographs = read_images(paths, max_size_px=1600).images
     given, prior = projective_reconstruction(scene), prior_for(scene, CENTRED)
-    variant = Stratified(ParallelLines(), refined=False).with_images(photographs)
+    variant = Stratified(ParallelLines(), refine=False).with_images(photographs)
     found = projective_scene(given, prior)
     located = variant.plane.locate(found, np.random.default_rng(0))
     plane = true_plane(scene, found)

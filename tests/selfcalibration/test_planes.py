@@ -67,7 +67,7 @@ def test_the_cheirality_bounds_hold_the_true_plane(seed):
     region = CheiralityRegion.of(
         found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)
     )
-    assert region.share_outside(plane[None])[0] == 0.0
+    assert region.wrong_side_ratio(plane[None])[0] == 0.0
     inside = [
         part.contains((np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0))[None, :3]
                       / (np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0))[3])[0]
@@ -86,14 +86,14 @@ def test_samples_of_the_bounds_are_inside_them():
         assert part.contains(v).all()
         assert (np.ptp(v, axis=0) > 0.1 * np.ptp(part.box, axis=1)).all()
         back = part.reference_planes(v)
-        assert region.share_outside(back).max() == 0.0
+        assert region.wrong_side_ratio(back).max() == 0.0
 
 
 @pytest.mark.parametrize(("plane", "way"), PAIRS, ids=lambda v: type(v).__name__)
 @pytest.mark.parametrize("seed", range(3))
 def test_exact_cameras_give_the_exact_answer_in_closed_form(plane, way, seed):
     scene = make_scene(seed=seed)
-    answer = Stratified(plane, way, refined=False).calibrate(
+    answer = Stratified(plane, way, refine=False).calibrate(
         projective_reconstruction(scene, seed=seed), prior=prior_for(scene), rng=np.random.default_rng(seed)
     )
     np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=1e-8)
@@ -103,7 +103,7 @@ def test_exact_cameras_give_the_exact_answer_in_closed_form(plane, way, seed):
 
 def test_an_unknown_constant_calibration_comes_out_whole():
     scene = make_scene(seed=4, principal_shift=(70.0, -50.0))
-    answer = Stratified(ModulusConstraint(), refined=False).calibrate(
+    answer = Stratified(ModulusConstraint(), refine=False).calibrate(
         projective_reconstruction(scene, seed=4),
         prior=prior_for(scene, NOTHING_BUT_CONSTANT),
         rng=np.random.default_rng(4),
@@ -127,7 +127,7 @@ def test_three_views_of_a_constant_camera_suffice(seed):
 def test_zooming_cameras_are_found_by_the_search_and_refused_by_the_modulus_constraint():
     scene = make_scene(seed=6, zoom=0.3)
     given, prior = projective_reconstruction(scene, seed=6), prior_for(scene, CENTRED_ZOOM)
-    answer = Stratified(refined=False).calibrate(given, prior=prior, rng=np.random.default_rng(0))
+    answer = Stratified(refine=False).calibrate(given, prior=prior, rng=np.random.default_rng(0))
     np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[:, 0, 0], rtol=1e-8)
     with pytest.raises(StageFailure, match="three photographs of one camera"):
         Stratified(ModulusConstraint()).calibrate(given, prior=prior, rng=np.random.default_rng(0))

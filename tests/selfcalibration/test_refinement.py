@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.selfcalibration.test_direct_methods import adjusted, at_distance, prior_for, reprojected
 from tests.synthetic import make_scene, projective_reconstruction
-from thesisrecon.selfcalibration.candidates import Answer, distinct_candidates, square_pixel_calibrations
+from thesisrecon.selfcalibration.candidates import Candidate, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration.focal_scan import planes_for_focals
 from thesisrecon.selfcalibration.frame import normalized_frame, solver_unknowns
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
@@ -109,6 +109,10 @@ def test_answers_are_told_apart_by_focals_or_plane():
     scene = make_scene(views=4, points=40, seed=6)
     frame = normalized_frame(projective_reconstruction(scene, seed=6), prior_for(scene))
     K, plane = square_pixel_calibrations(np.zeros(4)), np.array([0.1, 0.2, 0.3])
-    answers = [Answer(plane, K, 2.0, "a"), Answer(1.001 * plane, K, 1.0, "b"), Answer(-plane, K, 3.0, "c")]
+    answers = [
+        Candidate(plane, K, 2.0, "a"),
+        Candidate(1.001 * plane, K, 1.0, "b"),
+        Candidate(-plane, K, 3.0, "c"),
+    ]
     assert [a.method for a in distinct_candidates(frame, answers, 9)] == ["b", "c"]
     assert [a.method for a in distinct_candidates(frame, answers, 1)] == ["b"]

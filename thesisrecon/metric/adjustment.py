@@ -8,13 +8,12 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric.model import CENTRE, FOCAL, K1, WIDTH, MetricModel, residual_norms
 from thesisrecon.numerics.block_scatter import BlockScatter, block_scatter
 from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import IntrinsicsPrior
 from thesisrecon.numerics.noise import best_huber_width, noise_from_distances
 from thesisrecon.numerics.observations import Observations
-from thesisrecon.records import Assumptions
 
 MIN_OBSERVATIONS = 40
 # Where Huber's loss never turns, in sigmas.
@@ -48,7 +47,7 @@ class Adjustment:
     inflation : by how much the noise counts for more than its size says, since it is not independent.
     """
 
-    assumed: Assumptions
+    prior: IntrinsicsPrior
     lens_std: float
     noise_floor_px: float
     population: Population | None = None
@@ -62,12 +61,12 @@ class Adjustment:
             max_iterations=iterations,
         )
 
-    def prior(self, model: MetricModel) -> IntrinsicsPrior:
+    def row_prior(self, model: MetricModel) -> IntrinsicsPrior:
         """What is assumed of each row of the model's intrinsics."""
         group = model.cameras.group
         first = np.unique(group, return_index=True)[1]
         mean, std = np.zeros((len(first), WIDTH)), np.zeros((len(first), WIDTH))
-        mean[:, : K1 + 1], std[:, : K1 + 1] = self.assumed.mean[first], self.assumed.std[first]
+        mean[:, : K1 + 1], std[:, : K1 + 1] = self.prior.mean[first], self.prior.std[first]
         std[:, K1 + 1 :] = np.where(self._shares_a_lens(model) & (std[:, K1] > 0.0), self.lens_std, 0.0)[
             :, None
         ]
@@ -79,11 +78,12 @@ class Adjustment:
         silent = ~np.isfinite(mean)
         mean[silent] = model.cameras.intrinsics[silent]
         p = self.population
-        return IntrinsicsPrior(mean, std) if p is None else IntrinsicsPrior(mean, std, p.rows, p.spread)
+        kind, spread = (None, None) if p is None else (p.rows, p.spread)
+        return IntrinsicsPrior.unshared(mean, std, kind=kind, spread=spread)
 
     def free(self, model: MetricModel) -> B8:
         """(8,) intrinsics that move in some camera."""
-        return np.asarray((self.prior(model).std > 0.0).any(axis=0))
+        return np.asarray((self.row_prior(model).std > 0.0).any(axis=0))
 
     def run(
         self, model: MetricModel, *, free: B8 | None = None, iterations: int
@@ -93,7 +93,7 @@ class Adjustment:
         ``free`` (8,) keeps some intrinsics where they are. Raises ``StageFailure`` where hardly anything is
         explained.
         """
-        prior, moves = self.prior(model), self.free(model)
+        prior, moves = self.row_prior(model), self.free(model)
         result = refine_metric_bundle(
             model.cameras,
             model.X,
@@ -115,7 +115,7 @@ class Adjustment:
             model.X,
             explained(model),
             free=self.free(model),
-            prior=self.prior(model),
+            prior=self.row_prior(model),
             noise=(self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px),
         )
 

@@ -14,9 +14,10 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.camera_matrix import distort, undistort
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.metric_cameras import MetricCameras
-from thesisrecon.numerics.separate_refinement import refine_points
-from thesisrecon.records import Assumptions, Reconstruction, Tracks, Upgrade
+from thesisrecon.numerics.partial_bundle import refine_points
+from thesisrecon.records import Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1 and the two radial coefficients that nothing
 # is assumed of in words.
@@ -165,23 +166,23 @@ def explained_shares(model: MetricModel) -> F64:
     return np.asarray(np.where(seen > 0, good / np.maximum(seen, 1), 1.0))
 
 
-def camera_rows(assumed: Assumptions) -> tuple[I64, I64]:
+def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
     """Row of each view (V,) in a table of intrinsics, and which rows share their values (G, 8).
 
     Views have a row in common where they share all that is not known beforehand and have the same knowledge.
     k2 and k3 are shared as k1 is.
     """
-    moves = (assumed.std > 0.0).any(axis=0)
-    knowledge = np.nan_to_num(np.concatenate([assumed.mean, assumed.std], axis=1), nan=-1.0, posinf=-1.0)
+    moves = (prior.std > 0.0).any(axis=0)
+    knowledge = np.nan_to_num(np.concatenate([prior.mean, prior.std], axis=1), nan=-1.0, posinf=-1.0)
     same = np.unique(knowledge, axis=0, return_inverse=True)[1].reshape(-1, 1)
-    key = np.concatenate([assumed.shared[:, moves], same], axis=1)
+    key = np.concatenate([prior.shared[:, moves], same], axis=1)
     first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)[1:]
-    shared = assumed.shared[first]
+    shared = prior.shared[first]
     return group.reshape(-1).astype(np.int64), np.column_stack([shared, shared[:, K1], shared[:, K1]])
 
 
 def upgraded_model(
-    reconstruction: Reconstruction, upgrade: Upgrade, assumed: Assumptions, max_rotation_residual: float
+    reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior, max_rotation_residual: float
 ) -> MetricModel | None:
     """The model of an upgraded projective reconstruction; None where fewer than three cameras are sound.
 
@@ -210,8 +211,8 @@ def upgraded_model(
     X = np.where(finite[:, None], X, 0.0)
     # The upgrade fixes the frame up to scale: bring the scene's spread to 1.
     spread = float(np.median(np.linalg.norm(X[finite] - np.median(X[finite], axis=0), axis=1)))
-    group, shared = camera_rows(assumed)
-    rows = _intrinsics(upgrade.K, reconstruction.registered, reconstruction.sizes, assumed)
+    group, shared = camera_rows(prior)
+    rows = _intrinsics(upgrade.K, reconstruction.registered, reconstruction.sizes, prior)
     cameras = MetricCameras(R, t / spread, rows[np.unique(group, return_index=True)[1]], group, shared)
     ok = reconstruction.inlier & registered[reconstruction.tracks.view_index]
     return MetricModel(
@@ -226,13 +227,13 @@ def upgraded_model(
     )
 
 
-def _intrinsics(K: F64, registered: B8, sizes: I64, assumed: Assumptions) -> F64:
+def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F64:
     """(V, 8) from the focals of the registered views that share them; a camera without any starts from the
     others' field of view. The rest is as assumed."""
-    group, longest = assumed.group, sizes.max(axis=1)
+    group, longest = prior.group, sizes.max(axis=1)
     typical = float(np.median(K[registered, 0, 0] / longest[registered]))
     rows = np.zeros((len(K), WIDTH))
-    rows[:, 1 : K1 + 1] = assumed.mean[:, 1:]
+    rows[:, 1 : K1 + 1] = prior.mean[:, 1:]
     for g in range(int(group.max()) + 1):
         views = np.flatnonzero(group == g)
         known = views[registered[views]]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.errors import StageFailure
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric.adjustment import FOCAL_AND_CENTRE, Adjustment, with_wide_gate
 from thesisrecon.metric.checks import self_check
 from thesisrecon.metric.model import (
@@ -38,7 +39,7 @@ from thesisrecon.metric.uncertainty import (
 )
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.noise import noise_from_distances
-from thesisrecon.records import Assumptions, MetricResult, Reconstruction, SelfCalibration, Upgrade
+from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Upgrade
 
 SETTLED = 0.002
 START_ROUNDS = 3
@@ -81,15 +82,15 @@ class MetricRefinement:
         reconstruction: Reconstruction,
         calibration: SelfCalibration,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> MetricResult:
         """The final model of one projective reconstruction; ``StageFailure`` where no candidate survives."""
-        adjustment = Adjustment(assumed, self.lens_std, self.noise_floor_px)
+        adjustment = Adjustment(prior, self.lens_std, self.noise_floor_px)
         trials = [self._start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
         if not models:
-            raise _no_candidate(assumed, len(trials))
+            raise _no_candidate(prior, len(trials))
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         costs = np.array([truncated_cost(m, gate) for m in models])
         completion = Completion(self.outlier_sigmas, np.radians(self.min_angle_deg), self.min_points)
@@ -105,7 +106,7 @@ class MetricRefinement:
         intervals = intrinsic_intervals(
             model,
             scatter,
-            adjustment.prior(model),
+            adjustment.row_prior(model),
             floor_rel=self.model_floor_rel,
             borrowed=borrowed,
             noise_inflation=adjustment.inflation,
@@ -128,7 +129,7 @@ class MetricRefinement:
         image centre is: all of them are kept at first, the principal point is free with the focal, and the
         gate narrows as the residuals shrink.
         """
-        model = upgraded_model(reconstruction, upgrade, adjustment.assumed, self.max_rotation_residual)
+        model = upgraded_model(reconstruction, upgrade, adjustment.prior, self.max_rotation_residual)
         if model is None:
             return None
         early, _ = self.outlier_sigmas
@@ -154,7 +155,7 @@ class MetricRefinement:
         population = estimate_population(own, model.cameras.shared)
         if population is None:
             return model, adjustment, own, scatter
-        inflation = float(np.sqrt(max(scatter.typical_ratio, 1.0)))
+        inflation = float(np.sqrt(max(scatter.median_ratio, 1.0)))
         model, adjustment = bind(model, replace(adjustment, inflation=inflation), population)
         model = self._settle(model, adjustment)
         return model, adjustment, own, adjustment.scatter(model)
@@ -175,14 +176,14 @@ class MetricRefinement:
 NOTHING_SHARED = "shares no points with the model"
 
 
-def _no_candidate(assumed: Assumptions, tried: int) -> StageFailure:
-    if not assumed.focal_known.any():
+def _no_candidate(prior: IntrinsicsPrior, tried: int) -> StageFailure:
+    if not prior.focal_known.any():
         return StageFailure(
             "no candidate calibration survives metric bundle adjustment",
             f"{tried} were tried",
             "photograph the scene from more directions",
         )
-    wide = float(assumed.std[assumed.focal_known, 0].max())
+    wide = float(prior.std[prior.focal_known, 0].max())
     return StageFailure(
         "the photographs contradict the focal length that was given",
         f"none of {tried} calibrations near it (+- {wide:.1%}) explains them",

@@ -22,12 +22,13 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric.adjustment import Adjustment
 from thesisrecon.metric.model import CENTRE, FOCAL, WIDTH, MetricModel
 from thesisrecon.metric.uncertainty import LEAST_BLOCKS, USUAL_INFLATION
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.metric_bundle import MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import IntrinsicsPrior, MetricCameras
+from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 
 CENTRE_STD = 0.1
@@ -63,16 +64,16 @@ class PerViewFit:
         assert cameras.shared is not None
         rows = cameras.group[views]
         shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
-        prior, free = adjustment.prior(model), adjustment.free(model)
+        prior, free = adjustment.row_prior(model), adjustment.free(model)
         std = prior.std[rows].copy()
         for column in columns:
             shared[:, column], free[column] = own, True
             longest = model.sizes[views].max(axis=1)
             std[:, column] = CENTRE_STD * longest if column in CENTRE else np.inf
-        known = IntrinsicsPrior(prior.mean[rows], std)
+        known = IntrinsicsPrior.unshared(prior.mean[rows], std)
         if np.isfinite(focal_spread):
             spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
-            known = replace(known, population=cameras.shared[rows, FOCAL], spread=spread)
+            known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
         options = replace(adjustment, inflation=1.0).options(model, iterations=ROUNDS)
         return refine_metric_bundle(
             MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),
@@ -156,7 +157,7 @@ def _sets(model: MetricModel, adjustment: Adjustment, views: I64, column: int) -
     """Views that share a column; those whose principal point is known."""
     assert model.cameras.shared is not None
     rows = model.cameras.group[views]
-    held = adjustment.prior(model).std[rows, column] == 0.0
+    held = adjustment.row_prior(model).std[rows, column] == 0.0
     number = model.cameras.shared[rows, column]
     sets = [_Set(np.flatnonzero((number == k) & ~held)) for k in np.unique(number)]
     if column != FOCAL:
@@ -199,7 +200,7 @@ def _centres_off(
 ) -> F64:
     """(n, 2) long sides: own principal points from the known one, or from the median of the set."""
     rows = model.cameras.group[views[s.places]]
-    off = (both.cameras.intrinsics[s.places] - adjustment.prior(model).mean[rows])[:, CENTRE]
+    off = (both.cameras.intrinsics[s.places] - adjustment.row_prior(model).mean[rows])[:, CENTRE]
     off /= model.sizes[views[s.places]].max(axis=1, keepdims=True)
     return np.asarray(off if s.known else off - np.median(off, axis=0))
 
@@ -253,8 +254,8 @@ def contradicted_focals(model: MetricModel, adjustment: Adjustment) -> list[str]
     The model is adjusted once more with nothing known of any focal, from where it is; what comes out is
     compared with what was said, both uncertainties together. Empty where nothing was said.
     """
-    assumed = adjustment.assumed
-    said = np.flatnonzero(assumed.focal_known & model.registered)
+    prior = adjustment.prior
+    said = np.flatnonzero(prior.focal_known & model.registered)
     if len(said) == 0:
         return []
     number = _numbers_when_free(model, adjustment)
@@ -263,7 +264,7 @@ def contradicted_focals(model: MetricModel, adjustment: Adjustment) -> list[str]
     failed_checks = []
     for k in np.unique(number[said]):
         view = int(said[number[said] == k][0])
-        mean, deviation = float(assumed.mean[view, 0]), float(assumed.std[view, 0])
+        mean, deviation = float(prior.mean[view, 0]), float(prior.std[view, 0])
         off = float(np.log(focal[view] / mean))
         if abs(off) > LEAST_DIFFERENCE and abs(off) > MAX_SIGMAS * float(np.hypot(std[view], deviation)):
             whose = "" if len(np.unique(number[said])) == 1 else f" of view {view}"
@@ -279,11 +280,11 @@ def centre_of_a_bent_model(model: MetricModel, adjustment: Adjustment, scatter: 
     """A sentence where a principal point lies far off what was said of it and parts of the scene contradict
     each other as well: photographs cropped alike do the first, but not the second."""
     views = np.flatnonzero(model.registered)
-    if scatter.blocks < LEAST_BLOCKS or not scatter.contradiction > MOST_CONTRADICTION:
+    if scatter.blocks < LEAST_BLOCKS or not scatter.overdispersion > MOST_CONTRADICTION:
         return []
-    said = adjustment.assumed.std[views][:, CENTRE]
+    said = adjustment.prior.std[views][:, CENTRE]
     values = model.cameras.intrinsics[model.cameras.group[views]][:, CENTRE]
-    off = np.abs(values - adjustment.assumed.mean[views][:, CENTRE])
+    off = np.abs(values - adjustment.prior.mean[views][:, CENTRE])
     sigmas = np.where(said > 0.0, off / np.where(said > 0.0, said, 1.0), 0.0).max(axis=1)
     worst = int(sigmas.argmax())
     if not sigmas[worst] > MAX_CENTRE_SIGMAS:
@@ -291,7 +292,7 @@ def centre_of_a_bent_model(model: MetricModel, adjustment: Adjustment, scatter: 
     share = float(off[worst].max() / model.sizes[views[worst]].max())
     return [
         f"the principal point lies {share:.0%} of the long side off ({sigmas[worst]:.0f} standard deviations "
-        f"of what is said of it) and parts of the scene contradict each other by {scatter.contradiction:.0f} "
+        f"of what is said of it) and parts of the scene contradict each other by {scatter.overdispersion:.0f} "
         "times what their points let expect: photographs were zoomed or cropped one by one, or the model is "
         "bent"
     ]
@@ -301,7 +302,7 @@ def _numbers_when_free(model: MetricModel, adjustment: Adjustment) -> I64:
     """(G,) numbers of the focals when nothing is known of them: known ones, which are not tied, are one where
     one value was given for them."""
     assert model.cameras.shared is not None
-    prior, number = adjustment.prior(model), model.cameras.shared[:, FOCAL].copy()
+    prior, number = adjustment.row_prior(model), model.cameras.shared[:, FOCAL].copy()
     known = np.flatnonzero(prior.std[:, FOCAL] == 0.0)
     number[known] = number.max() + 1 + np.unique(prior.mean[known, FOCAL], return_inverse=True)[1].reshape(-1)
     return np.asarray(number)
@@ -315,13 +316,13 @@ def _free_focals(model: MetricModel, adjustment: Adjustment, number: I64) -> tup
     assert cameras.shared is not None
     shared = cameras.shared.copy()
     shared[:, FOCAL] = number
-    prior = adjustment.prior(model)
+    prior = adjustment.row_prior(model)
     std, free = prior.std.copy(), adjustment.free(model)
     std[:, FOCAL], free[FOCAL] = np.inf, True
     result = refine_metric_bundle(
         replace(cameras, shared=shared), model.X,
         Observations(t.view_index[index], t.point_index[index], t.xy[index]), free=free,
-        prior=IntrinsicsPrior(prior.mean, std),
+        prior=IntrinsicsPrior.unshared(prior.mean, std),
         options=replace(
             adjustment.options(model, iterations=ROUNDS), covariance=True, noise_floor_px=model.sigma_px
         ),

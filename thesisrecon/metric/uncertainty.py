@@ -31,10 +31,10 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric.adjustment import Adjustment, Population
 from thesisrecon.metric.model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricModel
 from thesisrecon.numerics.block_scatter import BlockScatter
-from thesisrecon.numerics.metric_cameras import IntrinsicsPrior
 from thesisrecon.records import IntrinsicInterval
 
 USUAL_INFLATION = 4.0
@@ -51,9 +51,9 @@ TAIL = (1.2, 1.6)
 def model_error_share(scatter: BlockScatter, tail: float) -> float:
     """0 where nothing but normal noise is seen, 1 where the model of camera and noise is surely not the whole
     truth."""
-    if scatter.blocks < LEAST_BLOCKS or not np.isfinite(scatter.contradiction):
+    if scatter.blocks < LEAST_BLOCKS or not np.isfinite(scatter.overdispersion):
         return 1.0
-    signs = [(scatter.contradiction, CONTRADICTION), (tail, TAIL)]
+    signs = [(scatter.overdispersion, CONTRADICTION), (tail, TAIL)]
     return max(float(np.clip((sign - low) / (high - low), 0.0, 1.0)) for sign, (low, high) in signs)
 
 
@@ -63,7 +63,7 @@ def model_error_floor(model: MetricModel, scatter: BlockScatter, floor_rel: floa
     ``floor_rel`` is that of one camera behind all photographs, relative to the focal; k1's is as large.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        alone = np.maximum(np.nan_to_num(scatter.model / scatter.tied), 1.0) ** 0.25
+        alone = np.maximum(np.nan_to_num(scatter.variance / scatter.shared_variance), 1.0) ** 0.25
     units = np.ones_like(model.cameras.intrinsics)
     units[:, (SKEW, *CENTRE)] = model.cameras.intrinsics[:, :1]
     return np.asarray(floor_rel * model_error_share(scatter, model.tail) * alone * units)
@@ -101,11 +101,11 @@ def own_values(
     first = np.unique(group, return_index=True)[1]
     value = model.cameras.intrinsics.copy()
     value[:, FOCAL] = np.log(value[:, FOCAL])
-    members = np.unique(adjustment.assumed.alike[first], return_inverse=True)[1].reshape(-1)
+    members = np.unique(adjustment.prior.kind[first], return_inverse=True)[1].reshape(-1)
     registered = np.isin(np.arange(len(first)), group[model.registered])
-    inflation = np.sqrt(np.maximum(scatter.typical_ratio, 1.0))
+    inflation = np.sqrt(np.maximum(scatter.median_ratio, 1.0))
     members = np.where(registered, members, -1)
-    std = inflation * np.sqrt(np.maximum(scatter.model, 0.0))
+    std = inflation * np.sqrt(np.maximum(scatter.variance, 0.0))
     return OwnValues(value, std, model_error_floor(model, scatter, floor_rel), members)
 
 
@@ -251,7 +251,7 @@ def intrinsic_intervals(
         row = model.cameras.intrinsics[g]
         intervals = {}
         for name, column in _COLUMNS.items():
-            value, variance = float(row[column]), float(scatter.model[g, column])
+            value, variance = float(row[column]), float(scatter.variance[g, column])
             if not variance > 0.0:
                 intervals[name] = IntrinsicInterval(value, 0.0, "assumed")
                 continue

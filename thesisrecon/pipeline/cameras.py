@@ -37,11 +37,11 @@ def reconstruct_projective(work: Work, attempt: int = 0) -> None:
 
 
 def _calibrate(work: Work, attempt: int) -> None:
-    run, assumed = work.run, work.assumed
+    run, prior = work.run, work.prior
     projective = work.result.projective
     assert projective is not None
     upstream = run.logs["projective"].keys[f"attempt-{attempt}"]
-    wish = [assumed.shared, assumed.mean, assumed.std, assumed.alike]
+    wish = [prior.shared, prior.mean, prior.std, prior.kind]
     key = run.key("selfcalibration", run.variant_key("selfcalibration"), upstream, wish, run.seed)
     run.progress("selfcalibration", 0, 1)
     calibration = run.kept(
@@ -50,7 +50,7 @@ def _calibrate(work: Work, attempt: int) -> None:
         key,
         lambda: with_images(work.config.selfcalibration, work.result.images).calibrate(
             projective,
-            assumed=assumed,
+            prior=prior,
             rng=stream(run.seed, "selfcalibration", attempt),
         ),
     )
@@ -62,14 +62,14 @@ def _calibrate(work: Work, attempt: int) -> None:
 
 def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
     """What is to be said of a critical motion that the assumptions make good for; the rest is a doubt."""
-    verdict = calibration.verdict
-    if verdict is None or not (verdict.critical and verdict.identifiable):
+    identifiability = calibration.identifiability
+    if identifiability is None or not (identifiability.critical and identifiability.identifiable):
         return ()
-    return ("; ".join(verdict.sentences),)
+    return ("; ".join(identifiability.sentences),)
 
 
 def _refine(work: Work, attempt: int) -> None:
-    run, assumed = work.run, work.assumed
+    run, prior = work.run, work.prior
     projective, calibration = work.result.projective, work.result.calibration
     assert projective is not None
     assert calibration is not None
@@ -83,7 +83,7 @@ def _refine(work: Work, attempt: int) -> None:
         lambda: work.config.metric.refine(
             projective,
             calibration,
-            assumed=assumed,
+            prior=prior,
             rng=stream(run.seed, "metric", attempt),
         ),
     )

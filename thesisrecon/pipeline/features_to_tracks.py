@@ -25,7 +25,7 @@ def find_features(work: Work) -> None:
     variant = run.variant_key("features")
     keys = {
         f"{i:05d}": run.key("features", variant, photograph.digest)
-        for i, photograph in enumerate(work.photographs.photographs)
+        for i, photograph in enumerate(work.photographs.decoded)
     }
     features = run.kept_all(
         "features", keys, _detect_all, lambda missing: (([i], (work.config, [images[i]])) for i in missing)

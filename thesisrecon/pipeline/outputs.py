@@ -18,14 +18,14 @@ from thesisrecon import __version__
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.config import PipelineConfig, toml_from_config, with_images
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.intrinsics import assume
+from thesisrecon.intrinsics import prior_for
 from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views
 from thesisrecon.io.colmap_files import write_colmap_model
 from thesisrecon.io.exports import write_point_cloud
 from thesisrecon.io.files import read_json, write_json, write_text
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.records import Image, Reconstruction, RunResult, TexturedMesh
-from thesisrecon.report.data import Photograph, ReportData
+from thesisrecon.report.data import ReportImage, ReportData
 from thesisrecon.report.page import write_report
 from thesisrecon.report.summary import cameras_table, point_colours, summarize
 from thesisrecon.runtime.run import Run, Until, stream
@@ -58,11 +58,11 @@ def upgrade_affine(
         config = config or PipelineConfig()
         variant = with_images(config.selfcalibration, photographs) if photographs else config.selfcalibration
         rng = stream(seed, "selfcalibration")
-        assumed = assume(reconstruction, config.intrinsics)
+        prior = prior_for(reconstruction, config.intrinsics)
         if isinstance(variant, Stratified):
-            plane = variant.locate(reconstruction, assumed=assumed, rng=rng)
+            plane = variant.locate(reconstruction, prior=prior, rng=rng)
         else:
-            plane = variant.calibrate(reconstruction, assumed=assumed, rng=rng).plane_at_infinity
+            plane = variant.calibrate(reconstruction, prior=prior, rng=rng).plane_at_infinity
     return upgrade_to_affine(reconstruction, plane)
 
 
@@ -230,7 +230,7 @@ def _peak_memory_mb() -> float:
 
 def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: StageFailure | None) -> ReportData:
     photographs = tuple(
-        Photograph(image.name, image.size, image.original_size, _thumbnail(image)) for image in result.images
+        ReportImage(image.name, image.size, image.original_size, _thumbnail(image)) for image in result.images
     )
     return ReportData(
         title=run.title,

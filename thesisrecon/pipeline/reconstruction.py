@@ -95,5 +95,5 @@ def _take_steps(work: Work, *, surface_asked: bool) -> None:
         except StageFailure as failure:
             if surface_asked or step not in SURFACE_STEPS:
                 raise
-            work.run.warnings.append(f"there is no model: {failure}")
+            work.run.warnings.append(f"No surface model was built: {failure}")
             return

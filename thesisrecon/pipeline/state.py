@@ -15,10 +15,10 @@ import numpy as np
 
 from thesisrecon.config import Matcher, PipelineConfig
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.intrinsics import assumptions_of_views
-from thesisrecon.io.images import PhotographSet
-from thesisrecon.numerics.morton_order import morton_pair_order
-from thesisrecon.records import Assumptions, Features, Image, RunResult
+from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
+from thesisrecon.io.images import ImageSet
+from thesisrecon.numerics.observations import morton_pair_order
+from thesisrecon.records import Features, Image, RunResult
 from thesisrecon.runtime.run import Run
 
 KEPT_BYTES = 2**30
@@ -111,7 +111,7 @@ class Work:
     """What the steps of one run hand on: ``result`` grows, the rest is what they need beside it."""
 
     run: Run
-    photographs: PhotographSet
+    photographs: ImageSet
     result: RunResult
     until: str
     prepared: PreparedViews | None = None
@@ -121,11 +121,11 @@ class Work:
         return self.run.config
 
     @property
-    def assumed(self) -> Assumptions:
+    def prior(self) -> IntrinsicsPrior:
         """What the user lets us assume of the cameras."""
         scales = np.array([image.scale for image in self.result.images])
         sizes = [image.original_size for image in self.result.images]
-        return assumptions_of_views(self.config.intrinsics, sizes, self.photographs.exif_focal_px, scales)
+        return prior_from_options(self.config.intrinsics, sizes, self.photographs.exif_focal_px, scales)
 
     def check_photographs(self) -> None:
         """Refuse what is too little before anything is computed."""

@@ -12,18 +12,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.candidates import (
-    answers_from_theta,
-    conclude,
-    focals_of_groups,
-    guarded,
+    as_stage_failure,
+    candidates_from_parameters,
+    group_focals_from_planes,
     require_cameras,
+    select_candidate,
 )
-from thesisrecon.selfcalibration.frame import ReferenceFrame, assumed_frame
+from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
 
-WEIGHTS = (1.0 / 0.01, 1.0 / 0.2, 1.0 / 0.1, 1.0 / 0.1)
+SCAN_WEIGHTS = (1.0 / 0.01, 1.0 / 0.2, 1.0 / 0.1, 1.0 / 0.1)
 """Of skew, aspect and the two coordinates of the principal point."""
 
 
@@ -70,7 +71,7 @@ def focal_pairs(focals: F64, same_camera: bool) -> tuple[F64, F64]:
 
 
 def planes_for_focals(
-    frame: ReferenceFrame, criterion: RotationCriterion, log_f: F64, *, refined: int = 8
+    frame: ReferenceFrame, criterion: RotationCriterion, log_f: F64, *, max_refined: int = 8
 ) -> tuple[F64, float]:
     """The plane at infinity (3,) that suits known log focals (G,) best, and the criterion's cost there.
 
@@ -84,13 +85,13 @@ def planes_for_focals(
     if not len(planes):
         return np.full(3, np.nan), np.inf
     theta = np.concatenate([planes, np.repeat(log_f[None], len(planes), axis=0)], axis=1)
-    order = np.argsort(criterion.cost(frame, theta[:, :3], theta[:, 3:]), kind="stable")[:refined]
+    order = np.argsort(criterion.cost(frame, theta[:, :3], theta[:, 3:]), kind="stable")[:max_refined]
     theta, cost = refine_hypotheses(criterion, frame, theta[order], planes_only=True)
     best = int(np.nan_to_num(cost, nan=np.inf).argmin())
     return theta[best, :3], float(cost[best])
 
 
-def calibrations_of(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
+def calibrations_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
     """Unit-free K (B, R, 3, 3) of all cameras that planes p (B, 3) and reference focals (B,) imply.
 
     The triangular factor of C C', C = (A - a p') K_r, written out; what RQ of the upgraded camera gives.
@@ -115,7 +116,7 @@ def scan_cost(K: F64) -> F64:
     All four are taken over k22: the paper's cameras have a focal near 1, ours any.
     """
     parts = np.stack([K[..., 0, 1], K[..., 0, 0] - K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]], axis=-1)
-    total = np.sum(np.abs(parts) * WEIGHTS, axis=-1) / K[..., 1, 1]
+    total = np.sum(np.abs(parts) * SCAN_WEIGHTS, axis=-1) / K[..., 1, 1]
     return np.asarray(np.sum(total**2, axis=-1))
 
 
@@ -130,21 +131,21 @@ class FocalScan:
 
     focal_range: tuple[float, float] = (0.2, 40.0)
     focal_steps: int = 65
-    refined: int = 10
+    max_refined: int = 10
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    @guarded
+    @as_stage_failure
     def calibrate(
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
         """Upgrade by the scan; ``StageFailure`` below three cameras and where no answer puts the scene in
         front of the cameras."""
         require_cameras(reconstruction)
-        frame = assumed_frame(reconstruction, assumed)
+        frame = normalized_frame(reconstruction, prior)
         focals = np.geomspace(*self.focal_range, self.focal_steps)
         planes, references = [], []
         for other in np.delete(np.arange(len(frame.views)), frame.reference):
@@ -154,9 +155,11 @@ class FocalScan:
         p, f = np.concatenate(planes), np.concatenate(references)
         good = np.isfinite(p).all(axis=1)
         p, f = p[good], f[good]
-        best = np.argsort(scan_cost(calibrations_of(frame, p, f)), kind="stable")[: self.refined]
-        theta = np.concatenate([p[best], focals_of_groups(frame, p[best], f[best])], axis=1)
-        answers = answers_from_theta(
+        best = np.argsort(scan_cost(calibrations_from_planes(frame, p, f)), kind="stable")[: self.max_refined]
+        theta = np.concatenate([p[best], group_focals_from_planes(frame, p[best], f[best])], axis=1)
+        answers = candidates_from_parameters(
             frame, *refine_hypotheses(self.criterion, frame, theta), "Gherardi and Fusiello's scan"
         )
-        return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)
+        return select_candidate(
+            frame, reconstruction, self.criterion, answers, max_candidates=1, min_in_front_ratio=0.5
+        )

@@ -25,26 +25,27 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.candidates import (
-    Answer,
-    conclude,
-    guarded,
+    Candidate,
+    as_stage_failure,
+    focal_only_std,
     require_cameras,
-    square_calibrations,
-    square_std,
+    select_candidate,
+    square_pixel_calibrations,
 )
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
 from thesisrecon.selfcalibration.frame import (
     ReferenceFrame,
-    UnknownIntrinsics,
-    assumed_frame,
-    focal_prior,
-    unknown_intrinsics,
+    SolverUnknowns,
+    normalized_frame,
+    solver_unknowns,
+    weak_focal_prior,
 )
 from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_residuals, require_pairs
-from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs
+from thesisrecon.selfcalibration.pair_geometry import PairGeometry, pair_geometries
 from thesisrecon.selfcalibration.refinement import RotationCriterion
 
 _ROOT2 = np.sqrt(2.0)
@@ -234,7 +235,7 @@ WRONG_PAIR = 1e-2
 
 
 @dataclass(frozen=True)
-class FocalVote:
+class FocalPosterior:
     """``log_f`` and ``std`` (G,) of the groups' log focals; ``support`` (G, B) log posterior on the grid."""
 
     log_f: F64
@@ -242,18 +243,18 @@ class FocalVote:
     support: F64
 
 
-def vote_on_focals(
+def focal_posterior(
     pairs: PairGeometry,
     group: I64,
     grid: F64,
     *,
     prior: tuple[F64, F64],
     principal_std: float = 0.01,
-) -> FocalVote:
+) -> FocalPosterior:
     """Log focals of G groups of cameras from all pairs.
 
     group (R,) camera number, dense; grid (B,) of log focals, evenly spaced; ``prior`` finite means and
-    standard deviations (G,) of log focals (:func:`focal_prior`). Pairs within a group are asked about one
+    standard deviations (G,) of log focals (:func:`weak_focal_prior`). Pairs within a group are asked about one
     focal, pairs between groups about two, and the other's is integrated out. Pairs share observations: of
     V (V - 1) / 2 pairs only 2 V - 3 are independent, and the sum of the votes is scaled down accordingly.
     """
@@ -276,12 +277,12 @@ def vote_on_focals(
             gi, gj = group[between.i[m]], group[between.j[m]]
             support[gi] += _robust(_marginal(table + log_prior[gj]))
             support[gj] += _robust(_marginal(table.T + log_prior[gi]))
-    posterior = independent_share(pairs) * support + log_prior
+    posterior = independence_factor(pairs) * support + log_prior
     log_f, std = _moments(grid, posterior)
-    return FocalVote(log_f, np.hypot(std, cell / np.sqrt(12.0)), posterior)
+    return FocalPosterior(log_f, np.hypot(std, cell / np.sqrt(12.0)), posterior)
 
 
-def independent_share(pairs: PairGeometry) -> float:
+def independence_factor(pairs: PairGeometry) -> float:
     """(2 V - 3) / M, at most 1, of M pairs between V cameras: what each says that the others do not."""
     views = len(np.unique(np.concatenate([pairs.i, pairs.j])))
     return min(1.0, (2.0 * views - 3.0) / max(len(pairs.i), 1))
@@ -311,7 +312,7 @@ def _moments(grid: F64, posterior: F64) -> tuple[F64, F64]:
 
 
 def refine_focals(
-    pairs: PairGeometry, unknown: UnknownIntrinsics, log_f: F64, *, principal_std: float = 1e-3
+    pairs: PairGeometry, unknown: SolverUnknowns, log_f: F64, *, principal_std: float = 1e-3
 ) -> tuple[F64, F64]:
     """Log focals (R,) of the cameras and their standard deviations from all pairs, near a start (R,).
 
@@ -321,8 +322,8 @@ def refine_focals(
     wrong with each view's by itself. The loss turns at three sigmas: first that of soft L1, which leads to
     the minimum from afar, then Cauchy's against wrong pairs.
     """
-    unknown = unknown.with_weak_focals()
-    x, share = unknown.start(log_f[None])[0], independent_share(pairs)
+    unknown = unknown.with_focal_prior()
+    x, share = unknown.start(log_f[None])[0], independence_factor(pairs)
     covariance = np.zeros((len(x), len(x)))
     for loss in ("soft_l1", "soft_l1", "cauchy", "cauchy") if len(x) else ():
         whitening = kruppa_whitening(pairs, unknown.focals(x[None])[0], principal_std=principal_std)
@@ -332,7 +333,7 @@ def refine_focals(
             w = dual_images(unknown.calibrations(batch))
             g = kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j])
             white = np.einsum("mac,bmc->bma", root, g).reshape(len(batch), -1)
-            return np.concatenate([white, unknown.deviations(batch)], axis=1)
+            return np.concatenate([white, unknown.prior_residuals(batch)], axis=1)
 
         found = minimize_residuals(
             lambda y: residuals(y[None])[0], x, jacobian=lambda y: _central(residuals, y), loss=loss,
@@ -366,46 +367,48 @@ class FocalsFromFundamental:
     focal_range: tuple[float, float] = (0.1, 60.0)
     focal_steps: int = 151
     max_std: float = 0.15
-    min_common: int = 20
-    min_principal_std: float = 1e-3
+    min_common_points: int = 20
+    min_principal_point_std: float = 1e-3
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    @guarded
+    @as_stage_failure
     def calibrate(
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
         """Upgrade by the vote; ``StageFailure`` below three cameras, without pairs, and where no answer puts
         the scene in front of the cameras."""
         require_cameras(reconstruction)
-        frame = assumed_frame(reconstruction, assumed)
-        pairs = camera_pairs(frame, reconstruction, min_common=self.min_common)
-        require_pairs(pairs, self.min_common)
-        log_f, std = self.focals(pairs, frame, assumed)
+        frame = normalized_frame(reconstruction, prior)
+        pairs = pair_geometries(frame, reconstruction, min_common_points=self.min_common_points)
+        require_pairs(pairs, self.min_common_points)
+        log_f, std = self.focals(pairs, frame, prior)
         log_f = np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
         plane, cost = planes_for_focals(frame, self.criterion, log_f)
-        answer = Answer(plane, square_calibrations(log_f[frame.group]), cost, "focals from F")
-        found = conclude(frame, reconstruction, self.criterion, [answer], kept=1, min_positive=0.5)
+        answer = Candidate(plane, square_pixel_calibrations(log_f[frame.group]), cost, "focals from F")
+        found = select_candidate(
+            frame, reconstruction, self.criterion, [answer], max_candidates=1, min_in_front_ratio=0.5
+        )
         return self._with_own_deviations(found, frame, std)
 
-    def focals(self, pairs: PairGeometry, frame: ReferenceFrame, assumed: Assumptions) -> tuple[F64, F64]:
+    def focals(self, pairs: PairGeometry, frame: ReferenceFrame, prior: IntrinsicsPrior) -> tuple[F64, F64]:
         """Log focals (R,) of the cameras, unit-free, and their standard deviations."""
         several = frame.n_groups > 1
         grid = log_grid(self.focal_range, self.focal_steps // 4 if several else self.focal_steps)
-        offset = np.median(assumed.std[frame.views, 3]) / frame.pixel_from_unit[frame.views[0], 0, 0]
-        principal_std = float(np.clip(np.nan_to_num(offset), self.min_principal_std, 0.1))
+        offset = np.median(prior.std[frame.views, 3]) / frame.pixel_from_unit[frame.views[0], 0, 0]
+        principal_std = float(np.clip(np.nan_to_num(offset), self.min_principal_point_std, 0.1))
         nothing = np.full(frame.n_groups, np.nan), np.full(frame.n_groups, np.inf)
         known = nothing if frame.focal_mean is None or frame.focal_std is None else (
             frame.focal_mean, frame.focal_std,
         )  # fmt: skip
-        prior = focal_prior(*known)
-        vote = vote_on_focals(pairs, frame.group, grid, principal_std=principal_std, prior=prior)
-        unknown = unknown_intrinsics(frame, assumed)
+        weak = weak_focal_prior(*known)
+        vote = focal_posterior(pairs, frame.group, grid, principal_std=principal_std, prior=weak)
+        unknown = solver_unknowns(frame, prior)
         start, spread = vote.log_f[frame.group], vote.std[frame.group]
-        log_f, std = refine_focals(pairs, unknown, start, principal_std=self.min_principal_std)
+        log_f, std = refine_focals(pairs, unknown, start, principal_std=self.min_principal_point_std)
         # Residuals also vanish where everything is blurred, at focals near 0: there the vote stands.
         strayed = np.abs(log_f - start) > STRAYED * np.maximum(spread, 0.1)
         return np.where(strayed, start, log_f), np.where(strayed, np.maximum(spread, self.max_std), std)
@@ -413,7 +416,7 @@ class FocalsFromFundamental:
     def _with_own_deviations(
         self, found: SelfCalibration, frame: ReferenceFrame, std: F64
     ) -> SelfCalibration:
-        K_std = square_std(frame, found.K, std)
+        K_std = focal_only_std(frame, found.K, std)
         open_views = frame.views[std >= self.max_std]
         if not len(open_views):
             return replace(found, K_std=K_std)

@@ -19,12 +19,15 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
-from thesisrecon.records import Assumptions, Reconstruction
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.records import Reconstruction
 
-FLAT = 1e-11
+_RANK_TOLERANCE = 1e-11
 """Share of the largest below which a singular value, or a distance of centres, is rounding."""
 
-KNOWN_STD = 1e-4
+HOMOGRAPHY_NOISE = 0.01
+
+_KNOWN_FOCAL_STD = 1e-4
 """Relative deviation that a focal known exactly gets, so that every criterion stays finite."""
 
 
@@ -48,7 +51,7 @@ class ReferenceFrame:
     reference_from_projective: F64
     focal_mean: F64 | None = None
     focal_std: F64 | None = None
-    assumed: Assumptions | None = None
+    prior: IntrinsicsPrior | None = None
 
     @property
     def n_groups(self) -> int:
@@ -64,7 +67,7 @@ class ReferenceFrame:
             self.pixel_from_unit, self.reference_from_projective,
             None if self.focal_mean is None else self.focal_mean[kept],
             None if self.focal_std is None else self.focal_std[kept],
-            self.assumed,
+            self.prior,
         )  # fmt: skip
 
 
@@ -109,26 +112,26 @@ def _require_cameras_of_full_rank(P: F64) -> None:
     """``StageFailure`` where a camera (R, 3, 4) is no camera, or all have one centre."""
     if not np.isfinite(P).all() or (np.linalg.norm(P, axis=(1, 2)) == 0.0).any():
         bad = int((~np.isfinite(P)).any(axis=(1, 2)).sum() + (np.linalg.norm(P, axis=(1, 2)) == 0.0).sum())
-        evidence = f"{bad} of {len(P)} cameras are zero or not finite"
+        evidence = f"{bad} of {len(P)} projective cameras are zero or not finite"
     else:
         S = np.linalg.svd(P / np.linalg.norm(P, axis=(1, 2))[:, None, None], compute_uv=False)
-        flat = int((S[:, 2] < FLAT * S[:, 0]).sum())
+        flat = int((S[:, 2] < _RANK_TOLERANCE * S[:, 0]).sum())
         centres = np.linalg.svd(P)[2][:, 3]
         apart = float(np.sqrt(np.maximum(1.0 - (centres @ centres[0]) ** 2, 0.0)).max())
-        if not flat and apart > FLAT:
+        if not flat and apart > _RANK_TOLERANCE:
             return
         evidence = (
-            f"{flat} of {len(P)} cameras see a line only" if flat else f"their centres are {apart:.1e} apart"
+            f"{flat} of {len(P)} projective cameras have rank below 3" if flat else f"the camera centres are {apart:.1e} apart"
         )
     raise StageFailure(
-        "the projective cameras are not such that they can be calibrated",
+        "the projective cameras cannot be calibrated",
         evidence,
-        "photograph the scene from different places",
+        "take images from different positions",
     )
 
 
-def assumed_frame(
-    reconstruction: Reconstruction, assumed: Assumptions, *, reference: int | None = None
+def normalized_frame(
+    reconstruction: Reconstruction, prior: IntrinsicsPrior, *, reference: int | None = None
 ) -> ReferenceFrame:
     """:func:`build_frame` in coordinates that have the assumed aspect and principal point in them.
 
@@ -136,25 +139,25 @@ def assumed_frame(
     diag(f, f, 1) as far as the assumption holds.
     """
     frame = build_frame(
-        reconstruction, assumed.group, reference=reference, unit=_unit_of(assumed, reconstruction.sizes)
+        reconstruction, prior.group, reference=reference, unit=_unit_of(prior, reconstruction.sizes)
     )
-    known = assumed.focal_known[frame.views]
+    known = prior.focal_known[frame.views]
     unit = frame.pixel_from_unit[frame.views, 0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_f = np.log(assumed.mean[frame.views, 0] / unit)
+        log_f = np.log(prior.mean[frame.views, 0] / unit)
     mean, std = np.full(frame.n_groups, np.nan), np.full(frame.n_groups, np.inf)
     for g in range(frame.n_groups):
         mine = known & (frame.group == g)
         if mine.any():
             mean[g] = np.median(log_f[mine])
-            std[g] = max(float(np.median(assumed.std[frame.views[mine], 0])), KNOWN_STD)
-    return replace(frame, focal_mean=mean, focal_std=std, assumed=assumed)
+            std[g] = max(float(np.median(prior.std[frame.views[mine], 0])), _KNOWN_FOCAL_STD)
+    return replace(frame, focal_mean=mean, focal_std=std, prior=prior)
 
 
-def _unit_of(assumed: Assumptions, sizes: I64) -> F64:
+def _unit_of(prior: IntrinsicsPrior, sizes: I64) -> F64:
     unit = pixel_from_unit(sizes)
-    unit[:, 1, 1] *= assumed.mean[:, 1]
-    unit[:, :2, 2] = assumed.mean[:, 3:5]
+    unit[:, 1, 1] *= prior.mean[:, 1]
+    unit[:, :2, 2] = prior.mean[:, 3:5]
     return unit
 
 
@@ -172,12 +175,12 @@ def metric_from_calibration(p: F64, K: F64) -> F64:
         return np.full((4, 4), np.nan)
 
 
-COLUMNS = 5
+_N_INTRINSICS = 5
 """log focal, log aspect over the assumed one, skew, principal point (x, y) off the assumed one, unit-free."""
 
 
 @dataclass(frozen=True)
-class UnknownIntrinsics:
+class SolverUnknowns:
     """D unknown numbers and where they stand in the calibrations of R cameras.
 
     ``place`` (R, 5): number of the unknown in :data:`COLUMNS`, -1 where ``value`` (R, 5) is known. ``mean``
@@ -185,23 +188,23 @@ class UnknownIntrinsics:
     a place to start.
     """
 
-    place: I64
-    value: F64
+    index: I64
+    known: F64
     mean: F64
     std: F64
 
     @property
-    def loosest(self) -> float:
+    def max_nonfocal_std(self) -> float:
         """The largest deviation of an unknown that is no focal, 0 where there is none."""
-        focals = np.unique(self.place[:, 0])
+        focals = np.unique(self.index[:, 0])
         others = np.delete(np.arange(len(self.std)), focals[focals >= 0])
         return float(self.std[others].max(initial=0.0))
 
     def calibrations(self, unknowns: F64) -> F64:
         """Unit-free K (B, R, 3, 3) of unknowns (B, D)."""
-        values = np.repeat(self.value[None], len(unknowns), axis=0)
-        free = self.place >= 0
-        values[:, free] = unknowns[:, self.place[free]]
+        values = np.repeat(self.known[None], len(unknowns), axis=0)
+        free = self.index >= 0
+        values[:, free] = unknowns[:, self.index[free]]
         K = np.zeros((*values.shape[:2], 3, 3))
         K[..., 0, 0] = np.exp(np.clip(values[..., 0], -12.0, 12.0))
         K[..., 1, 1] = K[..., 0, 0] * np.exp(np.clip(values[..., 1], -3.0, 3.0))
@@ -217,78 +220,121 @@ class UnknownIntrinsics:
         variance = np.einsum("drij,de,erij->rij", slope, covariance, slope)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
-    def deviations(self, unknowns: F64) -> F64:
+    def prior_residuals(self, unknowns: F64) -> F64:
         """(unknowns - mean) / std (B, D), 0 where nothing is known."""
         known = np.isfinite(self.std)
         scale = np.where(known, self.std, 1.0)
         return np.where(known, (unknowns - self.mean) / scale, 0.0)
 
-    def with_weak_focals(self) -> UnknownIntrinsics:
-        """The same, what is told of no focal replaced by :func:`focal_prior`."""
-        focals = np.unique(self.place[:, 0])
+    def with_focal_prior(self) -> SolverUnknowns:
+        """The same, what is told of no focal replaced by :func:`weak_focal_prior`."""
+        focals = np.unique(self.index[:, 0])
         focals = focals[focals >= 0]
         mean, std = self.mean.copy(), self.std.copy()
-        told = np.where(np.isfinite(std[focals]), mean[focals], np.nan)
-        mean[focals], std[focals] = focal_prior(told, std[focals])
+        known_mean = np.where(np.isfinite(std[focals]), mean[focals], np.nan)
+        mean[focals], std[focals] = weak_focal_prior(known_mean, std[focals])
         return replace(self, mean=mean, std=std)
 
-    def start(self, log_f: F64) -> F64:
+    def from_log_focals(self, log_f: F64) -> F64:
         """Unknowns (B, D) of log focals (B, R) of the cameras; what has no prior mean starts at 0.
 
         A focal that several cameras share starts at their median; focals that are known are not asked for.
         """
         unknowns = np.repeat(self.mean[None], len(log_f), axis=0)
-        for k in np.unique(self.place[:, 0][self.place[:, 0] >= 0]):
-            unknowns[:, k] = np.median(log_f[:, self.place[:, 0] == k], axis=1)
+        for k in np.unique(self.index[:, 0][self.index[:, 0] >= 0]):
+            unknowns[:, k] = np.median(log_f[:, self.index[:, 0] == k], axis=1)
         return unknowns
 
-    def focals(self, unknowns: F64) -> F64:
+    def log_focals(self, unknowns: F64) -> F64:
         """Log focals (B, R)."""
         return np.asarray(np.log(self.calibrations(unknowns)[..., 0, 0]))
 
 
-def focal_prior(mean: F64, std: F64) -> tuple[F64, F64]:
+def weak_focal_prior(mean: F64, std: F64) -> tuple[F64, F64]:
     """Finite means and deviations (G,) of log focals: 1.2 long sides to a factor of 2.5 where nothing is
     known."""
-    silent = ~(np.isfinite(mean) & np.isfinite(std))
-    return np.where(silent, np.log(1.2), mean), np.where(silent, np.log(2.5), std)
+    unknown = ~(np.isfinite(mean) & np.isfinite(std))
+    return np.where(unknown, np.log(1.2), mean), np.where(unknown, np.log(2.5), std)
 
 
-def unknown_intrinsics(
-    frame: ReferenceFrame, assumed: Assumptions, *, focals_only: bool = False
-) -> UnknownIntrinsics:
+def solver_unknowns(
+    frame: ReferenceFrame, prior: IntrinsicsPrior, *, focals_only: bool = False
+) -> SolverUnknowns:
     """The unknowns of the registered cameras; ``focals_only`` takes all the others for known.
 
-    The frame must be one of :func:`thesisrecon.selfcalibration.frame.assumed_frame`, whose coordinates have
+    The frame must be one of :func:`thesisrecon.selfcalibration.frame.normalized_frame`, whose coordinates have
     the assumed aspect and principal point in them already.
     """
-    mean, std = _unit_free(frame, assumed)
+    mean, std = _unit_free(frame, prior)
     if focals_only:
         std[:, 1:] = 0.0
     place = np.full(mean.shape, -1, dtype=np.int64)
     means: list[float] = []
     stds: list[float] = []
-    for column in range(COLUMNS):
-        shared = assumed.shared[frame.views, column]
+    for column in range(_N_INTRINSICS):
+        shared = prior.shared[frame.views, column]
         for number in np.unique(shared[std[:, column] > 0.0]):
             rows = np.flatnonzero((shared == number) & (std[:, column] > 0.0))
             place[rows, column] = len(means)
             means.append(float(mean[rows[0], column]))
             stds.append(float(std[rows[0], column]))
-    return UnknownIntrinsics(place, mean, np.array(means), np.array(stds))
+    return SolverUnknowns(place, mean, np.array(means), np.array(stds))
 
 
-def _unit_free(frame: ReferenceFrame, assumed: Assumptions) -> tuple[F64, F64]:
+def _unit_free(frame: ReferenceFrame, prior: IntrinsicsPrior) -> tuple[F64, F64]:
     """Means and standard deviations (R, 5) in the coordinates of the frame."""
     rows, unit = frame.views, frame.pixel_from_unit[frame.views]
-    mean, std = np.zeros((len(rows), COLUMNS)), assumed.std[rows, :COLUMNS].copy()
-    focal = assumed.mean[rows, 0]
-    silent = ~(np.isfinite(focal) & np.isfinite(std[:, 0]))
-    mean[:, 0] = np.log(np.where(silent, unit[:, 0, 0], focal) / unit[:, 0, 0])
-    std[silent, 0] = np.inf
-    std[:, 1] /= assumed.mean[rows, 1]
-    mean[:, 2] = assumed.mean[rows, 2] / unit[:, 0, 0]
+    mean, std = np.zeros((len(rows), _N_INTRINSICS)), prior.std[rows, :_N_INTRINSICS].copy()
+    focal = prior.mean[rows, 0]
+    unknown = ~(np.isfinite(focal) & np.isfinite(std[:, 0]))
+    mean[:, 0] = np.log(np.where(unknown, unit[:, 0, 0], focal) / unit[:, 0, 0])
+    std[unknown, 0] = np.inf
+    std[:, 1] /= prior.mean[rows, 1]
+    mean[:, 2] = prior.mean[rows, 2] / unit[:, 0, 0]
     std[:, 2] /= unit[:, 0, 0]
     std[:, 3] /= unit[:, 0, 0]
     std[:, 4] /= unit[:, 1, 1]
     return mean, std
+
+
+@dataclass(frozen=True)
+class ConicConstraints:
+    """What makes the image conic linear: ``std`` (R, 4) of skew, principal x, y and half the aspect, infinite
+    where nothing is known; ``first`` (R,) the place of the first camera of the same constant K (its own where
+    it is that one); ``reference`` the place of the reference view.
+    """
+
+    std: F64
+    first: I64
+    reference: int
+
+
+def conic_constraints(frame: ReferenceFrame, prior: IntrinsicsPrior) -> ConicConstraints:
+    """The assumptions in the coordinates of an ``normalized_frame``.
+
+    Known or roughly known intrinsics are equations weighed by their deviation; views that share or know all
+    five are one constant K.
+    """
+    rows = frame.views
+    unit = frame.pixel_from_unit[rows, 0, 0][:, None]
+    std = np.column_stack([prior.std[rows, 2:5] / unit, prior.std[rows, 1] / prior.mean[rows, 1] / 2.0])
+    # A constant K is constant in unit-free coordinates only where these are the same for all its views.
+    known = np.where(prior.std[rows, :5] == 0.0, prior.mean[rows, :5], np.nan)
+    same_value = (known[:, None] == known[None]) | (
+        prior.shared[rows, None, :5] == prior.shared[None, rows, :5]
+    )
+    same_unit = np.isclose(frame.pixel_from_unit[rows, None], frame.pixel_from_unit[None, rows]).all(
+        axis=(2, 3)
+    )
+    first = (same_value.all(axis=2) & same_unit).argmax(axis=1).astype(np.int64)
+    return ConicConstraints(std, first, frame.reference)
+
+
+_SQUARE_PIXEL_STD = (0.0, HOMOGRAPHY_NOISE, HOMOGRAPHY_NOISE, 0.0)
+"""Deviations of cameras without skew, with square pixels and the principal point near the middle."""
+
+
+def square_pixel_constraints(frame: ReferenceFrame) -> ConicConstraints:
+    """Square pixels and a central principal point for every camera, and no constancy."""
+    n = len(frame.views)
+    return ConicConstraints(np.tile(_SQUARE_PIXEL_STD, (n, 1)), np.arange(n, dtype=np.int64), frame.reference)

@@ -12,23 +12,24 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.candidates import (
-    Answer,
-    answers_from_theta,
-    conclude,
-    distinct_answers,
-    focals_of_groups,
-    guarded,
+    Candidate,
+    as_stage_failure,
+    candidates_from_parameters,
+    distinct_candidates,
+    group_focals_from_planes,
     require_cameras,
+    select_candidate,
 )
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.focal_scan import focal_pairs, plane_from_focals
 from thesisrecon.selfcalibration.frame import (
     ReferenceFrame,
-    UnknownIntrinsics,
-    assumed_frame,
-    unknown_intrinsics,
+    SolverUnknowns,
+    normalized_frame,
+    solver_unknowns,
 )
 from thesisrecon.selfcalibration.quadric import minimize_quadric, quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
@@ -52,49 +53,54 @@ class HypothesesAndRefinement:
 
     focal_range: tuple[float, float] = (0.2, 40.0)
     focal_steps: int = 45
-    subsets: int = 6
-    refined: int = 40
-    kept: int = 3
-    freed: int = 8
-    min_positive: float = 0.95
+    camera_subsets: int = 6
+    max_refined: int = 40
+    max_candidates: int = 3
+    max_full_refined: int = 8
+    min_in_front_ratio: float = 0.95
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
     search: CheiralitySearch | None = field(default_factory=CheiralitySearch)
 
-    @guarded
+    @as_stage_failure
     def calibrate(
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> SelfCalibration:
         """Upgrade a projective reconstruction of at least three cameras; ``StageFailure`` where nothing
         holds."""
         require_cameras(reconstruction)
-        frame = assumed_frame(reconstruction, assumed)
+        frame = normalized_frame(reconstruction, prior)
         planes, log_f = self._propose(frame, reconstruction, rng)
         cost = np.nan_to_num(self.criterion.cost(frame, planes, log_f), nan=np.inf)
-        best = np.argsort(cost, kind="stable")[: self.refined]
+        best = np.argsort(cost, kind="stable")[: self.max_refined]
         theta = np.concatenate([planes[best], log_f[best]], axis=1)
         theta, cost = refine_hypotheses(self.criterion, frame, theta)
-        answers = answers_from_theta(frame, theta, cost, "hypotheses and refinement")
-        unknown = unknown_intrinsics(frame, assumed)
-        if unknown.loosest > LOOSE:
+        answers = candidates_from_parameters(frame, theta, cost, "hypotheses and refinement")
+        unknown = solver_unknowns(frame, prior)
+        if unknown.max_nonfocal_std > LOOSE:
             answers = self._with_all_intrinsics(frame, unknown, answers)
-        return conclude(
-            frame, reconstruction, self.criterion, answers, kept=self.kept, min_positive=self.min_positive
+        return select_candidate(
+            frame,
+            reconstruction,
+            self.criterion,
+            answers,
+            max_candidates=self.max_candidates,
+            min_in_front_ratio=self.min_in_front_ratio,
         )
 
     def _with_all_intrinsics(
-        self, frame: ReferenceFrame, unknown: UnknownIntrinsics, answers: Sequence[Answer]
-    ) -> list[Answer]:
+        self, frame: ReferenceFrame, unknown: SolverUnknowns, answers: Sequence[Candidate]
+    ) -> list[Candidate]:
         """The best distinct answers under the nonlinear quadric, over all that the assumptions leave open."""
-        found: list[Answer] = []
-        for answer in distinct_answers(frame, answers, self.freed):
+        found: list[Candidate] = []
+        for answer in distinct_candidates(frame, answers, self.max_full_refined):
             log_f = answer.log_focals(frame)[frame.group]
             best = minimize_quadric(frame, unknown, answer.plane, log_f, loss_scale=self.criterion.scale)
             found.append(
-                Answer(best.plane, best.K, best.cost, "hypotheses and nonlinear quadric", best.K_std)
+                Candidate(best.plane, best.K, best.cost, "hypotheses and nonlinear quadric", best.K_std)
             )
         return found
 
@@ -105,7 +111,7 @@ class HypothesesAndRefinement:
         focals = np.geomspace(*self.focal_range, self.focal_steps)
         found = [quadric_hypotheses(frame, focals)]
         others = np.delete(np.arange(len(frame.views)), frame.reference)
-        for _ in range(self.subsets if len(others) > 3 else 0):
+        for _ in range(self.camera_subsets if len(others) > 3 else 0):
             size = int(rng.integers(3, len(others)))
             chosen = np.sort(np.append(rng.choice(others, size, replace=False), frame.reference))
             found.append(quadric_hypotheses(frame.subset(chosen), focals[::4]))
@@ -117,4 +123,4 @@ class HypothesesAndRefinement:
         p = np.concatenate([part[0] for part in found])
         f = np.concatenate([part[1] for part in found])
         good = np.isfinite(p).all(axis=1) & np.isfinite(f)
-        return p[good], focals_of_groups(frame, p[good], f[good])
+        return p[good], group_focals_from_planes(frame, p[good], f[good])

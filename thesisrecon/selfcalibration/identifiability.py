@@ -15,21 +15,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import IntrinsicsPrior, MetricCameras
+from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.numerics.observations import Observations
-from thesisrecon.records import Assumptions, IdentifiabilityReport, Reconstruction, Upgrade
+from thesisrecon.records import IdentifiabilityReport, Reconstruction, Upgrade
 from thesisrecon.selfcalibration.critical_motions import (
-    LEAST_MOVE,
     MAX_FOCAL_STD,
-    MIN_SIGNIFICANCE,
-    MOST_NOISE,
+    MAX_NOISE_RATIO,
+    MIN_INFINITY_SHIFT,
+    MIN_ROTATION_SIGNIFICANCE,
     UpgradedCameras,
     measure_motion,
     motion_sentences,
     nearest_critical_motion,
-    shifts_without_an_answer,
+    projective_infinity_shifts,
 )
 from thesisrecon.selfcalibration.frame import build_frame
 
@@ -45,7 +46,7 @@ FREE = np.array([True, True, False, True, True, False])
 
 
 def check_identifiability(
-    reconstruction: Reconstruction, upgrade: Upgrade, assumed: Assumptions
+    reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> IdentifiabilityReport:
     """The verdict on an answer of self-calibration.
 
@@ -55,34 +56,36 @@ def check_identifiability(
     :data:`~thesisrecon.selfcalibration.critical_motions.TOLERANCES`, ``focal_long_sides`` (median, adjusted),
     ``focal_std_rel`` (worst view),
     ``focal_std_rel_median``, ``focal_std_rel_free`` (median, aspect and principal point free),
-    ``principal_point_std_free`` (long sides), ``turn_significance``, ``spare_equations`` of the counting
+    ``principal_point_std_free`` (long sides), ``rotation_significance``, ``excess_equations`` of the counting
     argument, and ``noise_px``.
     """
-    problem = _core_problem(reconstruction, upgrade, assumed)
-    spare = spare_equations(assumed, reconstruction.registered)
+    problem = _core_problem(reconstruction, upgrade, prior)
+    spare = excess_equations(prior, reconstruction.registered)
     if problem is None:
-        return verdict_without_an_answer(reconstruction, assumed)
+        return identifiability_without_calibration(reconstruction, prior)
     fit = problem.adjust(rounds=ROUNDS)
     free = problem.with_nothing_known(fit).adjust(rounds=0)
     return _verdict(problem, fit, free, spare)
 
 
-def verdict_without_an_answer(reconstruction: Reconstruction, assumed: Assumptions) -> IdentifiabilityReport:
+def identifiability_without_calibration(
+    reconstruction: Reconstruction, prior: IntrinsicsPrior
+) -> IdentifiabilityReport:
     """The verdict where self-calibration found nothing: what the projective cameras alone tell."""
-    frame = build_frame(reconstruction, assumed.group)
-    evidence = shifts_without_an_answer(frame.A, frame.a)
+    frame = build_frame(reconstruction, prior.group)
+    evidence = projective_infinity_shifts(frame.A, frame.a)
     motion, nearness = nearest_critical_motion(evidence)
     motion = motion if nearness < 1.0 else ""
     evidence |= {
         "nearness": nearness,
-        "spare_equations": float(spare_equations(assumed, reconstruction.registered)),
+        "excess_equations": float(excess_equations(prior, reconstruction.registered)),
     }
-    given = _given_focal_std(assumed.std[reconstruction.registered, 0])
+    given = _given_focal_std(prior.std[reconstruction.registered, 0])
     sentences = motion_sentences(motion, evidence, identifiable=False, focal_std=given)
     return IdentifiabilityReport(False, motion, nearness < 1.0, evidence, sentences)
 
 
-def spare_equations(assumed: Assumptions, registered: B8) -> int:
+def excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
     """How many equations the counting argument has beyond the 8 it needs: m n_known + (m - 1) n_constant - 8.
 
     Written for any pattern of sharing: five intrinsics of each of m views less the number of values that are
@@ -90,8 +93,8 @@ def spare_equations(assumed: Assumptions, registered: B8) -> int:
     """
     unknown = 0
     for column in range(5):
-        open_ = registered & ~np.isfinite(assumed.std[:, column])
-        unknown += len(np.unique(assumed.shared[open_, column]))
+        open_ = registered & ~np.isfinite(prior.std[:, column])
+        unknown += len(np.unique(prior.shared[open_, column]))
     return 5 * int(registered.sum()) - unknown - NEEDED_EQUATIONS
 
 
@@ -137,12 +140,14 @@ class _Problem:
             self,
             cameras=replace(fit.cameras, shared=shared, intrinsics=intrinsics),
             X=fit.X,
-            prior=IntrinsicsPrior(intrinsics, std),
+            prior=IntrinsicsPrior.unshared(intrinsics, std),
             sigma_px=max(fit.sigma_px, 1e-6),
         )
 
 
-def _core_problem(reconstruction: Reconstruction, upgrade: Upgrade, assumed: Assumptions) -> _Problem | None:
+def _core_problem(
+    reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
+) -> _Problem | None:
     """The upgraded cameras and points with some of their observations; None where hardly any is usable."""
     views = np.flatnonzero(reconstruction.registered)
     cameras, X, usable = _upgraded(reconstruction, upgrade, views)
@@ -154,14 +159,14 @@ def _core_problem(reconstruction: Reconstruction, upgrade: Upgrade, assumed: Ass
         return None
     views = views[seen]
     points, point = np.unique(t.point_index[index], return_inverse=True)
-    mean, std = assumed.mean[views].copy(), assumed.std[views].copy()
+    mean, std = prior.mean[views].copy(), prior.std[views].copy()
     mean[:, 0] = np.where(np.isfinite(mean[:, 0]), mean[:, 0], upgrade.K[views, 0, 0])
     intrinsics = np.column_stack([upgrade.K[views, 0, 0], mean[:, 1:5], np.zeros(len(views))])
     own = np.arange(len(views), dtype=np.int64)
     return _Problem(
-        MetricCameras(cameras.R[seen], cameras.t[seen], intrinsics, own, assumed.shared[views]), X[points],
+        MetricCameras(cameras.R[seen], cameras.t[seen], intrinsics, own, prior.shared[views]), X[points],
         Observations(np.searchsorted(views, t.view_index[index]), point.astype(np.int64), t.xy[index]),
-        IntrinsicsPrior(mean, std), max(reconstruction.sigma_px, 1e-3), len(index) / max(total, 1),
+        IntrinsicsPrior.unshared(mean, std), max(reconstruction.sigma_px, 1e-3), len(index) / max(total, 1),
         reconstruction.sizes[views].max(axis=1).astype(np.float64), views,
         _projective_noise(reconstruction, index),
     )  # fmt: skip
@@ -253,25 +258,25 @@ def _verdict(
         "focal_std_rel_median": float(np.median(std)),
         "focal_std_rel_free": float(np.median(own)),
         "principal_point_std_free": float(np.median(centre / problem.longest) * np.sqrt(problem.share)),
-        "turn_significance": turn_significance(cameras.R, fit.pose_covariance)
+        "rotation_significance": rotation_significance(cameras.R, fit.pose_covariance)
         / float(np.sqrt(problem.share)),
-        "spare_equations": float(spare),
+        "excess_equations": float(spare),
         "noise_px": fit.sigma_px,
-        "noise_over_projective": fit.sigma_px
+        "noise_ratio_to_projective": fit.sigma_px
         / max(problem.projective_px, NOISE_FLOOR_REL * float(np.median(problem.longest))),
     }
     undetermined = views[std >= MAX_FOCAL_STD]
     # A prior that fixes the focal does so whatever the cameras did.
     turned = (
-        evidence["turn_significance"] >= MIN_SIGNIFICANCE
-        and evidence["image_shift_beyond_roll"] >= LEAST_MOVE
+        evidence["rotation_significance"] >= MIN_ROTATION_SIGNIFICANCE
+        and evidence["infinity_shift_beyond_roll"] >= MIN_INFINITY_SHIFT
     )
     settled = bool((problem.prior.std[:, 0] < MAX_FOCAL_STD).all())
     identifiable = (
         len(views) - len(undetermined) >= max(3, (len(views) + 1) // 2)
         and spare >= 0
         and (turned or settled)
-        and evidence["noise_over_projective"] < MOST_NOISE
+        and evidence["noise_ratio_to_projective"] < MAX_NOISE_RATIO
     )
     given = _given_focal_std(problem.prior.std[:, 0])
     sentences = motion_sentences(motion, evidence, identifiable=identifiable, focal_std=given)
@@ -293,7 +298,7 @@ def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:
     return np.asarray(np.where(np.isfinite(std), std, np.inf), dtype=np.float64)
 
 
-def turn_significance(R: F64, covariance: F64 | None) -> float:
+def rotation_significance(R: F64, covariance: F64 | None) -> float:
     """By how many of its standard deviations the tilt of the optical axes against each other stands out
     (rms).
 

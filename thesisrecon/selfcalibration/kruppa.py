@@ -19,26 +19,27 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.candidates import (
-    Answer,
-    conclude,
-    guarded,
-    log_focals_of,
+    Candidate,
+    as_stage_failure,
+    group_log_focals,
     require_cameras,
-    square_calibrations,
+    select_candidate,
+    square_pixel_calibrations,
 )
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
-from thesisrecon.selfcalibration.frame import UnknownIntrinsics, assumed_frame, unknown_intrinsics
-from thesisrecon.selfcalibration.pair_geometry import PairGeometry, camera_pairs
+from thesisrecon.selfcalibration.frame import SolverUnknowns, normalized_frame, solver_unknowns
+from thesisrecon.selfcalibration.pair_geometry import PairGeometry, pair_geometries
 from thesisrecon.selfcalibration.refinement import RotationCriterion
 
 _ROOT2 = np.sqrt(2.0)
 
 
 @dataclass(frozen=True)
-class KruppaMinimum:
+class KruppaFit:
     """``unknowns`` (D,), unit-free ``K`` (R, 3, 3), ``cost`` (mean squared residual of a pair) and
     ``covariance`` (D, D)."""
 
@@ -73,16 +74,16 @@ def dual_images(K: F64) -> F64:
     return np.asarray(K @ K.swapaxes(-1, -2))
 
 
-def kruppa_cost(pairs: PairGeometry, K: F64, *, scale: float) -> F64:
+def kruppa_cost(pairs: PairGeometry, K: F64, *, loss_scale: float) -> F64:
     """Mean robust cost (B,) of a pair for calibrations K (B, R, 3, 3); soft L1 that turns at ``scale``."""
     w = dual_images(K)
     squared = np.sum(kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j]) ** 2, axis=-1)
-    return np.asarray(np.mean(2.0 * scale**2 * (np.sqrt(1.0 + squared / scale**2) - 1.0), axis=1))
+    return np.asarray(np.mean(2.0 * loss_scale**2 * (np.sqrt(1.0 + squared / loss_scale**2) - 1.0), axis=1))
 
 
 def minimize_kruppa(
-    pairs: PairGeometry, unknown: UnknownIntrinsics, start: F64, *, scale: float = 0.02, noise: float = 0.01
-) -> KruppaMinimum:
+    pairs: PairGeometry, unknown: SolverUnknowns, start: F64, *, loss_scale: float = 0.02, noise: float = 0.01
+) -> KruppaFit:
     """The minimum of the Kruppa equations over all unknown intrinsics nearest to a start (D,).
 
     Soft L1 that turns at ``scale``; what is known beforehand weighs against residuals of size ``noise``.
@@ -91,19 +92,19 @@ def minimize_kruppa(
     def residuals(batch: F64) -> F64:
         w = dual_images(unknown.calibrations(batch))
         r = kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j]).reshape(len(batch), -1)
-        return np.concatenate([r, noise * unknown.deviations(batch)], axis=1)
+        return np.concatenate([r, noise * unknown.prior_residuals(batch)], axis=1)
 
     def jacobian(x: F64) -> F64:
         steps = np.diag(np.full(len(x), 1e-6))
         return np.asarray(((residuals(x + steps) - residuals(x - steps)) / 2e-6).T)
 
     found = minimize_residuals(
-        lambda x: residuals(x[None])[0], start, jacobian=jacobian, loss="soft_l1", loss_scale=scale,
+        lambda x: residuals(x[None])[0], start, jacobian=jacobian, loss="soft_l1", loss_scale=loss_scale,
         max_iterations=80, tolerance=1e-14,
     )  # fmt: skip
     data = found.residual[: 3 * len(pairs.i)]
     K = unknown.calibrations(found.x[None])[0]
-    return KruppaMinimum(found.x, K, float(np.sum(data**2) / len(pairs.i)), found.covariance)
+    return KruppaFit(found.x, K, float(np.sum(data**2) / len(pairs.i)), found.covariance)
 
 
 @dataclass(frozen=True)
@@ -121,50 +122,52 @@ class KruppaEquations:
     focal_range: tuple[float, float] = (0.2, 40.0)
     focal_steps: int = 90
     starts: int = 4
-    scale: float = 0.02
-    min_common: int = 20
-    own_matches: bool = False
+    loss_scale: float = 0.02
+    min_common_points: int = 20
+    refit_pairs: bool = False
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    @guarded
+    @as_stage_failure
     def calibrate(
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
         """Upgrade by the Kruppa equations; ``StageFailure`` below three cameras, without pairs, and where no
         answer puts the scene in front of the cameras."""
         require_cameras(reconstruction)
-        frame = assumed_frame(reconstruction, assumed)
-        pairs = camera_pairs(frame, reconstruction, min_common=self.min_common, refine=self.own_matches)
-        require_pairs(pairs, self.min_common)
-        unknown = unknown_intrinsics(frame, assumed)
+        frame = normalized_frame(reconstruction, prior)
+        pairs = pair_geometries(frame, reconstruction, min_common_points=self.min_common_points, refine=self.refit_pairs)
+        require_pairs(pairs, self.min_common_points)
+        unknown = solver_unknowns(frame, prior)
         answers = []
         for log_f in self._scan(pairs, len(frame.views)):
             start = unknown.start(np.full((1, len(frame.views)), log_f))[0]
-            found = minimize_kruppa(pairs, unknown, start, scale=self.scale)
-            plane, cost = planes_for_focals(frame, self.criterion, log_focals_of(frame, found.K))
+            found = minimize_kruppa(pairs, unknown, start, loss_scale=self.loss_scale)
+            plane, cost = planes_for_focals(frame, self.criterion, group_log_focals(frame, found.K))
             K_std = unknown.calibration_std(found.unknowns, found.covariance)
-            answers.append(Answer(plane, found.K, cost, "Kruppa equations", K_std))
-        return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)
+            answers.append(Candidate(plane, found.K, cost, "Kruppa equations", K_std))
+        return select_candidate(
+            frame, reconstruction, self.criterion, answers, max_candidates=1, min_in_front_ratio=0.5
+        )
 
     def _scan(self, pairs: PairGeometry, n: int) -> list[float]:
         """The best local minima of one common focal; logarithms."""
         grid = log_grid(self.focal_range, self.focal_steps)
-        K = square_calibrations(np.repeat(grid[:, None], n, axis=1))
-        cost = kruppa_cost(pairs, K, scale=self.scale)
+        K = square_pixel_calibrations(np.repeat(grid[:, None], n, axis=1))
+        cost = kruppa_cost(pairs, K, loss_scale=self.loss_scale)
         padded = np.pad(cost, 1, constant_values=np.inf)
         minima = np.flatnonzero((cost <= padded[:-2]) & (cost <= padded[2:]))
         return [float(grid[k]) for k in minima[np.argsort(cost[minima], kind="stable")][: self.starts]]
 
 
-def require_pairs(pairs: PairGeometry, min_common: int) -> None:
+def require_pairs(pairs: PairGeometry, min_common_points: int) -> None:
     """``StageFailure`` below two pairs of cameras."""
     if len(pairs.i) < 2:
         raise StageFailure(
             "focal lengths from fundamental matrices need at least 2 pairs of photographs",
-            f"{counted(len(pairs.i), 'pair')} with {min_common} points or more in common",
+            f"{counted(len(pairs.i), 'pair')} with {min_common_points} points or more in common",
             "add photographs with more overlap",
         )

@@ -19,22 +19,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.records import Assumptions, Reconstruction, SelfCalibration
+from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.candidates import (
     FOCAL_LIMITS,
-    Answer,
-    answers_from_theta,
-    conclude,
-    focals_of_groups,
-    guarded,
+    Candidate,
+    as_stage_failure,
+    candidates_from_parameters,
+    group_focals_from_planes,
     require_cameras,
+    select_candidate,
 )
 from thesisrecon.selfcalibration.frame import (
     ReferenceFrame,
-    UnknownIntrinsics,
-    assumed_frame,
-    unknown_intrinsics,
+    SolverUnknowns,
+    normalized_frame,
+    solver_unknowns,
 )
 from thesisrecon.selfcalibration.refinement import RotationCriterion
 
@@ -128,18 +129,18 @@ class LinearQuadric:
     normalising_focal: float = 1.67
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    @guarded
+    @as_stage_failure
     def calibrate(
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
         """Upgrade by the quadric; ``StageFailure`` below three cameras and where no answer puts the scene in
         front of the cameras."""
         require_cameras(reconstruction)
-        frame = assumed_frame(reconstruction, assumed)
+        frame = normalized_frame(reconstruction, prior)
         p, log_f = _with_cameras(frame, *quadric_hypotheses(frame, np.array([self.normalising_focal])))
         found = _conclude_best(frame, reconstruction, self.criterion, p, log_f)
         # What pulls the answer is no noise: nothing here tells how far off it is.
@@ -162,17 +163,17 @@ class ScannedQuadric:
     repeats: int = 30
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    @guarded
+    @as_stage_failure
     def calibrate(
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
         """As :meth:`LinearQuadric.calibrate`."""
         require_cameras(reconstruction)
-        frame = assumed_frame(reconstruction, assumed)
+        frame = normalized_frame(reconstruction, prior)
         focals = np.geomspace(*self.focal_range, self.focal_steps)
         p, log_f = _with_cameras(frame, *quadric_hypotheses(frame, focals))
         best = int(np.nan_to_num(self.criterion.cost(frame, p, log_f), nan=np.inf).argmin()) if len(p) else 0
@@ -189,16 +190,16 @@ class ScannedQuadric:
 
 
 def _with_cameras(frame: ReferenceFrame, p: F64, f_reference: F64) -> tuple[F64, F64]:
-    return p, focals_of_groups(frame, p, f_reference)
+    return p, group_focals_from_planes(frame, p, f_reference)
 
 
 def _conclude_best(
     frame: ReferenceFrame, reconstruction: Reconstruction, criterion: RotationCriterion, p: F64, log_f: F64
 ) -> SelfCalibration:
-    answers = answers_from_theta(
+    answers = candidates_from_parameters(
         frame, np.concatenate([p, log_f], axis=1), criterion.cost(frame, p, log_f), "linear quadric"
     )
-    return conclude(frame, reconstruction, criterion, answers, kept=1, min_positive=0.5)
+    return select_candidate(frame, reconstruction, criterion, answers, max_candidates=1, min_in_front_ratio=0.5)
 
 
 _UPPER = np.triu_indices(3)
@@ -209,7 +210,7 @@ PASSES = 6
 
 
 @dataclass(frozen=True)
-class QuadricMinimum:
+class QuadricFit:
     """``plane`` (3,) p of the plane at infinity (p, 1), ``unknowns`` (D,), unit-free ``K`` (R, 3, 3), the
     ``cost`` (mean squared residual of a camera), the ``noise`` of one residual entry, ``covariance``
     (3 + D, 3 + D) and what it means for the entries of K, ``K_std`` (R, 3, 3)."""
@@ -241,8 +242,8 @@ def _unit(conic: F64) -> F64:
 
 
 def minimize_quadric(
-    frame: ReferenceFrame, unknown: UnknownIntrinsics, plane: F64, log_f: F64, *, loss_scale: float = 0.05
-) -> QuadricMinimum:
+    frame: ReferenceFrame, unknown: SolverUnknowns, plane: F64, log_f: F64, *, loss_scale: float = 0.05
+) -> QuadricFit:
     """The nearest minimum of the criterion from a plane at infinity (3,) and log focals (R,).
 
     Huber's loss turns at ``loss_scale``, so that a camera that bad matches made wrong does not pull the rest.
@@ -250,7 +251,7 @@ def minimize_quadric(
     first pass supposes 1 %, each further one takes what the last one found until that no longer falls.
     """
     # Both sides also come together where all focals go to 0, which must cost more than the noise.
-    unknown = unknown.with_weak_focals()
+    unknown = unknown.with_focal_prior()
     theta, noise = np.concatenate([plane, unknown.start(log_f[None])[0]]), 0.01
     for _ in range(PASSES):
         supposed = noise
@@ -259,17 +260,17 @@ def minimize_quadric(
             break
     K = unknown.calibrations(theta[None, 3:])[0]
     K_std = unknown.calibration_std(theta[3:], covariance[3:, 3:])
-    return QuadricMinimum(theta[:3], theta[3:], K, cost, noise, covariance, K_std)
+    return QuadricFit(theta[:3], theta[3:], K, cost, noise, covariance, K_std)
 
 
 def _minimize(
-    frame: ReferenceFrame, unknown: UnknownIntrinsics, theta: F64, noise: float, loss_scale: float
+    frame: ReferenceFrame, unknown: SolverUnknowns, theta: F64, noise: float, loss_scale: float
 ) -> tuple[F64, float, F64, float]:
     def residuals(batch: F64) -> F64:
         K = unknown.calibrations(batch[:, 3:])
         data = dual_image_residuals(frame.A, frame.a, K, K[:, frame.reference], batch[:, :3])
         return np.concatenate(
-            [data.reshape(len(batch), -1), noise * unknown.deviations(batch[:, 3:])], axis=1
+            [data.reshape(len(batch), -1), noise * unknown.prior_residuals(batch[:, 3:])], axis=1
         )
 
     def jacobian(x: F64) -> F64:
@@ -306,25 +307,27 @@ class NonlinearQuadric:
     loss_scale: float = 0.05
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    @guarded
+    @as_stage_failure
     def calibrate(
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
         """Upgrade by the quadric; ``StageFailure`` below three cameras and where no answer puts the scene in
         front of the cameras."""
         require_cameras(reconstruction)
-        frame = assumed_frame(reconstruction, assumed)
-        unknown = unknown_intrinsics(frame, assumed)
+        frame = normalized_frame(reconstruction, prior)
+        unknown = solver_unknowns(frame, prior)
         p, f = quadric_hypotheses(frame, np.geomspace(*self.focal_range, self.focal_steps))
-        log_f = focals_of_groups(frame, p, f)
+        log_f = group_focals_from_planes(frame, p, f)
         cost = self.criterion.cost(frame, p, log_f)
         best = np.argsort(cost, kind="stable")[: self.starts]
         answers = []
         for b in best[np.isfinite(cost[best])]:
             found = minimize_quadric(frame, unknown, p[b], log_f[b][frame.group], loss_scale=self.loss_scale)
-            answers.append(Answer(found.plane, found.K, found.cost, "nonlinear quadric", found.K_std))
-        return conclude(frame, reconstruction, self.criterion, answers, kept=1, min_positive=0.5)
+            answers.append(Candidate(found.plane, found.K, found.cost, "nonlinear quadric", found.K_std))
+        return select_candidate(
+            frame, reconstruction, self.criterion, answers, max_candidates=1, min_in_front_ratio=0.5
+        )

@@ -9,16 +9,27 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.records import Assumptions, Image, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration.candidates import Answer, conclude, guarded, require_cameras
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.records import Image, Reconstruction, SelfCalibration
+from thesisrecon.selfcalibration.candidates import (
+    Candidate,
+    as_stage_failure,
+    require_cameras,
+    select_candidate,
+)
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, PlaneCandidates, ProjectiveScene
 from thesisrecon.selfcalibration.frame import (
     ReferenceFrame,
-    UnknownIntrinsics,
-    assumed_frame,
-    unknown_intrinsics,
+    SolverUnknowns,
+    normalized_frame,
+    solver_unknowns,
 )
-from thesisrecon.selfcalibration.hartley import HartleyLinear, PollefeysQuadric, Strata, conic_knowledge
+from thesisrecon.selfcalibration.hartley import (
+    CalibrationProblem,
+    FixedPlaneQuadric,
+    LinearAbsoluteConic,
+    conic_constraints,
+)
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.quadric import dual_image_residuals, minimize_quadric
@@ -38,10 +49,10 @@ class Stratified:
     """
 
     plane: CheiralitySearch | ModulusConstraint | ParallelLines = field(default_factory=CheiralitySearch)
-    calibration: HartleyLinear | PollefeysQuadric = field(default_factory=HartleyLinear)
-    refined: bool = True
-    kept: int = 1
-    min_positive: float = 0.5
+    calibration: LinearAbsoluteConic | FixedPlaneQuadric = field(default_factory=LinearAbsoluteConic)
+    refine: bool = True
+    max_candidates: int = 1
+    min_in_front_ratio: float = 0.5
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
     def with_images(self, photographs: Iterable[Image]) -> Stratified:
@@ -50,12 +61,12 @@ class Stratified:
             return self
         return replace(self, plane=self.plane.with_images(photographs))
 
-    @guarded
+    @as_stage_failure
     def calibrate(
         self,
         reconstruction: Reconstruction,
         *,
-        assumed: Assumptions,
+        prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> SelfCalibration:
         """Upgrade a projective reconstruction of at least three cameras.
@@ -63,29 +74,29 @@ class Stratified:
         ``StageFailure`` where no plane is found, and where no plane that was found has a calibration; the
         reason is that of the best plane.
         """
-        scene = projective_scene(reconstruction, assumed)
+        scene = projective_scene(reconstruction, prior)
         found = self.plane.locate(scene, rng)
-        unknown = unknown_intrinsics(scene.frame, assumed)
+        unknown = solver_unknowns(scene.frame, prior)
         answers = self._answers(scene, found, unknown)
-        return conclude(
+        return select_candidate(
             scene.frame, reconstruction, self.criterion, answers,
-            kept=self.kept, min_positive=self.min_positive,
+            max_candidates=self.max_candidates, min_in_front_ratio=self.min_in_front_ratio,
         )  # fmt: skip
 
     def locate(
-        self, reconstruction: Reconstruction, *, assumed: Assumptions, rng: np.random.Generator
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
     ) -> F64:
         """The best plane at infinity alone, unit (4,) in the projective frame; ``StageFailure`` as above."""
-        scene = projective_scene(reconstruction, assumed)
+        scene = projective_scene(reconstruction, prior)
         p = self.plane.locate(scene, rng).planes[0]
         plane = np.append(p, 1.0) @ scene.frame.reference_from_projective
         return np.asarray(plane / np.linalg.norm(plane))
 
     def _answers(
-        self, scene: ProjectiveScene, found: PlaneCandidates, unknown: UnknownIntrinsics
-    ) -> list[Answer]:
-        strata = Strata(scene.frame, scene.knowledge, unknown, found.orthogonal)
-        answers: list[Answer] = []
+        self, scene: ProjectiveScene, found: PlaneCandidates, unknown: SolverUnknowns
+    ) -> list[Candidate]:
+        strata = CalibrationProblem(scene.frame, scene.knowledge, unknown, found.orthogonal)
+        answers: list[Candidate] = []
         refusals: list[StageFailure] = []
         for plane in found.planes:
             try:
@@ -96,26 +107,26 @@ class Stratified:
             answers.append(self._answer(scene.frame, plane, K))
         if not answers:
             raise refusals[0]
-        if not self.refined:
+        if not self.refine:
             return answers
-        best = sorted(answers, key=lambda answer: answer.cost)[: max(self.kept, REFINED)]
+        best = sorted(answers, key=lambda answer: answer.cost)[: max(self.max_candidates, REFINED)]
         return [refined_answer(scene.frame, unknown, answer) for answer in best]
 
-    def _answer(self, frame: ReferenceFrame, plane: F64, K: F64) -> Answer:
+    def _answer(self, frame: ReferenceFrame, plane: F64, K: F64) -> Candidate:
         r = dual_image_residuals(frame.A, frame.a, K[None], K[None, frame.reference], plane[None])
         name = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
-        return Answer(plane, K, float(np.mean(np.sum(r**2, axis=-1))), name)
+        return Candidate(plane, K, float(np.mean(np.sum(r**2, axis=-1))), name)
 
 
-def refined_answer(frame: ReferenceFrame, unknown: UnknownIntrinsics, answer: Answer) -> Answer:
+def refined_answer(frame: ReferenceFrame, unknown: SolverUnknowns, answer: Candidate) -> Candidate:
     """The nearest minimum of the nonlinear criterion over plane and intrinsics."""
     log_f = 0.5 * np.log(answer.K[:, 0, 0] * answer.K[:, 1, 1])
     least = minimize_quadric(frame, unknown, answer.plane, log_f)
-    return Answer(least.plane, least.K, least.cost, f"{answer.method}, refined", least.K_std)
+    return Candidate(least.plane, least.K, least.cost, f"{answer.method}, refined", least.K_std)
 
 
-def projective_scene(reconstruction: Reconstruction, assumed: Assumptions) -> ProjectiveScene:
+def projective_scene(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> ProjectiveScene:
     """The scene as the ways to the plane see it; ``StageFailure`` below three registered cameras."""
     require_cameras(reconstruction)
-    frame = assumed_frame(reconstruction, assumed)
-    return ProjectiveScene(reconstruction, frame, conic_knowledge(frame, assumed))
+    frame = normalized_frame(reconstruction, prior)
+    return ProjectiveScene(reconstruction, frame, conic_constraints(frame, prior))

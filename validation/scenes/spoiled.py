@@ -9,19 +9,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric.model import MetricModel, camera_rows
 from thesisrecon.numerics.metric_cameras import MetricCameras
-from thesisrecon.records import Assumptions, Reconstruction
+from thesisrecon.records import Reconstruction
 
 
-def model_from_reconstruction(found: Reconstruction, assumed: Assumptions) -> MetricModel:
+def model_from_reconstruction(found: Reconstruction, prior: IntrinsicsPrior) -> MetricModel:
     """The working model of a metric reconstruction."""
     assert found.K is not None
     assert found.distortion is not None
     views = found.registered
     K = np.where(views[:, None, None], found.K, np.eye(3))
     Q = np.linalg.inv(K) @ found.P
-    group, shared = camera_rows(assumed)
+    group, shared = camera_rows(prior)
     rows = np.zeros((len(shared), 8))
     for g in range(len(rows)):
         mine = np.flatnonzero((group == g) & views)

@@ -21,18 +21,10 @@ import numpy as np
 from thesisrecon.arrays import B8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import assume
+from thesisrecon.intrinsics import prior_for
 from thesisrecon.io.files import write_text
 from thesisrecon.records import MetricResult
 from thesisrecon.runtime.run import stream
-from validation.studies.calibration_parts import (
-    MODES,
-    Cameras,
-    OwnRows,
-    keep_observations,
-    named,
-    one_camera,
-)
 from validation.metrics.intervals import (
     LEVEL,
     IntervalScores,
@@ -42,6 +34,14 @@ from validation.metrics.intervals import (
 )
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
+from validation.studies.calibration_parts import (
+    MODES,
+    Cameras,
+    OwnRows,
+    keep_observations,
+    named,
+    one_camera,
+)
 
 COVERAGE = 0.92, 0.98
 ZOOM = 0.3
@@ -71,12 +71,12 @@ def _solve(
     )
     config = PipelineConfig()
     config = replace(config, intrinsics=replace(config.intrinsics, cameras=cameras))
-    assumed = assume(projective, config.intrinsics)
+    prior = prior_for(projective, config.intrinsics)
     try:
         calibration = config.selfcalibration.calibrate(
-            projective, assumed=assumed, rng=stream(number, "selfcalibration")
+            projective, prior=prior, rng=stream(number, "selfcalibration")
         )
-        result = config.metric.refine(projective, calibration, assumed=assumed, rng=stream(number, "metric"))
+        result = config.metric.refine(projective, calibration, prior=prior, rng=stream(number, "metric"))
     except StageFailure:
         return None
     return one_camera(interval_scores(result, scene.K), cameras), result

@@ -13,8 +13,6 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.records import MetricResult, Reconstruction, RunResult, Tracks
-from validation.studies.reconstruction import OURS
-from validation.studies.subsets import Matched, solve, take_views
 from validation.metrics.cameras import TrueCameras
 from validation.metrics.intervals import (
     LEVEL,
@@ -24,6 +22,8 @@ from validation.metrics.intervals import (
     join_scores,
 )
 from validation.metrics.record import Metric
+from validation.studies.reconstruction import OURS
+from validation.studies.subsets import Matched, solve, take_views
 
 Cameras = Literal["shared", "per-image"]
 MODES: tuple[Cameras, ...] = ("shared", "per-image")
@@ -48,7 +48,7 @@ def check_parts(name: str, run: RunResult | None, truth: TrueCameras) -> list[li
     tables = [check_subsets(f"{name}, subsets, {cameras}", matched, truth.K, cameras) for cameras in MODES]
     weak = list(weak_views(matched, run.metric.reconstruction))
     for alike in (True, False):
-        title = f"{name}, per-image, one weak photograph, {'alike' if alike else 'nothing assumed alike'}"
+        title = f"{name}, per-image, one weak photograph, {'alike' if alike else 'nothing prior alike'}"
         tables.append(check_weak(title, weak, truth.K, alike=alike))
     return tables
 
@@ -113,7 +113,7 @@ def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
 
 
 def _try(matched: Matched, cameras: Cameras, seed: int, *, alike: bool = True) -> MetricResult | None:
-    wish = replace(PipelineConfig().intrinsics, cameras=cameras, alike=alike)
+    wish = replace(PipelineConfig().intrinsics, cameras=cameras, common_prior=alike)
     result, failures, _ = solve(matched, PipelineConfig(intrinsics=wish), seed=seed, first=0)
     if result is None:
         print(f"{matched.name}, seed {seed}: {failures[0]}", flush=True)

@@ -21,9 +21,9 @@ from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
-from thesisrecon.projective.initial_pair import require_parallax
+from thesisrecon.projective.initial_pair import require_pair_with_parallax
 from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.metrics.record import Metric, markdown_table
@@ -31,7 +31,7 @@ from validation.scenes.critical import Motion, Sequence, make_sequence, projecti
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur
 
 OURS = "ours"
-CALIBRATOR = HypothesesAndRefinement(search=None, subsets=0, focal_steps=17)
+CALIBRATOR = HypothesesAndRefinement(search=None, camera_subsets=0, focal_steps=17)
 """The default with fewer hypotheses: the verdict is what is measured, and 6000 trials must end."""
 ZOOM = 0.3
 WRONG_FOCAL = 0.15
@@ -55,10 +55,10 @@ def run_trial(motion: Motion, seed: int, *, by_hand: bool, zoom: float) -> Trial
     scene = make_sequence(motion, rng, by_hand=by_hand, zoom=zoom)
     try:
         if motion in WITHOUT_PARALLAX:
-            require_parallax(_neighbours(scene, rng))
+            require_pair_with_parallax(_neighbours(scene, rng))
         reconstruction = projective_estimate(scene, rng)
-        wish = IntrinsicsAssumption(cameras="per-image" if zoom else "shared")
-        verdict = CALIBRATOR.calibrate(reconstruction, assumed=assume(reconstruction, wish), rng=rng).verdict
+        wish = IntrinsicsOptions(cameras="per-image" if zoom else "shared")
+        verdict = CALIBRATOR.calibrate(reconstruction, prior=prior_for(reconstruction, wish), rng=rng).verdict
     except StageFailure as failure:
         said = [name.value for name in Motion if name.value in str(failure) and name is not Motion.GENERAL]
         return Trial(" or ".join(said) or "refused without a name", False, np.nan)
@@ -127,9 +127,9 @@ def check_motion(
 
 def dinosaur_verdict(reconstruction: Reconstruction, *, cameras: str = "shared") -> IdentifiabilityReport:
     """The verdict on projective cameras of the dinosaur; ``StageFailure`` where there is none."""
-    wish = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")
+    wish = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
     answer = HypothesesAndRefinement().calibrate(
-        reconstruction, assumed=assume(reconstruction, wish), rng=np.random.default_rng(0)
+        reconstruction, prior=prior_for(reconstruction, wish), rng=np.random.default_rng(0)
     )
     assert answer.verdict is not None
     return answer.verdict

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.intrinsics import assumptions_of_views
+from thesisrecon.intrinsics import prior_from_options
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import MetricResult, RunResult
 from thesisrecon.runtime.run import stream
@@ -54,7 +54,7 @@ def time_ours(images: Path, work: Path) -> dict[str, float]:
 def _stages(matched: RunResult) -> tuple[dict[str, float], MetricResult]:
     config, n, tracks = PipelineConfig(), len(matched.images), matched.tracks
     assert tracks is not None
-    assumed = assumptions_of_views(
+    prior = prior_from_options(
         config.intrinsics, [image.size for image in matched.images], np.full(n, np.nan), np.ones(n)
     )
     sizes = np.array([image.size for image in matched.images], dtype=np.int64)
@@ -72,10 +72,10 @@ def _stages(matched: RunResult) -> tuple[dict[str, float], MetricResult]:
     )
     calibration = clocked(
         "selfcalibration",
-        lambda rng: config.selfcalibration.calibrate(projective, assumed=assumed, rng=rng),
+        lambda rng: config.selfcalibration.calibrate(projective, prior=prior, rng=rng),
     )
     result = clocked(
-        "metric", lambda rng: config.metric.refine(projective, calibration, assumed=assumed, rng=rng)
+        "metric", lambda rng: config.metric.refine(projective, calibration, prior=prior, rng=rng)
     )
     return seconds, result
 

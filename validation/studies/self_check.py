@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 
 import thesisrecon
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for
 from thesisrecon.metric.adjustment import Adjustment
 from thesisrecon.metric.checks import self_check
 from thesisrecon.metric.model import MetricModel, retriangulate
 from thesisrecon.metric.shared_camera import check_shared_cameras, contradicted_focals
-from thesisrecon.records import Assumptions, IntrinsicInterval, RunResult, SelfCalibration
+from thesisrecon.records import IntrinsicInterval, RunResult, SelfCalibration
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import load_fixture_scene, load_real_scene
 from validation.scenes.spoiled import SPOILINGS, centres, model_from_reconstruction
@@ -96,23 +96,23 @@ def judge(
     return Outcome(is_wrong(settled, right), is_doubted(settled, calibration, adjustment))
 
 
-def spoiled_outcomes(result: RunResult, assumed: Assumptions, seeds: int) -> dict[str, list[Outcome | None]]:
+def spoiled_outcomes(result: RunResult, prior: IntrinsicsPrior, seeds: int) -> dict[str, list[Outcome | None]]:
     """Outcomes by kind of one scene."""
     assert result.metric is not None
     assert result.calibration is not None
-    adjustment = Adjustment(assumed, 0.02, 0.02)
-    right = settle(model_from_reconstruction(result.metric.reconstruction, assumed), adjustment)
+    adjustment = Adjustment(prior, 0.02, 0.02)
+    right = settle(model_from_reconstruction(result.metric.reconstruction, prior), adjustment)
     assert right is not None
     found: dict[str, list[Outcome | None]] = defaultdict(list)
     for number, spoiling in enumerate(SPOILINGS):
         for seed in range(seeds):
             bad = spoiling.spoil(right, np.random.default_rng([seed, number]))
             found[spoiling.name].append(judge(bad, right, result.calibration, adjustment))
-    held, told = _focal_held(right, assumed)
+    held, told = _focal_held(right, prior)
     found["focal held 10 % off"].append(judge(held, right, result.calibration, Adjustment(told, 0.02, 0.02)))
     found["right, as it is"].append(judge(right, right, result.calibration, adjustment))
     # Few views with a focal of their own each leave these open, which their intervals say and not the rest.
-    one_camera = len(np.unique(assumed.shared[:, 0])) == 1
+    one_camera = len(np.unique(prior.shared[:, 0])) == 1
     for seed in range(seeds if one_camera else 0):
         rng = np.random.default_rng([seed, 99])
         found["right, some views and points"].append(
@@ -121,14 +121,14 @@ def spoiled_outcomes(result: RunResult, assumed: Assumptions, seeds: int) -> dic
     return found
 
 
-def _focal_held(model: MetricModel, assumed: Assumptions) -> tuple[MetricModel, Assumptions]:
+def _focal_held(model: MetricModel, prior: IntrinsicsPrior) -> tuple[MetricModel, IntrinsicsPrior]:
     intrinsics = model.cameras.intrinsics.copy()
     intrinsics[:, 0] *= HELD_OFF
-    mean, std = assumed.mean.copy(), assumed.std.copy()
+    mean, std = prior.mean.copy(), prior.std.copy()
     mean[:, 0], std[:, 0] = intrinsics[model.cameras.group, 0], 0.0
     return (
         model.with_cameras(replace(model.cameras, intrinsics=intrinsics)),
-        replace(assumed, mean=mean, std=std),
+        replace(prior, mean=mean, std=std),
     )
 
 
@@ -161,9 +161,9 @@ def main() -> int:
         result = thesisrecon.reconstruct(scene.image_paths[0].parent, wishes.runs / name, until="metric")
         assert result.metric is not None
         for cameras in ("shared", "per-image"):
-            wish = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")
-            assumed = assume(result.metric.reconstruction, wish)
-            for kind, outcomes in spoiled_outcomes(result, assumed, wishes.seeds).items():
+            wish = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
+            prior = prior_for(result.metric.reconstruction, wish)
+            for kind, outcomes in spoiled_outcomes(result, prior, wishes.seeds).items():
                 table[kind] += outcomes
         print(name, "done", flush=True)
     print("\n| made | models | nothing left | wrong | of these doubted | right | of these doubted |")

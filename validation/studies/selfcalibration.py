@@ -24,29 +24,29 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config import KINDS, SelfCalibrator
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsAssumption, assumptions_of_views
+from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_from_options
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.records import Assumptions, Reconstruction
-from thesisrecon.selfcalibration.hartley import PollefeysQuadric
+from thesisrecon.records import Reconstruction
+from thesisrecon.selfcalibration.hartley import FixedPlaneQuadric
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.stratified import Stratified
-from validation.studies.epipolar_cube import OFF_FACE
 from validation.metrics.focal_bound import focal_bound
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.cloud import make_cloud
 from validation.scenes.rigs import Rig, cube_rig, noisy_tracks, projective_from_truth, zoomed
+from validation.studies.epipolar_cube import OFF_FACE
 
 WITH_BUNDLE = "the whole, with the metric stage"
 BOUND = "the bound"
 VARIANTS: dict[str, SelfCalibrator] = {
     **{kind: variant() for kind, variant in KINDS["selfcalibration"].items()},
-    "stratified, closed form": Stratified(refined=False),
-    "stratified, Pollefeys' K, closed form": Stratified(calibration=PollefeysQuadric(), refined=False),
+    "stratified, closed form": Stratified(refine=False),
+    "stratified, Pollefeys' K, closed form": Stratified(calibration=FixedPlaneQuadric(), refine=False),
     "modulus constraint": Stratified(ModulusConstraint()),
-    "modulus constraint, closed form": Stratified(ModulusConstraint(), refined=False),
+    "modulus constraint, closed form": Stratified(ModulusConstraint(), refine=False),
     "modulus constraint, Pollefeys' K, closed form": Stratified(
-        ModulusConstraint(), PollefeysQuadric(), refined=False
+        ModulusConstraint(), FixedPlaneQuadric(), refine=False
     ),
 }
 """Every kind of the table, and the stratified one (by default Hartley's search, then his K) in its parts."""
@@ -111,15 +111,15 @@ def make_rig(cell: Cell, rng: np.random.Generator) -> Rig:
     return zoomed(rig, np.exp(rng.uniform(-ZOOM, ZOOM, len(rig.K)))) if cell.mode == "zooming" else rig
 
 
-def assumptions(rig: Rig, mode: str) -> Assumptions:
+def assumptions(rig: Rig, mode: str) -> IntrinsicsPrior:
     """Square pixels, a principal point near the middle, no distortion; the focal constant or free."""
-    wish = IntrinsicsAssumption(
+    wish = IntrinsicsOptions(
         focal="constant" if mode == "constant" else "free",
         principal_point_std_rel=PRINCIPAL_STD,
         k1="known",
     )
     n = len(rig.K)
-    return assumptions_of_views(wish, [rig.size] * n, np.full(n, np.nan), np.ones(n))
+    return prior_from_options(wish, [rig.size] * n, np.full(n, np.nan), np.ones(n))
 
 
 def run_cell(cell: Cell, methods: Sequence[str], seeds: Iterable[int]) -> list[Trial]:
@@ -127,12 +127,12 @@ def run_cell(cell: Cell, methods: Sequence[str], seeds: Iterable[int]) -> list[T
     trials = []
     for seed in seeds:
         rig, projective = draw_cell(cell, seed)
-        assumed = assumptions(rig, cell.mode)
+        prior = assumptions(rig, cell.mode)
         for method in methods:
             if method == BOUND:
                 trials.append(_bound(cell, seed, rig))
             else:
-                trials.append(_run(cell, seed, method, rig, projective, assumed))
+                trials.append(_run(cell, seed, method, rig, projective, prior))
     return trials
 
 
@@ -151,12 +151,12 @@ def draw_cell(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
 
 
 def _run(
-    cell: Cell, seed: int, method: str, rig: Rig, projective: Reconstruction, assumed: Assumptions
+    cell: Cell, seed: int, method: str, rig: Rig, projective: Reconstruction, prior: IntrinsicsPrior
 ) -> Trial:
     start = time.perf_counter()
     head = (cell.scene, cell.mode, cell.sigma_px, cell.views, seed, method)
     try:
-        K, sure = focals_of(method, projective, assumed)
+        K, sure = focals_of(method, projective, prior)
     except StageFailure as failure:
         return Trial(*head, np.nan, np.nan, False, time.perf_counter() - start, failure.reason)
     seconds = time.perf_counter() - start
@@ -176,15 +176,15 @@ def _bound(cell: Cell, seed: int, rig: Rig) -> Trial:
     return Trial(*head, 0.6745 * float(np.median(judged)), 0.6745 * float(judged.max()), True, 0.0)
 
 
-def focals_of(method: str, projective: Reconstruction, assumed: Assumptions) -> tuple[F64, bool]:
+def focals_of(method: str, projective: Reconstruction, prior: IntrinsicsPrior) -> tuple[F64, bool]:
     """K (V, 3, 3) by a kind of the table or by the whole, and whether the method stands by it."""
     rng = np.random.default_rng(0)
     if method == WITH_BUNDLE:
-        calibration = HypothesesAndRefinement().calibrate(projective, assumed=assumed, rng=rng)
-        result = MetricRefinement().refine(projective, calibration, assumed=assumed, rng=rng)
+        calibration = HypothesesAndRefinement().calibrate(projective, prior=prior, rng=rng)
+        result = MetricRefinement().refine(projective, calibration, prior=prior, rng=rng)
         assert result.reconstruction.K is not None
         return result.reconstruction.K, result.trusted
-    answer = VARIANTS[method].calibrate(projective, assumed=assumed, rng=rng)
+    answer = VARIANTS[method].calibrate(projective, prior=prior, rng=rng)
     return answer.K, answer.identifiable
 
 

@@ -18,25 +18,25 @@ import numpy as np
 import thesisrecon
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsAssumption, assume
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.records import Image, Reconstruction
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
-from thesisrecon.selfcalibration.hartley import HartleyLinear, PollefeysQuadric
+from thesisrecon.selfcalibration.hartley import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.stratified import Stratified
 from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene
 
 PLANES: Mapping[str, CheiralitySearch | ModulusConstraint | ParallelLines] = {
-    "cheirality, grid alone": CheiralitySearch(descent=0),
+    "cheirality, grid alone": CheiralitySearch(refine_iterations=0),
     "cheirality search": CheiralitySearch(),
     "modulus constraint": ModulusConstraint(),
     "parallel lines": ParallelLines(),
-    "parallel lines, right angles": ParallelLines(right_angles=True),
+    "parallel lines, right angles": ParallelLines(orthogonal_directions=True),
 }
-WAYS: dict[str, HartleyLinear | PollefeysQuadric] = {
-    "Hartley": HartleyLinear(),
-    "Pollefeys": PollefeysQuadric(),
+WAYS: dict[str, LinearAbsoluteConic | FixedPlaneQuadric] = {
+    "Hartley": LinearAbsoluteConic(),
+    "Pollefeys": FixedPlaneQuadric(),
 }
 
 
@@ -58,17 +58,17 @@ def measure(
     projective: Reconstruction, photographs: Sequence[Image], K: F64, *, cameras: str = "shared"
 ) -> Iterator[Row]:
     """Every method on one set, against the calibrations K (V, 3, 3) at working size."""
-    wish = IntrinsicsAssumption(cameras="per-image" if cameras == "per-image" else "shared")
-    assumed = assume(projective, wish)
+    wish = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
+    prior = prior_for(projective, wish)
     views = np.flatnonzero(projective.registered)
     for plane_name, plane in PLANES.items():
         for way_name, way in WAYS.items():
             for refined in (False, True):
-                variant = Stratified(plane, way, refined=refined).with_images(photographs)
+                variant = Stratified(plane, way, refine=refined).with_images(photographs)
                 start = time.perf_counter()
                 head = (plane_name, way_name, refined)
                 try:
-                    answer = variant.calibrate(projective, assumed=assumed, rng=np.random.default_rng(0))
+                    answer = variant.calibrate(projective, prior=prior, rng=np.random.default_rng(0))
                 except StageFailure as failure:
                     yield Row(*head, np.nan, np.nan, time.perf_counter() - start, failure.reason)
                     continue

@@ -22,7 +22,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsAssumption, assumptions_of_views
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.pipeline.cameras import ATTEMPTS
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import MetricResult, Tracks, TwoView
@@ -144,7 +144,7 @@ def solve(
     """
     n = len(matched.sizes)
     sizes = [(int(width), int(height)) for width, height in matched.sizes]
-    assumed = assumptions_of_views(config.intrinsics, sizes, np.full(n, np.nan), np.ones(n))
+    prior = prior_from_options(config.intrinsics, sizes, np.full(n, np.nan), np.ones(n))
     found: list[MetricResult] = []
     failures: list[str] = []
     for attempt in range(first, first + ATTEMPTS):
@@ -154,11 +154,11 @@ def solve(
                 rng=stream(seed, "projective", attempt), attempt=attempt,
             )  # fmt: skip
             calibration = config.selfcalibration.calibrate(
-                projective, assumed=assumed, rng=stream(seed, "selfcalibration", attempt)
+                projective, prior=prior, rng=stream(seed, "selfcalibration", attempt)
             )
             found.append(
                 config.metric.refine(
-                    projective, calibration, assumed=assumed, rng=stream(seed, "metric", attempt)
+                    projective, calibration, prior=prior, rng=stream(seed, "metric", attempt)
                 )
             )
         except StageFailure as failure:
@@ -187,7 +187,7 @@ def run_trial(
     subset = take_views(matched, chosen, kept)
     # Two photographs have one pair to begin with.
     first = int(rng.integers(max(min(LATEST_START, sum(pair.accepted for pair in subset.pairs)), 1)))
-    wish = IntrinsicsAssumption(cameras="shared" if mode == "shared" else "per-image")
+    wish = IntrinsicsOptions(cameras="shared" if mode == "shared" else "per-image")
     start, names = time.perf_counter(), tuple(int(view) for view in chosen)
     nothing = Trial(number, names, 0, np.nan, np.nan, (), 0, 0.0, reasons=matched.reasons)
     try:
