@@ -1,6 +1,4 @@
-"""The work of ``thesisrecon views``: pictures of the model of a finished run on the way of a camera, and
-views between photographs of which no model was made.
-"""
+"""Frames, animation and description that the commands ``render`` and ``interpolate`` write."""
 
 from __future__ import annotations
 
@@ -17,33 +15,35 @@ import PIL.ImageColor
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import OutputError, UsageError
+from thesisrecon.errors import OutputError, UsageError, counted
 from thesisrecon.io.exports import read_cameras
-from thesisrecon.io.files import is_partial, read_json, write_json, write_text
+from thesisrecon.io.files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
+from thesisrecon.io.images import read_image
 from thesisrecon.io.meshes import read_mesh
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report.page import strip_page
 from thesisrecon.runtime.executors import Workers
 from thesisrecon.settings import in_words, unknown_word
-from thesisrecon.view_interpolation import Film, named_photograph
-from thesisrecon.views.paths import interpolate, orbit, surface_points, upward
+from thesisrecon.view_interpolation import ViewSequence
+from thesisrecon.views.paths import interpolate_cameras, orbit, sample_surface, estimate_up
 from thesisrecon.views.render import Light, Shading, render
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
 PATHS, LIGHTS = ("orbit", "interpolate"), ("none", "camera", "sun")
 METHODS = {
-    "interpolation": ("thesisrecon.view_interpolation", "interpolation_film"),
-    "tensor": ("thesisrecon.view_synthesis", "tensor_film"),
+    "interpolation": ("thesisrecon.view_interpolation", "interpolated_sequence"),
+    "tensor": ("thesisrecon.view_synthesis", "trilinear_sequence"),
 }
-"""Ways to views without a model, and what makes the film of each."""
-FRAMES_BETWEEN, BETWEEN_MS = 21, 100
-"""Pictures where their number is not asked for, and how long each is shown."""
-LARGEST_PX = 8192
-MOST_FRAMES = 9999
-"""As many as the numbers of their files have room for."""
-LONG_SIDE_PX = 1000
-"""Of the pictures where no size is asked for."""
+"""Method -> module and function that returns its :class:`ViewSequence`."""
+_FRAME_MS = 100
+"""Time per frame of an animation of ``interpolate``."""
+_MAX_SIDE_PX = 8192
+_MAX_FRAMES = 9999
+"""File names have four digits."""
+_DEFAULT_SIDE_PX = 1000
+_NO_MODEL = "No surface model was built"
+"""Beginning of the warning of a run whose surface stage failed."""
 
 Progress = Callable[[str, int, int], None]
 
@@ -51,20 +51,31 @@ Progress = Callable[[str, int, int], None]
 def _check_frames(frames: int) -> None:
     if frames < 1:
         raise UsageError(f"--frames takes a whole number of at least 1; got {frames}")
-    if frames > MOST_FRAMES:
-        raise UsageError(f"--frames takes at most {MOST_FRAMES}; got {in_words(frames)}")
+    if frames > _MAX_FRAMES:
+        raise UsageError(f"--frames takes at most {_MAX_FRAMES}; got {in_words(frames)}")
 
 
 @dataclass(frozen=True)
-class ViewWishes:
-    """What pictures are wanted.
+class RenderOptions:
+    """Options of ``render``.
 
-    ``path``: "orbit" around the model, or "interpolate" from photograph to photograph. ``size`` (width,
-    height), None = the shape of the first photograph, its long side at most 1000 px. ``light``: "none" shows
-    the colours of the photographs, "camera" has a lamp at the camera, "sun" one from above. A model without
-    colours is always lit. ``background`` (red, green, blue), 0 to 255.
+    Parameters
+    ----------
+    path : {"orbit", "interpolate"}
+        Around the model, or from camera to camera.
+    frames : int
+        Number of frames.
+    size : tuple of int, optional
+        (width, height); by default that of the first image, reduced to a long side of 1000 px.
+    light : {"none", "camera", "sun"}
+        "none" shows the colours of the model; a model without colours is lit by the camera headlight.
+    background : tuple of int
+        (red, green, blue), 0 to 255.
 
-    Raises :class:`UsageError` for anything else.
+    Raises
+    ------
+    UsageError
+        For any other value.
     """
 
     path: str = "orbit"
@@ -78,81 +89,37 @@ class ViewWishes:
             if word not in words:
                 raise UsageError(unknown_word(kind, word, list(words)))
         _check_frames(self.frames)
-        if self.size is not None and not all(1 <= side <= LARGEST_PX for side in self.size):
+        if self.size is not None and not all(1 <= side <= _MAX_SIDE_PX for side in self.size):
             width, height = self.size
-            raise UsageError(f"--size takes sides of 1 to {LARGEST_PX} pixels; got {width}x{height}")
+            raise UsageError(f"--size takes sides of 1 to {_MAX_SIDE_PX} pixels; got {width}x{height}")
 
 
 @dataclass(frozen=True)
-class ViewFiles:
-    """What was written: ``frames`` in ``folder``, of ``size`` (width, height), and the ``animation``."""
+class InterpolateOptions:
+    """Options of ``interpolate``.
 
-    folder: Path
-    frames: tuple[Path, ...]
-    animation: Path
-    size: tuple[int, int]
+    Parameters
+    ----------
+    images : tuple of Path
+        Two or three different files.
+    method : {"interpolation", "tensor"}
+        A key of :data:`METHODS`.
+    frames : int
+        Number of frames.
+    seed : int
+        Random seed.
+    max_size_px : int, optional
+        Long side to which larger images are reduced.
 
-
-def size_from_text(text: str) -> tuple[int, int]:
-    """(width, height) of ``WIDTHxHEIGHT``; :class:`UsageError` for other text."""
-    found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
-    if found is None:
-        raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")
-    return int(found[1]), int(found[2])
-
-
-def color_from_text(text: str) -> tuple[int, int, int]:
-    """(red, green, blue) of a name ("white"), "#rrggbb" or "rgb(...)"; :class:`UsageError` for other text."""
-    try:
-        return PIL.ImageColor.getrgb(text.strip())[:3]
-    except ValueError:
-        raise UsageError(f"--background takes a colour as white or #20304f; got {text!r}") from None
-
-
-def write_views(
-    out: Path, folder: Path, wishes: ViewWishes, *, threads: int = 1, progress: Progress | None = None
-) -> ViewFiles:
-    """Render the model of the run in ``out`` into ``folder``.
-
-    Writes ``frame-0001.png`` and so on, an animated file named after the path, and ``frames.json`` with the
-    cameras of the frames. Frames of an earlier call that this one does not replace are removed. The files do
-    not depend on ``threads``; ``progress`` hears (stage, done, total). Raises :class:`UsageError` where the
-    run, its model or its cameras are absent, where ``folder`` holds what is not of this command, and where
-    it cannot be written.
+    Raises
+    ------
+    UsageError
+        For any other value.
     """
-    mesh, cameras = _run_of(out)
-    _claim(folder)
-    path = _cameras_on_path(mesh, list(cameras.values()), wishes)
-    # Written first: from now on the folder is known as one of this command.
-    write_json(folder / FRAMES, _description(path, wishes))
-    _remove_old(folder, len(path))
-    files = [folder / frame_name(k + 1) for k in range(len(path))]
-    shading = _shading(mesh, list(cameras.values()), wishes.light)
-    tell, done = progress or (lambda *_: None), 0
 
-    def draw(k: int) -> None:
-        view = render(mesh, path[k], shading=shading(path[k]), background=wishes.background)
-        write_frame(folder, k + 1, view.color)
-
-    def finished(_: int, __: Any) -> None:
-        nonlocal done
-        done += 1
-        # The last step is the animation.
-        tell("views", done, len(path) + 1)
-
-    Workers(threads).run(draw, [(k,) for k in range(len(path))], finished)
-    animation = write_animation(folder / f"{wishes.path}{animation_suffix()}", files)
-    finished(len(path), animation)
-    return ViewFiles(folder, tuple(files), animation, path[0].size)
-
-
-@dataclass(frozen=True)
-class BetweenWishes:
-    """What pictures are wanted of 2 or 3 ``photographs``: how many, and by which ``method``."""
-
-    photographs: tuple[Path, ...]
+    images: tuple[Path, ...]
     method: str = "interpolation"
-    frames: int = FRAMES_BETWEEN
+    frames: int = 21
     seed: int = 0
     max_size_px: int | None = None
 
@@ -160,106 +127,248 @@ class BetweenWishes:
         if self.method not in METHODS:
             raise UsageError(unknown_word("method", self.method, list(METHODS)))
         _check_frames(self.frames)
-        if len(self.photographs) not in (2, 3):
-            raise UsageError(f"views lie between 2 or 3 photographs; got {len(self.photographs)}")
-        for path in self.photographs:
+        if len(self.images) not in (2, 3):
+            raise UsageError(f"interpolate takes 2 or 3 images; got {len(self.images)}")
+        for path in self.images:
             if path.is_dir():
-                raise UsageError(f"{path} is a folder; views lie between photographs")
-        for first, second in combinations(self.photographs, 2):
+                raise UsageError(f"{path} is a folder; interpolate takes image files")
+        for first, second in combinations(self.images, 2):
             if first.is_file() and second.is_file() and first.samefile(second):
-                raise UsageError(f"{first} is given twice; give different photographs")
+                raise UsageError(f"{first} is given twice; give different images")
 
 
-def write_between(
-    folder: Path, wishes: BetweenWishes, *, threads: int = 1, progress: Progress | None = None
+@dataclass(frozen=True)
+class ViewFiles:
+    """Files that a command wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder.
+    frames : tuple of Path
+        One PNG per frame.
+    animation : Path
+        Animated WebP or PNG of all frames.
+    size : tuple of int
+        (width, height) of a frame.
+    """
+
+    folder: Path
+    frames: tuple[Path, ...]
+    animation: Path
+    size: tuple[int, int]
+
+    def __str__(self) -> str:
+        width, height = self.size
+        files = f"{counted(len(self.frames), 'frame')} of {width} x {height} px and {self.animation.name}"
+        return f"{files} written to {printable(str(self.folder))}"
+
+
+def size_from_text(text: str) -> tuple[int, int]:
+    """Parse ``WIDTHxHEIGHT``.
+
+    Parameters
+    ----------
+    text : str
+        As "1000x700".
+
+    Returns
+    -------
+    tuple of int
+        (width, height).
+
+    Raises
+    ------
+    UsageError
+        For other text.
+    """
+    found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
+    if found is None:
+        raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def color_from_text(text: str) -> tuple[int, int, int]:
+    """Parse a colour.
+
+    Parameters
+    ----------
+    text : str
+        A name ("white"), "#rrggbb" or "rgb(...)".
+
+    Returns
+    -------
+    tuple of int
+        (red, green, blue), 0 to 255.
+
+    Raises
+    ------
+    UsageError
+        For other text.
+    """
+    try:
+        return PIL.ImageColor.getrgb(text.strip())[:3]
+    except ValueError:
+        raise UsageError(f"--background takes a colour as white or #20304f; got {text!r}") from None
+
+
+def render_run(
+    out: Path, folder: Path, options: RenderOptions, *, threads: int = 1, progress: Progress | None = None
 ) -> ViewFiles:
-    """Views between photographs into ``folder``.
+    """Render the model of a run; write frames, an animation and ``frames.json``.
 
-    Writes ``frame-0001.png`` and so on, an animated file and a page ``strip.html`` of all frames, and
-    ``frames.json`` with the place of each. Frames of an earlier call that this one does not replace are
-    removed; nothing is written before the photographs are known to have views between them. The files do not
-    depend on ``threads``; ``progress`` hears (stage, done, total). Raises :class:`UsageError` and
-    :class:`StageFailure` with what is wrong with the photographs, :class:`UsageError` where ``folder`` holds
-    what is not of this command or cannot be written.
+    Frames of an earlier call that this one does not replace are removed. The files do not depend on
+    ``threads``.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of a finished run.
+    folder : Path
+        Output folder; new, empty or written by an earlier call.
+    options : RenderOptions
+        Camera path, size and lighting.
+    threads : int
+        Frames rendered at one time.
+    progress : callable, optional
+        Receives (stage, done, total).
+
+    Returns
+    -------
+    ViewFiles
+        The files.
+
+    Raises
+    ------
+    UsageError
+        If the run, its model or its cameras are missing, or ``folder`` holds other files or is not writable.
+    """
+    mesh, cameras = _read_run(out)
+    _claim(folder)
+    path = _camera_path(mesh, list(cameras.values()), options)
+    # Written first: it marks the folder as one of these commands.
+    write_json(folder / FRAMES, _description(path, options))
+    _remove_old(folder, len(path))
+    files = [folder / frame_name(k + 1) for k in range(len(path))]
+    shading = _shading(mesh, list(cameras.values()), options.light)
+    report, done = progress or (lambda *_: None), 0
+
+    def draw(k: int) -> None:
+        view = render(mesh, path[k], shading=shading(path[k]), background=options.background)
+        write_frame(folder, k + 1, view.color)
+
+    def finished(_: int, __: Any) -> None:
+        nonlocal done
+        done += 1
+        # The last step is the animation.
+        report("views", done, len(path) + 1)
+
+    Workers(threads).run(draw, [(k,) for k in range(len(path))], finished)
+    animation = write_animation(folder / f"{options.path}{animation_suffix()}", files)
+    finished(len(path), animation)
+    return ViewFiles(folder, tuple(files), animation, path[0].size)
+
+
+def interpolate_images(
+    folder: Path, options: InterpolateOptions, *, threads: int = 1, progress: Progress | None = None
+) -> ViewFiles:
+    """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``.
+
+    Frames of an earlier call that this one does not replace are removed. Nothing is written before the images
+    have been matched. The files do not depend on ``threads``.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder; new, empty or written by an earlier call.
+    options : InterpolateOptions
+        Images, method and number of frames.
+    threads : int
+        Threads of one frame.
+    progress : callable, optional
+        Receives (stage, done, total).
+
+    Returns
+    -------
+    ViewFiles
+        The files.
+
+    Raises
+    ------
+    UsageError
+        If an image is missing, two are the same, or ``folder`` holds other files or is not writable.
+    StageFailure
+        If the images cannot be read, do not match or admit no view in between.
     """
     _claim(folder)
     config = PipelineConfig()
-    if wishes.max_size_px is not None:
-        config = replace(config, images=ImageOptions(wishes.max_size_px))
-    photographs = [
-        named_photograph(path, max_size_px=config.images.max_size_px).images[0] for path in wishes.photographs
+    if options.max_size_px is not None:
+        config = replace(config, images=ImageOptions(options.max_size_px))
+    images = [
+        read_image(path, max_size_px=config.images.max_size_px).images[0] for path in options.images
     ]
-    tell, count = progress or (lambda *_: None), wishes.frames
-    tell("correspondence", 0, 1)
-    film = _film_of(wishes.method)(photographs, wishes.frames, config=config, seed=wishes.seed)
-    tell("correspondence", 1, 1)
-    write_json(folder / FRAMES, {"method": wishes.method, **film.told, "frames": _places(film)})
+    report, count = progress or (lambda *_: None), options.frames
+    report("correspondence", 0, 1)
+    module, name = METHODS[options.method]
+    make_sequence: Callable[..., ViewSequence] = getattr(import_module(module), name)
+    sequence = make_sequence(images, count, config=config, seed=options.seed)
+    report("correspondence", 1, 1)
+    listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(sequence.frame_metadata)]
+    write_json(folder / FRAMES, {"method": options.method, **sequence.metadata, "frames": listed})
     _remove_old(folder, count)
     frames = []
     for k in range(count):
-        rgb = film.draw(k, threads)
+        rgb = sequence.draw(k, threads)
         write_frame(folder, k + 1, rgb)
-        frames.append((film.captions[k], rgb))
-        tell("views", k + 1, count + 2)
+        frames.append((sequence.captions[k], rgb))
+        report("views", k + 1, count + 2)
     files = [folder / frame_name(k + 1) for k in range(count)]
     animation = write_animation(
-        folder / f"{wishes.method}{animation_suffix()}", files, milliseconds=BETWEEN_MS
+        folder / f"{options.method}{animation_suffix()}", files, milliseconds=_FRAME_MS
     )
-    tell("views", count + 1, count + 2)
-    title = "Between " + " and ".join(image.name for image in photographs)
-    write_text(folder / STRIP, strip_page(title, frames, notes=film.notes))
-    tell("views", count + 2, count + 2)
+    report("views", count + 1, count + 2)
+    title = "Between " + " and ".join(image.name for image in images)
+    write_text(folder / STRIP, strip_page(title, frames, notes=sequence.notes))
+    report("views", count + 2, count + 2)
     height, width = frames[0][1].shape[:2]
     return ViewFiles(folder, tuple(files), animation, (width, height))
 
 
-def _film_of(method: str) -> Callable[..., Film]:
-    """The maker of films by that method, loaded when it is asked for."""
-    module, name = METHODS[method]
-    maker: Callable[..., Film] = getattr(import_module(module), name)
-    return maker
-
-
-def _places(film: Film) -> list[dict[str, Any]]:
-    return [{"name": frame_name(k + 1), **place} for k, place in enumerate(film.places)]
-
-
-def _run_of(out: Path) -> tuple[TexturedMesh, dict[str, Camera]]:
-    """The model and the cameras of a finished run."""
+def _read_run(out: Path) -> tuple[TexturedMesh, dict[str, Camera]]:
+    """Read the model and the cameras of a finished run."""
     if not out.is_dir() or not any((out / name).is_file() for name in (MODEL, CAMERAS, "run.json")):
-        raise UsageError(f"{out} holds no run; make one with thesisrecon reconstruct PHOTOGRAPHS -o {out}")
+        raise UsageError(f"{out} holds no run; create one with thesisrecon reconstruct IMAGES -o {out}")
     if not (out / MODEL).is_file():
-        raise UsageError(_why_no_model(out))
+        raise UsageError(_missing_model(out))
     return read_mesh(out / MODEL), read_cameras(out / CAMERAS)
 
 
-def _why_no_model(out: Path) -> str:
-    """A run that went as far as it could says itself why it has no model; others have not come so far."""
-    told = read_json(out / "summary.json")
-    warnings = told.get("warnings", []) if isinstance(told, dict) else []
-    reason = next((str(w) for w in warnings if str(w).startswith("there is no model")), None)
+def _missing_model(out: Path) -> str:
+    """Why a run has no model: its surface stage failed, or it has not been run."""
+    summary = read_json(out / "summary.json")
+    warnings = summary.get("warnings", []) if isinstance(summary, dict) else []
+    reason = next((str(w) for w in warnings if str(w).startswith(_NO_MODEL)), None)
     if reason is not None:
-        return f"the run in {out} found its cameras and no surface: {reason}"
+        return f"the run in {out} has cameras but no model: {reason}"
     return (
-        f"the run in {out} has no model yet ({MODEL}); thesisrecon reconstruct PHOTOGRAPHS -o {out}, "
-        "without --until, goes on to it"
+        f"the run in {out} has no model yet ({MODEL}); continue it with thesisrecon reconstruct IMAGES "
+        f"-o {out}, without --until"
     )
 
 
 def _claim(folder: Path) -> None:
-    """Refuse a folder with files that this command did not make: photographs may be called frame-0001.png,
-    too."""
+    """Refuse a folder with files that these commands did not write: an image may be called frame-0001.png."""
     if isinstance(read_json(folder / FRAMES), dict):
         return
     try:
         names = [path.name for path in folder.iterdir()] if folder.exists() else []
     except OSError as error:
         raise UsageError(f"the folder {folder} cannot be used: {error.strerror}") from None
-    strange = sorted(name for name in names if not is_partial(name))
-    if strange:
+    foreign = sorted(name for name in names if not is_partial(name))
+    if foreign:
         raise UsageError(
-            f"the folder {folder} holds {strange[0]!r}, which is not of this command; choose an empty or a "
-            "new folder"
+            f"the folder {folder} contains {foreign[0]!r}, which this command did not create; choose an "
+            "empty or a new folder"
         )
 
 
@@ -272,31 +381,28 @@ def _remove_old(folder: Path, frames: int) -> None:
         for path in old:
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise OutputError(f"the folder {folder}, of which old frames must go,", error) from None
+        raise OutputError(f"the folder {folder}", error) from None
 
 
-def _cameras_on_path(mesh: TexturedMesh, cameras: list[Camera], wishes: ViewWishes) -> list[Camera]:
-    size = wishes.size or _default_size(cameras[0])
-    if wishes.path == "interpolate":
-        return interpolate(cameras, wishes.frames, size=size)
-    points = surface_points(mesh)
-    return orbit(cameras, points if len(points) else mesh.vertices, wishes.frames, size=size)
-
-
-def _default_size(camera: Camera) -> tuple[int, int]:
-    width, height = camera.resized(min(1.0, LONG_SIDE_PX / max(camera.size))).size
-    return width, height
+def _camera_path(mesh: TexturedMesh, cameras: list[Camera], options: RenderOptions) -> list[Camera]:
+    size = options.size
+    if size is None:
+        width, height = cameras[0].scaled(min(1.0, _DEFAULT_SIDE_PX / max(cameras[0].size))).size
+        size = width, height
+    if options.path == "interpolate":
+        return interpolate_cameras(cameras, options.frames, size=size)
+    points = sample_surface(mesh)
+    return orbit(cameras, points if len(points) else mesh.vertices, options.frames, size=size)
 
 
 def _shading(mesh: TexturedMesh, cameras: list[Camera], light: str) -> Callable[[Camera], Shading | None]:
-    """The light of each frame."""
+    """Return the shading as a function of the camera of a frame."""
     plain = mesh.colors is None and (mesh.texture is None or mesh.uv is None)
     if light == "none" and not plain:
         return lambda _: None
     if light == "sun":
-        # From above, the left and where the first photograph was taken: walls and ground keep their
-        # brightness.
-        towards = upward(cameras) - 0.5 * cameras[0].R[0] - cameras[0].R[2]
+        # From above, the left and the first camera: walls and ground keep their brightness.
+        towards = estimate_up(cameras) - 0.5 * cameras[0].R[0] - cameras[0].R[2]
         sun = Shading(ambient=0.4, lights=(Light(direction=_triple(towards), color=(0.9,) * 3),))
         return lambda _: sun
     return lambda camera: Shading(
@@ -309,11 +415,11 @@ def _triple(vector: F64) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _description(path: list[Camera], wishes: ViewWishes) -> dict[str, Any]:
-    """``frames.json``: what was asked for, and the camera of each frame as in ``cameras.json``."""
+def _description(path: list[Camera], options: RenderOptions) -> dict[str, Any]:
+    """Content of ``frames.json``: the options, and the camera of each frame as in ``cameras.json``."""
     frames = [
         {"name": frame_name(k + 1), "K": camera.K, "R": camera.R, "t": camera.t, "centre": camera.centre}
         for k, camera in enumerate(path)
     ]
-    asked = {"path": wishes.path, "light": wishes.light, "background": list(wishes.background)}
-    return {**asked, "width": path[0].size[0], "height": path[0].size[1], "frames": frames}
+    given = {"path": options.path, "light": options.light, "background": list(options.background)}
+    return {**given, "width": path[0].size[0], "height": path[0].size[1], "frames": frames}

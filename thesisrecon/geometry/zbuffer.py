@@ -200,6 +200,10 @@ def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) ->
     ``vertices`` (N, 3), ``faces`` (M, 3); both sides of a face are seen. ``threads`` draw strips of rows: the
     result is the same whatever their number.
     """
+    if not camera.is_pinhole:
+        raise ValueError(
+            "Rendering needs a camera without distortion: undistort the image or drop the distortion"
+        )
     width, height = camera.size
     seen = (vertices @ camera.R.T + camera.t) @ (camera.K / camera.K[2, 2]).T
     corners = np.ascontiguousarray(seen[faces])
@@ -211,11 +215,11 @@ def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) ->
     def draw(rows: tuple[int, int]) -> None:
         rasterize_rows(corners, near, rows, depth, face, weights)
 
-    in_strips(draw, height, threads)
+    run_in_strips(draw, height, threads)
     return Raster(depth, face, weights)
 
 
-def in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
+def run_in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
     """Call ``work`` with the first and last + 1 row of as many strips as there are threads, one in each."""
     edges = np.linspace(0, height, max(threads, 1) + 1).round().astype(int)
     strips = [(int(a), int(b)) for a, b in pairwise(edges)]

@@ -1,8 +1,6 @@
-"""Compiled loops of rendering; each has a plain twin in the tests.
+"""Rendering of a mesh from any camera, in colour and depth (thesis, section 2.6).
 
-Light sources and the way a surface answers to them (2.6): Lambert's law and a highlight.
-
-Section 2.6: the model seen by any camera, in colour and depth.
+Lighting follows Lambert's law with a Blinn highlight. Each kernel has a NumPy twin in the tests.
 """
 
 from __future__ import annotations
@@ -15,14 +13,23 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.camera import Camera
-from thesisrecon.geometry.zbuffer import Raster, in_strips, rasterize, sample_texture
+from thesisrecon.geometry.zbuffer import Raster, rasterize, run_in_strips, sample_texture
 from thesisrecon.records import RenderedView, TexturedMesh
 
 
 @njit(cache=True, nogil=True)
 def sum_face_normals(vertices: F64, faces: I64, total: F64) -> None:
-    """Add to ``total`` (N, 3), for each vertex, the cross products of the sides of its faces: their normals
-    by twice their areas."""
+    """Add the cross products of the sides of each face to its vertices, in ``total`` (N, 3).
+
+    Parameters
+    ----------
+    vertices : ndarray (N, 3)
+        Vertices.
+    faces : ndarray (M, 3)
+        Vertex numbers.
+    total : ndarray (N, 3)
+        Area-weighted normals, added to.
+    """
     for m in range(faces.shape[0]):
         i, j, l = faces[m, 0], faces[m, 1], faces[m, 2]
         ux, uy, uz = (
@@ -52,11 +59,21 @@ def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
 def shade_points(
     color: F32, points: F32, normals: F32, eye: F64, lamps: F64, surface: tuple[float, float, float]
 ) -> None:
-    """Turn colours (P, 3), 0 to 255, into what the eye (3,) sees of them under lamps.
+    """Shade colours in place.
 
-    ``points``, ``normals`` (P, 3), the latter of any length, turned towards the eye; those of length 0 have
-    no lamp's light. ``lamps`` (L, 7): 1 and a position, or 0 and the direction towards the lamp, and its
-    colour. ``surface``: ambient light, strength and exponent of the highlight.
+    Parameters
+    ----------
+    color : ndarray (P, 3)
+        Unlit colours, 0 to 255; overwritten.
+    points, normals : ndarray (P, 3)
+        Surface points and normals of any length. Normals are flipped towards the eye; zero normals get no
+        light.
+    eye : ndarray (3,)
+        Camera centre.
+    lamps : ndarray (L, 7)
+        1 and a position, or 0 and the direction towards the light; then its colour.
+    surface : tuple of float
+        Ambient light, strength and exponent of the highlight.
     """
     ambient, specular, shininess = surface
     for p in range(color.shape[0]):
@@ -89,8 +106,21 @@ def shade_points(
 
 @njit(cache=True, nogil=True)
 def average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: np.ndarray) -> None:
-    """Means of ``samples`` x ``samples`` blocks of colours (samples H, samples W, 3), the background (3,)
-    where ``drawn`` < 0, rounded into ``out`` (H, W, 3) uint8."""
+    """Average ``samples`` x ``samples`` blocks of pixels into an 8-bit image.
+
+    Parameters
+    ----------
+    color : ndarray (samples H, samples W, 3)
+        Colours, 0 to 255.
+    drawn : ndarray (samples H, samples W)
+        Face numbers; negative values take the background colour.
+    samples : int
+        Samples per pixel side.
+    background : ndarray (3,)
+        Background colour.
+    out : ndarray (H, W, 3) of uint8
+        The result.
+    """
     total = np.empty(3, dtype=np.float32)
     share = np.float32(1.0 / (samples * samples))
     for y in range(out.shape[0]):
@@ -106,8 +136,22 @@ def average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: n
 
 @dataclass(frozen=True)
 class Light:
-    """A lamp: at ``position`` (3,), or far away in ``direction`` (3,), the one towards it; ``color`` is its
-    strength in red, green and blue, 1 as bright as the texture says. Exactly one of the two is given."""
+    """A light source at a position or at infinity.
+
+    Parameters
+    ----------
+    direction : tuple of float, optional
+        Direction towards a distant light.
+    position : tuple of float, optional
+        Position of a point light. Exactly one of direction and position is given.
+    color : tuple of float
+        Strength in red, green and blue; 1 leaves the texture as it is.
+
+    Raises
+    ------
+    ValueError
+        If both or neither of direction and position are given, or the direction is zero.
+    """
 
     direction: tuple[float, float, float] | None = None
     position: tuple[float, float, float] | None = None
@@ -121,7 +165,7 @@ class Light:
 
     @property
     def row(self) -> list[float]:
-        """As :func:`~thesisrecon.views.render.shade_points` takes it."""
+        """The row that :func:`shade_points` takes."""
         if self.position is not None:
             return [1.0, *self.position, *self.color]
         return [0.0, *(self.direction or (0.0, 0.0, 0.0)), *self.color]
@@ -129,9 +173,17 @@ class Light:
 
 @dataclass(frozen=True)
 class Shading:
-    """Light everywhere (``ambient``), ``lights``, and a highlight (Blinn 1977) of strength ``specular`` and
-    width by ``shininess``. Both sides of a surface answer alike. Photographs hold the light they were taken
-    in: a texture is as it was seen without any shading."""
+    """Ambient light, light sources and a highlight (Blinn 1977). Both sides of a surface are lit alike.
+
+    Parameters
+    ----------
+    ambient : float
+        Ambient light.
+    lights : tuple of Light
+        Light sources.
+    specular, shininess : float
+        Strength and exponent of the highlight.
+    """
 
     ambient: float = 0.3
     lights: tuple[Light, ...] = ()
@@ -139,31 +191,50 @@ class Shading:
     shininess: float = 30.0
 
     def shade(self, color: F32, points: F32, normals: F32, eye: F64) -> None:
-        """Light colours (P, 3), 0 to 255, in place, of points (P, 3) seen from ``eye`` (3,), with
-        normals (P, 3) of any length."""
+        """Shade colours in place.
+
+        Parameters
+        ----------
+        color : ndarray (P, 3)
+            Unlit colours, 0 to 255; overwritten.
+        points, normals : ndarray (P, 3)
+            Surface points and normals of any length.
+        eye : ndarray (3,)
+            Camera centre.
+        """
         lamps = np.array([light.row for light in self.lights], dtype=np.float64).reshape(-1, 7)
         surface = (float(self.ambient), float(self.specular), float(self.shininess))
         shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lamps, surface)
 
 
 def vertex_normals(mesh: TexturedMesh) -> F64:
-    """Unit normals (N, 3): the mean over the faces at a vertex, by their area."""
+    """Return unit vertex normals, the area-weighted mean over the adjacent faces.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+        The mesh, N vertices.
+
+    Returns
+    -------
+    ndarray (N, 3)
+        Unit normals, zero for unused vertices.
+    """
     total = np.zeros_like(mesh.vertices)
     sum_face_normals(mesh.vertices, mesh.faces, total)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])
 
 
 STRIP = 16
-"""Rows that are coloured at a time."""
+"""Rows that are coloured at a time, so that intermediate arrays stay in cache."""
 
 BARE = (200, 200, 200)
-"""Colour of a mesh that has none."""
+"""Colour of a mesh without texture and vertex colours."""
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """A mesh as the kernels take it: ``points``, ``normals``, ``colors`` (N, 3) of its vertices, ``uv``
-    (M, 3, 2); what is not drawn is None."""
+    """A mesh as the kernels take it; unused arrays are None."""
 
     faces: I64
     points: F32 | None
@@ -182,21 +253,32 @@ def render(
     samples: int = 2,
     threads: int = 1,
 ) -> RenderedView:
-    """The mesh as ``camera`` sees it.
+    """Render a mesh.
 
     Parameters
     ----------
-    mesh : with a texture, colours of its vertices, or neither (then light grey).
-    camera : where from; any pose, also within the model.
-    shading : lights; None shows colours as they were photographed. A bare mesh is best seen with a light.
-    background : colour where nothing is.
-    samples : points a side that each pixel's colour is the mean of, at least 1. Depth and validity are
-        those of the pixel's centre.
-    threads : draw strips of rows; the picture does not depend on them.
+    mesh : TexturedMesh
+        Mesh with a texture, vertex colours or neither (light grey).
+    camera : Camera
+        Camera without distortion; it may stand inside the model.
+    shading : Shading, optional
+        Lighting. None shows the texture as photographed.
+    background : tuple of int
+        Colour of empty pixels.
+    samples : int
+        Samples per pixel side, averaged. Depth and validity refer to the pixel centre.
+    threads : int
+        Number of threads; the image does not depend on it.
+
+    Returns
+    -------
+    RenderedView
+        Colour, depth and validity of each pixel.
 
     Raises
     ------
-    ValueError : for fewer than one sample and a mesh whose arrays do not belong together.
+    ValueError
+        If ``samples`` is below 1 or the mesh arrays are inconsistent.
     """
     if samples < 1:
         raise ValueError(f"render needs at least one sample a side; got {samples}")
@@ -207,7 +289,7 @@ def render(
     if samples == 1:
         fine = centre
     else:
-        fine = rasterize(mesh.vertices, mesh.faces, camera.resized(samples), threads=threads)
+        fine = rasterize(mesh.vertices, mesh.faces, camera.scaled(samples), threads=threads)
     rgb = np.empty((*valid.shape, 3), dtype=np.uint8)
     behind = np.asarray(background, dtype=np.float32)
     surface = _prepared(mesh, lit=shading is not None)
@@ -222,13 +304,13 @@ def render(
                 _light(surface, part, color, camera.centre, shading)
             average_blocks(color, part.face, samples, behind, rgb[first:last])
 
-    in_strips(paint, len(rgb), threads)
+    run_in_strips(paint, len(rgb), threads)
     return RenderedView(rgb, depth, valid)
 
 
 def _check(mesh: TexturedMesh) -> None:
     if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
-        raise ValueError("the faces of the mesh name vertices that it does not have")
+        raise ValueError("the faces refer to vertices that do not exist")
     if mesh.uv is not None and mesh.uv.shape != (len(mesh.faces), 3, 2):
         raise ValueError(f"uv must be ({len(mesh.faces)}, 3, 2); got {mesh.uv.shape}")
     if mesh.colors is not None and mesh.colors.shape != mesh.vertices.shape:
@@ -248,7 +330,7 @@ def _prepared(mesh: TexturedMesh, *, lit: bool) -> _Surface:
 
 
 def _colors(surface: _Surface, raster: Raster) -> F32:
-    """(H, W, 3) 0..255 before any light."""
+    """Unlit colours (H, W, 3), 0 to 255."""
     if surface.texture is not None and surface.uv is not None:
         color = np.zeros((*raster.face.shape, 3), dtype=np.float32)
         sample_texture(surface.texture, raster.interpolate(surface.uv), raster.face, color)
@@ -267,6 +349,17 @@ def _light(surface: _Surface, raster: Raster, color: F32, eye: F64, shading: Sha
     shading.shade(color.reshape(-1, 3), points, normals, eye)
 
 
-def bare(mesh: TexturedMesh) -> TexturedMesh:
-    """The shape alone, without texture and colours."""
+def without_texture(mesh: TexturedMesh) -> TexturedMesh:
+    """Return the mesh without texture and colours.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+        The mesh.
+
+    Returns
+    -------
+    TexturedMesh
+        The shape alone.
+    """
     return replace(mesh, colors=None, uv=None, texture=None)

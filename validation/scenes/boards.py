@@ -133,7 +133,7 @@ def _rendered(board: Board) -> list[NDArray[np.float32]]:
     found = []
     for R, t in zip(board.R, board.t, strict=True):
         camera = Camera(K, R, t, SIZE)
-        fine = render(mesh, camera.resized(PER_PIXEL), samples=1).color.astype(np.float32) / np.float32(255.0)
+        fine = render(mesh, camera.scaled(PER_PIXEL), samples=1).color.astype(np.float32) / np.float32(255.0)
         found.append(integrate_pixels(fine, PER_PIXEL, SENSOR.blur_px))
     return found
 

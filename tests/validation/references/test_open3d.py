@@ -119,7 +119,7 @@ def test_a_glb_opens_in_trimesh_with_its_texture(model, tmp_path):
 def test_its_own_pictures_agree_with_ours():
     maps = ring_of()
     mesh = open3d_surfaces.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
-    camera = Camera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).resized(2)
+    camera = Camera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).scaled(2)
     try:
         theirs = open3d_meshes.render_open3d(mesh, camera)
     except RuntimeError as error:

@@ -166,7 +166,7 @@ def _camera(scene: str, wishes: Wishes) -> Camera:
     with PIL.Image.open(truth.image_paths[view]) as opened:
         size = opened.size
     camera = Camera(truth.K[view], truth.R[view], -truth.R[view] @ truth.C[view], size)
-    return camera.resized(640.0 / max(size))
+    return camera.scaled(640.0 / max(size))
 
 
 def _drawn(mesh: TexturedMesh, off_pct: F64, camera: Camera) -> NDArray[np.uint8]:
