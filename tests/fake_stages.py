@@ -213,7 +213,7 @@ class FakeDense:
         points = SparsePoints(np.zeros((0, 3)), np.zeros((len(P), 0), dtype=bool))
         return MultiViewScene(views, points, dict.fromkeys(views, ()))
 
-    def surroundings(self, scene, view):
+    def required_views(self, scene, view):
         return frozenset({view, *list(scene.views)[:2]})
 
     def depth_map(self, scene, view):

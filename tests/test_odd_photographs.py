@@ -9,7 +9,7 @@ import PIL.Image
 import pytest
 import trimesh
 
-from tests.textures import texture
+from tests.synthetic import texture
 from thesisrecon.cli.main import run_command
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"

@@ -1,7 +1,8 @@
-"""What the records themselves compute."""
+"""Records and counted words."""
 
 import numpy as np
 
+from thesisrecon.errors import counted
 from thesisrecon.records import DisparityMap
 
 
@@ -11,3 +12,9 @@ def test_holes_are_filled_with_what_is_farther():
     filled = DisparityMap(disparity, np.isfinite(disparity).astype(np.float32), 0.5).filled()
     assert filled.dtype == np.float32
     np.testing.assert_array_equal(filled, [[5, 5, 3, 3, 3, 3], [nan] * 6, [1, 1, 4, 2, 2, 2]])
+
+
+def test_one_is_told_as_one():
+    assert [counted(n, "photograph") for n in (0, 1, 2)] == ["0 photographs", "1 photograph", "2 photographs"]
+    assert [counted(n, "verified match") for n in (1, 7)] == ["1 verified match", "7 verified matches"]
+    assert counted(1200, "face", "1 200") == "1 200 faces"

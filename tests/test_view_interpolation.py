@@ -11,14 +11,14 @@ import PIL.Image
 import pytest
 
 import thesisrecon
-from tests.textures import texture
+from tests.synthetic import texture
 from thesisrecon import view_interpolation as between
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import METHODS, BetweenWishes, write_between
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import Image
-from thesisrecon.views.interpolation import pair_of_rectified, unsure
+from thesisrecon.views.interpolation import pair_from_rectified, with_full_confidence
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 SHIFT = 6
@@ -40,7 +40,7 @@ def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities
     left, right = wall
     expected = np.roll(left, -SHIFT // 2, axis=1)[:, 10:-20].astype(int)
     d = np.full(left.shape[:2], SHIFT, dtype=np.float32)
-    for known in (None, d, (d, d), (unsure(d), unsure(d))):
+    for known in (None, d, (d, d), (with_full_confidence(d), with_full_confidence(d))):
         view = thesisrecon.interpolate_view(left, right, 0.5, disparity=known)
         assert view.dtype == np.uint8
         assert view.shape == left.shape
@@ -126,8 +126,8 @@ def still(monkeypatch):
 
     def prepare_pair(first, second, **_):
         related.append((first.name, second.name))
-        nothing = unsure(np.zeros(first.rgb.shape[:2], np.float32))
-        return pair_of_rectified(first.rgb, second.rgb, (nothing, nothing))
+        nothing = with_full_confidence(np.zeros(first.rgb.shape[:2], np.float32))
+        return pair_from_rectified(first.rgb, second.rgb, (nothing, nothing))
 
     monkeypatch.setattr(between, "prepare_pair", prepare_pair)
     return related

@@ -6,28 +6,28 @@ import pytest
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.degeneracy import (
     NEIGHBOURS,
+    _contradicted_ratios,
     assess_degeneracy,
-    contradicted_shares,
-    geometries_of_plane,
+    fundamentals_of_plane,
     log10_false_alarms,
     multiplicity_weights,
 )
 from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.planes import (
-    count_transferred,
+    _count_transferred,
+    _plane_distances,
+    _plane_normal_equations,
     find_dominant_plane,
     plane_covariance,
-    plane_distances,
-    plane_normal_equations,
     refine_plane,
 )
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import (
     epipoles,
     estimate_homography,
-    homography_distances,
     homography_residuals,
+    homography_sampson_residuals,
     sampson_residuals,
     symmetric_residuals,
     unit_norm,
@@ -131,7 +131,7 @@ def test_a_wide_covariance_is_a_reason():
 def test_the_front_door_judges_when_asked():
     pair = make_pair(200, np.random.default_rng(1))
     xy1, xy2, _ = spoil(pair, np.random.default_rng(1), sigma=0.3, outliers=0.2)
-    plain, told = estimate_fundamental(xy1, xy2), estimate_fundamental(xy1, xy2, judge=True)
+    plain, told = estimate_fundamental(xy1, xy2), estimate_fundamental(xy1, xy2, check_degeneracy=True)
     assert plain.degeneracy is None
     assert told.degeneracy is not None
     assert told.degeneracy.determined
@@ -164,8 +164,8 @@ def test_plane_distances_match_their_numpy_twin():
     pair = make_pair(50, np.random.default_rng(2), planar=True)
     xy1, xy2, _ = spoil(pair, np.random.default_rng(2), sigma=2.0, outliers=0.1)
     H = estimate_homography(pair.xy1, pair.xy2)
-    expected = np.sum(homography_distances(H, xy1, xy2) ** 2, axis=1)
-    np.testing.assert_allclose(plane_distances(H.ravel(), np.hstack([xy1, xy2])), expected, rtol=1e-6)
+    expected = np.sum(homography_sampson_residuals(H, xy1, xy2) ** 2, axis=1)
+    np.testing.assert_allclose(_plane_distances(H.ravel(), np.hstack([xy1, xy2])), expected, rtol=1e-6)
 
 
 def test_normal_equations_of_a_plane_match_their_numpy_twin():
@@ -185,7 +185,7 @@ def test_normal_equations_of_a_plane_match_their_numpy_twin():
         total += share
         expected += (1.0 - share) ** 2 * A.T @ inverse @ A
     G = np.empty((9, 9))
-    assert plane_normal_equations(h, np.hstack([xy1, xy2]), 0.08, G) == pytest.approx(total, rel=1e-9)
+    assert _plane_normal_equations(h, np.hstack([xy1, xy2]), 0.08, G) == pytest.approx(total, rel=1e-9)
     assert 1.0 < total < 29.0
     np.testing.assert_allclose(G, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
@@ -205,14 +205,14 @@ def test_contradicted_shares_match_their_numpy_twin():
         over = np.linalg.norm(parallax[near] - parallax[k], axis=1) > apart[near]
         expected.append(np.mean(on_plane[near] & over))
     assert 0.1 < np.mean(expected) < 0.9
-    np.testing.assert_allclose(contradicted_shares(h, points, on_plane, chosen, 0.05), expected)
+    np.testing.assert_allclose(_contradicted_ratios(h, points, on_plane, chosen, 0.05), expected)
 
 
 def test_transfers_are_counted_as_by_numpy():
     pair = make_pair(60, np.random.default_rng(3))
     H = np.stack([estimate_homography(pair.xy1[k : k + 12], pair.xy2[k : k + 12]) for k in (0, 12, 24)])
     expected = [int(np.sum(homography_residuals(h, pair.xy1, pair.xy2) < 30.0)) for h in H]
-    np.testing.assert_array_equal(count_transferred(H, pair.xy1, pair.xy2, 30.0), expected)
+    np.testing.assert_array_equal(_count_transferred(H, pair.xy1, pair.xy2, 30.0), expected)
 
 
 def test_geometries_of_a_plane_keep_the_plane_and_the_two_matches():
@@ -223,7 +223,7 @@ def test_geometries_of_a_plane_keep_the_plane_and_the_two_matches():
     h = estimate_homography(points[:, :2], points[:, 2:]).ravel()
     away = points[:6].copy()
     away[:, 2:] += rng.uniform(0.2, 0.5, (6, 2))
-    F, agree, sums = geometries_of_plane(h, away, np.ones((1, 6)), np.array([[0, 1], [2, 5]]), 1e-6)
+    F, agree, sums = fundamentals_of_plane(h, away, np.ones((1, 6)), np.array([[0, 1], [2, 5]]), 1e-6)
     for f, (a, b) in zip(F, ((0, 1), (2, 5)), strict=True):
         r = np.abs(sampson_residuals(f.reshape(3, 3), points[:, :2], points[:, 2:]))
         assert r.max() < 1e-9
@@ -290,6 +290,6 @@ def test_one_that_would_change_places_with_the_wall_is_contradicted():
     points[list(patch), 2] += 3.0
     on_plane = np.ones(100, bool)
     on_plane[[lone, *patch]] = False
-    shares = contradicted_shares(np.eye(3).ravel(), points, on_plane, np.array([lone, 88]), 0.1)
+    shares = _contradicted_ratios(np.eye(3).ravel(), points, on_plane, np.array([lone, 88]), 0.1)
     assert shares[0] == 1.0
     assert shares[1] == 0.0

@@ -7,15 +7,15 @@ from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.configuration import (
     Configuration,
     classify_configuration,
-    turned_camera,
-    turning_ratio,
+    rotation_homography,
+    rotation_homography_test,
 )
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.two_view import homography_distances, homography_residuals
+from thesisrecon.geometry.two_view import homography_residuals, homography_sampson_residuals
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 from validation.scenes.two_views import make_two_views
 
@@ -88,7 +88,7 @@ def test_a_camera_that_did_not_move_turned_by_nothing():
     xy2 = xy1 + rng.normal(0.0, 0.5, xy1.shape)
     found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
     assert found.kind is Configuration.ROTATION
-    assert found.turn_deg < 1.0
+    assert found.rotation_deg < 1.0
 
 
 def test_the_angle_of_a_rotation_is_found_without_the_camera():
@@ -98,7 +98,7 @@ def test_the_angle_of_a_rotation_is_found_without_the_camera():
     xy1, xy2 = (xy + rng.normal(0.0, 0.2, xy.shape) for xy in (scene.xy1, scene.xy2))
     found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
     angle = np.degrees(np.arccos((np.trace(R) - 1.0) / 2.0))
-    assert found.turn_deg == pytest.approx(angle, abs=0.5)
+    assert found.rotation_deg == pytest.approx(angle, abs=0.5)
 
 
 @pytest.mark.parametrize("focal", [0.8, 3.0])
@@ -106,7 +106,7 @@ def test_a_turned_camera_is_told_from_a_homography_with_the_eigenvalues_of_a_rot
     """H = A R A^-1 has those eigenvalues for every A; only for an A of square pixels is it a rotation's."""
     rng = np.random.default_rng(1)
     xy1 = rng.uniform(-1.2, 1.2, (100, 2))
-    turn = turned_camera(np.array([np.log(focal), 0.1, -0.2, 0.02, 0.15, -0.05]))
+    turn = rotation_homography(np.array([np.log(focal), 0.1, -0.2, 0.02, 0.15, -0.05]))
     skewed = np.diag([1.0, 2.5, 1.0])
     for H, is_turn in ((turn, True), (skewed @ turn @ np.linalg.inv(skewed), False)):
         xy2 = dehomogenize(homogenize(xy1) @ H.T)
@@ -114,9 +114,10 @@ def test_a_turned_camera_is_told_from_a_homography_with_the_eigenvalues_of_a_rot
         for seed in range(20):
             noisy = [xy + np.random.default_rng(seed).normal(0.0, 1e-3, xy.shape) for xy in (xy1, xy2)]
             fitted = minimize_residuals(
-                lambda h, noisy=noisy: homography_distances(h.reshape(3, 3), *noisy).ravel(), H.ravel()
+                lambda h, noisy=noisy: homography_sampson_residuals(h.reshape(3, 3), *noisy).ravel(),
+                H.ravel(),
             ).x.reshape(3, 3)
-            ratios.append(turning_ratio(fitted, *noisy, risk=0.001))
+            ratios.append(rotation_homography_test(fitted, *noisy, risk=0.001))
         assert (np.array(ratios) <= 1.0).sum() == (20 if is_turn else 0)
         assert min(ratios) >= -1e-6
 
@@ -126,7 +127,7 @@ def test_homography_distances_are_half_the_transfer_of_a_similarity():
     rng = np.random.default_rng(4)
     xy1, xy2 = rng.uniform(0.0, 100.0, (2, 30, 2))
     H = np.array([[0.8, -0.6, 3.0], [0.6, 0.8, -5.0], [0.0, 0.0, 1.0]])
-    whitened = np.linalg.norm(homography_distances(H, xy1, xy2), axis=1)
+    whitened = np.linalg.norm(homography_sampson_residuals(H, xy1, xy2), axis=1)
     np.testing.assert_allclose(whitened, homography_residuals(H, xy1, xy2) / np.sqrt(2.0))
 
 

@@ -1,4 +1,4 @@
-"""Linear solvers, refinements and the robust estimators on scenes with truth."""
+"""Robust estimators of the fundamental matrix and their parts."""
 
 import numpy as np
 import pytest
@@ -6,14 +6,38 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.epipolar.pairs import angle_between, make_pair, spoil
+from tests.geometry.properties import holds_for_every
+from thesisrecon.epipolar.configuration import Configuration, _refine_translation, classify_configuration
+from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
-from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
+from thesisrecon.epipolar.ransac import (
+    EpipolarDistanceTest,
+    LeastMedianOfSquares,
+    SampsonTest,
+    SymmetricDistanceTest,
+    ThesisRansac,
+    discard_outliers,
+)
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
+from thesisrecon.epipolar.sampling import sampson_distances
+from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.two_view import sampson_residuals, symmetric_residuals
+from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.two_view import (
+    algebraic_residuals,
+    epipolar_distances,
+    fundamental_from_cameras,
+    sampson_residuals,
+    symmetric_residuals,
+    unit_norm,
+)
+from thesisrecon.records import FundamentalFit, Matches
+from validation.scenes.two_views import make_two_views
 
 seeds = st.integers(0, 2**31)
+
+
 ROBUST = [
     LocallyOptimisedRansac(),
     ThesisRansac(samples=300),
@@ -278,3 +302,256 @@ def test_refinement_refuses_a_start_without_rank(F):
         refine_sampson(F, pair.xy1, pair.xy2)
     with pytest.raises(ValueError, match="loss_px"):
         refine_sampson(pair.F, pair.xy1, pair.xy2, loss_px=0.0)
+
+
+H = np.array([[1.02, 0.03, 12.0], [-0.02, 0.99, -7.0], [1e-5, -2e-5, 1.0]])
+
+
+POLES = np.array([[4000.0, 300.0, 1.0], [500.0, -5000.0, 1.0]])
+
+
+def plane_with_parallax(counts, *, sigma=0.2, flat=300):
+    """Matches of a plane, then some moved along lines through each of the epipoles; F of the first."""
+    rng = np.random.default_rng(1)
+    xy1 = rng.uniform((0.0, 0.0), (1000.0, 800.0), (flat + sum(counts), 2))
+    x2 = np.c_[xy1, np.ones(len(xy1))] @ H.T
+    xy2 = x2[:, :2] / x2[:, 2:]
+    for pole, first, count in zip(POLES, (flat, flat + counts[0]), counts, strict=True):
+        some = slice(first, first + count)
+        along = pole[:2] / pole[2] - xy2[some]
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        xy2[some] += rng.uniform(60.0, 200.0, (count, 1)) * along
+    xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (xy1, xy2))
+    F = unit_norm(cross_matrix(POLES[0]) @ H)
+    inliers = np.abs(sampson_residuals(F, xy1, xy2)) < 1.0
+    return FundamentalFit(F, inliers, sigma, 1e-16 * np.eye(9)), xy1, xy2
+
+
+def test_an_epipole_that_explains_as_many_is_a_reason():
+    fit, xy1, xy2 = plane_with_parallax((30, 30), flat=100)
+    found = assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(0))
+    assert any("another geometry explains" in reason for reason in found.reasons)
+    assert found.competing_model is not None
+    of_rival = np.abs(sampson_residuals(found.competing_model, xy1, xy2))
+    assert (of_rival[-30:] < 1.0).mean() > 0.9
+    assert (of_rival[:100] < 1.0).mean() > 0.9
+
+
+def test_matches_amid_those_of_the_plane_are_a_reason():
+    fit, xy1, xy2 = plane_with_parallax((40, 0))
+    found = assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(0))
+    assert any("lie amid matches of the plane" in reason for reason in found.reasons)
+    assert found.contradicted > 0.8 * found.off_plane
+
+
+def test_relief_of_a_plane_of_few_matches_is_that_of_noise():
+    """The parameters that F and the homography take from the residuals are allowed for."""
+    errors = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        scene = make_two_views(Configuration.PLANE, 24, rng)
+        xy1, xy2 = (xy + rng.normal(0.0, 0.5, xy.shape) for xy in (scene.xy1, scene.xy2))
+        errors.append(classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2).homography_errors)
+    assert 0.0 < np.median(errors) < 2.1
+
+
+def test_the_translation_is_where_no_other_epipole_has_less_error():
+    rng = np.random.default_rng(2)
+    e = np.array([0.6, -0.5, 0.62])
+    f = (cross_matrix(e / np.linalg.norm(e)) / np.sqrt(2.0)).ravel()
+    x1 = rng.normal(size=(60, 2))
+    towards = e[:2] / e[2] - x1
+    points = np.c_[x1, x1 + rng.uniform(0.05, 0.3, (60, 1)) * towards] + rng.normal(0.0, 0.05, (60, 4))
+    _refine_translation(f, points, np.inf)
+
+    def cost(e):
+        g = (cross_matrix(e) / (np.sqrt(2.0) * np.linalg.norm(e))).ravel()
+        return float(np.sum(np.asarray(sampson_distances(g, points)) ** 2))
+
+    best = np.array([f[7], f[2], f[3]])
+    slopes = [(cost(best + 1e-5 * d) - cost(best - 1e-5 * d)) / 2e-5 for d in np.eye(3)]
+    away = [(cost(best + 1e-2 * d) - cost(best)) / 1e-2 for d in np.eye(3)]
+    assert np.abs(slopes).max() < 0.02 * np.abs(away).max()
+
+
+def test_both_images_are_conditioned():
+    """The units and the origin of either image do not matter to the normalised eight-point method."""
+    pair = make_pair(40, np.random.default_rng(3))
+    xy1, xy2, _ = spoil(pair, np.random.default_rng(3), sigma=0.5, outliers=0.0)
+    F = estimate_eight_point(xy1, xy2)
+    for s, t in ((1e-3, 1.0), (1.0, 1e-3)):
+        S, T = (
+            np.array([[s, 0, 5.0], [0, s, 3.0], [0, 0, 1]]),
+            np.array([[t, 0, -2.0], [0, t, 7.0], [0, 0, 1]]),
+        )
+        moved = estimate_eight_point(s * xy1 + [5.0, 3.0], t * xy2 + [-2.0, 7.0])
+        assert angle_between(unit_norm(T.T @ moved @ S), F) < 1e-9
+
+
+def test_a_plane_of_much_noise_is_still_explained_by_a_homography():
+    rng = np.random.default_rng(4)
+    pair = make_pair(300, rng, planar=True)
+    xy1, xy2, _ = spoil(pair, rng, sigma=2.0, outliers=0.0)
+    fit = FundamentalFit(pair.F, np.ones(300, dtype=bool), 2.0, 1e-12 * np.eye(9))
+    n = np.arange(300)
+    matches = Matches(0, 1, n, n, xy1, xy2, np.ones(300, np.float32), np.tile(np.eye(2), (300, 1, 1)))
+    found = PairVerification().verify(matches, fit, np.random.default_rng(0))
+    assert found.homography_inlier_ratio > 0.95
+
+
+def test_algorithm_2_minimises_the_criterion_it_is_told():
+    pair = make_pair(60, np.random.default_rng(5))
+    # One image smaller: there the two criteria differ. After ten rounds the inliers stay the same.
+    xy1, xy2, _ = spoil(pair, np.random.default_rng(5), sigma=0.5, outliers=0.0)
+    xy2 = 0.25 * xy2
+    algorithm = ThesisRansac(threshold_px=3.0, epipolar_distance=True, rounds=10)
+    fit = algorithm.estimate(xy1, xy2, np.random.default_rng(0))
+    kept = fit.inliers
+    again = refine_epipolar_distance(fit.F, xy1[kept], xy2[kept])
+    other = refine_sampson(fit.F, xy1[kept], xy2[kept])
+    assert angle_between(fit.F, again) < 0.1 * angle_between(other, again)
+
+
+TESTS = [SampsonTest(), EpipolarDistanceTest(), SymmetricDistanceTest()]
+
+
+@holds_for_every()
+def test_5_5_and_5_6_the_two_distances_are_multiples_of_one_residual(rng):
+    F, xy1, xy2 = rng.normal(size=(3, 3)), rng.normal(size=(20, 2)), rng.normal(size=(20, 2))
+    d = epipolar_distances(F, xy1, xy2)
+    np.testing.assert_allclose(np.sqrt(np.sum(d**2, axis=1)), symmetric_residuals(F, xy1, xy2), rtol=1e-9)
+    # 1 / s^2 = 1 / d1^2 + 1 / d2^2: the Sampson distance is the shorter of all three.
+    s = np.abs(sampson_residuals(F, xy1, xy2))
+    np.testing.assert_allclose(s * np.sqrt(np.sum(d**2, axis=1)), d[:, 0] * d[:, 1], rtol=1e-9)
+    assert (2.0 * s <= symmetric_residuals(F, xy1, xy2) * (1.0 + 1e-9)).all()
+
+
+def test_5_3_the_residual_over_its_gradient_has_the_noise_of_a_coordinate():
+    rng, sigma = np.random.default_rng(0), 0.7
+    pair = make_pair(300, rng)
+    F = fundamental_from_cameras(pair.P1, pair.P2)
+    found = []
+    for _ in range(20):
+        xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (pair.xy1, pair.xy2))
+        found.append(sampson_residuals(F, xy1, xy2))
+        raw = algebraic_residuals(F, xy1, xy2)
+        assert np.std(raw / found[-1]) > 0.0
+    assert np.std(found) == pytest.approx(sigma, rel=0.03)
+
+
+@pytest.mark.parametrize(("test", "share"), [(TESTS[0], 0.95), (TESTS[1], 0.95), (TESTS[2], 0.916)])
+def test_the_share_of_right_matches_that_pass(test, share):
+    rng = np.random.default_rng(1)
+    pair = make_pair(4000, rng)
+    F = fundamental_from_cameras(pair.P1, pair.P2)
+    xy1, xy2 = (xy + rng.normal(0.0, 0.5, xy.shape) for xy in (pair.xy1, pair.xy2))
+    sigma, inliers = discard_outliers(F, xy1, xy2, test=test)
+    assert sigma == pytest.approx(0.5, rel=0.1)
+    assert inliers.mean() == pytest.approx(share, abs=0.035)
+
+
+@pytest.mark.parametrize("settings", [{"both_lines": True}, {"sum_of_lines": True}])
+def test_algorithm_2_with_the_tests_of_the_text_finds_the_right_matches(settings):
+    rng = np.random.default_rng(2)
+    xy1, xy2, wrong = spoil(make_pair(150, rng), rng, sigma=0.3, outliers=0.3)
+    fit = ThesisRansac(samples=300, **settings).estimate(xy1, xy2, rng)
+    usual = ThesisRansac(samples=300).estimate(xy1, xy2, np.random.default_rng(2))
+    assert np.mean(fit.inliers == usual.inliers) > 0.9
+    assert fit.sigma_px == pytest.approx(usual.sigma_px, rel=0.2)
+    assert wrong.any()
+
+
+def test_one_test_at_a_time():
+    with pytest.raises(ValueError, match="not by both"):
+        ThesisRansac(both_lines=True, sum_of_lines=True)
+
+
+FAST = LocallyOptimisedRansac()
+
+
+def squared_error(F, pair, good):
+    return float(np.mean(symmetric_residuals(F, pair.xy1[good], pair.xy2[good]) ** 2) / 2.0)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("n", [30, 100])
+def test_it_is_as_good_as_the_gold_standard_at_any_noise(n, sigma):
+    """At 2 px most right matches lie beyond the threshold of 1 px."""
+    ours, gold, sigmas = [], [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        pair = make_pair(n, rng)
+        xy1, xy2, _ = spoil(pair, rng, sigma=sigma, outliers=0.0)
+        fit, everyone = estimate_fundamental(xy1, xy2, seed=seed), np.ones(n, dtype=bool)
+        ours.append(squared_error(fit.F, pair, everyone))
+        gold.append(squared_error(refine_reprojection(pair.F, xy1, xy2), pair, everyone))
+        sigmas.append(fit.sigma_px / sigma)
+        assert fit.inliers.mean() > 0.9
+    assert np.sqrt(np.mean(ours) / np.mean(gold)) < 1.15
+    assert np.median(sigmas) == pytest.approx(1.0, abs=0.1)
+
+
+def test_noise_with_a_heavy_tail_keeps_its_tail_as_inliers_where_it_is_asked_for():
+    rng = np.random.default_rng(5)
+    pair = make_pair(400, rng)
+    xy1, xy2, wrong = spoil(pair, rng, sigma=0.3, outliers=0.3)
+    tail = ~wrong & (rng.random(400) < 0.15)
+    xy1[tail] += rng.normal(0.0, 1.2, (int(tail.sum()), 2))
+    everything = FAST.estimate(xy1, xy2, np.random.default_rng(0))
+    precise = LocallyOptimisedRansac(inlier_sigmas=2.5).estimate(xy1, xy2, np.random.default_rng(0))
+    assert everything.inliers[~wrong].mean() > 0.97
+    assert everything.inliers[wrong].mean() < 0.05
+    assert precise.inliers[tail].mean() < 0.75
+    np.testing.assert_array_equal(precise.F, everything.F)
+    r = np.abs(sampson_residuals(precise.F, xy1, xy2))
+    np.testing.assert_array_equal(precise.inliers, r < max(2.5 * precise.sigma_px, 0.3))
+
+
+def test_noise_beyond_the_threshold_is_not_invented_for_wrong_matches():
+    """Of many wrong matches some are near any wide band: they must not widen the noise."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        pair = make_pair(200, rng)
+        xy1, xy2, wrong = spoil(pair, rng, sigma=0.3, outliers=0.75)
+        fit = estimate_fundamental(xy1, xy2, seed=seed)
+        assert fit.sigma_px < 0.5
+        assert fit.inliers[wrong].mean() < 0.05
+
+
+def test_other_ends_of_the_search_are_told_as_rivals():
+    """Two motions of as many matches each: the one that is not taken is the first rival."""
+    rng = np.random.default_rng(0)
+    one, other = make_pair(60, rng), make_pair(60, np.random.default_rng(1))
+    xy1, xy2 = np.vstack([one.xy1, other.xy1]), np.vstack([one.xy2, other.xy2])
+    noisy1, noisy2 = (xy + rng.normal(0.0, 0.2, xy.shape) for xy in (xy1, xy2))
+    fit = LocallyOptimisedRansac(starts=8).estimate(noisy1, noisy2, np.random.default_rng(0))
+    everyone = np.ones(60, dtype=bool)
+    errors = [
+        [squared_error(F, pair, everyone) for pair in (one, other)] for F in (fit.F, *fit.competing_models)
+    ]
+    taken = int(np.argmin(errors[0]))
+    assert errors[0][taken] < 0.5
+    assert min(error[1 - taken] for error in errors[1:]) < 0.5
+
+
+def test_searches_that_disagree_are_repeated():
+    rng = np.random.default_rng(2)
+    pair = make_pair(100, rng)
+    xy1, xy2, _ = spoil(pair, rng, sigma=0.3, outliers=0.2)
+    drawn = [
+        LocallyOptimisedRansac(starts=k).estimate(xy1, xy2, np.random.default_rng(0)).iterations
+        for k in (1, 3, 5)
+    ]
+    assert drawn[1] >= 3 * drawn[0]
+    assert drawn[2] >= 5 * drawn[0]
+    hopeless = rng.uniform(0.0, 1000.0, (2, 60, 2))
+    fit = LocallyOptimisedRansac(max_starts=8).estimate(*hopeless, np.random.default_rng(0))
+    assert fit.inliers.mean() < 0.5
+    # Eight searches at the threshold and eight with the wider gate, of a share of the samples each.
+    assert 3 * 1024 < fit.iterations <= 2 * FAST.max_samples
+
+
+@pytest.mark.parametrize("wrong_call", [{"starts": 5, "max_starts": 4}, {"inlier_sigmas": 0.0}])
+def test_impossible_settings_are_refused(wrong_call):
+    with pytest.raises(ValueError, match=next(reversed(wrong_call))):
+        LocallyOptimisedRansac(**wrong_call)

@@ -65,7 +65,7 @@ HOSTILE = {
     "of two sizes": (1e-8 * GOOD1, GOOD2),
     "one wild match": (np.r_[GOOD1, [[1e12, 5.0]]], np.r_[GOOD2, [[5.0, 1e12]]]),
 }
-NAN_BY_DEFINITION = ("turn_deg", "turning_camera_ratio")
+NAN_BY_DEFINITION = ("rotation_deg", "rotation_camera_ratio")
 
 
 def rng():
@@ -73,7 +73,7 @@ def rng():
 
 
 def default_with_all_it_says(xy1, xy2):
-    fit = estimate_fundamental(xy1, xy2, judge=True)
+    fit = estimate_fundamental(xy1, xy2, check_degeneracy=True)
     e1, e2 = epipoles_of(fit)
     return fit, epipolar_distance_interval(fit, xy1, xy2), e1.direction, e2.direction, e1.covariance
 

@@ -35,7 +35,7 @@ def test_pencil_spans_the_null_space(seed):
     points, _ = noisy_points(seed)
     pencil = np.empty((2, 9))
     sample = np.arange(10, 17)
-    assert linear.null_pencil(points, sample, pencil)
+    assert linear._null_pencil(points, sample, pencil)
     np.testing.assert_allclose(pencil @ pencil.T, np.eye(2), atol=1e-12)
     assert np.abs(equations(points[sample]) @ pencil.T).max() < 1e-12
 
@@ -43,17 +43,17 @@ def test_pencil_spans_the_null_space(seed):
 def test_dependent_equations_have_no_pencil():
     points, _ = noisy_points(0)
     points[16] = points[15]
-    assert not linear.null_pencil(points, np.arange(10, 17), np.empty((2, 9)))
+    assert not linear._null_pencil(points, np.arange(10, 17), np.empty((2, 9)))
 
 
 @settings(max_examples=50, deadline=None)
 @given(seeds)
 def test_determinants(seed):
     f, g = np.random.default_rng(seed).normal(size=(2, 9))
-    assert linear.det3(f) == pytest.approx(np.linalg.det(f.reshape(3, 3)), abs=1e-12)
+    assert linear._det3(f) == pytest.approx(np.linalg.det(f.reshape(3, 3)), abs=1e-12)
     h = 1e-5
-    slope = (linear.det3(f + h * g) - linear.det3(f - h * g)) / (2 * h)
-    assert linear.mixed_det3(f, g) == pytest.approx(slope, abs=1e-7)
+    slope = (linear._det3(f + h * g) - linear._det3(f - h * g)) / (2 * h)
+    assert linear._mixed_det3(f, g) == pytest.approx(slope, abs=1e-7)
 
 
 @settings(max_examples=100, deadline=None)
@@ -63,7 +63,7 @@ def test_cubic_with_three_real_roots(expected):
     roots = np.empty(3)
     full = np.concatenate([expected, np.repeat(expected[-1:], 3 - len(expected))])
     _, a, b, c = np.poly(full)
-    found = np.sort(roots[: linear.monic_cubic_roots(a, b, c, roots)])
+    found = np.sort(roots[: linear._cubic_roots(a, b, c, roots)])
     for x in expected:
         assert np.abs(found - x).min() < 1e-3
     if len(expected) == 3:
@@ -75,7 +75,7 @@ def test_cubic_with_three_real_roots(expected):
 def test_cubic_with_one_real_root(x, re, im):
     _, a, b, c = np.real(np.poly([x, re + 1j * im, re - 1j * im]))
     roots = np.empty(3)
-    assert linear.monic_cubic_roots(a, b, c, roots) == 1
+    assert linear._cubic_roots(a, b, c, roots) == 1
     assert roots[0] == pytest.approx(x, abs=1e-6)
 
 
@@ -119,9 +119,9 @@ def test_distances_and_score_equal_numpy(seed):
 def test_sequential_test_gives_up_wrong_matrices_early_and_keeps_right_ones():
     rng = np.random.default_rng(0)
     n, right, wrong, kept, seen = 2000, 0.4, 0.05, 0, []
-    evidence = kernels.log_ratios(right, wrong)
+    evidence = kernels._log_likelihood_ratios(right, wrong)
     np.testing.assert_allclose(evidence, [np.log(wrong / right), np.log((1 - wrong) / (1 - right))])
-    assert kernels.log_ratios(0.06, 0.05) == (0.0, 0.0)
+    assert kernels._log_likelihood_ratios(0.06, 0.05) == (0.0, 0.0)
     f = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0])  # y1 - y2
     for _ in range(200):
         for share in (right, wrong):
@@ -158,7 +158,7 @@ def robust_cost(f, points, criterion, gate, delta):
     return float(np.where(r <= delta, 0.5 * r**2, delta * (r - 0.5 * delta)).sum())
 
 
-@pytest.mark.parametrize("criterion", [rank2.SAMPSON, rank2.DISTANCE])
+@pytest.mark.parametrize("criterion", [rank2.SAMPSON, rank2.EPIPOLAR_DISTANCE])
 @pytest.mark.parametrize(("gate", "delta"), [(1.0, 0.7), (2e-3, 1e-3)])
 def test_normal_equations_are_the_derivatives_of_the_cost(criterion, gate, delta):
     points, f = noisy_points(4, n=300)
@@ -184,14 +184,14 @@ def test_tangent_is_the_derivative_of_the_representation(seed):
     U, V = np.linalg.qr(rng.normal(size=(3, 3)))[0], np.linalg.qr(rng.normal(size=(3, 3)))[0]
     phi = rng.uniform(0.1, 0.7)
     B = np.empty((9, 7))
-    rank2.tangent(U, V, phi, B)
+    rank2.orthonormal_tangent(U, V, phi, B)
     for j, step in enumerate(1e-6 * np.eye(7)):
         ends = []
         for sign in (1.0, -1.0):
             Un, Vn, f = np.empty((3, 3)), np.empty((3, 3)), np.empty(9)
-            rank2.rotate_columns(U, sign * step[:3], Un)
-            rank2.rotate_columns(V, sign * step[3:6], Vn)
-            rank2.compose(Un, Vn, phi + sign * step[6], f)
+            rank2._rotate_columns(U, sign * step[:3], Un)
+            rank2._rotate_columns(V, sign * step[3:6], Vn)
+            rank2.fundamental_from_orthonormal(Un, Vn, phi + sign * step[6], f)
             ends.append(f)
             np.testing.assert_allclose(Un.T @ Un, np.eye(3), atol=1e-12)
             assert np.linalg.norm(f) == pytest.approx(1.0)
@@ -205,18 +205,18 @@ def test_damped_solve_equals_numpy(seed, damping):
     J, g = rng.normal(size=(20, 7)), rng.normal(size=7)
     H = J.T @ J
     step = np.empty(7)
-    assert rank2.solve_damped(H, g, damping, step)
+    assert rank2._solve_damped(H, g, damping, step)
     expected = np.linalg.solve(H + damping * np.diag(np.diag(H)), -g)
     np.testing.assert_allclose(step, expected, rtol=1e-7)
 
 
 def test_damped_solve_refuses_what_is_not_positive():
-    assert not rank2.solve_damped(-np.eye(7), np.ones(7), 1e-3, np.empty(7))
-    assert not rank2.solve_damped(np.full((7, 7), np.nan), np.ones(7), 1e-3, np.empty(7))
+    assert not rank2._solve_damped(-np.eye(7), np.ones(7), 1e-3, np.empty(7))
+    assert not rank2._solve_damped(np.full((7, 7), np.nan), np.ones(7), 1e-3, np.empty(7))
 
 
 @settings(max_examples=20, deadline=None)
-@given(seeds, st.sampled_from([rank2.SAMPSON, rank2.DISTANCE]))
+@given(seeds, st.sampled_from([rank2.SAMPSON, rank2.EPIPOLAR_DISTANCE]))
 def test_refinement_never_raises_the_cost_and_keeps_rank_two(seed, criterion):
     points, f = noisy_points(seed)
     start = f + np.random.default_rng(seed).normal(0.0, 0.02, 9)

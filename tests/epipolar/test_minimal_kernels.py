@@ -18,8 +18,8 @@ def batch_of(points, rng):
     """The samples (LANES, 7) of one batch and the solved batch."""
     uniforms = rng.random((minimal.LANES, 7))
     X, Y = np.ones((28, minimal.LANES)), np.empty((minimal.ROWS, minimal.LANES))
-    kernels.draw_batch(points, uniforms, X)
-    minimal.solve_batch(X, Y)
+    kernels._draw_batch(points, uniforms, X)
+    minimal.solve_seven_point_batch(X, Y)
     samples = np.empty((minimal.LANES, 7), dtype=np.int64)
     for u, sample in zip(uniforms, samples, strict=True):
         draw_sample(u, len(points), sample)
@@ -49,7 +49,7 @@ def test_every_oriented_solution_of_the_exact_solver_is_found_and_no_other(seed)
             for f in exact[: minimal.seven_point(points, sample, exact)].copy()
             if oriented(f, points, sample)
         ]
-        count = minimal.lane_solutions(Y, lane, np.empty(9), found)
+        count = minimal.seven_point_batch_solutions(Y, lane, np.empty(9), found)
         counts += count != len(expected)
         for f in expected[: count if count == len(expected) else 0]:
             differences.append(min(min(np.linalg.norm(f - g), np.linalg.norm(f + g)) for g in found[:count]))
@@ -65,7 +65,7 @@ def test_solutions_satisfy_the_seven_equations_and_are_singular():
     F = np.empty((3, 9))
     for lane, sample in enumerate(samples):
         x1, x2 = np.c_[points[sample, :2], np.ones(7)], np.c_[points[sample, 2:], np.ones(7)]
-        for f in F[: minimal.lane_solutions(Y, lane, np.empty(9), F)]:
+        for f in F[: minimal.seven_point_batch_solutions(Y, lane, np.empty(9), F)]:
             M = f.reshape(3, 3)
             assert np.linalg.norm(f) == pytest.approx(1.0)
             assert np.abs(np.einsum("na,ab,nb->n", x2, M, x1)).max() < 1e-6
@@ -80,7 +80,7 @@ def test_degenerate_samples_never_give_numbers_that_are_not_finite():
         _, Y = batch_of(np.ascontiguousarray(points), rng)
         F = np.empty((3, 9))
         for lane in range(minimal.LANES):
-            assert np.isfinite(F[: minimal.lane_solutions(Y, lane, np.empty(9), F)]).all()
+            assert np.isfinite(F[: minimal.seven_point_batch_solutions(Y, lane, np.empty(9), F)]).all()
 
 
 @settings(max_examples=200, deadline=None)
@@ -91,7 +91,7 @@ def test_cubic_with_three_real_roots(expected):
         return
     _, a, b, c = np.poly(expected)
     roots = np.empty(3)
-    assert minimal.newton_cubic_roots(a, b, c, roots) == 3
+    assert minimal._newton_cubic_roots(a, b, c, roots) == 3
     np.testing.assert_allclose(np.sort(roots), expected, atol=1e-8)
 
 
@@ -100,11 +100,11 @@ def test_cubic_with_three_real_roots(expected):
 def test_cubic_with_one_real_root(x, re, im):
     _, a, b, c = np.real(np.poly([x, re + 1j * im, re - 1j * im]))
     roots = np.empty(3)
-    assert minimal.newton_cubic_roots(a, b, c, roots) == 1
+    assert minimal._newton_cubic_roots(a, b, c, roots) == 1
     assert roots[0] == pytest.approx(x, abs=1e-8)
 
 
 def test_cubic_without_numbers_has_no_root():
     for bad in (np.nan, np.inf):
-        assert minimal.newton_cubic_roots(bad, 1.0, 1.0, np.empty(3)) == 0
-        assert minimal.newton_cubic_roots(1.0, 1.0, bad, np.empty(3)) == 0
+        assert minimal._newton_cubic_roots(bad, 1.0, 1.0, np.empty(3)) == 0
+        assert minimal._newton_cubic_roots(1.0, 1.0, bad, np.empty(3)) == 0

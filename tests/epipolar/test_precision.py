@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
+from validation.studies.epipolar import DEFAULT, GOLD, check_precision
 
 from tests.epipolar.pairs import make_pair
 from thesisrecon.epipolar.configuration import Configuration
@@ -21,7 +22,6 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
 from thesisrecon.records import FundamentalFit
 from validation.scenes.two_views import make_two_views
-from validation.studies.epipolar import DEFAULT, GOLD, check_precision
 
 
 def bound_of(seed, n=40, sigma=0.5):

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
     NO_SEGMENTS,
-    TrifocalReprojection,
-    TrifocalStep,
+    _minimize_algebraic_error,
+    _ReprojectionProblem,
+    _Step,
     estimate_trifocal,
-    minimize_algebraic_error,
     refine_trifocal,
 )
 from thesisrecon.errors import StageFailure
@@ -105,9 +105,9 @@ def test_the_least_error_does_not_hang_on_the_signs_of_singular_vectors():
     rng = np.random.default_rng(3)
     equations = tensor_equations(*matches(three_cameras(rng), rng, 30, 0, 0.5))
     start = equations.solve()
-    expected = minimize_algebraic_error(equations, start)
+    expected = _minimize_algebraic_error(equations, start)
     fickle = FickleEquations(equations.A, equations.noise, equations.transforms)
-    found = minimize_algebraic_error(fickle, start)
+    found = _minimize_algebraic_error(fickle, start)
     assert len(fickle.calls) > 5
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert np.linalg.norm(equations.A @ expected.ravel()) < 1.0001 * np.linalg.norm(
@@ -124,7 +124,7 @@ def test_each_step_comes_nearer_to_the_truth_and_the_noise_is_told(n, m):
         points, segments = matches(P, rng, n, m, 0.5)
         exact, _ = matches(P, rng, 100, 0, 0.0)
         equations = tensor_equations(points, segments)
-        algebraic = minimize_algebraic_error(equations, equations.solve())
+        algebraic = _minimize_algebraic_error(equations, equations.solve())
         np.testing.assert_allclose(
             abs(np.sum(algebraic * tensor_from_cameras(*cameras_from_tensor(algebraic)))), 1.0, atol=1e-9
         )
@@ -197,7 +197,7 @@ def test_the_refinement_is_at_a_minimum_and_its_gradient_is_right():
     rng = np.random.default_rng(3)
     points, segments = matches(three_cameras(rng), rng, 9, 8, 1.0)
     equations = tensor_equations(points, segments)
-    problem = TrifocalReprojection.of(points, segments, equations.transforms, 1.0)
+    problem = _ReprojectionProblem.of(points, segments, equations.transforms, 1.0)
     state = problem.start(equations.solve())
     system, h = problem.linearize(state), 1e-7
     for step, slope in _single_steps(system, h):
@@ -212,19 +212,19 @@ def _single_steps(system, h):
     """Moves of single parameters of each kind with the cost's slope along them."""
     points, lines = system.blocks
     for k in range(24):
-        yield TrifocalStep(h * np.eye(24)[k], np.zeros_like(points.h), np.zeros_like(lines.h)), system.g[k]
+        yield _Step(h * np.eye(24)[k], np.zeros_like(points.h), np.zeros_like(lines.h)), system.g[k]
     for k in range(3):
         move = np.zeros_like(points.h)
         move[2, k] = h
-        yield TrifocalStep(np.zeros(24), move, np.zeros_like(lines.h)), points.h[2, k]
+        yield _Step(np.zeros(24), move, np.zeros_like(lines.h)), points.h[2, k]
     for k in range(4):
         move = np.zeros_like(lines.h)
         move[5, k] = h
-        yield TrifocalStep(np.zeros(24), np.zeros_like(points.h), move), lines.h[5, k]
+        yield _Step(np.zeros(24), np.zeros_like(points.h), move), lines.h[5, k]
 
 
 def _scaled(step, by):
-    return TrifocalStep(by * step.cameras, by * step.points, by * step.lines)
+    return _Step(by * step.cameras, by * step.points, by * step.lines)
 
 
 def test_a_few_wrong_matches_do_not_spoil_the_tensor():

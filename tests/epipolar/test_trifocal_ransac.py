@@ -16,10 +16,10 @@ from tests.epipolar.test_trifocal_estimation import (
 from tests.geometry.properties import holds_for_every
 from thesisrecon.epipolar.six_point import (
     SAMPLE,
+    _score,
     draw_samples,
     reprojection_distances,
-    score,
-    search,
+    search_trifocal,
     six_point,
 )
 from thesisrecon.epipolar.trifocal_estimation import (
@@ -29,7 +29,7 @@ from thesisrecon.epipolar.trifocal_estimation import (
     estimate_trifocal,
     refine_trifocal,
 )
-from thesisrecon.epipolar.trifocal_ransac import TrifocalRansac, line_distances_px, noise_of_tracks
+from thesisrecon.epipolar.trifocal_ransac import TrifocalRansac, _line_distances_px, _track_noise
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera, project
 from thesisrecon.geometry.homogeneous import homogenize
@@ -147,17 +147,17 @@ def test_distances_are_those_of_the_least_reprojection_error():
         assert found[k] / SCALE == pytest.approx(np.linalg.norm(off(best)), rel=1e-4)
     squared = (found / 0.01) ** 2
     plain = np.mean([np.maximum(0.0, 1.0 - squared / w**2).sum() for w in (1.0, 2.0, 4.0)])
-    assert score(cameras, track, 1e4, 0.0) == pytest.approx(plain, rel=1e-9)
-    assert score(cameras, track, 1e4, plain + 1.0) == 0.0
+    assert _score(cameras, track, 1e4, 0.0) == pytest.approx(plain, rel=1e-9)
+    assert _score(cameras, track, 1e4, plain + 1.0) == 0.0
 
 
 def test_the_search_keeps_the_best_and_what_is_better_already():
     rng = np.random.default_rng(2)
     track = tracks(matches(three_cameras(rng), rng, 60, 0, 0.3)[0])
     best, samples = np.zeros((3, 3, 4)), draw_samples(rng.random((50, SAMPLE)), 60)
-    found = search(track, samples, track, 2.0 * SCALE, 0.0, best)
-    assert found == pytest.approx(score(best, track, 1.0 / (2.0 * SCALE) ** 2, 0.0))
-    assert search(track, samples, track, 2.0 * SCALE, 60.0, np.zeros((3, 3, 4))) == 60.0
+    found = search_trifocal(track, samples, track, 2.0 * SCALE, 0.0, best)
+    assert found == pytest.approx(_score(best, track, 1.0 / (2.0 * SCALE) ** 2, 0.0))
+    assert search_trifocal(track, samples, track, 2.0 * SCALE, 60.0, np.zeros((3, 3, 4))) == 60.0
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])
@@ -165,8 +165,8 @@ def test_the_noise_of_tracks_is_found_among_wrong_ones(sigma):
     rng = np.random.default_rng(3)
     right = sigma * np.linalg.norm(rng.normal(size=(300, 3)), axis=1)
     wrong = 600.0 * rng.random(300) ** (1.0 / 3.0)
-    assert noise_of_tracks(np.append(right, wrong), 2.0, 600.0) == pytest.approx(sigma, rel=0.08)
-    assert noise_of_tracks(np.zeros(20), 2.0, 600.0) < 1e-4
+    assert _track_noise(np.append(right, wrong), 2.0, 600.0) == pytest.approx(sigma, rel=0.08)
+    assert _track_noise(np.zeros(20), 2.0, 600.0) < 1e-4
 
 
 def planted(rng, n, share, sigma):
@@ -208,7 +208,7 @@ def test_lines_that_agree_join_the_tracks():
     assert not found.inliers[:25].any()
     assert found.inliers[25:].mean() > 0.95
     assert found.fit.lines.shape[0] == found.line_inliers.sum()
-    np.testing.assert_allclose(line_distances_px(P, matches(P, rng, 0, 9, 0.0)[1]), 0.0, atol=1e-6)
+    np.testing.assert_allclose(_line_distances_px(P, matches(P, rng, 0, 9, 0.0)[1]), 0.0, atol=1e-6)
 
 
 def test_same_generator_same_bytes():

@@ -128,5 +128,5 @@ def test_wrong_calls():
         PairVerification().verify(as_matches(xy, xy), fit, np.random.default_rng(0))
     with pytest.raises(ValueError, match="min_inliers"):
         PairVerification(min_inliers=3)
-    with pytest.raises(ValueError, match="min_share"):
-        PairVerification(min_share=1.5)
+    with pytest.raises(ValueError, match="min_inlier_ratio"):
+        PairVerification(min_inlier_ratio=1.5)

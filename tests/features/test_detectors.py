@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from tests.textures import photograph, texture
+from tests.synthetic import photograph, texture
 from thesisrecon.features.harris import CornerMeasure, HarrisCorners, find_corners, select_spread
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.records import Image

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordinates, maximum_filter
 
-from tests.textures import texture
+from tests.synthetic import texture
 from thesisrecon.features.kernels import (
     corner_response,
     fit_maxima,

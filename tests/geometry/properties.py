@@ -1,8 +1,9 @@
-"""What the property tests of chapter 3 share: deterministic examples and random cameras and points."""
+"""Strategies of hypothesis for cameras and points, and NumPy twins of the triangulation kernels."""
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_centre
@@ -39,3 +40,117 @@ def gap(a, b):
     """Distance of two arrays of any scale and sign: the sine of their angle."""
     a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
     return float(min(np.linalg.norm(a - b), np.linalg.norm(a + b)))
+
+
+def reprojection_costs(P, X, xy):
+    """Sum over the views that see it of squared distances, per point; P (V, 3, 4), X (N, 4), xy (V, N, 2)."""
+    xh = np.einsum("vab,nb->vna", P, X)
+    return np.asarray(np.nansum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=(0, 2)))
+
+
+def view_scales(P, xy):
+    """1 over the norm of M's first two rows, the pixels' origin in the middle of the view's points."""
+    middle = np.nanmean(xy, axis=1)
+    return np.asarray(
+        1.0 / np.linalg.norm(P[:, :2, :3] - middle[:, :, None] * P[:, 2:, :3], axis=(1, 2)), dtype=np.float64
+    )
+
+
+def linear_point(P, scale, xy):
+    """Least singular vector of the rows of one point; P (V, 3, 4), scale (V,), xy (V, 2)."""
+    rows = [
+        scale[v] * (xy[v, i] * P[v, 2] - P[v, i])
+        for v in range(len(P))
+        for i in range(2)
+        if xy[v, 0] == xy[v, 0]
+    ]
+    return np.asarray(np.linalg.svd(np.array(rows))[2][3])
+
+
+def iterated_point(P, scale, xy, *, passes=10, tolerance=1e-6):
+    """Rows over the depths of the pass before, until these rest; else the better of last and first."""
+    first = X = linear_point(P, scale, xy)
+    before = None
+    for _ in range(passes):
+        depths = np.abs(P[:, 2] @ X)
+        if before is not None and (np.abs(depths / before - 1.0) < tolerance).all():
+            return X
+        X, before = linear_point(P, 1.0 / depths, xy), depths
+    one, last = (reprojection_costs(P, x[None], xy[:, None])[0] for x in (first, X))
+    return X if last < one else first
+
+
+def midpoint(P, xy):
+    """Point (3,) nearest to the rays of one point."""
+    A, b = np.zeros((3, 3)), np.zeros(3)
+    for camera, pixel in zip(P, xy, strict=True):
+        if np.isnan(pixel).any():
+            continue
+        centre = -np.linalg.solve(camera[:, :3], camera[:, 3])
+        ray = np.linalg.solve(camera[:, :3], [*pixel, 1.0])
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        A, b = A + across, b + across @ centre
+    return np.asarray(np.linalg.solve(A, b))
+
+
+def least_reprojection_cost(P, xy, start):
+    """Cost of the least-squares optimum of one point from a finite start (4,)."""
+
+    def residual(x):
+        xh = P @ np.append(x, 1.0)
+        return np.asarray((xh[:, :2] / xh[:, 2:] - xy).ravel())
+
+    best = least_squares(residual, start[:3] / start[3], method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return float(2.0 * best.cost)
+
+
+def correct_matches(F, xy1, xy2):
+    """Hartley and Sturm's polynomial method step by step: shift, turn, six roots, infinity, feet, back."""
+    E1, f = _to_origin_and_axis(xy1, np.linalg.svd(F)[2][2])
+    E2, g = _to_origin_and_axis(xy2, np.linalg.svd(F)[0][:, 2])
+    G = np.linalg.inv(E2).swapaxes(1, 2) @ F @ np.linalg.inv(E1)
+    a, b, c, d = G[:, 1, 1], G[:, 1, 2], G[:, 2, 1], G[:, 2, 2]
+    size = np.sqrt(a**2 + b**2 + c**2 + d**2)
+    a, b, c, d = a / size, b / size, c / size, d / size
+    feet1, feet2 = np.empty_like(xy1), np.empty_like(xy2)
+    for n in range(len(xy1)):
+        s, one = _best_parameter(a[n], b[n], c[n], d[n], f[n], g[n])
+        line1 = np.array([s * f[n], one, -s])
+        line2 = np.array([-g[n] * (c[n] * s + d[n] * one), a[n] * s + b[n] * one, c[n] * s + d[n] * one])
+        feet1[n], feet2[n] = _foot(E1[n], line1), _foot(E2[n], line2)
+    return feet1, feet2
+
+
+def _to_origin_and_axis(xy, epipole):
+    """Rigid motions (N, 3, 3) that take each point to the origin and the epipole to (1, 0, f); and f (N,)."""
+    E, f = np.empty((len(xy), 3, 3)), np.empty(len(xy))
+    for n, (x, y) in enumerate(xy):
+        T = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]])
+        e = T @ epipole
+        e /= np.hypot(e[0], e[1])
+        E[n], f[n] = np.array([[e[0], e[1], 0.0], [-e[1], e[0], 0.0], [0.0, 0.0, 1.0]]) @ T, e[2]
+    return E, f
+
+
+def _best_parameter(a, b, c, d, f, g):
+    """The best stationary point of s(t), homogeneous: (t, 1), or (1, 0) for infinity (methods 6.3.3)."""
+    p = np.array([a * a + g * g * c * c, 2 * (a * b + g * g * c * d), b * b + g * g * d * d])
+    q, r = np.array([f**4, 0.0, 2 * f**2, 0.0, 1.0]), np.array([a * c, a * d + b * c, b * d])
+    polynomial = -(a * d - b * c) * np.convolve(q, r)
+    polynomial[1:] += np.append(np.convolve(p, p), 0.0)[:6]
+
+    def cost(t):
+        return t**2 / (1 + f**2 * t**2) + (c * t + d) ** 2 / ((a * t + b) ** 2 + g**2 * (c * t + d) ** 2)
+
+    candidates = [(cost(t), (float(t), 1.0)) for t in np.roots(polynomial).real]
+    candidates.append(
+        (1 / f**2 + c**2 / (a**2 + g**2 * c**2), (1.0, 0.0)) if f != 0.0 else (np.inf, (1.0, 0.0))
+    )
+    return min(candidates)[1]
+
+
+def _foot(E, line):
+    """Nearest point of a line to the origin, moved back."""
+    u, v, w = line
+    back = np.linalg.solve(E, [-u * w, -v * w, u * u + v * v])
+    return np.asarray(back[:2] / back[2])

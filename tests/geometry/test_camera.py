@@ -120,15 +120,15 @@ def test_3_27_cheirality_is_a_sign_of_depth_that_no_scale_changes(rng):
     P, _, R, centre = random_camera(rng)
     X = random_points(rng, 20)
     true_depth = (dehomogenize(X) - centre) @ R[2]
-    chi = cheirality(X, P)
+    chi = cheirality(P, X)
     np.testing.assert_array_equal(chi > 0.0, true_depth > 0.0)
-    np.testing.assert_allclose(cheirality(-2.0 * X, -0.5 * P), chi, rtol=1e-9)
-    np.testing.assert_allclose(depth(X, P), true_depth, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(cheirality(-0.5 * P, -2.0 * X), chi, rtol=1e-9)
+    np.testing.assert_allclose(depth(P, X), true_depth, rtol=1e-8, atol=1e-9)
     # The magnitude is an inverse depth: t = 1/chi for a normalised camera and point.
     unit, normal = X / X[:, 3:], normalize_camera(P)
-    np.testing.assert_allclose(1.0 / cheirality(unit, normal), unit @ normal[2], rtol=1e-8)
+    np.testing.assert_allclose(1.0 / cheirality(normal, unit), unit @ normal[2], rtol=1e-8)
     at_infinity = np.append(rng.normal(size=3), 0.0)[None]
-    assert cheirality(at_infinity, P)[0] == 0.0
+    assert cheirality(P, at_infinity)[0] == 0.0
 
 
 @holds_for_every()

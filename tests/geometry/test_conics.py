@@ -10,17 +10,17 @@ from thesisrecon.geometry.conics import (
     ABSOLUTE_DUAL_QUADRIC,
     angle_between_pixels,
     angle_between_planes,
+    bilinear_form,
     calibration_from_dual_image,
     calibration_from_image,
     conic_through,
     dual,
     dual_image_of_absolute_conic,
     dual_quadric_of_plane,
-    form,
     image_of_absolute_conic,
     image_of_infinity,
     incidence_residual,
-    meet_line,
+    intersect_line,
     plane_at_infinity,
     project_dual_quadric,
     tangency_discriminant,
@@ -70,7 +70,7 @@ def test_3_1_points_that_leave_a_conic_free_are_refused():
 @holds_for_every()
 def test_3_2_absolute_conic_has_no_real_points(rng):
     x = rng.normal(size=(20, 3))
-    assert (form(ABSOLUTE_CONIC, x, x) > 0.0).all()
+    assert (bilinear_form(ABSOLUTE_CONIC, x, x) > 0.0).all()
     imaginary = np.array([1.0, 1j, 0.0])
     assert imaginary @ ABSOLUTE_CONIC @ imaginary == 0.0
 
@@ -99,12 +99,12 @@ def test_3_5_and_3_6_lines_meet_in_two_points_or_touch_or_miss(rng, d):
     other = far.copy()
     other[:-1] += np.linalg.svd(far[None, :-1])[2][1]
     assert tangency_discriminant(C, inside, far) > 0.0
-    found = meet_line(C, inside, far)
+    found = intersect_line(C, inside, far)
     assert found.shape == (2, d)
     assert incidence_residual(C, found).max() < 1e-10
     assert tangency_discriminant(C, far, other) < 0.0
-    assert meet_line(C, far, other).shape == (0, d)
-    through_both = meet_line(C, x[0], x[1])
+    assert intersect_line(C, far, other).shape == (0, d)
+    through_both = intersect_line(C, x[0], x[1])
     assert min(gap(through_both[0], x[0]), gap(through_both[0], x[1])) < 1e-7
 
 
@@ -115,7 +115,7 @@ def test_3_7_the_tangent_touches_in_its_point_alone(rng, d):
     assert incidence_sine(t, x[0]) < 1e-12
     along = np.cross(t, rng.normal(size=3)) if d == 3 else np.linalg.svd(t[None])[2][1]
     assert abs(tangency_discriminant(C, x[0], along)) < 1e-9 * (along @ along)
-    touching = meet_line(C, x[0], along)
+    touching = intersect_line(C, x[0], along)
     assert len(touching) >= 1
     assert max(gap(point, x[0]) for point in touching) < 1e-5
 
@@ -139,11 +139,11 @@ def test_3_9_planes_of_outline_tangents_touch_the_quadric(rng):
     P, *_ = random_camera(rng)
     outline = dual(project_dual_quadric(P, dual(Q)))
     inside = np.linalg.inv(outline)[:, 2]
-    on_outline = meet_line(outline, inside, inside + inside[2] * np.array([50.0, 80.0, 0.0]))
+    on_outline = intersect_line(outline, inside, inside + inside[2] * np.array([50.0, 80.0, 0.0]))
     assert len(on_outline) == 2
     planes = back_project_lines(P, tangent(outline, on_outline))
     scaled = planes / np.linalg.norm(planes, axis=1, keepdims=True)
-    assert np.abs(form(dual(Q), scaled, scaled)).max() < 1e-6 * np.linalg.norm(dual(Q))
+    assert np.abs(bilinear_form(dual(Q), scaled, scaled)).max() < 1e-6 * np.linalg.norm(dual(Q))
 
 
 @holds_for_every()
@@ -229,9 +229,9 @@ def test_3_4_2_intersection_and_tangency_of_surfaces_are_kept_by_projective_tran
     # The two surfaces share x[0] with its tangent plane, before and after.
     assert gap(tangent(moved, y[0]), transform_planes(G, plane)) < 1e-9
     assert gap(tangent(moved_touching, y[0]), transform_planes(G, plane)) < 1e-9
-    assert abs(form(dual(moved), tangent(moved, y[0]), tangent(moved, y[0]))) < 1e-9
+    assert abs(bilinear_form(dual(moved), tangent(moved, y[0]), tangent(moved, y[0]))) < 1e-9
     # A line through two points of the surface meets it in their images, one that misses it still does.
-    assert abs(form(moved, y[1], y[1])) < 1e-9
+    assert abs(bilinear_form(moved, y[1], y[1])) < 1e-9
     for start, end in ((x[1], x[2]), rng.normal(size=(2, d))):
         before = tangency_discriminant(C, start, end)
         after = tangency_discriminant(moved, G @ start, G @ end)

@@ -1,23 +1,37 @@
-"""Sections 3.6.1 and 3.6.4: homographies of planes, their epipoles, fundamental matrices and cameras."""
+"""Homographies, lines and planes (sections 3.2, 3.6.1)."""
 
 import numpy as np
 import pytest
 
 from tests.geometry.properties import gap, holds_for_every, random_camera, random_points
 from thesisrecon.geometry.camera_matrix import camera_centre, project
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
 from thesisrecon.geometry.homographies import (
+    camera_from_homography,
     compatibility_residual,
     fundamental_from_homography,
-    homographies_of_fundamental,
+    homography_from_fundamental,
     homography_through_line,
     image_from_plane,
     infinite_homography,
     plane_homography,
     plane_of_homography,
-    second_camera,
 )
-from thesisrecon.geometry.lines_and_planes import incidence_sine, plane_through
+from thesisrecon.geometry.lines_and_planes import (
+    back_project_lines,
+    dual_line,
+    incidence_sine,
+    join_of_line_and_point,
+    join_points,
+    line_through,
+    lines_meet_residual,
+    meet_of_line_and_plane,
+    meet_of_lines,
+    meet_of_planes,
+    plane_through,
+    project_line,
+    unit_normals,
+)
 from thesisrecon.geometry.strata import random_transform, transform_cameras, transform_planes
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
@@ -134,8 +148,8 @@ def test_3_37_to_3_40_homographies_of_planes_make_the_second_camera(rng):
     M, m, pi = P2[:, :3], P2[:, 3], plane[:3] / plane[3]
     at_origin, of_plane = M, image_from_plane(P2, plane)
     np.testing.assert_allclose(of_plane, at_origin - np.outer(m, pi), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(second_camera(at_origin, m), P2)
-    np.testing.assert_allclose(second_camera(of_plane, m, plane=pi), P2, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(camera_from_homography(at_origin, m), P2)
+    np.testing.assert_allclose(camera_from_homography(of_plane, m, plane=pi), P2, rtol=1e-9, atol=1e-9)
     found, residual = plane_of_homography(-3.0 * of_plane, P2)
     assert residual < 1e-9
     assert gap(found, plane) < 1e-6
@@ -151,12 +165,12 @@ def test_theorem_3_6_2_and_3_41_every_member_is_a_homography_of_the_pair(rng):
     _, e2 = epipoles(F)
     x = homogenize(rng.normal(size=(8, 2)))
     for plane in (None, rng.normal(size=3)):
-        H = homographies_of_fundamental(F, plane=plane)
+        H = homography_from_fundamental(F, plane=plane)
         assert compatibility_residual(H, F) < 1e-9
         np.testing.assert_allclose(np.cross(e2, x @ H.T), x @ F.T, atol=1e-9)
         assert plane_of_homography(H, P2)[1] < 1e-6
     # The member of (3.41) is singular: its plane holds the second centre.
-    singular = homographies_of_fundamental(F)
+    singular = homography_from_fundamental(F)
     assert np.linalg.svd(singular, compute_uv=False)[2] < 1e-12
     plane, _ = plane_of_homography(singular, P2)
     assert incidence_sine(plane, camera_centre(P2)) < 1e-6
@@ -190,3 +204,95 @@ def test_3_42_every_pair_of_the_family_has_the_fundamental_matrix(rng):
     member = canonical_cameras(F, plane=P2[:, :3].T @ e2 / s, scale=scale / s)[1]
     assert gap(member, P2) < 1e-7
     assert np.isfinite(dehomogenize(camera_centre(member))).all()
+
+
+@holds_for_every()
+def test_3_2_homogeneous_coordinates_mean_the_same_at_every_scale(rng):
+    X = rng.normal(size=(5, 3))
+    scale = rng.uniform(0.1, 5.0, (5, 1)) * rng.choice([-1.0, 1.0], (5, 1))
+    np.testing.assert_allclose(dehomogenize(scale * homogenize(X)), X, rtol=1e-12)
+
+
+@holds_for_every()
+def test_3_2_join_of_points_and_meet_of_lines_are_dual(rng):
+    x, y, z = random_points(rng, 3, 3)
+    l, m = line_through(x, y), line_through(x, z)
+    assert incidence_sine(l, x) < 1e-14
+    assert incidence_sine(l, y) < 1e-14
+    assert incidence_sine(l, z) > 1e-9
+    assert gap(meet_of_lines(l, m), x) < 1e-7
+
+
+@holds_for_every()
+def test_3_2_parallel_lines_meet_at_infinity(rng):
+    a, b, c, d = rng.normal(size=4)
+    point = meet_of_lines(np.array([a, b, c]), np.array([a, b, d]))
+    assert point[2] == 0.0
+    assert gap(point[:2], np.array([-b, a])) < 1e-12
+
+
+@holds_for_every()
+def test_3_2_unit_normals_measure_distances(rng):
+    line, plane = rng.normal(size=3), rng.normal(size=4)
+    for dual in (line, plane):
+        n = unit_normals(dual)
+        foot = -n[-1] * n[:-1]
+        moved = foot + 2.5 * n[:-1]
+        assert abs(n @ np.append(foot, 1.0)) < 1e-12
+        assert abs(n @ np.append(moved, 1.0) - 2.5) < 1e-12
+    np.testing.assert_array_equal(unit_normals(np.array([0.0, 0.0, 3.0])), [0.0, 0.0, 3.0])
+
+
+@holds_for_every()
+def test_3_2_three_points_span_a_plane_and_three_planes_meet_in_a_point(rng):
+    X, Y, Z, other = random_points(rng, 4)
+    plane = plane_through(X, Y, Z)
+    assert max(incidence_sine(plane, p) for p in (X, Y, Z)) < 1e-13
+    assert incidence_sine(plane, other) > 1e-9
+    planes = rng.normal(size=(3, 4))
+    assert incidence_sine(planes, meet_of_planes(*planes)).max() < 1e-13
+    assert np.abs(plane_through(X, Y, X + 2.0 * Y)).max() < 1e-13 * np.abs(plane).max() + 1e-12
+
+
+@holds_for_every()
+def test_3_2_lines_of_space_join_and_meet(rng):
+    X, Y, Z = random_points(rng, 3)
+    L = join_points(X, Y)
+    plane = join_of_line_and_point(L, Z)
+    assert gap(plane, plane_through(X, Y, Z)) < 1e-6
+    assert np.abs(join_of_line_and_point(L, 0.3 * X + Y)).max() < 1e-12
+    through_x = plane_through(X, Z, rng.normal(size=4))
+    assert gap(meet_of_line_and_plane(L, through_x), X) < 1e-6
+    assert np.abs(meet_of_line_and_plane(L, plane)).max() < 1e-9
+
+
+@holds_for_every()
+def test_3_2_the_line_of_two_planes_is_dual_to_that_of_two_points(rng):
+    X, Y, Z, W = random_points(rng, 4)
+    L = join_points(X, Y)
+    of_planes = join_points(plane_through(X, Y, Z), plane_through(X, Y, W))
+    assert gap(dual_line(L), of_planes) < 1e-6
+    np.testing.assert_array_equal(dual_line(dual_line(L)), L)
+
+
+@holds_for_every()
+def test_3_2_two_lines_of_space_meet_only_where_they_share_a_point(rng):
+    X, Y, Z, W = random_points(rng, 4)
+    L = join_points(X, Y)
+    assert lines_meet_residual(L, join_points(0.7 * X + Y, Z)) < 1e-13
+    direction = np.append(dehomogenize(Y) - dehomogenize(X), 0.0)
+    assert lines_meet_residual(L, join_points(Z, direction)) < 1e-13
+    assert lines_meet_residual(L, join_points(Z, W)) > 1e-9
+
+
+@holds_for_every()
+def test_3_2_lines_project_to_the_lines_of_their_points(rng):
+    P, *_ = random_camera(rng)
+    X, Y = random_points(rng, 2)
+    L = join_points(X, Y)
+    l = project_line(P, L)
+    assert gap(l, line_through(P @ X, P @ Y)) < 1e-9
+    assert gap(cross_matrix(l), P @ L @ P.T) < 1e-9
+    plane = back_project_lines(P, l)
+    assert incidence_sine(plane, X) < 1e-12
+    assert incidence_sine(plane, Y) < 1e-12

@@ -19,7 +19,7 @@ from thesisrecon.geometry.two_view import (
     estimate_homography,
     fundamental_from_cameras,
     homography_residuals,
-    rotation_planes,
+    quasi_euclidean_planes,
     sampson_residuals,
     symmetric_residuals,
     unit_norm,
@@ -84,7 +84,7 @@ def test_3_42_the_default_planes_are_the_true_one_and_its_twisted_twin_where_cal
     F = cross_matrix(t / np.linalg.norm(t)) @ R + noise * rng.normal(size=(3, 3))
     F = enforce_rank_two(rng.choice([-3.0, 0.2]) * F)
     found = []
-    for plane in rotation_planes(F):
+    for plane in quasi_euclidean_planes(F):
         A = canonical_cameras(F, plane=plane)[1][:, :3]
         found.append(A * np.sign(np.linalg.det(A)) / np.cbrt(abs(np.linalg.det(A))))
     near = min(np.linalg.norm(A - R) for A in found)
@@ -92,9 +92,9 @@ def test_3_42_the_default_planes_are_the_true_one_and_its_twisted_twin_where_cal
     assert np.trace(found[0]) >= np.trace(found[1])
     # No other plane gives a left part nearer to a multiple of a rotation.
     residual = [
-        _distance_from_rotations(F, rotation_planes(F)[0] + d) for d in 0.05 * rng.normal(size=(20, 3))
+        _distance_from_rotations(F, quasi_euclidean_planes(F)[0] + d) for d in 0.05 * rng.normal(size=(20, 3))
     ]
-    assert _distance_from_rotations(F, rotation_planes(F)[0]) <= min(residual) + 1e-12
+    assert _distance_from_rotations(F, quasi_euclidean_planes(F)[0]) <= min(residual) + 1e-12
 
 
 def _distance_from_rotations(F, plane):

@@ -9,7 +9,7 @@ from thesisrecon.geometry.conics import (
     curvature_sign,
     dual,
     image_of_absolute_conic,
-    meet_line,
+    intersect_line,
     plane_at_infinity,
     tangents_from,
 )
@@ -95,7 +95,7 @@ def test_numbers_that_are_not_finite(call, value):
         lambda: strata.transform_planes(np.zeros((4, 4)), np.ones(4)),
         lambda: strata.transform_conics(np.zeros((4, 4)), np.eye(4)),
         lambda: image_of_absolute_conic(np.ones((3, 3))),
-        lambda: meet_line(CONIC, np.zeros(3), LINE),
+        lambda: intersect_line(CONIC, np.zeros(3), LINE),
         lambda: curvature_sign(np.zeros((4, 4))),
         lambda: epipoles(np.eye(4)),
         lambda: canonical_cameras(np.zeros((2, 3))),

@@ -15,11 +15,10 @@ from thesisrecon.geometry.three_view import (
     cameras_from_tensor,
     estimate_tensor_linear,
     fundamentals_from_tensor,
-    incidences,
     line_residuals,
     point_residuals,
     point_transfer_homography,
-    reordered_tensor,
+    reorder_tensor,
     tensor_epipoles,
     tensor_equations,
     tensor_from_cameras,
@@ -28,6 +27,7 @@ from thesisrecon.geometry.three_view import (
     transfer_lines_to_first,
     transfer_points,
     transform_tensor,
+    trifocal_incidence,
     unit_tensor,
 )
 from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_residuals
@@ -94,7 +94,7 @@ def test_trifocal_constraint_of_points(rng):
     assert np.linalg.matrix_rank(np.array(nine)) == 4
     assert np.linalg.matrix_rank(rows.reshape(4, 27)) == 4
     through = [np.cross(x[v], rng.normal(size=(6, 3))) for v in (1, 2)]
-    assert np.abs(incidences(T, x[0], *through)).max() < 1e-9
+    assert np.abs(trifocal_incidence(T, x[0], *through)).max() < 1e-9
 
 
 @holds_for_every()
@@ -174,10 +174,10 @@ def test_cameras_from_the_tensor_have_the_tensor(rng):
 @holds_for_every(st.sampled_from(list(itertools.permutations(range(3)))))
 def test_the_tensor_of_the_views_in_another_order(rng, order):
     P = three_cameras(rng)
-    found = reordered_tensor(tensor_from_cameras(*P), order)
+    found = reorder_tensor(tensor_from_cameras(*P), order)
     assert gap(found, tensor_from_cameras(*P[list(order)])) < 1e-5
     with pytest.raises(ValueError, match="order of 0, 1, 2"):
-        reordered_tensor(found, (0, 1, 1))
+        reorder_tensor(found, (0, 1, 1))
 
 
 @holds_for_every()

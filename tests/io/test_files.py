@@ -1,6 +1,7 @@
-"""Files that appear whole or not at all, on disks that fill and in places that cannot be written."""
+"""Reading and writing text, lists of pairs and cameras; files are written atomically."""
 
 import errno
+import json
 import os
 import pickle
 import resource
@@ -14,8 +15,21 @@ import pytest
 from thesisrecon.errors import DISK, MEND, OutputError, UsageError
 from thesisrecon.io.colmap_files import write_colmap_model
 from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints
-from thesisrecon.io.exports import write_point_cloud
-from thesisrecon.io.files import is_partial, link, read_json, write_atomically, write_json, write_text
+from thesisrecon.io.exports import read_cameras, write_point_cloud
+from thesisrecon.io.files import (
+    is_partial,
+    link,
+    printable,
+    read_bytes,
+    read_json,
+    read_text,
+    shorten_middle,
+    shortened,
+    write_atomically,
+    write_json,
+    write_text,
+)
+from thesisrecon.io.pair_list import read_pairs
 from validation.studies.full_disk import disk_ends, remount, small_disk
 
 MANY = np.zeros((20_000, 3))
@@ -150,3 +164,136 @@ def test_names_of_what_a_kill_leaves():
     assert is_partial(".points.ply.partial")
     assert not is_partial("points.ply.partial")
     assert not is_partial(".lock")
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("größe 写真 \U0001f4f7 e\u0301.jpg", "größe 写真 \U0001f4f7 e\u0301.jpg"),
+        ("a\nb\t\x1b[31m\x7f\x85", "a\\x0ab\\x09\\x1b[31m\\x7f\\x85"),
+        ("a\u2028b\u2029c", "a\\u2028b\\u2029c"),
+        ("\u202egpj.exe\u2066", "\\u202egpj.exe\\u2066"),
+        (os.fsdecode(b"gr\xfc\xdfe"), "gr\\xfc\\xdfe"),
+        ("half \ud800", "half \\ud800"),
+        ("both \ud800\udcff", "both \\ud800\\udcff"),
+        ("<b>&\"'", "<b>&\"'"),
+    ],
+)
+def test_names_are_shown_in_one_line_and_in_their_order(name, shown):
+    assert printable(name) == shown
+    shown.encode("utf-8")
+
+
+def test_long_text_is_begun():
+    assert shortened("x" * 60) == "x" * 60
+    assert shortened("x" * 61) == "x" * 57 + "..."
+
+
+def test_a_long_sentence_keeps_its_beginning_and_its_end():
+    said = f"'--seed': '{'9' * 50}' is no integer"
+    assert shorten_middle(said, len(said)) == said
+    assert shorten_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
+    assert len(shorten_middle(said, 60)) == 60
+
+
+def test_only_regular_files_of_a_size_are_read(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"\xef\xbb\xbfgr\xc3\xb6\xc3\x9fe")
+    assert read_text(path) == "größe"
+    assert len(read_bytes(path, largest=11)) == 10
+    with pytest.raises(OSError, match=r"larger than 0 MiB"):
+        read_bytes(path, largest=9)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UsageError, match="pipe cannot be read: it is a pipe, a device or a socket"):
+        read_text(tmp_path / "pipe")
+    with pytest.raises(UsageError, match="cannot be read: No such file"):
+        read_text(tmp_path / "nowhere")
+    # Files of the system say that they are empty.
+    if Path("/proc/self/status").exists():
+        assert b"Pid:" in read_bytes(Path("/proc/self/status"))
+
+
+def test_names_with_and_without_blanks(tmp_path):
+    path = tmp_path / "pairs.txt"
+    path.write_text(
+        '# a list\n\na.jpg b.jpg\n"my a.jpg"  "my b.jpg"\nc d.jpg\te.jpg\n"f.jpg"\t"g.jpg"\n',
+        encoding="utf-8",
+    )
+    assert read_pairs(path) == [
+        ("a.jpg", "b.jpg"),
+        ("my a.jpg", "my b.jpg"),
+        ("c d.jpg", "e.jpg"),
+        ("f.jpg", "g.jpg"),
+    ]
+
+
+def test_the_mark_and_the_line_ends_of_other_systems_belong_to_no_name(tmp_path):
+    path = tmp_path / "pairs.txt"
+    path.write_bytes(b"\xef\xbb\xbfa.jpg b.jpg\r\nc.jpg\td.jpg\r\n")
+    assert read_pairs(path) == [("a.jpg", "b.jpg"), ("c.jpg", "d.jpg")]
+
+
+@pytest.mark.parametrize("line", ["a.jpg", "a.jpg b.jpg c.jpg", 'a.jpg "b.jpg', "a\tb\tc"])
+def test_a_line_that_is_no_pair_is_named(tmp_path, line):
+    path = tmp_path / "pairs.txt"
+    path.write_text(f"a.jpg b.jpg\n{line}\n", encoding="utf-8")
+    with pytest.raises(UsageError, match=r"line 2 of .* takes two file names"):
+        read_pairs(path)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "pairs.txt"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UsageError, match="not a UTF-8 text"):
+        read_pairs(path)
+
+
+ONE = {
+    "name": "a.jpg",
+    "width": 160,
+    "height": 120,
+    "K": [[150.0, 0, 79.5], [0, 151.0, 59.5], [0, 0, 1]],
+    "distortion": [-0.05, 0, 0],
+    "R": np.eye(3).tolist(),
+    "t": [0.1, 0.2, 3.0],
+    "centre": [-0.1, -0.2, -3.0],
+}
+
+
+def written(folder, content):
+    path = folder / "cameras.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def test_cameras_are_those_of_the_file_in_its_order(tmp_path):
+    cameras = read_cameras(written(tmp_path, {"cameras": [{**ONE, "name": "b.jpg"}, ONE]}))
+    assert list(cameras) == ["b.jpg", "a.jpg"]
+    assert cameras["a.jpg"].size == (160, 120)
+    np.testing.assert_array_equal(cameras["a.jpg"].K, ONE["K"])
+    np.testing.assert_allclose(cameras["a.jpg"].centre, ONE["centre"])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"cameras": []}, "holds no camera"),
+        ({"cameras": [{**ONE, "K": [[1.0, 0], [0, 1.0]]}]}, "does not hold cameras of this program"),
+        ({"cameras": [{**ONE, "t": [None, 0, 0]}]}, "does not hold cameras"),
+        ({"cameras": [{"name": "a.jpg"}]}, "does not hold cameras"),
+        ({"cameras": {"0000.jpg": {}}}, "does not hold cameras"),
+        ([], "does not hold cameras"),
+        ("text", "does not hold cameras"),
+    ],
+)
+def test_other_files_are_told_in_a_sentence(content, words, tmp_path):
+    with pytest.raises(UsageError, match=words):
+        read_cameras(written(tmp_path, content))
+
+
+def test_an_absent_or_damaged_file_is_told(tmp_path):
+    with pytest.raises(UsageError, match=r"there is no cameras\.json"):
+        read_cameras(tmp_path / "cameras.json")
+    (tmp_path / "cameras.json").write_text("{", encoding="utf-8")
+    with pytest.raises(UsageError, match="does not hold cameras"):
+        read_cameras(tmp_path / "cameras.json")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import zoom
 
-from tests.textures import disparity, photograph, sideways_fundamental, stereo_scene, texture
+from tests.synthetic import disparity, photograph, sideways_fundamental, stereo_scene, texture
 from thesisrecon import match_pair
 from thesisrecon.config import preset
 from thesisrecon.errors import StageFailure

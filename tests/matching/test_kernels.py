@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from tests.textures import disparity, photograph, stereo_scene, texture
+from tests.synthetic import disparity, photograph, stereo_scene, texture
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching.alignment import align_windows

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tests.textures import disparity, photograph, sideways_fundamental, stereo_scene, texture
+from tests.synthetic import disparity, photograph, sideways_fundamental, stereo_scene, texture
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from tests.textures import photograph, texture
+from tests.synthetic import photograph, texture
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners

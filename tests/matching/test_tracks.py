@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from tests.textures import photograph, sideways_fundamental, texture
+from tests.synthetic import photograph, sideways_fundamental, texture
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks

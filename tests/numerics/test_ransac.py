@@ -1,5 +1,6 @@
-"""Sampling, stopping and noise scale; nothing here knows what is sampled."""
+"""RANSAC, noise estimation, Morton order and Levenberg-Marquardt."""
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -7,9 +8,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import chisquare
+from scipy.stats import chisquare, norm
 
-from thesisrecon.numerics.noise import noise_scale, noise_width, trimmed_noise_scale
+from thesisrecon.numerics.levenberg_marquardt import invert_information, minimize_residuals, solve_positive
+from thesisrecon.numerics.losses import LOSSES, loss_code
+from thesisrecon.numerics.noise import (
+    TAIL,
+    NoiseMixture,
+    best_huber_width,
+    effective_noise,
+    fit_noise_mixture,
+    noise_scale,
+    noise_width,
+    trimmed_noise_scale,
+)
+from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.numerics.ransac import SampleConsensus, draw_sample, required_samples
 
 
@@ -103,7 +116,7 @@ def test_consensus_finds_the_line_among_outliers():
 
 def test_consensus_stops_at_the_share_that_is_enough_and_breaks_ties_by_the_spread():
     x = np.arange(10.0)
-    found = SampleConsensus(0.1, max_samples=500, enough_share=0.9).search(
+    found = SampleConsensus(0.1, max_samples=500, stop_inlier_ratio=0.9).search(
         Line(x, x), 10, np.random.default_rng(0)
     )
     assert found is not None
@@ -140,3 +153,203 @@ def test_wrong_matches_do_not_widen_the_noise():
     assert noise_width(r[:5], 1.0) == 1.0
     assert trimmed_noise_scale(r[:10], 0.5) == 0.5
     assert trimmed_noise_scale(np.zeros(50), 0.5) == 0.0
+
+
+def draw(n, wrong, tail, seed):
+    """Absolute residuals in order: noise of 0.5, a tail four times as wide, wrong ones up to 300."""
+    rng = np.random.default_rng(seed)
+    kind = rng.random(n)
+    r = rng.normal(0.0, 0.5, n) * np.where(kind < tail, TAIL, 1.0)
+    r[kind > 1.0 - wrong] = rng.uniform(0.0, 300.0, int(np.sum(kind > 1.0 - wrong)))
+    return np.sort(np.abs(r))
+
+
+def test_one_round_is_the_textbook_step():
+    r = draw(60, 0.3, 0.2, 0)
+    mixture = np.array([0.7, 80.0, 0.5, 0.2, 0.3])
+    widths = np.array([0.7, 0.7 * TAIL, 80.0])
+    p = mixture[2:] * 2.0 * norm.pdf(r[:, None], scale=widths)
+    posterior = p / p.sum(axis=1, keepdims=True)
+    squares = posterior.T @ r**2
+    counts = posterior.sum(axis=0)
+    likelihood = fit_noise_mixture(r, 7.0, 50.0, 1, mixture)
+    sigma = np.sqrt((squares[0] + squares[1] / TAIL**2) / (counts[0] + counts[1] - 7.0))
+    assert mixture[0] == pytest.approx(sigma, rel=1e-9)
+    assert mixture[1] == pytest.approx(np.sqrt((squares[2] + 50.0**2) / (counts[2] + 1.0)), rel=1e-9)
+    np.testing.assert_allclose(mixture[2:], (counts + np.array([1.0, 0.5, 1.0])) / 62.5, rtol=1e-9)
+    # The factor 2 / sqrt(2 pi) of half-normal densities is left out.
+    assert likelihood == pytest.approx(np.mean(np.log(p.sum(axis=1))) - np.log(2.0 * norm.pdf(0.0)), rel=1e-9)
+
+
+def test_the_compiled_mixture_equals_the_plain_code():
+    r, a = draw(200, 0.4, 0.1, 1), np.array([0.3, 100.0, 0.5, 0.1, 0.4])
+    b = a.copy()
+    assert fit_noise_mixture(r, 7.0, 90.0, 5, a) == pytest.approx(
+        fit_noise_mixture.py_func(r, 7.0, 90.0, 5, b), rel=1e-12
+    )
+    np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("n", "wrong"), [(100, 0.0), (1000, 0.0), (1000, 0.3), (1000, 0.6), (5000, 0.5)])
+@pytest.mark.parametrize("start", [0.4, 1.0])
+def test_the_noise_is_found_among_wrong_residuals(n, wrong, start):
+    found = NoiseMixture.fit(draw(n, wrong, 0.0, 2), start, spread=150.0, parameters=0)
+    assert found.sigma == pytest.approx(0.5, rel=0.15)
+    assert found.wrong == pytest.approx(wrong, abs=0.05)
+    assert found.core + found.tail + found.wrong == pytest.approx(1.0)
+    assert 2.5 * found.sigma < found.limit < 15.0 * found.sigma
+
+
+def test_a_heavy_tail_moves_the_end_of_the_noise_outwards_and_of_its_core_inwards():
+    light = NoiseMixture.fit(draw(2000, 0.3, 0.02, 3), 0.5, spread=150.0)
+    heavy = NoiseMixture.fit(draw(2000, 0.3, 0.25, 3), 0.5, spread=150.0)
+    assert heavy.tail > 0.15 > 0.06 > light.tail
+    assert heavy.limit > light.limit
+    assert heavy.core_limit / heavy.sigma < light.core_limit / light.sigma
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(-4.0, 4.0), st.integers(0, 1000))
+def test_the_mixture_scales_with_its_residuals(power, seed):
+    r, s = draw(80, 0.3, 0.1, seed), 10.0**power
+    one, other = NoiseMixture.fit(r, 0.5, spread=150.0), NoiseMixture.fit(s * r, 0.5 * s, spread=150.0 * s)
+    assert other.sigma == pytest.approx(s * one.sigma, rel=1e-6)
+    assert other.limit == pytest.approx(s * one.limit, rel=1e-4)
+    assert other.log_likelihood == pytest.approx(one.log_likelihood - np.log(s), abs=1e-6)
+
+
+def test_the_truer_model_is_the_likelier():
+    r = draw(300, 0.3, 0.0, 5)
+    worse = np.sort(np.hypot(r, 0.5))
+    fits = [NoiseMixture.fit(x, 0.5, spread=150.0) for x in (r, worse)]
+    assert fits[0].log_likelihood > fits[1].log_likelihood
+
+
+def test_exact_residuals_give_a_finite_mixture():
+    found = NoiseMixture.fit(np.zeros(40), 1e-9, spread=1.0)
+    assert 0.0 < found.sigma < 1e-9
+    assert np.isfinite([found.limit, found.core_limit, found.log_likelihood]).all()
+
+
+def test_normal_residuals_want_least_squares_and_heavy_ones_a_bend():
+    rng = np.random.default_rng(7)
+    normal = np.abs(rng.normal(0.0, 0.5, 2000))
+    assert best_huber_width(normal, 0.5) == np.inf
+    assert effective_noise(normal, np.inf) == pytest.approx(0.5, rel=0.05)
+    # Huber's width of 1.345 sigma keeps 95 % of the information of normal noise.
+    assert effective_noise(normal, 1.345 * 0.5) == pytest.approx(0.5 / np.sqrt(0.95), rel=0.05)
+    laplace = rng.exponential(0.5, 2000)
+    width = best_huber_width(laplace, 0.5)
+    assert width <= 1.0
+    # The best M-estimator of a Laplace scale b has variance b^2, least squares 2 b^2.
+    assert effective_noise(laplace, width) < 0.9 * np.sqrt(2.0) * 0.5
+
+
+def test_the_noise_of_a_fit_allows_for_what_was_fitted():
+    r = np.ones(17)
+    assert effective_noise(r, np.inf, parameters=7) == pytest.approx(np.sqrt(1.7))
+    assert effective_noise(r, 0.5, parameters=7) > 1.0
+
+
+def times_made(first, second, room):
+    """How often a view is made where those asked for last are kept in a room for so many."""
+    kept = OrderedDict()
+    made = 0
+    for view in np.stack([first, second], axis=1).ravel().tolist():
+        made += view not in kept
+        kept[view] = None
+        kept.move_to_end(view)
+        if len(kept) > room:
+            kept.popitem(last=False)
+    return made
+
+
+def test_every_pair_is_visited_once_and_a_pair_and_its_turned_one_together():
+    i, j = np.array([5, 3, 9, 5, 0]), np.array([3, 5, 2, 9, 1])
+    order = morton_pair_order(i, j)
+    assert sorted(order) == [0, 1, 2, 3, 4]
+    places = np.argsort(order)
+    assert abs(places[0] - places[1]) == 1
+    assert len(morton_pair_order([], [])) == 0
+
+
+@pytest.mark.parametrize("room", [16, 60, 120])
+def test_views_are_made_few_times_whatever_room_there_is(room):
+    i, j = np.divmod(np.arange(300 * 300), 300)
+    i, j = i[i != j], j[i != j]
+    order = morton_pair_order(i, j)
+    # Tiles with one side of half the room are the best there is, up to a factor.
+    assert times_made(i[order], j[order], room) < 2.0 * 300**2 / room
+    assert times_made(i, j, room) > 0.9 * len(i)
+
+
+@pytest.mark.parametrize("name", sorted(LOSSES))
+def test_weight_is_the_derivative_of_the_loss(name):
+    s = np.array([0.01, 0.5, 1.9, 2.3, 9.0, 400.0])
+    h = 1e-6 * s
+    rho = LOSSES[name]
+    slope = (rho(s + h, 1.5)[0] - rho(s - h, 1.5)[0]) / (2 * h)
+    np.testing.assert_allclose(rho(s, 1.5)[1], slope, rtol=1e-5, atol=1e-8)
+    assert np.all(np.diff(rho(s, 1.5)[0]) >= 0.0)
+    np.testing.assert_allclose(rho(np.array([1e-8]), 1.5)[0], 1e-8, rtol=1e-6)
+
+
+def test_unknown_loss_and_scale_are_refused():
+    with pytest.raises(ValueError, match="loss must be one of"):
+        loss_code("tukey", 1.0)
+    with pytest.raises(ValueError, match="positive"):
+        loss_code("huber", 0.0)
+
+
+def test_rosenbrock_from_the_classical_start():
+    answer = minimize_residuals(
+        lambda x: np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]]), np.array([-1.2, 1.0]), max_iterations=100
+    )
+    assert answer.converged
+    np.testing.assert_allclose(answer.x, [1.0, 1.0], atol=1e-6)
+
+
+def test_covariance_of_a_line_is_the_textbook_one():
+    rng = np.random.default_rng(1)
+    u = np.linspace(0.0, 1.0, 400)
+    y = 2.0 - 3.0 * u + 0.1 * rng.normal(size=400)
+    A = np.column_stack([np.ones_like(u), u])
+    answer = minimize_residuals(lambda x: A @ x - y, np.zeros(2), jacobian=lambda _: A)
+    expected = np.sum((A @ answer.x - y) ** 2) / 398 * np.linalg.inv(A.T @ A)
+    np.testing.assert_allclose(answer.covariance, expected, rtol=1e-6)
+
+
+def test_cauchy_ignores_outliers_that_bend_least_squares():
+    u = np.linspace(0.0, 1.0, 100)
+    y = 1.0 + 2.0 * u
+    y[::5] += 50.0
+    plain = minimize_residuals(lambda x: x[0] + x[1] * u - y, np.zeros(2))
+    robust = minimize_residuals(lambda x: x[0] + x[1] * u - y, plain.x, loss="cauchy", loss_scale=0.1)
+    assert abs(plain.x[0] - 1.0) > 5.0
+    np.testing.assert_allclose(robust.x, [1.0, 2.0], atol=0.02)
+
+
+def test_rank_deficient_and_useless_parameters_are_harmless():
+    answer = minimize_residuals(lambda x: np.array([x[0] + x[1] - 3.0, 0.0]), np.zeros(3))
+    assert answer.cost < 1e-12
+    assert answer.x[2] == 0.0
+    assert np.isfinite(answer.covariance).all()
+
+
+def test_states_outside_the_domain_are_refused_not_raised():
+    def residual(x):
+        return np.where(x > 0.0, np.log(np.maximum(x, 1e-300)) - 2.0, np.nan)
+
+    answer = minimize_residuals(residual, np.array([0.01]), max_iterations=100)
+    np.testing.assert_allclose(answer.x, np.exp(2.0), rtol=1e-6)
+    with pytest.raises(ValueError, match="finite"):
+        minimize_residuals(residual, np.array([-1.0]))
+
+
+def test_guards_of_the_linear_algebra():
+    assert solve_positive(-np.eye(2), np.ones(2)) is None
+    assert solve_positive(np.array([[np.nan]]), np.ones(1)) is None
+    assert np.isinf(invert_information(np.array([[np.nan]]))).all()
+    covariance = invert_information(np.diag([4.0, 0.0]))
+    assert covariance[0, 0] == pytest.approx(0.25)
+    assert np.isfinite(covariance).all()

@@ -1,11 +1,38 @@
+"""Figures, drawings and the three-dimensional scene of the report."""
+
+import base64
 import dataclasses
+import io
 import json
 
 import numpy as np
+import pytest
+from PIL import Image as PillowImage
 
-from tests.report.synthetic import made_up_run
+from tests.report.synthetic import SIZE, made_up_cameras, made_up_run
+from thesisrecon.records import HeldOut
 from thesisrecon.report import figures as figures_module
-from thesisrecon.report.figures import build_scene, histogram_path, pair_matrix_figure, scene_figure
+from thesisrecon.report.drawing import (
+    DIFFERENCE_LIMIT,
+    HUES,
+    SCALE,
+    UNKNOWN,
+    clip_line,
+    depth_side,
+    draw_depth,
+    draw_held_out,
+    draw_pair,
+    paint_scale,
+    spread_matches,
+    thumbnail,
+)
+from thesisrecon.report.figures import (
+    build_scene,
+    histogram_path,
+    pair_matrix_figure,
+    scene_figure,
+    upright_rotation,
+)
 
 
 def test_the_scene_is_valid_json_with_escaped_names():
@@ -56,3 +83,217 @@ def test_histogram_bars_stand_on_the_ground():
     assert path.count("M") == 3
     assert path.startswith("M0.0 10.0v-5.0")
     assert "M20.0 10.0v-10.0" in path
+
+
+def opened(uri):
+    head, text = uri.split(",", 1)
+    assert head == "data:image/jpeg;base64"
+    return PillowImage.open(io.BytesIO(base64.b64decode(text)))
+
+
+def test_a_thumbnail_keeps_the_aspect_and_shrinks_when_there_are_many():
+    photograph = made_up_run(points=50).photographs[0]
+    few, many = thumbnail(photograph, 10), thumbnail(photograph, 2000)
+    assert few is not None
+    assert many is not None
+    assert opened(few.uri).size == (few.width, few.height) == (360, 240)
+    assert many.width < few.width / 3
+    assert thumbnail(dataclasses.replace(photograph, rgb=None), 10) is None
+
+
+def test_the_lines_pass_through_the_numbered_matches():
+    data = made_up_run(points=400)
+    pair = data.pairs[2]
+    flat = [np.full((SIZE[1], SIZE[0], 3), 90, dtype=np.uint8)] * 2
+    first, second = (
+        dataclasses.replace(data.photographs[v], rgb=rgb)
+        for v, rgb in zip((pair.i, pair.j), flat, strict=True)
+    )
+    drawn = draw_pair(pair, first, second)
+    assert drawn is not None
+    pixels = np.asarray(opened(drawn.uri)).astype(int)
+    s = 640 / max(SIZE)
+    chosen = spread_matches(pair.xy1, len(HUES))
+    for x, y in (pair.xy1[chosen] + 0.5) * s - 0.5:
+        # A dot of the colour of its line: bright and coloured or at least far from the grey ground.
+        spot = pixels[round(y), round(x)]
+        assert np.abs(spot - 70).max() > 60
+    # The second half holds lines as well: something coloured crosses it from side to side.
+    right = pixels[:, 640 + 8 + 1 :]
+    assert (np.ptp(right, axis=2) > 40).any(axis=0).mean() > 0.95
+
+
+def test_a_pair_without_pixels_or_matches_is_no_error():
+    data = made_up_run(points=100)
+    pair = data.pairs[0]
+    bare = dataclasses.replace(data.photographs[0], rgb=None)
+    assert draw_pair(pair, bare, data.photographs[1]) is None
+    empty = dataclasses.replace(pair, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+    assert draw_pair(empty, data.photographs[0], data.photographs[1]) is not None
+
+
+def test_lines_are_cut_at_the_edges_of_the_photograph():
+    level = clip_line(np.array([0.0, 1.0, -10.0]), 100, 50)
+    assert level == ((-0.5, 10.0), (99.5, 10.0))
+    upright = clip_line(np.array([1.0, 0.0, -10.0]), 100, 50)
+    assert upright == ((10.0, -0.5), (10.0, 49.5))
+    assert clip_line(np.array([0.0, 1.0, 20.0]), 100, 50) is None
+    assert clip_line(np.zeros(3), 100, 50) is None
+
+
+def test_spread_matches_are_different_and_far_apart():
+    xy = np.random.default_rng(0).uniform(0, 100, (500, 2))
+    chosen = spread_matches(xy, 12)
+    assert len(set(chosen.tolist())) == 12
+    gaps = np.linalg.norm(xy[chosen][:, None] - xy[chosen][None], axis=2) + np.eye(12) * 1e9
+    assert gaps.min() > 20
+    assert len(spread_matches(xy[:5], 12)) == 5
+    assert len(spread_matches(np.zeros((0, 2)), 12)) == 0
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3)])
+def test_odd_pictures_have_thumbnails(shape):
+    photograph = dataclasses.replace(
+        made_up_run(points=50).photographs[0], rgb=np.zeros(shape, dtype=np.uint8)
+    )
+    assert thumbnail(photograph, 3) is not None
+
+
+def lightness(rgb):
+    """CIE L* (...) of sRGB (..., 3)."""
+    v = rgb / 255.0
+    linear = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+    return np.asarray(116.0 * np.cbrt(linear @ (0.2126, 0.7152, 0.0722)) - 16.0)
+
+
+def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness():
+    steps = np.diff(lightness(paint_scale(np.linspace(0, 1, 33)).astype(float)))
+    assert steps.min() > 1.8
+    assert steps.max() < 1.6 * steps.min()
+    ends = paint_scale(np.array([-3.0, 0.0, 1.0, 7.0, np.nan]))
+    assert ["#" + bytes(c).hex() for c in ends[:4]] == [SCALE[0], SCALE[0], SCALE[-1], SCALE[-1]]
+    assert tuple(ends[4]) == UNKNOWN
+
+
+def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
+    depth = np.tile(np.linspace(2.0, 6.0, 300, dtype=np.float32), (200, 1))
+    depth[:, 200:250] = np.nan
+    depth[0, 0] = 1e4  # a stray takes none of the scale
+    drawn = draw_depth(depth)
+    assert (drawn.picture.width, drawn.picture.height) == (300, 200)
+    assert drawn.near == pytest.approx(2.0, abs=0.06)
+    assert drawn.far == pytest.approx(6.0, abs=0.06)
+    assert drawn.share == pytest.approx(250 / 300)
+    pixels = np.asarray(opened(drawn.picture.uri)).astype(float)
+    light = lightness(pixels[100])
+    assert light[2] > 90
+    assert light[190] < 55
+    assert light[290] < 20
+    assert (np.diff(light[5:190:20]) < -2).all()
+    assert np.abs(pixels[100, 210:240] - UNKNOWN).max() < 8
+
+
+@pytest.mark.parametrize("value", [np.nan, 3.0])
+def test_depth_maps_without_depth_or_relief_are_no_error(value):
+    drawn = draw_depth(np.full((30, 40), value, dtype=np.float32))
+    assert drawn.share == float(np.isfinite(value))
+    np.testing.assert_equal((drawn.near, drawn.far), (value, value))
+
+
+def test_depth_pictures_shrink_when_there_are_many():
+    rng = np.random.default_rng(1)
+    noise = rng.uniform(1, 5, (480, 640)).astype(np.float32)  # the hardest picture for a JPEG
+    assert draw_depth(noise, side=depth_side(10)).picture.width == 360
+    assert 300 * len(draw_depth(noise, side=depth_side(300)).picture.uri) < 4_000_000
+
+
+def test_the_comparison_shows_what_differs():
+    real = np.full((300, 400, 3), 120, dtype=np.uint8)
+    rendered, compared = real.copy(), np.ones((300, 400), dtype=bool)
+    rendered[:, 200:] += np.uint8(DIFFERENCE_LIMIT)
+    compared[200:] = False
+    pictures = draw_held_out(HeldOut(0, real, rendered, compared, 20.0, 0.9))
+    photo, model, apart = (np.asarray(opened(p.uri)).astype(float) for p in pictures)
+    assert np.abs(photo - 120).max() < 4
+    assert np.abs(model[:190, 210:] - 184).max() < 4
+    for picture in (model, apart):
+        assert np.abs(picture[210:] - UNKNOWN).max() < 8
+    assert lightness(apart[100, 100]) < 20
+    assert lightness(apart[100, 300]) > 90
+    large = [np.zeros((900, 1200, 3), dtype=np.uint8)] * 2
+    assert draw_held_out(HeldOut(0, *large, np.ones((900, 1200), dtype=bool), 0.0, 0.0))[2].width == 640
+
+
+def rotation(axis, angle):
+    """Rodrigues' formula."""
+    a = axis / np.linalg.norm(axis)
+    A = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * A + (1 - np.cos(angle)) * A @ A)
+
+
+def test_up_is_found_whatever_the_frame_of_the_reconstruction():
+    rotations, _ = made_up_cameras(7)
+    turn = rotation(np.array([0.3, -1.0, 0.7]), 2.1)
+    upright = upright_rotation(rotations @ turn.T)
+    assert np.allclose(upright @ upright.T, np.eye(3))
+    assert np.isclose(np.linalg.det(upright), 1)
+    # In the made-up world y points down and the wall is along +z.
+    assert (upright @ turn @ [0, -1, 0])[2] > 0.99
+    assert (upright @ turn @ [0, 0, 1])[1] > 0.99
+
+
+def test_up_of_a_ring_of_cameras_is_its_axis():
+    level = [rotation(np.array([0.0, 1.0, 0.0]), angle) for angle in np.linspace(0, 2 * np.pi, 9)[:-1]]
+    tilted = np.stack([rotation(np.array([1.0, 0.0, 0.0]), -0.4) @ R for R in level])
+    assert (upright_rotation(tilted) @ [0, -1, 0])[2] > 0.999
+
+
+def test_parallel_cameras_and_cameras_that_look_down_have_an_up():
+    ahead = np.tile(np.eye(3), (4, 1, 1))
+    assert (upright_rotation(ahead) @ [0, -1, 0])[2] > 0.999
+    single = upright_rotation(np.eye(3)[None])
+    assert (single @ [0, 0, 1])[1] > 0.999
+
+
+def test_strays_are_left_out_and_many_points_are_thinned():
+    data = made_up_run(points=600)
+    assert data.metric is not None
+    before = data.metric.reconstruction
+    X = before.X.copy()
+    X[5, :3] = 1e5
+    scene = build_scene(dataclasses.replace(before, X=X), max_points=200)
+    assert scene is not None
+    assert 150 <= len(scene.points) <= 200
+    assert 5 not in scene.index
+    assert (scene.high - scene.low).max() < 20
+
+
+def test_the_pyramids_point_at_what_the_cameras_saw():
+    data = made_up_run(points=300)
+    assert data.metric is not None
+    scene = build_scene(data.metric.reconstruction)
+    assert scene is not None
+    assert scene.views.tolist() == list(range(8))
+    gaze = scene.corners.mean(axis=1) - scene.centres
+    towards = scene.points.mean(axis=0) - scene.centres
+    cosine = np.sum(gaze * towards, axis=1) / np.linalg.norm(gaze, axis=1) / np.linalg.norm(towards, axis=1)
+    assert (cosine > 0.95).all()
+    # The first two corners are those of the upper edge, and up is z.
+    assert (scene.corners[:, :2, 2].mean(axis=1) > scene.corners[:, 2:, 2].mean(axis=1)).all()
+
+
+def test_nothing_registered_gives_no_scene():
+    data = made_up_run(points=50)
+    assert data.metric is not None
+    nothing = np.zeros_like(data.metric.reconstruction.registered)
+    assert build_scene(dataclasses.replace(data.metric.reconstruction, registered=nothing)) is None
+
+
+def test_a_scene_without_points_still_shows_its_cameras():
+    data = made_up_run(points=50)
+    assert data.metric is not None
+    nothing = np.zeros_like(data.metric.reconstruction.valid)
+    scene = build_scene(dataclasses.replace(data.metric.reconstruction, valid=nothing))
+    assert scene is not None
+    assert len(scene.points) == 0
+    assert len(scene.centres) == 8

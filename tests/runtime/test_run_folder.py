@@ -1,13 +1,23 @@
-"""The run directory: records survive, damage is noticed, another run's folder is left alone."""
+"""The run folder, its record files, and a disk that is full."""
 
+import errno
 import importlib
+import json
+import os
+import shutil
 import sys
+import zipfile
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
-from thesisrecon.errors import UsageError
+from tests.fake_stages import fake_config, photographs
+from thesisrecon.cli.main import run_command
+from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io.files import read_json, write_atomically
+from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import (
     Features,
     IntrinsicInterval,
@@ -17,8 +27,10 @@ from thesisrecon.records import (
     StageReport,
     Tracks,
 )
-from thesisrecon.runtime.record_files import ChangedRecord, bytes_from_record
+from thesisrecon.runtime.record_files import ChangedRecord, _seal, bytes_from_record, read_record
 from thesisrecon.runtime.run_folder import RunDirectory, StageFolder, code_key, key_of
+from validation.studies.full_disk import Refusal, SmallRuns, disk_ends, filled, refused_at, table
+from validation.studies.kill_anywhere import different, outputs
 
 
 def some_features(value=1.0):
@@ -246,3 +258,175 @@ def test_code_of_the_caller_counts_by_its_file(tmp_path, monkeypatch):
         keys.append(code_key(name))
     assert len(set(keys)) == 3
     assert code_key("typed_into_a_prompt") == code_key("typed_into_a_prompt")
+
+
+def saved(path, record, *, packed=False, **arrays):
+    """A file that is sealed, whatever it holds."""
+    told = json.dumps({"key": "k", "record": record}).encode()
+    save = np.savez_compressed if packed else np.savez
+    save(path, description=np.frombuffer(told, dtype=np.uint8), **arrays)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.comment = _seal(archive)
+    return path
+
+
+def refused(path, words="npz: "):
+    with pytest.raises(ChangedRecord, match=words):
+        read_record(path, "k")
+    return True
+
+
+REPORT = {"type": "StageReport", "fields": {"stage": "x", "seconds": 1.0}}
+
+
+def test_only_records_are_made(tmp_path):
+    path = tmp_path / "a.npz"
+    assert read_record(saved(path, REPORT), "k").stage == "x"
+    assert read_record(path, "other") is None
+    for kind in ("Path", "annotations", "__builtins__", "field", "soup", "F64"):
+        assert refused(saved(path, {"type": kind, "fields": {}}))
+    assert refused(saved(path, {"array": "array0"}), "array0")
+    assert read_record(saved(path, {"array": "array0"}, array0=np.arange(3)), "k").tolist() == [0, 1, 2]
+
+
+def test_nothing_is_unpacked(tmp_path):
+    path = saved(tmp_path / "a.npz", REPORT, packed=True)
+    assert refused(path, "not compressed")
+    with zipfile.ZipFile(path, "w") as archive:
+        # An array that claims to be larger than the machine.
+        head = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117) + b"\n"
+        archive.writestr("description.npy", b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head)
+    assert refused(path)
+
+
+TRACKS = Tracks(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)), 1, 3)
+
+
+Change = Callable[[dict[str, Any]], object]
+
+
+CHANGES = [
+    ("beyond the views", lambda parts: parts["array0"].__setitem__(1, 10**9)),
+    ("below zero", lambda parts: parts["array1"].__setitem__(1, -1)),
+    ("NaN", lambda parts: parts["array2"].__setitem__((0, 0), np.nan)),
+    ("one bit less", lambda parts: parts["array2"].__setitem__((0, 0), np.nextafter(1.0, 0.0))),
+    ("another type", lambda parts: parts.update(array0=parts["array0"].astype(np.int32))),
+    ("another shape", lambda parts: parts.update(array2=parts["array2"].T)),
+    ("fewer", lambda parts: parts.update(array1=parts["array1"][:2])),
+    ("missing", lambda parts: parts.pop("array1")),
+    ("more", lambda parts: parts.update(array3=np.zeros(3))),
+    ("exchanged", lambda parts: parts.update(array0=parts["array1"], array1=parts["array0"])),
+    ("a number of the description", lambda parts: parts.update(description=told_otherwise(parts))),
+]
+
+
+def told_otherwise(parts):
+    told = parts["description"].tobytes().replace(b'"n_views": 1', b'"n_views": 2')
+    assert told != parts["description"].tobytes()
+    return np.frombuffer(told, dtype=np.uint8)
+
+
+@pytest.mark.parametrize("change", [change for _, change in CHANGES], ids=[name for name, _ in CHANGES])
+def test_what_another_program_has_written_anew_is_told(change, tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(bytes_from_record(TRACKS, "k"))
+    assert read_record(path, "k").n_points == 3
+    with np.load(path) as file:
+        parts = {name: file[name].copy() for name in file.files}
+        seal = file.zip.comment
+    change(parts)
+    np.savez(path, **parts)
+    assert refused(path, "seal")
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.comment = seal
+    assert refused(path, "seal")
+    assert read_record(path, "another") is None
+
+
+def run(out, **options):
+    reconstruct(photographs(3), out, config=fake_config(), threads=1, **options)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The outputs of a run to the model, and how many files it wrote."""
+    out = tmp_path_factory.mktemp("whole") / "out"
+    with disk_ends(0, 0) as written:
+        run(out)
+    return outputs(out), written[0]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.55, 0.7, 0.85, 1.0])
+def test_a_run_whose_disk_is_full_goes_on_with_room(share, whole, tmp_path):
+    wanted, count = whole
+    out = tmp_path / "out"
+    with disk_ends(1 + round(share * (count - 1)), errno.ENOSPC), pytest.raises(OutputError) as refused:
+        run(out)
+    assert str(refused.value).endswith(
+        "cannot be written: No space left on device; make room there, then the same command goes on from "
+        f"what is kept in {out}"
+    )
+    there = outputs(out)
+    assert {name: wanted.get(name) for name in there} == there
+    run(out)
+    assert different(outputs(out), wanted) == ()
+
+
+def test_a_file_in_the_place_of_a_folder_of_the_run(whole, tmp_path):
+    out = tmp_path / "out"
+    run(out, until="features")
+    (out / "02-matches").write_text("of nobody")
+    with pytest.raises(OutputError, match=r"02-matches.* move away the file that stands where a folder"):
+        run(out)
+    (out / "02-matches").unlink()
+    run(out)
+    assert different(outputs(out), whole[0]) == ()
+
+
+def test_the_results_of_a_whole_run_stay_until_they_are_replaced(whole, tmp_path):
+    """Written anew over a full disk, no good file is lost or cut."""
+    out = tmp_path / "out"
+    run(out)
+    shutil.rmtree(out / "08-model")
+    with disk_ends(1, errno.ENOSPC), pytest.raises(OutputError):
+        run(out)
+    there = outputs(out)
+    assert {name: whole[0].get(name) for name in there} == there
+    assert "model.glb" in there
+    run(out)
+    assert different(outputs(out), whole[0]) == ()
+
+
+def test_the_command_says_it_in_a_sentence(tmp_path, monkeypatch, capsys):
+    """On a small disk where one can be mounted, else one that is full by decree."""
+    runs = SmallRuns(tmp_path, 2, 128, "features")
+    wanted = runs.whole(tmp_path / "whole")
+    try:
+        refusal = filled(runs, 0.5, wanted)
+    except PermissionError:
+        refusal = refused_at(runs, 3, errno.ENOSPC, wanted)
+    assert refusal.wrong == ""
+    assert "No space left on device; make room there" in refusal.said
+
+    def compile_kernels(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device", "kernels/index.nbi")
+
+    monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", compile_kernels)
+    assert run_command(["reconstruct", str(runs.images), "-o", str(tmp_path / "other")]) == 2
+    said = capsys.readouterr().err
+    assert said == (
+        "thesisrecon: kernels/index.nbi cannot be written: No space left on device; make room there\n"
+    )
+
+
+def test_the_check_names_what_is_wrong():
+    said = "thesisrecon: a cannot be written: no; make room there, then the same command goes on\n"
+    well = Refusal("file 1: No space left on device", 2, said, (), ())
+    bad = Refusal("a disk of 3 KiB", 1, "Traceback\nOSError\n", ("points.ply",), ("model.glb",))
+    assert well.wrong == ""
+    assert bad.wrong == (
+        "exit code 1; not one sentence; names no place; does not say what to do; strange files: points.ply; "
+        "differs: model.glb"
+    )
+    assert table([well]).splitlines()[2:] == [f"| {well.when} | 2 | {said.strip()} | nothing |"]
+    assert os.strerror(errno.ENOSPC) in well.when

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
-from thesisrecon.selfcalibration.frame import solver_unknowns
 from thesisrecon.selfcalibration.hartley import CalibrationProblem
 from thesisrecon.selfcalibration.stratified import projective_scene
+from thesisrecon.selfcalibration.unknowns import solver_unknowns
 
 NOTHING_BUT_CONSTANT = IntrinsicsOptions(
     aspect="constant", skew="constant", principal_point="constant", principal_point_std_rel=None

@@ -22,9 +22,10 @@ from thesisrecon.selfcalibration.focals_from_fundamental import (
     kruppa_whitening,
     pair_focals,
 )
-from thesisrecon.selfcalibration.frame import normalized_frame, weak_focal_prior
+from thesisrecon.selfcalibration.frame import normalized_frame
 from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_cost, kruppa_residuals
 from thesisrecon.selfcalibration.pair_geometry import PairGeometry, fit_fundamental, pair_geometries
+from thesisrecon.selfcalibration.unknowns import weak_focal_prior
 
 
 def random_pair(seed):

@@ -22,8 +22,8 @@ from thesisrecon.selfcalibration.hartley import (
     largest_rotation,
     solve_conic,
     solve_conic_batch,
-    square_pixel_constraints,
 )
+from thesisrecon.selfcalibration.unknowns import square_pixel_constraints
 
 WAYS = [LinearAbsoluteConic(), FixedPlaneQuadric()]
 

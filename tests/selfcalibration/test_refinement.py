@@ -11,10 +11,11 @@ from tests.selfcalibration.test_direct_methods import adjusted, at_distance, pri
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.selfcalibration.candidates import Candidate, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration.focal_scan import planes_for_focals
-from thesisrecon.selfcalibration.frame import normalized_frame, solver_unknowns
+from thesisrecon.selfcalibration.frame import normalized_frame
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.quadric import dual_image_residuals
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
+from thesisrecon.selfcalibration.unknowns import solver_unknowns
 
 FREE = RotationCriterion(focal_weight=0.0)
 
@@ -63,10 +64,9 @@ def test_unknowns_are_what_the_assumptions_leave_open():
     several = solver_unknowns(normalized_frame(rec, free), free)
     assert len(several.std) == 4 + 4
     assert several.max_nonfocal_std == np.inf
-    start = several.start(np.log(np.tile([1.0, 1.1, 1.2, 1.3], (1, 1))))
-    np.testing.assert_allclose(np.exp(several.focals(start))[0], [1.0, 1.1, 1.2, 1.3])
-    assert several.std[several.place[0, 3]] == pytest.approx(30.0 / 1536.0)
-    assert solver_unknowns(normalized_frame(rec, free), free, focals_only=True).place[:, 1:].max() == -1
+    start = several.from_log_focals(np.log(np.tile([1.0, 1.1, 1.2, 1.3], (1, 1))))
+    np.testing.assert_allclose(np.exp(several.log_focals(start))[0], [1.0, 1.1, 1.2, 1.3])
+    assert several.std[several.index[0, 3]] == pytest.approx(30.0 / 1536.0)
     known = prior_for(scene)
     known.mean[:, 0], known.std[:, 0] = 1500.0, 0.0
     fixed = solver_unknowns(normalized_frame(rec, known), known)

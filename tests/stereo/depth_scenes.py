@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from tests.textures import texture
+from tests.synthetic import texture
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import (
     camera_from_centre,

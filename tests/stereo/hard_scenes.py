@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from tests.stereo.depth_scenes import Walled
-from tests.textures import texture
+from tests.synthetic import texture
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera, project
 from thesisrecon.geometry.homogeneous import homogenize

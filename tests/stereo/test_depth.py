@@ -65,15 +65,17 @@ def test_the_same_bytes_whatever_the_number_of_threads_and_one_by_one(walled):
 def test_the_surroundings_of_a_view_are_enough_for_its_map(linker):
     """What is sent to a worker elsewhere: a part of the scene, and the same bytes come back."""
     walled = make_walled(on_arc(tuple(np.linspace(-15.0, 15.0, 5))))
-    choice = replace(STEREO.choice, most=1)
-    stereo = replace(STEREO, linker=linker, choice=choice, least_partners=2, max_side=80, match_side=64)
+    selection = replace(STEREO.selection, max_neighbours=1)
+    stereo = replace(
+        STEREO, linker=linker, selection=selection, min_comparison_views=2, max_side=80, match_side=64
+    )
     scene = stereo.prepare(walled.images, walled.reconstruction)
     raw = {i: stereo.depth_map(scene, i) for i in scene.views}
     for i in (0, 2):
-        near = stereo.surroundings(scene, i)
+        near = stereo.required_views(scene, i)
         assert i in near
         assert len(near) < len(scene.views)
-        part = scene.part(near)
+        part = scene.subset(near)
         assert set(part.views) == set(part.matched) == near
         assert len(part.points.X) < len(scene.points.X) or part.points.seen[sorted(near)].any(axis=0).all()
         partly = {j: raw[j] for j in near}

@@ -4,11 +4,12 @@ import numpy as np
 
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.stereo.depth_kernels import (
-    continue_surface,
+    DepthStd,
     count_agreement,
     fuse_inverse_depths,
     inverse_depths,
     splat_depths,
+    surface_continuation,
     update_kalman,
 )
 from thesisrecon.stereo.plane_kernels import fit_planes
@@ -105,7 +106,7 @@ def test_agreement_counts_what_comes_back_and_what_is_seen_through():
     std = np.full(SHAPE, 1e-3, np.float32)
     agree, contradict = np.zeros(SHAPE, np.uint8), np.zeros(SHAPE, np.uint8)
     limits = np.array([1.0, 0.01, 2.0])
-    count_agreement(depth, std, to, other, std, back, limits, agree, contradict)
+    count_agreement(DepthStd(depth, std), to, DepthStd(other, std), back, limits, agree, contradict)
     v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
     x, y = u + 3.0 / depth, v + 1.0 / depth
     inside = (x > -0.5) & (x < SHAPE[1] - 0.5) & (y > -0.5) & (y < SHAPE[0] - 0.5)
@@ -121,7 +122,7 @@ def test_agreement_counts_what_comes_back_and_what_is_seen_through():
 def test_depths_land_on_the_nearest_pixels_of_another_view_the_nearer_before_the_farther():
     rng = np.random.default_rng(5)
     to = np.column_stack([np.diag([1.0, 1.0, 1.1]), [3.0, -1.0, 0.2]])
-    depth = holes(rng, rng.choice([0.5, 1.0], SHAPE))
+    depth = holes(rng, rng.selection([0.5, 1.0], SHAPE))
     out = np.full((19, 25), np.nan, np.float32)
     out[4, 5], out[6, 7] = 0.1, 9.0
     wanted = out.copy()
@@ -159,12 +160,12 @@ def test_what_continues_a_surface_lies_on_the_plane_of_what_is_sure_about_it():
     sure = (rng.random(SHAPE) < 0.6).astype(np.uint8)
     sure[:, 26:] = 0
     doubtful = (sure == 0) & (rng.random(SHAPE) < 0.5)
-    rho[doubtful] += rng.choice([0.0, 2e-3], int(doubtful.sum())).astype(np.float32)
+    rho[doubtful] += rng.selection([0.0, 2e-3], int(doubtful.sum())).astype(np.float32)
     rho = holes(rng, rho)
     sure[np.isnan(rho)] = 0
     std = np.full(SHAPE, 4e-4, np.float32)
     joins = np.empty(SHAPE, np.uint8)
-    continue_surface(rho, std, sure, 3, 0.05, 2.0, joins)
+    surface_continuation(rho, std, sure, 3, 0.05, 2.0, joins)
     wanted = np.zeros(SHAPE, bool)
     for v, u in np.argwhere((sure == 0) & np.isfinite(rho)):
         near = (np.abs(x - u) <= 3) & (np.abs(y - v) <= 3) & (sure > 0)

@@ -10,11 +10,11 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import DepthMap, DisparityMap
-from thesisrecon.stereo.consistency import Completion, Consistency, piece_sizes, transfer
 from thesisrecon.stereo.correspondence import PairMatching, brightness_gain, sample_disparity
+from thesisrecon.stereo.depth import DepthCompletion, GeometricConsistency, region_sizes, transfer
 from thesisrecon.stereo.depth_fusion import follow, inverse_depth_of
 from thesisrecon.stereo.neighbours import (
-    NeighbourChoice,
+    NeighbourSelection,
     pinhole_view,
     ray_angles_deg,
     shared_projections,
@@ -68,20 +68,22 @@ def test_views_are_refused_with_a_sentence(walled):
 
 def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):
     views, points = views_of(walled), sparse_points(walled.reconstruction)
-    choice = NeighbourChoice(most=2)
-    assert set(choice.choose(points, views, 1)) == {0, 2}
-    assert set(choice.choose(points, views, 2)) == {1, 3}
+    selection = NeighbourSelection(max_neighbours=2)
+    assert set(selection.select(points, views, 1)) == {0, 2}
+    assert set(selection.select(points, views, 2)) == {1, 3}
     S = np.diag([1e3, 1e3, 1e3, 1.0])
     larger = {i: replace(view, P=1e3 * view.P @ np.linalg.inv(S)) for i, view in views.items()}
-    assert choice.choose(replace(points, X=1e3 * points.X), larger, 1) == choice.choose(points, views, 1)
+    assert selection.select(replace(points, X=1e3 * points.X), larger, 1) == selection.select(
+        points, views, 1
+    )
 
 
 def test_a_view_at_the_same_place_or_with_few_points_is_no_neighbour(walled):
     views, points = views_of(walled), sparse_points(walled.reconstruction)
     same = {0: views[0], 1: replace(views[1], P=views[0].P)}
-    assert NeighbourChoice().choose(points, same, 0) == []
+    assert NeighbourSelection().select(points, same, 0) == []
     few = replace(points, seen=points.seen & (np.arange(points.seen.shape[1]) < 5))
-    assert NeighbourChoice().choose(few, views, 0) == []
+    assert NeighbourSelection().select(few, views, 0) == []
     centres = [camera_centre(view.P) for view in views.values()]
     angles = ray_angles_deg(np.zeros((1, 3)), *(c[:3] / c[3] for c in centres[:2]))
     assert angles == pytest.approx(11.3, abs=0.1)
@@ -200,7 +202,7 @@ def test_what_a_view_lacks_is_taken_from_others_where_the_photographs_agree():
     # The other view is wrong there: what the photographs say counts, with the planes around the gap.
     other[120:] *= 0.8
     own, offering = replace(maps[0], depth=depth), replace(maps[1], depth=other)
-    found = Completion().complete(own, [offering], views, refinement=PlaneRefinement())
+    found = DepthCompletion().complete(own, [offering], views, refinement=PlaneRefinement())
     kept = np.isfinite(depth)
     assert (found.depth[kept] == depth[kept]).all()
     error = np.abs(found.depth[lacks] / maps[0].depth[lacks] - 1.0)
@@ -213,7 +215,7 @@ def test_what_a_view_lacks_is_taken_from_others_where_the_photographs_agree():
     assert np.isfinite(found.std[np.isfinite(found.depth)]).all()
     assert (found.views[lacks][np.isfinite(found.depth[lacks])] == 1).all()
     nothing = replace(offering, depth=np.full_like(other, np.nan))
-    assert Completion().complete(own, [nothing], views, refinement=PlaneRefinement()) is own
+    assert DepthCompletion().complete(own, [nothing], views, refinement=PlaneRefinement()) is own
 
 
 def test_what_other_views_see_through_and_small_pieces_go():
@@ -223,15 +225,15 @@ def test_what_other_views_see_through_and_small_pieces_go():
     depth[80:100, 20:40] *= 0.6
     depth[100, 200:203] = np.nan
     depth[101, 199:203] = np.nan
-    found = Consistency().confirm(replace(maps[0], depth=depth), [maps[1]])
+    found = GeometricConsistency().confirm(replace(maps[0], depth=depth), [maps[1]])
     assert np.isnan(found.depth[80:100, 20:40]).all()
     assert np.isfinite(found.depth).mean() > 0.7
     assert (found.views == np.isfinite(found.depth)).all()
-    alone = Consistency().confirm(maps[0], [])
+    alone = GeometricConsistency().confirm(maps[0], [])
     assert np.isnan(alone.depth).all()
     lonely = np.full((50, 60), np.nan, dtype=np.float32)
     lonely[:20], lonely[30:32, 5:8] = 2.0, 3.0
-    sizes = piece_sizes(lonely, 0.02)
+    sizes = region_sizes(lonely, 0.02)
     assert (sizes[:20] == 1200).all()
     assert (sizes[30:32, 5:8] == 6).all()
     assert sizes[25, 5] == 0
@@ -244,12 +246,12 @@ def test_what_nobody_confirms_stays_if_it_continues_what_is_confirmed():
     other[20:26, 60:200] = np.nan
     depth = maps[0].depth.copy()
     depth[22:25, 100:103] *= 0.98
-    found = Consistency().confirm(replace(maps[0], depth=depth), [replace(maps[1], depth=other)])
+    found = GeometricConsistency().confirm(replace(maps[0], depth=depth), [replace(maps[1], depth=other)])
     assert np.isnan(found.depth[22:25, 100:103]).all()
     strip = np.isfinite(found.depth[20:26, 110:180])
     assert strip.mean() > 0.95
     other[20:60, 60:200] = np.nan
-    found = Consistency().confirm(maps[0], [replace(maps[1], depth=other)])
+    found = GeometricConsistency().confirm(maps[0], [replace(maps[1], depth=other)])
     assert np.isnan(found.depth[35:45, 110:180]).all()
 
 

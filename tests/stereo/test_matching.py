@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from tests.textures import texture
+from tests.synthetic import texture
 from thesisrecon.stereo.cost import CensusAndColour, estimate_noise, prepare_pair, row_strips
 from thesisrecon.stereo.postprocessing import DisparityPostprocessing
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
@@ -185,7 +185,7 @@ def test_the_front_door():
         (lambda: PathPenalties(P1=2.0), "penalties must obey"),
         (lambda: PathPenalties(edge=0.0), "edge"),
         (lambda: DisparityPostprocessing(radius=-1), "must not be negative"),
-        (lambda: DisparityPostprocessing(least_confidence=1.0), "least_confidence"),
+        (lambda: DisparityPostprocessing(min_confidence=1.0), "min_confidence"),
         (lambda: MaximumLikelihoodScanline(detection=1.0), "detection"),
         (lambda: MaximumLikelihoodScanline(radius=9), "radius"),
         (lambda: MaximumLikelihoodScanline(cohesion="both"), "cohesion"),

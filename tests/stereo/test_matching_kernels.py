@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tests.stereo import matching_twins as twins
+from tests.stereo import twins
 from thesisrecon.stereo.cost_kernels import (
     census,
     cost_volume,

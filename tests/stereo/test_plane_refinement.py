@@ -4,9 +4,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from tests.stereo.depth_twins import Setting, squares
-from tests.textures import texture
-from thesisrecon.stereo.plane_kernels import UNKNOWN, begin_planes, pack_squares, rate_planes, sweep_planes
+from tests.stereo.twins import Setting, squares
+from tests.synthetic import texture
+from thesisrecon.stereo.plane_kernels import (
+    UNKNOWN,
+    PatchViews,
+    PatchWindow,
+    begin_planes,
+    pack_squares,
+    rate_planes,
+    sweep_planes,
+)
 
 SHAPE = (13, 17)
 PLANE = np.array([1.0, 6e-3, -4e-3])
@@ -24,7 +32,7 @@ def arguments(setting, others):
         start += other.size
     packed = np.concatenate(words)
     gray, H, e = setting.gray, setting.H, setting.e
-    return gray, packed, np.array(layout), H, e, setting.offsets, setting.likeness
+    return PatchViews(gray, packed, np.array(layout), H, e), PatchWindow(setting.offsets, setting.likeness)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +105,7 @@ def test_a_pass_equals_that_of_plain_numpy(scene, backward):
     cost = np.empty(SHAPE, np.float32)
     begin_planes(*given, planes, cost)
     wanted, wanted_cost = planes.copy(), cost.copy()
-    setting.sweep(wanted, wanted_cost, step_px=0.4, settled=0.02, backward=backward)
+    setting.sweep(wanted, wanted_cost, step_px=0.4, converged_cost=0.02, backward=backward)
     sweep_planes(*given, 0.4, 0.02, backward, planes, cost)
     # Sums in single precision may turn a choice between planes of one cost.
     assert np.mean(np.isclose(cost, wanted_cost, atol=5e-4)) > 0.97
@@ -115,7 +123,7 @@ def test_passes_find_the_plane_and_fill_what_has_none(scene):
         sweep_planes(*given, 0.5 * 0.5**k, 0.0, k % 2 == 1, planes, cost)
     assert (cost <= before).all()
     off = 5.0 * np.abs(planes[..., 0] - (PLANE[0] + x * PLANE[1] + y * PLANE[2]))
-    seen = np.isfinite(given[0])
+    seen = np.isfinite(given[0].gray)
     assert np.isfinite(planes[seen]).mean() > 0.98
     assert np.nanmedian(off[seen]) < 0.05
     assert np.mean(off[seen] < 0.5) > 0.8

@@ -1,6 +1,6 @@
-"""Rows are epipolar lines, maps are inverse, nearer is farther left on the right, bad pairs are refused."""
+"""Planar and polar rectification, and resampling of images through a map."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -8,24 +8,41 @@ from hypothesis import strategies as st
 
 from tests.geometry.properties import holds_for_every
 from tests.stereo.rectification_scenes import MOTIONS, PLANAR, SIZE, make_pair
+from tests.synthetic import texture
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.stereo.epipolar_pair import pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo.planar import CommonOrientation, FrameLimits, PlanarRectification
-from thesisrecon.stereo.planar_methods import Hartley, LeastDistortion, LoopZhang
-from thesisrecon.stereo.polar import Polar, PolarRectification
+from thesisrecon.stereo.planar import (
+    CommonOrientationRectifier,
+    FrameLimits,
+    HartleyRectifier,
+    LoopZhangRectifier,
+    MinimumDistortionRectifier,
+    PlanarRectification,
+)
+from thesisrecon.stereo.polar import PolarRectification, PolarRectifier
 from thesisrecon.stereo.rectification import (
-    LeastDistorted,
+    BestRectifier,
     disparity_range,
     jacobians,
     measure_quality,
     rectify_cameras,
     rectify_pair,
 )
+from thesisrecon.stereo.resampling import NOT_SHRUNK, STRIP_ROWS, sample_image, warp_image
 
-PLANAR_METHODS = (Hartley(), LoopZhang(), LeastDistortion(), CommonOrientation())
+PLANAR_METHODS = (
+    HartleyRectifier(),
+    LoopZhangRectifier(),
+    MinimumDistortionRectifier(),
+    CommonOrientationRectifier(),
+)
+
+
 CASES = [(method, motion) for method in PLANAR_METHODS for motion in PLANAR]
-CASES += [(Polar(), motion) for motion in MOTIONS]
+
+
+CASES += [(PolarRectifier(), motion) for motion in MOTIONS]
 
 
 def named(value):
@@ -44,7 +61,7 @@ def both_pairs(scene):
 def test_exact_matches_share_their_row_and_nearer_ones_are_farther_left_on_the_right(method, motion):
     scene = make_pair(motion, np.random.default_rng(0))
     for pair in both_pairs(scene):
-        if pair.cameras is None and isinstance(method, CommonOrientation):
+        if pair.cameras is None and isinstance(method, CommonOrientationRectifier):
             continue
         rectified = method.rectify(pair)
         left = rectified.rectified_from_original(0, scene.xy1)
@@ -63,8 +80,8 @@ def test_no_pixel_shrinks_by_more_than_is_stated_and_none_is_mirrored(method, mo
     pair = both_pairs(scene)[1]
     rectified = method.rectify(pair)
     quality = measure_quality(rectified, pair)
-    assert quality.least_scale >= 1.0 / method.limits.most_shrink - 1e-2
-    assert quality.growth <= method.limits.most_growth
+    assert quality.least_scale >= 1.0 / method.limits.max_shrink - 1e-2
+    assert quality.size_ratio <= method.limits.max_growth
     for side in (0, 1):
         inside = np.isfinite(rectified.rectified_from_original(side, pair.regions[side])).all(axis=1)
         J = jacobians(rectified, side, pair.regions[side][inside])
@@ -87,11 +104,13 @@ def test_the_maps_are_inverse_to_each_other(rng, case):
         pixels = rng.uniform([0.0, 0.0], np.array(scene.sizes[side]) - 1.0, (200, 2))
         there = rectified.rectified_from_original(side, pixels)
         there = there[np.isfinite(there).all(axis=1)]
-        kept = pixels[np.isfinite(rectified.rectified_from_original(side, pixels)).all(axis=1)]
-        assert np.abs(rectified.original_from_rectified(side, there) - kept).max(initial=0.0) < 1e-9
+        coverage = pixels[np.isfinite(rectified.rectified_from_original(side, pixels)).all(axis=1)]
+        assert np.abs(rectified.original_from_rectified(side, there) - coverage).max(initial=0.0) < 1e-9
 
 
-@pytest.mark.parametrize(("method", "motion"), [(LoopZhang(), "toed in"), (Polar(), "forward")], ids=named)
+@pytest.mark.parametrize(
+    ("method", "motion"), [(LoopZhangRectifier(), "toed in"), (PolarRectifier(), "forward")], ids=named
+)
 def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
     rectified = method.rectify(both_pairs(make_pair(motion, np.random.default_rng(2)))[0])
     rows = range(37, 42)
@@ -104,12 +123,12 @@ def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
 
 def test_a_parallel_pair_stays_as_it_is():
     scene = make_pair("parallel", np.random.default_rng(3))
-    for method in (LoopZhang(), LeastDistortion(), CommonOrientation()):
+    for method in (LoopZhangRectifier(), MinimumDistortionRectifier(), CommonOrientationRectifier()):
         rectified = method.rectify(both_pairs(scene)[1])
         for H in (rectified.H1, rectified.H2):
             expected = np.eye(3)
             expected[:2, 2] = (H / H[2, 2])[:2, 2]
-            if isinstance(method, LeastDistortion):
+            if isinstance(method, MinimumDistortionRectifier):
                 # The disparities of any scene slope a little; a shear takes part of that.
                 assert np.abs(H / H[2, 2] - expected).max() < 0.1
             else:
@@ -119,7 +138,7 @@ def test_a_parallel_pair_stays_as_it_is():
 def test_disparities_of_a_common_orientation_are_inverse_depths():
     scene = make_pair("toed in", np.random.default_rng(4))
     pair = both_pairs(scene)[1]
-    rectified = CommonOrientation().rectify(pair)
+    rectified = CommonOrientationRectifier().rectify(pair)
     d = (
         rectified.rectified_from_original(0, scene.xy1)[:, 0]
         - rectified.rectified_from_original(1, scene.xy2)[:, 0]
@@ -136,7 +155,7 @@ def test_disparities_of_a_common_orientation_are_inverse_depths():
 def test_hartley_leaves_the_second_photograph_rigid_about_its_centre_and_makes_the_first_like_it():
     scene = make_pair("beside", np.random.default_rng(5))
     pair = both_pairs(scene)[0]
-    hartley = Hartley().rectify(pair)
+    hartley = HartleyRectifier().rectify(pair)
     centre = (np.array(scene.sizes[1]) - 1.0) / 2.0
     J = jacobians(hartley, 1, centre[None])[0]
     s = np.linalg.svd(J, compute_uv=False)
@@ -162,7 +181,7 @@ def test_loop_and_zhang_keep_angles_and_ratios_and_the_least_distorted_is_not_be
 def test_noise_of_matches_is_the_noise_of_rows():
     scene = make_pair("beside", np.random.default_rng(7), noise_px=0.2)
     pair = both_pairs(scene)[1]
-    for method in (*PLANAR_METHODS, Polar()):
+    for method in (*PLANAR_METHODS, PolarRectifier()):
         quality = measure_quality(method.rectify(pair), pair)
         assert 0.2 < quality.rms_dy_px / np.sqrt(2.0) / quality.greatest_scale + 0.1 < 0.35
 
@@ -180,7 +199,7 @@ def test_epipoles_inside_are_for_polar_frames_alone(motion):
         rectify_cameras(*scene.P, *scene.sizes),
     ):
         assert isinstance(best, PolarRectification)
-        assert min(measure_quality(best, pair).kept) > 0.5
+        assert min(measure_quality(best, pair).coverage) > 0.5
 
 
 def test_the_best_is_planar_for_neighbours_and_polar_where_planar_frames_stretch():
@@ -190,7 +209,7 @@ def test_the_best_is_planar_for_neighbours_and_polar_where_planar_frames_stretch
     with pytest.raises(ValueError, match="one of"):
         rectify_pair(scene.F, scene.xy1, scene.xy2, *scene.sizes, method="none")
     wide = make_pair("toed in", np.random.default_rng(9))
-    turned = replace(LeastDistorted((LeastDistortion(), Polar())), bending=-1.0)
+    turned = replace(BestRectifier((MinimumDistortionRectifier(), PolarRectifier())), bending=-1.0)
     assert isinstance(turned.rectify(both_pairs(wide)[0]), PolarRectification)
 
 
@@ -272,8 +291,117 @@ def test_wrong_calls_are_value_errors(change):
     with pytest.raises(ValueError, match=r"rectif|matches|photograph"):
         rectify_pair(**call)
     with pytest.raises(ValueError, match="most_shrink"):
-        FrameLimits(most_shrink=0.5)
+        FrameLimits(max_shrink=0.5)
     with pytest.raises(ValueError, match="most_shear"):
-        LeastDistortion(most_shear=0.0)
+        MinimumDistortionRectifier(max_shear=0.0)
     with pytest.raises(ValueError, match="side"):
         rectify_cameras(*scene.P, SIZE, SIZE).rectified_from_original(2, scene.xy1)
+
+
+def cubic(x):
+    x = np.abs(x)
+    near, far = 1.5 * x**3 - 2.5 * x**2 + 1.0, -0.5 * x**3 + 2.5 * x**2 - 4.0 * x + 2.0
+    return np.where(x < 1.0, near, np.where(x < 2.0, far, 0.0))
+
+
+def sample_plainly(image, xy, rows):
+    """Twin of ``sample_image`` for lookups of at least two rows and columns, by one weight per pixel."""
+    height, width = image.shape[:2]
+    padded = np.pad(image.astype(np.float64), ((12, 12), (12, 12), (0, 0)), mode="edge")
+    down = np.concatenate([np.diff(xy, axis=0), xy[-2:-1] - xy[-1:]])
+    across = np.concatenate([np.diff(xy, axis=1), xy[:, -2:-1] - xy[:, -1:]], axis=1)
+    spread = np.hypot(across, down)
+    spread = np.where(spread > NOT_SHRUNK, spread, 1.0)
+    out = np.full((rows, xy.shape[1], image.shape[2]), np.nan)
+    for i, j in np.ndindex(rows, xy.shape[1]):
+        x, y = xy[i, j]
+        if not (0.0 <= x <= width - 1.0 and 0.0 <= y <= height - 1.0):
+            continue
+        u, v = np.arange(-12, width + 12), np.arange(-12, height + 12)
+        w = np.outer(cubic((v - y) / spread[i, j, 1]), cubic((u - x) / spread[i, j, 0]))
+        x0, y0 = int(x), int(y)
+        if np.isnan(image[y0 : y0 + 2, x0 : x0 + 2]).any():
+            continue
+        known = np.isfinite(padded[:, :, 0])
+        out[i, j] = np.sum(w[known][:, None] * padded[known], axis=0) / w[known].sum()
+    return out
+
+
+def a_map(scale):
+    """A homography that shows the photograph ``1 / scale`` as large, turned."""
+    c, s = scale * np.cos(0.3), scale * np.sin(0.3)
+    H = np.linalg.inv(np.array([[c, -s, 20.0], [s, c, -4.0], [1e-4, 2e-4, 1.0]]))
+    return PlanarRectification(H / H[2, 2], np.eye(3), (60, 50))
+
+
+@pytest.mark.parametrize("scale", [0.6, 1.0, 2.3])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_kernel_is_its_plain_twin(scale, channels):
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0.0, 255.0, (70, 90, channels)).astype(np.float32)
+    image[30:33, 40:44] = np.nan
+    xy = a_map(scale).lookup(0, range(51))
+    out = np.empty((50, 60, channels), np.float32)
+    sample_image(image, xy, out)
+    plain = sample_plainly(image, xy, 50)
+    np.testing.assert_array_equal(np.isnan(out), np.isnan(plain))
+    assert np.isfinite(out).mean() > 0.2
+    np.testing.assert_allclose(out, plain, atol=0.02, equal_nan=True)
+
+
+def test_strips_do_not_show_and_grey_is_one_channel():
+    image = texture(260, 200).astype(np.float32)
+    H = np.array([[0.8, 0.1, 3.0], [-0.1, 0.7, 20.0], [1e-4, 0.0, 1.0]])
+    rectified = PlanarRectification(H, H, (150, 2 * STRIP_ROWS + 1))
+    whole = np.empty((rectified.size[1], 150, 1), np.float32)
+    sample_image(image[:, :, None], rectified.lookup(0, range(rectified.size[1])), whole)
+    grey = rectified.warp(image, 0)
+    np.testing.assert_array_equal(grey, whole[:, :, 0])
+    colour = rectified.warp(np.repeat(image[:, :, None], 3, axis=2), 1)
+    assert colour.shape == (*grey.shape, 3)
+    np.testing.assert_array_equal(colour[:, :, 2], grey)
+
+
+def test_whole_pixels_are_kept_and_quadratics_are_reproduced():
+    image = texture(40, 50).astype(np.float32)
+    same = PlanarRectification(np.eye(3), np.eye(3), (50, 40))
+    np.testing.assert_allclose(same.warp(image, 0), image, atol=1e-4)
+    y, x = np.mgrid[0:40, 0:50].astype(np.float64)
+    quadratic = (0.05 * x**2 - 0.03 * x * y + 0.02 * y**2 + x).astype(np.float32)
+    H = np.array([[1.3, 0.2, -5.0], [-0.2, 1.4, 2.0], [0.0, 0.0, 1.0]])
+    larger = PlanarRectification(H, H, (60, 60))
+    found = larger.warp(quadratic, 0)
+    u, v = np.moveaxis(larger.lookup(0, range(60)), 2, 0)
+    inner = (u > 2) & (u < 47) & (v > 2) & (v < 37)
+    expected = 0.05 * u**2 - 0.03 * u * v + 0.02 * v**2 + u
+    np.testing.assert_allclose(found[inner], expected[inner], atol=1e-3)
+
+
+def test_what_is_too_fine_for_the_frame_becomes_grey_not_another_pattern():
+    stripes = np.zeros((200, 200), np.float32)
+    stripes[:, ::2] = 200.0
+    third = PlanarRectification(np.diag([1 / 3, 1 / 3, 1.0]), np.eye(3), (66, 66))
+    inner = third.warp(stripes, 0)[5:-5, 5:-5]
+    assert np.abs(inner - 100.0).max() < 8.0
+
+
+@dataclass(frozen=True)
+class OneRow:
+    """The lookup of a frame of a single pixel."""
+
+    size: tuple[int, int] = (1, 1)
+
+    def lookup(self, side, rows):
+        return np.full((len(rows), 1, 2), 3.0 + side)
+
+
+def test_small_frames_and_wrong_images():
+    image = texture(8, 9).astype(np.float32)
+    assert warp_image(OneRow(), image, 0)[0, 0] == pytest.approx(image[3, 3], abs=1e-4)
+    same = PlanarRectification(np.eye(3), np.eye(3), (9, 8))
+    for wrong in (np.zeros(3, np.float32), np.zeros((0, 4), np.float32)):
+        with pytest.raises(ValueError, match="image to warp"):
+            same.warp(wrong, 0)
+    with pytest.raises(ValueError, match="side"):
+        same.warp(image, 2)
+    assert np.isnan(PlanarRectification(np.eye(3), np.eye(3), (12, 8)).warp(image, 0)[:, 9:]).all()

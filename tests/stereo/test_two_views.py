@@ -18,7 +18,11 @@ def courtyard():
     scene = load_fixture_scene()
     half = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
     views = (6, 7)
-    images, places, P = [], [], [camera_from_centre(half @ scene.K[k], scene.R[k], scene.C[k]) for k in views]
+    images, correspondences, P = (
+        [],
+        [],
+        [camera_from_centre(half @ scene.K[k], scene.R[k], scene.C[k]) for k in views],
+    )
     for k in views:
         with PIL.Image.open(scene.image_paths[k]) as image:
             images.append(np.asarray(image.resize(SIZE, PIL.Image.Resampling.BOX)))
@@ -29,8 +33,8 @@ def courtyard():
         rays = np.stack([x * stride, y * stride, np.ones_like(x)], axis=-1) @ np.linalg.inv(scene.K[k]).T
         X = (rays * depth[..., None]) @ scene.R[k] + scene.C[k]
         xy = project(P[side], X.reshape(-1, 3)), project(P[1 - side], X.reshape(-1, 3))
-        places.append(tuple(part.reshape(*depth.shape, 2) for part in xy))
-    return images, P, places
+        correspondences.append(tuple(part.reshape(*depth.shape, 2) for part in xy))
+    return images, P, correspondences
 
 
 def test_both_photographs_know_where_their_pixels_are_in_the_other(courtyard):
@@ -40,7 +44,7 @@ def test_both_photographs_know_where_their_pixels_are_in_the_other(courtyard):
     seen = np.all((there > 0) & (there < np.array(SIZE)), axis=1)
     pair = match_two_views(images[0], images[1], F, here[seen], there[seen], pairs=PairMatching())
     for side in (0, 1):
-        found = pair.places(side, SIZE)
+        found = pair.correspondences(side, SIZE)
         assert found.shape == (384, 512, 2)
         at, to = truth[side]
         slope = to - at
@@ -59,7 +63,7 @@ def test_there_and_back_is_where_one_was(courtyard):
     darker = (images[1] * 0.8).astype(np.uint8)
     pair = match_two_views(images[0], darker, F, here[seen], there[seen], pairs=PairMatching())
     np.testing.assert_allclose(pair.gain, 1.25 * np.ones(3), rtol=0.2)
-    forth, back = pair.places(0, SIZE), pair.places(1, SIZE)
+    forth, back = pair.correspondences(0, SIZE), pair.correspondences(1, SIZE)
     at = np.rint(forth)
     inside = np.all((at >= 0) & (at <= np.array(SIZE) - 1), axis=2)
     x, y = at[inside].astype(int).T
@@ -67,4 +71,4 @@ def test_there_and_back_is_where_one_was(courtyard):
     off = np.linalg.norm(again - np.indices((384, 512))[::-1].transpose(1, 2, 0)[inside], axis=1)
     assert np.nanmedian(off) < 0.3
     with pytest.raises(ValueError, match="side"):
-        pair.places(2, SIZE)
+        pair.correspondences(2, SIZE)

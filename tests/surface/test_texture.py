@@ -1,4 +1,4 @@
-"""Texture from photographs: what is seen, which photograph is taken, seams, and what nobody sees."""
+"""Texture atlas, view selection and blending."""
 
 from dataclasses import replace
 
@@ -11,9 +11,18 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.surface.color_correction import SingleView
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.mesh import face_neighbours
+from thesisrecon.surface.mesh import face_neighbours, vertex_normals
+from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_atlas import TextureAtlas, pack_rectangles
-from thesisrecon.surface.texture_blending import BlendedViews
+from thesisrecon.surface.texture_blending import BlendedViews, equalizing_gains
+from thesisrecon.surface.texture_kernels import (
+    SeenSurface,
+    combine_colors,
+    continue_faces,
+    diffuse,
+    grow_colors,
+    observe_points,
+)
 from thesisrecon.surface.texture_views import charts_of, choose_views, color_vertices, face_quality
 from thesisrecon.views.render import render
 
@@ -159,3 +168,165 @@ def test_a_surface_that_nobody_sees_is_refused(sphere):
     away = replace(away, seen=np.zeros_like(away.seen))
     with pytest.raises(StageFailure, match="no texture"):
         TextureAtlas().texture(sphere, [away])
+
+
+def test_gains_are_found(sphere):
+    views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
+    found = BlendedViews().prepare(sphere, views).gains
+    wanted = np.exp(np.log(GAINS).mean()) / np.array(GAINS)
+    np.testing.assert_allclose(found, np.repeat(wanted[:, None], 3, axis=1), atol=0.025)
+    np.testing.assert_array_equal(BlendedViews(level=False).prepare(sphere, views).gains, 1.0)
+
+
+def test_gains_of_views_that_share_nothing_stay():
+    weight = np.array([[1, 1, 1, 0, 0], [1, 1, 1, 0, 0], [0, 0, 0, 1, 1]], dtype=np.float32)
+    color = np.full((3, 5, 3), 100, dtype=np.float32)
+    color[1] = 144.0
+    np.testing.assert_allclose(equalizing_gains(weight, color)[:, 0], [1.2, 1 / 1.2, 1.0], rtol=1e-4)
+
+
+def test_what_one_photograph_contradicts_is_left_out(sphere):
+    views = [photograph(m) for m in ring_of(24)]
+    spoiled = views[0].rgb.copy()
+    spoiled[40:80, 60:100] = [255, 0, 255]
+    views[0] = replace(views[0], rgb=spoiled)
+    towards = sphere.vertices @ views[0].P[:, :3].T + views[0].P[:, 3]
+    x, y = (towards[:, :2] / towards[:, 2:]).T
+    facing = (sphere.vertices @ np.linalg.solve(views[0].P[:, :3], views[0].P[:, 3])) < 0
+    hit = facing & (np.abs(x - 80) < 15) & (np.abs(y - 60) < 15)
+    error = []
+    for scatter in (1e6, 20.0):
+        prepared = BlendedViews(scatter=scatter).prepare(sphere, views)
+        color = prepared.colors(sphere.vertices, vertex_normals(sphere))[0]
+        error.append(float(np.sqrt(np.mean((color - paint(sphere.vertices))[hit] ** 2))))
+    assert error[0] > 12.0
+    assert error[1] < 0.3 * error[0]
+
+
+def test_points_have_their_colours(sphere):
+    prepared = BlendedViews().prepare(sphere, [photograph(m) for m in ring_of()])
+    color, shown = prepared.colors(sphere.vertices, vertex_normals(sphere))
+    assert shown.mean() > 0.95
+    assert np.median(np.abs(color - paint(sphere.vertices))[shown]) < 3.0
+
+
+def test_a_view_is_left_out(sphere):
+    views = [photograph(m) for m in ring_of()]
+    black = replace(views[3], rgb=np.zeros_like(views[3].rgb))
+    model = SurfaceModel()
+    with_black = [*views[:3], black, *views[4:]]
+    one, other = (model.color(sphere, some, without=3) for some in (views, with_black))
+    assert one.texture is not None
+    np.testing.assert_array_equal(one.texture, other.texture)
+    np.testing.assert_array_equal(one.faces, sphere.faces)
+
+
+def test_spread_shares_matches_its_twin(sphere):
+    neighbours = face_neighbours(sphere.faces)
+    rng = np.random.default_rng(0)
+    share = rng.random((len(neighbours), 3)).astype(np.float32)
+    share[rng.random(share.shape) < 0.3] = 0.0
+    spread = rng.random(share.shape).astype(np.float32)
+    out = np.empty_like(share)
+    diffuse(share, neighbours, 0.1, spread, out)
+    around = np.where(neighbours[..., None] >= 0, spread[neighbours], 0.0).sum(axis=1)
+    count = np.maximum((neighbours >= 0).sum(axis=1, keepdims=True), 1)
+    np.testing.assert_allclose(out, np.where(share > 0, 0.1 * share + 0.9 * around / count, 0.0), rtol=1e-5)
+
+
+def observed(points, normals, P, depth, clear, slack):
+    """Plain weights (N,) of :func:`observe_points`."""
+    weight = np.zeros(len(points))
+    M, height, width = P[:, :3], *depth.shape
+    centre = -np.linalg.solve(M, P[:, 3])
+    for n, (X, N) in enumerate(zip(points, normals, strict=True)):
+        x = M @ X + P[:, 3]
+        u, v = x[:2] / x[2]
+        inside = x[2] > 0 and 0 <= u <= width - 1 and 0 <= v <= height - 1
+        if not inside or N @ (centre - X) <= 0:
+            continue
+        left, top = int(u), int(v)
+        rows, columns = [top, min(top + 1, height - 1)], [left, min(left + 1, width - 1)]
+        s, t = np.array([1 - u + left, u - left]), np.array([1 - v + top, v - top])
+        if x[2] * (1 - slack) <= depth[np.ix_(rows, columns)].max():
+            trust = t @ clear[np.ix_(rows, columns)] @ s
+            weight[n] = trust * abs(np.linalg.det(M)) * (N @ (centre - X)) / x[2] ** 3
+    return weight
+
+
+def test_observe_points_matches_its_twin(sphere):
+    view = BlendedViews().prepare(sphere, [photograph(ring_of()[2])]).views[0]
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(400, 3))
+    points *= 1.01 / np.linalg.norm(points, axis=1, keepdims=True)
+    normals = points + 0.2 * rng.normal(size=points.shape)
+    weight, color = np.zeros(400, np.float32), np.zeros((400, 3), np.float32)
+    gain = np.array([1.0, 2.0, 0.5], np.float32)
+    P, rgb = view.view.P, view.view.rgb
+    seen = SeenSurface(P, view.depth, view.clear, view.slack, rgb, gain)
+    observe_points(points, normals, seen, weight, color)
+    wanted = observed(points, normals, P, view.depth, view.clear, view.slack)
+    np.testing.assert_allclose(weight, wanted, rtol=1e-4, atol=1e-6)
+    assert 50 < (weight > 0).sum() < 350
+    x = points @ P[:, :3].T + P[:, 3]
+    near = np.rint(x[:, :2] / x[:, 2:]).astype(int)
+    good = weight > 0.5 * weight.max()
+    apart = color[good] / gain - rgb[near[good, 1], near[good, 0]]
+    assert np.median(np.abs(apart)) < 6.0
+
+
+def test_combine_colors_matches_its_twin():
+    rng = np.random.default_rng(2)
+    weight = rng.random((5, 60)).astype(np.float32)
+    weight[rng.random(weight.shape) < 0.4] = 0.0
+    weight[:, 0] = 0.0
+    color = (255 * rng.random((5, 60, 3))).astype(np.float32)
+    out = np.full((60, 3), 7.0, np.float32)
+    combine_colors(weight, color, 2.0, 30.0, out)
+    np.testing.assert_array_equal(out[0], 7.0)
+    for n in np.flatnonzero(weight.any(axis=0)):
+        w, c = weight[:, n].astype(float), color[:, n].astype(float)
+        w, c = w[w > 0] / w.max(), c[w > 0]
+        middle = np.empty(3)
+        for k in range(3):
+            order = np.argsort(c[:, k], kind="stable")
+            middle[k] = c[order[np.searchsorted(np.cumsum(w[order]), 0.5 * w.sum())], k]
+        final = w**2 / (1 + ((c - middle) ** 2).mean(axis=1) / 30.0**2) ** 2
+        np.testing.assert_allclose(out[n], final @ c / final.sum(), rtol=1e-4)
+
+
+def test_grow_colors_matches_its_twin():
+    rng = np.random.default_rng(3)
+    texture = rng.integers(0, 256, (12, 15, 3)).astype(np.uint8)
+    drawn = rng.random((12, 15)) < 0.1
+    before, was = texture.astype(float), drawn.copy()
+    grow_colors(texture, drawn)
+    padded = np.pad(was, 1)
+    sums = np.pad(np.where(was[..., None], before, 0.0), ((1, 1), (1, 1), (0, 0)))
+    shifts = [(j, i) for j in range(3) for i in range(3)]
+    count = sum(padded[j : j + 12, i : i + 15].astype(int) for j, i in shifts)
+    total = sum(sums[j : j + 12, i : i + 15] for j, i in shifts)
+    np.testing.assert_array_equal(drawn, count > 0)
+    new = drawn & ~was
+    np.testing.assert_array_equal(texture[new], np.floor(total[new] / count[new][:, None] + 0.5))
+    np.testing.assert_array_equal(texture[~new], before[~new])
+
+
+def test_faces_are_continued_by_a_texel():
+    corners = np.array([[[2.2, 2.1, 1.0], [8.3, 2.4, 1.0], [2.5, 8.2, 1.0]]])
+    face = np.full((12, 12), -1)
+    face[3:5, 3:6] = 0
+    weights = np.zeros((12, 12, 2), np.float32)
+    continue_faces(corners, 4.0, face, weights)
+    wanted = np.full((12, 12), -1)
+    wanted[3:5, 2:7] = 0
+    wanted[2:6, 3:6] = 0
+    np.testing.assert_array_equal(face, wanted)
+    for y, x in np.argwhere(face >= 0):
+        if not (3 <= y < 5 and 3 <= x < 6):
+            found = np.linalg.solve(corners[0].T, [x, y, 1.0])
+            np.testing.assert_allclose(weights[y, x], found[1:], atol=1e-6)
+    face = np.full((12, 12), -1)
+    face[3, 3] = 0
+    continue_faces(corners, 0.1, face, weights)
+    assert (face >= 0).sum() < 5

@@ -2,7 +2,6 @@
 
 from collections import Counter
 
-from thesisrecon.epipolar.configuration import Configuration
 from validation.studies.epipolar_certainty import (
     certainty_metrics,
     certainty_table,
@@ -11,6 +10,8 @@ from validation.studies.epipolar_certainty import (
     judge_pairs,
     named_rightly,
 )
+
+from thesisrecon.epipolar.configuration import Configuration
 
 
 def test_no_wrong_f_of_a_facade_is_called_sure():

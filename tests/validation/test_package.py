@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from thesisrecon.io.pair_list import COUNT, demo_images
+from thesisrecon.io.pair_list import DEMO_IMAGES, demo_images
 from validation.scenes.real import ROOT
 from validation.studies.package.built import NEEDED, wheel_faults
 from validation.studies.package.environments import dependencies, lowest_versions
@@ -23,7 +23,7 @@ def test_the_wheel_carries_the_photographs_of_the_demo():
         assert (ROOT / source).is_file()
     photographs = [ROOT / source for source in laid_in if source.endswith(".jpg")]
     assert sorted(photographs) == demo_images()
-    assert len(photographs) == COUNT
+    assert len(photographs) == DEMO_IMAGES
 
 
 def test_lowest_versions_are_those_of_the_project_and_need_a_bound():
@@ -65,7 +65,7 @@ def test_a_suite_is_well_where_something_passed_and_nothing_broke():
 
 
 def test_what_is_missing_or_does_not_belong_in_a_wheel_is_told():
-    photographs = [f"thesisrecon/courtyard/images/{i:04d}.jpg" for i in range(COUNT)]
+    photographs = [f"thesisrecon/courtyard/images/{i:04d}.jpg" for i in range(DEMO_IMAGES)]
     good = [*NEEDED, *photographs, "thesisrecon/cli/main.py", "thesisrecon-0.1.0.dist-info/METADATA"]
     assert wheel_faults(good, 1_000_000) == []
     strangers = ["tests/cli/test_cli.py", "thesisrecon/__pycache__/cli.cpython-311.pyc"]
@@ -73,7 +73,7 @@ def test_what_is_missing_or_does_not_belong_in_a_wheel_is_told():
     assert told[0] == "thesisrecon/py.typed is missing"
     assert told[1:3] == [f"{name} does not belong there" for name in strangers]
     assert "9.00 MB" in told[3]
-    assert wheel_faults(good[: len(NEEDED)], 1) == [f"0 photographs instead of {COUNT}"]
+    assert wheel_faults(good[: len(NEEDED)], 1) == [f"0 photographs instead of {DEMO_IMAGES}"]
 
 
 def test_a_run_writes_into_its_folder_alone_and_speaks_to_nobody(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thesisrecon.records import RenderedView
-from thesisrecon.views.image_similarity import GREY, exposed_alike, psnr_db, ssim, ssim_map, whole_pixels
+from thesisrecon.views.image_similarity import GREY, covered_pixels, match_exposure, psnr_db, ssim, ssim_map
 
 
 def pictures():
@@ -54,7 +54,7 @@ def test_exposure_is_made_alike():
     real, _ = pictures()
     darker = np.rint(real * [0.5, 0.8, 1.0]).astype(np.uint8)
     mask = np.ones(real.shape[:2], bool)
-    assert psnr_db(real, exposed_alike(real, darker, mask), mask) > 45.0
+    assert psnr_db(real, match_exposure(real, darker, mask), mask) > 45.0
 
 
 def test_pixels_at_the_rim_are_not_whole():
@@ -63,10 +63,10 @@ def test_pixels_at_the_rim_are_not_whole():
     rendered = RenderedView(np.zeros((6, 7, 3), np.uint8), np.zeros((6, 7), np.float32), valid)
     wanted = np.zeros((6, 7), bool)
     wanted[2:4, 3:5] = True
-    np.testing.assert_array_equal(whole_pixels(rendered), wanted)
+    np.testing.assert_array_equal(covered_pixels(rendered), wanted)
 
 
-@pytest.mark.parametrize("compare", [psnr_db, ssim, exposed_alike])
+@pytest.mark.parametrize("compare", [psnr_db, ssim, match_exposure])
 def test_pictures_that_do_not_belong_together_are_refused(compare):
     real, noisy = pictures()
     with pytest.raises(ValueError, match="one size"):

@@ -12,7 +12,14 @@ from scipy.spatial.transform import Rotation
 from tests.surface.sphere import K, looking_at_origin
 from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh
-from thesisrecon.views.paths import fitted, geometric_median, interpolate, orbit, surface_points, upward
+from thesisrecon.views.paths import (
+    estimate_up,
+    fit_to_size,
+    geometric_median,
+    interpolate_cameras,
+    orbit,
+    sample_surface,
+)
 
 SIZE = (160, 120)
 UP = np.array([0.0, -1.0, 0.0])  # of cameras whose y axis points down
@@ -137,9 +144,9 @@ def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled():
     for camera in ring(np.linspace(-1, 1, 12), -6.0):
         roll = Rotation.from_rotvec([0, 0, rng.normal(0.0, 0.06)]).as_matrix()
         cameras.append(Camera(K, roll @ camera.R, roll @ camera.t, SIZE))
-    assert np.degrees(np.arccos(upward(cameras) @ UP)) < 4.0
+    assert np.degrees(np.arccos(estimate_up(cameras) @ UP)) < 4.0
     (one,) = ring(np.array([0.7]))
-    np.testing.assert_allclose(upward([one]), -one.R[1], atol=1e-9)
+    np.testing.assert_allclose(estimate_up([one]), -one.R[1], atol=1e-9)
 
 
 def test_of_cameras_that_look_straight_down_up_is_behind_them():
@@ -148,14 +155,14 @@ def test_of_cameras_that_look_straight_down_up_is_behind_them():
         a = 2 * np.pi * k / 8
         R = np.array([[np.cos(a), 0, np.sin(a)], [np.sin(a), 0, -np.cos(a)], [0, 1.0, 0]])
         down.append(Camera(K, R, -R @ np.array([0.5 * np.cos(a), -4.0, 0.5 * np.sin(a)]), SIZE))
-    np.testing.assert_allclose(upward(down), UP, atol=1e-9)
+    np.testing.assert_allclose(estimate_up(down), UP, atol=1e-9)
     assert all(camera.centre[1] < -3.0 for camera in orbit(down, ball(), 6))
 
 
 def test_interpolation_ends_at_the_real_cameras_and_passes_all():
     cameras = ring(np.array([0.0, 0.3, 0.5, 1.1, 1.3]), -1.0)
     cameras[2] = Camera(1.2 * K * [[1], [1], [1 / 1.2]], cameras[2].R, cameras[2].t, SIZE)
-    path = interpolate(cameras, 400)
+    path = interpolate_cameras(cameras, 400)
     for real, frame in ((cameras[0], path[0]), (cameras[-1], path[-1])):
         np.testing.assert_allclose(frame.P, real.P)
     centres = centres_of(path)
@@ -167,7 +174,7 @@ def test_interpolation_ends_at_the_real_cameras_and_passes_all():
 
 
 def test_interpolation_has_a_constant_speed_whatever_the_spacing():
-    path = interpolate(ring(np.array([0.0, 0.05, 0.5, 0.6, 2.0])), 200)
+    path = interpolate_cameras(ring(np.array([0.0, 0.05, 0.5, 0.6, 2.0])), 200)
     steps = np.linalg.norm(np.diff(centres_of(path), axis=0), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=0.02)
 
@@ -176,7 +183,7 @@ def test_interpolation_has_a_constant_speed_whatever_the_spacing():
 @given(seed=st.integers(0, 10_000))
 def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed):
     angles = np.cumsum(np.random.default_rng(seed).uniform(0.02, 0.8, 6))
-    for camera in interpolate(ring(angles, 0.0), 30):
+    for camera in interpolate_cameras(ring(angles, 0.0), 30):
         np.testing.assert_allclose(camera.R[1], -UP, atol=1e-9)
         np.testing.assert_allclose(camera.centre[1], 0.0, atol=1e-9)
         assert np.linalg.det(camera.R) == pytest.approx(1.0)
@@ -184,12 +191,12 @@ def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed):
 
 def test_turning_on_the_spot_takes_its_time():
     still = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 1, 4), 0.0)]
-    path = interpolate(still, 31)
+    path = interpolate_cameras(still, 31)
     turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
     np.testing.assert_allclose(turns, 1.0 / 30, rtol=1e-6)
     # Half a turn at one place of a way: no frame jumps.
     far = [Camera(K, c.R, -c.R @ np.array([3.0 * k, 0, 0]), SIZE) for k, c in enumerate(still)]
-    path = interpolate(
+    path = interpolate_cameras(
         [*far[:2], Camera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE), *far[2:]], 100
     )
     turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
@@ -199,19 +206,19 @@ def test_turning_on_the_spot_takes_its_time():
 def test_coincident_cameras_and_one_camera_stand_still():
     camera = ring(np.array([0.3]))[0]
     for cameras in ([camera], [camera] * 3):
-        path = interpolate(cameras, 5)
+        path = interpolate_cameras(cameras, 5)
         assert len(path) == 5
         for frame in path:
             np.testing.assert_allclose(frame.P, camera.P, atol=1e-12)
     moving = ring(np.array([0.0, 0.0, 0.5, 0.5, 1.0]))
-    steps = np.linalg.norm(np.diff(centres_of(interpolate(moving, 50)), axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(centres_of(interpolate_cameras(moving, 50)), axis=0), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=0.05)
 
 
 def test_other_shapes_of_pictures_show_all_that_the_camera_saw():
     camera = ring(np.array([0.3]))[0]
     for size in ((320, 240), (400, 100), (30, 90)):
-        other = fitted(camera, size)
+        other = fit_to_size(camera, size)
         rays = np.linalg.inv(camera.K) @ np.array(
             [[-0.5, 159.5, -0.5, 159.5], [-0.5, -0.5, 119.5, 119.5], [1, 1, 1, 1]]
         )
@@ -221,24 +228,24 @@ def test_other_shapes_of_pictures_show_all_that_the_camera_saw():
         assert min(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) <= 1.0 + 1e-9
         assert max(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) == pytest.approx(1.0)
     turned = Camera(K, camera.R, camera.t, (120, 160))
-    assert {frame.size for frame in interpolate([camera, turned], 5)} == {SIZE}
+    assert {frame.size for frame in interpolate_cameras([camera, turned], 5)} == {SIZE}
     assert {frame.size for frame in orbit([camera, turned], ball(), 5, size=(70, 50))} == {(70, 50)}
 
 
 def test_points_lie_on_the_surface_by_its_area():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [5, 3, 0], [8, 0, 0]])
     mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [3, 4, 5], [0, 0, 1]]))
-    X = surface_points(mesh, 1000)
+    X = sample_surface(mesh, 1000)
     small = X[:, 0] < 2
     assert small.mean() == pytest.approx(0.1, abs=0.005)
     assert (X[small, :2].sum(axis=1) <= 1.0 + 1e-12).all()
     np.testing.assert_allclose(X[small].mean(axis=0), [1 / 3, 1 / 3, 0], atol=0.02)
-    assert len(surface_points(TexturedMesh(vertices, np.array([[0, 0, 1]])))) == 0
+    assert len(sample_surface(TexturedMesh(vertices, np.array([[0, 0, 1]])))) == 0
 
 
 def test_wrong_calls_are_refused():
     cameras = ring(np.array([0.0]))
-    for path in (lambda c, n: orbit(c, ball(), n), interpolate):
+    for path in (lambda c, n: orbit(c, ball(), n), interpolate_cameras):
         with pytest.raises(ValueError, match="at least one camera"):
             path([], 5)
         with pytest.raises(ValueError, match="at least one frame; got 0"):

@@ -6,7 +6,7 @@ import pytest
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import TexturedMesh
-from thesisrecon.views.render import Light, Shading, bare, render
+from thesisrecon.views.render import Light, Shading, render, without_texture
 
 K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])
 SIZE = (64, 48)
@@ -76,8 +76,8 @@ def test_nothing_is_seen_where_nothing_is():
 
 def test_a_shape_alone_has_no_colours():
     mesh = wall(colors=np.zeros((4, 3), dtype=np.uint8))
-    assert bare(mesh).colors is None
-    assert (render(bare(mesh), Camera(K, np.eye(3), np.zeros(3), SIZE)).color == 200).all()
+    assert without_texture(mesh).colors is None
+    assert (render(without_texture(mesh), Camera(K, np.eye(3), np.zeros(3), SIZE)).color == 200).all()
 
 
 def test_wrong_calls_are_refused():

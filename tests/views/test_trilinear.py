@@ -16,7 +16,7 @@ from thesisrecon.views.virtual_camera import (
     AnyRotation,
     CalibratedPair,
     SmallRotation,
-    guessed_intrinsics,
+    default_intrinsics,
     pair_from_fundamental,
 )
 
@@ -101,7 +101,7 @@ def test_wrong_intrinsics_leave_f_and_both_photographs_as_they_are(orientation):
     """New views are then right but for a projective transform: what both see stays one point."""
     pair = _pair((0.02, -0.1, 0.03), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(1))
-    F, guess = _fundamental(pair), guessed_intrinsics((1000, 700), focal=1.3)
+    F, guess = _fundamental(pair), default_intrinsics((1000, 700), focal=1.3)
     found = pair_from_fundamental(F, xy1, xy2, K1=guess, K2=guess, orientation=orientation)
     again = _fundamental(found)
     np.testing.assert_allclose(again * np.sign(np.sum(again * F)), F, atol=1e-9)
@@ -159,7 +159,7 @@ def test_matches_beside_their_epipolar_lines_go_where_their_nearest_place_on_it_
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(2))
     virtual = seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, 0.1]))
-    lines = virtual.lines_across(xy1, xy2)
+    lines = virtual.perpendicular_lines(xy1, xy2)
     across = np.stack([lines[:, 1], -lines[:, 0]], axis=1)
     np.testing.assert_allclose(
         virtual.transfer(xy1, xy2 + 2.0 * across)[0], virtual.transfer(xy1, xy2)[0], atol=1e-7
@@ -288,7 +288,7 @@ def test_motions_that_are_none_are_wrong_calls(rotation, translation, K, sentenc
 
 
 def test_intrinsics_are_guessed_from_the_size():
-    K = guessed_intrinsics((1000, 700))
+    K = default_intrinsics((1000, 700))
     np.testing.assert_array_equal(K, [[1000.0, 0.0, 499.5], [0.0, 1000.0, 349.5], [0.0, 0.0, 1.0]])
     with pytest.raises(ValueError, match="positive"):
-        guessed_intrinsics((1000, 700), focal=0.0)
+        default_intrinsics((1000, 700), focal=0.0)
