@@ -188,7 +188,7 @@ class DepthEstimator(Protocol):
 
     ``match_rectified`` is its matcher alone, on a rectified pair of arrays; ``match_two_views`` rectifies two
     photographs by their F, by homographies where ``planar``, and matches them from either side.
-    ``surroundings`` are the views that the map of a view takes, itself among them."""
+    ``required_views`` are the views that the map of a view takes, itself among them."""
 
     def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap: ...
 
@@ -198,7 +198,7 @@ class DepthEstimator(Protocol):
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene: ...
 
-    def surroundings(self, scene: MultiViewScene, view: int) -> frozenset[int]: ...
+    def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]: ...
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap: ...
 
@@ -301,7 +301,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
         selfcalibration=Stratified(),
         dense=MultiViewStereo(
             # It has an opinion of blank walls too, and says how little that is worth.
-            pairs=PairMatching(matcher=MaximumLikelihoodScanline(), least_confidence=0.25),
+            pairs=PairMatching(matcher=MaximumLikelihoodScanline(), min_confidence=0.25),
             linker=SequenceLinking(),
             refinement=None,
             completion=None,

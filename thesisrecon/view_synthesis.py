@@ -20,7 +20,7 @@ from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.view_interpolation import ViewSequence
 from thesisrecon.views.trilinear_synthesis import TensorSynthesis, prepare_synthesis
-from thesisrecon.views.virtual_camera import VirtualCamera, guessed_intrinsics, pair_from_fundamental
+from thesisrecon.views.virtual_camera import VirtualCamera, default_intrinsics, pair_from_fundamental
 
 _BEYOND = 0.5
 """Baselines by which a sequence extends beyond either camera."""
@@ -113,7 +113,7 @@ def prepare_trilinear_views(
     K1, K2 = _intrinsics(found, K, config)
     pair = pair_from_fundamental(found.pair.F, found.pair.xy1, found.pair.xy2, K1=K1, K2=K2)
     first, second = found.images
-    places = found.dense.places(0, first.size), found.dense.places(1, second.size)
+    places = found.dense.correspondences(0, first.size), found.dense.correspondences(1, second.size)
     return prepare_synthesis(pair, (first.rgb, second.rgb), places, gain=found.dense.gain)
 
 
@@ -267,6 +267,6 @@ def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfi
     prior = prior_from_options(config.intrinsics, sizes, found.exif_focal_px, scales).mean
     both = []
     for image, (f, aspect, skew, u, v, _) in zip(found.images, prior.tolist(), strict=True):
-        f = f if np.isfinite(f) else float(guessed_intrinsics(image.size)[0, 0])
+        f = f if np.isfinite(f) else float(default_intrinsics(image.size)[0, 0])
         both.append(calibration_matrix(f, aspect * f, u, v, skew=skew))
     return both[0], both[1]

@@ -122,7 +122,7 @@ def test_agreement_counts_what_comes_back_and_what_is_seen_through():
 def test_depths_land_on_the_nearest_pixels_of_another_view_the_nearer_before_the_farther():
     rng = np.random.default_rng(5)
     to = np.column_stack([np.diag([1.0, 1.0, 1.1]), [3.0, -1.0, 0.2]])
-    depth = holes(rng, rng.selection([0.5, 1.0], SHAPE))
+    depth = holes(rng, rng.choice([0.5, 1.0], SHAPE))
     out = np.full((19, 25), np.nan, np.float32)
     out[4, 5], out[6, 7] = 0.1, 9.0
     wanted = out.copy()
@@ -160,7 +160,7 @@ def test_what_continues_a_surface_lies_on_the_plane_of_what_is_sure_about_it():
     sure = (rng.random(SHAPE) < 0.6).astype(np.uint8)
     sure[:, 26:] = 0
     doubtful = (sure == 0) & (rng.random(SHAPE) < 0.5)
-    rho[doubtful] += rng.selection([0.0, 2e-3], int(doubtful.sum())).astype(np.float32)
+    rho[doubtful] += rng.choice([0.0, 2e-3], int(doubtful.sum())).astype(np.float32)
     rho = holes(rng, rho)
     sure[np.isnan(rho)] = 0
     std = np.full(SHAPE, 4e-4, np.float32)

@@ -164,18 +164,18 @@ def test_hartley_leaves_the_second_photograph_rigid_about_its_centre_and_makes_t
         type(m).__name__: np.ptp(measure_quality(m.rectify(pair), pair).disparities)
         for m in PLANAR_METHODS[:3]
     }
-    assert spread["Hartley"] == min(spread.values())
+    assert spread["HartleyRectifier"] == min(spread.values())
 
 
 def test_loop_and_zhang_keep_angles_and_ratios_and_the_least_distorted_is_not_beaten():
     for motion in ("beside", "toed in", "rolled", "behind"):
         pair = both_pairs(make_pair(motion, np.random.default_rng(6), noise_px=0.1))[0]
         found = {type(m).__name__: measure_quality(m.rectify(pair), pair) for m in PLANAR_METHODS[:3]}
-        assert np.abs(np.array(found["LoopZhang"].orthogonality_deg) - 90.0).max() < 5.0
-        assert np.abs(np.array(found["LoopZhang"].aspect) - 1.0).max() < 0.1
+        assert np.abs(np.array(found["LoopZhangRectifier"].orthogonality_deg) - 90.0).max() < 5.0
+        assert np.abs(np.array(found["LoopZhangRectifier"].aspect) - 1.0).max() < 0.1
         least = min(quality.distortion for quality in found.values())
         # The crop, which the measure heeds, depends on the result.
-        assert found["LeastDistortion"].distortion < least + 0.01
+        assert found["MinimumDistortionRectifier"].distortion < least + 0.01
 
 
 def test_noise_of_matches_is_the_noise_of_rows():

@@ -18,7 +18,7 @@ from thesisrecon.pipeline.state import Work
 from thesisrecon.records import DepthMap, HeldOut, Image, PinholeView, Reconstruction, TexturedMesh
 from thesisrecon.runtime.run_folder import code_key
 from thesisrecon.stereo.depth import MultiViewScene
-from thesisrecon.views.image_similarity import exposed_alike, psnr_db, ssim, whole_pixels
+from thesisrecon.views.image_similarity import match_exposure, psnr_db, ssim, covered_pixels
 from thesisrecon.views.render import render
 
 FEWEST_VIEWS = 3
@@ -54,10 +54,10 @@ def compare_held_out(
         return None
     height, width = view.rgb.shape[:2]
     rendered = render(painted, Camera.from_matrix(view.P, (width, height)), threads=threads)
-    compared = whole_pixels(rendered) & view.seen
+    compared = covered_pixels(rendered) & view.seen
     if not compared.any():
         return None
-    picture = exposed_alike(view.rgb, rendered.color, compared)
+    picture = match_exposure(view.rgb, rendered.color, compared)
     return HeldOut(
         view.view,
         view.rgb,
@@ -94,8 +94,8 @@ def match_densely(work: Work) -> None:
 
     def seen_from(view: int) -> tuple[MultiViewScene, frozenset[int]]:
         """What is sent for one view; in this process, everything as it is."""
-        near = work.config.dense.surroundings(scene, view)
-        return (scene if run.workers.in_process else scene.part(near)), near
+        near = work.config.dense.required_views(scene, view)
+        return (scene if run.workers.in_process else scene.subset(near)), near
 
     found = run.kept_all(
         "dense",
@@ -159,7 +159,7 @@ def build_model(work: Work) -> None:
         lambda: compare_held_out(mesh, result.views, without, threads=threads),
     )
     work.result = replace(work.result, mesh=mesh, held_out=held_out)
-    bare = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())
+    without_texture = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())
     counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    run.finish("model", counts=counts, metrics={"share_untextured": bare})
+    run.finish("model", counts=counts, metrics={"share_untextured": without_texture})
     run.progress("model", 1, 1)

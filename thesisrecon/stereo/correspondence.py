@@ -16,10 +16,10 @@ from thesisrecon.geometry.two_view import canonical_cameras
 from thesisrecon.records import DisparityMap, PinholeView
 from thesisrecon.stereo.cost import MAX_DISPARITIES
 from thesisrecon.stereo.epipolar_pair import pair_of_fundamental
-from thesisrecon.stereo.planar_methods import Hartley, LeastDistortion, LoopZhang
+from thesisrecon.stereo.planar import HartleyRectifier, LoopZhangRectifier, MinimumDistortionRectifier
 from thesisrecon.stereo.rectification import (
     AnyRectification,
-    LeastDistorted,
+    BestRectifier,
     disparity_range,
     rectify,
     rectify_cameras,
@@ -62,13 +62,13 @@ class PairMatching:
 
     ``matcher`` finds the disparities, in the range of the sparse points widened by ``range_margin`` of itself
     at either end. Their deviation is what the matcher tells but at least ``least_sigma_px``, in pixels of the
-    rectified frame, and larger where its confidence is low; below ``least_confidence`` there are none.
+    rectified frame, and larger where its confidence is low; below ``min_confidence`` there are none.
     """
 
     matcher: SemiGlobalMatching | MaximumLikelihoodScanline = field(default_factory=SemiGlobalMatching)
     range_margin: float = 0.25
-    least_sigma_px: float = 0.2
-    least_confidence: float = 0.0
+    min_sigma_px: float = 0.2
+    min_confidence: float = 0.0
 
     def correspond(
         self,
@@ -103,13 +103,13 @@ class PairMatching:
         sigma = np.full(shape, np.nan, dtype=np.float32)
         confidence = np.zeros(shape, dtype=np.float32)
         sigma_px = found.sigma_px if np.isfinite(found.sigma_px) else 0.0
-        deviation = max(sigma_px, self.least_sigma_px)
+        deviation = max(sigma_px, self.min_sigma_px)
         for first in range(0, shape[0], STRIP_ROWS):
             rows = slice(first, min(first + STRIP_ROWS, shape[0]))
             pixels = resized(_pixels(shape[1], rows), told[0], own[0])
             places = frame.rectified_from_original(0, pixels)
             d, sure = sample_disparity(found, places)
-            inside: B8 = np.asarray(np.isfinite(d) & (sure >= self.least_confidence))
+            inside: B8 = np.asarray(np.isfinite(d) & (sure >= self.min_confidence))
             where = places[inside]
             right, a, b = (
                 frame.original_from_rectified(1, where - np.outer(d[inside] + step, (1.0, 0.0)), within=False)
@@ -211,7 +211,7 @@ def _pixels(width: int, rows: slice) -> F64:
     return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
-PLANAR = LeastDistorted((Hartley(), LoopZhang(), LeastDistortion()))
+PLANAR = BestRectifier((HartleyRectifier(), LoopZhangRectifier(), MinimumDistortionRectifier()))
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ class RectifiedPair:
     left: DisparityMap
     right: DisparityMap
 
-    def places(self, side: int, size: tuple[int, int]) -> F32:
+    def correspondences(self, side: int, size: tuple[int, int]) -> F32:
         """Where the pixels of the photograph of ``side``, of ``size`` (width, height), are in the other one.
 
         (H, W, 2) px. What the other one does not see is taken for background

@@ -27,18 +27,18 @@ class InverseDepth:
     value: F32
     std: F32
     views: U8
-    rivals: U8
+    conflicts: U8
 
     @property
-    def divided(self) -> B8:
+    def contradictory(self) -> B8:
         """(H, W) where no two agree although two or more speak."""
-        return np.asarray((self.views < 2) & (self.rivals > 0))
+        return np.asarray((self.views < 2) & (self.conflicts > 0))
 
     def where(self, keep: B8) -> InverseDepth:
         """What is kept, unknown elsewhere."""
         value, std = (np.where(keep, part, np.float32(np.nan)) for part in (self.value, self.std))
-        views, rivals = (np.where(keep, part, np.uint8(0)) for part in (self.views, self.rivals))
-        return InverseDepth(value, std, views, rivals)
+        views, conflicts = (np.where(keep, part, np.uint8(0)) for part in (self.views, self.conflicts))
+        return InverseDepth(value, std, views, conflicts)
 
 
 class Linker(Protocol):
@@ -53,7 +53,7 @@ class Linker(Protocol):
     ) -> InverseDepth:
         """Inverse depths of the pixels of ``view``."""
 
-    def reach(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
+    def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
         """The numbers of the other views that :meth:`link` asks for."""
 
 
@@ -85,10 +85,10 @@ class RobustFusion:
         result = _nothing(shape)
         if found:
             rho, std = (np.stack([one[k] for one in found]) for k in (0, 1))
-            fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.rivals)
+            fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.conflicts)
         return result
 
-    def reach(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
+    def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
         """The neighbours."""
         del view, views
         return set(neighbours)
@@ -125,11 +125,11 @@ class SequenceLinking:
         if not ends:
             return result
         rho, std = (np.stack(part) for part in ([e.value for e in ends], [e.std for e in ends]))
-        fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.rivals)
+        fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.conflicts)
         result.views[:] = np.where(np.isfinite(result.value), np.maximum.reduce([e.views for e in ends]), 0)
         return result
 
-    def reach(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
+    def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
         """Those next in the sequence, on either side."""
         del neighbours
         order = sorted(views)

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F32, F64, U8
+
+
+class DepthStd(NamedTuple):
+    """Depth and its standard deviation, (H, W) each, NaN = unknown."""
+
+    depth: F32
+    std: F32
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -37,7 +46,7 @@ def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> N
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fuse_inverse_depths(
-    rho: F32, std: F32, gate: float, out: F32, out_std: F32, support: U8, rivals: U8
+    rho: F32, std: F32, gate: float, out: F32, out_std: F32, support: U8, conflicts: U8
 ) -> None:
     """One inverse depth (H, W) of several (K, H, W): the mean, weighted by the inverse variances, of those
     that agree within ``gate`` deviations with the one that most agree with (the more certain among equals).
@@ -59,7 +68,7 @@ def fuse_inverse_depths(
                         weight += 1.0 / np.float64(std[m, v, u]) ** 2
                 if n > most or (n == most and weight > weight_of_best):
                     best, most, weight_of_best = k, n, weight
-            support[v, u], rivals[v, u] = most, known - most
+            support[v, u], conflicts[v, u] = most, known - most
             if best < 0:
                 out[v, u], out_std[v, u] = np.nan, np.nan
                 continue
@@ -113,11 +122,9 @@ def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_agreement(
-    depth: F32,
-    std: F32,
+    own: DepthStd,
     to: F64,
-    other: F32,
-    other_std: F32,
+    other: DepthStd,
     back: F64,
     limits: F64,
     agree: U8,
@@ -131,8 +138,10 @@ def count_agreement(
     depth that differs by less than the relative bound plus the deviations of both; seen through what is
     nearer than what the other view sees there by more.
     """
+    depth, std = own
+    other_depth, other_std = other
     height, width = depth.shape
-    rows, columns = other.shape
+    rows, columns = other_depth.shape
     for v in range(height):
         for u in range(width):
             z = np.float64(depth[v, u])
@@ -144,7 +153,7 @@ def count_agreement(
             if not (w > 0.0 and -0.5 < x < columns - 0.5 and -0.5 < y < rows - 0.5):
                 continue
             q, p = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
-            found = np.float64(other[q, p])
+            found = np.float64(other_depth[q, p])
             if not np.isfinite(found):
                 continue
             bound = limits[1] * w + limits[2] * np.sqrt(
@@ -182,7 +191,9 @@ def splat_depths(depth: F32, to: F64, out: F32) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def continue_surface(rho: F32, std: F32, sure: U8, radius: int, alike: float, gate: float, joins: U8) -> None:
+def surface_continuation(
+    rho: F32, std: F32, sure: U8, radius: int, alike: float, gate: float, joins: U8
+) -> None:
     """``joins`` (H, W): whether the inverse depth of a pixel that is not sure continues the surface about it.
 
     The surface is the plane that fits the sure pixels within ``radius``, those that differ by at most the

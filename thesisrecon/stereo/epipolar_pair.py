@@ -24,8 +24,8 @@ from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
     fundamental_from_cameras,
-    require_parallax,
-    rotation_planes,
+    quasi_euclidean_planes,
+    require_parallax_of_matches,
 )
 
 FOCAL_PER_SIDE = 1.2
@@ -46,9 +46,9 @@ class EpipolarPencil:
     centres: F64
     units: F64
     sizes: tuple[tuple[int, int], tuple[int, int]]
-    turned: bool = False
+    flipped: bool = False
 
-    def places(self, side: int, xy: F64) -> F64:
+    def normalized(self, side: int, xy: F64) -> F64:
         """z (..., 2) of pixels (..., 2)."""
         return np.asarray((xy - self.centres[side]) / self.units[side])
 
@@ -62,7 +62,7 @@ class EpipolarPencil:
 
     def planes(self, side: int, xy: F64) -> F64:
         """p (..., 2), any positive length, of the half-planes that hold pixels (..., 2)."""
-        z = self.places(side, xy)
+        z = self.normalized(side, xy)
         L = self.lines[side]
         q = z @ L[:2] + L[2]
         return np.stack([q[..., 1], -q[..., 0]], axis=-1)
@@ -75,7 +75,7 @@ class EpipolarPencil:
 
     def half_lines(self, side: int, phi: F64) -> HalfLines:
         """The half epipolar lines phi (N,) of a view."""
-        l = plane_of(phi) @ self.lines[side].T
+        l = plane_from_angle(phi) @ self.lines[side].T
         norm = np.linalg.norm(l[:, :2], axis=1)
         n, offset = l[:, :2] / norm[:, None], l[:, 2] / norm
         d = np.stack([-n[:, 1], n[:, 0]], axis=1)
@@ -84,9 +84,9 @@ class EpipolarPencil:
         e = e / max(away, abs(e[2]))
         return HalfLines(-offset[:, None] * n, d, offset, e)
 
-    def swept(self, side: int, phi: F64, z: F64) -> F64:
+    def sweep_rate(self, side: int, phi: F64, z: F64) -> F64:
         """How far lines phi (N,) move across their points z (N, 2) per radian, in places."""
-        p = plane_of(phi)
+        p = plane_from_angle(phi)
         l, moving = p @ self.lines[side].T, p @ (self.lines[side] @ _J).T
         return np.asarray(
             np.abs(np.sum(moving[:, :2] * z, axis=1) + moving[:, 2]) / np.linalg.norm(l[:, :2], axis=1)
@@ -154,12 +154,12 @@ class HalfLines:
         return np.maximum(enter, self.start), leave
 
 
-def plane_of(phi: F64) -> F64:
+def plane_from_angle(phi: F64) -> F64:
     """(cos phi, sin phi), (N, 2)."""
     return np.stack([np.cos(phi), np.sin(phi)], axis=-1)
 
 
-def pencil_of_fundamental(
+def _pencil_of_fundamental(
     F: F64, sizes: tuple[tuple[int, int], tuple[int, int]]
 ) -> tuple[EpipolarPencil, float]:
     """The pencil of F (3, 3), of either orientation, and the ratio of the singular values of F in places."""
@@ -176,7 +176,7 @@ def pencil_of_fundamental(
     return EpipolarPencil(lines, centres, units, sizes), ratio
 
 
-def orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> tuple[EpipolarPencil, float]:
+def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> tuple[EpipolarPencil, float]:
     """The pencil with the second view's sign such that matches share their half-planes, and how many do."""
     p1, p2 = pencil.planes(0, xy1), pencil.planes(1, xy2)
     with np.errstate(invalid="ignore"):
@@ -191,8 +191,8 @@ def orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> tuple[EpipolarPencil, 
 
 Size = tuple[int, int]
 
-LEAST_MATCHES = 8
-SAME_HALF = 0.8
+MIN_MATCHES = 8
+MIN_SAME_HALF = 0.8
 """Share of matches that must lie on the same half of their epipolar lines: wrong ones do by chance."""
 SAMPLES = 16
 """Places along either side of a photograph at which distortion is measured."""
@@ -239,20 +239,20 @@ def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) ->
     F = np.asarray(F, dtype=np.float64)
     if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
         raise ValueError(f"rectification needs a finite F (3, 3) that is not zero; got shape {F.shape}")
-    if len(xy1) < LEAST_MATCHES:
+    if len(xy1) < MIN_MATCHES:
         raise StageFailure(
             "the pair has too few matches to rectify it",
-            f"{counted(len(xy1), 'match')}, needed at least {LEAST_MATCHES}",
+            f"{counted(len(xy1), 'match')}, needed at least {MIN_MATCHES}",
             "match the photographs anew, or rectify from cameras",
         )
-    pencil, ratio = pencil_of_fundamental(F, sizes)
+    pencil, ratio = _pencil_of_fundamental(F, sizes)
     if not ratio > 1e-9:
         raise StageFailure(
             "the fundamental matrix has rank 1 and no epipolar lines",
             f"its second singular value is {ratio:.1g} of the first",
             "estimate it from more matches",
         )
-    require_parallax(F, xy1, xy2, advice=", or rectify from cameras if the scene is a plane")
+    require_parallax_of_matches(F, xy1, xy2, advice=", or rectify from cameras if the scene is a plane")
     return _complete(pencil, xy1, xy2, None)
 
 
@@ -277,16 +277,16 @@ def pair_of_cameras(
         raise ValueError("rectification needs finite cameras; the left part of one is singular")
     P = P * np.sign(det)[:, None, None]
     F = _fundamental(P)
-    if len(xy1) >= LEAST_MATCHES:
-        require_parallax(F, xy1, xy2, at_infinity=infinite_homography(P[0], P[1]))
-    return _complete(pencil_of_fundamental(F, sizes)[0], xy1, xy2, P)
+    if len(xy1) >= MIN_MATCHES:
+        require_parallax_of_matches(F, xy1, xy2, at_infinity=infinite_homography(P[0], P[1]))
+    return _complete(_pencil_of_fundamental(F, sizes)[0], xy1, xy2, P)
 
 
 def _fundamental(P: F64) -> F64:
     centres = np.stack([camera_centre(camera) for camera in P])
-    places = centres[:, :3] / centres[:, 3:]
-    apart = float(np.linalg.norm(places[1] - places[0]))
-    if not apart > 1e-12 * (1.0 + float(np.abs(places).max())):
+    normalized = centres[:, :3] / centres[:, 3:]
+    apart = float(np.linalg.norm(normalized[1] - normalized[0]))
+    if not apart > 1e-12 * (1.0 + float(np.abs(normalized).max())):
         raise StageFailure(
             "the cameras have one centre and no epipolar lines",
             f"their centres are {apart:.1g} apart",
@@ -315,21 +315,21 @@ def _checked_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
 def _complete(pencil: EpipolarPencil, xy1: F64, xy2: F64, P: F64 | None) -> EpipolarPair:
     """Orientation, direction of disparities, and what both photographs see."""
     seen1, seen2, P_z = (xy1, xy2, None) if P is None else _virtual_matches(pencil, P)
-    pencil, share = orient(pencil, seen1, seen2)
-    if share < SAME_HALF:
+    pencil, share = _orient(pencil, seen1, seen2)
+    if share < MIN_SAME_HALF:
         raise StageFailure(
             "matches lie on opposite halves of their epipolar lines, which no scene shows",
             f"only {100.0 * share:.0f} % of {len(seen1)} agree on the halves",
             "the fundamental matrix or the matches are wrong; estimate them anew",
         )
     P_z = _quasi_euclidean(pencil, xy1, xy2) if P_z is None else P_z
-    pencil = replace(pencil, turned=not _farther_is_along(pencil, P_z, seen1, seen2))
+    pencil = replace(pencil, flipped=not _farther_is_along(pencil, P_z, seen1, seen2))
     arc = _common_arc(pencil, xy1)
     regions = (_region(pencil, 0, arc), _region(pencil, 1, arc))
     return EpipolarPair(pencil, xy1, xy2, arc, regions, P)
 
 
-def _places_from_pixels(pencil: EpipolarPencil, side: int) -> F64:
+def _normalizing_transform(pencil: EpipolarPencil, side: int) -> F64:
     s, c = 1.0 / pencil.units[side], pencil.centres[side]
     return np.array([[s, 0.0, -s * c[0]], [0.0, s, -s * c[1]], [0.0, 0.0, 1.0]])
 
@@ -350,22 +350,22 @@ def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[F64, F64, F64]:
         raise StageFailure(
             "nothing is in front of both cameras", "they look away from each other", "choose another pair"
         )
-    z = np.stack([_places_from_pixels(pencil, side) @ P[side] for side in (0, 1)])
+    z = np.stack([_normalizing_transform(pencil, side) @ P[side] for side in (0, 1)])
     return project(P[0], X), project(P[1], X), z
 
 
 def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
     """Two cameras (2, 3, 4) in places with the pencil's F: of four candidates the one with most in front."""
-    z = np.stack([pencil.places(0, xy1), pencil.places(1, xy2)])
+    z = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)])
     L1, L2 = pencil.lines
     F = L2 @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ L1.T
     best, most = np.empty((2, 3, 4)), -1
-    for plane in rotation_planes(F):
+    for plane in quasi_euclidean_planes(F):
         for scale in (1.0, -1.0):
             P = np.stack(canonical_cameras(F, plane=plane, scale=scale))
             X = triangulate_linear(P, z)
             with np.errstate(divide="ignore", invalid="ignore"):
-                front = int(np.sum((depth(X, P[0]) > 0.0) & (depth(X, P[1]) > 0.0)))
+                front = int(np.sum((depth(P[0], X) > 0.0) & (depth(P[1], X) > 0.0)))
             if front > most:
                 best, most = P, front
     return best
@@ -373,7 +373,7 @@ def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
 
 def _farther_is_along(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> bool:
     """Whether points that recede along their rays of view 1 move along the half-lines of view 2."""
-    z = np.stack([pencil.places(0, xy1), pencil.places(1, xy2)])
+    z = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)])
     X = triangulate_linear(P, z)
     centre = camera_centre(P[0])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -440,7 +440,7 @@ def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     # The corners that bound the arc are of it, rounding or not.
     inside = np.abs(pencil.angles(side, grid, about=middle) - middle) <= half + 1e-9
     low, high = (
-        pencil.places(side, np.array(corner)) for corner in ((0.0, 0.0), (width - 1.0, height - 1.0))
+        pencil.normalized(side, np.array(corner)) for corner in ((0.0, 0.0), (width - 1.0, height - 1.0))
     )
     rim = pencil.half_lines(side, np.array(arc))
     enter, leave = rim.chord(low, high)

@@ -56,7 +56,7 @@ def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> 
 
 
 @dataclass(frozen=True)
-class NeighbourChoice:
+class NeighbourSelection:
     """At most ``most`` neighbours, the one that adds most first.
 
     A point counts by the angle between its rays: most at ``best_deg``, less for smaller angles, whose depth
@@ -66,14 +66,14 @@ class NeighbourChoice:
     with fewer than ``least_points`` common points of at least ``least_deg`` is none.
     """
 
-    most: int = 4
+    max_neighbours: int = 4
     best_deg: float = 10.0
-    below_deg: float = 3.0
-    above_deg: float = 10.0
-    least_deg: float = 1.0
-    least_points: int = 12
+    sigma_below_deg: float = 3.0
+    sigma_above_deg: float = 10.0
+    min_angle_deg: float = 1.0
+    min_points: int = 12
 
-    def choose(self, points: SparsePoints, views: dict[int, PinholeView], view: int) -> list[int]:
+    def select(self, points: SparsePoints, views: dict[int, PinholeView], view: int) -> list[int]:
         """Numbers of the neighbours of ``view`` among ``views``, perhaps none."""
         centre = _centre(views[view].P)
         worth: dict[int, F64] = {}
@@ -86,15 +86,15 @@ class NeighbourChoice:
                 direction[other] = baseline / np.linalg.norm(baseline)
         served = np.zeros(len(points.X))
         chosen: list[int] = []
-        while worth and len(chosen) < self.most:
+        while worth and len(chosen) < self.max_neighbours:
             gains = {
                 j: float(np.sum(np.sqrt(served + w) - np.sqrt(served)))
                 * 0.7 ** sum(direction[j] @ direction[c] > 0.5 for c in chosen)
                 for j, w in worth.items()
             }
-            best = max(gains, key=lambda j: (gains[j], -j))
-            served += worth.pop(best)
-            chosen.append(best)
+            best_neighbour = max(gains, key=lambda j: (gains[j], -j))
+            served += worth.pop(best_neighbour)
+            chosen.append(best_neighbour)
         return chosen
 
     def _weights(
@@ -102,15 +102,15 @@ class NeighbourChoice:
     ) -> F64 | None:
         """What the points are worth (N,) with ``other``, None where it is no neighbour."""
         common = points.seen[view] & points.seen[other]
-        if other == view or int(common.sum()) < self.least_points:
+        if other == view or int(common.sum()) < self.min_points:
             return None
         angle = ray_angles_deg(points.X[common], centre, _centre(views[other].P))
-        if int(np.sum(angle >= self.least_deg)) < self.least_points:
+        if int(np.sum(angle >= self.min_angle_deg)) < self.min_points:
             return None
         off = angle - self.best_deg
-        width = np.where(off < 0.0, self.below_deg, self.above_deg)
+        width = np.where(off < 0.0, self.sigma_below_deg, self.sigma_above_deg)
         weights = np.zeros(len(points.X))
-        weights[common] = np.where(angle >= self.least_deg, np.exp(-0.5 * (off / width) ** 2), 0.0)
+        weights[common] = np.where(angle >= self.min_angle_deg, np.exp(-0.5 * (off / width) ** 2), 0.0)
         return weights
 
 

@@ -10,15 +10,17 @@ Planar rectification of two metric cameras: both turn about their centres to one
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.stereo.epipolar_pair import EpipolarPair, plane_of
+from thesisrecon.stereo.epipolar_pair import MIN_MATCHES, EpipolarPair, plane_from_angle
 from thesisrecon.stereo.resampling import require_side, warp_image
 
 CROP_MARGIN = 1.0
@@ -37,19 +39,19 @@ class FrameLimits:
     is refused.
     """
 
-    most_shrink: float = 1.4
-    most_growth: float = 6.0
+    max_shrink: float = 1.4
+    max_growth: float = 6.0
 
     def __post_init__(self) -> None:
-        if not (self.most_shrink >= 1.0 and self.most_growth >= 1.0):
+        if not (self.max_shrink >= 1.0 and self.max_growth >= 1.0):
             raise ValueError(
-                f"most_shrink and most_growth are at least 1; got {self.most_shrink}, {self.most_growth}"
+                f"most_shrink and most_growth are at least 1; got {self.max_shrink}, {self.max_growth}"
             )
 
     def require(self, extent: F64, pair: EpipolarPair) -> tuple[int, int]:
         """The whole size of a frame, or ``StageFailure`` where it is too large, or has no pixels."""
         width, height = float(extent[0]), float(extent[1])
-        most = self.most_growth * max(w * h for w, h in pair.sizes)
+        most = self.max_growth * max(w * h for w, h in pair.sizes)
         if not width * height <= most:
             raise StageFailure(
                 "the rectified photographs are too distorted",
@@ -126,11 +128,11 @@ def pencil_rows(pair: EpipolarPair, phi: float, *, infinite: float | None = None
     Row 0 of the frame is the plane ``phi``; the line at infinity is the plane ``infinite``, phi + pi/2 where
     that is None.
     """
-    v, w = plane_of(np.array([phi, phi + 0.5 * np.pi if infinite is None else infinite]))
+    v, w = plane_from_angle(np.array([phi, phi + 0.5 * np.pi if infinite is None else infinite]))
     return np.stack([np.stack([-L @ v, L @ w]) for L in pair.pencil.lines])
 
 
-def planes_in_reach(pair: EpipolarPair) -> tuple[float, float]:
+def admissible_lines(pair: EpipolarPair) -> tuple[float, float]:
     """The phi whose line at infinity misses what both photographs see; ``StageFailure`` where none does."""
     low, high = pair.arc
     if not high - low < np.pi - 1e-6:
@@ -145,7 +147,7 @@ def planes_in_reach(pair: EpipolarPair) -> tuple[float, float]:
 def require_in_front(pair: EpipolarPair, rows: F64) -> None:
     """``StageFailure`` unless the line at infinity of rows (2, 2, 3) passes beside all that both see."""
     for side, (xy, samples) in enumerate(zip(pair.matches, pair.regions, strict=True)):
-        third = homogenize(pair.pencil.places(side, np.concatenate([samples, xy]))) @ rows[side, 1]
+        third = homogenize(pair.pencil.normalized(side, np.concatenate([samples, xy]))) @ rows[side, 1]
         if not third.min() > 1e-6 * third.max():
             raise StageFailure(
                 "the line sent to infinity crosses the photographs",
@@ -154,7 +156,7 @@ def require_in_front(pair: EpipolarPair, rows: F64) -> None:
             )
 
 
-def undistorting_rows(pair: EpipolarPair, rows: F64) -> F64:
+def affine_rows(pair: EpipolarPair, rows: F64) -> F64:
     """First rows (2, 3) for which the affine part of either homography is a similarity (Loop and Zhang 1999).
 
     Their shear keeps the midlines of a photograph square and of equal ratio; here the midlines are those of
@@ -163,7 +165,7 @@ def undistorting_rows(pair: EpipolarPair, rows: F64) -> F64:
     """
     first = []
     for side in (0, 1):
-        z = homogenize(pair.pencil.places(side, pair.regions[side]))
+        z = homogenize(pair.pencil.normalized(side, pair.regions[side]))
         v, w = rows[side]
         middle = z - z.mean(axis=0)
         third = z @ w
@@ -182,13 +184,13 @@ def undistorting_rows(pair: EpipolarPair, rows: F64) -> F64:
 def homographies_of_rows(pair: EpipolarPair, first: F64, rows: F64) -> F64:
     """Homographies (2, 3, 3) of pixels with first rows (2, 3) and others (2, 2, 3) in places, turned if the
     pair is."""
-    H = np.concatenate([first[:, None], rows], axis=1) @ _to_places(pair)
-    if pair.pencil.turned:
+    H = np.concatenate([first[:, None], rows], axis=1) @ _normalizing_transforms(pair)
+    if pair.pencil.flipped:
         H[:, :2] *= -1.0
     return H
 
 
-def frame(pair: EpipolarPair, H: F64, limits: FrameLimits) -> PlanarRectification:
+def crop_and_scale(pair: EpipolarPair, H: F64, limits: FrameLimits) -> PlanarRectification:
     """Scale, crop to what both see and origins of homographies (2, 3, 3) of pixels whose rows agree.
 
     Raises ``StageFailure`` where a line at infinity crosses what both see, or the frame would be too large.
@@ -207,7 +209,7 @@ def frame(pair: EpipolarPair, H: F64, limits: FrameLimits) -> PlanarRectificatio
     return PlanarRectification(H[0], H[1], (width, height))
 
 
-def _to_places(pair: EpipolarPair) -> F64:
+def _normalizing_transforms(pair: EpipolarPair) -> F64:
     p = pair.pencil
     T = np.zeros((2, 3, 3))
     T[:, 0, 0] = T[:, 1, 1] = 1.0 / p.units
@@ -292,11 +294,11 @@ def _scale(pair: EpipolarPair, H: F64, kept: list[B8], limits: FrameLimits) -> f
             "the rectified photographs have nothing in common", "", "choose views that overlap more"
         )
     area = float(np.exp(-0.5 * np.mean(np.log(found[:, 0] * found[:, 1]))))
-    return max(area, 1.0 / (limits.most_shrink * float(found[:, 1].min())))
+    return max(area, 1.0 / (limits.max_shrink * float(found[:, 1].min())))
 
 
 @dataclass(frozen=True)
-class CommonOrientation:
+class CommonOrientationRectifier:
     """Fusiello, Trucco and Verri, "A compact algorithm for rectification of stereo pairs", MVA 12(1), 2000.
 
     H = K R (K_i R_i)^-1 with x of the new orientation R along the baseline. They take the first camera's
@@ -321,4 +323,164 @@ class CommonOrientation:
             raise StageFailure("both cameras look along the baseline", "", "rectify in polar coordinates")
         z = z / np.linalg.norm(z)
         orientation = np.stack([x, np.cross(z, x), z])
-        return frame(pair, np.asarray(orientation @ np.linalg.inv(P[:, :, :3])), self.limits)
+        return crop_and_scale(pair, np.asarray(orientation @ np.linalg.inv(P[:, :, :3])), self.limits)
+
+
+SEARCH = 96
+"""Lines at infinity that are tried before the best one is refined."""
+
+
+@dataclass(frozen=True)
+class HartleyRectifier:
+    """Hartley, "Theory and practice of projective rectification", IJCV 35(2), 1999.
+
+    The second photograph is mapped by G R T: rigidly about its centre but for what sends the epipole to
+    infinity along x. The first one's homography is the compatible one whose x differ least from the second's
+    (sum of squares over the matches). In the pencil: the line at infinity is the one perpendicular to the
+    line through epipole and centre, and the least squares are linear in the first row, whatever compatible
+    homography one begins with.
+    """
+
+    limits: FrameLimits = field(default_factory=FrameLimits)
+
+    def rectify(self, pair: EpipolarPair) -> PlanarRectification:
+        """The two homographies; ``StageFailure`` where they cannot be."""
+        if len(pair.xy1) < MIN_MATCHES:
+            raise StageFailure("Hartley's rectification needs matches", f"{len(pair.xy1)} are given", "")
+        low, high = admissible_lines(pair)
+        middle = pair.pencil.centres[1][None]
+        phi = float(pair.pencil.angles(1, middle, about=0.5 * (low + high))[0])
+        rows = pencil_rows(pair, phi, infinite=_perpendicular(pair, phi))
+        require_in_front(pair, rows)
+        v, w = rows[1]
+        # With v a similarity about the centre, the origin of places.
+        second = np.array([v[1], -v[0], 0.0])
+        z1, z2 = (homogenize(pair.pencil.normalized(s, xy)) for s, xy in enumerate(pair.matches))
+        design = z1 / (z1 @ rows[0, 1])[:, None]
+        first = np.linalg.lstsq(design, z2 @ second / (z2 @ w), rcond=None)[0]
+        return crop_and_scale(pair, homographies_of_rows(pair, np.stack([first, second]), rows), self.limits)
+
+
+def _perpendicular(pair: EpipolarPair, phi: float) -> float:
+    """The plane above phi that view 2 sees as the line through the epipole square to that to its centre."""
+    e = pair.pencil.epipole(1)
+    at_infinity = abs(e[2]) < 1e-12 * np.hypot(e[0], e[1])
+    # The centre is the origin of places. Of an epipole at infinity it is the line at infinity itself.
+    line = np.array([0.0, 0.0, 1.0] if at_infinity else [e[0], e[1], -(e[0] ** 2 + e[1] ** 2) / e[2]])
+    p = np.linalg.lstsq(pair.pencil.lines[1], line, rcond=None)[0]
+    return phi + float(np.mod(np.arctan2(p[1], p[0]) - phi, np.pi))
+
+
+@dataclass(frozen=True)
+class LoopZhangRectifier:
+    """Loop and Zhang, "Computing rectifying homographies for stereo vision", CVPR 1999.
+
+    The line at infinity is the one for which the third coordinate varies least over both images: the sum of
+    w'PP'w / w'p p'w, the variance of w'x over its squared mean. The similarity and the shear then make the
+    affine part square. Departures: variances are those over what both photographs see, not over all pixels;
+    the minimum over the one-parameter pencil is searched over all of it, not descended to from a guess.
+    """
+
+    limits: FrameLimits = field(default_factory=FrameLimits)
+
+    def rectify(self, pair: EpipolarPair) -> PlanarRectification:
+        """The two homographies; ``StageFailure`` where they cannot be."""
+        rows = pencil_rows(pair, loop_zhang_line(pair))
+        return crop_and_scale(pair, homographies_of_rows(pair, affine_rows(pair, rows), rows), self.limits)
+
+
+@dataclass(frozen=True)
+class MinimumDistortionRectifier:
+    """The planar rectification of least ``RectificationQuality.distortion``.
+
+    Line at infinity, scale along the rows and shear of either side (5 unknowns; least squares from those of
+    :class:`LoopZhang`): the variance of the log singular values of both homographies, symmetric in growing
+    and shrinking, and a quarter of the mean squared gradient of the disparities. Between Hartley, who makes
+    the first photograph like the second, and Loop and Zhang, who spare either by itself: ``most_scale`` (log)
+    and ``most_shear`` say by how much a photograph may give up its aspect and its right angles so that both
+    sides become alike.
+    """
+
+    limits: FrameLimits = field(default_factory=FrameLimits)
+    max_scale: float = 0.05
+    max_shear: float = 0.06
+
+    def __post_init__(self) -> None:
+        if not (self.max_scale > 0.0 and self.max_shear > 0.0):
+            raise ValueError(
+                f"most_scale and most_shear must be positive; got {self.max_scale} and {self.max_shear}"
+            )
+
+    def rectify(self, pair: EpipolarPair) -> PlanarRectification:
+        """The two homographies; ``StageFailure`` where they cannot be."""
+        low, high = admissible_lines(pair)
+        # Off the lines that touch what both see, where derivatives grow without bound.
+        inset = 0.01 * (high - low)
+        start = np.array(
+            [np.clip(loop_zhang_line(pair), low + 2.0 * inset, high - 2.0 * inset), 0.0, 0.0, 0.0, 0.0]
+        )
+        bound = np.array([0.0, self.max_scale, self.max_shear, self.max_scale, self.max_shear])
+        found = scipy.optimize.least_squares(
+            lambda q: _distortion_residuals(pair, *_adjusted(pair, q)),
+            start,
+            bounds=(np.append(low + inset, -bound[1:]), np.append(high - inset, bound[1:])),
+            max_nfev=40,
+        )
+        first, rows = _adjusted(pair, found.x)
+        return crop_and_scale(pair, homographies_of_rows(pair, first, rows), self.limits)
+
+
+def _adjusted(pair: EpipolarPair, q: F64) -> tuple[F64, F64]:
+    """First rows (2, 3) and the others (2, 2, 3) of phi, log scale and shear of either side (5,)."""
+    rows = pencil_rows(pair, float(q[0]))
+    return np.exp(q[1::2])[:, None] * affine_rows(pair, rows) + q[2::2, None] * rows[:, 0], rows
+
+
+def _distortion_residuals(pair: EpipolarPair, first: F64, rows: F64) -> F64:
+    """Numbers whose sum of squares is the squared distortion of homographies in places."""
+    H = np.concatenate([first[:, None], rows], axis=1)
+    logs = []
+    for side in (0, 1):
+        J = homography_jacobians(H[side], pair.pencil.normalized(side, pair.regions[side]))
+        logs.append(np.log(np.maximum(singular_values(J), 1e-9) / pair.pencil.units[side]).ravel())
+    every = np.concatenate(logs)
+    residuals = (every - every.mean()) / np.sqrt(len(every))
+    if len(pair.xy1) < MIN_MATCHES:
+        return np.asarray(residuals)
+    moved = [homogenize(pair.pencil.normalized(s, xy)) @ H[s].T for s, xy in enumerate(pair.matches)]
+    left, right = (xh[:, :2] / xh[:, 2:] for xh in moved)
+    slopes = disparity_gradients(left, right)
+    return np.concatenate([residuals, 0.5 * slopes.ravel() / np.sqrt(len(slopes))])
+
+
+def loop_zhang_line(pair: EpipolarPair) -> float:
+    """The phi of Loop and Zhang's line at infinity, phi + pi/2: least variation of the third coordinate.
+
+    ``StageFailure`` where every line crosses what both photographs see.
+    """
+    z = [homogenize(pair.pencil.normalized(s, pair.regions[s])) for s in (0, 1)]
+
+    def variation(phi: float) -> float:
+        third = [z[s] @ w for s, w in enumerate(pencil_rows(pair, phi)[:, 1])]
+        return float(sum(np.var(t) / np.mean(t) ** 2 for t in third))
+
+    phi = _search(pair, variation)
+    require_in_front(pair, pencil_rows(pair, phi))
+    return phi
+
+
+def _search(pair: EpipolarPair, cost: Callable[[float], float]) -> float:
+    """The phi of least ``cost`` among those that :func:`planes_in_reach`."""
+    low, high = admissible_lines(pair)
+    # At the ends the line at infinity touches what both see.
+    tried = low + (high - low) * (np.arange(SEARCH) + 0.5) / SEARCH
+    with np.errstate(all="ignore"):
+        costs = np.array([cost(phi) for phi in tried])
+    if not np.isfinite(costs).any():
+        raise StageFailure("no line can be sent to infinity", "", "rectify in polar coordinates")
+    k = int(np.nanargmin(costs))
+    step = (high - low) / SEARCH
+    found = scipy.optimize.minimize_scalar(
+        cost, bounds=(max(low, tried[k] - step), min(high, tried[k] + step)), method="bounded"
+    )
+    return float(found.x) if found.fun <= costs[k] else float(tried[k])

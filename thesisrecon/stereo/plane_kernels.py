@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -19,6 +21,47 @@ SAME_PLANE = 0.1
 """Planes that differ by less, in steps of the search over the whole window, are one."""
 SUMS = {"reassoc", "contract", "arcp", "nsz"}
 """What the compiler may do to sums over a window, so that samples are done several at once; NaN stays NaN."""
+
+
+class PatchViews(NamedTuple):
+    """A reference view, its K neighbours, and the transfer of pixels to them.
+
+    A pixel (x, y, 1) of inverse depth rho is at ``H[k]`` (x, y, 1) + rho ``e[k]`` in neighbour k.
+
+    Attributes
+    ----------
+    gray : ndarray (H, W) float32
+        Grey levels of the reference view, NaN = no pixel.
+    squares : ndarray (S,) uint32
+        Packed pixels of all neighbours, see :func:`pack_squares`.
+    layout : ndarray (K, 3) int64
+        Offset into ``squares``, width and height of each neighbour.
+    H : ndarray (K, 3, 3)
+        Homographies of the plane at infinity.
+    e : ndarray (K, 3)
+        Epipoles.
+    """
+
+    gray: F32
+    squares: U32
+    layout: I64
+    H: F64
+    e: F64
+
+
+class PatchWindow(NamedTuple):
+    """Sampling of the matching window.
+
+    Attributes
+    ----------
+    offsets : ndarray (2, S) float32
+        Integer pixel offsets, opposite corners of the window first and last, (0, 0) among them.
+    weights : ndarray (256,) float32
+        Weight of a sample by its absolute grey level difference to the centre.
+    """
+
+    offsets: F32
+    weights: F32
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -71,13 +114,14 @@ def fit_planes(rho: F32, radius: int, alike: float, gx: F32, gy: F32) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def window_samples(gray: F32, u: int, v: int, offsets: F32, likeness: F32, samples: F32) -> float:
+def _window_samples(gray: F32, u: int, v: int, window: PatchWindow, samples: F32) -> float:
     """Fill ``samples`` (2, S) of the window about a pixel: weights that sum to 1, the more alike the centre
     the more, and weighted grey levels less their mean; returns the weighted variance of the levels.
 
     What is outside or has no pixel weighs 0. ``offsets`` (2, S) whole px, among them (0, 0), ``likeness``
     (256,) the weight by grey difference.
     """
+    offsets, weights = window
     height, width = gray.shape
     centre = gray[v, u]
     total, mean, square = 0.0, 0.0, 0.0
@@ -87,7 +131,7 @@ def window_samples(gray: F32, u: int, v: int, offsets: F32, likeness: F32, sampl
         if 0 <= a < width and 0 <= b < height:
             level = gray[b, a] - centre
             if abs(level) < 256.0:
-                weight = likeness[int(abs(level))]
+                weight = weights[int(abs(level))]
                 samples[0, k], samples[1, k] = weight, weight * level
                 total, mean, square = total + weight, mean + weight * level, square + weight * level * level
     mean /= total
@@ -191,7 +235,7 @@ def _cost_at_border(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
-def view_cost(
+def _view_cost(
     squares: U32, layout: I64, k: int, way: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
     """1 - weighted NCC of a window with its image in view ``k``, -1 where that is not held.
@@ -214,11 +258,8 @@ def view_cost(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
-def plane_cost(
-    squares: U32,
-    layout: I64,
-    H: F64,
-    e: F64,
+def _plane_cost(
+    views: PatchViews,
     at: tuple[int, int],
     plane: F64,
     offsets: F32,
@@ -228,13 +269,14 @@ def plane_cost(
 ) -> float:
     """Mean of the least two costs, the second at most ``HIDDEN`` above the first: a neighbour from which the
     pixel is hidden has no say. ``way`` (8,) is scratch."""
+    _, squares, layout, H, e = views
     if not plane[0] > 0.0:
         return UNKNOWN
     least, second = UNKNOWN, UNKNOWN
     for k in range(layout.shape[0]):
         if not _carry(H, e, k, at, plane, way):
             continue
-        cost = view_cost(squares, layout, k, way, offsets, samples, variance)
+        cost = _view_cost(squares, layout, k, way, offsets, samples, variance)
         if cost >= 0.0:
             if cost < least:
                 least, second = cost, least
@@ -245,7 +287,7 @@ def plane_cost(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def motion_px(H: F64, e: F64, k: int, at: tuple[int, int], rho: float) -> float:
+def _motion_px(H: F64, e: F64, k: int, at: tuple[int, int], rho: float) -> float:
     """Pixels that the place in view ``k`` moves per unit of inverse depth."""
     u, v = at
     z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2] + rho * e[k, 2]
@@ -260,7 +302,7 @@ def _step(H: F64, e: F64, at: tuple[int, int], rho: float, px: float) -> float:
     """The step of inverse depth that moves the place in any view by at most ``px``."""
     most = 0.0
     for k in range(H.shape[0]):
-        most = max(most, motion_px(H, e, k, at, rho))
+        most = max(most, _motion_px(H, e, k, at, rho))
     return px / most
 
 
@@ -276,15 +318,10 @@ def _continued(planes: F32, a: int, b: int, u: int, v: int, trial: F64) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS)
 def sweep_planes(
-    gray: F32,
-    squares: U32,
-    layout: I64,
-    H: F64,
-    e: F64,
-    offsets: F32,
-    likeness: F32,
+    views: PatchViews,
+    window: PatchWindow,
     step_px: float,
-    settled: float,
+    converged_cost: float,
     backward: bool,
     planes: F32,
     cost: F32,
@@ -297,6 +334,7 @@ def sweep_planes(
     ``offsets`` (2, S) px are the samples of the window, ``likeness`` (256,) their weight by grey difference;
     ``squares`` and ``layout`` those of the neighbours, see :func:`view_cost`.
     """
+    gray, H, e, offsets = views.gray, views.H, views.e, window.offsets
     height, width = gray.shape
     samples, way = np.empty((2, offsets.shape[1]), np.float32), np.empty(8)
     plane, trial = np.empty(3), np.empty(3)
@@ -306,9 +344,9 @@ def sweep_planes(
         v = height - 1 - row if backward else row
         for column in range(width):
             u = width - 1 - column if backward else column
-            if not np.isfinite(gray[v, u]) or cost[v, u] <= settled:
+            if not np.isfinite(gray[v, u]) or cost[v, u] <= converged_cost:
                 continue
-            variance = window_samples(gray, u, v, offsets, likeness, samples)
+            variance = _window_samples(gray, u, v, window, samples)
             for d in range(3):
                 plane[d] = planes[v, u, d]
             least = float(cost[v, u])
@@ -329,7 +367,7 @@ def sweep_planes(
                     for d in range(3):
                         trial[d] = plane[d]
                     trial[k // 2 - 1] += by if k < 4 else by / reach
-                tried = plane_cost(squares, layout, H, e, (u, v), trial, offsets, samples, variance, way)
+                tried = _plane_cost(views, (u, v), trial, offsets, samples, variance, way)
                 if tried < least:
                     least = tried
                     for d in range(3):
@@ -341,21 +379,18 @@ def sweep_planes(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS)
 def rate_planes(
-    gray: F32,
-    squares: U32,
-    layout: I64,
-    H: F64,
-    e: F64,
-    offsets: F32,
-    likeness: F32,
+    views: PatchViews,
+    window: PatchWindow,
     planes: F32,
-    accepted: float,
+    max_cost: float,
     least: F32,
     support: U8,
     slope: F32,
 ) -> None:
     """``least`` cost (H, W) of planes in a neighbour, in how many it is at most ``accepted`` (``support``),
     and ``slope``, the root of the sum of the squared pixels per unit of inverse depth over these."""
+    gray, squares, layout, H, e = views
+    offsets = window.offsets
     height, width = gray.shape
     samples, way, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
     for v in range(height):
@@ -363,42 +398,38 @@ def rate_planes(
             least[v, u], support[v, u], slope[v, u] = UNKNOWN, 0, 0.0
             if not (np.isfinite(gray[v, u]) and planes[v, u, 0] > 0.0):
                 continue
-            variance = window_samples(gray, u, v, offsets, likeness, samples)
+            variance = _window_samples(gray, u, v, window, samples)
             for d in range(3):
                 plane[d] = planes[v, u, d]
             total = 0.0
             for k in range(layout.shape[0]):
                 if not _carry(H, e, k, (u, v), plane, way):
                     continue
-                one = view_cost(squares, layout, k, way, offsets, samples, variance)
+                one = _view_cost(squares, layout, k, way, offsets, samples, variance)
                 if 0.0 <= one < least[v, u]:
                     least[v, u] = one
-                if 0.0 <= one <= accepted:
+                if 0.0 <= one <= max_cost:
                     support[v, u] += 1
-                    total += motion_px(H, e, k, (u, v), plane[0]) ** 2
+                    total += _motion_px(H, e, k, (u, v), plane[0]) ** 2
             slope[v, u] = np.sqrt(total)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS)
 def begin_planes(
-    gray: F32,
-    squares: U32,
-    layout: I64,
-    H: F64,
-    e: F64,
-    offsets: F32,
-    likeness: F32,
+    views: PatchViews,
+    window: PatchWindow,
     planes: F32,
     cost: F32,
 ) -> None:
     """``cost`` (H, W) of the planes that a search begins with, ``UNKNOWN`` where there is none."""
+    gray, offsets = views.gray, window.offsets
     height, width = gray.shape
     samples, way, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
     for v in range(height):
         for u in range(width):
             cost[v, u] = UNKNOWN
             if np.isfinite(gray[v, u]) and planes[v, u, 0] > 0.0:
-                variance = window_samples(gray, u, v, offsets, likeness, samples)
+                variance = _window_samples(gray, u, v, window, samples)
                 for d in range(3):
                     plane[d] = planes[v, u, d]
-                cost[v, u] = plane_cost(squares, layout, H, e, (u, v), plane, offsets, samples, variance, way)
+                cost[v, u] = _plane_cost(views, (u, v), plane, offsets, samples, variance, way)

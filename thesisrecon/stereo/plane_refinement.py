@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F32, F64, I64, U8, U32
+from thesisrecon.arrays import B8, F32, U8
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.records import PinholeView
 from thesisrecon.stereo.depth_fusion import InverseDepth
-from thesisrecon.stereo.depth_kernels import continue_surface
+from thesisrecon.stereo.depth_kernels import surface_continuation
 from thesisrecon.stereo.plane_kernels import (
     UNKNOWN,
+    PatchViews,
+    PatchWindow,
     begin_planes,
     fit_planes,
     pack_squares,
@@ -39,7 +41,7 @@ class PlaneRefinement:
 
     A pixel is kept with two neighbours of cost up to ``accepted``, with one of up to half of it, or if two of
     the matches that it began with agree. The window is ``radius`` px wide to either side, sampled every
-    ``spacing``; a grey difference of ``likeness`` levels weighs 1/e. ``sigma_px`` is the deviation of a place
+    ``spacing``; a grey difference of ``intensity_scale`` levels weighs 1/e. ``sigma_px`` is the deviation of a place
     in the neighbours; the plane counts for what the matching found too within ``gate`` deviations.
     """
 
@@ -47,10 +49,10 @@ class PlaneRefinement:
     first_step_px: float = 0.5
     radius: int = 4
     spacing: int = 2
-    likeness: float = 15.0
-    accepted: float = 0.4
-    doubtful: float = 0.6
-    settled: float = 0.1
+    intensity_scale: float = 15.0
+    max_cost: float = 0.4
+    max_doubtful_cost: float = 0.6
+    converged_cost: float = 0.1
     gate: float = 3.0
     sigma_px: float = 0.4
 
@@ -60,7 +62,7 @@ class PlaneRefinement:
         """The inverse depths of ``reference`` with those of more pixels, from its neighbours ``others``."""
         if not others or not np.isfinite(found.value).any():
             return found
-        setting = _Setting.of(reference, others, self._offsets(), self.likeness)
+        setting = _Setting.of(reference, others, self._offsets(), self.intensity_scale)
         planes = self._planes(found.value)
         cost = setting.begin(planes)
         self._sweep(setting, planes, cost, self.sweeps)
@@ -77,14 +79,14 @@ class PlaneRefinement:
     ) -> tuple[F32, F32, U8]:
         """Inverse depth, deviation and support (H, W) of the pixels that are ``wanted``, begun with ``rho``
         (H, W); NaN where no plane is accepted. Planes of other pixels stay as they are."""
-        setting = _Setting.of(reference, others, self._offsets(), self.likeness)
+        setting = _Setting.of(reference, others, self._offsets(), self.intensity_scale)
         planes = self._planes(rho)
         begun = np.where(wanted[..., None], planes, np.float32(np.nan))
         # Nothing is tried where a plane costs nothing.
         cost = np.where(wanted, setting.begin(begun), np.float32(0.0))
         self._sweep(setting, planes, cost, sweeps)
         planes[~wanted] = np.nan
-        least, support, slope = setting.rate(planes, self.accepted)
+        least, support, slope = setting.rate(planes, self.max_cost)
         seen = self._seen(least, support)
         with np.errstate(divide="ignore"):
             std = (self.sigma_px / slope).astype(np.float32)
@@ -100,16 +102,15 @@ class PlaneRefinement:
     def _sweep(self, setting: _Setting, planes: F32, cost: F32, sweeps: int) -> None:
         for k in range(sweeps):
             step = self.first_step_px * 0.5**k
-            views, window = setting.views, (setting.offsets, setting.likeness)
-            sweep_planes(*views, *window, step, self.settled, k % 2 == 1, planes, cost)
+            sweep_planes(setting.views, setting.window, step, self.converged_cost, k % 2 == 1, planes, cost)
 
     def _seen(self, least: F32, support: U8) -> B8:
         """(H, W) planes that two neighbours accept, or one without doubt."""
-        return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * self.accepted)))
+        return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * self.max_cost)))
 
     def _kept(self, found: InverseDepth, setting: _Setting, planes: F32) -> InverseDepth:
         rho = planes[..., 0]
-        least, support, slope = setting.rate(planes, self.accepted)
+        least, support, slope = setting.rate(planes, self.max_cost)
         seen = self._seen(least, support)
         joining, std = self._joining(setting, planes, seen, least)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -124,18 +125,22 @@ class PlaneRefinement:
         std = np.where(seen, std, np.where(matched, found.std, np.nan)).astype(np.float32)
         views = np.where(both, np.maximum(support, found.views), np.where(seen, support, found.views))
         views = np.where(joining, np.maximum(views, 1), views)
-        return InverseDepth(value, std, np.where(np.isfinite(value), views, 0).astype(np.uint8), found.rivals)
+        return InverseDepth(
+            value, std, np.where(np.isfinite(value), views, 0).astype(np.uint8), found.conflicts
+        )
 
     def _joining(self, setting: _Setting, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
         """(H, W) pixels of doubtful planes that continue the surface of those that are seen, and the
         deviation of their inverse depths."""
-        doubtful = ~seen & (least <= self.doubtful)
-        slope = setting.rate(np.where(doubtful[..., None], planes, np.float32(np.nan)), self.doubtful)[2]
+        max_doubtful_cost = ~seen & (least <= self.max_doubtful_cost)
+        slope = setting.rate(
+            np.where(max_doubtful_cost[..., None], planes, np.float32(np.nan)), self.max_doubtful_cost
+        )[2]
         with np.errstate(divide="ignore"):
             std = (self.sigma_px / slope).astype(np.float32)
         joins = np.zeros(seen.shape, dtype=np.uint8)
-        rho = np.where(seen | doubtful, planes[..., 0], np.float32(np.nan))
-        continue_surface(rho, std, seen.astype(np.uint8), self.radius + 1, ALIKE, self.gate, joins)
+        rho = np.where(seen | max_doubtful_cost, planes[..., 0], np.float32(np.nan))
+        surface_continuation(rho, std, seen.astype(np.uint8), self.radius + 1, ALIKE, self.gate, joins)
         return joins > 0, std
 
     def _offsets(self) -> F32:
@@ -148,13 +153,12 @@ class PlaneRefinement:
 class _Setting:
     """The grey levels of a view and its neighbours (row by row), and how pixels go from one to the others."""
 
-    views: tuple[F32, U32, I64, F64, F64]
-    offsets: F32
-    likeness: F32
+    views: PatchViews
+    window: PatchWindow
 
     @classmethod
     def of(
-        cls, reference: PinholeView, others: Sequence[PinholeView], offsets: F32, likeness: float
+        cls, reference: PinholeView, others: Sequence[PinholeView], offsets: F32, intensity_scale: float
     ) -> _Setting:
         gray = [_gray(view) for view in (reference, *others)]
         layout = np.array([(0, *one.shape[::-1]) for one in gray[1:]], dtype=np.int64)
@@ -166,22 +170,22 @@ class _Setting:
         centre = camera_centre(reference.P)
         H = np.stack([other.P[:, :3] @ M for other in others])
         e = np.stack([other.P @ (centre / centre[3]) for other in others])
-        table = np.exp(-np.arange(256.0) / likeness).astype(np.float32)
+        table = np.exp(-np.arange(256.0) / intensity_scale).astype(np.float32)
         packed = np.concatenate([words.ravel() for words in squares])
-        return cls((gray[0], packed, layout, H, e), offsets, table)
+        return cls(PatchViews(gray[0], packed, layout, H, e), PatchWindow(offsets, table))
 
     def begin(self, planes: F32) -> F32:
         """Cost (H, W) of planes (H, W, 3)."""
         cost = np.empty(planes.shape[:2], dtype=np.float32)
-        begin_planes(*self.views, self.offsets, self.likeness, planes, cost)
+        begin_planes(self.views, self.window, planes, cost)
         return cost
 
-    def rate(self, planes: F32, accepted: float) -> tuple[F32, U8, F32]:
+    def rate(self, planes: F32, max_cost: float) -> tuple[F32, U8, F32]:
         """Least cost, support and slope (H, W) of planes (H, W, 3)."""
         shape = planes.shape[:2]
         least, slope = np.full(shape, UNKNOWN, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         support = np.zeros(shape, dtype=np.uint8)
-        rate_planes(*self.views, self.offsets, self.likeness, planes, accepted, least, support, slope)
+        rate_planes(self.views, self.window, planes, max_cost, least, support, slope)
         return least, support, slope
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thesisrecon.arrays import F32, F64
-from thesisrecon.stereo.epipolar_pair import LEAST_MATCHES, EpipolarPair, EpipolarPencil, HalfLines
+from thesisrecon.stereo.epipolar_pair import MIN_MATCHES, EpipolarPair, EpipolarPencil, HalfLines
 from thesisrecon.stereo.planar import FrameLimits, common_crop, disparity_gradients
 from thesisrecon.stereo.resampling import require_side, warp_image
 
@@ -57,7 +57,7 @@ class PolarRectification:
         middle = 0.5 * float(self.angles[0] + self.angles[-1])
         phi = self.pencil.angles(require_side(side), xy, about=middle)
         lines, rows = self.pencil.half_lines(side, phi), self._row_of(phi)
-        t = np.sum(self.pencil.places(side, xy) * lines.direction, axis=1)
+        t = np.sum(self.pencil.normalized(side, xy) * lines.direction, axis=1)
         along = self._sign * self.pencil.units[side] * (t - lines.sagitta)
         columns = self.scales[side] * along + self.shears[side] * rows - self.origins[side]
         valid = (columns >= -0.5) & (columns <= self.size[0] - 0.5) if within else np.full(len(xy), True)
@@ -65,7 +65,7 @@ class PolarRectification:
 
     @property
     def _sign(self) -> float:
-        return -1.0 if self.pencil.turned else 1.0
+        return -1.0 if self.pencil.flipped else 1.0
 
     def lookup(self, side: int, rows: range) -> F64:
         """(len(rows), width, 2) px in the photograph for the pixels of these rows."""
@@ -106,7 +106,7 @@ class PolarRectification:
 
 
 @dataclass(frozen=True)
-class Polar:
+class PolarRectifier:
     """Half epipolar lines in either photograph, no pixel shrinking by more than ``limits.most_shrink``.
 
     Neighbouring rows are at most a pixel apart at the middle of what either view shows of them, and nearer
@@ -119,15 +119,15 @@ class Polar:
     """
 
     limits: FrameLimits = field(default_factory=FrameLimits)
-    most_scale: float = 0.1
-    most_shear: float = 0.06
+    max_scale: float = 0.1
+    max_shear: float = 0.06
 
     def rectify(self, pair: EpipolarPair) -> PolarRectification:
         """The polar frame; ``StageFailure`` where it would be too large or the views share nothing."""
-        pencil, sign = pair.pencil, -1 if pair.pencil.turned else 1
+        pencil, sign = pair.pencil, -1 if pair.pencil.flipped else 1
         phi = _half_planes(pair)
         chords = [_chord(pencil, side, phi) for side in (0, 1)]
-        angles = _rows_of(pencil, phi, chords, self.limits.most_shrink)[::sign]
+        angles = _rows_of(pencil, phi, chords, self.limits.max_shrink)[::sign]
         bare = PolarRectification(pencil, angles, np.ones(2), np.zeros(2), np.zeros(2), (1, len(angles)))
         alike = self._made_alike(bare, pair)
         ends = []
@@ -142,12 +142,12 @@ class Polar:
 
     def _made_alike(self, bare: PolarRectification, pair: EpipolarPair) -> PolarRectification:
         left, right = _matches_in(bare, pair)
-        if len(left) < LEAST_MATCHES:
+        if len(left) < MIN_MATCHES:
             return bare
         # d changes by the difference of both scales along x and of both shears along y.
         slope = disparity_gradients(left, right).mean(axis=0)
-        scale = np.exp(np.clip(-slope[0], -self.most_scale, self.most_scale))
-        shear = np.clip(-0.5 * slope[1], -self.most_shear, self.most_shear)
+        scale = np.exp(np.clip(-slope[0], -self.max_scale, self.max_scale))
+        shear = np.clip(-0.5 * slope[1], -self.max_shear, self.max_shear)
         scales = np.array([max(scale, 1.0), max(1.0 / scale, 1.0)])
         return replace(bare, scales=scales, shears=np.array([shear, -shear]))
 
@@ -175,22 +175,22 @@ def _chord(pencil: EpipolarPencil, side: int, phi: F64) -> tuple[HalfLines, F64,
     """The half-lines and where they enter and leave the photograph, in places, the later first where not."""
     width, height = pencil.sizes[side]
     lines = pencil.half_lines(side, phi)
-    low = pencil.places(side, np.zeros(2))
-    high = pencil.places(side, np.array([width - 1.0, height - 1.0]))
+    low = pencil.normalized(side, np.zeros(2))
+    high = pencil.normalized(side, np.array([width - 1.0, height - 1.0]))
     return lines, *lines.chord(low, high)
 
 
 def _rows_of(
-    pencil: EpipolarPencil, phi: F64, chords: list[tuple[HalfLines, F64, F64]], most_shrink: float
+    pencil: EpipolarPencil, phi: F64, chords: list[tuple[HalfLines, F64, F64]], max_shrink: float
 ) -> F64:
     """Half-planes of the rows, increasing (H,)."""
     per_radian = np.zeros(len(phi))
     for side, (lines, enter, leave) in enumerate(chords):
         met = leave >= enter
-        for t, shrink in ((0.5 * (enter + leave), 1.0), (enter, most_shrink), (leave, most_shrink)):
+        for t, shrink in ((0.5 * (enter + leave), 1.0), (enter, max_shrink), (leave, max_shrink)):
             at = np.where(met, t, 0.0)[:, None]
-            swept = pencil.swept(side, phi, lines.foot + at * lines.direction) * pencil.units[side]
-            per_radian = np.maximum(per_radian, np.where(met, swept / shrink, 0.0))
+            sweep_rate = pencil.sweep_rate(side, phi, lines.foot + at * lines.direction) * pencil.units[side]
+            per_radian = np.maximum(per_radian, np.where(met, sweep_rate / shrink, 0.0))
     # The most that neighbours need, so that nothing shrinks between the sampled half-planes either.
     each = np.maximum(per_radian[:-1], per_radian[1:]) * np.diff(phi)
     rows = np.concatenate([[0.0], np.cumsum(np.maximum(each, 1e-12))])

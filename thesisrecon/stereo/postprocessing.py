@@ -292,22 +292,22 @@ class DisparityPostprocessing:
     """What is believed of the best disparities.
 
     ``left_right_px``: the partner's own best disparity may differ by as much. ``smallest_piece``: connected
-    pieces of fewer pixels are peaks and go, as do larger ones all but without texture. ``least_confidence``:
+    pieces of fewer pixels are peaks and go, as do larger ones all but without texture. ``min_confidence``:
     less is unknown. ``radius``: every
     disparity becomes the mean of those within so many pixels that differ from it by a pixel at most, which
     takes the noise of the sub-pixel fit from a surface and leaves its edges.
     """
 
     left_right_px: float = 1.0
-    smallest_piece: int = 60
-    least_confidence: float = 0.02
+    min_region_px: int = 60
+    min_confidence: float = 0.02
     radius: int = 2
 
     def __post_init__(self) -> None:
-        if not (self.left_right_px >= 0.0 and self.smallest_piece >= 0 and self.radius >= 0):
+        if not (self.left_right_px >= 0.0 and self.min_region_px >= 0 and self.radius >= 0):
             raise ValueError("left_right_px, smallest_piece and radius must not be negative")
-        if not 0.0 <= self.least_confidence < 1.0:
-            raise ValueError(f"least_confidence must be in [0, 1); got {self.least_confidence}")
+        if not 0.0 <= self.min_confidence < 1.0:
+            raise ValueError(f"min_confidence must be in [0, 1); got {self.min_confidence}")
 
     def apply(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
         """The map of disparities (H, W) of the left pixels, given those of the right ones, NaN = none.
@@ -315,9 +315,9 @@ class DisparityPostprocessing:
         ``texture`` (H, W) from :func:`texture_of`: what surfaces without any inherit from their rims is kept,
         with little confidence. Takes possession of ``left`` and ``confidence``.
         """
-        limits = np.array([self.left_right_px, self.least_confidence], np.float32)
+        limits = np.array([self.left_right_px, self.min_confidence], np.float32)
         check_left_right(left, right, confidence, limits)
-        remove_peaks(left, texture > TEXTURED, STEP_PX, self.smallest_piece)
+        remove_peaks(left, texture > TEXTURED, STEP_PX, self.min_region_px)
         closed = np.empty_like(left)
         fill_pinholes(left, SURROUNDED, closed)
         closed[np.isnan(texture)] = np.nan

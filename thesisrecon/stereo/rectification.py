@@ -15,15 +15,17 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.stereo.epipolar_pair import EpipolarPair, Size, pair_of_cameras, pair_of_fundamental
 from thesisrecon.stereo.planar import (
-    CommonOrientation,
+    CommonOrientationRectifier,
     FrameLimits,
+    HartleyRectifier,
+    LoopZhangRectifier,
+    MinimumDistortionRectifier,
     PlanarRectification,
     disparity_bounds,
     disparity_gradients,
     singular_values,
 )
-from thesisrecon.stereo.planar_methods import Hartley, LeastDistortion, LoopZhang
-from thesisrecon.stereo.polar import Polar, PolarRectification
+from thesisrecon.stereo.polar import PolarRectification, PolarRectifier
 
 STEP_PX = 0.01
 """Half the distance over which derivatives of a map are taken."""
@@ -59,12 +61,12 @@ class RectificationQuality:
     rms_dy_px: float
     orthogonality_deg: tuple[float, float]
     aspect: tuple[float, float]
-    kept: tuple[float, float]
-    growth: float
+    coverage: tuple[float, float]
+    size_ratio: float
     least_scale: float
     greatest_scale: float
     stretch: float
-    slant: float
+    disparity_slope: float
     disparities: tuple[float, float]
 
     @property
@@ -74,8 +76,8 @@ class RectificationQuality:
         ``log stretch`` and half the ``slant``, as the root of the sum of squares: a slant s stretches windows
         of one side against the other by s, to first order half of it for either.
         """
-        slant = self.slant if np.isfinite(self.slant) else 0.0
-        return float(np.hypot(np.log(self.stretch), 0.5 * slant))
+        disparity_slope = self.disparity_slope if np.isfinite(self.disparity_slope) else 0.0
+        return float(np.hypot(np.log(self.stretch), 0.5 * disparity_slope))
 
 
 def measure_quality(rectification: Rectification, pair: EpipolarPair) -> RectificationQuality:
@@ -83,29 +85,29 @@ def measure_quality(rectification: Rectification, pair: EpipolarPair) -> Rectifi
 
     It need not have been made from this pair: the epipolar geometry of ``pair`` says only what both see.
     """
-    values, kept, midlines = [], [], []
+    values, coverage, midlines = [], [], []
     for side in (0, 1):
         samples = pair.regions[side]
         inside = np.isfinite(rectification.rectified_from_original(side, samples)).all(axis=1)
         J = jacobians(rectification, side, samples[inside])
         values.append(singular_values(J[np.isfinite(J).all(axis=(1, 2))]))
-        kept.append(_share_inside(rectification, side, pair.sizes[side]))
+        coverage.append(_share_inside(rectification, side, pair.sizes[side]))
         midlines.append(_midlines(rectification, side, pair.sizes[side]))
     found = np.concatenate(values)
     found = found if len(found) else np.full((1, 2), np.nan)
     logs = np.log(np.maximum(found, 1e-12))
-    dy, slant, disparities = _matches(rectification, pair)
+    dy, disparity_slope, disparities = _matches(rectification, pair)
     width, height = rectification.size
     return RectificationQuality(
         rms_dy_px=dy,
         orthogonality_deg=(midlines[0][0], midlines[1][0]),
         aspect=(midlines[0][1], midlines[1][1]),
-        kept=(kept[0], kept[1]),
-        growth=width * height / max(w * h for w, h in pair.sizes),
+        coverage=(coverage[0], coverage[1]),
+        size_ratio=width * height / max(w * h for w, h in pair.sizes),
         least_scale=float(found[:, 1].min()),
         greatest_scale=float(found[:, 0].max()),
         stretch=float(np.exp(np.std(logs))),
-        slant=slant,
+        disparity_slope=disparity_slope,
         disparities=disparities,
     )
 
@@ -150,8 +152,8 @@ def _matches(rectification: Rectification, pair: EpipolarPair) -> tuple[float, f
         return float("nan"), float("nan"), (float("nan"), float("nan"))
     left, right = left[seen], right[seen]
     dy = float(np.sqrt(np.mean((left[:, 1] - right[:, 1]) ** 2)))
-    slant = float(np.sqrt(np.mean(np.sum(disparity_gradients(left, right) ** 2, axis=1))))
-    return dy, slant, disparity_bounds(left[:, 0] - right[:, 0], margin=0.0)
+    disparity_slope = float(np.sqrt(np.mean(np.sum(disparity_gradients(left, right) ** 2, axis=1))))
+    return dy, disparity_slope, disparity_bounds(left[:, 0] - right[:, 0], margin=0.0)
 
 
 AnyRectification = PlanarRectification | PolarRectification
@@ -166,7 +168,7 @@ class Rectifier(Protocol):
 
 
 @dataclass(frozen=True)
-class LeastDistorted:
+class BestRectifier:
     """The one of several methods that distorts a pair least, measured by ``RectificationQuality.distortion``.
 
     Methods that keep the angle of a photograph's midlines within ``angle_deg`` of a right one and their ratio
@@ -203,17 +205,17 @@ class LeastDistorted:
         turned = max((abs(a - 90.0) for a in quality.orthogonality_deg if np.isfinite(a)), default=0.0)
         aspect = max((abs(a - 1.0) for a in quality.aspect if np.isfinite(a)), default=0.0)
         bent = self.bending if isinstance(found, PolarRectification) else 0.0
-        cost = quality.distortion + bent + self.size * np.log(quality.growth)
+        cost = quality.distortion + bent + self.size * np.log(quality.size_ratio)
         return turned > self.angle_deg or aspect > self.aspect, float(cost)
 
 
 def _methods(limits: FrameLimits) -> Mapping[Method, Rectifier]:
     return {
-        "hartley": Hartley(limits),
-        "loop-zhang": LoopZhang(limits),
-        "least-distortion": LeastDistortion(limits),
-        "polar": Polar(limits),
-        "metric": CommonOrientation(limits),
+        "hartley": HartleyRectifier(limits),
+        "loop-zhang": LoopZhangRectifier(limits),
+        "least-distortion": MinimumDistortionRectifier(limits),
+        "polar": PolarRectifier(limits),
+        "metric": CommonOrientationRectifier(limits),
     }
 
 
@@ -227,8 +229,8 @@ def rectify(
     limits = FrameLimits() if limits is None else limits
     methods = _methods(limits)
     if method == "best":
-        bare = Polar(limits, most_scale=0.0, most_shear=0.0)
-        return LeastDistorted((*methods.values(), bare)).rectify(pair)
+        bare = PolarRectifier(limits, max_scale=0.0, max_shear=0.0)
+        return BestRectifier((*methods.values(), bare)).rectify(pair)
     if method not in methods:
         raise ValueError(f"a method of rectification is one of {['best', *methods]}; got {method!r}")
     return methods[method].rectify(pair)

@@ -287,7 +287,7 @@ class MaximumLikelihoodScanline:
     and s^2 = 4 make 16.
 
     A measurement is the colours of the pixel and of those within ``radius``; the paper's is the pixel alone
-    (``radius`` 0), and says that any vector will do. s^2 is ``least_variance`` (the paper's 4) and what the
+    (``radius`` 0), and says that any vector will do. s^2 is ``min_variance`` (the paper's 4) and what the
     images' own noise adds to it.
 
     The paper charges a pixel at the border, beyond the other camera's view, as a hidden one. That draws the
@@ -296,7 +296,7 @@ class MaximumLikelihoodScanline:
     """
 
     detection: float = 0.99
-    least_variance: float = 4.0
+    min_variance: float = 4.0
     radius: int = 1
     cohesion: Cohesion = "along and across"
     steps_per_nat: float = 16.0
@@ -306,8 +306,8 @@ class MaximumLikelihoodScanline:
     def __post_init__(self) -> None:
         if not 0.5 <= self.detection < 1.0:
             raise ValueError(f"detection must be in [0.5, 1); got {self.detection}")
-        if not (self.least_variance > 0.0 and self.steps_per_nat > 0.0 and 0 <= self.radius <= 4):
-            raise ValueError("least_variance and steps_per_nat must be above 0, radius in 0 .. 4")
+        if not (self.min_variance > 0.0 and self.steps_per_nat > 0.0 and 0 <= self.radius <= 4):
+            raise ValueError("min_variance and steps_per_nat must be above 0, radius in 0 .. 4")
         if self.cohesion not in ("none", "along", "along and across"):
             raise ValueError(f"cohesion must be none, along, or along and across; got {self.cohesion}")
 
@@ -322,7 +322,7 @@ class MaximumLikelihoodScanline:
         first, last = checked_range(disparity_range)
         sides = prepare_pair(left, right)
         noise = float(np.mean([estimate_noise(side) for side in sides]))
-        variance = self.least_variance + noise**2
+        variance = self.min_variance + noise**2
         components = len(sides[0].channels) * (2 * self.radius + 1) ** 2
         hidden = self.hidden_cost(components, variance)
         model = (

@@ -25,9 +25,14 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.records import Reconstruction, TwoView
 from thesisrecon.stereo.epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo.planar import CommonOrientation, PlanarRectification
-from thesisrecon.stereo.planar_methods import Hartley, LeastDistortion, LoopZhang
-from thesisrecon.stereo.polar import Polar
+from thesisrecon.stereo.planar import (
+    CommonOrientationRectifier,
+    HartleyRectifier,
+    LoopZhangRectifier,
+    MinimumDistortionRectifier,
+    PlanarRectification,
+)
+from thesisrecon.stereo.polar import PolarRectifier
 from thesisrecon.stereo.rectification import (
     AnyRectification,
     RectificationQuality,
@@ -111,11 +116,11 @@ def _opencv_cameras(pair: RealPair) -> PlanarRectification:
 
 
 METHODS: Mapping[str, tuple[bool, Callable[[RealPair], AnyRectification | None]]] = {
-    "Hartley": (False, lambda p: Hartley().rectify(p.loose)),
-    "Loop-Zhang": (False, lambda p: LoopZhang().rectify(p.loose)),
-    "least distortion": (False, lambda p: LeastDistortion().rectify(p.loose)),
-    "polar": (False, lambda p: Polar().rectify(p.loose)),
-    "metric": (True, lambda p: CommonOrientation().rectify(p.metric)),
+    "Hartley": (False, lambda p: HartleyRectifier().rectify(p.loose)),
+    "Loop-Zhang": (False, lambda p: LoopZhangRectifier().rectify(p.loose)),
+    "least distortion": (False, lambda p: MinimumDistortionRectifier().rectify(p.loose)),
+    "polar": (False, lambda p: PolarRectifier().rectify(p.loose)),
+    "metric": (True, lambda p: CommonOrientationRectifier().rectify(p.metric)),
     BEST_F: (False, lambda p: rectify(p.loose)),
     BEST: (True, lambda p: rectify(p.metric)),
     OPENCV_F: (False, _opencv_f),
@@ -195,10 +200,10 @@ QUANTITIES: tuple[tuple[str, str, Callable[[Measured], float], float | None, boo
     ("aspect off 1", "", lambda m: _off(m.quality.aspect, 1.0), ASPECT, True),
     ("kept of what both see", "", lambda m: m.kept, KEPT, False),
     ("stretch", "", lambda m: m.quality.stretch, None, True),
-    ("slant of disparities", "", lambda m: m.quality.slant, None, True),
+    ("slant of disparities", "", lambda m: m.quality.disparity_slope, None, True),
     ("distortion", "", lambda m: m.quality.distortion, None, True),
     ("least scale", "", lambda m: m.quality.least_scale, None, False),
-    ("pixels over the photograph's", "", lambda m: m.quality.growth, None, True),
+    ("pixels over the photograph's", "", lambda m: m.quality.size_ratio, None, True),
     ("range of disparities", "px", lambda m: float(np.ptp(m.quality.disparities)), None, True),
     ("time", "ms", lambda m: 1e3 * m.seconds, None, True),
 )
@@ -274,9 +279,9 @@ def check_hand_made(names: Sequence[str]) -> list[Metric]:
             "matches": float(len(found.xy1)),
             "RMS |dy|": q.rms_dy_px,
             "distortion": q.distortion,
-            "kept of A": q.kept[0],
-            "kept of B": q.kept[1],
-            "pixels over the photograph's": q.growth,
+            "kept of A": q.coverage[0],
+            "kept of B": q.coverage[1],
+            "pixels over the photograph's": q.size_ratio,
         }
         kind = "planar" if isinstance(chosen, PlanarRectification) else "polar"
         rows.append(Metric("kusvod2", name, "", values, "RMS |dy|", note=kind))

@@ -23,14 +23,14 @@ import plotly.graph_objects as go
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.view_synthesis import match_photographs
+from thesisrecon.view_synthesis import match_images
 from thesisrecon.views.trilinear import seed_of_two
 from thesisrecon.views.trilinear_synthesis import AGREE_PX, prepare_synthesis
 from thesisrecon.views.virtual_camera import (
     CalibratedPair,
     VirtualCamera,
     camera_at,
-    guessed_intrinsics,
+    default_intrinsics,
     pair_from_fundamental,
 )
 from validation.metrics.pictures import picture_metrics, psnr_db, ssim
@@ -141,9 +141,9 @@ class Measured:
 def measure_courtyard(out: Path | None) -> list[Measured]:
     """All places by true cameras and correspondence, and by F and matches with true and guessed K."""
     truth = courtyard()
-    found = match_photographs(*truth.photographs, config=PipelineConfig())
-    dense = found.dense.places(0, SIZE), found.dense.places(1, SIZE)
-    K, guess = truth.poses[0].K, guessed_intrinsics(SIZE)
+    found = match_images(*truth.photographs, config=PipelineConfig())
+    dense = found.dense.correspondences(0, SIZE), found.dense.correspondences(1, SIZE)
+    K, guess = truth.poses[0].K, default_intrinsics(SIZE)
     matches = found.pair.xy1, found.pair.xy2
     pairs = {
         "all true": truth.pair,
@@ -245,14 +245,14 @@ def measure_fountain(out: Path | None) -> list[Metric]:
     if scene is None or scene.K is None or scene.R is None or scene.C is None:
         return []
     (K1, K, K2), (R1, R, R2), (C1, C, C2) = scene.K[4:7], scene.R[4:7], scene.C[4:7]
-    found = match_photographs(scene.image_paths[4], scene.image_paths[6])
+    found = match_images(scene.image_paths[4], scene.image_paths[6])
     images = found.images
     size = images[0].size
-    dense = found.dense.places(0, size), found.dense.places(1, size)
+    dense = found.dense.correspondences(0, size), found.dense.correspondences(1, size)
     with PIL.Image.open(scene.image_paths[5]) as image:
         wanted = np.asarray(image.convert("RGB"))
     baseline = float(np.linalg.norm(C1 - C2))
-    guess = guessed_intrinsics(size)
+    guess = default_intrinsics(size)
     matches = found.pair.xy1, found.pair.xy2
     pairs = {
         "true cameras": CalibratedPair(K1, K2, R2 @ R1.T, R2 @ (C1 - C2) / baseline),
