@@ -71,5 +71,5 @@ def test_pictures_that_do_not_belong_together_are_refused(compare):
     real, noisy = pictures()
     with pytest.raises(ValueError, match="one size"):
         compare(real, noisy[:-1], np.ones((40, 50), bool))
-    with pytest.raises(ValueError, match="nothing to compare"):
+    with pytest.raises(ValueError, match="no pixel is shown by both"):
         compare(real, noisy, np.zeros((40, 50), bool))

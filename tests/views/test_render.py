@@ -84,7 +84,7 @@ def test_wrong_calls_are_refused():
     camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
     with pytest.raises(ValueError, match="at least one sample"):
         render(wall(), camera, samples=0)
-    with pytest.raises(ValueError, match="vertices that it does not have"):
+    with pytest.raises(ValueError, match="vertices that do not exist"):
         render(TexturedMesh(np.zeros((2, 3)), np.array([[0, 1, 2]])), camera)
     with pytest.raises(ValueError, match="uv must be"):
         render(wall(uv=np.zeros((1, 3, 2)), texture=np.zeros((2, 2, 3), np.uint8)), camera)

@@ -246,9 +246,9 @@ def _bad_pair(problem):
     [
         ("few", "too few matches; 7, needed at least 8"),
         ("rank 1", "rank 1 and no epipolar lines"),
-        ("of others", "the fundamental matrix is not that of the matches"),
+        ("of others", "the fundamental matrix does not fit the matches"),
         ("turned", "show no parallax"),
-        ("behind", "the scene is not in front of both photographs"),
+        ("behind", "the scene is not in front of both cameras"),
     ],
 )
 def test_pairs_that_cannot_work_are_refused_with_a_sentence(problem, sentence):

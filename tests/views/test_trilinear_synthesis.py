@@ -10,8 +10,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.views.trilinear import seed_of_first, seed_of_two
 from thesisrecon.views.trilinear_synthesis import complete_correspondence, guess_rows, prepare_synthesis
 from thesisrecon.views.virtual_camera import CalibratedPair, VirtualCamera, camera_at, cameras_along
-from thesisrecon.views.warping import DIRECTIONS
-from thesisrecon.views.warping_kernels import distances_to_known
+from thesisrecon.views.warping import DIRECTIONS, distances_to_known
 
 SIZE = (160, 120)
 
@@ -142,7 +141,7 @@ def test_paths_that_are_none_are_wrong_calls(frames, beyond):
     ],
 )
 def test_cameras_beyond_the_scene_or_that_look_away_are_refused(synthesis, rotation, translation):
-    with pytest.raises(StageFailure, match="sees nothing of the scene"):
+    with pytest.raises(StageFailure, match="sees almost nothing of the scene"):
         synthesis.render(VirtualCamera(rotation, np.array(translation), K, SIZE))
 
 
@@ -150,7 +149,7 @@ def test_shapes_and_places_that_do_not_fit_are_refused():
     image, places = np.zeros((6, 8, 3)), np.full((6, 8, 2), np.nan, np.float32)
     with pytest.raises(StageFailure, match="no dense correspondence"):
         prepare_synthesis(PAIR, (image, image), (places, places))
-    with pytest.raises(ValueError, match="photograph 2 is"):
+    with pytest.raises(ValueError, match="image 2 must be"):
         prepare_synthesis(PAIR, (image, image), (places + 1, places[:5]))
     with pytest.raises(ValueError, match="at least 1 x 1"):
         VirtualCamera(np.eye(3), np.zeros(3), K, (0, 5))
@@ -215,7 +214,7 @@ def test_everything_is_believed_where_asked_to():
 
 def test_photographs_that_contradict_each_other_have_no_correspondence():
     places, _ = _true_places()
-    with pytest.raises(StageFailure, match="no pixel of photograph 1 is known"):
+    with pytest.raises(StageFailure, match="no pixel of image 1 has a known correspondence"):
         complete_correspondence(PAIR, (places[0] + 50.0, places[1]), agree_px=1.5)
 
 

@@ -1,1 +1,1 @@
-"""Sections 1.2, 1.3 and 2.6: new views of a model or between photographs."""
+"""New views of a model or of images (thesis, sections 1.2, 1.3 and 2.6)."""

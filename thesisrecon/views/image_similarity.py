@@ -1,4 +1,4 @@
-"""How like two pictures of one camera are, over the pixels that both have."""
+"""Similarity of a rendered and a real image over the pixels that both show: PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -9,27 +9,52 @@ from thesisrecon.arrays import B8, F64, U8
 from thesisrecon.records import RenderedView
 
 WINDOW_PX = 1.5
-"""Deviation of the Gaussian window of the structural similarity."""
+"""Standard deviation of the Gaussian window of SSIM."""
 
 GREY = np.array([0.299, 0.587, 0.114])
-"""Shares of red, green and blue in the luma of Rec. 601."""
+"""Luma weights of Rec. 601."""
 
 FLOOR_LUMINANCE, FLOOR_CONTRAST = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
-"""What keeps the quotients of the structural similarity steady where a picture is black or even."""
+"""Stabilising constants of SSIM for dark and uniform regions."""
 
 
-def whole_pixels(rendered: RenderedView) -> B8:
-    """(H, W) pixels that the surface covers together with their eight neighbours: the colour of others is
-    partly that of the background."""
+def covered_pixels(rendered: RenderedView) -> B8:
+    """Return the pixels whose eight neighbours are covered by the surface too.
+
+    The colour of other pixels is partly that of the background.
+
+    Parameters
+    ----------
+    rendered : RenderedView
+        A rendered view.
+
+    Returns
+    -------
+    ndarray (H, W) of bool
+        Pixels to compare.
+    """
     return np.asarray(scipy.ndimage.binary_erosion(rendered.valid, np.ones((3, 3))))
 
 
-def exposed_alike(real: U8, rendered: U8, compared: B8) -> U8:
-    """The picture ``rendered`` (H, W, 3) as bright as ``real``: one factor for each channel, by least squares
-    over the pixels ``compared`` (H, W).
+def match_exposure(real: U8, rendered: U8, compared: B8) -> U8:
+    """Match the exposure of a rendered image to a real one by one factor per channel (least squares).
 
-    A model has one exposure and photographs have each their own, which nothing but the photograph tells.
-    Raises ``ValueError`` where the shapes do not agree or nothing is compared.
+    Parameters
+    ----------
+    real, rendered : ndarray (H, W, 3) of uint8
+        The images.
+    compared : ndarray (H, W) of bool
+        Pixels to compare.
+
+    Returns
+    -------
+    ndarray (H, W, 3) of uint8
+        The rendered image with the exposure of the real one.
+
+    Raises
+    ------
+    ValueError
+        If the shapes disagree or no pixel is compared.
     """
     _check(real, rendered, compared)
     a, b = real[compared].astype(np.float64), rendered[compared].astype(np.float64)
@@ -38,10 +63,24 @@ def exposed_alike(real: U8, rendered: U8, compared: B8) -> U8:
 
 
 def psnr_db(real: U8, rendered: U8, compared: B8) -> float:
-    """Peak signal-to-noise ratio of two pictures (H, W, 3), in dB over the pixels ``compared`` (H, W).
+    """Return the peak signal-to-noise ratio of two images.
 
-    All channels alike; infinite for pictures that are the same. Raises ``ValueError`` where the shapes do not
-    agree or nothing is compared.
+    Parameters
+    ----------
+    real, rendered : ndarray (H, W, 3) of uint8
+        The images.
+    compared : ndarray (H, W) of bool
+        Pixels to compare.
+
+    Returns
+    -------
+    float
+        PSNR in dB over all channels; infinite for equal images.
+
+    Raises
+    ------
+    ValueError
+        If the shapes disagree or no pixel is compared.
     """
     _check(real, rendered, compared)
     apart = (real.astype(np.float64) - rendered)[compared]
@@ -50,19 +89,50 @@ def psnr_db(real: U8, rendered: U8, compared: B8) -> float:
 
 
 def ssim(real: U8, rendered: U8, compared: B8) -> float:
-    """Structural similarity of two pictures (H, W, 3): its mean over the pixels ``compared`` (H, W).
+    """Return the mean structural similarity of two images; see :func:`ssim_map`.
 
-    See :func:`ssim_map`; raises ``ValueError`` like it.
+    Parameters
+    ----------
+    real, rendered : ndarray (H, W, 3) of uint8
+        The images.
+    compared : ndarray (H, W) of bool
+        Pixels to compare.
+
+    Returns
+    -------
+    float
+        Mean SSIM over the compared pixels.
+
+    Raises
+    ------
+    ValueError
+        If the shapes disagree or no pixel is compared.
     """
     return float(np.mean(ssim_map(real, rendered, compared)[compared]))
 
 
 def ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
-    """Structural similarity at each pixel (H, W) of two pictures (H, W, 3).
+    """Return the structural similarity of two images at each pixel.
 
-    Luma in Gaussian windows of 1.5 px, constants 0.01 and 0.03 (Wang, Bovik, Sheikh and Simoncelli, IEEE
-    Transactions on Image Processing 2004). A window takes in only pixels that are ``compared`` (H, W). Raises
-    ``ValueError`` where the shapes do not agree or nothing is compared.
+    Luma in Gaussian windows of 1.5 px with the constants 0.01 and 0.03 (Wang, Bovik, Sheikh and Simoncelli,
+    IEEE Transactions on Image Processing 2004). Windows use compared pixels only.
+
+    Parameters
+    ----------
+    real, rendered : ndarray (H, W, 3) of uint8
+        The images.
+    compared : ndarray (H, W) of bool
+        Pixels to compare.
+
+    Returns
+    -------
+    ndarray (H, W)
+        SSIM of each pixel.
+
+    Raises
+    ------
+    ValueError
+        If the shapes disagree or no pixel is compared.
     """
     _check(real, rendered, compared)
     a, b = (np.where(compared, picture @ GREY, 0.0) for picture in (real, rendered))
@@ -79,12 +149,12 @@ def ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
 def _check(real: U8, rendered: U8, compared: B8) -> None:
     if real.shape != rendered.shape or real.shape != (*compared.shape, 3):
         raise ValueError(
-            f"pictures and mask must be of one size; got {real.shape}, {rendered.shape} and {compared.shape}"
+            f"images and mask must have one size; got {real.shape}, {rendered.shape} and {compared.shape}"
         )
     if not compared.any():
-        raise ValueError("nothing to compare: no pixel is in both pictures")
+        raise ValueError("no pixel is shown by both images")
 
 
 def _windowed(values: F64) -> F64:
-    """(H, W) means in Gaussian windows, nothing beyond the border."""
+    """Gaussian-weighted means (H, W), zero beyond the border."""
     return np.asarray(scipy.ndimage.gaussian_filter(values, WINDOW_PX, mode="constant", truncate=3.5))

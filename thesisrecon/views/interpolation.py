@@ -1,8 +1,5 @@
-"""Places between two photographs: along the rows of the rectified frame, and out of it again.
-
-The monotonicity constraint (figure 1.1): pixels of a row keep their order in the other photograph.
-
-Views between two photographs whose dense correspondence is known.
+"""View interpolation between two images with known dense correspondence (thesis, section 1.2; Seitz and Dyer
+1995).
 """
 
 from __future__ import annotations
@@ -14,62 +11,91 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.zbuffer import in_strips
+from thesisrecon.geometry.zbuffer import run_in_strips
 from thesisrecon.records import DisparityMap
 from thesisrecon.views.interpolation_kernels import (
     ONE_SURFACE_PX,
     blend,
+    blending_weights,
+    disparity_from_rectified,
     fill_empty_rows,
+    filter_guesses_by_colour,
+    filter_guesses_by_median,
+    intermediate_positions,
     mark_crossings,
-    place_between,
-    settle_guesses,
-    smooth_guesses,
-    take_back,
-    weigh,
 )
 from thesisrecon.views.warping import fill_holes, forward_map, sample
 
 SHRINK = 0.8
-"""Steps by which the quadrilateral is made smaller until it is in front of both cameras."""
+"""Factor by which the quadrilateral is reduced until it lies in front of both cameras."""
 LEAST_DEPTH = 0.2
-"""Third coordinates of its corners are at least so many times that of the middle."""
+"""Minimum third coordinate of its corners, in units of that of its centre."""
 
 
 @dataclass(frozen=True)
-class FrameBetween:
-    """The frames of views between two photographs of ``size`` (width, height), after Seitz and Dyer.
+class IntermediateFrame:
+    """Image frames of the views between two images.
 
-    ``H`` (2, 3, 3) take the photographs to the rectified frame. There a point of the view at s is (1 - s)
-    x_left + s x_right: exactly its image in a camera on the baseline, all three being parallel. Out of the
-    rectified frame leads a homography that takes a quadrilateral to the corners of the picture; the
-    quadrilateral is that of the first photograph for s = 0, that of the second for s = 1, and runs in
-    straight lines in between, so that both ends are the photographs.
+    In the rectified frame a point of the view at s is (1 - s) x_left + s x_right, its exact image in a camera
+    on the baseline (all three cameras are parallel). A homography leads out of the rectified frame; it takes
+    a quadrilateral to the image corners. The quadrilateral is that of the first image for s = 0, that of the
+    second for s = 1, and linear in between, so that both ends are the images themselves.
+
+    Parameters
+    ----------
+    H : ndarray (2, 3, 3)
+        Homographies from the images to the rectified frame.
+    size : tuple of int
+        Width and height of the images.
     """
 
     H: F64
     size: tuple[int, int]
 
     def original_from_rectified(self, s: float) -> F64:
-        """(3, 3) from the rectified frame at s to the pixels of the view, det > 0 where H's are."""
+        """Return the homography from the rectified frame at s to the pixels of the view.
+
+        Parameters
+        ----------
+        s : float
+            Position between the images, 0 to 1.
+
+        Returns
+        -------
+        ndarray (3, 3)
+            The homography; its determinant is positive where those of H are.
+        """
         corners = self._corners()
         ends = [_mapped(H, corners) for H in self.H]
         return _homography((1.0 - s) * ends[0] + s * ends[1], corners)
 
     def points(self, xy1: F64, xy2: F64, s: float) -> F64:
-        """Where the view at s sees points whose pixels (N, 2), (N, 2) in the photographs are known."""
+        """Return the image points of the view at s.
+
+        Parameters
+        ----------
+        xy1, xy2 : ndarray (N, 2)
+            Corresponding pixels of the two images.
+        s : float
+            Position between the images, 0 to 1.
+
+        Returns
+        -------
+        ndarray (N, 2)
+            Pixels of the view.
+        """
         left, right = _mapped(self.H[0], xy1), _mapped(self.H[1], xy2)
         return _mapped(self.original_from_rectified(s), (1.0 - s) * left + s * right)
 
     def _corners(self) -> F64:
-        """The four points of the quadrilateral (4, 2) px: the corners, drawn to the middle where they
-        must."""
+        """Corners (4, 2) of the quadrilateral: the image corners, moved inwards where necessary."""
         width, height = self.size
         middle = 0.5 * np.array([width - 1.0, height - 1.0])
         reach = np.maximum(middle, 0.5) * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         third = self.H[:, 2]
         least = LEAST_DEPTH * (third @ np.append(middle, 1.0))
         if not (least > 0.0).all():
-            raise ValueError("the middle of the photograph is beyond the line sent to infinity")
+            raise ValueError("the image centre lies beyond the line at infinity of the rectification")
         while not (homogenize(middle + reach) @ third.T >= least).all():
             reach *= SHRINK
         corners: F64 = middle + reach
@@ -82,7 +108,7 @@ def _mapped(H: F64, xy: F64) -> F64:
 
 
 def _homography(source: F64, target: F64) -> F64:
-    """(3, 3) that takes four points to four others, H[2] positive at the first of them."""
+    """The homography (3, 3) that takes four points to four others, H[2] positive at the first of them."""
     rows = []
     for (x, y), (u, v) in zip(source, target, strict=True):
         rows.append([x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, -u])
@@ -95,13 +121,22 @@ def _homography(source: F64, target: F64) -> F64:
 
 
 SLACK_PX = 0.5
-"""Partners may cross by so much: less is the noise of disparities, not the scene."""
+"""Correspondences may cross by this much: less is noise of the disparities."""
 
 
 @dataclass(frozen=True)
 class Monotonicity:
-    """How far a pair obeys the constraint: ``violated`` (H, W) pixels that change their order with another
-    one of their row, ``share`` of the ``known`` ones (a share of all pixels, too)."""
+    """Result of the monotonicity test.
+
+    Parameters
+    ----------
+    violated : ndarray (H, W) of bool
+        Pixels whose order relative to another pixel of their row differs between the images.
+    share : float
+        Share of violating pixels among those with known disparity.
+    known : float
+        Share of pixels with known disparity.
+    """
 
     violated: B8
     share: float
@@ -109,17 +144,33 @@ class Monotonicity:
 
     @property
     def holds(self) -> bool:
-        """Whether no pixel violates it: every view between shows the same points."""
+        """Whether no pixel violates the constraint; every view between then shows the same points."""
         return self.share == 0.0
 
 
 def check_monotonicity(disparity: F32, *, slack_px: float = SLACK_PX) -> Monotonicity:
-    """Which pixels of a rectified photograph violate the constraint, from their disparities (H, W), NaN =
-    unknown.
+    """Test the monotonicity constraint (figure 1.1) on a rectified image.
 
-    For pixels u1 left of v1 their partners must be u2 left of v2; then u lies left of v in every view
-    between. A thin thing in front of a far background violates it, with all of the background that it passes.
-    Raises ``ValueError`` for another shape.
+    If u1 is left of v1 then their correspondences must satisfy u2 left of v2; u is then left of v in every
+    view between. A thin object in front of a distant background violates it, together with the background
+    that it passes.
+
+    Parameters
+    ----------
+    disparity : ndarray (H, W)
+        Disparities, NaN if unknown.
+    slack_px : float
+        Tolerance in pixels.
+
+    Returns
+    -------
+    Monotonicity
+        Violating pixels and their share.
+
+    Raises
+    ------
+    ValueError
+        If ``disparity`` is not two-dimensional.
     """
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
     if disparity.ndim != 2:
@@ -132,35 +183,44 @@ def check_monotonicity(disparity: F32, *, slack_px: float = SLACK_PX) -> Monoton
 
 
 SPARSE = 7
-"""Every seventh pixel of every seventh row suffices for a median."""
+"""Subsampling step for medians."""
 PREPARING = 2
-"""Threads that prepare a photograph."""
+"""Threads that prepare an image."""
 DARK, BRIGHT = 8.0, 247.0
-"""Levels whose ratio tells how much brighter a photograph is."""
+"""Range of levels used for the ratio of exposures."""
 
 
 @dataclass(frozen=True)
 class Blending:
-    """How two warped photographs become one.
+    """Parameters of blending two warped images.
 
-    Pixels whose inverse depth differs by no more than ``alike_px`` show the same surface. Weights are the
-    confidence, but at least ``least``; ``guessed`` of what only the other photograph's holes can show, whose
-    disparity is that of the background beside it; ``rim`` is what is left of them beside a cut. Guessed
-    disparities are the median of those around, weighted by their likeness in colour, which falls to 1 / e at
-    a difference of ``colour`` levels in sum over the channels; other guesses count ``hearsay`` of known ones.
+    Parameters
+    ----------
+    alike_px : float
+        Largest difference of disparity between pixels of one surface.
+    colour : float
+        Difference of colour (sum over channels) at which weights of guessed disparities fall to 1 / e.
+    guess_weight : float
+        Weight of guessed disparities relative to known ones.
+    least : float
+        Minimum weight of pixels with known disparity; otherwise the weight is the confidence.
+    guessed : float
+        Weight of pixels with guessed disparity.
+    rim : float
+        Factor of the weight beside a depth discontinuity.
     """
 
     alike_px: float = 1.5
     colour: float = 30.0
-    hearsay: float = 0.5
+    guess_weight: float = 0.5
     least: float = 0.2
     guessed: float = 0.01
     rim: float = 0.2
 
 
 @dataclass(frozen=True)
-class Warped:
-    """One photograph seen from between: ``colors`` (H, W, 3), ``near`` (H, W), ``source`` (H, W, 2)."""
+class WarpedImage:
+    """One image warped to an intermediate view: colours, disparity (``near``) and source pixels."""
 
     colors: F32
     near: F32
@@ -169,8 +229,7 @@ class Warped:
 
 @dataclass(frozen=True)
 class _Side:
-    """What is known of a photograph's pixels: ``places`` (h, w, 2) in the rectified frame, ``disparity`` (h,
-    w) without holes, ``weight`` (h, w)."""
+    """An image with its pixel positions in the rectified frame, disparities without holes and weights."""
 
     levels: F32
     places: F64
@@ -180,18 +239,28 @@ class _Side:
 
 @dataclass(frozen=True)
 class InterpolatedPair:
-    """Two photographs (h, w, 3) uint8 of one size and what lies between them (thesis, section 1.2).
+    """Two images and the views between them (thesis, section 1.2).
 
-    ``H`` (2, 3, 3) takes either one's pixels to the rectified frame, third coordinate positive for what is
-    seen; ``left`` and ``right`` are the disparities of the first and the second one there (x_right = x_left -
-    d either way), larger for nearer points.
+    Each pixel of either image moves along its row by a share of its disparity and out of the rectified frame
+    in one step, so that colours are sampled once. Nearer pixels occlude farther ones, which also handles
+    violations of monotonicity. What only one image shows is taken from it, with the disparity of the adjacent
+    background; what neither shows is filled from behind.
 
-    Every pixel of either photograph is moved along its row by its share of its disparity and out of the
-    rectified frame at once, so that colours are sampled once only and from the photographs. Nearer pixels
-    hide farther ones, which is all it takes where monotonicity fails. What one photograph alone shows is
-    taken from it, with the disparity of the background beside it; what none shows is filled from behind.
+    Parameters
+    ----------
+    images : tuple of ndarray (h, w, 3) of uint8
+        The images.
+    H : ndarray (2, 3, 3)
+        Homographies to the rectified frame, third coordinate positive for visible pixels.
+    left, right : DisparityMap
+        Disparities of the first and the second image in the rectified frame (x_right = x_left - d in both).
+    blending : Blending
+        Parameters of blending.
 
-    Raises ``ValueError`` for photographs of different sizes and maps of different shapes.
+    Raises
+    ------
+    ValueError
+        If the sizes of the images or the shapes of the maps differ.
     """
 
     images: tuple[U8, U8]
@@ -212,13 +281,13 @@ class InterpolatedPair:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the photographs and of the views."""
+        """Width and height of the images and of the views."""
         return self.images[0].shape[1], self.images[0].shape[0]
 
     @cached_property
-    def frame(self) -> FrameBetween:
-        """Where points lie between."""
-        return FrameBetween(self.H, self.size)
+    def frame(self) -> IntermediateFrame:
+        """The frames of the views between."""
+        return IntermediateFrame(self.H, self.size)
 
     @cached_property
     def _sides(self) -> tuple[_Side, _Side]:
@@ -230,12 +299,12 @@ class InterpolatedPair:
 
     @cached_property
     def known(self) -> float:
-        """Share of the pixels of both photographs whose partner is known."""
+        """Share of the pixels of both images with known correspondence."""
         return float(np.mean([side.weight > 1.5 * self.blending.guessed for side in self._sides]))
 
     @cached_property
     def gain(self) -> F32:
-        """(3,) by how much the second photograph is brighter than the first, the median of known pixels."""
+        """Ratio (3,) of the exposure of the second image to the first, the median over known pixels."""
         first = self._sides[0]
         grid = np.ix_(range(0, self.size[1], SPARSE), range(0, self.size[0], SPARSE))
         places = first.places[grid].copy()
@@ -254,14 +323,29 @@ class InterpolatedPair:
         return np.asarray(np.exp(np.median(np.log(levels[1][known] / levels[0][known]), axis=0)), np.float32)
 
     def view(self, s: float, *, turn: F64 | None = None, threads: int = 1) -> U8:
-        """The view at s in [0, 1] from the first photograph to the second, (h, w, 3) uint8.
+        """Render the view at s.
 
-        s = 0 and s = 1 are the photographs themselves. ``turn`` (3, 3), of pixels, is what the camera there
-        is turned or zoomed by. ``threads`` draw strips of rows and change no byte. Raises ``ValueError`` for
-        s elsewhere: there is nothing beyond the photographs.
+        Parameters
+        ----------
+        s : float
+            Position from the first image (0) to the second (1), which are returned unchanged.
+        turn : ndarray (3, 3), optional
+            Homography of a rotation or zoom of the camera, in pixels.
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        ndarray (h, w, 3) of uint8
+            The view.
+
+        Raises
+        ------
+        ValueError
+            If s is outside 0 to 1.
         """
         if not 0.0 <= s <= 1.0:
-            raise ValueError(f"s is a place from 0 (the first photograph) to 1 (the second); got {s}")
+            raise ValueError(f"s must be from 0 (first image) to 1 (second image); got {s}")
         if turn is None and s in (0.0, 1.0):
             return self.images[int(s)].copy()
         rgb, near = self.seen(s, turn=turn, threads=threads)
@@ -269,8 +353,22 @@ class InterpolatedPair:
         return np.clip(np.rint(np.nan_to_num(filled)), 0.0, 255.0).astype(np.uint8)
 
     def seen(self, s: float, *, turn: F64 | None = None, threads: int = 1) -> tuple[F32, F32]:
-        """Colours (h, w, 3) and disparities (h, w) of the view at s before what neither photograph shows is
-        filled, NaN there."""
+        """Render the view at s before holes are filled.
+
+        Parameters
+        ----------
+        s : float
+            Position between the images, 0 to 1.
+        turn : ndarray (3, 3), optional
+            Homography of a rotation or zoom of the camera, in pixels.
+        threads : int
+            Number of threads.
+
+        Returns
+        -------
+        tuple of ndarray
+            Colours (h, w, 3) and disparities (h, w), NaN where neither image shows the scene.
+        """
         warped = [self.warped(side, s, turn=turn, threads=threads) for side in (0, 1)]
         sides, blending = self._sides, self.blending
         out = np.empty_like(warped[0].colors), np.empty_like(warped[0].near)
@@ -286,11 +384,28 @@ class InterpolatedPair:
                 (out[0][part], out[1][part]),
             )
 
-        in_strips(work, self.size[1], threads)
+        run_in_strips(work, self.size[1], threads)
         return out
 
-    def warped(self, side: int, s: float, *, turn: F64 | None = None, threads: int = 1) -> Warped:
-        """One photograph alone as the view at s sees it, as bright as this is."""
+    def warped(self, side: int, s: float, *, turn: F64 | None = None, threads: int = 1) -> WarpedImage:
+        """Warp one image to the view at s, with the exposure of that view.
+
+        Parameters
+        ----------
+        side : int
+            0 for the first image, 1 for the second.
+        s : float
+            Position between the images, 0 to 1.
+        turn : ndarray (3, 3), optional
+            Homography of a rotation or zoom of the camera, in pixels.
+        threads : int
+            Number of threads.
+
+        Returns
+        -------
+        Warped
+            Colours, disparities and source pixels.
+        """
         this = self._sides[side]
         target = np.empty_like(this.places)
         G = self.frame.original_from_rectified(s)
@@ -299,8 +414,8 @@ class InterpolatedPair:
             middle = np.array([0.5 * (self.size[0] - 1.0), 0.5 * (self.size[1] - 1.0), 1.0])
             G = np.ascontiguousarray(np.sign(turn[2] @ middle) * (turn @ G))
         share = s - side
-        in_strips(
-            lambda rows: place_between(this.places, this.disparity, share, G, rows, target),
+        run_in_strips(
+            lambda rows: intermediate_positions(this.places, this.disparity, share, G, rows, target),
             self.size[1],
             threads,
         )
@@ -309,7 +424,7 @@ class InterpolatedPair:
         )
         colors = sample(this.levels, source, threads=threads)
         colors *= self.gain ** np.float32(share)
-        return Warped(colors, near, source)
+        return WarpedImage(colors, near, source)
 
 
 def _side(image: U8, H: F64, found: DisparityMap, blending: Blending) -> _Side:
@@ -320,37 +435,77 @@ def _side(image: U8, H: F64, found: DisparityMap, blending: Blending) -> _Side:
     shape = image.shape[:2]
     places = np.empty((*shape, 2))
     disparity, sure, weight = (np.empty(shape, dtype=np.float32) for _ in range(3))
-    take_back(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
-    levels, settled = image.astype(np.float32), np.empty_like(disparity)
-    likeness = (blending.colour, blending.hearsay)
-    in_strips(
-        lambda rows: settle_guesses(levels, disparity, sure, rows, likeness, settled), shape[0], PREPARING
+    disparity_from_rectified(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
+    levels, filtered = image.astype(np.float32), np.empty_like(disparity)
+    weighting = (blending.colour, blending.guess_weight)
+    run_in_strips(
+        lambda rows: filter_guesses_by_colour(levels, disparity, sure, rows, weighting, filtered),
+        shape[0],
+        PREPARING,
     )
-    in_strips(lambda rows: smooth_guesses(settled, sure, rows, disparity), shape[0], PREPARING)
-    weigh(disparity, sure, (blending.guessed, blending.least, blending.rim), weight)
+    run_in_strips(lambda rows: filter_guesses_by_median(filtered, sure, rows, disparity), shape[0], PREPARING)
+    blending_weights(disparity, sure, (blending.guessed, blending.least, blending.rim), weight)
     return _Side(levels, places, disparity, weight)
 
 
-def pair_of_rectified(left: U8, right: U8, maps: tuple[DisparityMap, DisparityMap]) -> InterpolatedPair:
-    """Two photographs (h, w, 3) that are rectified as they are."""
+def pair_from_rectified(left: U8, right: U8, maps: tuple[DisparityMap, DisparityMap]) -> InterpolatedPair:
+    """Build the pair of two images that are already rectified.
+
+    Parameters
+    ----------
+    left, right : ndarray (h, w, 3) of uint8
+        The rectified images.
+    maps : tuple of DisparityMap
+        Disparities of both images.
+
+    Returns
+    -------
+    InterpolatedPair
+        The pair with identity homographies.
+
+    Raises
+    ------
+    ValueError
+        If the maps do not have the shape of the images.
+    """
     for found in maps:
         if found.disparity.shape != left.shape[:2]:
             raise ValueError(
-                f"disparities must have the shape of the photographs {left.shape[:2]}; got "
-                f"{found.disparity.shape}"
+                f"disparities must have the shape of the images {left.shape[:2]}; got {found.disparity.shape}"
             )
     return InterpolatedPair((left, right), np.stack([np.eye(3)] * 2), *maps)
 
 
-def unsure(disparity: F32) -> DisparityMap:
-    """Disparities (H, W), NaN = unknown, of which no more is known: each as sure as the next."""
+def with_full_confidence(disparity: F32) -> DisparityMap:
+    """Wrap plain disparities as a map with confidence 1 where they are known.
+
+    Parameters
+    ----------
+    disparity : ndarray (H, W)
+        Disparities, NaN if unknown.
+
+    Returns
+    -------
+    DisparityMap
+        The map.
+    """
     known = np.isfinite(disparity)
     return DisparityMap(disparity, known.astype(np.float32), 0.0)
 
 
-def other_side(left: DisparityMap) -> DisparityMap:
-    """The disparities of the right photograph that those of the left one imply: the nearer of two that meet
-    there; pixels that none meets take the farther of their neighbours within two pixels on both sides."""
+def disparity_of_right(left: DisparityMap) -> DisparityMap:
+    """Derive the disparities of the right image from those of the left one.
+
+    Parameters
+    ----------
+    left : DisparityMap
+        Disparities of the left image.
+
+    Returns
+    -------
+    DisparityMap
+        The larger disparity where two meet; isolated gaps of rounding take the smaller neighbour.
+    """
     height, width = left.disparity.shape
     disparity = np.full((height, width), -np.inf, dtype=np.float32)
     confidence = np.zeros((height, width), dtype=np.float32)
@@ -367,7 +522,7 @@ def other_side(left: DisparityMap) -> DisparityMap:
 
 
 def _cracks_closed(disparity: F32) -> F32:
-    """Single unknown pixels between two known ones of a row, which rounding left, take the smaller."""
+    """Fill single unknown pixels between two known ones of a row with the smaller value."""
     closed = disparity.copy()
     between = np.fmin(disparity[:, :-2], disparity[:, 2:])
     both = np.isfinite(disparity[:, :-2]) & np.isfinite(disparity[:, 2:]) & np.isnan(disparity[:, 1:-1])

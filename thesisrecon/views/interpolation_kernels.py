@@ -1,4 +1,4 @@
-"""Compiled loops of interpolation; each has a plain twin in the tests."""
+"""Compiled loops of view interpolation; each has a NumPy twin in the tests."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ ONE_SURFACE_PX = 1.0
 
 
 REACH, SPARSE = 12, 3
-"""How far about a guessed pixel its disparity is looked for, and how many pixels are skipped in between."""
+"""Radius and step of the search for the disparity of a guessed pixel."""
 WINDOW = 2 * REACH // SPARSE + 1
 NEAR = 2
-"""How far about a guessed pixel others must agree with it."""
+"""Radius of the median over guessed pixels."""
 
 
 @njit(cache=True, nogil=True)
 def mark_crossings(disparity: F32, slack: float, crossing: B8) -> None:
-    """Mark pixels (H, W) whose partner x - d lies on the wrong side of that of another pixel of their row, by
-    more than ``slack`` px; NaN takes no part."""
+    """Mark pixels whose correspondence x - d crosses that of another pixel of their row.
+
+    Parameters
+    ----------
+    disparity : ndarray (H, W)
+        Disparities; NaN takes no part.
+    slack : float
+        Tolerance in pixels.
+    crossing : ndarray (H, W) of bool
+        The result.
+    """
     height, width = disparity.shape
     least = np.empty(width + 1)
     for y in range(height):
@@ -39,7 +48,13 @@ def mark_crossings(disparity: F32, slack: float, crossing: B8) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_empty_rows(disparity: F32) -> None:
-    """Give rows (H, W) that are NaN throughout the nearest other row, the upper one of two; in place."""
+    """Copy the nearest other row into rows that are NaN throughout, in place.
+
+    Parameters
+    ----------
+    disparity : ndarray (H, W)
+        Disparities; of two equally near rows the upper one is taken.
+    """
     height = disparity.shape[0]
     known = np.empty(height, np.bool_)
     for y in range(height):
@@ -57,15 +72,23 @@ def fill_empty_rows(disparity: F32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def take_back(
+def disparity_from_rectified(
     maps: tuple[F32, F32], H: F64, rows: tuple[int, int], places: F64, disparity: F32, sure: F32
 ) -> None:
-    """Disparity and confidence of the pixels of a photograph, rows [first, last), from its rectified frame.
+    """Transfer disparity and confidence from the rectified frame to the pixels of an image.
 
-    ``maps``: disparities (H, W) without holes and confidences (H, W), 0 where unknown; ``H`` (3, 3) takes
-    pixels to their frame. ``places`` (h, w, 2) px in the frame, NaN beyond the line sent to infinity;
-    ``disparity`` (h, w) bilinear where the four pixels around are of one surface, else the nearest one's;
-    beyond the frame that of its border, with confidence 0.
+    Parameters
+    ----------
+    maps : tuple of ndarray (H, W)
+        Disparities without holes and confidences, 0 if unknown.
+    H : ndarray (3, 3)
+        Homography from the image to the rectified frame.
+    rows : tuple of int
+        First and last row (exclusive).
+    places : ndarray (h, w, 2)
+        Output: positions in the frame, NaN beyond the line at infinity.
+    disparity, sure : ndarray (h, w)
+        Output: disparity, bilinear on one surface, otherwise nearest; confidence, 0 outside the frame.
     """
     field, confidence = maps
     height, width = field.shape
@@ -95,14 +118,23 @@ def take_back(
 
 
 @njit(cache=True, nogil=True)
-def settle_guesses(
+def filter_guesses_by_colour(
     levels: F32, disparity: F32, sure: F32, rows: tuple[int, int], limits: tuple[float, float], out: F32
 ) -> None:
-    """Make the guessed disparities of a photograph follow its colours, rows [first, last).
+    """Replace guessed disparities by a colour-weighted median of their surroundings.
 
-    Those whose confidence ``sure`` (h, w) is 0 become the weighted median of ``disparity`` (h, w) over every
-    ``SPARSE``-th pixel of every such row within ``REACH``. Weights fall with the difference of ``levels``
-    (h, w, 3), to 1 / e at ``limits[0]`` in sum over the channels; guesses weigh ``limits[1]`` of known ones.
+    Parameters
+    ----------
+    levels : ndarray (h, w, 3)
+        Colours.
+    disparity, sure : ndarray (h, w)
+        Disparities and confidences, 0 for guesses.
+    rows : tuple of int
+        First and last row (exclusive).
+    limits : tuple of float
+        Colour difference at which weights fall to 1 / e; weight of guesses relative to known values.
+    out : ndarray (h, w)
+        The result.
     """
     height, width = disparity.shape
     values, weights = np.empty(WINDOW * WINDOW, np.float32), np.empty(WINDOW * WINDOW)
@@ -134,9 +166,18 @@ def settle_guesses(
 
 
 @njit(cache=True, nogil=True)
-def smooth_guesses(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
-    """Guessed disparities (h, w), whose confidence ``sure`` is 0, become the median of those within ``NEAR``
-    pixels, rows [first, last): a pixel alone is a speck in every view between."""
+def filter_guesses_by_median(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
+    """Replace guessed disparities by the median of their neighbours, which removes isolated pixels.
+
+    Parameters
+    ----------
+    disparity, sure : ndarray (h, w)
+        Disparities and confidences, 0 for guesses.
+    rows : tuple of int
+        First and last row (exclusive).
+    out : ndarray (h, w)
+        The result.
+    """
     height, width = disparity.shape
     values = np.empty((2 * NEAR + 1) ** 2, np.float32)
     for y in range(rows[0], rows[1]):
@@ -156,7 +197,7 @@ def smooth_guesses(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -
 
 @njit(cache=True, nogil=True)
 def _weighted_median(values: F32, weights: F64, half: float) -> float:
-    """The least of ``values`` (N,) up to which the weights sum to ``half``."""
+    """The smallest of ``values`` (N,) up to which the weights sum to ``half``."""
     order, total = np.argsort(values), 0.0
     for k in order:
         total += weights[k]
@@ -166,11 +207,26 @@ def _weighted_median(values: F32, weights: F64, half: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def place_between(
+def intermediate_positions(
     places: F64, disparity: F32, share: float, G: F64, rows: tuple[int, int], target: F64
 ) -> None:
-    """Where pixels lie in a view between: ``places`` (h, w, 2) moved left by ``share`` of their disparity
-    (h, w), then by the homography ``G`` (3, 3), into rows of ``target`` (h, w, 2); NaN beyond infinity."""
+    """Compute the pixel positions in an intermediate view.
+
+    Parameters
+    ----------
+    places : ndarray (h, w, 2)
+        Positions in the rectified frame.
+    disparity : ndarray (h, w)
+        Disparities.
+    share : float
+        Share of the disparity by which pixels move left.
+    G : ndarray (3, 3)
+        Homography from the rectified frame to the view.
+    rows : tuple of int
+        First and last row (exclusive).
+    target : ndarray (h, w, 2)
+        Output: positions, NaN beyond the line at infinity.
+    """
     for y in range(rows[0], rows[1]):
         for x in range(disparity.shape[1]):
             u, v = places[y, x, 0] - share * disparity[y, x], places[y, x, 1]
@@ -199,13 +255,25 @@ def blend(
     limits: tuple[float, float, float],
     out: tuple[F32, F32],
 ) -> None:
-    """One picture of two.
+    """Blend two warped images.
 
-    ``colors`` (H, W, 3) and inverse depth ``fronts`` (H, W) of both, NaN where nothing is; ``weights`` (h, w) of
-    the pixels of either photograph, those at or below ``limits[1]`` being guesses; ``sources`` (H, W, 2)
-    which pixel is seen. Where both are within ``limits[0]`` of each other's inverse depth their mean, weighted
-    further by 1 - s and s, s = ``limits[2]``; else what is no guess, of two that are none the nearer one, of
-    two that are the farther one. ``out``: colours and inverse depth, NaN where neither has any.
+    Where both inverse depths agree, the weighted mean is taken. Otherwise known pixels win over guessed ones;
+    of two known pixels the nearer wins, of two guessed ones the farther.
+
+    Parameters
+    ----------
+    colors : tuple of ndarray (H, W, 3)
+        Warped colours.
+    fronts : tuple of ndarray (H, W)
+        Inverse depths, NaN if empty.
+    sources : tuple of ndarray (H, W, 2)
+        Source pixels.
+    weights : tuple of ndarray (h, w)
+        Weights of the source pixels.
+    limits : tuple of float
+        Tolerance of inverse depth, weight up to which a pixel counts as guessed, and s.
+    out : tuple of ndarray
+        Colours and inverse depth, NaN where both are empty.
     """
     alike, guess, s = limits
     rgb, near = out
@@ -236,11 +304,17 @@ def blend(
 
 
 @njit(cache=True, nogil=True)
-def weigh(disparity: F32, sure: F32, floors: tuple[float, float, float], out: F32) -> None:
-    """Weights (h, w) of the pixels of a photograph in the mean of two.
+def blending_weights(disparity: F32, sure: F32, floors: tuple[float, float, float], out: F32) -> None:
+    """Compute the blending weight of each pixel of an image.
 
-    Those of confidence 0 have ``floors[0]``, others their confidence but at least ``floors[1]``, times
-    ``floors[2]`` beside a cut: pixels at the rim of a surface are a mixture of two.
+    Parameters
+    ----------
+    disparity, sure : ndarray (h, w)
+        Disparities and confidences, 0 for guesses.
+    floors : tuple of float
+        Weight of guesses, minimum weight of other pixels, factor beside a depth discontinuity (mixed pixels).
+    out : ndarray (h, w)
+        The weights.
     """
     height, width = disparity.shape
     for y in range(height):

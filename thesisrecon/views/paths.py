@@ -1,4 +1,4 @@
-"""Ways of a camera past a model: around its middle, and along the cameras of the photographs (1.2)."""
+"""Camera paths around a model and along the registered cameras (thesis, section 1.2)."""
 
 from __future__ import annotations
 
@@ -12,39 +12,52 @@ from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh
 
 ROUND_GAP = np.radians(120.0)
-"""Cameras that leave no wider gap stand all round the scene, and an orbit closes the circle."""
+"""Cameras without a wider gap in azimuth surround the scene; the orbit is then a full circle."""
 
 LEAST_SWING = np.radians(30.0)
-"""An orbit that does not close swings over at least this much."""
+"""Minimum arc of an orbit that is not a full circle."""
 
 TILT_WEIGHT = 0.02
-"""Squared ratio of how much a photographer rolls the camera to how much it is tilted (about 3 and 20 deg)."""
+"""Squared ratio of typical roll to typical tilt of hand-held cameras (about 3 and 20 degrees)."""
 
 STEEPEST = 0.1
-"""Least horizontal distance of an orbit in units of its distance: nearer to the axis up is not defined."""
+"""Minimum horizontal distance of an orbit relative to its distance: near the vertical axis "up" is
+undefined."""
 
 GROWTH = 1.1 ** np.arange(13)
-"""Factors of the radius that are tried, in this order, until the orbit is clear and shows the model."""
+"""Radius factors, tried in this order until the orbit keeps clear of the model and shows it."""
 
 CLEARANCE = 0.5
-"""How near to the model an orbit may come, in units of the median distance of the cameras from it."""
+"""Minimum distance to the model, in units of the median distance of the cameras."""
 
 SHOWN = 0.9
-"""How much of the model each picture must show, in units of the median over the cameras."""
+"""Minimum visible share of the model, in units of the median over the cameras."""
 
 TURNING = 3.0
-"""Where a camera turns this many times faster for its way than on the whole path, it slows down."""
+"""If rotation per path length exceeds the mean of the path by this factor, rotation determines the time."""
 
 STEPS = 64
-"""Pieces of each stretch between two cameras in which its length is measured."""
+"""Samples per spline segment for measuring its length."""
 
 SAMPLE = 5000
-"""Points of the model that are looked at to choose an orbit."""
+"""Model points that are used to choose an orbit."""
 
 
-def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera with a picture of ``size`` (width, height): all that it saw, as large as fits, with more at
-    two sides where the shapes differ."""
+def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
+    """Fit the camera to another image size: the whole field of view, as large as possible, centred.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    size : tuple of int
+        Width and height in pixels.
+
+    Returns
+    -------
+    Camera
+        The same pose with scaled intrinsics.
+    """
     factor = min(size[0] / camera.size[0], size[1] / camera.size[1])
     S = np.diag([factor, factor, 1.0])
     S[:2, 2] = 0.5 * (np.array(size) - 1.0) - factor * 0.5 * (np.array(camera.size) - 1.0)
@@ -54,35 +67,43 @@ def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
 def orbit(
     cameras: Sequence[Camera], X: F64, frames: int, *, size: tuple[int, int] | None = None
 ) -> list[Camera]:
-    """Cameras on a circle about the middle of the scene, all looking at it, upright.
+    """Place cameras on a circle about the centre of the scene, upright and looking at it.
 
-    The middle is the geometric median of X; radius and height above it are medians over the cameras, the
-    field of view is that of the first. Where the cameras stand all round (no gap over 120 deg) the path is a
-    full circle, begun at the first camera; else it swings to and fro once over the arc that they cover, at
-    least 30 deg: what no photograph saw is not shown. Either way the frames may be repeated without a jump.
-    The circle is widened, up to three times, until no camera on it is nearer to X than half the median
-    distance of the real ones, and each has about as much of X in its picture as they have.
+    The centre is the geometric median of X; radius and height are medians over the cameras; the field of view
+    is that of the first camera. If the cameras surround the scene (no gap above 120 degrees) the path is a
+    full circle from the first camera; otherwise it swings over the arc that they cover (at least 30 degrees),
+    because the rest was not observed. Both can be repeated without a jump. The radius grows up to threefold
+    until the circle keeps half the median camera distance from X and every frame shows about as much of X as
+    the cameras do.
 
     Parameters
     ----------
-    cameras : at least one.
-    X : (N, 3) points of the scene, evenly spread over its surface where it has one; not finite ones are left
-        out.
-    frames : how many, at least 1.
-    size : (width, height) of the pictures, by default of the first camera.
+    cameras : sequence of Camera
+        At least one registered camera.
+    X : ndarray (N, 3)
+        Scene points, evenly spread over the surface if there is one; non-finite points are ignored.
+    frames : int
+        Number of cameras, at least 1.
+    size : tuple of int, optional
+        Image size (width, height); default: that of the first camera.
+
+    Returns
+    -------
+    list of Camera
+        The path.
 
     Raises
     ------
-    ValueError : without a camera, a frame or a finite point, and where all points and cameras are in one
-        place.
+    ValueError
+        Without a camera, a frame or a finite point, or if all points and cameras coincide.
     """
     _check(cameras, frames)
     X = _sample(X)
     size = size or cameras[0].size
-    middle, up = geometric_median(X), upward(cameras)
+    middle, up = geometric_median(X), estimate_up(cameras)
     offset = np.array([camera.centre for camera in cameras]) - middle
     radius, height = _typical(offset, up, float(np.median(np.linalg.norm(X - middle, axis=1))))
-    K = fitted(cameras[0], size).K.copy()
+    K = fit_to_size(cameras[0], size).K.copy()
     K[:2, 2] = 0.5 * (np.array(size) - 1.0)
     right, ahead = _level_axes(up)
     azimuth = _azimuths(np.arctan2(offset @ ahead, offset @ right), frames)
@@ -93,23 +114,39 @@ def orbit(
         lift = height * (factor if height > 0.0 else 1.0)
         return [_looking_at(K, middle + factor * radius * a + lift * up, middle, up, size) for a in around]
 
-    return circle(_widening(circle, [fitted(camera, size) for camera in cameras], X))
+    return circle(_widening(circle, [fit_to_size(camera, size) for camera in cameras], X))
 
 
-def interpolate(
+def interpolate_cameras(
     cameras: Sequence[Camera], frames: int, *, size: tuple[int, int] | None = None
 ) -> list[Camera]:
-    """Cameras on a smooth way through ``cameras`` in their order, from the first to the last.
+    """Interpolate a smooth camera path through the cameras, from the first to the last.
 
-    Centres run on a centripetal Catmull-Rom spline (Yuksel et al. 2011), which makes no loops, at a constant
-    speed; where a camera turns more than three times faster for its way than on the whole path, on the spot
-    for instance, the turn sets the time. Rotations are interpolated on the sphere of quaternions, K linearly,
-    after all were brought to pictures of ``size`` (by default of the first camera).
+    Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011), which has no loops, at constant
+    speed. Where the rotation per path length exceeds three times the mean, the rotation determines the time.
+    Rotations are interpolated as quaternions, K linearly, after all cameras are fitted to ``size``.
 
-    Raises ``ValueError`` without a camera or a frame. One camera, or one frame, gives the first camera.
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        At least one camera, in order.
+    frames : int
+        Number of cameras of the path. One camera or one frame gives the first camera.
+    size : tuple of int, optional
+        Image size (width, height); default: that of the first camera.
+
+    Returns
+    -------
+    list of Camera
+        The path.
+
+    Raises
+    ------
+    ValueError
+        Without a camera or a frame.
     """
     _check(cameras, frames)
-    shown = [fitted(camera, size or cameras[0].size) for camera in cameras]
+    shown = [fit_to_size(camera, size or cameras[0].size) for camera in cameras]
     if len(shown) == 1 or frames == 1:
         return [shown[0]] * frames
     centres = np.array([camera.centre for camera in shown])
@@ -125,12 +162,22 @@ def interpolate(
     return [shown[0], *between, shown[-1]]
 
 
-def upward(cameras: Sequence[Camera]) -> F64:
-    """Unit vector (3,) that points up in the scene.
+def estimate_up(cameras: Sequence[Camera]) -> F64:
+    """Estimate the up direction of the scene.
 
-    It is the one to which the rows of the pictures are most nearly at right angles, and the optical axes a
-    little: people tilt cameras and hardly roll them. On the side of the pictures' own ups, or where these
-    cancel, of who looks down.
+    It is most nearly perpendicular to the image rows, and weakly to the optical axes: hand-held cameras are
+    tilted but hardly rolled. Its sign follows the image up directions or, if these cancel, the cameras that
+    look down.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Registered cameras.
+
+    Returns
+    -------
+    ndarray (3,)
+        Unit vector.
     """
     rows, down, axis = np.array([camera.R for camera in cameras]).transpose(1, 0, 2)
     up = np.linalg.eigh(rows.T @ rows + TILT_WEIGHT * axis.T @ axis)[1][:, 0]
@@ -139,8 +186,20 @@ def upward(cameras: Sequence[Camera]) -> F64:
 
 
 def geometric_median(X: F64, rounds: int = 100) -> F64:
-    """The point (3,) with the least sum of distances to X (N, 3): half of them may be anywhere without moving
-    it far (Weiszfeld's iteration)."""
+    """Return the point with the least sum of distances to X (Weiszfeld's iteration).
+
+    Parameters
+    ----------
+    X : ndarray (N, 3)
+        Points.
+    rounds : int
+        Number of iterations.
+
+    Returns
+    -------
+    ndarray (3,)
+        The geometric median, robust against up to half of the points.
+    """
     middle = X.mean(axis=0)
     least = 1e-9 * float(np.abs(X - middle).max())
     if not least > 0.0:
@@ -151,9 +210,21 @@ def geometric_median(X: F64, rounds: int = 100) -> F64:
     return np.asarray(middle)
 
 
-def surface_points(mesh: TexturedMesh, count: int = SAMPLE) -> F64:
-    """``count`` points (count, 3) spread over the surface by its area, the same each time; none where it has
-    no area."""
+def sample_surface(mesh: TexturedMesh, count: int = SAMPLE) -> F64:
+    """Sample points evenly over the area of a mesh, the same points each time.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+        The mesh.
+    count : int
+        Number of points.
+
+    Returns
+    -------
+    ndarray (count, 3)
+        Points; empty if the mesh has no area.
+    """
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
     if not len(area) or not area[-1] > 0.0:
@@ -184,8 +255,7 @@ def _sample(X: F64) -> F64:
 
 
 def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:
-    """Radius and height of a circle from ``offset`` (V, 3) of cameras from the middle; ``spread`` of the
-    scene is the distance where the cameras stand in its middle."""
+    """Radius and height of the orbit from camera offsets (V, 3) and the ``spread`` of the scene."""
     height = float(np.median(offset @ up))
     radius = float(np.median(np.linalg.norm(offset - np.outer(offset @ up, up), axis=1)))
     least = STEEPEST * max(np.hypot(radius, height), spread)
@@ -195,14 +265,14 @@ def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:
 
 
 def _level_axes(up: F64) -> tuple[F64, F64]:
-    """Two unit vectors at right angles to ``up`` and each other; up turns the first into the second."""
+    """Two unit vectors perpendicular to ``up``, which rotates the first into the second."""
     right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     right /= np.linalg.norm(right)
     return right, np.cross(up, right)
 
 
 def _azimuths(of_cameras: F64, frames: int) -> F64:
-    """(frames,) angles (rad) round the circle, or to and fro over the arc of the cameras."""
+    """Angles (frames,) in rad, all round the circle or to and fro over the arc of the cameras."""
     ordered = np.sort(of_cameras)
     gaps = np.diff(ordered, append=ordered[0] + 2.0 * np.pi)
     phase = 2.0 * np.pi * np.arange(frames) / frames
@@ -223,8 +293,9 @@ def _looking_at(K: F64, centre: F64, target: F64, up: F64, size: tuple[int, int]
 
 
 def _widening(circle: Callable[[float], list[Camera]], cameras: Sequence[Camera], X: F64) -> float:
-    """The first factor of the radius that keeps clear of X and shows enough of it; else, of those that keep
-    clear, the one that shows most; else the largest."""
+    """The first radius factor that is clear of X and shows enough of it; otherwise the clear one that shows
+    most.
+    """
     tree, nearest = scipy.spatial.cKDTree(X), [1 + len(X) // 1000]
 
     def distances(path: Sequence[Camera]) -> F64:
@@ -249,7 +320,7 @@ def _widening(circle: Callable[[float], list[Camera]], cameras: Sequence[Camera]
 
 
 def _share_in_view(camera: Camera, X: F64) -> float:
-    """Share of the points X (N, 3) that the camera has in its picture, hidden or not."""
+    """Share of the points X (N, 3) that project into the image, occluded or not."""
     x, y, z = camera.K @ (camera.R @ X.T + camera.t[:, None])
     width, height = camera.size
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -259,8 +330,7 @@ def _share_in_view(camera: Camera, X: F64) -> float:
 
 
 def _spline(centres: F64, place: F64) -> F64:
-    """Points (F, 3) at ``place`` (F,) in [0, n - 1] of the centripetal Catmull-Rom spline through centres
-    (n, 3), which it passes at whole numbers. It stands still between centres in one place."""
+    """Points (F, 3) at parameters ``place`` of the centripetal Catmull-Rom spline."""
     apart = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     differ = apart > 1e-9 * max(apart.sum(), float(np.abs(centres).max()))
     if not differ.any():
@@ -280,7 +350,9 @@ def _spline(centres: F64, place: F64) -> F64:
 
 
 def _evenly(centres: F64, turning: F64, frames: int) -> F64:
-    """(frames,) places on the spline at equal times; ``turning`` (n - 1,) rad between neighbours."""
+    """Spline parameters (frames,) at equal times; ``turning`` (n - 1,) is the rotation between neighbours in
+    rad.
+    """
     place = np.linspace(0.0, len(centres) - 1, STEPS * (len(centres) - 1) + 1)
     way = np.linalg.norm(np.diff(_spline(centres, place), axis=0), axis=1)
     turn = np.repeat(turning / STEPS, STEPS)

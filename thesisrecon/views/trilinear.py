@@ -1,11 +1,11 @@
-"""Section 1.3: the seed tensor, the tensor of a virtual camera, and where it takes matches.
+"""The trilinear tensor of virtual cameras (thesis, section 1.3; Avidan and Shashua 1997).
 
-Cameras P1 = [I 0], P2 = [a, a_4], P3 = [b, b_4] have the tensor T_i^jk = a_i^j b_4^k - a_4^j b_i^k. A third
-camera that turns and moves, [Rb, R b_4 + t], has
+Cameras P1 = [I 0], P2 = [a, a_4], P3 = [b, b_4] have the tensor T_i^jk = a_i^j b_4^k - a_4^j b_i^k. If the
+third camera rotates and moves to [Rb, R b_4 + t], the tensor becomes
 
     T'_i^jk = R_l^k T_i^jl + t^k a_i^j
 
-(Avidan and Shashua 1997): one tensor leads to all the others, and no camera or scene is ever made.
+One seed tensor gives all others; neither cameras nor scene points are needed.
 """
 
 from __future__ import annotations
@@ -31,11 +31,16 @@ from thesisrecon.views.virtual_camera import (
 
 @dataclass(frozen=True)
 class VirtualTensor:
-    """The tensor of two photographs and a camera: all that is needed to make its picture.
+    """The tensor of two images and a virtual camera.
 
-    ``T`` (3, 3, 3) = a_i^j b_4^k - a_4^j b_i^k with ``P2`` = [a, a_4] (3, 4) beside P1 = [I 0], in the frame
-    of :attr:`CalibratedPair.P2`; scales as they are, for signs and depths are read off them. ``K`` (3, 3) are
-    the intrinsics of the third camera.
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3)
+        a_i^j b_4^k - a_4^j b_i^k with its scale, which determines signs and depths.
+    P2 : ndarray (3, 4)
+        [a, a_4] beside P1 = [I 0], in the frame of :attr:`CalibratedPair.P2`.
+    K : ndarray (3, 3)
+        Intrinsics of the third camera.
     """
 
     T: F64
@@ -44,7 +49,7 @@ class VirtualTensor:
 
     @property
     def P3(self) -> F64:
-        """[b, b_4] (3, 4), the third camera with its scale: nine linear equations for each of its rows."""
+        """The third camera [b, b_4] (3, 4) with its scale, from nine linear equations per row."""
         design = np.zeros((3, 3, 4))
         design[:, :, 3] = self.P2[:, :3].T
         for i in range(3):
@@ -53,20 +58,41 @@ class VirtualTensor:
 
     @property
     def centre(self) -> F64:
-        """The third centre (4,), homogeneous."""
+        """Homogeneous centre (4,) of the third camera."""
         return camera_centre(self.P3)
 
     def swapped(self) -> VirtualTensor:
-        """The tensor <2, 1, 3> in the frame of the swapped pair."""
+        """Return the tensor <2, 1, 3> in the frame of the swapped pair.
+
+        Returns
+        -------
+        VirtualTensor
+            The tensor with the roles of the first two images exchanged.
+        """
         change = np.linalg.inv(np.vstack([self.P2, np.eye(4)[3]]))
         return VirtualTensor(_tensor(change[:3], self.P3 @ change), change[:3], self.K)
 
     def moved(self, rotation: F64, translation: F64, *, K: F64 | None = None) -> VirtualTensor:
-        """The tensor after a motion of the third camera from X_3 to R X_3 + t.
+        """Return the tensor after a motion of the third camera from X_3 to R X_3 + t.
 
-        ``rotation`` R (3, 3); ``translation`` t (3,) in units of the baseline; ``K`` the new intrinsics,
-        those of before by default. In pixels the motion is K R K_3^-1 and K t. Raises ``ValueError`` for
-        what is no rotation, translation or K.
+        Parameters
+        ----------
+        rotation : ndarray (3, 3)
+            R.
+        translation : ndarray (3,)
+            t in units of the baseline.
+        K : ndarray (3, 3), optional
+            New intrinsics; default: unchanged.
+
+        Returns
+        -------
+        VirtualTensor
+            The tensor; in pixels the motion is K R K_3^-1 and K t.
+
+        Raises
+        ------
+        ValueError
+            If the arguments are no rotation, translation or intrinsics.
         """
         require_rotation(rotation)
         require_translation(translation)
@@ -76,12 +102,21 @@ class VirtualTensor:
         T = np.einsum("kl,ijl->ijk", turn, self.T) + np.einsum("k,ji->ijk", shift, self.P2[:, :3])
         return VirtualTensor(T, self.P2, K)
 
-    def lines_across(self, xy1: F64, xy2: F64) -> F64:
-        """Lines (..., 3) of view 2 through x2 at right angles to the epipolar lines of x1 (..., 2).
+    def perpendicular_lines(self, xy1: F64, xy2: F64) -> F64:
+        """Return lines in image 2 through x2, perpendicular to the epipolar lines of x1.
 
-        Of all lines through x2, the sums of the vertical and the horizontal one which two trilinearities
-        take, it is the one that says most: along its epipolar line nothing is to be learnt, and an x2 beside
-        that line is as good as its nearest place on it. Zero for the epipole.
+        Of all lines through x2 these carry the most information: an x2 off its epipolar line acts as its
+        nearest point on the line.
+
+        Parameters
+        ----------
+        xy1, xy2 : ndarray (..., 2)
+            Matches in pixels.
+
+        Returns
+        -------
+        ndarray (..., 3)
+            Lines; zero at the epipole.
         """
         epipolar = np.cross(self.P2[:, 3], homogenize(xy1) @ self.P2[:, :3].T)
         norm = np.linalg.norm(epipolar[..., :2], axis=-1, keepdims=True)
@@ -89,15 +124,24 @@ class VirtualTensor:
         return np.concatenate([along, -np.sum(along * xy2, axis=-1, keepdims=True)], axis=-1)
 
     def transfer(self, xy1: F64, xy2: F64, *, lines: F64 | None = None) -> tuple[F64, F64]:
-        """Pixels (N, 2) of the third view, x''^k = x^i l_j T_i^jk, and their inverse depth (N,), 1 / depth there.
+        """Transfer matches to the third image, x''^k = x^i l_j T_i^jk.
 
-        ``xy1``, ``xy2`` (N, 2) px are matches; ``lines`` (N, 3) of view 2 through the second,
-        :meth:`lines_across` by default; any line but the epipolar one does for exact matches. Depth is z in
-        the third camera, in baselines. NaN where the point is behind it; the inverse depth of a match beyond
-        infinity is negative.
+        Parameters
+        ----------
+        xy1, xy2 : ndarray (N, 2)
+            Matches in pixels.
+        lines : ndarray (N, 3), optional
+            Lines through x2 in image 2 other than epipolar lines; default: :meth:`lines_across`.
+
+        Returns
+        -------
+        xy : ndarray (N, 2)
+            Pixels of the third image, NaN behind the camera.
+        inverse_depth : ndarray (N,)
+            1 / z in the third camera (z in baselines); negative beyond infinity.
         """
         x = homogenize(xy1)
-        lines = self.lines_across(xy1, xy2) if lines is None else lines
+        lines = self.perpendicular_lines(xy1, xy2) if lines is None else lines
         places = np.einsum("ni,nj,ijk->nk", x, lines, self.T)
         # With X = (x, rho), l'(a x + rho a_4) = 0 and the places are -(l'a_4) (b x + rho b_4).
         sweep = lines @ self.P2[:, 3]
@@ -109,12 +153,21 @@ class VirtualTensor:
         return np.where(seen[:, None], dehomogenize(places), np.nan), inverse_depth
 
     def disparity_per_inverse_depth(self, xy1: F64, xy2: F64) -> F64:
-        """How many pixels of view 2 matches (N, 2), (N, 2) are displaced by where their inverse depth in the third
-        view changes by one (first order); (N,). NaN at the epipole.
+        """Return the displacement in image 2 per unit of inverse depth in the third view, to first order.
+
+        Parameters
+        ----------
+        xy1, xy2 : ndarray (N, 2)
+            Matches in pixels.
+
+        Returns
+        -------
+        ndarray (N,)
+            Pixels per unit of inverse depth; NaN at the epipole.
         """
         x = homogenize(xy1)
         a, a4 = x @ self.P2[:, :3].T, self.P2[:, 3]
-        lines, third = self.lines_across(xy1, xy2), self.P3[2]
+        lines, third = self.perpendicular_lines(xy1, xy2), self.P3[2]
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = -np.sum(lines * a, axis=1) / (lines @ a4)
             # x_2 = (a + rho a_4) / w_2, and the inverse depth is rho / w_3.
@@ -124,24 +177,65 @@ class VirtualTensor:
 
 
 def seed_of_two(pair: CalibratedPair) -> VirtualTensor:
-    """The tensor <1, 2, 2> of two views, the second being its own third: all that F knows, as a tensor."""
+    """Return the seed tensor <1, 2, 2> of two views, in which the second view is also the third.
+
+    Parameters
+    ----------
+    pair : CalibratedPair
+        The cameras.
+
+    Returns
+    -------
+    VirtualTensor
+        The tensor; it holds the same information as F.
+    """
     return VirtualTensor(_tensor(pair.P2, pair.P2), pair.P2, pair.K2)
 
 
 def seed_of_first(pair: CalibratedPair) -> VirtualTensor:
-    """The tensor <1, 2, 1> of two views, the first being the third: its inverse depth is that in view 1."""
+    """Return the tensor <1, 2, 1> of two views; its inverse depth is that in view 1.
+
+    Parameters
+    ----------
+    pair : CalibratedPair
+        The cameras.
+
+    Returns
+    -------
+    VirtualTensor
+        The tensor.
+    """
     return VirtualTensor(_tensor(pair.P2, np.eye(3, 4)), pair.P2, pair.K1)
 
 
 def seed_of_three(
     T: F64, xy1: F64, xy2: F64, *, K: tuple[F64, F64, F64], orientation: Orientation | None = None
 ) -> tuple[CalibratedPair, VirtualTensor]:
-    """The tensor <1, 2, 3> of three photographs in the frame of the first two cameras.
+    """Return the tensor <1, 2, 3> of three images in the frame of the first two cameras.
 
-    ``T`` (3, 3, 3) in pixels, of points and lines of three views; ``xy1``, ``xy2`` (N, 2) px matches of the
-    first two; ``K`` the intrinsics of the three. The plane at infinity is that of the first two cameras
-    (:func:`pair_from_fundamental`), the scale of the third that which makes its left part a rotation. Raises
-    as :func:`pair_from_fundamental`.
+    The plane at infinity is that of :func:`pair_from_fundamental`; the scale of the third camera makes
+    its left part a rotation.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3)
+        Trifocal tensor in pixels.
+    xy1, xy2 : ndarray (N, 2)
+        Matches of the first two images in pixels.
+    K : tuple of ndarray (3, 3)
+        Intrinsics of the three images.
+    orientation : Orientation, optional
+        Decomposition of the essential matrix.
+
+    Returns
+    -------
+    CalibratedPair, VirtualTensor
+        The first two cameras, and the tensor in their frame.
+
+    Raises
+    ------
+    ValueError, StageFailure
+        As :func:`pair_from_fundamental`.
     """
     require_finite("seed_of_three", T)
     require_intrinsics(K[2])

@@ -1,14 +1,8 @@
-"""The transfer of every pixel of a photograph by a tensor.
+"""View synthesis from two images by the trilinear tensor (thesis, section 1.3).
 
-Where the pixels are that only one of two photographs shows.
-
-What the other one does not see is hidden behind what it sees: of the surfaces around such a pixel the nearest
-one is taken that would not stand in front of anything there.
-
-Section 1.3: pictures of virtual cameras from two photographs and their dense correspondence.
-
-Every pixel is transferred by the tensor of the virtual camera and drawn there, nearer ones in front; the
-colours are those of both photographs. No surface is made, and no depth but the order of pixels is used.
+Every pixel is transferred by the tensor of the virtual camera and drawn there, nearer pixels in front. No
+surface is built. A pixel without correspondence is occluded in the other image; it takes the depth of the
+nearest surrounding surface that would not stand in front of anything the other image shows.
 """
 
 from __future__ import annotations
@@ -23,19 +17,30 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import B8, F32, F64, I16, I32, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.geometry.zbuffer import in_strips
+from thesisrecon.geometry.zbuffer import run_in_strips
 from thesisrecon.views.trilinear import VirtualTensor, seed_of_first, seed_of_two
 from thesisrecon.views.virtual_camera import CalibratedPair, VirtualCamera, cameras_along
-from thesisrecon.views.warping import DIRECTIONS, fill_holes, forward_map, sample
-from thesisrecon.views.warping_kernels import distances_to_known
+from thesisrecon.views.warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
 
 
 @njit(cache=True, nogil=True)
 def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_depth: F32) -> None:
-    """Where the third view sees the pixels (x, y), y from ``first`` on, with matches ``places`` (H, W, 2).
+    """Transfer the pixels of some rows to the third view, as :meth:`VirtualTensor.transfer` does.
 
-    Written are ``xy`` (H, W, 2) and ``inverse_depth`` (H, W), as ``VirtualTensor.transfer`` has them; NaN where a
-    match is.
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3)
+        Tensor.
+    P2 : ndarray (3, 4)
+        Second camera.
+    places : ndarray (H, W, 2)
+        Corresponding pixels in image 2, NaN if unknown.
+    first : int
+        Number of the first row.
+    xy : ndarray (H, W, 2)
+        Output: pixels of the third view, NaN if unknown.
+    inverse_depth : ndarray (H, W)
+        Output: inverse depth in the third view, NaN if unknown.
     """
     height, width = inverse_depth.shape
     for row in range(height):
@@ -71,13 +76,26 @@ def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_dep
 def guess_rows(
     inverse_depth: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32
 ) -> None:
-    """Nearness of all pixels of a photograph, into ``out`` (H, W): the known one, or that of a pixel around.
+    """Complete the inverse depth of the pixels of an image from the pixels around them.
 
-    ``inverse_depth`` of this photograph (H, W) and of the other (h, w), each in its own view, NaN = unknown;
-    ``P2`` (3, 4) the other camera; ``distance`` (K, H, W) how many of the ``steps`` (K, 2) (down, right) lead
-    to the next known pixel. Of these pixels the nearest is taken, unless its surface would stand in front of
-    what the other photograph sees by more than ``step``: such a one only where all do. NaN where there is
-    none.
+    Of the known pixels around, the nearest is taken whose surface would not stand in front of what the
+    other image shows; if all would, the nearest of all.
+
+    Parameters
+    ----------
+    inverse_depth : tuple of ndarray
+        Inverse depth of this image (H, W) and of the other (h, w), each in its own view, NaN if
+        unknown.
+    P2 : ndarray (3, 4)
+        The other camera.
+    steps : ndarray (K, 2)
+        Search directions (down, right).
+    distance : ndarray (K, H, W)
+        Steps to the next known pixel in each direction.
+    step : float
+        Tolerance of inverse depth.
+    out : ndarray (H, W)
+        The result, NaN if no pixel was found.
     """
     own, other = inverse_depth
     for y in range(own.shape[0]):
@@ -92,15 +110,15 @@ def guess_rows(
                     continue
                 reach = n * n * (steps[k, 0] ** 2 + steps[k, 1] ** 2)
                 rho = own[y + n * steps[k, 0], x + n * steps[k, 1]]
-                stands = _stands_before(other, P2, x, y, rho, step)
+                stands = _occludes(other, P2, x, y, rho, step)
                 if (before and not stands) or (before == stands and reach < least):
                     least, before = reach, stands
                     out[y, x] = rho
 
 
 @njit(cache=True, nogil=True)
-def _stands_before(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> bool:
-    """Whether the point of a pixel at an inverse depth is in front of what the other photograph sees there."""
+def _occludes(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> bool:
+    """Whether a pixel at an inverse depth lies in front of what the other image shows there."""
     u = P2[0, 0] * x + P2[0, 1] * y + P2[0, 2] + rho * P2[0, 3]
     v = P2[1, 0] * x + P2[1, 1] * y + P2[1, 2] + rho * P2[1, 3]
     w = P2[2, 0] * x + P2[2, 1] * y + P2[2, 2] + rho * P2[2, 3]
@@ -116,40 +134,49 @@ def _stands_before(other: F32, P2: F64, x: int, y: int, rho: float, step: float)
 Both32 = tuple[F32, F32]
 
 SURFACE_PX = 1.0
-"""Neighbours whose disparities between the photographs differ by more are not of one surface."""
+"""Largest difference of disparity between neighbouring pixels of one surface."""
 SPARSE = 16
-"""Every sixteenth pixel of every sixteenth row suffices for a median."""
+"""Subsampling step for medians."""
 
 
-def complete_places(pair: CalibratedPair, places: Both32, *, agree_px: float) -> tuple[Both32, tuple[B8, B8]]:
-    """Places of all pixels in the other photograph, and which of them are known, not guessed.
+def complete_correspondence(
+    pair: CalibratedPair, places: Both32, *, agree_px: float
+) -> tuple[Both32, tuple[B8, B8]]:
+    """Complete the correspondence of two images.
 
     Parameters
     ----------
-    pair : the cameras.
-    places : two (H, W, 2) px of the other photograph, NaN = unknown.
-    agree_px : a place is known where the way there and back ends no farther off; inf believes all there are.
+    pair : CalibratedPair
+        The cameras.
+    places : tuple of ndarray (H, W, 2)
+        Corresponding pixels in the other image, NaN if unknown.
+    agree_px : float
+        Tolerance of the forward-backward check; inf accepts all correspondences.
 
     Returns
     -------
-    Two (H, W, 2) float32 and two (H, W).
+    places : tuple of ndarray (H, W, 2)
+        Complete correspondences, float32.
+    known : tuple of ndarray (H, W)
+        Pixels whose correspondence is known, not guessed.
 
     Raises
     ------
-    StageFailure : where nothing of a photograph is known in the other.
+    StageFailure
+        If no pixel of an image has a known correspondence.
     """
     known = _agreeing(places[0], places[1], agree_px), _agreeing(places[1], places[0], agree_px)
     for side in (0, 1):
         if not known[side].any():
             raise StageFailure(
-                "the photographs have no dense correspondence",
-                f"no pixel of photograph {side + 1} is known in the other one",
-                "choose photographs that overlap more",
+                "the images have no dense correspondence",
+                f"no pixel of image {side + 1} has a known correspondence",
+                "choose images that overlap more",
             )
     pairs = pair, pair.swapped()
     sure = [np.where(known[side][..., None], places[side], np.nan) for side in (0, 1)]
     own = [seed_of_first(one) for one in pairs]
-    inverse_depth = [transfer_grid(own[side], sure[side])[1] for side in (0, 1)]
+    inverse_depth = [transfer_image(own[side], sure[side])[1] for side in (0, 1)]
     steps = [surface_step(own[side], sure[side]) for side in (0, 1)]
     complete = [
         _completed(pairs[side], sure[side], (inverse_depth[side], inverse_depth[1 - side]), steps[1 - side])
@@ -158,20 +185,50 @@ def complete_places(pair: CalibratedPair, places: Both32, *, agree_px: float) ->
     return (complete[0], complete[1]), known
 
 
-def transfer_grid(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
-    """:meth:`VirtualTensor.transfer` of all pixels with matches ``places`` (H, W, 2); (H, W, 2), (H, W)."""
+def transfer_image(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
+    """Transfer all pixels of image 1; see :meth:`VirtualTensor.transfer`.
+
+    Parameters
+    ----------
+    virtual : VirtualTensor
+        The tensor.
+    places : ndarray (H, W, 2)
+        Corresponding pixels in image 2.
+    threads : int
+        Number of threads.
+
+    Returns
+    -------
+    xy : ndarray (H, W, 2)
+        Pixels of the third view.
+    inverse_depth : ndarray (H, W)
+        Inverse depth in the third view.
+    """
     xy, inverse_depth = np.empty(places.shape), np.empty(places.shape[:2], dtype=np.float32)
 
     def work(rows: tuple[int, int]) -> None:
         part = slice(*rows)
         transfer_rows(virtual.T, virtual.P2, places[part], rows[0], xy[part], inverse_depth[part])
 
-    in_strips(work, len(places), threads)
+    run_in_strips(work, len(places), threads)
     return xy, inverse_depth
 
 
 def surface_step(virtual: VirtualTensor, places: F32) -> float:
-    """``SURFACE_PX`` in units of a camera's inverse depth, for the middle one of the pixels of view 1."""
+    """Convert ``SURFACE_PX`` to inverse depth of the third view, for the median pixel.
+
+    Parameters
+    ----------
+    virtual : VirtualTensor
+        The tensor.
+    places : ndarray (H, W, 2)
+        Corresponding pixels in image 2.
+
+    Returns
+    -------
+    float
+        Difference of inverse depth.
+    """
     known = np.isfinite(places[::SPARSE, ::SPARSE]).all(axis=2)
     y, x = (SPARSE * index for index in np.nonzero(known))
     pixels = np.stack([x, y], axis=1).astype(np.float64)
@@ -181,7 +238,7 @@ def surface_step(virtual: VirtualTensor, places: F32) -> float:
 
 
 def _agreeing(places: F32, others: F32, agree_px: float) -> B8:
-    """(H, W) where the partner's partner is the pixel."""
+    """Pixels (H, W) that pass the forward-backward check."""
     if np.isinf(agree_px):
         return np.asarray(np.isfinite(places).all(axis=2))
     height, width = others.shape[:2]
@@ -194,8 +251,7 @@ def _agreeing(places: F32, others: F32, agree_px: float) -> B8:
 
 
 def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32], step: float) -> F32:
-    """``places`` (H, W, 2) with guesses where NaN; ``inverse_depth`` of this photograph and the other, ``step`` of
-    the other one's surfaces."""
+    """``places`` (H, W, 2) with guesses for NaN, from the inverse depth of both images."""
     own = inverse_depth[0]
     distance = np.empty((len(DIRECTIONS), *own.shape), dtype=np.int16)
     distances_to_known(own, DIRECTIONS, distance)
@@ -209,19 +265,27 @@ def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32]
 
 
 AGREE_PX = 1.5
-"""Half a pixel of rounding, and a pixel of noise."""
+"""Tolerance of the forward-backward check: half a pixel of rounding and a pixel of noise."""
 LEAST_SEEN = 0.05
-"""Share of its picture that a virtual camera must have of what the photographs show."""
+"""Minimum share of the image that must show the scene."""
 
 
 @dataclass(frozen=True)
 class TensorSynthesis:
-    """Two photographs ready for view synthesis; make it by :func:`prepare_synthesis`.
+    """Two images prepared for view synthesis by :func:`prepare_synthesis`.
 
-    ``pair`` the cameras; ``seeds`` the tensors <1, 2, 2> and <2, 1, 2>, or those with a third photograph;
-    ``levels`` two (H, W, 4) float32, the colours and 1 where the place of the pixel is known, 0 where it is
-    guessed; ``places`` two (H, W, 2) px of the other photograph; ``gain`` (3,) what makes the second as
-    bright as the first.
+    Parameters
+    ----------
+    pair : CalibratedPair
+        The cameras.
+    seeds : tuple of VirtualTensor
+        The tensors <1, 2, 2> and <2, 1, 2>, or those with a third image.
+    levels : tuple of ndarray (H, W, 4)
+        Colours, and 1 where the correspondence is known, 0 where it is guessed.
+    places : tuple of ndarray (H, W, 2)
+        Corresponding pixels in the other image.
+    gain : ndarray (3,)
+        Factor of the exposure of the second image.
     """
 
     pair: CalibratedPair
@@ -232,22 +296,51 @@ class TensorSynthesis:
 
     @property
     def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """(width, height) of the photographs."""
+        """Width and height of both images."""
         (h1, w1), (h2, w2) = (levels.shape[:2] for levels in self.levels)
         return (w1, h1), (w2, h2)
 
     def along(self, frames: int, *, beyond: float = 0.0) -> list[VirtualCamera]:
-        """Cameras from the first photograph to the second and beyond; see :func:`cameras_along`."""
+        """Place virtual cameras on the baseline; see :func:`cameras_along`.
+
+        Parameters
+        ----------
+        frames : int
+            Number of cameras.
+        beyond : float
+            Extension at both ends, in baselines.
+
+        Returns
+        -------
+        list of VirtualCamera
+            The cameras.
+        """
         third = np.linalg.inv(self.seeds[0].K) @ self.seeds[0].P3
         R3 = scipy.spatial.transform.Rotation.from_matrix(third[:, :3] @ self.pair.K1).as_matrix()
         return cameras_along(self.pair, frames, sizes=self.sizes, beyond=beyond, third=(R3, third[:, 3]))
 
     def render(self, camera: VirtualCamera, *, threads: int = 1) -> U8:
-        """The picture (H, W, 3) of a virtual camera.
+        """Render the image of a virtual camera.
 
-        What both photographs see is mixed by how near the camera is to either, exposures likewise; what
-        neither sees is filled from behind. The same bytes whatever the number of threads. Raises
-        ``StageFailure`` where the camera sees next to nothing of the scene.
+        Pixels that both images show are blended by the position of the camera; what neither shows is
+        filled from behind.
+
+        Parameters
+        ----------
+        camera : VirtualCamera
+            The camera.
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        ndarray (H, W, 3) of uint8
+            The image.
+
+        Raises
+        ------
+        StageFailure
+            If the camera sees almost nothing of the scene.
         """
         moved = [seed.moved(camera.rotation, camera.translation, K=camera.K) for seed in self.seeds]
         step = surface_step(moved[0], self.places[0])
@@ -255,17 +348,16 @@ class TensorSynthesis:
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
         if not seen.mean() >= LEAST_SEEN:
             raise StageFailure(
-                "the virtual camera sees nothing of the scene that the photographs show",
+                "the virtual camera sees almost nothing of the scene",
                 f"{100.0 * seen.mean():.1f} % of its picture, needed {100.0 * LEAST_SEEN:.0f} %",
-                "it may be beyond the scene or look away: move it less (by baselines) or turn it back",
+                "move the camera less (in baselines) or rotate it back",
             )
         rgb, inverse_depth = self._mixed(layers, self._share_of_second(moved[0]), step)
         filled = fill_holes(rgb, inverse_depth, step=step)
         return np.asarray(np.clip(np.rint(filled), 0.0, 255.0), dtype=np.uint8)
 
     def _share_of_second(self, virtual: VirtualTensor) -> np.float32:
-        """How far along the baseline the camera is: 0 beside the first photograph, 1 beside the second, and
-        not beyond."""
+        """Position of the camera along the baseline, clipped to 0 (first image) and 1 (second image)."""
         centre, baseline = virtual.centre, self.pair.centre2
         along = np.linalg.solve(self.pair.K1, centre[:3]) @ baseline / (centre[3] * baseline @ baseline)
         return np.float32(np.clip(along, 0.0, 1.0))
@@ -273,13 +365,13 @@ class TensorSynthesis:
     def _layer(
         self, side: int, virtual: VirtualTensor, size: tuple[int, int], step: float, threads: int
     ) -> tuple[F32, F32]:
-        """What the camera sees of one photograph, (H, W, 4), and its inverse_depth (H, W); NaN where nothing."""
-        xy, inverse_depth = transfer_grid(virtual, self.places[side], threads=threads)
+        """The camera's view of one image (H, W, 4) and its inverse depth (H, W), NaN if empty."""
+        xy, inverse_depth = transfer_image(virtual, self.places[side], threads=threads)
         source, front = forward_map(xy, inverse_depth, size=size, step=step, threads=threads)
         return sample(self.levels[side], source, threads=threads), front
 
     def _mixed(self, layers: list[tuple[F32, F32]], share: np.float32, step: float) -> tuple[F32, F32]:
-        """Colours and inverse depth of both layers together; NaN where neither sees anything."""
+        """Blended colours and inverse depth of both layers, NaN where both are empty."""
         (first, near1), (second, near2) = layers
         of_second = _weight_of_second(layers, share, step)
         dark, bright = self.gain**-share, self.gain ** (1 - share)
@@ -290,11 +382,11 @@ class TensorSynthesis:
 
 
 def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: float) -> F32:
-    """(H, W) how much of the second photograph is in the mixture, 0 to 1; NaN where neither is.
+    """Blending weight (H, W) of the second image, NaN where both are empty.
 
-    ``share`` of it where both show the same. Where they differ the nearer surface is shown, as far as its
-    photograph is to be believed: fully from half the way on, not at all in the last quarter before the
-    other one, which would have shown it.
+    Where both show the same surface it is ``share``. Where they differ the nearer surface is shown,
+    fully in the half next to its own image and not at all in the last quarter before the other one,
+    which would have shown it.
     """
     (first, near1), (second, near2) = layers
     seen1, seen2 = np.isfinite(near1), np.isfinite(near2)
@@ -321,32 +413,43 @@ def prepare_synthesis(
     seed: VirtualTensor | None = None,
     agree_px: float = AGREE_PX,
 ) -> TensorSynthesis:
-    """What does not depend on the virtual camera.
+    """Prepare everything that does not depend on the virtual camera.
 
     Parameters
     ----------
-    pair : the cameras, guessed or known.
-    images : two (H, W, 3) levels 0 .. 255.
-    places : two (H, W, 2) px: where the pixels of the one photograph are in the other, NaN = unknown.
-    gain : (3,) what makes the second photograph as bright as the first.
-    seed : the tensor that virtual cameras move from: that of three photographs (:func:`seed_of_three`), or
-        <1, 2, 2> by default.
-    agree_px : places whose way there and back ends farther off are guessed anew, for what only one photograph
-        shows has no partner (:func:`complete_places`); inf where also these are right.
+    pair : CalibratedPair
+        The cameras, guessed or known.
+    images : tuple of array_like (H, W, 3)
+        Levels 0 to 255.
+    places : tuple of ndarray (H, W, 2)
+        Corresponding pixels in the other image, NaN if unknown.
+    gain : array_like (3,)
+        Factor of the exposure of the second image.
+    seed : VirtualTensor, optional
+        Tensor that virtual cameras start from; default <1, 2, 2>, or that of :func:`seed_of_three`.
+    agree_px : float
+        Tolerance of the forward-backward check; inf if all correspondences are right.
+
+    Returns
+    -------
+    TensorSynthesis
+        The prepared images.
 
     Raises
     ------
-    ValueError : for shapes that do not belong together.
-    StageFailure : where no place is known.
+    ValueError
+        If the shapes do not fit.
+    StageFailure
+        If no correspondence is known.
     """
     rgb = [np.asarray(image, dtype=np.float32) for image in images]
     for side, (image, there) in enumerate(zip(rgb, places, strict=True)):
         if image.ndim != 3 or image.shape[2] != 3 or there.shape != (*image.shape[:2], 2):
             raise ValueError(
-                f"photograph {side + 1} is (H, W, 3) with places (H, W, 2); got {image.shape} and "
+                f"image {side + 1} must be (H, W, 3) with places (H, W, 2); got {image.shape} and "
                 f"{there.shape}"
             )
-    complete, known = complete_places(pair, places, agree_px=agree_px)
+    complete, known = complete_correspondence(pair, places, agree_px=agree_px)
     levels = [
         np.concatenate([image, sure[..., None].astype(np.float32)], axis=2)
         for image, sure in zip(rgb, known, strict=True)

@@ -1,10 +1,8 @@
-"""Section 1.3: the two cameras that the seed of view synthesis is made of, from F and intrinsics.
+"""Two cameras from F and intrinsics, and virtual cameras along their baseline (thesis, section 1.3).
 
-Intrinsics are fixed to a guess where nothing better is known, as the thesis has it: the new views are then
-right up to a projective transform of space. The rotation between the two cameras is read off F, small as
-Avidan and Shashua (CVPR 1997, PAMI 1998) take it, or any.
-
-Virtual cameras of section 1.3, and their way along the baseline and beyond it.
+If the intrinsics are unknown they are guessed, as in the thesis; new views are then correct up to a
+projective transform of space. The rotation is taken from F, small as in Avidan and Shashua (CVPR 1997, PAMI
+1998) or general.
 """
 
 from __future__ import annotations
@@ -19,25 +17,43 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, rq
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, require_finite
-from thesisrecon.geometry.two_view import enforce_rank_two, epipoles, require_parallax, sampson_residuals
+from thesisrecon.geometry.two_view import (
+    enforce_rank_two,
+    epipoles,
+    require_parallax_of_matches,
+    sampson_residuals,
+)
 
 USUAL_FOCAL = 1.0
-"""Focal length over the long side of the picture: between a telephoto (2) and a wide-angle lens (0.6)."""
+"""Default focal length in units of the long side, between telephoto (2) and wide angle (0.6)."""
 LEAST_MATCHES = 8
 LARGEST_RESIDUAL = 0.005
-"""Median distance of matches from their epipolar lines, over the long side, beyond which F is not theirs."""
+"""Median distance of matches from their epipolar lines, in units of the long side, above which F is
+rejected."""
 RANK_ONE = 1e-9
 OFF_ROTATION = 1e-4
-"""Entries of R'R - I: of a rotation written with four digits."""
+"""Tolerance of R'R - I: a rotation written with four digits passes."""
 IN_FRONT = 0.75
-"""Share of matches in front of both cameras, the rotation being the right one."""
+"""Share of matches that must lie in front of both cameras."""
 
 
 @dataclass(frozen=True)
 class CalibratedPair:
-    """Two cameras, X_2 = R X_1 + t: ``K1``, ``K2``, ``R`` (3, 3), ``t`` (3,).
+    """Two calibrated cameras, X_2 = R X_1 + t. For two images |t| = 1 is the unit of length.
 
-    Of two photographs |t| is not to be known: it is the unit of length, 1.
+    Parameters
+    ----------
+    K1, K2 : ndarray (3, 3)
+        Intrinsics.
+    R : ndarray (3, 3)
+        Rotation from the first to the second camera frame.
+    t : ndarray (3,)
+        Translation.
+
+    Raises
+    ------
+    ValueError
+        If the arguments are no intrinsics, rotation or non-zero translation.
     """
 
     K1: F64
@@ -55,28 +71,34 @@ class CalibratedPair:
 
     @property
     def P2(self) -> F64:
-        """[a, a_4] = [K2 R K1^-1, K2 t] (3, 4) beside P1 = [I 0].
+        """The second camera [a, a_4] = [K2 R K1^-1, K2 t] (3, 4) beside P1 = [I 0].
 
-        Space is X_1 multiplied by K1, so that a point is (x, 1 / depth) for its pixel x in view 1, and a is
-        the homography of the plane at infinity.
+        Space points are K1 X_1, so a point is (x, 1 / depth) for its pixel x in view 1 and a is the
+        infinite homography.
         """
         return np.column_stack([self.K2 @ self.R @ np.linalg.inv(self.K1), self.K2 @ self.t])
 
     @property
     def centre2(self) -> F64:
-        """The second centre (3,) in the frame of the first camera."""
+        """Centre (3,) of the second camera in the frame of the first."""
         return np.asarray(-self.R.T @ self.t)
 
     def swapped(self) -> CalibratedPair:
-        """The same cameras in the other order."""
+        """Return the same cameras in the other order.
+
+        Returns
+        -------
+        CalibratedPair
+            The pair with the first and second camera exchanged.
+        """
         return CalibratedPair(self.K2, self.K1, self.R.T, self.centre2)
 
 
 class Orientation(Protocol):
-    """A way from an essential matrix to rotations and directions of the baseline."""
+    """Decomposition of an essential matrix into rotation and translation."""
 
     def candidates(self, E: F64) -> list[tuple[F64, F64]]:
-        """Pairs of R (3, 3) and unit t (3,) of E (3, 3)."""
+        """Candidate pairs of R (3, 3) and unit t (3,) of E (3, 3)."""
         ...
 
 
@@ -85,7 +107,18 @@ class AnyRotation:
     """The four decompositions of an essential matrix (HZ 9.6.2)."""
 
     def candidates(self, E: F64) -> list[tuple[F64, F64]]:
-        """R = U W V' or U W' V', t the last column of U or its opposite."""
+        """Decompose E into R = U W V' or U W' V' and t = +-u_3.
+
+        Parameters
+        ----------
+        E : ndarray (3, 3)
+            Essential matrix.
+
+        Returns
+        -------
+        list of tuple
+            R (3, 3) and unit t (3,).
+        """
         U, _, Vt = np.linalg.svd(E)
         quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         turns = [U @ W @ Vt for W in (quarter, quarter.T)]
@@ -95,14 +128,30 @@ class AnyRotation:
 
 @dataclass(frozen=True)
 class SmallRotation:
-    """R = I + [w]x to first order, as Avidan and Shashua take it (after Rousso et al., CVPR 1996).
+    """R = I + [w]x to first order, as in Avidan and Shashua (after Rousso et al., CVPR 1996).
 
-    E ~ [t]x (I + [w]x) is linear in the scale s of E and in s w: nine equations for four unknowns (least
-    squares). The rotation of the vector w is returned, for I + [w]x is none.
+    E ~ [t]x (I + [w]x) is linear in the scale s of E and in s w: nine equations for four unknowns. The
+    returned rotation is that of the rotation vector w.
     """
 
     def candidates(self, E: F64) -> list[tuple[F64, F64]]:
-        """One rotation, with t and its opposite."""
+        """Decompose E by least squares.
+
+        Parameters
+        ----------
+        E : ndarray (3, 3)
+            Essential matrix.
+
+        Returns
+        -------
+        list of tuple
+            The rotation with both signs of t.
+
+        Raises
+        ------
+        StageFailure
+            If no small rotation explains E.
+        """
         _, t = epipoles(E)
         across = cross_matrix(t)
         columns = [across, *(across @ cross_matrix(axis) for axis in np.eye(3))]
@@ -110,19 +159,33 @@ class SmallRotation:
         solution = np.linalg.lstsq(design, E.ravel(), rcond=None)[0]
         if not abs(solution[0]) > 1e-6 * np.linalg.norm(solution):
             raise StageFailure(
-                "the rotation between the two photographs is not small",
-                "no rotation near none explains the fundamental matrix",
-                "take the rotation for any instead",
+                "the rotation between the two images is not small",
+                "no small rotation explains the fundamental matrix",
+                "use AnyRotation",
             )
         R = scipy.spatial.transform.Rotation.from_rotvec(solution[1:] / solution[0]).as_matrix()
         return [(R, t), (R, -t)]
 
 
-def guessed_intrinsics(size: tuple[int, int], *, focal: float = USUAL_FOCAL) -> F64:
-    """K (3, 3) with square pixels, the principal point in the middle of ``size`` (width, height) and a focal
-    length of ``focal`` long sides.
+def default_intrinsics(size: tuple[int, int], *, focal: float = USUAL_FOCAL) -> F64:
+    """Return default intrinsics: square pixels, principal point in the image centre.
 
-    Raises ``ValueError`` for a focal length that is not positive.
+    Parameters
+    ----------
+    size : tuple of int
+        Width and height in pixels.
+    focal : float
+        Focal length in units of the long side.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        K.
+
+    Raises
+    ------
+    ValueError
+        If the focal length is not positive.
     """
     f = focal * max(size)
     return calibration_matrix(f, f, 0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0))
@@ -131,28 +194,34 @@ def guessed_intrinsics(size: tuple[int, int], *, focal: float = USUAL_FOCAL) -> 
 def pair_from_fundamental(
     F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64, orientation: Orientation | None = None
 ) -> CalibratedPair:
-    """The two cameras of F and its matches, seen through K1 and K2 (section 1.3).
+    """Compute the two cameras of F for given intrinsics (thesis, section 1.3).
+
+    The fundamental matrix of the result is F exactly. The first camera has K1; of all second cameras
+    that F allows, the left part is nearest to K2 R K1^-1 (least squares in coordinates of K2 and K1)
+    with R from the essential matrix. Its intrinsics differ from K2 as far as F contradicts them.
 
     Parameters
     ----------
-    F : (3, 3), x2' F x1 = 0.
-    xy1, xy2 : (N >= 8, 2) px matches that obey F; they say which camera looks where, and whether F is theirs.
-    K1, K2 : (3, 3) intrinsics, guessed (:func:`guessed_intrinsics`) or known.
-    orientation : :class:`AnyRotation` by default, or :class:`SmallRotation`.
+    F : ndarray (3, 3)
+        Fundamental matrix, x2' F x1 = 0.
+    xy1, xy2 : ndarray (N, 2)
+        At least eight matches in pixels that agree with F; they select the decomposition.
+    K1, K2 : ndarray (3, 3)
+        Intrinsics, known or guessed (:func:`guessed_intrinsics`).
+    orientation : Orientation, optional
+        Default :class:`AnyRotation`; or :class:`SmallRotation`.
 
     Returns
     -------
-    Cameras with a baseline of length 1 whose fundamental matrix is F exactly, so that both photographs agree
-    on every point. They have K1 and, of all second cameras that F allows, the one whose left part is nearest
-    to K2 R K1^-1 (least squares, in coordinates of K2 and K1) with R of the essential matrix: its K2 differs
-    from the given one as far as F contradicts the intrinsics.
+    CalibratedPair
+        Cameras with a baseline of length 1.
 
     Raises
     ------
     ValueError
-        Wrong shapes, numbers that are not finite, K that are no intrinsics.
+        For wrong shapes, non-finite values or invalid intrinsics.
     StageFailure
-        Too few matches, an F of rank 1 or of other matches, no parallax, and matches that lie behind the
+        For too few matches, an F of rank 1 or of other matches, no parallax, or points behind the
         cameras.
     """
     F, xy1, xy2 = _checked(F, xy1, xy2)
@@ -162,13 +231,13 @@ def pair_from_fundamental(
     E = K2.T @ F @ K1
     rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
     candidates = (orientation or AnyRotation()).candidates(E / np.linalg.norm(E))
-    shares = [share_in_front(R, t, rays1, rays2) for R, t in candidates]
+    shares = [ratio_in_front(R, t, rays1, rays2) for R, t in candidates]
     best = int(np.argmax(shares))
     if not shares[best] >= IN_FRONT:
         raise StageFailure(
-            "the scene is not in front of both photographs",
+            "the scene is not in front of both cameras",
             f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, for the best of {len(shares)} cameras",
-            "the fundamental matrix or the intrinsics are wrong; estimate them anew",
+            "check the fundamental matrix and the intrinsics",
         )
     return _pair_with(F, K1, K2, *candidates[best])
 
@@ -183,8 +252,8 @@ def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
     if not np.linalg.det(left) > 0.0:
         raise StageFailure(
             "the fundamental matrix contradicts the intrinsics",
-            "no second camera that it allows is near to one with these",
-            "give the focal length of the photographs, or none",
+            "no second camera that it allows is close to these intrinsics",
+            "set another focal length, or none",
         )
     own, turn = rq(left)
     baseline: F64 = np.asarray(np.linalg.solve(own, e2), dtype=np.float64)
@@ -193,9 +262,25 @@ def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
 
 
 def nearest_plane(a: F64, a4: F64, wanted: F64, *, K1: F64, K2: F64) -> tuple[float, F64]:
-    """m and v (3,) for which m (a + a_4 v') is nearest to ``wanted`` (3, 3): least squares of K2^-1 (.) K1.
+    """Find m and v for which m (a + a_4 v') is nearest to ``wanted``: least squares of K2^-1 (.) K1.
 
-    Of all planes that may play infinity it is the one that is where it would be in a metric frame.
+    Parameters
+    ----------
+    a : ndarray (3, 3)
+        Left part of the second camera.
+    a4 : ndarray (3,)
+        Epipole in image 2.
+    wanted : ndarray (3, 3)
+        Infinite homography to approximate.
+    K1, K2 : ndarray (3, 3)
+        Intrinsics.
+
+    Returns
+    -------
+    m : float
+        Scale.
+    v : ndarray (3,)
+        Plane at infinity of the metric frame.
     """
     back = np.linalg.inv(K2)
     members = [a, *(np.outer(a4, axis) for axis in np.eye(3))]
@@ -204,8 +289,23 @@ def nearest_plane(a: F64, a4: F64, wanted: F64, *, K1: F64, K2: F64) -> tuple[fl
     return float(m), np.asarray(mv) / m
 
 
-def share_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
-    """Share of the rays (N, 3), (N, 3) that meet, at their nearest, in front of both cameras."""
+def ratio_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
+    """Return the share of ray pairs that meet, at their closest points, in front of both cameras.
+
+    Parameters
+    ----------
+    R : ndarray (3, 3)
+        Rotation.
+    t : ndarray (3,)
+        Translation.
+    rays1, rays2 : ndarray (N, 3)
+        Corresponding rays.
+
+    Returns
+    -------
+    float
+        Share, 0 to 1.
+    """
     turned = rays1 @ R.T
     normal = np.cross(turned, rays2)
     first = -np.sum(np.cross(t, rays2) * normal, axis=1)
@@ -214,7 +314,18 @@ def share_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
 
 
 def require_rotation(R: F64) -> None:
-    """``ValueError`` unless R (3, 3) is a rotation: R'R = I, det R = 1, to ``OFF_ROTATION``."""
+    """Check that R is a rotation: R'R = I and det R = 1 within ``OFF_ROTATION``.
+
+    Parameters
+    ----------
+    R : ndarray (3, 3)
+        The matrix.
+
+    Raises
+    ------
+    ValueError
+        If it is not a rotation.
+    """
     R = np.asarray(R, dtype=np.float64)
     if R.shape != (3, 3) or not np.isfinite(R).all():
         raise ValueError(f"a rotation is a finite matrix (3, 3); got shape {R.shape}")
@@ -224,13 +335,35 @@ def require_rotation(R: F64) -> None:
 
 
 def require_translation(t: F64) -> None:
-    """``ValueError`` unless t is three finite numbers."""
+    """Check that t consists of three finite numbers.
+
+    Parameters
+    ----------
+    t : ndarray (3,)
+        The vector.
+
+    Raises
+    ------
+    ValueError
+        If it is not a translation.
+    """
     if np.shape(t) != (3,) or not np.isfinite(t).all():
         raise ValueError(f"a translation is three finite numbers; got {t}")
 
 
 def require_intrinsics(K: F64) -> None:
-    """``ValueError`` unless K (3, 3) is upper triangular with positive focals and K33 = 1."""
+    """Check that K is upper triangular with positive focal lengths and K33 = 1.
+
+    Parameters
+    ----------
+    K : ndarray (3, 3)
+        The matrix.
+
+    Raises
+    ------
+    ValueError
+        If it is not a matrix of intrinsics.
+    """
     K = np.asarray(K, dtype=np.float64)
     if K.shape != (3, 3) or not np.isfinite(K).all():
         raise ValueError(f"intrinsics are a finite matrix (3, 3); got shape {K.shape}")
@@ -248,15 +381,15 @@ def _checked(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64, F64]:
     require_finite("view synthesis, for its matches,", xy1, xy2)
     if len(xy1) < LEAST_MATCHES:
         raise StageFailure(
-            "the two photographs have too few matches",
+            "the two images have too few matches",
             f"{len(xy1)}, needed at least {LEAST_MATCHES}",
-            "choose photographs that overlap more",
+            "choose images that overlap more",
         )
     return F, xy1, xy2
 
 
 def _require_theirs(F: F64, xy1: F64, xy2: F64) -> None:
-    """Refuse an F without epipolar lines, matches that are not on them, and matches without parallax."""
+    """Reject an F of rank 1, matches that do not fit F, and matches without parallax."""
     s = np.linalg.svd(F, compute_uv=False)
     if not s[1] > RANK_ONE * s[0]:
         raise StageFailure(
@@ -268,20 +401,32 @@ def _require_theirs(F: F64, xy1: F64, xy2: F64) -> None:
     extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
     if not np.median(distance) <= LARGEST_RESIDUAL * extent:
         raise StageFailure(
-            "the fundamental matrix is not that of the matches",
-            f"half of them are more than {np.median(distance):.3g} px off their epipolar lines",
+            "the fundamental matrix does not fit the matches",
+            f"their median distance from the epipolar lines is {np.median(distance):.3g} px",
             "estimate it from these matches",
         )
-    require_parallax(F, xy1, xy2)
+    require_parallax_of_matches(F, xy1, xy2)
 
 
 @dataclass(frozen=True)
 class VirtualCamera:
-    """The third camera of the seed after a motion from X_3 to R X_3 + t: the second one's, where two
-    photographs are all there is.
+    """The third camera of the seed after a motion from X_3 to R X_3 + t.
 
-    ``rotation`` R (3, 3); ``translation`` t (3,) in baselines; ``K`` (3, 3) and ``size`` (width, height) of
-    its picture. Raises ``ValueError`` for what is no rotation, translation or K, and a size below 1 px.
+    Parameters
+    ----------
+    rotation : ndarray (3, 3)
+        R.
+    translation : ndarray (3,)
+        t in baselines.
+    K : ndarray (3, 3)
+        Intrinsics.
+    size : tuple of int
+        Width and height in pixels.
+
+    Raises
+    ------
+    ValueError
+        If the arguments are no rotation, translation or intrinsics, or the size is below 1 px.
     """
 
     rotation: F64
@@ -294,7 +439,7 @@ class VirtualCamera:
         require_translation(self.translation)
         require_intrinsics(self.K)
         if min(self.size) < 1:
-            raise ValueError(f"a picture is at least 1 x 1 px; got {self.size}")
+            raise ValueError(f"an image is at least 1 x 1 px; got {self.size}")
 
 
 def cameras_along(
@@ -305,14 +450,34 @@ def cameras_along(
     beyond: float = 0.0,
     third: tuple[F64, F64] | None = None,
 ) -> list[VirtualCamera]:
-    """``frames`` cameras from the first photograph to the second, and ``beyond`` baselines farther at both
-    ends.
+    """Place virtual cameras on the baseline from the first image to the second and beyond.
 
-    Centres are evenly spaced on the line of the baseline; rotations go on about their axis as from the first
-    to the second. Pictures have the second one's size (width, height); where ``sizes`` are equal K is
-    interpolated, else it is K2. One frame is the middle. ``third`` R (3, 3), t (3,) of the seed's third
-    camera, X_3 = R X_1 + t, by default the second one. Raises ``ValueError`` for no frame, and for a
-    ``beyond`` that is negative or no number.
+    Centres are equally spaced on the baseline; the rotation continues about its axis. K is interpolated
+    if both sizes are equal, otherwise it is K2. One frame is the middle.
+
+    Parameters
+    ----------
+    pair : CalibratedPair
+        The cameras.
+    frames : int
+        Number of cameras, at least 1.
+    sizes : tuple
+        Width and height of both images; views have the size of the second.
+    beyond : float
+        Extension at both ends, in baselines.
+    third : tuple of ndarray, optional
+        R (3, 3) and t (3,) of the third camera of the seed, X_3 = R X_1 + t; default: the second
+        camera.
+
+    Returns
+    -------
+    list of VirtualCamera
+        The cameras.
+
+    Raises
+    ------
+    ValueError
+        If ``frames`` is below 1 or ``beyond`` is negative or not finite.
     """
     if frames < 1:
         raise ValueError(f"a path needs at least one frame; got {frames}")
@@ -329,7 +494,24 @@ def camera_at(
     sizes: tuple[tuple[int, int], tuple[int, int]],
     third: tuple[F64, F64] | None = None,
 ) -> VirtualCamera:
-    """The camera at ``s`` baselines from the first photograph to the second; see :func:`cameras_along`."""
+    """Place one virtual camera on the baseline; see :func:`cameras_along`.
+
+    Parameters
+    ----------
+    pair : CalibratedPair
+        The cameras.
+    s : float
+        Position in baselines from the first image (0) to the second (1).
+    sizes : tuple
+        Width and height of both images.
+    third : tuple of ndarray, optional
+        R (3, 3) and t (3,) of the third camera of the seed; default: the second camera.
+
+    Returns
+    -------
+    VirtualCamera
+        The camera.
+    """
     turned = scipy.spatial.transform.Rotation.from_rotvec(
         s * scipy.spatial.transform.Rotation.from_matrix(pair.R).as_rotvec()
     ).as_matrix()

@@ -1,26 +1,354 @@
-"""Forward warping: the pixels of a photograph at other places, what is nearer in front of what is farther.
+"""Forward warping of an image, nearer pixels in front (thesis, sections 1.2 and 1.3).
 
-Both ways of section 1 need it: interpolation (1.2) moves pixels along their rows, the trilinear tensor (1.3)
-anywhere. Instead of walking through the photograph in an order that lets nearer pixels overwrite farther ones
-(McMillan and Bishop 1995), the inverse depth of every pixel is compared: the same picture, whatever the order.
+McMillan and Bishop (1995) order the pixels so that nearer ones overwrite farther ones. Here the inverse
+depth of each pixel is compared, which gives the same image in any order. Each kernel has a NumPy twin in the tests.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
-from thesisrecon.arrays import F32, F64
-from thesisrecon.geometry.zbuffer import in_strips
-from thesisrecon.views.warping_kernels import distances_to_known, draw_surface, fill_from_behind, sample_at
+from thesisrecon.arrays import F32, F64, I16, I32
+from thesisrecon.geometry.raster import cubic_weights
+from thesisrecon.geometry.zbuffer import run_in_strips
+
+SLACK = 1e-7
+"""Barycentric distance by which a triangle reaches beyond its edges, so that no rounding opens a crack."""
+
+BEHIND = 0.4
+"""Pixels in this farther part of the range of inverse depth count as background; a single far pixel
+may be an outlier."""
+
+LEAST_AREA = 1e-9
+"""Twice the area (px^2) of the smallest triangle that is drawn."""
+
+
+@njit(cache=True, nogil=True)
+def _joined(target: F64, inverse_depth: F32, a: tuple[int, int], b: tuple[int, int], limits: F64) -> bool:
+    """Whether two neighbouring pixels belong to one surface; False if one has no position."""
+    # Comparisons with NaN are false.
+    near = abs(inverse_depth[a] - inverse_depth[b]) <= limits[0]
+    dx, dy = target[a[0], a[1], 0] - target[b[0], b[1], 0], target[a[0], a[1], 1] - target[b[0], b[1], 1]
+    return bool(near and abs(dx) <= limits[1] and abs(dy) <= limits[1])
+
+
+@njit(cache=True, nogil=True)
+def _draw_triangle(
+    target: F64,
+    inverse_depth: F32,
+    corners: tuple[int, int, int, int, int, int],
+    rows: tuple[int, int],
+    source: F32,
+    front: F32,
+) -> None:
+    """Draw the triangle of three source pixels, clockwise in the image; back faces are not drawn."""
+    ya, xa, yb, xb, yc, xc = corners
+    ax, ay = target[ya, xa, 0], target[ya, xa, 1]
+    bx, by = target[yb, xb, 0] - ax, target[yb, xb, 1] - ay
+    cx, cy = target[yc, xc, 0] - ax, target[yc, xc, 1] - ay
+    area = bx * cy - by * cx
+    if area < LEAST_AREA:
+        return
+    low_y, high_y = min(0.0, by, cy) + ay - SLACK, max(0.0, by, cy) + ay + SLACK
+    low_x, high_x = min(0.0, bx, cx) + ax - SLACK, max(0.0, bx, cx) + ax + SLACK
+    na = inverse_depth[ya, xa]
+    nb, nc = inverse_depth[yb, xb] - na, inverse_depth[yc, xc] - na
+    first, last = max(int(np.ceil(low_y)), rows[0]), min(int(np.floor(high_y)) + 1, rows[1])
+    left, right = max(int(np.ceil(low_x)), 0), min(int(np.floor(high_x)) + 1, front.shape[1])
+    for y in range(first, last):
+        for x in range(left, right):
+            px, py = x - ax, y - ay
+            b, c = (px * cy - py * cx) / area, (bx * py - by * px) / area
+            if b < -SLACK or c < -SLACK or b + c > 1.0 + SLACK:
+                continue
+            near = np.float32(na + b * nb + c * nc)
+            # The comparison is false only where something nearer is there.
+            if front[y, x] >= near:
+                continue
+            front[y, x] = near
+            source[y, x, 0] = xa + b * (xb - xa) + c * (xc - xa)
+            source[y, x, 1] = ya + b * (yb - ya) + c * (yc - ya)
+
+
+@njit(cache=True, nogil=True)
+def _slope(
+    target: F64, inverse_depth: F32, at: tuple[int, int], step: tuple[int, int], limits: F64, out: F64
+) -> int:
+    """Write the change of position and inverse depth per ``step``; return the number of neighbours used."""
+    height, width = inverse_depth.shape
+    ahead, behind = (at[0] + step[0], at[1] + step[1]), (at[0] - step[0], at[1] - step[1])
+    has_ahead = ahead[0] < height and ahead[1] < width and _joined(target, inverse_depth, at, ahead, limits)
+    has_behind = behind[0] >= 0 and behind[1] >= 0 and _joined(target, inverse_depth, at, behind, limits)
+    to, fro = (ahead if has_ahead else at), (behind if has_behind else at)
+    count = int(has_ahead) + int(has_behind)
+    for k in range(2):
+        out[k] = (target[to[0], to[1], k] - target[fro[0], fro[1], k]) / max(count, 1)
+    out[2] = (inverse_depth[to] - inverse_depth[fro]) / max(count, 1)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _draw_footprint(
+    surface: tuple[F64, F32],
+    at: tuple[int, int],
+    limits: F64,
+    rows: tuple[int, int],
+    picture: tuple[F32, F32],
+) -> None:
+    """Draw what a pixel covers, half a pixel to each side, moved as its neighbours are."""
+    target, inverse_depth = surface
+    source, front = picture
+    across, down = np.empty(3), np.empty(3)
+    n_across = _slope(target, inverse_depth, at, (0, 1), limits, across)
+    n_down = _slope(target, inverse_depth, at, (1, 0), limits, down)
+    if n_across == 2 and n_down == 2:
+        return
+    # A pixel without neighbours keeps its shape, as far as it is known.
+    if n_across == 0:
+        across[0], across[1] = (down[1], -down[0]) if n_down else (1.0, 0.0)
+    if n_down == 0:
+        down[0], down[1] = -across[1], across[0]
+    area = across[0] * down[1] - across[1] * down[0]
+    if area < LEAST_AREA:
+        return
+    tx, ty, near = target[at[0], at[1], 0], target[at[0], at[1], 1], inverse_depth[at]
+    reach_x = 0.5 * (abs(across[0]) + abs(down[0])) + SLACK
+    reach_y = 0.5 * (abs(across[1]) + abs(down[1])) + SLACK
+    first, last = max(int(np.ceil(ty - reach_y)), rows[0]), min(int(np.floor(ty + reach_y)) + 1, rows[1])
+    left, right = max(int(np.ceil(tx - reach_x)), 0), min(int(np.floor(tx + reach_x)) + 1, front.shape[1])
+    for y in range(first, last):
+        for x in range(left, right):
+            px, py = x - tx, y - ty
+            u = (px * down[1] - py * down[0]) / area
+            v = (across[0] * py - across[1] * px) / area
+            if abs(u) > 0.5 + SLACK or abs(v) > 0.5 + SLACK:
+                continue
+            here = np.float32(near + u * across[2] + v * down[2])
+            if front[y, x] >= here:
+                continue
+            front[y, x] = here
+            source[y, x, 0] = min(max(at[1] + u, 0.0), inverse_depth.shape[1] - 1.0)
+            source[y, x, 1] = min(max(at[0] + v, 0.0), inverse_depth.shape[0] - 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _beside(target: F64, a: tuple[int, int], reach: float, rows: tuple[int, int]) -> bool:
+    """Whether nothing that four pixels make can be seen in the rows: all lie farther from these on one side
+    than a pixel and its neighbours of one surface reach."""
+    least, most = np.inf, -np.inf
+    for y in range(a[0], min(a[0] + 2, target.shape[0])):
+        for x in range(a[1], min(a[1] + 2, target.shape[1])):
+            # A comparison with NaN is false.
+            least = target[y, x, 1] if target[y, x, 1] < least else least
+            most = target[y, x, 1] if target[y, x, 1] > most else most
+    return bool(most < rows[0] - reach - 1.0 or least > rows[1] + reach)
+
+
+@njit(cache=True, nogil=True)
+def draw_surface(
+    target: F64, inverse_depth: F32, limits: F64, rows: tuple[int, int], source: F32, front: F32
+) -> None:
+    """Draw the surface of an image's pixels into some rows of another view, nearest in front.
+
+    Four pixels around a point form two triangles, three connected ones form one; at discontinuities and
+    borders a pixel covers half a pixel to each side.
+
+    Parameters
+    ----------
+    target : ndarray (h, w, 2)
+        Position of each pixel in the view, NaN for none.
+    inverse_depth : ndarray (h, w)
+        Inverse depth, NaN for none.
+    limits : ndarray (2,)
+        Largest differences of inverse depth and of position (px) between neighbours of one surface.
+    rows : tuple of int
+        First and last row (exclusive) of the view.
+    source : ndarray (H, W, 2)
+        Output: position in the image shown at each pixel.
+    front : ndarray (H, W)
+        Output: its inverse depth, NaN if empty.
+    """
+    height, width = inverse_depth.shape
+    for y in range(height):
+        for x in range(width):
+            a = (y, x)
+            # What is nowhere has a NaN among these.
+            if np.isnan(inverse_depth[a] + target[y, x, 0] + target[y, x, 1]):
+                continue
+            if _beside(target, a, limits[1], rows):
+                continue
+            right = x + 1 < width and _joined(target, inverse_depth, a, (y, x + 1), limits)
+            below = y + 1 < height and _joined(target, inverse_depth, a, (y + 1, x), limits)
+            if x + 1 < width and y + 1 < height:
+                across = _joined(target, inverse_depth, (y + 1, x), (y + 1, x + 1), limits)
+                down = _joined(target, inverse_depth, (y, x + 1), (y + 1, x + 1), limits)
+                corner_a, corner_d = right and below, across and down
+                if corner_a:
+                    _draw_triangle(target, inverse_depth, (y, x, y, x + 1, y + 1, x), rows, source, front)
+                if corner_d:
+                    _draw_triangle(
+                        target, inverse_depth, (y + 1, x + 1, y + 1, x, y, x + 1), rows, source, front
+                    )
+                # These two reach over the diagonal that the others leave.
+                if right and down and not (corner_a and corner_d):
+                    _draw_triangle(target, inverse_depth, (y, x + 1, y + 1, x + 1, y, x), rows, source, front)
+                if below and across and not (corner_a and corner_d):
+                    _draw_triangle(target, inverse_depth, (y + 1, x, y, x, y + 1, x + 1), rows, source, front)
+            inner = right and below and x > 0 and y > 0
+            if not (
+                inner
+                and _joined(target, inverse_depth, a, (y, x - 1), limits)
+                and _joined(target, inverse_depth, a, (y - 1, x), limits)
+            ):
+                _draw_footprint((target, inverse_depth), a, limits, rows, (source, front))
+
+
+@njit(cache=True, nogil=True)
+def sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None:
+    """Sample rows of an image by cubic convolution; bilinear beside the border, NaN beside NaN.
+
+    Parameters
+    ----------
+    image : ndarray (h, w, C)
+        Levels.
+    source : ndarray (H, W, 2)
+        Positions in pixels.
+    rows : tuple of int
+        First and last row (exclusive).
+    out : ndarray (H, W, C)
+        The samples.
+    """
+    height, width, channels = image.shape
+    wx, wy = np.empty(4, np.float32), np.empty(4, np.float32)
+    for y in range(rows[0], rows[1]):
+        for x in range(source.shape[1]):
+            u, v = source[y, x, 0], source[y, x, 1]
+            if not (u >= -0.5 and v >= -0.5 and u <= width - 0.5 and v <= height - 0.5):
+                out[y, x] = np.nan
+                continue
+            x0 = min(max(int(np.floor(u)), 0), max(width - 2, 0))
+            y0 = min(max(int(np.floor(v)), 0), max(height - 2, 0))
+            inner = x0 >= 1 and y0 >= 1 and x0 + 2 < width and y0 + 2 < height
+            value = np.float32(np.nan)
+            if inner:
+                cubic_weights(u - x0, wx)
+                cubic_weights(v - y0, wy)
+            for c in range(channels):
+                if inner:
+                    value = np.float32(0.0)
+                    for k in range(4):
+                        row = image[y0 - 1 + k]
+                        value += wy[k] * (
+                            wx[0] * row[x0 - 1, c]
+                            + wx[1] * row[x0, c]
+                            + wx[2] * row[x0 + 1, c]
+                            + wx[3] * row[x0 + 2, c]
+                        )
+                if not inner or np.isnan(value):
+                    value = _linear(image, u, v, x0, y0, c)
+                out[y, x, c] = value
+
+
+@njit(cache=True, nogil=True)
+def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.float32:
+    """Bilinear, of the border pixel beyond it."""
+    x1, y1 = min(x0 + 1, image.shape[1] - 1), min(y0 + 1, image.shape[0] - 1)
+    s, t = min(max(u - x0, 0.0), 1.0), min(max(v - y0, 0.0), 1.0)
+    top = image[y0, x0, c] + s * (image[y0, x1, c] - image[y0, x0, c])
+    bottom = image[y1, x0, c] + s * (image[y1, x1, c] - image[y1, x0, c])
+    return np.float32(top + t * (bottom - top))
+
+
+@njit(cache=True, nogil=True)
+def distances_to_known(inverse_depth: F32, steps: I32, distance: I16) -> None:
+    """Count the steps from each pixel to the next known pixel in each direction.
+
+    Parameters
+    ----------
+    inverse_depth : ndarray (H, W)
+        Inverse depth, NaN if unknown.
+    steps : ndarray (K, 2)
+        Directions (down, right).
+    distance : ndarray (K, H, W)
+        Output: number of steps; 0 at known pixels, -1 if there is none.
+    """
+    height, width = inverse_depth.shape
+    for k in range(steps.shape[0]):
+        dy, dx = steps[k]
+        # From where the step leads to where it comes from.
+        for i in range(height):
+            y = height - 1 - i if dy > 0 or (dy == 0 and dx > 0) else i
+            for j in range(width):
+                x = width - 1 - j if dx > 0 else j
+                v, u = y + dy, x + dx
+                if not np.isnan(inverse_depth[y, x]):
+                    distance[k, y, x] = 0
+                elif 0 <= v < height and 0 <= u < width and distance[k, v, u] >= 0:
+                    distance[k, y, x] = distance[k, v, u] + 1
+                else:
+                    distance[k, y, x] = -1
+
+
+@njit(cache=True, nogil=True)
+def fill_from_behind(
+    rgb: F32, inverse_depth: F32, steps: I32, distance: I16, limits: tuple[float, float], out: F32
+) -> None:
+    """Fill holes with the colours of the background around them.
+
+    Parameters
+    ----------
+    rgb : ndarray (H, W, C)
+        Levels.
+    inverse_depth : ndarray (H, W)
+        Inverse depth, NaN at holes.
+    steps : ndarray (K, 2)
+        Directions (down, right).
+    distance : ndarray (K, H, W)
+        Steps to the next known pixel, from :func:`distances_to_known`.
+    limits : tuple of float
+        Tolerance of inverse depth and search radius (px).
+    out : ndarray (H, W, C)
+        The result; weights are 1 / distance^2, NaN where no direction leads to a known pixel.
+    """
+    reach = np.empty(steps.shape[0])
+    colors = np.empty(rgb.shape[2])
+    for y in range(rgb.shape[0]):
+        for x in range(rgb.shape[1]):
+            if not np.isnan(inverse_depth[y, x]):
+                continue
+            least, most, total = np.inf, -np.inf, 0.0
+            colors[:] = 0.0
+            for k in range(steps.shape[0]):
+                n = distance[k, y, x]
+                reach[k] = n * np.hypot(steps[k, 0], steps[k, 1]) if n > 0 else np.nan
+                if reach[k] <= limits[1]:
+                    least = min(least, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
+                    most = max(most, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
+            behind = least + max(limits[0], BEHIND * (most - least))
+            for k in range(steps.shape[0]):
+                if not reach[k] <= limits[1]:
+                    continue
+                n = distance[k, y, x]
+                v, u = y + n * steps[k, 0], x + n * steps[k, 1]
+                if inverse_depth[v, u] > behind:
+                    continue
+                weight = 1.0 / (reach[k] * reach[k])
+                total += weight
+                for c in range(colors.size):
+                    colors[c] += weight * rgb[v, u, c]
+            for c in range(colors.size):
+                out[y, x, c] = np.float32(colors[c] / total) if total > 0.0 else np.float32(np.nan)
+
 
 STRETCH = 3.0
-"""Pixels that neighbours of one surface come apart at most: what is stretched more is no surface."""
+"""Neighbouring pixels of one surface come at most this far apart (px)."""
 
 DIRECTIONS = np.array(
     [(a, b) for a in range(-2, 3) for b in range(-2, 3) if np.gcd(a, b) == 1], dtype=np.int32
 )
-"""Sixteen (down, right) in which holes look for what is around them."""
+"""Sixteen directions (down, right) in which known pixels around a hole are searched."""
 
 
 def forward_warp(
@@ -32,29 +360,39 @@ def forward_warp(
     step: float = np.inf,
     threads: int = 1,
 ) -> tuple[F32, F32]:
-    """A photograph as another view sees it whose places of all pixels are known.
+    """Warp an image to another view with known pixel positions.
 
-    The pixels are corners of small triangles, within which places are interpolated and colours sampled by
-    cubic convolution: exact to a fraction of a pixel where the photograph is linear. Neighbours are of one
-    surface where they come no more than 3 px apart and their inverse depth differs by no more than ``step``; at
-    cuts every pixel covers half a pixel to each side. Surfaces seen from behind are not drawn.
+    Pixels are corners of small triangles in which positions are interpolated and colours sampled by
+    cubic convolution. Neighbours belong to one surface if they come at most 3 px apart and their
+    inverse depth differs by at most ``step``; at discontinuities a pixel covers half a pixel to each
+    side. Back faces are not drawn.
 
     Parameters
     ----------
-    image : (h, w, C) levels, C >= 1.
-    target_xy : (h, w, 2) px where each pixel comes to lie, NaN = nowhere.
-    inverse_depth : (h, w) larger in front of smaller, in any unit: a disparity, an inverse depth; NaN = nowhere.
-    size : (width, height) of the picture.
-    step : greatest difference of the inverse depth of neighbours on one surface.
-    threads : draw strips of rows; the picture does not depend on them.
+    image : array_like (h, w, C)
+        Levels.
+    target_xy : ndarray (h, w, 2)
+        Position of each pixel in the view, NaN for none.
+    inverse_depth : ndarray (h, w)
+        Larger values are in front, in any unit (a disparity, for example); NaN for none.
+    size : tuple of int
+        Width and height of the view.
+    step : float
+        Largest difference of inverse depth of neighbours on one surface.
+    threads : int
+        Number of threads; the result does not depend on it.
 
     Returns
     -------
-    (H, W, C) and the inverse depth (H, W) of what is seen, both float32, NaN where nothing lands.
+    colors : ndarray (H, W, C) of float32
+        Levels, NaN where nothing lands.
+    front : ndarray (H, W) of float32
+        Inverse depth of the visible pixel, NaN where nothing lands.
 
     Raises
     ------
-    ValueError : for shapes that do not belong together, sizes below one pixel and a negative step.
+    ValueError
+        For shapes that do not fit, a size below one pixel or a negative step.
     """
     levels = np.ascontiguousarray(image, dtype=np.float32)
     if levels.ndim != 3 or levels.shape[:2] != np.shape(inverse_depth):
@@ -74,9 +412,32 @@ def forward_map(
     step: float = np.inf,
     threads: int = 1,
 ) -> tuple[F32, F32]:
-    """Which place (H, W, 2) of a photograph each pixel of another view sees, and its inverse depth (H, W).
+    """Compute which position of an image each pixel of another view shows.
 
-    Arguments, NaN and errors as in :func:`forward_warp`, for several images of the same places.
+    Parameters
+    ----------
+    target_xy : ndarray (h, w, 2)
+        Position of each pixel in the view, NaN for none.
+    inverse_depth : ndarray (h, w)
+        Larger values are in front; NaN for none.
+    size : tuple of int
+        Width and height of the view.
+    step : float
+        Largest difference of inverse depth of neighbours on one surface.
+    threads : int
+        Number of threads.
+
+    Returns
+    -------
+    source : ndarray (H, W, 2) of float32
+        Position in the image, NaN where nothing lands.
+    front : ndarray (H, W) of float32
+        Inverse depth, NaN where nothing lands.
+
+    Raises
+    ------
+    ValueError
+        For shapes that do not fit, a size below one pixel or a negative step.
     """
     target = np.ascontiguousarray(target_xy, dtype=np.float64)
     near = np.ascontiguousarray(inverse_depth, dtype=np.float32)
@@ -89,40 +450,62 @@ def forward_map(
     source = np.full((size[1], size[0], 2), np.nan, dtype=np.float32)
     front = np.full((size[1], size[0]), np.nan, dtype=np.float32)
     limits = np.array([step, STRETCH])
-    in_strips(lambda rows: draw_surface(target, near, limits, rows, source, front), size[1], threads)
+    run_in_strips(lambda rows: draw_surface(target, near, limits, rows, source, front), size[1], threads)
     return source, front
 
 
 def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
-    """Cubic samples of ``image`` (h, w, C) at ``source_xy`` (H, W, 2) px; (H, W, C) float32, NaN where it is
-    NaN or more than half a pixel outside.
+    """Sample an image by cubic convolution.
 
-    Beside the border and where one of the sixteen pixels around is NaN bilinear, NaN where one of four is.
+    Beside the border and beside NaN pixels the samples are bilinear.
+
+    Parameters
+    ----------
+    image : array_like (h, w, C)
+        Levels.
+    source_xy : ndarray (H, W, 2)
+        Positions in pixels.
+    threads : int
+        Number of threads.
+
+    Returns
+    -------
+    ndarray (H, W, C) of float32
+        Samples, NaN at NaN positions and more than half a pixel outside.
     """
     levels = np.ascontiguousarray(image, dtype=np.float32)
     out = np.empty((*source_xy.shape[:2], levels.shape[2]), dtype=np.float32)
-    in_strips(lambda rows: sample_at(levels, source_xy, rows, out), len(out), threads)
+    run_in_strips(lambda rows: sample_at(levels, source_xy, rows, out), len(out), threads)
     return out
 
 
 def fill_holes(rgb: F32, inverse_depth: F32, *, step: float = 0.0, reach_px: float = np.inf) -> F32:
-    """The picture with its holes filled from what is behind them: what was hidden is background.
+    """Fill holes with the background around them, since what was occluded is background.
 
-    Of the nearest known pixels in sixteen directions those count that are behind: their inverse depth is at most
-    ``step``, or 0.4 of its range, above the least. Their colours are averaged, weighted by 1 / distance^2.
+    Of the nearest known pixels in sixteen directions those count whose inverse depth is at most
+    ``step``, or 0.4 of its range, above the smallest. Their colours are averaged with weights 1 /
+    distance^2.
 
     Parameters
     ----------
-    rgb, inverse_depth : (H, W, C) and (H, W) float32 of :func:`forward_warp`; NaN inverse depth = a hole.
-    reach_px : holes look no farther; with a finite reach some may stay.
+    rgb : ndarray (H, W, C) of float32
+        Levels.
+    inverse_depth : ndarray (H, W) of float32
+        Inverse depth; NaN marks a hole.
+    step : float
+        Tolerance of inverse depth.
+    reach_px : float
+        Search radius.
 
     Returns
     -------
-    (H, W, C) float32; NaN only where no known pixel is in reach.
+    ndarray (H, W, C) of float32
+        The image; NaN where no known pixel is in reach.
 
     Raises
     ------
-    ValueError : for shapes that do not belong together.
+    ValueError
+        For shapes that do not fit.
     """
     if rgb.ndim != 3 or rgb.shape[:2] != inverse_depth.shape:
         raise ValueError(
