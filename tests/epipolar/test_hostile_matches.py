@@ -12,7 +12,7 @@ from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.precision import epipolar_distance_interval, epipoles_of
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
-from thesisrecon.epipolar.row_parameterization import refine_sampson_by_rows
+from thesisrecon.epipolar.row_parameterization import refine_by_rows
 from thesisrecon.errors import StageFailure
 
 PAIR = make_pair(60, np.random.default_rng(0))
@@ -92,7 +92,7 @@ FUNCTIONS = {
     "gradient": lambda a, b: refine_sampson(PAIR.F, a, b),
     "epipolar distance": lambda a, b: refine_epipolar_distance(PAIR.F, a, b),
     "reprojection": lambda a, b: refine_reprojection(PAIR.F, a, b),
-    "rows": lambda a, b: refine_sampson_by_rows(PAIR.F, a, b),
+    "rows": lambda a, b: refine_by_rows(PAIR.F, a, b),
     "configuration": lambda a, b: classify_configuration(PAIR.F, a, b),
     "noise": lambda a, b: discard_outliers(PAIR.F, a, b),
 }
