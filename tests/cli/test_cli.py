@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thesisrecon.cli import main as cli
-from thesisrecon.cli.inspect import intrinsic_lines, time_taken
+from thesisrecon.cli import common
+from thesisrecon.cli import reconstruct as cli
+from thesisrecon.cli.inspect import _duration, _intrinsic_lines
 from thesisrecon.cli.main import run_command
 from thesisrecon.io import pair_list as demo
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
@@ -62,7 +63,7 @@ def killed_and_resumed(photographs):
     run = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     assert run.stderr == ""
-    assert f"{VIEWS} of {VIEWS} photographs registered" in run.stdout
+    assert f"{VIEWS} of {VIEWS} images registered" in run.stdout
     return out, kept
 
 
@@ -104,7 +105,7 @@ def kept_bytes(out):
 def test_the_preset_of_the_thesis_runs_to_the_end(photographs, tmp_path, capsys):
     out = tmp_path / "out"
     assert run_command(["reconstruct", str(photographs), "-o", str(out), "--preset", "thesis", *SMALL]) == 0
-    assert "photographs registered" in capsys.readouterr().out
+    assert "images registered" in capsys.readouterr().out
     summary = read(out / "summary.json")
     assert summary["registered"] >= 4
     assert summary["registered"] + len(summary["refused"]) == VIEWS
@@ -120,8 +121,8 @@ def truth_focal(truth):
 def test_inspect_prints_what_was_found(killed_and_resumed, capsys):
     assert run_command(["inspect", str(killed_and_resumed[0])]) == 0
     printed = capsys.readouterr().out
-    assert f"{VIEWS} of {VIEWS} photographs registered" in printed
-    assert "camera 0: focal" in printed
+    assert f"{VIEWS} of {VIEWS} images registered" in printed
+    assert "camera 0: focal length" in printed
 
 
 def test_an_early_end_prints_what_its_stage_found(photographs, tmp_path, capsys):
@@ -130,8 +131,8 @@ def test_an_early_end_prints_what_its_stage_found(photographs, tmp_path, capsys)
     for path in sorted(photographs.iterdir())[:2]:
         shutil.copy(path, few)
     wanted = {
-        "features": r"^\d{3,} corners in 2 photographs\n",
-        "matches": r"^1 of 1 pair of .*, \d\d+ verified",
+        "features": r"^\d{3,} corners in 2 images\n",
+        "matches": r"^1 of 1 image pair accepted, \d\d+ verified",
     }
     for until, words in wanted.items():
         arguments = ["reconstruct", str(few), "-o", str(out), "--until", until, "--max-size", "480"]
@@ -211,9 +212,9 @@ def test_the_focal_length_is_given_as_the_readme_says(photographs, tmp_path, mon
 
 def test_the_last_line_tells_the_time_of_this_run():
     whole = {"seconds": {"total": 40.0}, "elapsed_seconds": 41.5, "resumed": []}
-    assert time_taken(whole) == "41.5 s"
+    assert _duration(whole) == "41.5 s"
     again = {**whole, "elapsed_seconds": 1.5, "resumed": ["features"]}
-    assert time_taken(again) == "1.5 s (40.0 s with what was kept of an earlier run)"
+    assert _duration(again) == "1.5 s (40.0 s including cached stages)"
 
 
 def test_every_camera_has_a_line_with_what_was_estimated_of_it():
@@ -225,11 +226,11 @@ def test_every_camera_has_a_line_with_what_was_estimated_of_it():
         }
 
     square, other = view(0, 900.0, aspect=1.0), view(1, 800.0, aspect=1.2, skew_px=2.0)
-    lines = intrinsic_lines([square, square, other, {"camera": 0, "registered": False}])
+    lines = _intrinsic_lines([square, square, other, {"camera": 0, "registered": False}])
     assert len(lines) == 2
-    assert lines[0].startswith("camera 0: focal 900.0 +- 0.5 px")
+    assert lines[0].startswith("camera 0: focal length 900.0 ± 0.5 px")
     assert "aspect" not in lines[0]
-    assert lines[1].endswith("aspect 1.20000 +- 0.50000, skew 2.00 +- 0.50 px")
+    assert lines[1].endswith("aspect ratio 1.20000 ± 0.50000, skew 2.00 ± 0.50 px")
 
 
 def test_ctrl_c_says_how_to_go_on(photographs, tmp_path, monkeypatch, capsys):
@@ -238,19 +239,19 @@ def test_ctrl_c_says_how_to_go_on(photographs, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", interrupt)
     assert run_command(["reconstruct", str(photographs), "-o", str(tmp_path / "out")]) == 130
-    assert "the same command goes on" in capsys.readouterr().err
+    assert "repeat the command to continue" in capsys.readouterr().err
 
 
 def test_an_error_in_the_program_is_a_sentence_too(photographs, tmp_path, monkeypatch, capsys):
     def fail(*_, **__):
         raise IndexError("index 3 is out of bounds")
 
-    monkeypatch.delenv(cli.DEBUG_VARIABLE, raising=False)
+    monkeypatch.delenv(common.DEBUG_VARIABLE, raising=False)
     monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", fail)
     arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out")]
     assert run_command(arguments) == 1
     assert "IndexError: index 3" in capsys.readouterr().err
-    monkeypatch.setenv(cli.DEBUG_VARIABLE, "1")
+    monkeypatch.setenv(common.DEBUG_VARIABLE, "1")
     with pytest.raises(IndexError):
         run_command(arguments)
 
@@ -293,7 +294,7 @@ def test_a_list_of_pairs_is_read_matched_and_told(photographs, tmp_path, capsys)
     wish.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
     given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
     assert run_command([*given, "--pairs", str(wish)]) == 0
-    assert "of 2 pairs of photographs accepted (15 are possible)" in capsys.readouterr().out
+    assert "of 2 image pairs accepted (15 are possible)" in capsys.readouterr().out
     pairs = json.loads((out / "summary.json").read_text(encoding="utf-8"))["pairs"]
     assert (pairs["matched"], pairs["possible"], pairs["chosen_by"]) == (2, 15, "the listed pairs")
     assert "2 of 15 pairs were tried: the listed pairs." in (out / "report.html").read_text(encoding="utf-8")

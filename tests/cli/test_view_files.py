@@ -1,4 +1,4 @@
-"""``thesisrecon views`` on a small run made by hand: the painted sphere and the cameras around it."""
+"""``thesisrecon render`` on a small run made by hand: the painted sphere and the cameras around it."""
 
 import json
 import shutil
@@ -10,7 +10,7 @@ import pytest
 
 from tests.surface.sphere import SHAPE, photograph, ring_of
 from thesisrecon.cli.main import run_command
-from thesisrecon.cli.view_files import ViewWishes, write_views
+from thesisrecon.cli.view_files import RenderOptions, render_run
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.io.files import write_json
@@ -79,10 +79,10 @@ def difference_from_photograph(frame, view):
 
 
 def test_interpolation_begins_and_ends_as_the_photographs(run, capsys):
-    assert run_command(["views", str(run), "--path", "interpolate", "--frames", "5", "--threads", "2"]) == 0
+    assert run_command(["render", str(run), "--path", "interpolate", "--frames", "5", "--threads", "2"]) == 0
     folder = run / "views" / "interpolate"
     said = capsys.readouterr()
-    assert said.out == f"5 pictures of 160 x 120 px and interpolate.webp are in {folder}\n"
+    assert said.out == f"5 frames of 160 x 120 px and interpolate.webp written to {folder}\n"
     assert said.err == ""
     names = sorted(path.name for path in folder.iterdir())
     assert names == [*(f"frame-000{k}.png" for k in range(1, 6)), "frames.json", "interpolate.webp"]
@@ -98,7 +98,7 @@ def test_interpolation_begins_and_ends_as_the_photographs(run, capsys):
 
 
 def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(run, tmp_path):
-    wanted = ["views", str(run), "--path", "orbit", "--frames", "6", "--size", "120x80"]
+    wanted = ["render", str(run), "--path", "orbit", "--frames", "6", "--size", "120x80"]
     wanted += ["--background", "#102030"]
     for threads in ("1", "2"):
         assert run_command([*wanted, "-o", str(tmp_path / threads), "--threads", threads]) == 0
@@ -120,7 +120,7 @@ def test_light_changes_the_colours_and_a_bare_model_is_lit(run, tmp_path):
     mean = {}
     for light in ("none", "camera", "sun"):
         folder = tmp_path / light
-        assert run_command(["views", str(run), "--frames", "1", "--light", light, "-o", str(folder)]) == 0
+        assert run_command(["render", str(run), "--frames", "1", "--light", light, "-o", str(folder)]) == 0
         mean[light] = pixels(folder / "frame-0001.png")
     assert np.abs(mean["none"] - mean["camera"]).mean() > 1
     assert np.abs(mean["sun"] - mean["camera"]).mean() > 1
@@ -129,13 +129,13 @@ def test_light_changes_the_colours_and_a_bare_model_is_lit(run, tmp_path):
         np.array([[0, 1, 2], [3, 2, 1], [4, 6, 5], [7, 5, 6], [0, 4, 1], [5, 1, 4]]),
     )
     write_mesh(run / "model.glb", cube)
-    assert run_command(["views", str(run), "--frames", "2", "-o", str(tmp_path / "cube")]) == 0
+    assert run_command(["render", str(run), "--frames", "2", "-o", str(tmp_path / "cube")]) == 0
     shown = pixels(tmp_path / "cube" / "frame-0001.png")[..., 0]
     assert len(np.unique(shown)) > 5
 
 
 def test_a_shorter_command_leaves_none_of_the_frames_before(run):
-    small = ["views", str(run), "--size", "40x30", "-o", str(run / "film"), "--frames"]
+    small = ["render", str(run), "--size", "40x30", "-o", str(run / "film"), "--frames"]
     assert run_command([*small, "4"]) == 0
     assert run_command([*small, "2", "--path", "interpolate"]) == 0
     names = sorted(path.name for path in (run / "film").iterdir())
@@ -157,8 +157,8 @@ def test_a_shorter_command_leaves_none_of_the_frames_before(run):
         (["-o", ""], "the folder has no name"),
     ],
 )
-def test_wrong_wishes_get_one_sentence(options, words, run, capsys):
-    assert run_command(["views", str(run), *options]) == 2
+def test_wrong_options_get_one_sentence(options, words, run, capsys):
+    assert run_command(["render", str(run), *options]) == 2
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
@@ -167,12 +167,12 @@ def test_wrong_wishes_get_one_sentence(options, words, run, capsys):
 
 def test_what_is_missing_is_named(run, tmp_path, capsys):
     def told(out):
-        assert run_command(["views", str(out)]) == 2
+        assert run_command(["render", str(out)]) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1
         return said
 
-    assert "holds no run; make one with thesisrecon reconstruct" in told(tmp_path / "nowhere")
+    assert "holds no run; create one with thesisrecon reconstruct" in told(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "holds no run" in told(tmp_path / "empty")
     (run / "cameras.json").rename(run / "other.json")
@@ -184,25 +184,25 @@ def test_what_is_missing_is_named(run, tmp_path, capsys):
     assert "without --until" in said
     reason = "No surface model was built: no depths were found; none of 4 views agrees with another."
     (run / "summary.json").write_text(json.dumps({"warnings": ["something else", reason]}))
-    assert f"found its cameras and no surface: {reason}" in told(run)
+    assert f"has cameras but no model: {reason}" in told(run)
 
 
 def test_a_folder_of_photographs_is_not_written_over(run, capsys):
     photographs = run / "photographs"
     photographs.mkdir()
     (photographs / "frame-0001.png").write_bytes(b"dear")
-    assert run_command(["views", str(run), "-o", str(photographs)]) == 2
-    assert "holds 'frame-0001.png', which is not of this command" in capsys.readouterr().err
+    assert run_command(["render", str(run), "-o", str(photographs)]) == 2
+    assert "contains 'frame-0001.png', which this command did not create" in capsys.readouterr().err
     assert (photographs / "frame-0001.png").read_bytes() == b"dear"
-    assert run_command(["views", str(run), "-o", str(photographs / "frame-0001.png")]) == 2
+    assert run_command(["render", str(run), "-o", str(photographs / "frame-0001.png")]) == 2
     assert "cannot be used" in capsys.readouterr().err
 
 
 def test_progress_is_told_to_its_end(run):
     heard = []
-    wishes = ViewWishes(frames=3, size=(40, 30))
-    written = write_views(run, run / "film", wishes, threads=2, progress=lambda *step: heard.append(step))
+    options = RenderOptions(frames=3, size=(40, 30))
+    written = render_run(run, run / "film", options, threads=2, progress=lambda *step: heard.append(step))
     assert heard == [("views", k, 4) for k in range(1, 5)]
     assert [path.is_file() for path in (*written.frames, written.animation)] == [True] * 4
     with pytest.raises(UsageError, match="unknown path"):
-        ViewWishes(path="spiral")
+        RenderOptions(path="spiral")

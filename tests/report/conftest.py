@@ -3,7 +3,7 @@ import shutil
 
 import pytest
 
-from tests.report.opened import ARGUMENTS
+from tests.report.synthetic import ARGUMENTS
 
 
 @pytest.fixture(scope="package")

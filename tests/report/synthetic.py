@@ -1,20 +1,43 @@
-"""A small made-up run: cameras on an arc before a curved, coloured wall, and all the page shows of it."""
+"""Runs made up for the report, a painted sphere with its model, and a page opened in a browser."""
 
 import dataclasses
+import io
+from functools import cache
 
 import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw
 
+from tests.surface.sphere import SHAPE, photograph, ring_of
+from tests.surface.sphere import K as SPHERE_K
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.records import IntrinsicInterval, MetricResult, Reconstruction, StageReport, Tracks, TwoView
+from thesisrecon.records import (
+    HeldOut,
+    IntrinsicInterval,
+    MetricResult,
+    Reconstruction,
+    StageReport,
+    Tracks,
+    TwoView,
+)
 from thesisrecon.report.data import ReportData, ReportImage
+from thesisrecon.surface.fusion import VolumetricFusion
+from thesisrecon.surface.mesh import simplify_mesh
+from thesisrecon.surface.texture_atlas import TextureAtlas
 
 SIZE = (480, 320)
+
+
 K = np.array([[520.0, 0.0, 231.0], [0.0, 520.0, 166.0], [0.0, 0.0, 1.0]])
+
+
 K1 = -0.03
+
+
 NOISE_PX = 0.3
+
+
 CONFIG = (
     '[features]\nkind = "corners"\n\n[matching]\n# a </script> in a comment must not hurt\nradius = 0.2\n'
 )
@@ -170,4 +193,106 @@ def _reports():
         ),
         StageReport("projective", 2.3, {"cameras": 8}, {"rms_px": 0.47}),
         StageReport("metric", 1.1, {"cameras": 8, "points": 1500}, {"rms_px": 0.42}),
+    )
+
+
+ARGUMENTS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    # The 3D views need WebGL; without a graphics card Chromium draws it in software only when told so.
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+
+
+class Witness:
+    """An opened page with all it complained of and asked for."""
+
+    def __init__(self, browser, path, width, *, drawn, script="", **context):
+        self.errors = []
+        self.requests = []
+        self.context = browser.new_context(viewport={"width": width, "height": 900}, **context)
+        self.page = self.context.new_page()
+        if script:
+            self.page.add_init_script(script)
+        self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("dialog", self._dialog)
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(path.as_uri())
+        for name in drawn:
+            self.page.wait_for_selector(f"#{name}[data-drawn]", timeout=60_000)
+
+    def _dialog(self, dialog):
+        self.errors.append(f"dialog {dialog.message}")
+        dialog.dismiss()
+
+    def pixels(self, selector):
+        """(H, W, 3) of an element as it is shown."""
+        shot = self.page.locator(selector).screenshot()
+        return np.asarray(PillowImage.open(io.BytesIO(shot)).convert("RGB"))
+
+
+SPHERE_SIZE = (SHAPE[1], SHAPE[0])
+
+
+SPHERE_NAMES = tuple(f"sphere {k} <b>.jpg" for k in range(8))
+
+
+@cache
+def sphere_model():
+    """The sphere in at most 6000 triangles with the texture of its photographs."""
+    mesh = simplify_mesh(VolumetricFusion().fuse(ring_of()), 6_000)
+    return TextureAtlas().texture(mesh, [photograph(m) for m in ring_of()])
+
+
+@cache
+def sphere_reconstruction():
+    maps = ring_of()
+    count = len(maps)
+    X = np.random.default_rng(2).normal(size=(300, 3))
+    X /= np.linalg.norm(X, axis=1, keepdims=True)
+    nothing = np.zeros(0, dtype=np.int64)
+    return Reconstruction(
+        stratum="metric",
+        P=np.stack([m.P for m in maps]),
+        X=homogenize(X),
+        registered=np.ones(count, dtype=bool),
+        valid=np.ones(len(X), dtype=bool),
+        inlier=np.zeros(0, dtype=bool),
+        tracks=Tracks(nothing, nothing, np.zeros((0, 2)), count, len(X)),
+        sizes=np.tile(np.array(SPHERE_SIZE), (count, 1)),
+        sigma_px=0.3,
+        reasons=("",) * count,
+        K=np.tile(SPHERE_K, (count, 1, 1)),
+        distortion=np.zeros((count, 3)),
+    )
+
+
+def sphere_run():
+    """The whole page of it: model, depth of all photographs but the last, the third held out."""
+    maps = ring_of()
+    rgb = [photograph(m).rgb for m in maps]
+    seen = np.isfinite(maps[2].depth)
+    shifted = np.roll(rgb[2], 1, axis=1)
+    return ReportData(
+        title="Sphere",
+        photographs=tuple(
+            ReportImage(name, SPHERE_SIZE, SPHERE_SIZE, pixels)
+            for name, pixels in zip(SPHERE_NAMES, rgb, strict=True)
+        ),
+        reports=(StageReport("dense", 2.0), StageReport("model", 1.0)),
+        config_text="",
+        summary={},
+        version="0.1.0",
+        metric=MetricResult(sphere_reconstruction(), ({},) * len(maps), {}, trusted=True),
+        model=sphere_model(),
+        depth_pictures={m.view: m.depth for m in maps[:-1]},
+        held_out=HeldOut(2, rgb[2], shifted, seen, psnr_db=27.3456, ssim=0.9123),
     )

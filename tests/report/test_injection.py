@@ -11,7 +11,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from tests.report.opened import Witness
+from tests.report.synthetic import Witness
 from thesisrecon.cli.main import run_command
 from thesisrecon.report.page import strip_page
 

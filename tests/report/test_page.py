@@ -1,3 +1,5 @@
+"""The page of a run, its data and figures of residuals, and the page of interpolated images."""
+
 import base64
 import dataclasses
 import hashlib
@@ -11,12 +13,20 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from tests.report.sphere_run import NAMES, sphere_run
-from tests.report.synthetic import made_up_run, projective_run
+from tests.report.synthetic import NOISE_PX, SPHERE_NAMES, Witness, made_up_run, projective_run, sphere_run
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.records import IntrinsicInterval, TexturedMesh
-from thesisrecon.report.data import ReportData, ReportImage
-from thesisrecon.report.page import render_report, write_report
+from thesisrecon.records import HeldOut, IntrinsicInterval, TexturedMesh
+from thesisrecon.report.data import (
+    BINS,
+    ReportData,
+    ReportImage,
+    common_limit_px,
+    histogram_shares,
+    reprojection_distances,
+    summarize_distances,
+    used_observations,
+)
+from thesisrecon.report.page import render_report, strip_page, write_report
 
 EVIL = [
     "<img src=x onerror=alert(1)>.jpg",
@@ -225,7 +235,7 @@ def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
     assert data.model is not None
     assert data.model.texture is not None
     texels = f"{data.model.texture.shape[1]} × {data.model.texture.shape[0]} texels"
-    for text in (texels, "27.3 dB", "0.912", html.escape(NAMES[2])):
+    for text in (texels, "27.3 dB", "0.912", html.escape(SPHERE_NAMES[2])):
         assert text in page
     assert "<b>.jpg" not in page
     assert render_report(sphere_run()) == page
@@ -293,3 +303,140 @@ def test_the_table_of_cameras_has_a_column_for_whatever_was_estimated():
     assert "1.0023 ± 0.0004" in page
     # At a quarter of the size: four times as much in the photograph.
     assert "2.0 ± 0.4" in page
+
+
+LEVELS = (20, 120, 220)
+
+
+def strip():
+    frames = [(f"picture <{k}>", np.full((60, 80, 3), level, np.uint8)) for k, level in enumerate(LEVELS)]
+    return strip_page("Between <a> and b", frames, notes=["all is well"])
+
+
+def test_names_are_escaped_and_nothing_is_loaded():
+    text = strip()
+    assert "Between &lt;a&gt; and b" in text
+    assert "picture <1>" not in text
+    assert "all is well." in text
+    assert 'src="http' not in text
+    with pytest.raises(ValueError, match="at least one"):
+        strip_page("nothing", [])
+
+
+@pytest.mark.browser
+def test_one_turns_through_the_pictures(browser, tmp_path):
+    path = tmp_path / "strip.html"
+    path.write_text(strip(), encoding="utf-8")
+    seen = Witness(browser, path, 900, drawn=())
+    assert abs(int(seen.pixels("#shown")[30, 40, 0]) - LEVELS[0]) < 4
+    seen.page.locator("#place").press("ArrowRight")
+    assert seen.page.inner_text("#told") == "picture <1>"
+    assert abs(int(seen.pixels("#shown")[30, 40, 0]) - LEVELS[1]) < 4
+    seen.page.click("#play")
+    for caption in ("picture <2>", "picture <0>"):
+        seen.page.locator("#told", has_text=caption).wait_for()
+    seen.page.click("#play")
+    assert seen.page.inner_text("#play") == "Play"
+    assert seen.errors == []
+    assert not [url for url in seen.requests if not url.startswith(("file:", "data:"))]
+    seen.context.close()
+
+
+def test_the_metric_reconstruction_goes_before_the_projective_one():
+    data, early = made_up_run(points=100), projective_run()
+    assert data.metric is not None
+    assert data.best_reconstruction is data.metric.reconstruction
+    assert early.best_reconstruction is early.reconstruction
+    assert dataclasses.replace(early, reconstruction=None).best_reconstruction is None
+
+
+def test_records_that_disagree_are_refused():
+    data = made_up_run(points=100)
+    with pytest.raises(ValueError, match="one camera per photograph"):
+        dataclasses.replace(data, photographs=data.photographs[:-1])
+    with pytest.raises(ValueError, match=r"colours must be \(100, 3\)"):
+        dataclasses.replace(data, colours=np.zeros((99, 3), dtype=np.uint8))
+    wrong = dataclasses.replace(data.pairs[0], j=99)
+    with pytest.raises(ValueError, match="pairs must name views"):
+        dataclasses.replace(data, pairs=[wrong])
+
+
+def test_intrinsics_are_told_in_pixels_of_the_file():
+    data = made_up_run(points=100)  # worked at a quarter of the size
+    assert data.metric is not None
+    working, original = data.metric.intrinsics[0], data.original_intrinsics[0]
+    assert original["focal_px"].value == pytest.approx(4 * working["focal_px"].value)
+    assert original["focal_px"].std == pytest.approx(4 * working["focal_px"].std)
+    # The middle of the file stays the middle: (x + 0.5) / s - 0.5.
+    assert original["principal_x_px"].value == pytest.approx(
+        4 * (working["principal_x_px"].value + 0.5) - 0.5
+    )
+    assert original["k1"] == working["k1"]
+    assert data.original_intrinsics[-1] == {}
+    assert dataclasses.replace(data, metric=None, colours=None).original_intrinsics == ({},) * 9
+
+
+def test_a_model_and_its_pictures_must_belong_to_the_run():
+    data = made_up_run(points=100)
+    mesh = TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))
+    assert dataclasses.replace(data, model=mesh).model is mesh
+    with pytest.raises(ValueError, match="model needs the metric reconstruction"):
+        dataclasses.replace(projective_run(), model=mesh)
+    with pytest.raises(ValueError, match="depth_pictures must name views below 9"):
+        dataclasses.replace(data, depth_pictures={9: np.ones((3, 4), dtype=np.float32)})
+    pixels = np.zeros((4, 6, 3), dtype=np.uint8)
+    compared = np.zeros((4, 6), dtype=bool)
+    compared[:2] = True
+    assert HeldOut(0, pixels, pixels, compared, 30.0, 0.9).share == 0.5
+    with pytest.raises(ValueError, match="of one size"):
+        HeldOut(0, pixels, pixels[:3], compared, 30.0, 0.9)
+
+
+def test_the_residuals_are_the_noise_that_was_added():
+    data = made_up_run(points=1500)
+    assert data.metric is not None
+    reconstruction = data.metric.reconstruction
+    distances = reprojection_distances(reconstruction)
+    assert len(distances[-1]) == 0  # the last view is not registered
+    assert sum(map(len, distances)) == len(used_observations(reconstruction))
+    summary = summarize_distances(np.concatenate(distances))
+    assert summary is not None
+    # Two independent coordinates make a Rayleigh distribution: RMS sqrt(2) sigma, median sigma sqrt(2 ln 2).
+    assert summary.rms_px == pytest.approx(np.sqrt(2) * NOISE_PX, rel=0.03)
+    assert summary.median_px == pytest.approx(np.sqrt(2 * np.log(2)) * NOISE_PX, rel=0.03)
+
+
+def test_only_inliers_of_registered_views_and_valid_points_count():
+    data = made_up_run(points=200)
+    assert data.metric is not None
+    before = data.metric.reconstruction
+    after = dataclasses.replace(before, valid=np.arange(200) < 100)
+    used = used_observations(after)
+    assert before.inlier[used].all()
+    assert before.registered[before.tracks.view_index[used]].all()
+    assert (before.tracks.point_index[used] < 100).all()
+    assert len(used_observations(dataclasses.replace(before, inlier=np.zeros_like(before.inlier)))) == 0
+
+
+def test_without_distortion_the_projective_residuals_grow_by_what_it_moved():
+    reconstruction = projective_run().reconstruction
+    assert reconstruction is not None
+    summary = summarize_distances(np.concatenate(reprojection_distances(reconstruction)))
+    assert summary is not None
+    assert summary.rms_px > 2 * NOISE_PX
+
+
+def test_histogram_holds_every_distance():
+    distances = np.array([0.0, 0.1, 0.49, 0.5, 7.0])
+    shares = histogram_shares(distances, 0.5)
+    assert len(shares) == BINS
+    assert shares.sum() == pytest.approx(1.0)
+    assert shares[-1] == pytest.approx(3 / 5)  # 0.49, 0.5 and the one beyond
+    assert histogram_shares(np.zeros(0), 1.0).sum() == 0
+
+
+def test_common_limit_is_round_and_covers_the_distances():
+    assert common_limit_px(np.full(100, 0.31)) == 0.5
+    assert common_limit_px(np.full(100, 250.2)) == 251.0
+    assert common_limit_px(np.zeros(0)) == 1.0
+    assert summarize_distances(np.zeros(0)) is None

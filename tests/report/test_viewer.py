@@ -1,18 +1,30 @@
-"""What the page tells its viewer of the model."""
+"""The viewer of the model and the page as a browser shows them."""
 
 import base64
+import dataclasses
 import io
 import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from PIL import Image as PillowImage
 
-from tests.report.sphere_run import NAMES, SIZE, sphere_model, sphere_reconstruction
+from tests.report.synthetic import (
+    SPHERE_NAMES,
+    SPHERE_SIZE,
+    Witness,
+    made_up_run,
+    sphere_model,
+    sphere_reconstruction,
+    sphere_run,
+)
+from tests.surface.sphere import SHAPE, K, photograph, ring_of
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report import viewer
 from thesisrecon.report.figures import upright_rotation
+from thesisrecon.report.page import write_report
 from thesisrecon.report.viewer import LEVELS, viewer_data
 
 
@@ -26,7 +38,7 @@ def upright():
 
 
 def data_of(mesh):
-    return viewer_data(mesh, sphere_reconstruction(), NAMES)
+    return viewer_data(mesh, sphere_reconstruction(), SPHERE_NAMES)
 
 
 def corners(data):
@@ -73,7 +85,7 @@ def test_a_model_with_colours_or_none_needs_no_texture():
 
 def test_the_viewer_stands_where_photographs_were_taken():
     data = data_of(sphere_model())
-    names = [f"{k + 1} · {name}" for k, name in enumerate(NAMES)]
+    names = [f"{k + 1} · {name}" for k, name in enumerate(SPHERE_NAMES)]
     assert [stand["name"] for stand in data["stands"]] == names
     turn = upright()
     for stand, P in zip(data["stands"], sphere_reconstruction().P, strict=True):
@@ -83,8 +95,8 @@ def test_the_viewer_stands_where_photographs_were_taken():
         np.testing.assert_allclose(ahead / np.linalg.norm(ahead), turn @ R[2], atol=1e-9)
         # Looking at the sphere from 3.8 away, the middle depth lies between its front and its back.
         assert 2.5 < np.linalg.norm(ahead) < 4.9
-        np.testing.assert_allclose(stand["field"], (SIZE[0] / 300.0, SIZE[1] / 300.0))
-    assert 0 <= data["start"] < len(NAMES)
+        np.testing.assert_allclose(stand["field"], (SPHERE_SIZE[0] / 300.0, SPHERE_SIZE[1] / 300.0))
+    assert 0 <= data["start"] < len(SPHERE_NAMES)
 
 
 def test_views_without_a_camera_are_no_stand():
@@ -92,7 +104,7 @@ def test_views_without_a_camera_are_no_stand():
     registered = reconstruction.registered.copy()
     registered[3] = False
     P = reconstruction.P * registered[:, None, None]
-    data = viewer_data(sphere_model(), replace(reconstruction, registered=registered, P=P), NAMES)
+    data = viewer_data(sphere_model(), replace(reconstruction, registered=registered, P=P), SPHERE_NAMES)
     assert [stand["name"][0] for stand in data["stands"]] == list("1235678")
 
 
@@ -126,3 +138,339 @@ def test_a_stray_does_not_take_the_resolution_of_the_rest():
     np.testing.assert_array_equal(
         corners(data_of(bare)), corners(data_of(replace(mesh, uv=None, texture=None)))
     )
+
+
+EVIL = [
+    "<img src=x onerror=alert(1)>.jpg",
+    "\"quote'&.png",
+    "</script><script>alert(2)</script>.jpg",
+    "c.jpg",
+]
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "report.html"
+    title = "<img src=x onerror=alert(9)>"
+    write_report(path, dataclasses.replace(made_up_run(names=EVIL, points=3000), title=title))
+    return path
+
+
+@pytest.fixture(scope="module", params=[1400, 420], ids=["desktop", "narrow"])
+def witness(request, browser, report):
+    opened = Witness(browser, report, request.param, drawn=("matrix-figure", "scene-figure"))
+    yield opened
+    opened.context.close()
+
+
+@pytest.mark.browser
+def test_nothing_complains_runs_or_reaches_out(witness):
+    witness.page.hover("#matrix-figure .nsewdrag")
+    assert witness.errors == []
+    assert all(url.startswith(("file:", "data:", "blob:")) for url in witness.requests)
+
+
+@pytest.mark.browser
+def test_the_canvas_shows_points_and_cameras(witness):
+    witness.page.wait_for_timeout(500)
+    pixels = witness.pixels("#scene-figure").astype(int)
+    ground = np.median(pixels.reshape(-1, 3), axis=0)
+    drawn = (np.abs(pixels - ground).max(axis=2) > 40).mean()
+    orange = ((pixels[..., 0] > 200) & (np.abs(pixels[..., 1] - 159) < 40) & (pixels[..., 2] < 110)).sum()
+    assert drawn > 0.01
+    assert orange > 50
+
+
+@pytest.mark.browser
+def test_the_matrix_is_drawn_in_colour(witness):
+    assert (np.ptp(witness.pixels("#matrix-figure"), axis=2) > 30).mean() > 0.2
+
+
+@pytest.mark.browser
+def test_names_are_shown_as_they_are(witness):
+    shown = witness.page.locator(".card .name").all_inner_texts()
+    assert [text.split(" ", 1)[1] for text in shown[: len(EVIL)]] == EVIL
+    assert witness.page.locator("h1").inner_text() == "<img src=x onerror=alert(9)>"
+    assert witness.page.locator("img[src='x']").count() == 0
+
+
+@pytest.mark.browser
+def test_the_page_is_no_wider_than_the_screen(witness):
+    width = witness.page.evaluate("document.documentElement.scrollWidth")
+    assert width <= witness.page.viewport_size["width"]
+
+
+@pytest.mark.browser
+def test_the_table_of_pairs_shows_its_last_column(witness):
+    overhang = witness.page.evaluate(
+        "(() => { const t = document.querySelector('.listing'); return t.scrollWidth - t.clientWidth; })()"
+    )
+    assert overhang <= 0
+
+
+@pytest.mark.browser
+def test_the_point_of_view_can_be_chosen(witness):
+    before = witness.pixels("#scene-figure")
+    witness.page.get_by_role("button", name="From above").click()
+    witness.page.wait_for_timeout(500)
+    after = witness.pixels("#scene-figure")
+    assert witness.errors == []
+    assert (before != after).any(axis=2).mean() > 0.005
+
+
+@pytest.mark.browser
+def test_the_numbers_of_the_cameras_unfold(witness):
+    table = witness.page.locator("#view details").first
+    table.locator("summary").click()
+    assert table.locator("tbody tr").count() == 3
+    assert "2081.4 ± 1.7" in table.inner_text()
+
+
+CANVAS = "#model-figure canvas"
+
+
+RECORD_VIEWS = """
+window.views = new Set();
+const before = WebGL2RenderingContext.prototype.uniformMatrix4fv;
+WebGL2RenderingContext.prototype.uniformMatrix4fv = function (place, turned, values) {
+  if (values[15] === 1) { views.add(values.join()); }
+  return before.call(this, place, turned, values);
+};
+"""
+
+
+WITHOUT_WEBGL = """
+const before = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+  return kind.startsWith("webgl") ? null : before.call(this, kind, ...rest);
+};
+"""
+
+
+@pytest.fixture(scope="module")
+def model_report(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "report.html"
+    write_report(path, sphere_run())
+    return path
+
+
+@pytest.fixture(scope="module", params=[1400, 420], ids=["desktop", "narrow"])
+def opened(request, browser, model_report):
+    model_page = Witness(
+        browser, model_report, request.param, drawn=("model-figure",), reduced_motion="reduce"
+    )
+    yield model_page
+    model_page.context.close()
+
+
+@pytest.fixture
+def model_page(opened):
+    opened.page.locator("#model-reset").click()
+    return opened
+
+
+def shown(model_page):
+    model_page.page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return model_page.pixels(CANVAS).astype(int)
+
+
+def where(picture):
+    """Row and column in the picture of every pixel of a photograph whose stand the viewer takes."""
+    height, width = picture.shape[:2]
+    side, up = (SHAPE[1] / 2 / K[0, 0], SHAPE[0] / 2 / K[1, 1])
+    field = max(up, side * height / width)
+    y, x = np.indices(SHAPE)
+    column = width / 2 * (1 + (x - K[0, 2]) / K[0, 0] / (field * width / height)) - 0.5
+    row = height / 2 * (1 + (y - K[1, 2]) / K[1, 1] / field) - 0.5
+    return np.rint(row).astype(int), np.rint(column).astype(int)
+
+
+def apart(one, two):
+    """Share of the pixels that differ clearly."""
+    return float((np.abs(one - two).max(axis=2) > 30).mean())
+
+
+def inner(view):
+    """The pixels of a photograph where the sphere is, off its rim."""
+    seen = np.isfinite(ring_of()[view].depth).astype(float)
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(seen, 3), (7, 7))
+    return np.asarray(near.min(axis=(2, 3)) > 0)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("view", [0, 3, 6])
+def test_where_a_photograph_was_taken_the_model_looks_like_it(model_page, view):
+    model_page.page.select_option("#model-stand", str(view))
+    picture = shown(model_page)
+    expected = photograph(ring_of()[view]).rgb.astype(int)
+    difference = picture[where(picture)] - expected
+    assert np.sqrt(np.mean(difference[inner(view)] ** 2)) < 14.0
+    ground = np.array([0x13, 0x1A, 0x22])
+    off = picture[where(picture)][:, [0, -1]]
+    assert np.abs(off - ground).max() <= 2
+
+
+@pytest.mark.browser
+def test_it_starts_at_a_photograph_and_comes_back_to_it(model_page):
+    start = shown(model_page)
+    model_page.page.get_by_role("button", name="Shape").click()
+    model_page.page.locator("#model").get_by_role("button", name="From above").click()
+    assert model_page.page.input_value("#model-stand") == ""
+    assert apart(shown(model_page), start) > 0.1
+    model_page.page.locator("#model-reset").click()
+    assert apart(shown(model_page), start) == 0.0
+    assert model_page.page.input_value("#model-stand") != ""
+
+
+@pytest.mark.browser
+def test_every_point_of_view_shows_all_of_the_model_in_its_middle(model_page):
+    pictures = []
+    for name in ("Behind the cameras", "From above", "From the left", "From the right"):
+        model_page.page.locator("#model").get_by_role("button", name=name).click()
+        picture = shown(model_page)
+        drawn = np.abs(picture - picture[2, picture.shape[1] // 2]).max(axis=2) > 12
+        rows, columns = (np.flatnonzero(drawn.any(axis=d)) for d in (1, 0))
+        height, width = drawn.shape
+        assert max(np.ptp(rows) / height, np.ptp(columns) / width) > 0.7
+        assert abs((rows[0] + rows[-1]) / height - 1.0) < 0.1
+        assert abs((columns[0] + columns[-1]) / width - 1.0) < 0.1
+        pictures.append(picture)
+    for k, one in enumerate(pictures):
+        assert all(apart(one, two) > 0.1 for two in pictures[:k])
+
+
+@pytest.mark.browser
+def test_shape_is_grey_and_texture_is_not(model_page):
+    coloured = np.ptp(shown(model_page), axis=2)
+    model_page.page.get_by_role("button", name="Shape").click()
+    grey = np.ptp(shown(model_page), axis=2)
+    middle = tuple(slice(n // 2 - n // 8, n // 2 + n // 8) for n in coloured.shape)
+    assert np.median(coloured[middle]) > 50
+    assert grey[middle].max() < 16
+    pressed = model_page.page.locator("button[data-paint][aria-pressed=true]")
+    assert pressed.all_inner_texts() == ["Shape"]
+    model_page.page.get_by_role("button", name="Texture").click()
+    assert np.median(np.ptp(shown(model_page), axis=2)[middle]) > 50
+
+
+@pytest.mark.browser
+def test_dragging_and_keys_turn_it(model_page):
+    start = shown(model_page)
+    box = model_page.page.locator(CANVAS).bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    model_page.page.mouse.move(x, y)
+    model_page.page.mouse.down()
+    model_page.page.mouse.move(x + 90, y + 20, steps=3)
+    model_page.page.mouse.up()
+    dragged = shown(model_page)
+    assert apart(dragged, start) > 0.1
+    model_page.page.mouse.move(x - 30, y)
+    assert apart(shown(model_page), dragged) == 0.0  # the button is up again
+    model_page.page.locator(CANVAS).focus()
+    for key in ("ArrowLeft", "ArrowUp", "+", "t"):
+        before = shown(model_page)
+        model_page.page.keyboard.press(key)
+        assert apart(shown(model_page), before) > 0.02, key
+    model_page.page.keyboard.press("Home")
+    model_page.page.locator(CANVAS).blur()  # the ring about what has the focus
+    assert apart(shown(model_page), start) == 0.0
+
+
+@pytest.mark.browser
+def test_the_wheel_moves_the_page_until_the_picture_was_clicked(model_page):
+    start = shown(model_page)
+    model_page.page.locator(CANVAS).hover()
+    before = model_page.page.evaluate("scrollY")
+    model_page.page.mouse.wheel(0, 200)
+    model_page.page.wait_for_timeout(500)
+    assert model_page.page.evaluate("scrollY") > before
+    assert apart(shown(model_page), start) == 0.0
+    model_page.page.locator(CANVAS).click()
+    scrolled = model_page.page.evaluate("scrollY")
+    model_page.page.mouse.wheel(0, 300)
+    assert apart(shown(model_page), start) > 0.05
+    assert model_page.page.evaluate("scrollY") == scrolled
+    model_page.page.locator("#model h2").click()
+    assert "awake" not in model_page.page.locator("#model-figure").get_attribute("class")
+
+
+@pytest.mark.browser
+def test_it_comes_back_after_the_graphics_card_was_lost(model_page):
+    start = shown(model_page)
+    model_page.page.evaluate(
+        f"""new Promise(function (done) {{
+          const canvas = document.querySelector("{CANVAS}");
+          const lose = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
+          canvas.addEventListener("webglcontextlost", function () {{
+            setTimeout(function () {{ lose.restoreContext(); }}, 50);
+          }});
+          canvas.addEventListener("webglcontextrestored", function () {{ setTimeout(done, 400); }});
+          lose.loseContext();
+        }})"""
+    )
+    assert apart(shown(model_page), start) == 0.0
+
+
+@pytest.mark.browser
+def test_nothing_complains_reaches_out_or_is_too_wide(model_page):
+    assert model_page.errors == []
+    assert all(url.startswith(("file:", "data:", "blob:")) for url in model_page.requests)
+    assert (
+        model_page.page.evaluate("document.documentElement.scrollWidth")
+        <= (model_page.page.viewport_size["width"])
+    )
+
+
+@pytest.mark.browser
+def test_pictures_of_depth_and_comparison_are_shown(model_page):
+    widths = model_page.page.evaluate(
+        "[...document.querySelectorAll('#depth img, #held-out img')].map(i => i.complete && i.naturalWidth)"
+    )
+    assert widths == [SHAPE[1]] * (7 + 3)
+
+
+@pytest.mark.browser
+def test_a_fine_screen_gets_at_most_twice_the_pixels_and_the_eye_glides(browser, model_report):
+    drawn = ("model-figure", "scene-figure")
+    screen = {"device_scale_factor": 3, "has_touch": True}
+    model_page = Witness(browser, model_report, 420, drawn=drawn, script=RECORD_VIEWS, **screen)
+    canvas = model_page.page.locator(CANVAS)
+    assert canvas.evaluate("c => c.width") == 2 * canvas.evaluate("c => c.clientWidth")
+    ways = []
+    for motion, name in (("no-preference", "From above"), ("reduce", "From the left")):
+        model_page.page.emulate_media(reduced_motion=motion)
+        model_page.page.evaluate("views.clear()")
+        model_page.page.locator("#model").get_by_role("button", name=name).click()
+        model_page.page.wait_for_timeout(700)
+        ways.append(model_page.page.evaluate("views.size"))
+    assert ways[0] > 1  # how many depends on how fast the machine draws
+    assert ways[1] == 1  # at once where motion is unwelcome
+    before = shown(model_page)
+    spread_fingers(model_page)
+    assert apart(shown(model_page), before) > 0.1
+    awake = "document.querySelector('#model-figure').classList.contains('awake')"
+    assert model_page.page.evaluate(awake)
+    model_page.page.locator("#model h2").tap()
+    assert not model_page.page.evaluate(awake)
+    model_page.context.close()
+
+
+def spread_fingers(model_page):
+    """Two fingers on the middle of the canvas go apart."""
+    hand = model_page.context.new_cdp_session(model_page.page)
+    box = model_page.page.locator(CANVAS).bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for kind, reach in (("touchStart", 30), ("touchMove", 40), ("touchMove", 60), ("touchEnd", 0)):
+        points = [{"x": x + side * reach, "y": y, "id": side + 1} for side in (-1, 1)] if reach else []
+        hand.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
+@pytest.mark.browser
+def test_without_webgl_a_sentence_says_so(browser, model_report):
+    model_page = Witness(browser, model_report, 1000, drawn=(), script=WITHOUT_WEBGL)
+    text = model_page.page.locator("#model-figure").inner_text()
+    assert "no WebGL 2" in text
+    assert "model.glb" in text
+    assert not model_page.page.locator("#model-reset").is_visible()
+    assert all("viewer" not in error.lower() for error in model_page.errors)
+    model_page.context.close()

@@ -12,8 +12,14 @@ from tests.surface.sphere import looking_at_origin, sphere_map
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap
 from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.linear import LinearSurface, normals, resampled, sampled_mesh, surface_from_depth
-from thesisrecon.surface.mesh import parts_of
+from thesisrecon.surface.linear import (
+    LinearSurface,
+    resample_surface,
+    surface_from_depth,
+    surface_normals,
+    triangulate_surface,
+)
+from thesisrecon.surface.mesh import connected_parts
 
 BOTH = pytest.mark.parametrize("surface", [LinearSurface(), BSplineSurface()], ids=["linear", "b-spline"])
 SHAPE = (60, 80)
@@ -62,7 +68,7 @@ def test_planes_are_exact_everywhere_with_their_normals(surface, a, b, seed):
     level = np.append(gradient[0], rho[0] - gradient[0] @ xy[0])
     normal = -P[:, :3].T @ level
     np.testing.assert_allclose(
-        normals(fit, xy), np.tile(normal / np.linalg.norm(normal), (200, 1)), atol=2e-3
+        surface_normals(fit, xy), np.tile(normal / np.linalg.norm(normal), (200, 1)), atol=2e-3
     )
     assert normal[2] < 0.0
 
@@ -102,19 +108,19 @@ def test_nothing_is_said_beyond_the_depths(surface):
     hole[20:40, 30:50] = False
     hole[:, 70:] = False
     fit = surface.fit(map_of(plane(pixels())[0].reshape(SHAPE), 1e-4, known=hole))
-    found = np.isfinite(resampled(fit).depth)
+    found = np.isfinite(resample_surface(fit).depth)
     np.testing.assert_array_equal(found, hole)
     outside = np.array([[-3.0, 5.0], [90.0, 5.0], [5.0, 70.0], [35.0, 30.0], [75.0, 10.0], [np.nan, 1.0]])
     assert np.isnan(fit.evaluate(outside).inverse_depth).all()
     nothing = surface.fit(map_of(np.full(SHAPE, 0.2), 1e-4, known=np.zeros(SHAPE, dtype=bool)))
     assert np.isnan(nothing.evaluate(pixels()).inverse_depth).all()
-    assert len(sampled_mesh(nothing).faces) == 0
+    assert len(triangulate_surface(nothing).faces) == 0
 
 
 def errors(surface, noisy, clean):
     """Relative errors of depths off the outline of the sphere, where it slopes away."""
     inner = binary_erosion(np.isfinite(clean.depth), iterations=5)
-    return np.asarray(resampled(surface.fit(noisy)).depth / clean.depth - 1.0)[inner]
+    return np.asarray(resample_surface(surface.fit(noisy)).depth / clean.depth - 1.0)[inner]
 
 
 def test_noise_is_averaged_where_the_surface_is_smooth():
@@ -161,11 +167,11 @@ def test_an_edge_is_not_smeared(slant):
     noise = 5e-4
     rho = truth + noise * np.random.default_rng(0).normal(size=SHAPE)
     fit = BSplineSurface().fit(map_of(rho, noise))
-    error = 1.0 / resampled(fit).depth - truth
+    error = 1.0 / resample_surface(fit).depth - truth
     assert np.abs(error).max() < 2.5 * noise
     assert np.sqrt(np.mean(error**2)) < noise / 3.0
-    mesh = sampled_mesh(fit)
-    assert len(np.unique(parts_of(mesh.faces, len(mesh.vertices)))) == 2
+    mesh = triangulate_surface(fit)
+    assert len(np.unique(connected_parts(mesh.faces, len(mesh.vertices)))) == 2
 
 
 def test_a_cut_may_end_within_the_surface():
@@ -176,11 +182,11 @@ def test_a_cut_may_end_within_the_surface():
     noise = 2e-4
     rho = truth + noise * np.random.default_rng(0).normal(size=SHAPE)
     fit = BSplineSurface().fit(map_of(rho, noise))
-    error = np.abs(1.0 / resampled(fit).depth - truth)
+    error = np.abs(1.0 / resample_surface(fit).depth - truth)
     near_the_end = (np.abs(y - 42) < 8) & (np.abs(x - 39.5) < 8)
     assert error[~near_the_end].max() < 5.0 * noise
-    mesh = sampled_mesh(fit)
-    assert len(np.unique(parts_of(mesh.faces, len(mesh.vertices)))) == 1
+    mesh = triangulate_surface(fit)
+    assert len(np.unique(connected_parts(mesh.faces, len(mesh.vertices)))) == 1
 
 
 def test_small_pieces_become_the_surface_about_them_or_nothing():
@@ -189,7 +195,7 @@ def test_small_pieces_become_the_surface_about_them_or_nothing():
     known[:, :60] = True
     known[10:13, 70:73] = True  # alone
     rho[30:33, 30:33] = 0.5  # before the wall
-    found = resampled(BSplineSurface().fit(map_of(rho, 1e-4, known=known))).depth
+    found = resample_surface(BSplineSurface().fit(map_of(rho, 1e-4, known=known))).depth
     np.testing.assert_allclose(found[:, :60], 5.0, rtol=1e-4)
     assert np.isnan(found[:, 60:]).all()
 
@@ -197,7 +203,7 @@ def test_small_pieces_become_the_surface_about_them_or_nothing():
 @BOTH
 def test_any_resolution(surface):
     fit = surface.fit(sphere_map(0, looking_at_origin(0.3, 0.2, 3.5)))
-    meshes = {scale: sampled_mesh(fit, scale) for scale in (0.5, 1.0, 2.0)}
+    meshes = {scale: triangulate_surface(fit, scale) for scale in (0.5, 1.0, 2.0)}
     faces = {scale: len(mesh.faces) for scale, mesh in meshes.items()}
     assert faces[0.5] == pytest.approx(faces[1.0] / 4, rel=0.15)
     assert faces[2.0] == pytest.approx(4 * faces[1.0], rel=0.15)
@@ -206,17 +212,17 @@ def test_any_resolution(surface):
         assert np.median(np.abs(radius - 1.0)) < 1e-3
         assert np.quantile(np.abs(radius - 1.0), 0.8) < 0.01  # the outline slopes away
     with pytest.raises(ValueError, match="positive"):
-        resampled(fit, 0.0)
+        resample_surface(fit, 0.0)
 
 
 def test_the_linear_surface_is_the_triangulated_map():
     depth_map = sphere_map(0, looking_at_origin(0.3, 0.2, 3.5), noise=0.02)
     fit = LinearSurface().fit(depth_map)
-    assert resampled(fit) is depth_map
+    assert resample_surface(fit) is depth_map
     y, x = np.indices(depth_map.depth.shape)
     at_pixels = fit.evaluate(np.stack([x.ravel(), y.ravel()], axis=1).astype(float)).inverse_depth
     np.testing.assert_allclose(1.0 / at_pixels, depth_map.depth.ravel(), rtol=1e-6)
-    mesh, plain = sampled_mesh(fit), surface_from_depth(depth_map)
+    mesh, plain = triangulate_surface(fit), surface_from_depth(depth_map)
     np.testing.assert_array_equal(mesh.faces, plain.faces)
     # The middle of a triangle of the mesh lies on the surface.
     middle = plain.vertices[plain.faces[::37]].mean(axis=1) @ depth_map.P[:, :3].T + depth_map.P[:, 3]
@@ -234,7 +240,7 @@ def test_normals_of_a_noisy_sphere():
         ray = np.column_stack([xy, np.ones(len(xy))]) / fit.evaluate(xy).inverse_depth[:, None]
         X = np.linalg.solve(camera[:, :3], (ray - camera[:, 3]).T).T
         true = X / np.linalg.norm(X, axis=1, keepdims=True)
-        off.append(np.degrees(np.arccos(np.clip(np.sum(true * normals(fit, xy), axis=1), -1.0, 1.0))))
+        off.append(np.degrees(np.arccos(np.clip(np.sum(true * surface_normals(fit, xy), axis=1), -1.0, 1.0))))
     assert np.nanmedian(off[1]) < 2.0
     assert np.nanmedian(off[0]) > 5.0 * np.nanmedian(off[1])
 

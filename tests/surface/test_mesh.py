@@ -13,7 +13,7 @@ from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.bspline import basis, energies
 from thesisrecon.surface.bspline_pieces import Domain, evaluate_pixels, pieces_of, sum_squares
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.mesh import coarser, face_areas
+from thesisrecon.surface.mesh import face_areas, simplify_mesh
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def cycles(faces):
 @pytest.mark.parametrize("most", [12_000, 3_000, 500])
 def test_a_coarser_sphere_is_still_the_sphere(sphere, most):
     assert len(sphere.faces) > 12_000
-    small = coarser(sphere, most)
+    small = simplify_mesh(sphere, most)
     assert 0.6 * most < len(small.faces) <= most
     side = np.sqrt(4 * np.pi / most)
     radius = np.linalg.norm(small.vertices, axis=1)
@@ -65,7 +65,7 @@ def test_a_coarser_sphere_is_still_the_sphere(sphere, most):
 
 
 def test_no_face_is_degenerate_or_told_twice(sphere):
-    small = coarser(sphere, 2_000)
+    small = simplify_mesh(sphere, 2_000)
     assert (np.diff(np.sort(small.faces, axis=1), axis=1) > 0).all()
     assert len(np.unique(cycles(small.faces), axis=0)) == len(small.faces)
     assert set(np.unique(small.faces)) == set(range(len(small.vertices)))
@@ -73,7 +73,7 @@ def test_no_face_is_degenerate_or_told_twice(sphere):
 
 def test_a_flat_sheet_stays_flat_and_looks_the_same_way():
     for flip, sign in ((False, 1.0), (True, -1.0)):
-        small = coarser(sheet(40, flip=flip), 300)
+        small = simplify_mesh(sheet(40, flip=flip), 300)
         assert 100 < len(small.faces) <= 300
         np.testing.assert_allclose(small.vertices[:, 2], 0.0, atol=1e-12)
         np.testing.assert_allclose(normals(small)[:, 2], sign)
@@ -81,7 +81,7 @@ def test_a_flat_sheet_stays_flat_and_looks_the_same_way():
 
 def test_the_two_sides_of_a_thin_wall_stay_apart():
     wall = joined(sheet(40, 0.01), sheet(40, 0.0, flip=True))
-    small = coarser(wall, 400)
+    small = simplify_mesh(wall, 400)
     assert sorted(np.unique(small.vertices[:, 2].round(9)).tolist()) == [0.0, 0.01]
     up = normals(small)[:, 2] > 0
     heights = small.vertices[small.faces][..., 2]
@@ -93,17 +93,17 @@ def test_a_ridge_stays_sharp():
     roof = sheet(60)
     height = 0.5 - np.abs(roof.vertices[:, 0] - 0.5)
     roof = replace(roof, vertices=np.column_stack([roof.vertices[:, :2], height]))
-    small = coarser(roof, 400)
+    small = simplify_mesh(roof, 400)
     off = np.abs(small.vertices[:, 2] - (0.5 - np.abs(small.vertices[:, 0] - 0.5)))
     assert off.max() < 1e-6
 
 
 def test_what_is_small_enough_is_left_alone_and_colours_are_averaged(sphere):
-    assert coarser(sphere, len(sphere.faces)) is sphere
+    assert simplify_mesh(sphere, len(sphere.faces)) is sphere
     high = sphere.vertices[:, 1] > 0
     colors = np.where(high[:, None], (200, 40, 90), (20, 60, 10)).astype(np.uint8)
     uv = np.zeros((len(sphere.faces), 3, 2))
-    small = coarser(replace(sphere, colors=colors, uv=uv), 1_000)
+    small = simplify_mesh(replace(sphere, colors=colors, uv=uv), 1_000)
     assert small.uv is None
     assert small.colors is not None
     assert small.colors.shape == small.vertices.shape
@@ -112,16 +112,16 @@ def test_what_is_small_enough_is_left_alone_and_colours_are_averaged(sphere):
 
 
 def test_the_same_mesh_gives_the_same_bytes(sphere):
-    one, two = coarser(sphere, 800), coarser(sphere, 800)
+    one, two = simplify_mesh(sphere, 800), simplify_mesh(sphere, 800)
     assert one.vertices.tobytes() == two.vertices.tobytes()
     assert one.faces.tobytes() == two.faces.tobytes()
 
 
 def test_a_mesh_of_nothing_but_one_place_becomes_empty():
     point = TexturedMesh(np.zeros((9, 3)), np.arange(9).reshape(3, 3))
-    assert len(coarser(point, 2).faces) <= 2
+    assert len(simplify_mesh(point, 2).faces) <= 2
     with pytest.raises(ValueError, match="max_faces"):
-        coarser(point, 0)
+        simplify_mesh(point, 0)
 
 
 CELL = 4
@@ -135,10 +135,10 @@ def labels(count, start, stop):
 @pytest.fixture
 def domain():
     rng = np.random.default_rng(0)
-    held = rng.random((21, 26)) < 0.85
-    right = (rng.random((21, 25)) < 0.7) & held[:, :-1] & held[:, 1:]
-    down = (rng.random((20, 26)) < 0.7) & held[:-1] & held[1:]
-    return Domain(held, held, right, down)
+    covered = rng.random((21, 26)) < 0.85
+    right = (rng.random((21, 25)) < 0.7) & covered[:, :-1] & covered[:, 1:]
+    down = (rng.random((20, 26)) < 0.7) & covered[:-1] & covered[1:]
+    return Domain(covered, covered, right, down)
 
 
 @pytest.fixture
@@ -147,23 +147,27 @@ def pieces(domain):
 
 
 def edges(domain):
-    number = np.arange(domain.held.size).reshape(domain.held.shape)
+    number = np.arange(domain.covered.size).reshape(domain.covered.shape)
     start = np.concatenate([number[:, :-1][domain.right], number[:-1][domain.down]])
     stop = np.concatenate([number[:, 1:][domain.right], number[1:][domain.down]])
     return start, stop
 
 
 def test_pieces_are_what_hangs_together_in_a_cell(domain, pieces):
-    y, x = np.indices(domain.held.shape)
+    y, x = np.indices(domain.covered.shape)
     cell = ((y // CELL) * pieces.shape[1] + x // CELL).ravel()
     start, stop = edges(domain)
     within = cell[start] == cell[stop]
     label = labels(cell.size, start[within], stop[within])
-    held = domain.held.ravel()
+    covered = domain.covered.ravel()
     found = pieces.piece.ravel()
-    assert (found[~held] == -1).all()
-    assert len(set(zip(label[held], found[held], strict=True))) == len(set(label[held])) == len(pieces.cell)
-    np.testing.assert_array_equal(pieces.cell[found[held]], cell[held])
+    assert (found[~covered] == -1).all()
+    assert (
+        len(set(zip(label[covered], found[covered], strict=True)))
+        == len(set(label[covered]))
+        == len(pieces.cell)
+    )
+    np.testing.assert_array_equal(pieces.cell[found[covered]], cell[covered])
 
 
 def test_coefficients_are_shared_by_what_hangs_together_within_reach(domain, pieces):
@@ -196,14 +200,14 @@ def rows_of(pieces):
 
 def test_values_and_sums_are_those_of_the_rows(pieces):
     rng = np.random.default_rng(1)
-    rows, held = rows_of(pieces), pieces.piece >= 0
-    c, target = rng.normal(size=pieces.count), rng.normal(size=held.shape)
-    weight = rng.random(held.shape) * (rng.random(held.shape) < 0.9)
+    rows, covered = rows_of(pieces), pieces.piece >= 0
+    c, target = rng.normal(size=pieces.count), rng.normal(size=covered.shape)
+    weight = rng.random(covered.shape) * (rng.random(covered.shape) < 0.9)
     along = basis((np.arange(CELL) + 0.5) / CELL)
-    value = np.empty(held.shape)
+    value = np.empty(covered.shape)
     evaluate_pixels(pieces.piece, pieces.coefficient, c, along, CELL, value)
-    np.testing.assert_allclose(value[held], rows @ c, atol=1e-12)
-    assert np.isnan(value[~held]).all()
+    np.testing.assert_allclose(value[covered], rows @ c, atol=1e-12)
+    assert np.isnan(value[~covered]).all()
     matrix, right = np.zeros((len(pieces.cell), 16, 16)), np.zeros((len(pieces.cell), 16))
     sum_squares(pieces.piece, target, weight, along, CELL, matrix, right)
     full = np.zeros((pieces.count, pieces.count))
@@ -211,10 +215,10 @@ def test_values_and_sums_are_those_of_the_rows(pieces):
     np.add.at(
         full, (pieces.coefficient[:, :, None], pieces.coefficient[:, None, :]), matrix + upper.swapaxes(1, 2)
     )
-    w = weight[held]
+    w = weight[covered]
     np.testing.assert_allclose(full, rows.T @ (w[:, None] * rows), atol=1e-12)
     total = np.bincount(pieces.coefficient.ravel(), right.ravel(), pieces.count)
-    np.testing.assert_allclose(total, rows.T @ (w * target[held]), atol=1e-12)
+    np.testing.assert_allclose(total, rows.T @ (w * target[covered]), atol=1e-12)
 
 
 def test_the_basis_is_that_of_cubic_splines():

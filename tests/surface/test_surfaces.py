@@ -12,9 +12,9 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.zbuffer import rasterize
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion, leaning
+from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion, incidence_cosines
 from thesisrecon.surface.linear import LinearSurface, surface_from_depth
-from thesisrecon.surface.mesh import face_areas, keep_large_parts, parts_of
+from thesisrecon.surface.mesh import connected_parts, face_areas, remove_small_parts
 from thesisrecon.surface.model import SurfaceModel
 
 
@@ -121,7 +121,7 @@ def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges():
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     centre = -np.linalg.solve(P[:, :3], P[:, 3])
     assert ((np.cross(b - a, c - a) * (centre - a)).sum(1) > 0).all()
-    part = parts_of(mesh.faces, len(mesh.vertices))
+    part = connected_parts(mesh.faces, len(mesh.vertices))
     assert len(np.unique(part)) == 2
 
 
@@ -142,13 +142,15 @@ def test_crumbs_are_dropped():
     grid = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     vertices = np.concatenate([grid, 0.01 * grid + 5.0])
     faces = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6]])
-    mesh = keep_large_parts(TexturedMesh(vertices, faces, colors=np.arange(24, dtype=np.uint8).reshape(8, 3)))
+    mesh = remove_small_parts(
+        TexturedMesh(vertices, faces, colors=np.arange(24, dtype=np.uint8).reshape(8, 3))
+    )
     assert len(mesh.vertices) == 4
     np.testing.assert_array_equal(mesh.faces, faces[:2])
     assert mesh.colors is not None
     np.testing.assert_array_equal(mesh.colors, np.arange(12).reshape(4, 3))
     empty = TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    assert keep_large_parts(empty) is empty
+    assert remove_small_parts(empty) is empty
 
 
 def test_sheets_show_each_place_once(ring):
@@ -199,7 +201,7 @@ def slanted(degrees):
 @pytest.mark.parametrize("degrees", [90.0, 40.0, 15.0])
 def test_how_far_rays_come_off_a_plane(degrees):
     depth = slanted(degrees).depth if degrees < 90.0 else np.ones(SHAPE, np.float32)
-    found = leaning(depth, K)
+    found = incidence_cosines(depth, K)
     normal = np.array([0.0, np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
     rays = np.stack([*np.indices(SHAPE)[::-1], np.ones(SHAPE)], axis=-1) @ np.linalg.inv(K).T
     inner = np.isfinite(depth)

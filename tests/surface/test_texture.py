@@ -9,21 +9,20 @@ from scipy.ndimage import map_coordinates
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.surface.color_correction import SingleView
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.mesh import face_neighbours, vertex_normals
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_atlas import TextureAtlas, pack_rectangles
-from thesisrecon.surface.texture_blending import BlendedViews, equalizing_gains
+from thesisrecon.surface.texture_blending import BlendedTexture, SeamLeveledTexture, equalizing_gains
 from thesisrecon.surface.texture_kernels import (
-    SeenSurface,
+    ViewSurface,
     combine_colors,
     continue_faces,
     diffuse,
     grow_colors,
     observe_points,
 )
-from thesisrecon.surface.texture_views import charts_of, choose_views, color_vertices, face_quality
+from thesisrecon.surface.texture_views import choose_views, color_vertices, face_quality, label_charts
 from thesisrecon.views.render import render
 
 GAINS = (1.0, 0.85, 1.1, 0.95, 1.05, 0.9, 1.0, 1.1)
@@ -56,10 +55,10 @@ def test_a_new_view_shows_the_painted_sphere(sphere):
     assert np.sqrt(np.mean(difference(colored) ** 2)) < 12.0
 
 
-@pytest.mark.parametrize("kind", [SingleView, BlendedViews])
+@pytest.mark.parametrize("kind", [SeamLeveledTexture, BlendedTexture])
 def test_exposures_are_levelled(sphere, kind):
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
-    rough = TextureAtlas(painter=SingleView(level=False)).texture(sphere, views)
+    rough = TextureAtlas(painter=SeamLeveledTexture(level=False)).texture(sphere, views)
     level = TextureAtlas(painter=kind(level=True)).texture(sphere, views)
     jump = [seam_jumps(mesh) for mesh in (rough, level)]
     assert np.median(jump[0]) > 8.0
@@ -111,7 +110,7 @@ def test_charts_are_large_and_take_what_sees_them(sphere):
     assert (quality[seen, label[seen]] > 0.0).all()
     assert np.median(quality[seen, label[seen]] / quality[seen].max(axis=1)) > 0.8
     patchwork = np.where(seen, quality.argmax(axis=1), -1)
-    charts, before = (len(np.unique(charts_of(x, neighbours)[seen])) for x in (label, patchwork))
+    charts, before = (len(np.unique(label_charts(x, neighbours)[seen])) for x in (label, patchwork))
     assert charts < 0.5 * before
     assert charts < 40
 
@@ -149,7 +148,7 @@ def test_an_atlas_that_cannot_be_as_small_as_asked_is_refused(sphere):
 @pytest.mark.parametrize("setting", [{"power": -1.0}, {"scatter": 0.0}, {"feather_px": 0.0}])
 def test_blending_settings_without_a_meaning_are_refused(setting):
     with pytest.raises(ValueError, match="needed"):
-        BlendedViews(**setting)
+        BlendedTexture(**setting)
 
 
 def test_unseen_faces_take_the_colour_of_their_surroundings(sphere):
@@ -172,10 +171,10 @@ def test_a_surface_that_nobody_sees_is_refused(sphere):
 
 def test_gains_are_found(sphere):
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
-    found = BlendedViews().prepare(sphere, views).gains
+    found = BlendedTexture().prepare(sphere, views).gains
     wanted = np.exp(np.log(GAINS).mean()) / np.array(GAINS)
     np.testing.assert_allclose(found, np.repeat(wanted[:, None], 3, axis=1), atol=0.025)
-    np.testing.assert_array_equal(BlendedViews(level=False).prepare(sphere, views).gains, 1.0)
+    np.testing.assert_array_equal(BlendedTexture(level=False).prepare(sphere, views).gains, 1.0)
 
 
 def test_gains_of_views_that_share_nothing_stay():
@@ -196,7 +195,7 @@ def test_what_one_photograph_contradicts_is_left_out(sphere):
     hit = facing & (np.abs(x - 80) < 15) & (np.abs(y - 60) < 15)
     error = []
     for scatter in (1e6, 20.0):
-        prepared = BlendedViews(scatter=scatter).prepare(sphere, views)
+        prepared = BlendedTexture(scatter=scatter).prepare(sphere, views)
         color = prepared.colors(sphere.vertices, vertex_normals(sphere))[0]
         error.append(float(np.sqrt(np.mean((color - paint(sphere.vertices))[hit] ** 2))))
     assert error[0] > 12.0
@@ -204,7 +203,7 @@ def test_what_one_photograph_contradicts_is_left_out(sphere):
 
 
 def test_points_have_their_colours(sphere):
-    prepared = BlendedViews().prepare(sphere, [photograph(m) for m in ring_of()])
+    prepared = BlendedTexture().prepare(sphere, [photograph(m) for m in ring_of()])
     color, shown = prepared.colors(sphere.vertices, vertex_normals(sphere))
     assert shown.mean() > 0.95
     assert np.median(np.abs(color - paint(sphere.vertices))[shown]) < 3.0
@@ -234,7 +233,7 @@ def test_spread_shares_matches_its_twin(sphere):
     np.testing.assert_allclose(out, np.where(share > 0, 0.1 * share + 0.9 * around / count, 0.0), rtol=1e-5)
 
 
-def observed(points, normals, P, depth, clear, slack):
+def observed(points, normals, P, depth, trust, tolerance):
     """Plain weights (N,) of :func:`observe_points`."""
     weight = np.zeros(len(points))
     M, height, width = P[:, :3], *depth.shape
@@ -248,24 +247,24 @@ def observed(points, normals, P, depth, clear, slack):
         left, top = int(u), int(v)
         rows, columns = [top, min(top + 1, height - 1)], [left, min(left + 1, width - 1)]
         s, t = np.array([1 - u + left, u - left]), np.array([1 - v + top, v - top])
-        if x[2] * (1 - slack) <= depth[np.ix_(rows, columns)].max():
-            trust = t @ clear[np.ix_(rows, columns)] @ s
+        if x[2] * (1 - tolerance) <= depth[np.ix_(rows, columns)].max():
+            trust = t @ trust[np.ix_(rows, columns)] @ s
             weight[n] = trust * abs(np.linalg.det(M)) * (N @ (centre - X)) / x[2] ** 3
     return weight
 
 
 def test_observe_points_matches_its_twin(sphere):
-    view = BlendedViews().prepare(sphere, [photograph(ring_of()[2])]).views[0]
+    view = BlendedTexture().prepare(sphere, [photograph(ring_of()[2])]).views[0]
     rng = np.random.default_rng(1)
     points = rng.normal(size=(400, 3))
     points *= 1.01 / np.linalg.norm(points, axis=1, keepdims=True)
     normals = points + 0.2 * rng.normal(size=points.shape)
     weight, color = np.zeros(400, np.float32), np.zeros((400, 3), np.float32)
     gain = np.array([1.0, 2.0, 0.5], np.float32)
-    P, rgb = view.view.P, view.view.rgb
-    seen = SeenSurface(P, view.depth, view.clear, view.slack, rgb, gain)
+    P, rgb = view.P, view.rgb
+    seen = ViewSurface(P, view.depth, view.trust, view.tolerance, rgb, gain)
     observe_points(points, normals, seen, weight, color)
-    wanted = observed(points, normals, P, view.depth, view.clear, view.slack)
+    wanted = observed(points, normals, P, view.depth, view.trust, view.tolerance)
     np.testing.assert_allclose(weight, wanted, rtol=1e-4, atol=1e-6)
     assert 50 < (weight > 0).sum() < 350
     x = points @ P[:, :3].T + P[:, 3]

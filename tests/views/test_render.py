@@ -1,14 +1,25 @@
-"""What a rendered picture must show."""
+"""Rendering: what an image must show, and how similar two images are."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.records import TexturedMesh
+from thesisrecon.records import RenderedView, TexturedMesh
+from thesisrecon.surface.linear import surface_from_depth
+from thesisrecon.surface.texture_atlas import TextureAtlas
+from thesisrecon.surface.texture_views import color_vertices
+from thesisrecon.views.image_similarity import GREY, covered_pixels, match_exposure, psnr_db, ssim, ssim_map
 from thesisrecon.views.render import Light, Shading, render, without_texture
 
 K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])
+
+
 SIZE = (64, 48)
 
 
@@ -98,3 +109,119 @@ def test_wrong_calls_are_refused():
         Camera(K * np.nan, np.eye(3), np.zeros(3), SIZE)
     with pytest.raises(ValueError, match="needs K"):
         Camera(K[:2], np.eye(3), np.zeros(3), SIZE)
+
+
+SPHERE_SIZE = (160, 120)
+
+
+def textured_surface(depth_map):
+    """The surface of a depth map with each pixel's place in the photograph as its place in the texture."""
+    mesh = surface_from_depth(depth_map)
+    xyz = np.column_stack([mesh.vertices, np.ones(len(mesh.vertices))]) @ depth_map.P.T
+    return replace(mesh, uv=(xyz[:, :2] / xyz[:, 2:])[mesh.faces], texture=photograph(depth_map).rgb)
+
+
+@settings(max_examples=15, deadline=None)
+@given(angle=st.floats(-3.1, 3.1), height=st.floats(-2.0, 2.0), distance=st.floats(2.8, 5.0))
+def test_from_its_own_camera_the_surface_shows_the_photograph_and_its_depth(angle, height, distance):
+    depth_map = sphere_map(0, looking_at_origin(angle, height, distance))
+    seen = render(textured_surface(depth_map), Camera.from_matrix(depth_map.P, SPHERE_SIZE), samples=1)
+    known = np.isfinite(depth_map.depth)
+    assert not (seen.valid & ~known).any()
+    assert (seen.valid & known).sum() > 0.9 * known.sum()  # but a rim of grazing rays
+    np.testing.assert_allclose(seen.depth[seen.valid], depth_map.depth[seen.valid], rtol=1e-4)
+    apart = np.abs(seen.color.astype(int) - photograph(depth_map).rgb)[seen.valid]
+    assert apart.max() <= 1
+
+
+def test_averaged_pixels_are_those_of_the_photograph_but_for_its_finest_detail():
+    depth_map = sphere_map(0, looking_at_origin(0.3, -1.0, 3.5))
+    seen = render(textured_surface(depth_map), Camera.from_matrix(depth_map.P, SPHERE_SIZE), samples=2)
+    inside = np.isfinite(depth_map.depth)
+    for _ in range(3):
+        inside[1:-1, 1:-1] &= inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:]
+    apart = np.abs(seen.color.astype(int) - photograph(depth_map).rgb)[inside]
+    assert np.mean(apart) < 1.0
+
+
+@pytest.mark.parametrize("kind", ["texture", "vertex colours"])
+def test_from_between_two_photographs_the_model_has_the_colours_of_the_scene(kind):
+    maps = [sphere_map(k, looking_at_origin(a, -1.0, 3.5)) for k, a in enumerate((-0.2, 0.2))]
+    views = [photograph(m) for m in maps]
+    mesh = surface_from_depth(maps[0])
+    mesh = TextureAtlas().texture(mesh, views) if kind == "texture" else color_vertices(mesh, views)
+    between = sphere_map(2, looking_at_origin(0.0, -0.9, 3.5))
+    seen = render(mesh, Camera.from_matrix(between.P, SPHERE_SIZE))
+    inside = seen.valid & np.isfinite(between.depth)
+    assert inside.mean() > 0.15
+    apart = np.abs(seen.color - paint(points_of(between)))[inside]
+    assert np.median(apart) < 2.5
+    assert np.mean(apart) < 6.0
+
+
+def pictures():
+    rng = np.random.default_rng(0)
+    y, x = np.indices((40, 50))
+    clean = 128 + 60 * np.sin(x / 4.0) * np.cos(y / 5.0)
+    real = np.repeat(clean[..., None], 3, axis=2) + np.array([0, 10, -10])
+    return real.round().astype(np.uint8), (real + rng.normal(0, 12, real.shape)).round().astype(np.uint8)
+
+
+def test_psnr_is_that_of_its_formula():
+    real, noisy = pictures()
+    mask = np.zeros((40, 50), bool)
+    mask[5:20, 3:40] = True
+    wanted = 10 * np.log10(255**2 / np.mean((real[mask].astype(float) - noisy[mask]) ** 2))
+    assert psnr_db(real, noisy, mask) == pytest.approx(wanted)
+    assert psnr_db(real, real, mask) == float("inf")
+
+
+def test_ssim_is_that_of_its_windows():
+    real, noisy = pictures()
+    a, b = real @ GREY, noisy @ GREY
+    y, x = 17, 21
+    taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    w = np.outer(taps, taps) / taps.sum() ** 2
+    p, q = (image[y - 5 : y + 6, x - 5 : x + 6] for image in (a, b))
+    mean_p, mean_q = (w * p).sum(), (w * q).sum()
+    spread_p, spread_q = (w * p * p).sum() - mean_p**2, (w * q * q).sum() - mean_q**2
+    common = (w * p * q).sum() - mean_p * mean_q
+    c1, c2 = 2.55**2, 7.65**2
+    value = (2 * mean_p * mean_q + c1) / (mean_p**2 + mean_q**2 + c1)
+    value *= (2 * common + c2) / (spread_p + spread_q + c2)
+    everything = np.ones(a.shape, bool)
+    assert ssim_map(real, noisy, everything)[y, x] == pytest.approx(value, abs=1e-3)
+    assert ssim(real, real, everything) == pytest.approx(1.0)
+    assert 0.3 < ssim(real, noisy, everything) < 0.95
+
+
+def test_what_is_not_compared_takes_no_part():
+    real, noisy = pictures()
+    mask = np.hypot(*(np.indices((40, 50)) - np.array([17, 21])[:, None, None])) < 9
+    spoiled = np.where(mask[..., None], noisy, 0).astype(np.uint8)
+    assert ssim(real, spoiled, mask) == pytest.approx(ssim(real, noisy, mask))
+
+
+def test_exposure_is_made_alike():
+    real, _ = pictures()
+    darker = np.rint(real * [0.5, 0.8, 1.0]).astype(np.uint8)
+    mask = np.ones(real.shape[:2], bool)
+    assert psnr_db(real, match_exposure(real, darker, mask), mask) > 45.0
+
+
+def test_pixels_at_the_rim_are_not_whole():
+    valid = np.zeros((6, 7), bool)
+    valid[1:5, 2:6] = True
+    rendered = RenderedView(np.zeros((6, 7, 3), np.uint8), np.zeros((6, 7), np.float32), valid)
+    wanted = np.zeros((6, 7), bool)
+    wanted[2:4, 3:5] = True
+    np.testing.assert_array_equal(covered_pixels(rendered), wanted)
+
+
+@pytest.mark.parametrize("compare", [psnr_db, ssim, match_exposure])
+def test_pictures_that_do_not_belong_together_are_refused(compare):
+    real, noisy = pictures()
+    with pytest.raises(ValueError, match="one size"):
+        compare(real, noisy[:-1], np.ones((40, 50), bool))
+    with pytest.raises(ValueError, match="no pixel is shown by both"):
+        compare(real, noisy, np.zeros((40, 50), bool))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import resource
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -15,55 +14,26 @@ from typing import Any, get_args
 import numpy as np
 
 from thesisrecon import __version__
-from thesisrecon.arrays import F32, F64, U8
-from thesisrecon.config import PipelineConfig, toml_from_config, with_images
+from thesisrecon.arrays import F32, U8
+from thesisrecon.config import toml_from_config
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.intrinsics import prior_for
 from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views
 from thesisrecon.io.colmap_files import write_colmap_model
 from thesisrecon.io.exports import write_point_cloud
 from thesisrecon.io.files import read_json, write_json, write_text
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.records import Image, Reconstruction, RunResult, TexturedMesh
-from thesisrecon.report.data import ReportImage, ReportData
+from thesisrecon.report.data import ReportData, ReportImage
 from thesisrecon.report.page import write_report
 from thesisrecon.report.summary import cameras_table, point_colours, summarize
-from thesisrecon.runtime.run import Run, Until, stream
+from thesisrecon.runtime.run import Run, Until
 from thesisrecon.runtime.run_folder import RunDirectory
 from thesisrecon.selfcalibration.affine import affine_camera_centres, upgrade_to_affine
-from thesisrecon.selfcalibration.stratified import Stratified
-from thesisrecon.surface.mesh import coarser
+from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 FARTHEST_AFFINE = 1e3
 """Points of the affine file are within this many standard deviations of the bulk of them."""
-
-
-def upgrade_affine(
-    reconstruction: Reconstruction,
-    plane: F64 | None = None,
-    *,
-    config: PipelineConfig | None = None,
-    photographs: Sequence[Image] = (),
-    seed: int = 0,
-) -> Reconstruction:
-    """A projective reconstruction in an affine frame: parallels and ratios along them are those of the scene.
-
-    ``plane`` (4,) is the plane at infinity in the projective frame. Without one it is located: by the plane's
-    way alone where ``config.selfcalibration`` is :class:`~thesisrecon.selfcalibration.stratified.Stratified`, so that no
-    calibration is needed, else as that of :func:`self_calibrate`. Raises :class:`StageFailure` where none is
-    found.
-    """
-    if plane is None:
-        config = config or PipelineConfig()
-        variant = with_images(config.selfcalibration, photographs) if photographs else config.selfcalibration
-        rng = stream(seed, "selfcalibration")
-        prior = prior_for(reconstruction, config.intrinsics)
-        if isinstance(variant, Stratified):
-            plane = variant.locate(reconstruction, prior=prior, rng=rng)
-        else:
-            plane = variant.calibrate(reconstruction, prior=prior, rng=rng).plane_at_infinity
-    return upgrade_to_affine(reconstruction, plane)
 
 
 def affine_of(result: RunResult) -> Reconstruction | None:
@@ -257,7 +227,7 @@ def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:
     """The model in a size that a page can carry."""
     if result.mesh is None:
         return None
-    coarse = coarser(result.mesh, PAGE_FACES)
+    coarse = simplify_mesh(result.mesh, PAGE_FACES)
     return TextureAtlas(max_texels=PAGE_TEXELS).texture(coarse, result.views, threads=run.workers.threads)
 
 

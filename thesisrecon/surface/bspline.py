@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import B8, F64
 from thesisrecon.numerics.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
-from thesisrecon.surface.bspline_pieces import Pieces, domain_of, evaluate_pixels, pieces_of, sum_squares
+from thesisrecon.surface.bspline_pieces import (
+    SplinePieces,
+    domain_of,
+    evaluate_pixels,
+    pieces_of,
+    sum_squares,
+)
 from thesisrecon.surface.linear import SurfaceSample
 
 _POLYNOMIALS = (
@@ -49,14 +55,14 @@ TILT = 1e-7
 
 
 @dataclass(frozen=True)
-class NormalEquations:
+class _NormalEquations:
     """Least squares of a spline in ``pieces`` with ``cell`` px between knots.
 
     ``rows, starts`` are the places of the sparse matrix and ``place`` (N, 256) where the entries of each
     piece go.
     """
 
-    pieces: Pieces
+    pieces: SplinePieces
     cell: int
     pixel_basis: F64
     energy: F64
@@ -65,7 +71,7 @@ class NormalEquations:
     place: NDArray[np.int32]
 
     @classmethod
-    def of(cls, pieces: Pieces, cell: int) -> NormalEquations:
+    def of(cls, pieces: SplinePieces, cell: int) -> _NormalEquations:
         """The equations' pattern, without numbers."""
         own, count = pieces.coefficient, pieces.count
         code = (own[:, None, :] * count + own[:, :, None]).reshape(-1)
@@ -162,20 +168,22 @@ class BSplineSurface:
         pieces = pieces_of(domain, cell)
         if not pieces.count:
             return BSplineFit(depth_map, pieces, cell, np.zeros(0))
-        value, deviation = _inverse(depth_map, domain.speaks)
-        coefficients = self._coefficients(NormalEquations.of(pieces, cell), value, deviation, domain.speaks)
+        value, deviation = _inverse(depth_map, domain.reliable)
+        coefficients = self._coefficients(
+            _NormalEquations.of(pieces, cell), value, deviation, domain.reliable
+        )
         return BSplineFit(depth_map, pieces, cell, coefficients)
 
-    def _coefficients(self, equations: NormalEquations, value: F64, deviation: F64, speaks: B8) -> F64:
-        unit = float(np.median(deviation[speaks]))
+    def _coefficients(self, equations: _NormalEquations, value: F64, deviation: F64, reliable: B8) -> F64:
+        unit = float(np.median(deviation[reliable]))
         value, deviation = value / unit, deviation / unit
         cells = equations.pieces.cell
-        weight, stiffness = np.where(speaks, 1.0, 0.0), np.full(len(cells), SOFTEST)
+        weight, stiffness = np.where(reliable, 1.0, 0.0), np.full(len(cells), SOFTEST)
         noise = np.zeros(0)
         for k in range(self.rounds):
             c = equations.solve(*equations.sums(value, weight / deviation**2), stiffness)
-            residual = np.where(speaks, equations.values(c) - value, 0.0) / deviation
-            weight = np.where(speaks, _weights(residual, speaks, redescending=k >= HUBER_ROUNDS), 0.0)
+            residual = np.where(reliable, equations.values(c) - value, 0.0) / deviation
+            weight = np.where(reliable, _weights(residual, reliable, redescending=k >= HUBER_ROUNDS), 0.0)
             found = self._mean_square(equations.pieces.shape, residual, weight)
             if k < SOFT_ROUNDS:
                 noise = self._allowed() * found
@@ -208,20 +216,20 @@ class BSplineSurface:
         return np.asarray(sums[0] / np.maximum(sums[1], 1e-12)).ravel()
 
 
-def _weights(residual: F64, speaks: B8, *, redescending: bool) -> F64:
+def _weights(residual: F64, reliable: B8, *, redescending: bool) -> F64:
     """Weights of residuals in deviations, Huber's or Tukey's; wider where all are larger than told."""
-    scale = max(1.0, MAD_FACTOR * float(np.median(np.abs(residual[speaks]))))
+    scale = max(1.0, MAD_FACTOR * float(np.median(np.abs(residual[reliable]))))
     r = np.abs(residual) / scale
     if redescending:
         return np.asarray(np.maximum(1.0 - (r / TUKEY) ** 2, FAINTEST) ** 2)
     return np.asarray(HUBER / np.maximum(r, HUBER))
 
 
-def _inverse(depth_map: DepthMap, speaks: B8) -> tuple[F64, F64]:
+def _inverse(depth_map: DepthMap, reliable: B8) -> tuple[F64, F64]:
     """Inverse depths and their deviations (H, W), 0 and 1 where they do not speak."""
-    depth = np.where(speaks, depth_map.depth, 1.0).astype(np.float64)
-    std = np.where(speaks, depth_map.std, 1.0).astype(np.float64)
-    return np.where(speaks, 1.0 / depth, 0.0), std / depth**2
+    depth = np.where(reliable, depth_map.depth, 1.0).astype(np.float64)
+    std = np.where(reliable, depth_map.std, 1.0).astype(np.float64)
+    return np.where(reliable, 1.0 / depth, 0.0), std / depth**2
 
 
 @dataclass(frozen=True)
@@ -229,12 +237,12 @@ class BSplineFit:
     """Coefficients of a spline in ``pieces``, ``cell`` px between knots."""
 
     given: DepthMap
-    pieces: Pieces
+    pieces: SplinePieces
     cell: int
     coefficients: F64
 
     @property
-    def passes_through(self) -> bool:
+    def interpolates(self) -> bool:
         """False: it passes near them."""
         return False
 

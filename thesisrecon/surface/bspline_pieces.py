@@ -20,7 +20,7 @@ from numba import njit
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.numerics.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
-from thesisrecon.surface.linear import one_surface, steepest_slope
+from thesisrecon.surface.linear import max_depth_slope, same_surface
 
 
 @njit(cache=True, nogil=True)
@@ -40,45 +40,6 @@ def join(parent: I64, a: int, b: int) -> None:
         parent[b] = a
     elif b < a:
         parent[a] = b
-
-
-@njit(cache=True, nogil=True)
-def label_pieces(known: B8, right: B8, down: B8, cell: int, piece: I64, first: I64) -> int:
-    """Number the pieces: ``piece`` (H, W), -1 where not ``known``; ``first`` (cells + 1,) that of each cell.
-
-    ``right`` (H, W - 1) and ``down`` (H - 1, W) say which neighbours are of one surface. Returns how many.
-    """
-    height, width = known.shape
-    rows, columns = (height + cell - 1) // cell, (width + cell - 1) // cell
-    parent = np.empty(cell * cell, dtype=np.int64)
-    number = np.empty(cell * cell, dtype=np.int64)
-    count = 0
-    for p in range(rows):
-        for q in range(columns):
-            first[p * columns + q] = count
-            y1, x1 = min((p + 1) * cell, height), min((q + 1) * cell, width)
-            for k in range(cell * cell):
-                parent[k] = k
-                number[k] = -1
-            for y in range(p * cell, y1):
-                for x in range(q * cell, x1):
-                    k = (y - p * cell) * cell + x - q * cell
-                    if x + 1 < x1 and right[y, x]:
-                        join(parent, k, k + 1)
-                    if y + 1 < y1 and down[y, x]:
-                        join(parent, k, k + cell)
-            for y in range(p * cell, y1):
-                for x in range(q * cell, x1):
-                    piece[y, x] = -1
-                    if not known[y, x]:
-                        continue
-                    root = root_of(parent, (y - p * cell) * cell + x - q * cell)
-                    if number[root] < 0:
-                        number[root] = count
-                        count += 1
-                    piece[y, x] = number[root]
-    first[rows * columns] = count
-    return count
 
 
 @njit(cache=True, nogil=True)
@@ -179,14 +140,14 @@ class Domain:
     """What of a depth map a surface stands in front of: ``held`` (H, W), and ``speaks``, whose depths count;
     ``right`` (H, W - 1), ``down`` (H - 1, W): whether neighbours are of one surface."""
 
-    held: B8
-    speaks: B8
+    covered: B8
+    reliable: B8
     right: B8
     down: B8
 
 
 @dataclass(frozen=True)
-class Pieces:
+class SplinePieces:
     """``piece`` (H, W), the number of the piece that each pixel is of, -1 for none; ``coefficient`` (N, 16),
     the coefficients of each piece; ``cell`` (N,), where it lies among the cells (``shape``); ``count`` of
     coefficients."""
@@ -205,26 +166,26 @@ def domain_of(depth_map: DepthMap, *, grazing_deg: float, least: int, reach: flo
     one they get its depth, beyond there is nothing.
     """
     depth, std = depth_map.depth.astype(np.float64), depth_map.std.astype(np.float64)
-    slope = steepest_slope(depth_map.P, grazing_deg)
+    slope = max_depth_slope(depth_map.P, grazing_deg)
     known = np.isfinite(depth) & (depth > 0.0) & (std > 0.0) & np.isfinite(std)
     depth = np.where(known, depth, np.nan)
     joined = [
         _alike(depth, std, np.full(depth.shape, slope), axis) & ~_steps(1.0 / depth, std / depth**2, axis)
         for axis in (0, 1)
     ]
-    speaks = known & (_sizes(joined, known) >= least)
-    if not speaks.any():
-        return Domain(speaks, speaks, joined[1], joined[0])
-    away, (y, x) = scipy.ndimage.distance_transform_edt(~speaks, return_indices=True)
-    held = known & (away <= reach)
+    reliable = known & (_sizes(joined, known) >= least)
+    if not reliable.any():
+        return Domain(reliable, reliable, joined[1], joined[0])
+    away, (y, x) = scipy.ndimage.distance_transform_edt(~reliable, return_indices=True)
+    covered = known & (away <= reach)
     for axis in (0, 1):
         # The depth of a pixel that does not speak is lent by the nearest that does.
         lent = _alike(depth[y, x], std[y, x], slope * (1.0 + 2.0 * away), axis)
-        joined[axis] = np.where(_both(speaks, axis), joined[axis], lent) & _both(held, axis)
+        joined[axis] = np.where(_both(reliable, axis), joined[axis], lent) & _both(covered, axis)
     # What was lent a depth must hang together with depths that speak.
-    held &= _sizes(joined, speaks) >= least
-    joined = [one & _both(held, axis) for axis, one in enumerate(joined)]
-    return Domain(held, speaks & held, joined[1], joined[0])
+    covered &= _sizes(joined, reliable) >= least
+    joined = [one & _both(covered, axis) for axis, one in enumerate(joined)]
+    return Domain(covered, reliable & covered, joined[1], joined[0])
 
 
 def _pairs(values: Any, axis: int) -> tuple[Any, Any]:
@@ -240,7 +201,7 @@ def _both(mask: B8, axis: int) -> B8:
 def _alike(depth: F64, std: F64, slope: F64, axis: int) -> B8:
     """Whether depths are near enough to the next along an axis for one surface."""
     with np.errstate(invalid="ignore"):
-        return one_surface(*_pairs(depth, axis), *_pairs(std, axis), np.maximum(*_pairs(slope, axis)))
+        return same_surface(*_pairs(depth, axis), *_pairs(std, axis), np.maximum(*_pairs(slope, axis)))
 
 
 def _steps(rho: F64, deviation: F64, axis: int) -> B8:
@@ -262,34 +223,52 @@ def _steps(rho: F64, deviation: F64, axis: int) -> B8:
 
 def _sizes(joined: Sequence[B8], counted: B8) -> I64:
     """(H, W) number of pixels, of those that are ``counted``, that each hangs together with."""
-    shape = counted.shape
-    number = np.arange(counted.size).reshape(shape)
-    start, stop = (
-        np.concatenate([_pairs(number, axis)[end][joined[axis]] for axis in (0, 1)]) for end in (0, 1)
-    )
-    graph = scipy.sparse.coo_array(
-        (np.ones(len(start), dtype=np.int8), (start, stop)), shape=(number.size, number.size)
-    )
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    return np.asarray(np.bincount(label, counted.ravel())[label].reshape(shape), dtype=np.int64)
+    number = np.arange(counted.size).reshape(counted.shape)
+    label = _components(number, joined, counted.size)
+    return np.asarray(np.bincount(label, counted.ravel())[label].reshape(counted.shape), dtype=np.int64)
 
 
-def pieces_of(domain: Domain, cell: int) -> Pieces:
+def pieces_of(domain: Domain, cell: int) -> SplinePieces:
     """The pieces of a domain in cells of ``cell`` px, and the coefficients of each.
 
     A node of the spline has a coefficient for every part of the surface that hangs together within the
     sixteen cells that it reaches: both sides of a cut have their own, and it is smooth round the end.
     """
-    height, width = domain.held.shape
+    height, width = domain.covered.shape
     shape = (-(-height // cell), -(-width // cell))
-    piece = np.empty((height, width), dtype=np.int64)
-    first = np.empty(shape[0] * shape[1] + 1, dtype=np.int64)
-    count = label_pieces(domain.held, domain.right, domain.down, cell, piece, first)
-    start, linked = _links(piece, domain, count)
-    coefficient = np.empty((count, 16), dtype=np.int64)
+    piece, cells = _label_pieces(domain, cell, shape[1])
+    first = np.searchsorted(cells, np.arange(shape[0] * shape[1] + 1))
+    start, linked = _links(piece, domain, len(cells))
+    coefficient = np.empty((len(cells), 16), dtype=np.int64)
     total = number_coefficients(first, shape[1], start, linked, coefficient)
-    cells = np.repeat(np.arange(len(first) - 1), np.diff(first))
-    return Pieces(piece, coefficient, cells, shape, total)
+    return SplinePieces(piece, coefficient, cells, shape, total)
+
+
+def _label_pieces(domain: Domain, cell: int, columns: int) -> tuple[I64, I64]:
+    """Pieces (H, W), -1 for none, numbered cell by cell and by their first pixel; the cell (N,) of each."""
+    y, x = np.indices(domain.covered.shape) // cell
+    place = y * columns + x
+    pixels = np.flatnonzero(domain.covered)
+    pixels = pixels[np.argsort(place.ravel()[pixels], kind="stable")]
+    number = np.full(place.shape, -1, dtype=np.int64)
+    number.ravel()[pixels] = np.arange(len(pixels))
+    inside = [
+        joined & (np.diff(place, axis=axis) == 0) & _both(domain.covered, axis)
+        for axis, joined in enumerate((domain.down, domain.right))
+    ]
+    label = _components(number, inside, len(pixels))
+    piece = number.copy()
+    piece.ravel()[pixels] = label
+    return piece, place.ravel()[pixels[np.unique(label, return_index=True)[1]]]
+
+
+def _components(number: I64, joined: Sequence[B8], count: int) -> I64:
+    """Connected components (count,) of numbered pixels; ``joined`` with the next along either axis."""
+    start, stop = (
+        np.concatenate([_pairs(number, axis)[end][joined[axis]] for axis in (0, 1)]) for end in (0, 1)
+    )
+    graph = scipy.sparse.coo_array((np.ones(len(start), dtype=np.int8), (start, stop)), shape=(count, count))
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _links(piece: I64, domain: Domain, count: int) -> tuple[I64, I64]:

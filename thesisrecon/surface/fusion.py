@@ -24,25 +24,25 @@ from thesisrecon.geometry.camera_matrix import decompose_camera, project
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface.fusion_kernels import (
     SIDE,
-    Distances,
-    Surface,
+    MapSamples,
+    SignedDistances,
     integrate_view,
     join_vertices,
     place_vertices,
     touched_blocks,
 )
-from thesisrecon.surface.linear import split_squares, steepest_slope, surface_from_depth
-from thesisrecon.surface.mesh import keep_large_parts, with_faces, without_unused_vertices
+from thesisrecon.surface.linear import max_depth_slope, surface_from_depth, triangulate_grid
+from thesisrecon.surface.mesh import remove_small_parts, remove_unused_vertices, select_faces
 
-FLATTEST = 0.1
+MIN_COSINE = 0.1
 """Surfaces seen more flatly than this count as seen so: what they measure across themselves is little."""
 
-FINER = 1.15
+VOXEL_GROWTH = 1.15
 """Factor by which voxels grow until their blocks fit into the memory that is allowed."""
 
 
 @dataclass(frozen=True)
-class Grid:
+class _Grid:
     """Where the blocks are: ``origin`` (3,) of the first voxel's centre, ``voxel`` side, ``blocks`` (B, 3)
     grid places in their order, ``place`` (X, Y, Z) the number of the block at each place or -1."""
 
@@ -66,7 +66,7 @@ class VolumetricFusion:
     truncation_voxels: float = 3.0
     max_blocks: int = 250_000
     grazing_deg: float = 5.0
-    least_part: float = 0.0005
+    min_part_share: float = 0.0005
 
     def __post_init__(self) -> None:
         if not (0.0 < self.voxel_px < np.inf and 0.0 < self.truncation_voxels < np.inf):
@@ -100,17 +100,17 @@ class VolumetricFusion:
                         _integrate(grid, truncation, one, some, value, weight)
 
             list(pool.map(integrate, parts))
-        mesh = extract_surface(grid, value, weight)
+        mesh = _extract_surface(grid, value, weight)
         if not len(mesh.faces):
-            raise nothing_to_fuse()
-        return keep_large_parts(mesh, self.least_part)
+            raise _nothing_to_fuse()
+        return remove_small_parts(mesh, self.min_part_share)
 
-    def _lay_out(self, measured: list[Measured]) -> tuple[Grid, float, list[Measured]]:
+    def _lay_out(self, measured: list[_FusionMap]) -> tuple[_Grid, float, list[_FusionMap]]:
         """The blocks that the surface may pass, where distances are cut, and the depths that are sure enough
         for that."""
-        footprints = [(m.depth / np.float32(m.focal))[np.isfinite(m.depth)] for m in measured]
+        footprints = [(m.samples.depth / np.float32(m.focal))[np.isfinite(m.samples.depth)] for m in measured]
         if not sum(map(len, footprints)):
-            raise nothing_to_fuse()
+            raise _nothing_to_fuse()
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
             truncation = self.truncation_voxels * voxel
@@ -118,27 +118,25 @@ class VolumetricFusion:
             grid = _grid(sure, voxel, truncation)
             if grid is not None and len(grid.blocks) <= self.max_blocks:
                 return grid, truncation, sure
-            voxel *= FINER
+            voxel *= VOXEL_GROWTH
 
 
 @dataclass(frozen=True)
-class Measured:
+class _FusionMap:
     """A depth map as the grid takes it: ``P`` (3, 4), ``focal`` in pixels, ``depth`` and ``std`` (H, W),
     ``lean`` (H, W) how far a ray comes off the surface for a unit of depth, ``slope`` the largest step in
     depth from one pixel to the next on one surface, in units of the depth."""
 
     P: F64
     focal: float
-    depth: F32
-    std: F32
-    lean: F32
-    slope: float
+    samples: MapSamples
 
-    def sure(self, truncation: float) -> Measured:
+    def sure(self, truncation: float) -> _FusionMap:
         """Without depths whose deviation across the surface a grid of this resolution cannot hold."""
         with np.errstate(invalid="ignore"):
-            held = self.std * self.lean <= truncation
-        return replace(self, depth=np.where(held, self.depth, np.float32(np.nan)))
+            certain = self.samples.std * self.samples.cosine <= truncation
+        depth = np.where(certain, self.samples.depth, np.float32(np.nan))
+        return replace(self, samples=self.samples._replace(depth=depth))
 
     @property
     def rays(self) -> tuple[F64, F64]:
@@ -147,23 +145,24 @@ class Measured:
         return np.ascontiguousarray(R.T @ np.linalg.inv(K)), -R.T @ t
 
 
-def _measured(depth_map: DepthMap, grazing_deg: float) -> Measured:
+def _measured(depth_map: DepthMap, grazing_deg: float) -> _FusionMap:
     K = decompose_camera(depth_map.P)[0]
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
     slope = float(1.0 / (focal * np.tan(np.radians(grazing_deg))))
     facing = _facing(depth_map, slope)
-    return Measured(facing.P, focal, facing.depth, facing.std, leaning(facing.depth, K), slope)
+    return _FusionMap(
+        facing.P, focal, MapSamples(facing.depth, facing.std, incidence_cosines(facing.depth, K), slope)
+    )
 
 
-def _integrate(grid: Grid, truncation: float, one: Measured, some: slice, value: F32, weight: F32) -> None:
+def _integrate(grid: _Grid, truncation: float, one: _FusionMap, some: slice, value: F32, weight: F32) -> None:
     K, R, t = decompose_camera(one.P)
     P = K @ np.column_stack([R, t + R @ grid.origin])
-    surface = Surface(one.depth, one.std, one.lean, one.slope)
-    sums = Distances(value[some], weight[some])
-    integrate_view(grid.blocks[some], grid.voxel, P, surface, truncation, sums)
+    sums = SignedDistances(value[some], weight[some])
+    integrate_view(grid.blocks[some], grid.voxel, P, one.samples, truncation, sums)
 
 
-def nothing_to_fuse() -> StageFailure:
+def _nothing_to_fuse() -> StageFailure:
     """The refusal of depth maps without depths."""
     return StageFailure(
         "no surface could be made",
@@ -172,7 +171,7 @@ def nothing_to_fuse() -> StageFailure:
     )
 
 
-def leaning(depth: F32, K: F64) -> F32:
+def incidence_cosines(depth: F32, K: F64) -> F32:
     """(H, W) how far a ray comes off its surface for a unit of depth: 1 seen straight on, towards 0 along it.
 
     Inverse depth is linear in the pixel on a plane, and its gradient with the ray gives the plane. Of the
@@ -189,8 +188,8 @@ def leaning(depth: F32, K: F64) -> F32:
     # Pixels (x, y, 1) of inverse depth (a, b, c) . (x, y, 1) are of the plane with the normal K' (a, b, c).
     c = inverse - a * x - b * y
     normal = np.einsum("ji,j...->i...", K.astype(np.float32), np.stack([a, b, c]))
-    lean = inverse / np.sqrt((normal**2).sum(axis=0))
-    return np.where(known, np.maximum(lean, np.float32(FLATTEST)), np.float32(1.0))
+    cosine = inverse / np.sqrt((normal**2).sum(axis=0))
+    return np.where(known, np.maximum(cosine, np.float32(MIN_COSINE)), np.float32(1.0))
 
 
 def _gentler(values: F32, axis: int) -> F32:
@@ -216,17 +215,18 @@ def _facing(depth_map: DepthMap, slope: float) -> DepthMap:
     return replace(depth_map, depth=np.where(flat, np.float32(np.nan), depth))
 
 
-def _grid(measured: Sequence[Measured], voxel: float, reach: float) -> Grid | None:
+def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid | None:
     """The blocks within ``reach`` of any depth; None where the box about them is too large to be listed."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for one in measured:
         directions, centre = one.rays
-        y, x = np.nonzero(np.isfinite(one.depth))
-        xyz = centre + one.depth[y, x, None] * (np.stack([x, y, np.ones_like(x)], axis=1) @ directions.T)
+        depth = one.samples.depth
+        y, x = np.nonzero(np.isfinite(depth))
+        xyz = centre + depth[y, x, None] * (np.stack([x, y, np.ones_like(x)], axis=1) @ directions.T)
         if len(xyz):
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
     if not np.isfinite(low).all():
-        raise nothing_to_fuse()
+        raise _nothing_to_fuse()
     edge = SIDE * voxel
     origin = low - 2.0 * reach
     shape = np.ceil((high - low + 4.0 * reach) / edge).astype(int) + 1
@@ -235,14 +235,14 @@ def _grid(measured: Sequence[Measured], voxel: float, reach: float) -> Grid | No
     marked = np.zeros(tuple(shape), dtype=np.uint8)
     for one in measured:
         directions, centre = one.rays
-        touched_blocks(one.depth, one.lean, directions, centre - origin, reach, edge, marked)
+        touched_blocks(one.samples, directions, centre - origin, reach, edge, marked)
     blocks = np.argwhere(marked).astype(np.int64)
     place = np.full(marked.shape, -1, dtype=np.int64)
     place[tuple(blocks.T)] = np.arange(len(blocks))
-    return Grid(origin, voxel, blocks, place)
+    return _Grid(origin, voxel, blocks, place)
 
 
-def extract_surface(grid: Grid, value: F32, weight: F32) -> TexturedMesh:
+def _extract_surface(grid: _Grid, value: F32, weight: F32) -> TexturedMesh:
     """The zero of ``value`` (B, 8, 8, 8) where ``weight`` is positive, as a net of triangles."""
     vertex = np.empty(value.shape, dtype=np.int64)
     count = place_vertices(grid.blocks, grid.place, value, weight, vertex, np.zeros((0, 3)))
@@ -253,7 +253,7 @@ def extract_surface(grid: Grid, value: F32, weight: F32) -> TexturedMesh:
         (join_vertices(grid.blocks, grid.place, value, weight, vertex, points, nothing), 3), np.int64
     )
     join_vertices(grid.blocks, grid.place, value, weight, vertex, points, faces)
-    return without_unused_vertices(TexturedMesh(grid.origin + grid.voxel * points, faces))
+    return remove_unused_vertices(TexturedMesh(grid.origin + grid.voxel * points, faces))
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ class DepthSheets:
     step: int = 2
     same: float = 0.02
     grazing_deg: float = 10.0
-    least_part: float = 0.0005
+    min_part_share: float = 0.0005
 
     def __post_init__(self) -> None:
         if self.step < 1 or not self.same >= 0.0 or not 0.0 < self.grazing_deg < 90.0:
@@ -284,16 +284,17 @@ class DepthSheets:
         sheets: list[TexturedMesh] = []
         shows: list[Callable[[F64], B8]] = []
         for depth_map in order:
-            sheet = keep_large_parts(
-                surface_from_depth(depth_map, step=self.step, grazing_deg=self.grazing_deg), self.least_part
+            sheet = remove_small_parts(
+                surface_from_depth(depth_map, step=self.step, grazing_deg=self.grazing_deg),
+                self.min_part_share,
             )
             shown = np.zeros(len(sheet.vertices), dtype=bool)
             for earlier in shows:
                 shown |= earlier(sheet.vertices)
             shows.append(self._shown_by(depth_map))
-            sheets.append(with_faces(sheet, np.asarray(~shown[sheet.faces].all(axis=1))))
+            sheets.append(select_faces(sheet, np.asarray(~shown[sheet.faces].all(axis=1))))
         if not sum(len(sheet.faces) for sheet in sheets):
-            raise nothing_to_fuse()
+            raise _nothing_to_fuse()
         starts = np.cumsum([0, *(len(sheet.vertices) for sheet in sheets[:-1])])
         faces = [sheet.faces + start for sheet, start in zip(sheets, starts, strict=True)]
         vertices = np.concatenate([sheet.vertices for sheet in sheets])
@@ -303,8 +304,8 @@ class DepthSheets:
         """Which of points (N, 3) lie on the sheet of a map: in a whole square of it, at its depth."""
         depth = depth_map.depth[:: self.step, :: self.step].astype(np.float64)
         std = depth_map.std[:: self.step, :: self.step].astype(np.float64)
-        slope = self.step * steepest_slope(depth_map.P, self.grazing_deg)
-        whole: B8 = np.asarray(split_squares(depth, std, slope).whole.all(axis=-1))
+        slope = self.step * max_depth_slope(depth_map.P, self.grazing_deg)
+        whole: B8 = np.asarray(triangulate_grid(depth, std, slope).whole.all(axis=-1))
 
         def shown(X: F64) -> B8:
             z = X @ depth_map.P[2, :3] + depth_map.P[2, 3]

@@ -12,22 +12,22 @@ from thesisrecon.arrays import F32, F64, I64, U8
 SIDE = 8
 """Voxels a side of a block."""
 
-BEYOND = 0.1
+WEIGHT_BEYOND = 0.1
 """Weight of a depth half a pixel and more beyond the last that is known."""
 
 
-class Surface(NamedTuple):
+class MapSamples(NamedTuple):
     """What one depth map tells: ``depth`` and its deviation ``std`` (H, W), ``lean`` (H, W) how far a ray
     comes off the surface for a unit of depth, and ``slope``, the largest relative step in depth from one
     pixel to the next on one surface."""
 
     depth: F32
     std: F32
-    lean: F32
+    cosine: F32
     slope: float
 
 
-class Distances(NamedTuple):
+class SignedDistances(NamedTuple):
     """Of the voxels of blocks (B, 8, 8, 8): the weighted mean distance to the surface, and its weight."""
 
     value: F32
@@ -36,7 +36,7 @@ class Distances(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def touched_blocks(
-    depth: F32, lean: F32, rays: F64, centre: F64, reach: float, edge: float, marked: U8
+    samples: MapSamples, rays: F64, centre: F64, reach: float, edge: float, marked: U8
 ) -> None:
     """Mark the blocks (X, Y, Z) that the surface may pass: those on a ray before and behind its point as
     long as the ray is within ``reach`` of the surface.
@@ -45,12 +45,13 @@ def touched_blocks(
     (x, y, 1) to the point at depth 1 less ``centre`` (3,), which counts from the grid's origin; ``edge`` is
     the side of a block. Points outside of the grid mark nothing.
     """
+    depth, cosine = samples.depth, samples.cosine
     for y in range(depth.shape[0]):
         for x in range(depth.shape[1]):
             z = depth[y, x]
             if not z > 0.0:
                 continue
-            along = reach / lean[y, x]
+            along = reach / cosine[y, x]
             steps = int(np.ceil(2.0 * along / (0.5 * edge))) + 1
             dx = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
             dy = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
@@ -66,7 +67,7 @@ def touched_blocks(
 
 @njit(cache=True, nogil=True)
 def integrate_view(
-    blocks: I64, voxel: float, P: F64, surface: Surface, truncation: float, sums: Distances
+    blocks: I64, voxel: float, P: F64, surface: MapSamples, truncation: float, sums: SignedDistances
 ) -> None:
     """Add one depth map to the signed distances of blocks (Curless and Levoy 1996).
 
@@ -76,7 +77,7 @@ def integrate_view(
     across the surface: the surface is taken to be plane as far as the ray is near it, and the error of that
     grows with 1 / lean^2.
     """
-    depth, std, lean, slope = surface
+    depth, std, cosine, slope = surface
     value, weight = sums
     height, width = depth.shape
     base = (truncation / 8.0) ** 2
@@ -95,15 +96,15 @@ def integrate_view(
                     if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
                         continue
                     seen, place, trust = _depth_at(depth, std, slope, u, v)
-                    spread, leaning = std[place], lean[place]
-                    distance = leaning * (seen - z)
+                    spread, incidence = std[place], cosine[place]
+                    distance = incidence * (seen - z)
                     if not distance > -truncation:
                         continue
-                    own = trust / (leaning * leaning * spread * spread + base)
+                    own = trust / (incidence * incidence * spread * spread + base)
                     if distance > truncation:
                         distance = truncation
                     else:
-                        own *= leaning**4
+                        own *= incidence**4
                     total = weight[b, i, j, k] + own
                     mean = value[b, i, j, k]
                     value[b, i, j, k] = np.float32(mean + own / total * (distance / truncation - mean))
@@ -140,7 +141,7 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
         row = other_row
     else:
         row, column = other_row, other_column
-    return depth[row, column], (row, column), BEYOND
+    return depth[row, column], (row, column), WEIGHT_BEYOND
 
 
 @njit(cache=True, nogil=True)

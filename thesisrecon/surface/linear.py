@@ -15,7 +15,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import DepthMap, TexturedMesh
-from thesisrecon.surface.mesh import without_unused_vertices
+from thesisrecon.surface.mesh import remove_unused_vertices
 
 
 def surface_from_depth(depth_map: DepthMap, *, step: int = 1, grazing_deg: float = 10.0) -> TexturedMesh:
@@ -40,16 +40,16 @@ def surface_from_depth(depth_map: DepthMap, *, step: int = 1, grazing_deg: float
         raise ValueError(f"step >= 1 and 0 < grazing_deg < 90 are needed; got {step} and {grazing_deg}")
     depth = depth_map.depth[::step, ::step].astype(np.float64)
     std = depth_map.std[::step, ::step].astype(np.float64)
-    squares = split_squares(depth, std, step * steepest_slope(depth_map.P, grazing_deg))
+    triangles = triangulate_grid(depth, std, step * max_depth_slope(depth_map.P, grazing_deg))
     index = np.arange(depth.size).reshape(depth.shape)
     corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], axis=-1)
     faces = []
     for rising, triples in ((True, RISING), (False, FALLING)):
         for k, triple in enumerate(triples):
-            faces.append(corners[(squares.rising == rising) & squares.whole[..., k]][:, triple])
+            faces.append(corners[(triangles.rising == rising) & triangles.whole[..., k]][:, triple])
     order = np.concatenate(faces)
     order = order[np.lexsort(order.T[::-1])]
-    return without_unused_vertices(TexturedMesh(back_project(depth_map.P, depth, step), order))
+    return remove_unused_vertices(TexturedMesh(back_project(depth_map.P, depth, step), order))
 
 
 RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))
@@ -57,7 +57,7 @@ RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))
 
 
 @dataclass(frozen=True)
-class Squares:
+class GridTriangles:
     """How the squares between pixels (H - 1, W - 1) are made of triangles: ``rising``, whether the diagonal
     runs from the lower left to the upper right, and ``whole`` (H - 1, W - 1, 2), which triangles are."""
 
@@ -65,13 +65,13 @@ class Squares:
     whole: B8
 
 
-def steepest_slope(P: F64, grazing_deg: float) -> float:
+def max_depth_slope(P: F64, grazing_deg: float) -> float:
     """Largest step in depth from a pixel to the next, in units of depth, on a surface seen no more flatly."""
     K = decompose_camera(P)[0]
     return float(1.0 / (np.sqrt(K[0, 0] * K[1, 1]) * np.tan(np.radians(grazing_deg))))
 
 
-def split_squares(depth: F64, std: F64, slope: float) -> Squares:
+def triangulate_grid(depth: F64, std: F64, slope: float) -> GridTriangles:
     """Triangles of a grid of depths (H, W) with deviations; ``slope``: the largest step in units of depth."""
     corner = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
     z, spread = (np.stack([values[c] for c in corner], axis=-1) for values in (depth, std))
@@ -82,19 +82,19 @@ def split_squares(depth: F64, std: F64, slope: float) -> Squares:
         triple = np.where(rising[..., None], RISING[k], FALLING[k])
         at, std_at = (np.take_along_axis(values, triple, axis=-1) for values in (z, spread))
         whole[..., k] = _whole(at, std_at, slope)
-    return Squares(rising, whole)
+    return GridTriangles(rising, whole)
 
 
 def _whole(z: F64, spread: F64, slope: float) -> B8:
     """Triangles (..., 3) with no side along which the surface breaks, and no corner without depth."""
     with np.errstate(invalid="ignore"):
-        joined = one_surface(
+        joined = same_surface(
             z, np.roll(z, 1, axis=-1), spread, np.roll(spread, 1, axis=-1), np.sqrt(2.0) * slope
         )
     return np.asarray(joined.all(axis=-1))
 
 
-def one_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> B8:
+def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> B8:
     """Whether two depths may be of one surface: at most ``slope`` of the smaller, or three deviations,
     apart."""
     limit = np.maximum(slope * np.minimum(z1, z2), 3.0 * np.hypot(std1, std2))
@@ -126,7 +126,7 @@ class FittedSurface(Protocol):
     def given(self) -> DepthMap: ...
 
     @property
-    def passes_through(self) -> bool:
+    def interpolates(self) -> bool:
         """Whether the depths of ``given`` are on the surface as they are."""
 
     def evaluate(self, xy: F64) -> SurfaceSample:
@@ -140,7 +140,7 @@ class DepthSurface(Protocol):
         """The surface; NaN wherever it would have to be made up."""
 
 
-def normals(surface: FittedSurface, xy: F64) -> F64:
+def surface_normals(surface: FittedSurface, xy: F64) -> F64:
     """Unit normals (N, 3) in the world at ``xy`` (N, 2) px, towards the camera; NaN where no surface is.
 
     Near a pixel the surface is the plane a . (x, y, 1) = 1 / z, whose normal in the camera is -K' a.
@@ -152,7 +152,7 @@ def normals(surface: FittedSurface, xy: F64) -> F64:
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
-def resampled(surface: FittedSurface, scale: float = 1.0) -> DepthMap:
+def resample_surface(surface: FittedSurface, scale: float = 1.0) -> DepthMap:
     """The surface as a depth map of ``scale`` times as many rows and columns, 1 for those it was made from.
 
     Deviations and counts of views are those of the nearest pixel that was given: what neighbouring pixels
@@ -161,7 +161,7 @@ def resampled(surface: FittedSurface, scale: float = 1.0) -> DepthMap:
     if not scale > 0.0:
         raise ValueError(f"scale must be positive; got {scale}")
     given = surface.given
-    if scale == 1.0 and surface.passes_through:
+    if scale == 1.0 and surface.interpolates:
         return given
     shape = tuple(max(round(n * scale), 1) for n in given.depth.shape)
     places = [(np.arange(n) + 0.5) / scale - 0.5 for n in shape]
@@ -186,10 +186,12 @@ def resampled(surface: FittedSurface, scale: float = 1.0) -> DepthMap:
     )
 
 
-def sampled_mesh(surface: FittedSurface, scale: float = 1.0, *, grazing_deg: float = 10.0) -> TexturedMesh:
+def triangulate_surface(
+    surface: FittedSurface, scale: float = 1.0, *, grazing_deg: float = 10.0
+) -> TexturedMesh:
     """The surface in triangles, ``scale`` of them along the side of a pixel; it breaks where
     :func:`~thesisrecon.surface.linear.surface_from_depth` says."""
-    return surface_from_depth(resampled(surface, scale), grazing_deg=grazing_deg)
+    return surface_from_depth(resample_surface(surface, scale), grazing_deg=grazing_deg)
 
 
 @dataclass(frozen=True)
@@ -212,8 +214,8 @@ class LinearSurface:
             np.pad(part.astype(np.float64), ((0, 1), (0, 1)), constant_values=np.nan)
             for part in (depth_map.depth, depth_map.std)
         )
-        slope = steepest_slope(depth_map.P, self.grazing_deg)
-        return LinearFit(depth_map, 1.0 / depth, split_squares(depth, std, slope))
+        slope = max_depth_slope(depth_map.P, self.grazing_deg)
+        return LinearFit(depth_map, 1.0 / depth, triangulate_grid(depth, std, slope))
 
 
 @dataclass(frozen=True)
@@ -223,10 +225,10 @@ class LinearFit:
 
     given: DepthMap
     inverse_depth: F64
-    squares: Squares
+    triangles: GridTriangles
 
     @property
-    def passes_through(self) -> bool:
+    def interpolates(self) -> bool:
         """True."""
         return True
 
@@ -238,14 +240,14 @@ class LinearFit:
         x, y = np.floor(at + 1e-9).astype(np.int64).T
         u, v = (at - np.stack([x, y], axis=1)).T
         a, b, c, d = (self.inverse_depth[y + j, x + i] for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)))
-        rising = self.squares.rising[y, x]
+        rising = self.triangles.rising[y, x]
         second = np.where(rising, u + v > 1.0, u > v)
         along_x = np.where(rising == second, d - c, b - a)
         along_y = np.where(second, d - b, c - a)
         value = np.where(
             rising & second, d - (1.0 - u) * along_x - (1.0 - v) * along_y, a + u * along_x + v * along_y
         )
-        whole = inside & self.squares.whole[y, x, second.astype(np.int64)]
+        whole = inside & self.triangles.whole[y, x, second.astype(np.int64)]
         pixel = inside & (np.maximum(np.abs(u), np.abs(v)) < 1e-6)
         value = np.where(whole, value, np.where(pixel, a, np.nan))
         return SurfaceSample(value, np.where(whole[:, None], np.stack([along_x, along_y], axis=1), np.nan))

@@ -12,7 +12,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.records import TexturedMesh
 
 
-def without_unused_vertices(mesh: TexturedMesh) -> TexturedMesh:
+def remove_unused_vertices(mesh: TexturedMesh) -> TexturedMesh:
     """The same surface with only the vertices that its faces name, in their order."""
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[mesh.faces] = True
@@ -21,11 +21,11 @@ def without_unused_vertices(mesh: TexturedMesh) -> TexturedMesh:
     return replace(mesh, vertices=mesh.vertices[used], faces=number[mesh.faces], colors=colors)
 
 
-def with_faces(mesh: TexturedMesh, keep: B8) -> TexturedMesh:
+def select_faces(mesh: TexturedMesh, keep: B8) -> TexturedMesh:
     """The surface of the faces that ``keep`` (M,) marks."""
     uv = None if mesh.uv is None else mesh.uv[keep]
     untextured = None if mesh.untextured is None else mesh.untextured[keep]
-    return without_unused_vertices(replace(mesh, faces=mesh.faces[keep], uv=uv, untextured=untextured))
+    return remove_unused_vertices(replace(mesh, faces=mesh.faces[keep], uv=uv, untextured=untextured))
 
 
 def face_areas(vertices: F64, faces: I64) -> F64:
@@ -45,7 +45,7 @@ def vertex_normals(mesh: TexturedMesh) -> F64:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
 
 
-def parts_of(faces: I64, vertices: int) -> I64:
+def connected_parts(faces: I64, vertices: int) -> I64:
     """(M,) number of the connected part that each face belongs to; faces connect by common vertices."""
     if not len(faces):
         return np.zeros(0, dtype=np.int64)
@@ -73,16 +73,16 @@ def face_neighbours(faces: I64) -> I64:
     return neighbour.reshape(-1, 3)
 
 
-def keep_large_parts(mesh: TexturedMesh, least_share: float = 0.002) -> TexturedMesh:
+def remove_small_parts(mesh: TexturedMesh, min_share: float = 0.002) -> TexturedMesh:
     """Without connected parts of less than ``least_share`` of the whole area: crumbs of wrong depths."""
     if not len(mesh.faces):
         return mesh
-    part = parts_of(mesh.faces, len(mesh.vertices))
+    part = connected_parts(mesh.faces, len(mesh.vertices))
     area = np.bincount(part, face_areas(mesh.vertices, mesh.faces))
-    return with_faces(mesh, area[part] >= least_share * area.sum())
+    return select_faces(mesh, area[part] >= min_share * area.sum())
 
 
-def coarser(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
+def simplify_mesh(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
     """The same surface with at most ``max_faces`` triangles; a mesh that has no more is returned as it is.
 
     Vertices that are connected within one cell of a cubic grid become one (Rossignac and Borrel 1993; two
@@ -97,7 +97,7 @@ def coarser(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
         raise ValueError(f"max_faces must be at least 1; got {max_faces}")
     if len(mesh.faces) <= max_faces:
         return mesh
-    mesh = without_unused_vertices(replace(mesh, uv=None, texture=None, untextured=None))
+    mesh = remove_unused_vertices(replace(mesh, uv=None, texture=None, untextured=None))
     extent = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
     cell = max(float(np.sqrt(face_areas(mesh.vertices, mesh.faces).sum() / max_faces)), 1e-9 * extent)
     while True:
@@ -108,7 +108,7 @@ def coarser(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
         cell *= max(1.02, float(np.sqrt(len(faces) / max_faces)))
     vertices = _cluster_places(mesh, cluster, cell)
     colors = None if mesh.colors is None else np.rint(_means(cluster, mesh.colors)).astype(np.uint8)
-    return without_unused_vertices(replace(mesh, vertices=vertices, faces=faces, colors=colors))
+    return remove_unused_vertices(replace(mesh, vertices=vertices, faces=faces, colors=colors))
 
 
 def _clusters(mesh: TexturedMesh, cell: float) -> I64:

@@ -10,7 +10,7 @@ from typing import Literal
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
-from thesisrecon.surface.linear import LinearSurface, resampled
+from thesisrecon.surface.linear import LinearSurface, resample_surface
 from thesisrecon.surface.texture_atlas import TextureAtlas
 from thesisrecon.surface.texture_views import color_vertices
 
@@ -44,7 +44,7 @@ class SurfaceModel:
     def surface_of(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
         """The surface alone; :class:`StageFailure` where the maps have no depths."""
         with ThreadPoolExecutor(max(threads, 1)) as pool:
-            fitted = list(pool.map(lambda m: resampled(self.surface.fit(m)), depth_maps))
+            fitted = list(pool.map(lambda m: resample_surface(self.surface.fit(m)), depth_maps))
         return self.fusion.fuse(fitted, threads=threads)
 
     def color(

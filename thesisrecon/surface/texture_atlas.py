@@ -2,8 +2,8 @@
 
 Each chart (connected faces that one photograph shows best) has the outline and the resolution that it has in
 that photograph. What is painted there is either what all photographs agree on
-(:class:`~thesisrecon.surface.texture_blending.BlendedViews`) or that photograph alone
-(:class:`~thesisrecon.surface.color_correction.SingleView`).
+(:class:`~thesisrecon.surface.texture_blending.BlendedTexture`) or that photograph alone
+(:class:`~thesisrecon.surface.color_correction.SeamLeveledTexture`).
 """
 
 from __future__ import annotations
@@ -17,19 +17,18 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.raster import resample, smooth
 from thesisrecon.records import PinholeView, TexturedMesh
-from thesisrecon.surface.color_correction import SingleView
 from thesisrecon.surface.mesh import face_neighbours
-from thesisrecon.surface.texture_blending import BlendedViews
+from thesisrecon.surface.texture_blending import BlendedTexture, SeamLeveledTexture
 from thesisrecon.surface.texture_views import (
     Charts,
-    camera_of,
-    charts_of,
     choose_views,
     face_quality,
+    label_charts,
     project,
+    view_camera,
 )
 
-MARGIN = 2
+CHART_MARGIN = 2
 """Pixels around each piece, so that what is drawn smaller does not mix pieces at once."""
 
 SWATCH = 3
@@ -37,7 +36,7 @@ SWATCH = 3
 
 
 @dataclass(frozen=True)
-class Pieces:
+class _AtlasFaces:
     """The faces of an atlas before packing: ``xy`` (M, 3, 2) corners in the photograph of the face, ``label``
     (M,) its place among the views or -1, ``chart`` (M,)."""
 
@@ -46,7 +45,7 @@ class Pieces:
     chart: I64
 
 
-LEAST_SCALE = 0.05
+MIN_SCALE = 0.05
 """Photographs reduced to less show nothing; the pieces' margins remain."""
 
 
@@ -60,8 +59,8 @@ class TextureAtlas:
 
     max_texels: int = 4096 * 4096
     smooth_rounds: int = 40
-    least_faces: int = 30
-    painter: BlendedViews | SingleView = field(default_factory=BlendedViews)
+    min_chart_faces: int = 30
+    painter: BlendedTexture | SeamLeveledTexture = field(default_factory=BlendedTexture)
 
     def __post_init__(self) -> None:
         if self.max_texels < 1:
@@ -75,28 +74,30 @@ class TextureAtlas:
         """
         neighbours = face_neighbours(mesh.faces)
         quality = face_quality(mesh, views, threads=threads)
-        label = choose_views(quality, neighbours, rounds=self.smooth_rounds, least_faces=self.least_faces)
+        label = choose_views(
+            quality, neighbours, rounds=self.smooth_rounds, min_chart_faces=self.min_chart_faces
+        )
         if not (label >= 0).any():
             raise StageFailure("the surface has no texture", "no photograph sees any of it")
-        chart = charts_of(label, neighbours)
+        chart = label_charts(label, neighbours)
         scale = 1.0
         while True:
             smaller = [_reduced(view, scale) for view in views]
-            pieces = Pieces(_corners(mesh, smaller, label), label, chart)
-            rectangles = _rectangles(pieces, smaller)
+            faces = _AtlasFaces(_corners(mesh, smaller, label), label, chart)
+            rectangles = _rectangles(faces, smaller)
             offsets, size = pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
             if size[0] * size[1] <= self.max_texels:
                 break
-            if scale <= LEAST_SCALE:
+            if scale <= MIN_SCALE:
                 texels = size[0] * size[1]
                 raise StageFailure(
                     "the texture is too large",
                     f"{len(rectangles)} pieces take {texels} texels, allowed are {self.max_texels}",
                     "allow more texels, or fewer pieces (least_faces)",
                 )
-            scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), LEAST_SCALE)
-        uv = pieces.xy + (offsets - rectangles[:, :2])[chart][:, None, :]
-        cut_out = _fill(smaller, pieces, rectangles, offsets, size)
+            scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), MIN_SCALE)
+        uv = faces.xy + (offsets - rectangles[:, :2])[chart][:, None, :]
+        cut_out = _fill(smaller, faces, rectangles, offsets, size)
         texture = self.painter.paint(mesh, smaller, Charts(label, chart, uv, cut_out), threads=threads)
         uv, texture = _swatches(mesh, label, uv, texture)
         return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
@@ -121,23 +122,23 @@ def _corners(mesh: TexturedMesh, views: Sequence[PinholeView], label: I64) -> F6
     xy = np.zeros((len(mesh.faces), 3, 2))
     for v, view in enumerate(views):
         mine = label == v
-        xy[mine] = project(camera_of(view), mesh.vertices)[0][mesh.faces[mine]]
+        xy[mine] = project(view_camera(view), mesh.vertices)[0][mesh.faces[mine]]
     return xy
 
 
-def _rectangles(pieces: Pieces, views: Sequence[PinholeView]) -> I64:
+def _rectangles(faces: _AtlasFaces, views: Sequence[PinholeView]) -> I64:
     """(C, 4) left, top, right, bottom of each chart in its photograph, the last two exclusive."""
-    charts = int(pieces.chart.max()) + 1
+    charts = int(faces.chart.max()) + 1
     low = np.full((charts, 2), np.iinfo(np.int64).max)
     high = np.full((charts, 2), -1)
     view = np.zeros(charts, dtype=np.int64)
-    seen = pieces.label >= 0
-    view[pieces.chart[seen]] = pieces.label[seen]
-    np.minimum.at(low, pieces.chart[seen], np.floor(pieces.xy[seen].min(axis=1)).astype(np.int64))
-    np.maximum.at(high, pieces.chart[seen], np.ceil(pieces.xy[seen].max(axis=1)).astype(np.int64) + 1)
+    seen = faces.label >= 0
+    view[faces.chart[seen]] = faces.label[seen]
+    np.minimum.at(low, faces.chart[seen], np.floor(faces.xy[seen].min(axis=1)).astype(np.int64))
+    np.maximum.at(high, faces.chart[seen], np.ceil(faces.xy[seen].max(axis=1)).astype(np.int64) + 1)
     sizes = np.array([[v.rgb.shape[1], v.rgb.shape[0]] for v in views])[view]
-    low = np.where(high < 0, 0, np.maximum(low - MARGIN, 0))
-    high = np.where(high < 0, 0, np.minimum(high + MARGIN, sizes))
+    low = np.where(high < 0, 0, np.maximum(low - CHART_MARGIN, 0))
+    high = np.where(high < 0, 0, np.minimum(high + CHART_MARGIN, sizes))
     return np.concatenate([low, high], axis=1)
 
 
@@ -161,12 +162,12 @@ def pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
 
 
 def _fill(
-    views: Sequence[PinholeView], pieces: Pieces, rectangles: I64, offsets: I64, size: tuple[int, int]
+    views: Sequence[PinholeView], faces: _AtlasFaces, rectangles: I64, offsets: I64, size: tuple[int, int]
 ) -> np.ndarray:
     """(H, W, 3) uint8: every chart's rectangle of its photograph at its place."""
     texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
-    first = np.unique(pieces.chart, return_index=True)[1]
-    for c, v in enumerate(pieces.label[first]):
+    first = np.unique(faces.chart, return_index=True)[1]
+    for c, v in enumerate(faces.label[first]):
         if v >= 0:
             left, top, right, bottom = rectangles[c]
             x, y = offsets[c]

@@ -15,19 +15,21 @@ from itertools import combinations
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, I64, U8
-from thesisrecon.geometry.zbuffer import rasterize, rasterize_rows
+from thesisrecon.geometry.raster import smooth
+from thesisrecon.geometry.zbuffer import interpolate_corners, rasterize, rasterize_rows
 from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface.mesh import vertex_normals
 from thesisrecon.surface.texture_kernels import (
-    SeenSurface,
+    ViewSurface,
     combine_colors,
     continue_faces,
     grow_colors,
     observe_points,
 )
-from thesisrecon.surface.texture_views import TOLERANCE_PX, Charts, camera_of
+from thesisrecon.surface.texture_views import DEPTH_TOLERANCE_PX, Charts, project, sample_view, view_camera
 
 CHUNK = 1 << 17
 """Points at a time, so that memory stays bounded."""
@@ -56,9 +58,21 @@ GAIN_POINTS = 50_000
 DARK, BRIGHT = 16.0, 240.0
 """Colours outside are clipped or nothing but noise, and say nothing of gains."""
 
+SMOOTHNESS = 0.1
+"""Weight of a step between neighbours within a chart against one left over at a seam."""
+
+ANCHOR = 1e-4
+"""Weight of the correction itself: what nothing decides stays as it was photographed."""
+
+BLUR_PX = 2.0
+"""Photographs are compared smoothed by this, since pieces fit to about a pixel."""
+
+SEAM_TEXELS = 3
+"""Texels beyond a chart that share its corrections: sampling reaches there."""
+
 
 @dataclass(frozen=True)
-class BlendedViews:
+class BlendedTexture:
     """Colours from all views that show a point.
 
     ``power`` of the pixels that a view spends on a point: 0 counts all alike, much more than 1 leaves the
@@ -105,20 +119,18 @@ class BlendedViews:
             grow_colors(texture, drawn)
         return texture
 
-    def prepare(
-        self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1
-    ) -> PreparedBlending:
+    def prepare(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> ViewBlender:
         """What the views show of ``mesh``, ready for :meth:`PreparedBlending.colors`."""
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             prepared = list(pool.map(lambda view: _prepared(mesh, view, self.feather_px), views))
         gains = np.ones((len(views), 3), dtype=np.float32)
-        blending = PreparedBlending(self, tuple(prepared), gains)
+        blending = ViewBlender(self, tuple(prepared), gains)
         if not self.level:
             return blending
         stride = max(1, len(mesh.vertices) // GAIN_POINTS)
         normals = vertex_normals(mesh)
         weight, color = blending.observe(mesh.vertices[::stride], normals[::stride])
-        return PreparedBlending(self, tuple(prepared), equalizing_gains(weight, color))
+        return ViewBlender(self, tuple(prepared), equalizing_gains(weight, color))
 
 
 def _points_of_rows(mesh: TexturedMesh, normals: F64, charts: Charts, rows: slice) -> tuple[I64, F64, F64]:
@@ -145,21 +157,11 @@ def _points_of_rows(mesh: TexturedMesh, normals: F64, charts: Charts, rows: slic
 
 
 @dataclass(frozen=True)
-class PreparedView:
-    """A view with the nearest depth and the trust (H, W) of each pixel."""
-
-    view: PinholeView
-    depth: F32
-    clear: F32
-    slack: float
-
-
-@dataclass(frozen=True)
-class PreparedBlending:
+class ViewBlender:
     """Views of one surface with the gains (V, 3) that make them equally bright."""
 
-    blending: BlendedViews
-    views: tuple[PreparedView, ...]
+    blending: BlendedTexture
+    views: tuple[ViewSurface, ...]
     gains: F32
 
     def observe(self, points: F64, normals: F64) -> tuple[F32, F32]:
@@ -167,8 +169,7 @@ class PreparedBlending:
         weight = np.zeros((len(self.views), len(points)), dtype=np.float32)
         color = np.zeros((len(self.views), len(points), 3), dtype=np.float32)
         for v, one in enumerate(self.views):
-            seen = SeenSurface(one.view.P, one.depth, one.clear, one.slack, one.view.rgb, self.gains[v])
-            observe_points(points, normals, seen, weight[v], color[v])
+            observe_points(points, normals, one._replace(gain=self.gains[v]), weight[v], color[v])
         return weight, color
 
     def colors(self, points: F64, normals: F64) -> tuple[F32, B8]:
@@ -183,8 +184,8 @@ class PreparedBlending:
         return out, shown
 
 
-def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> PreparedView:
-    camera = camera_of(view)
+def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> ViewSurface:
+    camera = view_camera(view)
     depth = rasterize(mesh.vertices, mesh.faces, camera).depth
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     # Pixels without a surface say nothing: something may stand there, or there is only a hole.
@@ -194,10 +195,11 @@ def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> Prepa
         outline = far - near > OUTLINE_PX / focal * near
     inside = np.pad(np.ones_like(view.seen[1:-1, 1:-1]), 1)
     distance = scipy.ndimage.distance_transform_edt(inside & view.seen & ~outline)
-    clear = np.clip(distance / feather_px, FAINT, 1.0)
+    trust = np.clip(distance / feather_px, FAINT, 1.0)
     # Between pixels, colours are mixed: none of the four may be one that the photograph lacks.
-    clear[scipy.ndimage.minimum_filter(view.seen, 3) == 0] = 0.0
-    return PreparedView(view, depth, clear.astype(np.float32), TOLERANCE_PX / focal)
+    trust[scipy.ndimage.minimum_filter(view.seen, 3) == 0] = 0.0
+    tolerance = DEPTH_TOLERANCE_PX / focal
+    return ViewSurface(view.P, depth, trust.astype(np.float32), tolerance, view.rgb, np.ones(3, np.float32))
 
 
 def equalizing_gains(weight: F32, color: F32) -> F32:
@@ -224,3 +226,107 @@ def equalizing_gains(weight: F32, color: F32) -> F32:
                 b[j] -= ratio
         gains[:, k] = np.exp(np.linalg.lstsq(A, b, rcond=None)[0])
     return gains
+
+
+@dataclass(frozen=True)
+class SeamLeveledTexture:
+    """Each piece as its own photograph shows it; ``level``: differences between photographs are taken out."""
+
+    level: bool = True
+
+    def paint(
+        self,
+        mesh: TexturedMesh,
+        views: Sequence[PinholeView],
+        charts: Charts,
+        *,
+        threads: int = 1,  # noqa: ARG002 - one linear system for all
+    ) -> NDArray[np.uint8]:
+        """The texture (H, W, 3)."""
+        if not self.level:
+            return charts.cut_out
+        return _level_seams(mesh, views, charts.label, charts.chart, uv=charts.uv, texture=charts.cut_out)
+
+
+def _level_seams(
+    mesh: TexturedMesh, views: Sequence[PinholeView], label: I64, chart: I64, *, uv: F64, texture: np.ndarray
+) -> np.ndarray:
+    """The texture (H, W, 3) uint8 with the corrections of all charts added."""
+    seen = np.flatnonzero(label >= 0)
+    # A node is a vertex of a chart.
+    key = chart[seen][:, None] * len(mesh.vertices) + mesh.faces[seen]
+    nodes, number = np.unique(key, return_inverse=True)
+    number = number.reshape(key.shape)
+    view = np.zeros(len(nodes), dtype=np.int64)
+    view[number.ravel()] = np.repeat(label[seen], 3)
+    vertex = nodes % len(mesh.vertices)
+    color = _colors(mesh, views, view, vertex)
+    first, second = _meeting(vertex)
+    if not len(first):
+        return texture
+    correction = _solve(color, (first, second), _sides(number))
+    values = np.zeros((len(mesh.faces), 3, 3), dtype=np.float32)
+    values[seen] = correction[number]
+    return _added(texture, uv, values, seen)
+
+
+def _colors(mesh: TexturedMesh, views: Sequence[PinholeView], view: I64, vertex: I64) -> F64:
+    """(N, 3) colour of every node in its own photograph."""
+    color = np.zeros((len(view), 3))
+    for v, one in enumerate(views):
+        mine = view == v
+        if mine.any():
+            planes = [smooth(one.rgb[..., k].astype(np.float32), BLUR_PX) for k in range(3)]
+            xy = project(view_camera(one), mesh.vertices[vertex[mine]])[0]
+            color[mine] = sample_view(one, xy, np.stack(planes, axis=-1))
+    return color
+
+
+def _meeting(vertex: I64) -> tuple[I64, I64]:
+    """Pairs of nodes at one vertex: each with the next of those that meet there."""
+    order = np.argsort(vertex, kind="stable")
+    same = vertex[order][1:] == vertex[order][:-1]
+    return order[:-1][same], order[1:][same]
+
+
+def _sides(number: I64) -> tuple[I64, I64]:
+    """The sides of all faces as pairs of nodes, each once."""
+    start, stop = number.ravel(), np.roll(number, -1, axis=1).ravel()
+    pairs = np.unique(np.stack([np.minimum(start, stop), np.maximum(start, stop)], axis=1), axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _solve(color: F64, seams: tuple[I64, I64], sides: tuple[I64, I64]) -> F32:
+    """Corrections (N, 3) by least squares: a Laplacian over seams and sides."""
+    count = len(color)
+    row = np.concatenate([seams[0], sides[0]])
+    column = np.concatenate([seams[1], sides[1]])
+    weight = np.concatenate([np.ones(len(seams[0])), np.full(len(sides[0]), SMOOTHNESS)])
+    W = scipy.sparse.coo_array((weight, (row, column)), shape=(count, count)).tocsr()
+    W = W + W.T
+    degree = np.asarray(W.sum(axis=1)).ravel() + ANCHOR
+    A = (scipy.sparse.diags_array(degree) - W).tocsr()
+    M = scipy.sparse.linalg.LinearOperator(A.shape, matvec=lambda x: x / degree)
+    difference = color[seams[1]] - color[seams[0]]
+    solution = np.zeros((count, 3), dtype=np.float32)
+    for k in range(3):
+        b = np.bincount(seams[0], difference[:, k], minlength=count)
+        b -= np.bincount(seams[1], difference[:, k], minlength=count)
+        solution[:, k] = scipy.sparse.linalg.cg(A, b, rtol=1e-4, maxiter=500, M=M)[0]
+    return solution
+
+
+def _added(texture: np.ndarray, uv: F64, values: F32, seen: I64) -> np.ndarray:
+    """The texture with values (M, 3, 3) of the corners of the faces ``seen`` added over these faces."""
+    height, width = texture.shape[:2]
+    corners = np.concatenate([uv[seen], np.ones((len(seen), 3, 1))], axis=2)
+    depth = np.full((height, width), np.inf, dtype=np.float32)
+    face = np.full((height, width), -1, dtype=np.int64)
+    weights = np.zeros((height, width, 2), dtype=np.float32)
+    rasterize_rows(np.ascontiguousarray(corners), 1e-3, (0, height), depth, face, weights)
+    offset = np.zeros((height, width, 3), dtype=np.float32)
+    interpolate_corners(face, weights, np.ascontiguousarray(values[seen]), offset)
+    distance, nearest = scipy.ndimage.distance_transform_edt(face < 0, return_indices=True)
+    offset = offset[tuple(nearest)]
+    offset[distance > SEAM_TEXELS] = 0.0
+    return np.asarray(np.clip(np.rint(texture + offset), 0, 255), dtype=np.uint8)

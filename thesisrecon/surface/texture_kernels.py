@@ -10,15 +10,15 @@ from numba import njit
 from thesisrecon.arrays import B8, F32, F64, I64, U8
 
 
-class SeenSurface(NamedTuple):
+class ViewSurface(NamedTuple):
     """A view of a surface: ``P`` (3, 4) = K [R t]; ``depth`` (H, W) nearest surface, inf where none;
     ``clear`` (H, W) 0..1 trust in each pixel; ``slack``, the part of its depth by which a point may lie
     behind what is seen; ``rgb`` (H, W, 3), and ``gain`` (3,) by which its colours are multiplied."""
 
     P: F64
     depth: F32
-    clear: F32
-    slack: float
+    trust: F32
+    tolerance: float
     rgb: U8
     gain: F32
 
@@ -43,14 +43,14 @@ def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> 
 
 
 @njit(cache=True, nogil=True)
-def observe_points(points: F64, normals: F64, view: SeenSurface, weight: F32, color: F32) -> None:
+def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, color: F32) -> None:
     """What one view shows at points (N, 3) with outer normals (N, 3).
 
     A point is seen where it lies at most ``view.slack`` of its depth behind the farthest of the four pixels
     around it. ``weight`` (N,) gets the pixels a unit of area covers, times the trust in them, 0 where the
     point is not seen from outside; ``color`` (N, 3) its bilinear colour times the gain.
     """
-    P, depth, clear, slack, rgb, gain = view
+    P, depth, trust, tolerance, rgb, gain = view
     height, width = depth.shape
     M = np.ascontiguousarray(P[:, :3])
     # (u, v, 1) z = M X + p: pixels per area are det M times the distance to the tangent plane over z^3.
@@ -74,11 +74,11 @@ def observe_points(points: F64, normals: F64, view: SeenSurface, weight: F32, co
         x, y = int(u), int(v)
         right, below = min(x + 1, width - 1), min(y + 1, height - 1)
         farthest = max(max(depth[y, x], depth[y, right]), max(depth[below, x], depth[below, right]))
-        if z * (1.0 - slack) > farthest:
+        if z * (1.0 - tolerance) > farthest:
             continue
         s, t = u - x, v - y
-        upper = clear[y, x] + s * (clear[y, right] - clear[y, x])
-        lower = clear[below, x] + s * (clear[below, right] - clear[below, x])
+        upper = trust[y, x] + s * (trust[y, right] - trust[y, x])
+        lower = trust[below, x] + s * (trust[below, right] - trust[below, x])
         weight[n] = np.float32((upper + t * (lower - upper)) * scale * towards / (z * z * z))
         for k in range(3):
             a, b = np.float32(rgb[y, x, k]), np.float32(rgb[y, right, k])

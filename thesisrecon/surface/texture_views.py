@@ -20,12 +20,12 @@ from thesisrecon.geometry.zbuffer import rasterize, sample_texture
 from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface.texture_kernels import diffuse
 
-TOLERANCE_PX = 3.0
+DEPTH_TOLERANCE_PX = 3.0
 """How far behind what is seen a vertex may lie and still be seen, in pixels at its depth: the z-buffer holds
 one depth a pixel, and of a slanted surface a pixel sees many."""
 
 
-def camera_of(view: PinholeView) -> Camera:
+def view_camera(view: PinholeView) -> Camera:
     """The camera of a view with the size of its picture."""
     return Camera.from_matrix(view.P, (view.rgb.shape[1], view.rgb.shape[0]))
 
@@ -39,9 +39,9 @@ def project(camera: Camera, vertices: F64) -> tuple[F64, F64]:
     return xy, depth
 
 
-def visible_vertices(mesh: TexturedMesh, view: PinholeView, xy: F64, depth: F64, *, threads: int = 1) -> B8:
+def _visible_vertices(mesh: TexturedMesh, view: PinholeView, xy: F64, depth: F64, *, threads: int = 1) -> B8:
     """(N,) vertices with pixels ``xy`` and ``depth`` that lie in the picture and behind nothing."""
-    camera = camera_of(view)
+    camera = view_camera(view)
     buffer = rasterize(mesh.vertices, mesh.faces, camera, threads=threads).depth
     width, height = camera.size
     with np.errstate(invalid="ignore"):
@@ -51,16 +51,16 @@ def visible_vertices(mesh: TexturedMesh, view: PinholeView, xy: F64, depth: F64,
     places = ((y, x), (y, right), (below, x), (below, right))
     farthest = np.max([buffer[place] for place in places], axis=0)
     seen = np.all([view.seen[place] for place in places], axis=0)
-    slack = TOLERANCE_PX * depth / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
-    return np.asarray(inside & seen & (depth <= farthest + slack))
+    tolerance = DEPTH_TOLERANCE_PX * depth / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+    return np.asarray(inside & seen & (depth <= farthest + tolerance))
 
 
 def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> F32:
     """(M, V) pixels that each face covers in each view, 0 where a view does not see all of its outside."""
     quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
     for v, view in enumerate(views):
-        xy, depth = project(camera_of(view), mesh.vertices)
-        seen = visible_vertices(mesh, view, xy, depth, threads=threads)
+        xy, depth = project(view_camera(view), mesh.vertices)
+        seen = _visible_vertices(mesh, view, xy, depth, threads=threads)
         a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
         # Pixels run downwards: what is anticlockwise outside has a negative area here.
         area = 0.5 * ((c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]) - (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]))
@@ -89,7 +89,7 @@ def color_vertices(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads:
         share = np.zeros(len(mesh.vertices))
         for k in range(3):
             share += np.bincount(mesh.faces[:, k], quality[:, v], minlength=len(share))
-        xy = np.nan_to_num(project(camera_of(view), mesh.vertices)[0])
+        xy = np.nan_to_num(project(view_camera(view), mesh.vertices)[0])
         total += share[:, None] * sample_view(view, xy)
         weight += share
     mean = np.where(weight[:, None] > 0.0, total / np.maximum(weight, 1e-30)[:, None], 128.0)
@@ -100,7 +100,7 @@ OWN = 0.1
 """Weight of a face's own shares against those of its neighbours."""
 
 
-def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, least_faces: int = 30) -> I64:
+def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, min_chart_faces: int = 30) -> I64:
     """(M,) view of each face, -1 where none sees it.
 
     Each face alone would take the view that shows it largest, and the surface would be a patchwork. Shares of
@@ -122,11 +122,11 @@ def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, least_faces
     lost = visible.any(axis=1) & (spread.max(axis=1) <= 0.0)
     label[lost] = share[lost].argmax(axis=1)
     for _ in range(3):
-        label = _join_small(label, visible, neighbours, least_faces)
+        label = _join_small(label, visible, neighbours, min_chart_faces)
     return label.astype(np.int64)
 
 
-def charts_of(label: I64, neighbours: I64) -> I64:
+def label_charts(label: I64, neighbours: I64) -> I64:
     """(M,) number of the chart of each face: connected faces of one label."""
     face = np.repeat(np.arange(len(label)), 3)
     other = neighbours.ravel()
@@ -137,10 +137,10 @@ def charts_of(label: I64, neighbours: I64) -> I64:
     return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def _join_small(label: I64, visible: np.ndarray, neighbours: I64, least_faces: int) -> I64:
-    chart = charts_of(label, neighbours)
+def _join_small(label: I64, visible: np.ndarray, neighbours: I64, min_chart_faces: int) -> I64:
+    chart = label_charts(label, neighbours)
     faces = np.bincount(chart)
-    small = (faces[chart] < least_faces) & (label >= 0)
+    small = (faces[chart] < min_chart_faces) & (label >= 0)
     # A chart can take over a view that sees all of its faces.
     sees = np.ones((len(faces), visible.shape[1]), dtype=bool)
     np.logical_and.at(sees, chart[small], visible[small])

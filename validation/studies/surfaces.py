@@ -1,18 +1,16 @@
-"""Linear and fitted surfaces of depth maps: ``python -m validation.studies.surfaces [-o OUT]``.
+"""Linear and B-spline surfaces of depth maps.
 
-Surfaces that are known, with noise and with a fifth of wrong depths; then the depth maps of the courtyard,
-their depths and normals against the truth. Everything before the depth maps is that of the photographs alone
-and kept in OUT; ``--variant thesis`` takes the maps that the thesis' own way gives.
+Known surfaces with noise and with a fifth of wrong depths; then depths and normals of the courtyard, whose
+depth maps come from the images alone and are kept in OUT.
 """
 
 from __future__ import annotations
 
-import argparse
-import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -22,20 +20,21 @@ from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera
 from thesisrecon.records import DepthMap
 from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.linear import DepthSurface, LinearSurface, normals, resampled
+from thesisrecon.surface.linear import DepthSurface, LinearSurface, surface_normals, resample_surface
 from validation.metrics.depth import SAME, true_depth, true_from_maps
-from validation.metrics.record import Metric, markdown_table
+from validation.metrics.record import Metric
 from validation.scenes.real import Scene, load_fixture_scene
+from validation.studies.runner import Part
 
 SURFACES: Mapping[str, DepthSurface] = {"linear": LinearSurface(), "b-spline": BSplineSurface()}
 SMOOTH_DEG = 3.0
-"""Where the normals to either side of a true pixel differ by more there is an edge, and no normal."""
+"""A pixel whose two one-sided normals differ by more lies on an edge and has no true normal."""
 NOISE = 5e-4
-"""Of inverse depths of about 0.2."""
+"""Standard deviation of the inverse depths, which are about 0.2."""
 
 
 def known_surfaces() -> dict[str, F64]:
-    """Inverse depths (240, 320) by name."""
+    """Return inverse depths (240, 320) by name."""
     y, x = np.indices((240, 320))
     u, v = x / 320.0 - 0.5, y / 240.0 - 0.5
 
@@ -55,7 +54,7 @@ def known_surfaces() -> dict[str, F64]:
 
 
 def check_known(name: str, rho: F64, wrong: float) -> Metric:
-    """RMS error of inverse depths in deviations of their noise, a share of them ``wrong``."""
+    """Return the RMS error of inverse depths over their noise, with a share of ``wrong`` ones."""
     K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
     rng = np.random.default_rng(0)
     noisy = rho + NOISE * rng.normal(size=rho.shape)
@@ -64,16 +63,16 @@ def check_known(name: str, rho: F64, wrong: float) -> Metric:
     views = np.ones(rho.shape, dtype=np.uint8)
     given = DepthMap(0, P, (1.0 / noisy).astype(np.float32), std.astype(np.float32), views)
     off = {
-        word: 1.0 / resampled(surface.fit(given)).depth.astype(np.float64) - rho
+        word: 1.0 / resample_surface(surface.fit(given)).depth.astype(np.float64) - rho
         for word, surface in SURFACES.items()
     }
     rms = {word: float(np.sqrt(np.nanmean(e**2))) / NOISE for word, e in off.items()}
-    what = f"RMS error, {wrong:.0%} wrong" if wrong else "RMS error"
-    return Metric("known surfaces", f"{name}: {what}", "deviations", rms, "b-spline")
+    label = f"RMS error, {wrong:.0%} wrong" if wrong else "RMS error"
+    return Metric("known surfaces", f"{name}: {label}", "standard deviations", rms, "b-spline")
 
 
 def true_normals(scene: Scene, view: int, depth: F64, stride: int) -> F64:
-    """(h, w, 3) unit normals in the camera of a true map, towards the camera, NaN at edges."""
+    """Return unit normals (h, w, 3) of a true depth map, in its camera and towards it, NaN at edges."""
     assert scene.K is not None
     K = scene.K[view]
     y, x = np.indices(depth.shape) * stride
@@ -92,70 +91,66 @@ def true_normals(scene: Scene, view: int, depth: F64, stride: int) -> F64:
 
 
 def check_map(found: DepthMap, scene: Scene, scale: float) -> dict[str, dict[str, float]]:
-    """What each surface of one map is worth at the places of the truth, which lie between its pixels."""
+    """Measure the surfaces of one depth map at the true samples, which lie between its pixels."""
     depth, stride, seen = true_depth(scene, found.view)
     true = true_normals(scene, found.view, depth, stride)
     shrink = found.depth.shape[1] / (stride * depth.shape[1])
     y, x = (np.indices(depth.shape) * stride + 0.5) * shrink - 0.5
     xy = np.stack([x, y], axis=-1).reshape(-1, 2)
     R = decompose_camera(found.P)[1]
-    told = {}
+    measured = {}
     for word, surface in SURFACES.items():
         start = time.process_time()
         fit = surface.fit(found)
         seconds = time.process_time() - start
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.abs(scale / fit.evaluate(xy).inverse_depth.reshape(depth.shape) / depth - 1.0)
-            cosine = np.sum((normals(fit, xy) @ R.T).reshape(true.shape) * true, axis=-1)
+            cosine = np.sum((surface_normals(fit, xy) @ R.T).reshape(true.shape) * true, axis=-1)
         known = seen & np.isfinite(error)
         angle = np.degrees(np.arccos(np.clip(cosine[seen & np.isfinite(cosine)], -1.0, 1.0)))
-        told[word] = {
-            "known, of what two views see (%)": 100.0 * known.sum() / seen.sum(),
+        measured[word] = {
+            "known, of the pixels that two views see (%)": 100.0 * known.sum() / seen.sum(),
             "depth error, median (%)": 100.0 * float(np.median(error[known])),
             "within 1 %, of the known (%)": 100.0 * float(np.mean(error[known] < SAME)),
             "normals, median error (deg)": float(np.median(angle)),
             "normals within 10 deg (%)": 100.0 * float(np.mean(angle < 10.0)),
             "processor seconds a view": seconds,
         }
-    return told
+    return measured
 
 
 def check_courtyard(out: Path, variant: str, views: Sequence[int] | None) -> list[Metric]:
-    """The mean over the views of the courtyard."""
+    """Return means over the views of the courtyard."""
     scene = load_fixture_scene("courtyard")
     dense = replace(preset(variant).dense, max_side=640)  # type: ignore[type-var]
     config = replace(PipelineConfig(), dense=dense)
     run = thesisrecon.reconstruct(list(scene.image_paths), out / variant, config=config, until="dense")
     scale = true_from_maps({m.view: m for m in run.depth_maps}, scene).scale
-    told = [check_map(m, scene, scale) for m in run.depth_maps if views is None or m.view in views]
+    measured = [check_map(m, scene, scale) for m in run.depth_maps if views is None or m.view in views]
     return [
         Metric(
             f"courtyard, {variant} maps",
             what,
             "",
-            {word: float(np.mean([one[word][what] for one in told])) for word in SURFACES},
+            {word: float(np.mean([one[word][what] for one in measured])) for word in SURFACES},
             "b-spline",
         )
-        for what in told[0]["linear"]
+        for what in measured[0]["linear"]
     ]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-o", "--out", type=Path, help="where the run on the courtyard is kept")
-    parser.add_argument("--variant", nargs="*", default=["default"], choices=("default", "thesis"))
-    parser.add_argument("--views", nargs="*", type=int, help="of the courtyard; all without it")
-    options = parser.parse_args(arguments)
-    metrics = [
-        check_known(name, rho, wrong) for name, rho in known_surfaces().items() for wrong in (0.0, 0.2)
-    ]
-    print(markdown_table(metrics), flush=True)
-    with tempfile.TemporaryDirectory() as temporary:
-        for variant in options.variant:
-            print(markdown_table(check_courtyard(options.out or Path(temporary), variant, options.views)))
-    return 0
+def surfaces_study(
+    out: Path,
+    variant: Sequence[Literal["default", "thesis"]] = ("default",),
+    views: Sequence[int] | None = None,
+) -> Iterator[Part]:
+    """Compare linear and B-spline surfaces of depth maps with the truth.
 
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    Parameters
+    ----------
+    variant : sequence of str
+        Presets whose depth maps of the courtyard are used.
+    """
+    yield [check_known(name, rho, wrong) for name, rho in known_surfaces().items() for wrong in (0.0, 0.2)]
+    for name in variant:
+        yield check_courtyard(out, name, views)

@@ -12,11 +12,10 @@ import PIL.Image
 from thesisrecon.arrays import B8, U8
 from thesisrecon.camera import Camera
 from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMesh
-from thesisrecon.surface.color_correction import SingleView
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_atlas import TextureAtlas
-from thesisrecon.surface.texture_blending import BlendedViews
-from thesisrecon.views.image_similarity import exposed_alike, psnr_db, ssim, whole_pixels
+from thesisrecon.surface.texture_blending import BlendedTexture, SeamLeveledTexture
+from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.harness.scenes import load_photographs
@@ -130,11 +129,11 @@ def _model(
 ) -> TexturedMesh:
     """A model with colours; ours leaves its ``surface`` for the methods that start from it."""
     if method == OURS:
-        bare = SurfaceModel().surface_of(maps)
-        np.savez(surface, vertices=bare.vertices, faces=bare.faces)
-        return SurfaceModel().color(bare, views)
+        without_texture = SurfaceModel().surface_of(maps)
+        np.savez(surface, vertices=without_texture.vertices, faces=without_texture.faces)
+        return SurfaceModel().color(without_texture, views)
     if method == SINGLE:
-        return TextureAtlas(painter=SingleView()).texture(_read_surface(surface), views)
+        return TextureAtlas(painter=SeamLeveledTexture()).texture(_read_surface(surface), views)
     if method == LEVELLED:
         views = _equally_bright(_read_surface(surface), views)
     return OpenTsdf(voxel_px=VOXELS_PX[method]).fuse(maps, views)
@@ -147,7 +146,7 @@ def _read_surface(path: Path) -> TexturedMesh:
 
 def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list[PinholeView]:
     """The photographs with one exposure, by the gains that our texture finds."""
-    gains = BlendedViews().prepare(surface, views).gains
+    gains = BlendedTexture().prepare(surface, views).gains
     return [
         replace(view, rgb=np.clip(np.rint(view.rgb * gain), 0, 255).astype(np.uint8))
         for view, gain in zip(views, gains, strict=True)
@@ -165,7 +164,7 @@ def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: Camera) -> None:
 def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[str, Likeness], B8]:
     """Pictures of one camera beside its photograph, and the pixels (H, W) compared: those that all of them
     cover whole."""
-    whole = {name: whole_pixels(picture) & view.seen for name, picture in drawn.items()}
+    whole = {name: covered_pixels(picture) & view.seen for name, picture in drawn.items()}
     compared = np.logical_and.reduce([view.seen, *whole.values()])
     found = {
         name: _likeness(view.rgb, picture.color, compared, float(whole[name].mean()))
@@ -190,7 +189,7 @@ def _drawn(outcomes: Mapping[str, Outcome], view: int) -> dict[str, RenderedView
 
 
 def _likeness(photograph: U8, color: U8, compared: B8, covered: float) -> Likeness:
-    alike = exposed_alike(photograph, color, compared)
+    alike = match_exposure(photograph, color, compared)
     return Likeness(
         psnr_db(photograph, alike, compared),
         ssim(photograph, alike, compared),
@@ -240,7 +239,7 @@ def _beside(photograph: U8, shown: Mapping[str, U8], compared: B8) -> U8:
     empty = np.zeros_like(photograph)
     above, below = [photograph], [empty]
     for color in shown.values():
-        alike = exposed_alike(photograph, color, compared)
+        alike = match_exposure(photograph, color, compared)
         off = np.abs(alike.astype(np.float64) - photograph).mean(axis=2) / RED_LEVELS
         above.append(alike)
         below.append(np.where(compared[..., None], coloured(off), 0).astype(np.uint8))
