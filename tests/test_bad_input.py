@@ -167,7 +167,7 @@ def test_two_views_are_too_few_for_self_calibration(folder, reconstruct):
         shutil.copy(path, folder)
     answer = reconstruct()
     assert answer.code == 3
-    assert "self-calibration needs at least 3 photographs" in answer.sentence
+    assert "self-calibration needs at least 3 registered images" in answer.sentence
     assert (answer.summary["stratum"], answer.summary["registered"]) == ("projective", 2)
 
 

@@ -1,19 +1,23 @@
-"""Scenes that give few depths or none, through the whole pipeline: cameras are given, depth and model real.
+"""Scenes that give few depths or none, through the whole pipeline, and a set of unusual images.
 
-A result or one sentence, no warnings, and the cameras in any case.
+In the first ones cameras are given, depth and model are real. The result is a model or one sentence, no
+warnings, and the cameras in any case.
 """
 
 # ruff: noqa: ARG002 (a stage that knows the answer ignores most of what it is given)
-
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 import trimesh
 
 from tests.fake_stages import FakeMetric, fake_config
 from tests.stereo.hard_scenes import blank_wall, fence, looking_ahead, photograph_scene, tunnel
+from tests.synthetic import texture
+from thesisrecon.cli.main import run_command
 from thesisrecon.config import preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline.reconstruction import reconstruct
@@ -65,6 +69,8 @@ HOPELESS = {
     "no texture": lambda: blank(0.0),
     "no points": without_points,
 }
+
+
 PARTLY = {
     "forward": ahead,
     "tiny baseline": lambda: abreast(0.05),
@@ -73,6 +79,8 @@ PARTLY = {
     "a small photograph": far_smaller,
     "burnt out": burnt_out,
 }
+
+
 MADE = {}
 
 
@@ -150,3 +158,41 @@ def test_what_can_be_seen_becomes_a_model(name, base, tmp_path):
     assert {w.split()[0] for w in result.warnings if w.endswith("has no depths")} == without
     if name == "a view of elsewhere":
         assert without == {"03.png"}
+
+
+COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for k, path in enumerate(sorted(COURTYARD.iterdir())[:5]):
+        with PIL.Image.open(path) as file:
+            picture = file.convert("RGB")
+        if k == 3:
+            picture = picture.resize((picture.width // 6, picture.height // 6), PIL.Image.Resampling.LANCZOS)
+        if k in (1, 2):
+            rgb = np.array(picture)
+            rgb[: rgb.shape[0] // 3] = 255
+            rgb[-60:, :200] = 0
+            picture = PIL.Image.fromarray(rgb)
+        picture.save(folder / f"{k}.png")
+    other = np.repeat(texture(300, 400, 9).astype(np.uint8)[..., None], 3, axis=2)
+    PIL.Image.fromarray(other).save(folder / "elsewhere.png")
+    return folder
+
+
+def test_the_others_become_a_model(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    command = ["reconstruct", str(folder), "-o", str(out), "--max-size", "240", "--threads", "2"]
+    assert run_command(command) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert "5 of 6 photographs registered" in printed.out
+    assert "refused: elsewhere.png" in printed.out
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert [entry["name"] for entry in summary["refused"]] == ["elsewhere.png"]
+    mesh = next(iter(trimesh.load(out / "model.glb").geometry.values()))
+    assert len(mesh.faces) > 10_000
+    assert np.isfinite(mesh.vertices).all()

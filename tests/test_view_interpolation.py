@@ -14,7 +14,7 @@ import thesisrecon
 from tests.synthetic import texture
 from thesisrecon import view_interpolation as between
 from thesisrecon.cli.main import run_command
-from thesisrecon.cli.view_files import METHODS, BetweenWishes, write_between
+from thesisrecon.cli.view_files import METHODS, InterpolateOptions, interpolate_images
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import Image
@@ -75,7 +75,7 @@ def test_wrong_calls_of_the_front_door_are_refused(wall):
 
 def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monkeypatch):
     a, b = photograph(0), photograph(1)
-    with pytest.raises(UsageError, match=r"0\.jpg and 0\.jpg are the same photograph"):
+    with pytest.raises(UsageError, match=r"0\.jpg and 0\.jpg are the same image"):
         between.prepare_pair(a, Image("0.jpg", a.rgb.copy(), a.size))
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
         between.prepare_pair(a, photograph(2, (40, 20)))
@@ -110,9 +110,7 @@ def test_what_cannot_be_rectified_is_told_without_the_library_s_other_ways(monke
     pair = SimpleNamespace(F=F, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
     monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
     config = SimpleNamespace(dense=Dense())
-    with pytest.raises(
-        StageFailure, match=r"too distorted; a number; take them from places beside each other"
-    ):
+    with pytest.raises(StageFailure, match=r"too distorted; a number; take the images side by side"):
         between.prepare_pair(photograph(0), photograph(1), config=config)
     Dense.failure = StageFailure("no parallax")
     with pytest.raises(StageFailure, match="no parallax"):
@@ -140,13 +138,13 @@ def even(name, level):
 def test_a_film_of_two_goes_from_one_to_the_other(still):
     film = between.interpolated_sequence([even("a", 100), even("b", 200)], 5)
     assert film.captions[1] == "75 % a, 25 % b"
-    assert film.places[4] == {"shares": [0.0, 1.0]}
+    assert film.frame_metadata[4] == {"weights": [0.0, 1.0]}
     levels = [float(film.draw(k, 1).mean()) for k in range(5)]
     assert levels[0] == 100.0
     assert levels[4] == 200.0
     # Exposures are mixed by their ratio, in which neither photograph is the darker one's.
     assert levels == sorted(levels)
-    assert film.told["violating_monotonicity"] == [0.0]
+    assert film.metadata["violating_monotonicity"] == [0.0]
     assert "0.0 % of these violate monotonicity" in film.notes[0]
     assert still == [("a", "b")]
     assert between.interpolated_sequence([even("a", 100), even("b", 200)], 1).captions == ("50 % a, 50 % b",)
@@ -157,14 +155,14 @@ def test_a_film_of_two_goes_from_one_to_the_other(still):
 
 def test_a_film_of_three_crosses_the_triangle(still):
     film = between.interpolated_sequence([even("a", 100), even("b", 200), even("c", 50)], 5)
-    assert [place["shares"] for place in film.places] == [
+    assert [place["weights"] for place in film.frame_metadata] == [
         [1.0, 0.0, 0.0],
         [0.75, 0.25, 0.0],
         [0.5, 0.5, 0.0],
         [0.25, 0.25, 0.5],
         [0.0, 0.0, 1.0],
     ]
-    assert still == [("a", "b"), ("the view between", "c")]
+    assert still == [("a", "b"), ("the interpolated view", "c")]
     levels = [float(film.draw(k, 1).mean()) for k in range(5)]
     assert levels[0] == 100.0
     assert levels[4] == 50.0
@@ -175,9 +173,9 @@ def test_a_film_of_three_crosses_the_triangle(still):
 def test_a_place_in_the_triangle_is_reached_by_interpolating_twice(still):
     three = [even("a", 100), even("b", 100), even("c", 100)]
     for weights, expected in (
-        ((0.2, 0.3, 0.5), [("a", "b"), ("the view between", "c")]),
+        ((0.2, 0.3, 0.5), [("a", "b"), ("the interpolated view", "c")]),
         ((0.4, 0.6, 0.0), [("a", "b")]),
-        ((0.5, 0.0, 0.5), [("the view between", "c")]),
+        ((0.5, 0.0, 0.5), [("the interpolated view", "c")]),
         ((0.0, 0.0, 1.0), []),
         ((0.0, 0.0, 1.0 - 1e-7), []),
     ):
@@ -193,14 +191,14 @@ def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
     photographs = [str(COURTYARD / f"000{k}.jpg") for k in (6, 7)]
     out = tmp_path / "früm one to other"
     options = ["--frames", "3", "--max-size", "512", "--threads", "2", "-o", str(out)]
-    assert run_command(["views", *photographs, *options]) == 0
+    assert run_command(["interpolate", *photographs, *options]) == 0
     said = capsys.readouterr()
-    assert said.out.splitlines()[0] == f"3 pictures of 512 x 384 px and interpolation.webp are in {out}"
+    assert said.out.splitlines()[0] == f"3 frames of 512 x 384 px and interpolation.webp written to {out}"
     names = ["frame-0001.png", "frame-0002.png", "frame-0003.png", "frames.json", "interpolation.webp"]
     assert sorted(path.name for path in out.iterdir()) == [*names, "strip.html"]
     told = json.loads((out / "frames.json").read_text(encoding="utf-8"))
-    assert told["photographs"] == ["0006.jpg", "0007.jpg"]
-    assert told["frames"][1] == {"name": "frame-0002.png", "shares": [0.5, 0.5]}
+    assert told["images"] == ["0006.jpg", "0007.jpg"]
+    assert told["frames"][1] == {"name": "frame-0002.png", "weights": [0.5, 0.5]}
     assert 0.0 < told["violating_monotonicity"][0] < 0.3
     assert told["known"][0] > 0.3
     with PIL.Image.open(out / "interpolation.webp") as film:
@@ -222,19 +220,19 @@ def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
     ("arguments", "words", "code"),
     [
         (["0004.jpg", "0004.jpg"], "is given twice", 2),
-        (["0004.jpg", "copy.jpg"], "0004.jpg and copy.jpg are the same photograph", 2),
-        (["0004.jpg", "nowhere.jpg"], "there is no photograph", 2),
+        (["0004.jpg", "copy.jpg"], "0004.jpg and copy.jpg are the same image", 2),
+        (["0004.jpg", "nowhere.jpg"], "there is no image file", 2),
         (["0004.jpg", "text.jpg"], "text.jpg is not an image", 3),
         (["0004.jpg", "small.jpg"], "one size; 0004.jpg is 1024 x 768 and small.jpg is 512 x 384 px", 2),
         (["0004.jpg", "noise.png", "--max-size", "256"], "do not match", 3),
-        (["0004.jpg"], "got one file", 2),
+        (["0004.jpg"], "2 or 3 images; got 1", 2),
         (["0004.jpg", "folder"], "is a folder", 2),
-        (["0000.jpg", "0001.jpg", "0002.jpg", "0003.jpg"], "2 or 3 photographs; got 4", 2),
-        (["0004.jpg", "0005.jpg", "--path", "orbit"], "--path is of a run", 2),
+        (["0000.jpg", "0001.jpg", "0002.jpg", "0003.jpg"], "2 or 3 images; got 4", 2),
+        (["0004.jpg", "0005.jpg", "--path", "orbit"], "--path", 2),
         (["0004.jpg", "0005.jpg", "--frames", "0"], "--frames takes a whole number of at least 1", 2),
         (["0004.jpg", "0005.jpg", "--max-size", "9"], "--max-size takes at least 64 px", 2),
         (["0004.jpg", "0005.jpg", "--method", "guessing"], "--method", 2),
-        (["folder", "--method", "interpolation"], "--method is of views between photographs", 2),
+        (["folder", "0004.jpg"], "is a folder", 2),
     ],
 )
 def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_path, capsys):
@@ -252,7 +250,7 @@ def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_
         for word in arguments
     ]
     out = tmp_path / "out"
-    assert run_command(["views", *placed, "-o", str(out)]) == code
+    assert run_command(["interpolate", *placed, "-o", str(out)]) == code
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
@@ -262,10 +260,10 @@ def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_
 def test_wishes_name_what_is_wrong(tmp_path):
     photographs = (COURTYARD / "0004.jpg", COURTYARD / "0005.jpg")
     with pytest.raises(UsageError, match="unknown method"):
-        BetweenWishes(photographs, method="guessing")
+        InterpolateOptions(photographs, method="guessing")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
-    with pytest.raises(UsageError, match="not of this command"):
-        write_between(tmp_path, BetweenWishes(photographs))
+    with pytest.raises(UsageError, match="which this command did not create"):
+        interpolate_images(tmp_path, InterpolateOptions(photographs))
 
 
 @pytest.mark.parametrize("method", METHODS)

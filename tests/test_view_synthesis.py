@@ -8,7 +8,7 @@ import PIL.Image
 import pytest
 
 import thesisrecon
-from thesisrecon.cli.view_files import BetweenWishes, write_between
+from thesisrecon.cli.view_files import InterpolateOptions, interpolate_images
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
@@ -92,10 +92,12 @@ def test_cameras_in_one_place_show_no_parallax():
 
 def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
     paths = tuple(SCENE.image_paths[6:8])
-    made = write_between(tmp_path / "film", BetweenWishes(paths, "tensor", frames=5, max_size_px=320))
+    made = interpolate_images(
+        tmp_path / "film", InterpolateOptions(paths, "tensor", frames=5, max_size_px=320)
+    )
     told = json.loads((tmp_path / "film" / "frames.json").read_text(encoding="utf-8"))
     assert [frame["baselines"] for frame in told["frames"]] == [-0.5, 0.0, 0.5, 1.0, 1.5]
-    assert told["photographs"] == ["0006.jpg", "0007.jpg"]
+    assert told["images"] == ["0006.jpg", "0007.jpg"]
     assert made.size == (320, 240)
     pictures = []
     for path in made.frames:
@@ -112,12 +114,12 @@ def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
 
 def test_films_are_of_two_different_photographs(found):
     first, second = found.images
-    with pytest.raises(UsageError, match="2 photographs; got 3"):
+    with pytest.raises(UsageError, match="2 images; got 3"):
         trilinear_sequence((first, second, first), 5)
-    with pytest.raises(UsageError, match="the same photograph"):
+    with pytest.raises(UsageError, match="the same image"):
         trilinear_sequence((first, first), 5)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(UsageError, match="there is no photograph"):
+    with pytest.raises(UsageError, match="there is no image file"):
         match_images(tmp_path / "none.png", tmp_path / "none.png")

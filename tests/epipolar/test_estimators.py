@@ -450,7 +450,9 @@ def test_the_share_of_right_matches_that_pass(test, share):
     assert inliers.mean() == pytest.approx(share, abs=0.035)
 
 
-@pytest.mark.parametrize("settings", [{"both_lines": True}, {"sum_of_lines": True}])
+@pytest.mark.parametrize(
+    "settings", [{"inlier_test": "epipolar-distance"}, {"inlier_test": "symmetric-distance"}]
+)
 def test_algorithm_2_with_the_tests_of_the_text_finds_the_right_matches(settings):
     rng = np.random.default_rng(2)
     xy1, xy2, wrong = spoil(make_pair(150, rng), rng, sigma=0.3, outliers=0.3)
@@ -462,8 +464,8 @@ def test_algorithm_2_with_the_tests_of_the_text_finds_the_right_matches(settings
 
 
 def test_one_test_at_a_time():
-    with pytest.raises(ValueError, match="not by both"):
-        ThesisRansac(both_lines=True, sum_of_lines=True)
+    with pytest.raises(ValueError, match="inlier_test"):
+        ThesisRansac(inlier_test="both")
 
 
 FAST = LocallyOptimisedRansac()

@@ -84,7 +84,9 @@ FUNCTIONS = {
         (fit := estimate_fundamental(a, b)).F, a, b, inliers=fit.inliers
     ),
     "thesis": lambda a, b: ThesisRansac(samples=30).estimate(a, b, rng()),
-    "both lines": lambda a, b: ThesisRansac(samples=30, both_lines=True).estimate(a, b, rng()),
+    "both lines": lambda a, b: ThesisRansac(samples=30, inlier_test="epipolar-distance").estimate(
+        a, b, rng()
+    ),
     "least median": lambda a, b: LeastMedianOfSquares(samples=30).estimate(a, b, rng()),
     "eight-point": estimate_eight_point,
     "eight-point raw": lambda a, b: estimate_eight_point(a, b, normalized=False),

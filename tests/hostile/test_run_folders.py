@@ -232,7 +232,7 @@ def test_inspect_lets_nothing_through_to_the_terminal(tmp_path, told):
     [
         (["reconstruct", "in", "-o", "out", "--until", "features"], 3),
         (["inspect", "in"], 2),
-        (["views", "in"], 2),
+        (["render", "in"], 2),
     ],
 )
 def test_programs_of_their_own_end_so_too(arguments, code, tmp_path):

@@ -1,4 +1,4 @@
-"""``thesisrecon views`` of models, cameras and photographs that are none."""
+"""``thesisrecon render`` and ``interpolate`` of models, cameras and photographs that are none."""
 
 import json
 
@@ -44,7 +44,7 @@ NO_CAMERAS = [
 def test_views_refuses_what_are_no_cameras(make, tmp_path, told):
     (tmp_path / "model.glb").write_bytes(files.glb(*files.triangle()))
     make(tmp_path / "cameras.json")
-    said = told(["views", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
+    said = told(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
     assert "cameras.json" in said
     assert not (tmp_path / "views").exists()
 
@@ -77,28 +77,36 @@ ACCESSOR = {"componentType": 5126, "type": "VEC3"}
 NO_MODELS = [
     ("device", links("/dev/zero"), "no model yet"),
     ("10 TiB", sparse(10**13, b"glTF"), "is larger than"),
-    ("text", writes("dear reader, dear reader"), "it is no GLB"),
+    ("text", writes("dear reader, dear reader"), "it is not a GLB"),
     ("short", writes(b"glTF"), "it ends after 4 bytes"),
     (
         "deep",
         writes(b"glTF" + np.array([2, 9, 400_000, 0x4E4F534A], "<u4").tobytes() + b"[" * 400_000),
         "JSON",
     ),
-    ("list", writes(files.glb([1, 2])), "its header is no table"),
-    ("nothing", writes(files.glb({})), "it is not one mesh of one piece"),
-    ("a file", writes(changed(buffers=[{"uri": "/etc/passwd", "byteLength": 48}])), "it names another file"),
-    ("a picture", writes(changed(images=[{"uri": "/dev/zero"}])), "it names another file"),
-    ("no view", writes(changed(accessors=[ACCESSOR | {"count": 10}])), "it claims 10 numbers in"),
+    ("list", writes(files.glb([1, 2])), "its header is not a JSON object"),
+    ("nothing", writes(files.glb({})), "it must hold one mesh with one primitive"),
+    (
+        "a file",
+        writes(changed(buffers=[{"uri": "/etc/passwd", "byteLength": 48}])),
+        "it refers to another file",
+    ),
+    ("a picture", writes(changed(images=[{"uri": "/dev/zero"}])), "it refers to another file"),
+    ("no view", writes(changed(accessors=[ACCESSOR | {"count": 10}])), "it claims 10 elements in"),
     ("count", writes(changed(accessors=[ACCESSOR | {"count": 10**12, "bufferView": 0}])), "it claims 10000"),
-    ("count in words", writes(changed(accessors=[ACCESSOR | {"count": "many"}])), "it claims many numbers"),
-    ("itself", writes(changed(nodes=[{"children": [0], "mesh": 0}])), "its nodes hold each other"),
-    ("circle", writes(changed(nodes=[{"children": [1]}, {"children": [0]}])), "its nodes hold each other"),
-    ("net", writes(changed(nodes=[{"children": [2]}, {"children": [2]}, {"mesh": 0}])), "no tree"),
-    ("a thousand times", writes(changed(nodes=[{"mesh": 0}] * 1000)), "it shows one mesh many times"),
-    ("faces beyond", writes(numbered(np.array([0, 1, 9], "<u4"))), "faces name vertices"),
+    ("count in words", writes(changed(accessors=[ACCESSOR | {"count": "many"}])), "it claims many elements"),
+    ("itself", writes(changed(nodes=[{"children": [0], "mesh": 0}])), "its nodes are cyclic"),
+    ("circle", writes(changed(nodes=[{"children": [1]}, {"children": [0]}])), "its nodes are cyclic"),
+    ("net", writes(changed(nodes=[{"children": [2]}, {"children": [2]}, {"mesh": 0}])), "not a tree"),
+    (
+        "a thousand times",
+        writes(changed(nodes=[{"mesh": 0}] * 1000)),
+        "it instantiates its mesh several times",
+    ),
+    ("faces beyond", writes(numbered(np.array([0, 1, 9], "<u4"))), "faces refer to missing vertices"),
     ("corners of NaN", writes(numbered(np.full((3, 3), np.nan, "<f4"))), "it holds no surface"),
-    ("program", writes(textured(b"%!PS-Adobe-3.0 EPSF-3.0\n")), "its texture is no JPEG or PNG"),
-    ("bomb", writes(textured(files.png(30_000, 30_000))), "its texture is no JPEG or PNG"),
+    ("program", writes(textured(b"%!PS-Adobe-3.0 EPSF-3.0\n")), "its texture is not a JPEG or PNG"),
+    ("bomb", writes(textured(files.png(30_000, 30_000))), "its texture is not a JPEG or PNG"),
 ]
 
 
@@ -106,22 +114,22 @@ NO_MODELS = [
 def test_views_refuses_what_is_no_model(make, words, tmp_path, told):
     make(tmp_path / "model.glb")
     camera()(tmp_path / "cameras.json")
-    said = told(["views", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
+    said = told(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
     assert "model" in said
     assert words in said
     assert not (tmp_path / "views").exists()
 
 
 BETWEEN = [
-    ("device", ["/dev/zero", "a.png"], 2, "there is no photograph /dev/zero"),
-    ("pipe", ["pipe.png", "a.png"], 2, "there is no photograph"),
-    ("round", ["round.png", "a.png"], 2, "there is no photograph"),
-    ("round twice", ["round.png", "round.png"], 2, "there is no photograph"),
+    ("device", ["/dev/zero", "a.png"], 2, "there is no image file /dev/zero"),
+    ("pipe", ["pipe.png", "a.png"], 2, "there is no image file"),
+    ("round", ["round.png", "a.png"], 2, "there is no image file"),
+    ("round twice", ["round.png", "round.png"], 2, "there is no image file"),
     ("linked", ["linked.png", "a.png"], 2, "is given twice"),
     ("bomb", ["bomb.png", "a.png"], 3, "claims more than 178 megapixels"),
     ("too long", [files.TOO_LONG, "a.png"], 2, "File name too long"),
     ("frames", ["a.png", "b.png", "--frames", "1000000000"], 2, "--frames takes at most 9999"),
-    ("background", ["a.png", "--background", "#" * 9000], 2, "got one file"),
+    ("background", ["a.png", "--background", "#" * 9000], 2, "--background"),
 ]
 
 
@@ -134,5 +142,5 @@ def test_views_between_what_is_no_photograph(words, code, said, tmp_path, told, 
     (folder / "round.png").symlink_to("round.png")
     (folder / "linked.png").symlink_to("a.png")
     monkeypatch.chdir(folder)
-    assert said in told(["views", *words, "--threads", "1"], code)
+    assert said in told(["interpolate", *words, "--threads", "1"], code)
     assert not (folder / "views").exists()

@@ -12,6 +12,7 @@ import PIL.Image
 import pytest
 
 from thesisrecon.errors import UsageError
+from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io.images import MAX_DECODED_BYTES, list_images, read_images, scene_name
 from thesisrecon.io.pixels import (
     EXIF_TRANSFORMS,
@@ -148,7 +149,7 @@ def test_the_first_frame_of_an_animation_is_used_and_said(tmp_path):
     frames = [PIL.Image.fromarray(picture(n)) for n in range(2)]
     frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:])
     photographs = read_images(tmp_path, max_size_px=1600)
-    assert photographs.decoded[0].note == "only its first frame is used"
+    assert photographs.decoded[0].note == "only the first frame is used"
 
 
 def test_what_cannot_be_read_gets_its_reason_and_the_others_go_on(tmp_path):
@@ -306,7 +307,7 @@ def test_threads_take_no_more_room_together_than_there_is():
     room, held, most = MemoryBudget(100), [0], [0]
 
     def use(amount):
-        with room.taken(amount):
+        with room.reserve(amount):
             held[0] += amount
             most[0] = max(most[0], held[0] if amount <= 100 else 0)
             assert amount <= 100 or held[0] == amount
@@ -325,9 +326,9 @@ def test_threads_take_no_more_room_together_than_there_is():
 
 def test_an_error_gives_the_room_back():
     room = MemoryBudget(10)
-    with pytest.raises(KeyError), room.taken(10):
+    with pytest.raises(KeyError), room.reserve(10):
         raise KeyError
-    with room.taken(10):
+    with room.reserve(10):
         pass
 
 
@@ -352,10 +353,67 @@ def test_a_photograph_whose_decoder_takes_too_much_is_refused_before_it_begins(t
     monkeypatch.setattr("thesisrecon.io.images.MAX_DECODED_BYTES", 5 * 90 * 80)
     read = read_images(tmp_path, max_size_px=1600)
     assert [image.name for image in read.images] == ["b.png"]
-    assert "reading a WEBP of that size takes" in read.refused["a.webp"]
-    assert "reading a JPEG in several scans of that size takes" in read.refused["c.jpg"]
+    assert "decoding a WEBP of this size takes" in read.refused["a.webp"]
+    assert "decoding a progressive JPEG of this size takes" in read.refused["c.jpg"]
     assert "save it as PNG or TIFF" in read.refused["a.webp"]
 
 
 def test_the_largest_sensors_are_read_in_every_kind_of_jpeg():
     assert MAX_DECODED_BYTES > 10 * 14204 * 10652
+
+
+def solid(k):
+    """A smooth picture with a bright bar at another place in each."""
+    rgb = np.tile(np.linspace(30, 200, 64).astype(np.uint8)[None, :, None], (48, 1, 3))
+    rgb[8 * k : 8 * k + 8] = [220, 40, 60]
+    return rgb
+
+
+def frames(folder, count):
+    return [write_frame(folder, k + 1, solid(k)) for k in range(count)]
+
+
+def test_frames_are_numbered_from_one_and_hold_their_picture(tmp_path):
+    written = frames(tmp_path / "new", 3)
+    assert [path.name for path in written] == ["frame-0001.png", "frame-0002.png", "frame-0003.png"]
+    assert frame_name(12345) == "frame-12345.png"
+    for k, path in enumerate(written):
+        with PIL.Image.open(path) as image:
+            np.testing.assert_array_equal(np.asarray(image), solid(k))
+    assert len(list((tmp_path / "new").iterdir())) == 3
+
+
+@pytest.mark.parametrize(("suffix", "apart"), [(".webp", 4.0), (".png", 0.0)])
+def test_an_animation_plays_all_frames_for_ever(suffix, apart, tmp_path):
+    path = write_animation(tmp_path / f"all{suffix}", frames(tmp_path, 4), milliseconds=50)
+    with PIL.Image.open(path) as image:
+        assert image.n_frames == 4
+        assert image.info["loop"] == 0
+        for k in range(4):
+            image.seek(k)
+            image.load()
+            assert image.info["duration"] == 50
+            assert np.abs(np.asarray(image.convert("RGB")).astype(int) - solid(k)).mean() <= apart
+    again = write_animation(tmp_path / f"again{suffix}", frames(tmp_path, 4), milliseconds=50)
+    assert again.read_bytes() == path.read_bytes()
+    assert animation_suffix() in (".webp", ".png")
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".png"])
+def test_one_frame_is_an_animation_too(suffix, tmp_path):
+    path = write_animation(tmp_path / f"one{suffix}", frames(tmp_path, 1))
+    with PIL.Image.open(path) as image:
+        assert image.size == (64, 48)
+
+
+def test_what_cannot_be_written_is_told(tmp_path):
+    (one,) = frames(tmp_path, 1)
+    with pytest.raises(ValueError, match=r"written as \.webp or \.png; got all\.gif"):
+        write_animation(tmp_path / "all.gif", [one])
+    with pytest.raises(ValueError, match="at least one frame"):
+        write_animation(tmp_path / "all.webp", [])
+    with pytest.raises(UsageError, match=r"absent\.png cannot be read"):
+        write_animation(tmp_path / "all.webp", [one, tmp_path / "absent.png"])
+    with pytest.raises(UsageError, match="cannot be written"):
+        write_frame(one, 1, solid(0))
+    assert not (tmp_path / "all.webp").exists()

@@ -7,7 +7,7 @@ import trimesh
 
 from thesisrecon.errors import UsageError
 from thesisrecon.io.exports import write_point_cloud
-from thesisrecon.io.meshes import read_mesh, unmerged, write_mesh
+from thesisrecon.io.meshes import _split_seams, read_mesh, write_mesh
 from thesisrecon.records import TexturedMesh
 
 
@@ -31,7 +31,7 @@ def color_of(mesh, face):
 
 def test_seams_have_a_vertex_for_each_place():
     mesh = roof()
-    vertices, faces, uv = unmerged(mesh)
+    vertices, faces, uv = _split_seams(mesh)
     assert len(vertices) == 6
     np.testing.assert_array_equal(vertices[faces], mesh.vertices[mesh.faces])
     np.testing.assert_array_equal(uv[faces], mesh.uv)

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from validation.studies.full_disk import Refusal, SmallRuns, disk_ends, filled, refused_at, table
+from validation.studies.kill_anywhere import different, outputs
 
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
@@ -29,8 +31,6 @@ from thesisrecon.records import (
 )
 from thesisrecon.runtime.record_files import ChangedRecord, _seal, bytes_from_record, read_record
 from thesisrecon.runtime.run_folder import RunDirectory, StageFolder, code_key, key_of
-from validation.studies.full_disk import Refusal, SmallRuns, disk_ends, filled, refused_at, table
-from validation.studies.kill_anywhere import different, outputs
 
 
 def some_features(value=1.0):

@@ -8,14 +8,14 @@ import time
 from pathlib import Path
 
 import pytest
+from validation.studies.kill_anywhere import different, outputs
+from validation.studies.stop_anywhere import Stop, stopped, table
 
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime.executors import ProcessPool
 from thesisrecon.runtime.signals import CODES, advised
-from validation.studies.kill_anywhere import different, outputs
-from validation.studies.stop_anywhere import Stop, stopped, table
 
 ROOT = Path(__file__).parents[2]
 COURTYARD = ROOT / "fixtures" / "courtyard" / "images"

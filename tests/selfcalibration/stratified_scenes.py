@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.synthetic import make_scene, projective_reconstruction
+from tests.synthetic import projective_reconstruction
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.selfcalibration.hartley import CalibrationProblem
 from thesisrecon.selfcalibration.stratified import projective_scene
@@ -64,14 +64,3 @@ def turned_about_one_axis(scene, degrees):
     ]
     centres[:, 1] += 0.3 * np.cos(np.arange(len(R)) * 2.0)
     return replace(scene, R=R, t=-np.einsum("vab,vb->va", R, centres))
-
-
-__all__ = [
-    "CENTRED",
-    "CENTRED_ZOOM",
-    "NOTHING_BUT_CONSTANT",
-    "make_scene",
-    "prior_for",
-    "setup",
-    "turned_about_one_axis",
-]

@@ -23,8 +23,14 @@ from thesisrecon.selfcalibration.focals_from_fundamental import (
     pair_focals,
 )
 from thesisrecon.selfcalibration.frame import normalized_frame
-from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_cost, kruppa_residuals
-from thesisrecon.selfcalibration.pair_geometry import PairGeometry, fit_fundamental, pair_geometries
+from thesisrecon.selfcalibration.kruppa import (
+    PairGeometry,
+    _fit_fundamental,
+    _kruppa_cost,
+    dual_conics,
+    kruppa_residuals,
+    pair_geometries,
+)
 from thesisrecon.selfcalibration.unknowns import weak_focal_prior
 
 
@@ -51,11 +57,11 @@ def test_the_closed_form_is_exact_at_any_scale_and_sign(seed, scale):
 @given(seed=st.integers(0, 100_000))
 def test_the_kruppa_equations_hold_at_the_truth_and_not_beside_it(seed):
     F, K1, K2 = random_pair(seed)
-    residual = kruppa_residuals(F[None], dual_images(K1)[None, None], dual_images(K2)[None, None])
+    residual = kruppa_residuals(F[None], dual_conics(K1)[None, None], dual_conics(K2)[None, None])
     assert np.abs(residual).max() < 1e-10
     wrong = K1 @ np.diag([1.3, 1.3, 1.0])
     assert (
-        np.abs(kruppa_residuals(F[None], dual_images(wrong)[None, None], dual_images(K2)[None, None])).max()
+        np.abs(kruppa_residuals(F[None], dual_conics(wrong)[None, None], dual_conics(K2)[None, None])).max()
         > 1e-4
     )
 
@@ -67,7 +73,7 @@ def test_kruppa_residuals_bear_full_calibrations(seed):
     K = [np.array([[1.3, 0.05, 0.1], [0.0, 1.4, -0.2], [0.0, 0.0, 1.0]]), np.diag([0.7, 0.8, 1.0])]
     R = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)).as_matrix()
     F = np.linalg.inv(K[1]).T @ cross_matrix(rng.normal(size=3)) @ R @ np.linalg.inv(K[0])
-    residual = kruppa_residuals(F[None], dual_images(K[0])[None, None], dual_images(K[1])[None, None])
+    residual = kruppa_residuals(F[None], dual_conics(K[0])[None, None], dual_conics(K[1])[None, None])
     assert np.abs(residual).max() < 1e-9
 
 
@@ -169,7 +175,7 @@ def test_whitened_residuals_square_to_the_chi_square():
     pairs = pair_geometries(frame, rec)
     log_f = np.full(4, 0.1)
     root = kruppa_whitening(pairs, log_f, principal_std=0.01)
-    w = dual_images(square_pixel_calibrations(log_f))[None]
+    w = dual_conics(square_pixel_calibrations(log_f))[None]
     g = kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j])[0]
     white = np.einsum("mab,mb->ma", root, g)
     chi = kruppa_chi_square(pairs, log_f[:1], log_f[:1], cell=0.0, principal_std=0.01)[:, 0]
@@ -184,7 +190,7 @@ def test_fit_starts_anywhere_near_and_does_not_raise_the_cost():
     assert (np.abs(np.linalg.det(fitted.F)) < 1e-12).all()
     assert (np.abs(np.abs(np.einsum("mab,mab->m", pairs.F, fitted.F)) - 1.0) < 1e-3).all()
     x = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 30, 2))
-    F, covariance = fit_fundamental(random_pair(1)[0], x[0], x[1])
+    F, covariance = _fit_fundamental(random_pair(1)[0], x[0], x[1])
     assert np.isfinite(F).all()
     assert (np.linalg.eigvalsh(covariance) > -1e-6 * np.trace(covariance)).all()
 
@@ -207,7 +213,9 @@ def test_the_kruppa_cost_is_the_square_of_small_residuals_and_linear_in_large_on
     F, K1, K2 = random_pair(7)
     pairs = PairGeometry(np.array([0]), np.array([1]), F[None], np.zeros((1, 9, 9)))
     wrong = np.stack([K1 @ np.diag([1.2, 1.2, 1.0]), K2])[None]
-    size = np.linalg.norm(kruppa_residuals(F[None], *(dual_images(wrong)[:, k : k + 1] for k in (0, 1))))
+    size = np.linalg.norm(kruppa_residuals(F[None], *(dual_conics(wrong)[:, k : k + 1] for k in (0, 1))))
     assert size > 1e-3
-    np.testing.assert_allclose(kruppa_cost(pairs, wrong, scale=1e3 * size), [size**2], rtol=1e-5)
-    np.testing.assert_allclose(kruppa_cost(pairs, wrong, scale=1e-3 * size), [2e-3 * size**2], rtol=2e-3)
+    np.testing.assert_allclose(_kruppa_cost(pairs, wrong, loss_scale=1e3 * size), [size**2], rtol=1e-5)
+    np.testing.assert_allclose(
+        _kruppa_cost(pairs, wrong, loss_scale=1e-3 * size), [2e-3 * size**2], rtol=2e-3
+    )

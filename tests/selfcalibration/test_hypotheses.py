@@ -120,7 +120,7 @@ def test_a_focal_that_leaves_no_answer_is_named_and_not_asked_for():
         HypothesesAndRefinement().calibrate(reconstruction, prior=prior, rng=np.random.default_rng(0))
     assert "near the focal length that was given" in str(failure.value)
     assert "1 px (+- 5.0%)" in failure.value.evidence
-    assert "the photographs contradict it" in failure.value.advice
+    assert "the images contradict it" in failure.value.advice
     assert "give the focal length" not in str(failure.value)
 
 

@@ -7,10 +7,10 @@ from tests.selfcalibration.stratified_scenes import (
     CENTRED,
     CENTRED_ZOOM,
     NOTHING_BUT_CONSTANT,
-    make_scene,
     setup,
     turned_about_one_axis,
 )
+from tests.synthetic import make_scene
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conics import calibration_from_dual_image
 from thesisrecon.intrinsics import IntrinsicsOptions

@@ -8,12 +8,11 @@ import pytest
 from tests.selfcalibration.stratified_scenes import (
     CENTRED,
     NOTHING_BUT_CONSTANT,
-    make_scene,
     prior_for,
     setup,
     true_plane,
 )
-from tests.synthetic import TrueScene, projective_reconstruction
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.images import read_images
 from thesisrecon.records import Tracks

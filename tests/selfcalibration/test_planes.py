@@ -5,14 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.selfcalibration.stratified_scenes import (
-    CENTRED_ZOOM,
-    NOTHING_BUT_CONSTANT,
-    make_scene,
-    prior_for,
-    setup,
-)
-from tests.synthetic import projective_reconstruction
+from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CONSTANT, prior_for, setup
+from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.selfcalibration.cheirality import CheiralityRegion, CheiralitySearch, local_minima
@@ -118,7 +112,7 @@ def test_three_views_of_a_constant_camera_suffice(seed):
     candidates = ModulusConstraint().locate(found, np.random.default_rng(0))
     nearest = np.linalg.norm(candidates.planes - plane, axis=1).min()
     assert nearest < 1e-6
-    answer = Stratified(ModulusConstraint(), kept=21).calibrate(
+    answer = Stratified(ModulusConstraint(), max_candidates=21).calibrate(
         projective_reconstruction(scene, seed=seed), prior=prior_for(scene), rng=np.random.default_rng(0)
     )
     assert answer.K[0, 0, 0] == pytest.approx(1500.0, rel=1e-6)

@@ -1,14 +1,19 @@
-"""The tables of self-calibration on photographs: rows of several methods, some of which failed."""
+"""Calibration on real images: tables, zoomed images and the dinosaur."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from validation.studies.dinosaur import compare, to_metrics
 
-from tests.validation.test_cameras import _reconstruction, _truth
+import thesisrecon
+from tests.validation.test_metrics import _reconstruction, _truth
 from thesisrecon.config import PipelineConfig
-from validation.metrics.intervals import IntervalScores, holding_std
-from validation.scenes.real import Scene
+from thesisrecon.intrinsics import IntrinsicsOptions
+from validation.metrics.intervals import IntervalScores, focal_errors_pct, holding_std, interval_scores
+from validation.scenes.dinosaur import load_dinosaur
+from validation.scenes.real import Scene, load_real_scene
+from validation.scenes.zoomed import rezoom_scene
 from validation.studies.calibration_bench import Rows
 from validation.studies.calibration_parts import keep_observations, one_camera
 from validation.studies.calibration_real import _change_pct, _pooled, _told
@@ -87,3 +92,51 @@ def test_points_that_one_photograph_sees_go_with_the_observations_taken():
     less = keep_observations(tracks, kept)
     assert 4 not in less.point_index
     assert len(less.xy) == 2 * (tracks.n_points - 1)
+
+
+ZOOM_MEDIAN_PCT, ZOOM_WORST_PCT = 0.5, 3.0
+
+
+@pytest.mark.real
+def test_zoomed_and_cropped_photographs_are_calibrated_each_for_itself(tmp_path):
+    whole = load_real_scene("Herz-Jesus-P8")
+    if whole is None:
+        pytest.skip("the photographs of Herz-Jesus-P8 are not on this machine (THESISRECON_DATA)")
+    scene = rezoom_scene(whole, tmp_path / "images", seed=0)
+    config = PipelineConfig(intrinsics=IntrinsicsOptions(cameras="per-image"))
+    result = thesisrecon.reconstruct(
+        list(scene.image_paths), tmp_path / "out", config=config, seed=0, until="metric"
+    )
+    assert result.metric is not None
+    assert result.metric.trusted, result.metric.failed_checks
+    found = result.metric.reconstruction
+    assert found.registered.all()
+    assert found.K is not None
+    assert scene.K is not None
+    errors = focal_errors_pct(found.K, scene.K)
+    assert np.median(errors) <= ZOOM_MEDIAN_PCT
+    assert errors.max() <= ZOOM_WORST_PCT
+    assert interval_scores(result.metric, scene.K).holding() >= 0.92
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    dinosaur = load_dinosaur()
+    if dinosaur is None:
+        pytest.skip("the dinosaur's tracks are not on this machine")
+    return compare(dinosaur)
+
+
+@pytest.mark.real
+def test_all_cameras_are_found_and_explain_the_tracks_as_well_as_the_published_ones(comparison):
+    missed = [row for row in to_metrics(comparison) if row.verdict == "missed"]
+    assert not missed, missed
+
+
+@pytest.mark.real
+def test_hardly_an_observation_is_refused_and_the_noise_is_small(comparison):
+    found = comparison.reconstruction
+    assert found.inlier.mean() > 0.97
+    assert found.valid.mean() > 0.98
+    assert comparison.rms_px(comparison.ours) < 0.45
+    assert np.nanmedian(comparison.ours.px) < 0.25

@@ -7,15 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from validation.studies.stop_anywhere import stopped
 
-from tests.report.opened import Witness
+from tests.report.synthetic import Witness
 from tests.validation.ablation.toy import Darts, marks
 from validation.ablation import Measure, Study, ablate, analyse, write_analysis
 from validation.ablation.progress import duration, words_of
 from validation.ablation.run import State
 from validation.command import main
 from validation.scenes.real import ROOT
-from validation.studies.stop_anywhere import stopped
 
 EVIL = "<img src=x onerror=alert(1)>"
 STUDY = """

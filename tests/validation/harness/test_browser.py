@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.report.opened import Witness
+from tests.report.synthetic import Witness
 from tests.validation.harness.toy_stages import STAGES, WAYS
 from validation.harness.gates import Gate
 from validation.harness.page import write_pages

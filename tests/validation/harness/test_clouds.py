@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.validation.test_cameras import N, _reconstruction, _truth
+from tests.validation.test_metrics import N, _reconstruction, _truth
 from validation.harness.records import Outcome
 from validation.harness.stages.clouds import _common_frame, _icp_metrics, _same_points, same_points
 from validation.scenes.real import Scene

@@ -1,0 +1,317 @@
+"""Studies of growth, pair choice, subsets, killed runs, fuzzing, cost and rounding: what they compute."""
+
+import json
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from validation.benchmark_table import main, ratio_table, ratios_to_ours
+from validation.studies.growth_of_cost import Cost, Meter
+from validation.studies.kill_anywhere import TORN, Kill, different, outputs
+from validation.studies.kill_anywhere import table as kill_table
+from validation.studies.pair_choice import Choice, choose, to_metrics
+
+from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
+from tests.synthetic import make_scene, true_pairs
+from thesisrecon.io.colmap_files import read_colmap_model
+from thesisrecon.io.colmap_model import MODEL_NUMBERS, inconsistency
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import PairChoice
+from validation.scenes.many_views import walk
+from validation.studies import fuzz_colmap, growth_of_cost, parallel, perturbation
+from validation.studies.growth import Growth, exponent, recall_of, table
+from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
+
+ROW = Growth(
+    "all-pairs", 10, 45, 45, 2, 1.0, 0.0, 9.0, 10.0, None, ((0, 1, True), (0, 2, False), (1, 2, True))
+)
+
+
+def test_the_exponent_is_that_of_a_power():
+    assert exponent([10, 30, 100], [3 * n**1.5 for n in (10, 30, 100)]) == pytest.approx(1.5)
+
+
+def test_recall_counts_the_accepted_pairs_alone():
+    assert recall_of(replace(ROW, pair_list=((0, 1, True), (0, 2, False))), ROW) == 0.5
+    assert recall_of(ROW, ROW) == 1.0
+
+
+def test_the_table_names_shares_and_exponents():
+    more = replace(
+        ROW, photographs=20, possible=190, tried=95, cpu_s=40.0, recall=0.985, overlapping_tried=1.0
+    )
+    text = table([ROW, more])
+    assert "95 of 190 (50 %)" in text
+    assert "| 100.0 % | 98.5 % |" in text
+    assert "processor time 2.00" in text
+
+
+def test_missed_pairs_are_told_and_judged():
+    good, bad = (Choice("a", 100, 30, 20, missed) for missed in ((), (41,)))
+    assert [metric.verdict for metric in to_metrics(good)] == ["reported", "reported", "reached"]
+    row = to_metrics(bad)[-1]
+    assert (row.verdict, row.values["overlap estimate"]) == ("missed", pytest.approx(95.0))
+    assert "41 verified" in row.note
+
+
+class FirstPairOnly:
+    def select(self, names, features, **rest):
+        del names, features, rest
+        return PairChoice(pairs=[(0, 1)], how="the first")
+
+
+def pair(i, j, inliers, accepted):
+    return SimpleNamespace(i=i, j=j, inliers=inliers, accepted=accepted)
+
+
+def test_accepted_pairs_that_were_not_tried_are_missed_and_others_are_not():
+    pairs = (pair(0, 1, 90, True), pair(0, 2, 70, True), pair(1, 2, 40, True), pair(0, 3, 20, False))
+    images = tuple(SimpleNamespace(name=str(n)) for n in range(4))
+    run = SimpleNamespace(images=images, features=(), pairs=pairs)
+    choice = choose("wall", run, 1, FirstPairOnly())
+    assert choice == Choice("wall", possible=4, tried=1, accepted=3, missed=(40, 70))
+    assert abs(choice.recall - 1 / 3) < 1e-12
+    row = to_metrics(choice)[-1]
+    assert row.verdict == "missed"
+    assert row.note == "missed pairs have 40, 70 verified matches"
+
+
+def test_a_set_without_accepted_pairs_misses_none():
+    assert [row.verdict for row in to_metrics(Choice("dark", 6, 3, 0, ()))][-1] == "reached"
+
+
+def matched_scene():
+    scene = make_scene(views=9, points=400, sigma_px=0.3, seed=4)
+    return Matched("synthetic", scene.tracks, true_pairs(scene), scene.sizes, scene.K[:, 0, 0])
+
+
+def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_see():
+    whole, views = matched_scene(), np.array([1, 4, 7])
+    kept = np.arange(400) < 250
+    part = take_views(whole, views, kept)
+    assert part.tracks.n_views == 3
+    assert np.bincount(part.tracks.point_index).min() >= 2
+    assert {(pair.i, pair.j) for pair in part.pairs} == {(0, 1), (0, 2), (1, 2)}
+    t = whole.tracks
+    seen = np.zeros((9, 400), dtype=bool)
+    seen[t.view_index, t.point_index] = True
+    assert part.tracks.n_points == int(((seen[views].sum(axis=0) >= 2) & kept).sum())
+    mine = part.tracks.xy[part.tracks.view_index == 1]
+    theirs = t.xy[t.view_index == 4]
+    assert all((np.abs(theirs - xy).max(axis=1) == 0.0).any() for xy in mine)
+
+
+def test_a_trial_finds_the_focal_length_and_is_the_same_twice():
+    first, again = (run_trial(matched_scene(), "shared", 3) for _ in range(2))
+    assert first.right
+    assert not first.failed_checks
+    assert first.registered == len(first.views)
+    assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
+
+
+def test_what_came_of_a_trial_is_told_apart():
+    wrong = Trial(0, (0, 1), 2, 10.0, 12.0, (), 1, 1.0)
+    shifted = replace(wrong, median_pct=np.nan, reasons=("pure translation",))
+    trials = {
+        "right": replace(wrong, median_pct=1.0),
+        "open": replace(wrong, interval_pct=11.0),
+        "refused": replace(shifted, failed_checks=("close to a pure translation",)),
+        "refused, another reason": replace(shifted, failed_checks=("too few points",)),
+        "right, doubted": replace(wrong, median_pct=1.0, failed_checks=("no",)),
+        "wrong": wrong,
+        "crash": replace(wrong, median_pct=np.nan, crash="ValueError: no"),
+    }
+    assert tuple(trials) == OUTCOMES
+    assert [trial.outcome for trial in trials.values()] == list(OUTCOMES)
+    assert replace(wrong, failed_checks=("no",)).outcome == "refused"
+    assert shifted.outcome == "wrong"
+    assert "| s | shared | 7 | 1 | 1 | 1 | 1 | 1 | 1 | 1 | 5.50 |" in table_row(
+        "s", "shared", [*trials.values()]
+    )
+
+
+def write(folder, seconds, focal):
+    folder.mkdir()
+    summary = {"seconds": {"total": seconds}, "cameras": [{"focal_px": focal}]}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    (folder / "points.ply").write_bytes(b"ply")
+    (folder / "report.html").write_text(f"{seconds} s")
+
+
+def test_times_are_no_difference_and_numbers_and_missing_files_are(tmp_path):
+    for name, seconds, focal in (("a", 1.0, 900.0), ("b", 2.0, 900.0), ("c", 1.0, 900.5)):
+        write(tmp_path / name, seconds, focal)
+    a, b, c = (outputs(tmp_path / name) for name in "abc")
+    assert different(a, b) == ()
+    assert different(a, c) == ("summary.json",)
+    (tmp_path / "b" / "points.ply").unlink()
+    assert different(a, outputs(tmp_path / "b")) == ("points.ply",)
+    rows = [
+        Kill("after 5 % of the time", True, 3, ()),
+        Kill("after 95 % of the time", False, 9, ("points.ply",)),
+    ]
+    assert kill_table(rows).splitlines()[2:] == [
+        "| after 5 % of the time | 3 | none |",
+        "| after 95 % of the time (had ended) | 9 | points.ply |",
+    ]
+
+
+def test_a_torn_write_leaves_no_half_file_under_its_name(tmp_path):
+    images = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
+    options = ["reconstruct", str(images), "-o", str(tmp_path / "out"), "--max-size", "128"]
+    program = [sys.executable, "-c", TORN, "2", *options, "--until", "features", "--threads", "1"]
+    ended = subprocess.run(program, check=False, capture_output=True)
+    assert ended.returncode == -signal.SIGKILL
+    whole = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name[0] != "."]
+    torn = list((tmp_path / "out").rglob(".*.partial"))
+    assert len(whole) == len(torn) == 1
+
+
+def test_good_inputs_are_models(tmp_path):
+    inputs = fuzz_colmap.corpus()
+    assert len(inputs) == len(MODEL_NUMBERS) + 6
+    assert max(map(len, inputs)) <= fuzz_colmap.LARGEST_INPUT
+    for data in inputs:
+        fuzz_colmap.read_input(data)
+        first, second = fuzz_colmap.LENGTHS.unpack_from(data)
+        rest = data[fuzz_colmap.LENGTHS.size :]
+        for name, part in (
+            ("cameras", rest[:first]),
+            ("images", rest[first : first + second]),
+            ("points3D", rest[first + second :]),
+        ):
+            (tmp_path / f"{name}.bin").write_bytes(part)
+        assert inconsistency(read_colmap_model(tmp_path)) == ""
+
+
+def test_nothing_is_found_and_a_fault_is(monkeypatch, capsys):
+    assert fuzz_colmap.main(["--plain", "--seconds", "1"]) == 0
+    assert "nothing found" in capsys.readouterr().out
+
+    def careless(contents):
+        return contents[Path("cameras.bin")][100_000]
+
+    monkeypatch.setattr(fuzz_colmap, "decode_model", careless)
+    assert fuzz_colmap.main(["--plain", "--seconds", "1"]) == 1
+    assert "IndexError" in capsys.readouterr().out
+
+
+def entry(group, method, seconds):
+    return {"group": group, "extra_info": {"method": method}, "stats": {"min": seconds}}
+
+
+def test_ratios_are_ours_over_each_reference(tmp_path, capsys):
+    told = {"benchmarks": [entry("F", "ours", 0.002), entry("F", "OpenCV", 0.008), entry("G", "OpenCV", 1.0)]}
+    (tmp_path / "b.json").write_text(json.dumps(told))
+    assert main([str(tmp_path / "b.json"), "-o", str(tmp_path / "r.json")]) == 0
+    assert "| F | OpenCV | 8 | **0.25** |" in capsys.readouterr().out
+    assert json.loads((tmp_path / "r.json").read_text())["ours_over"] == {"F": {"OpenCV": 0.25}}
+
+
+def test_a_group_without_ours_has_no_ratio():
+    assert ratios_to_ours({"G": {"OpenCV": 1.0}}) == {}
+    assert "| G | OpenCV | 1e+03 |  |" in ratio_table({"G": {"OpenCV": 1.0}})
+
+
+def test_a_file_that_is_no_benchmark_is_named(tmp_path, capsys):
+    (tmp_path / "b.json").write_text("[]")
+    assert main([str(tmp_path / "b.json")]) == 2
+    assert "is no benchmark of ours" in capsys.readouterr().err
+
+
+def test_a_longer_walk_begins_with_the_shorter_and_looks_at_the_yard():
+    few, many = walk(5, (480, 360)), walk(40, (480, 360))
+    for a, b in zip(few, many, strict=False):
+        np.testing.assert_array_equal(a.R, b.R)
+        np.testing.assert_array_equal(a.C, b.C)
+    centres = np.array([pose.C for pose in many])
+    angle = np.sort(np.degrees(np.arctan2(centres[:, 0], -1.4 - centres[:, 1])))
+    assert np.diff(angle).max() < 8.0, "the arc has no gap"
+    middle = np.array([pose.R @ (np.array([0.0, -1.1, 1.7]) - pose.C) for pose in many])
+    assert (middle[:, 2] > 4.0).all()
+
+
+def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_path):
+    CALLS.clear()
+    meter = Meter()
+    reconstruct(photographs(4), tmp_path, config=fake_config(), until="metric", progress=meter.hear)
+    meter.enter("end")
+    assert set(growth_of_cost.STAGES) <= set(meter.cpu_s)
+    assert all(peak > 20.0 for peak in meter.peak_mb.values())
+    costs = [
+        Cost(
+            n, dict.fromkeys(growth_of_cost.STAGES, n**1.5), {"images": 3.0 * n}, {"points": n**2}, 1.0, 0.01
+        )
+        for n in (10, 100)
+    ]
+    rows = growth_of_cost.table(costs).splitlines()
+    assert next(row for row in rows if row.startswith("| matches, processor s")).endswith("| 1.50 |")
+    assert next(row for row in rows if row.startswith("| whole run, peak MB")).endswith("| 1.00 |")
+    assert next(row for row in rows if row.startswith("| points")).endswith("| 2.00 |")
+
+
+def test_the_efficiency_is_that_of_two_workers():
+    found = {"one thread": [(10.0, 10.0)], "two processes": [(6.25, 12.5)]}
+    rows = {row.name: row for row in parallel.rows("a set", found)}
+    assert rows["efficiency by the clock"].values == {"two processes": 0.8}
+    assert rows["efficiency by work"].values == {"two processes": 0.8}
+    assert rows["efficiency by work"].verdict == "missed"
+
+
+def test_shaken_numbers_are_moved_by_their_rounding():
+    rng = np.random.default_rng(0)
+    for kind, rel in ((np.float64, 1e-12), (np.float32, 1.3e-7)):
+        values = np.linspace(1.0, 500.0, 1000).astype(kind)
+        apart = np.abs(perturbation.shaken(values, rng).astype(np.float64) / values - 1.0)
+        assert 0.0 < apart.max() <= rel
+    assert perturbation.shaken(values, rng).dtype == np.float32
+
+
+@pytest.mark.parametrize("stage", perturbation.STAGES)
+def test_a_shaken_run_lies_beside_the_still_one(stage, tmp_path):
+    """Fakes that know the truth: what is shaken is the stage that was asked for, and nothing comes of it."""
+    config = fake_config()
+    still = reconstruct(photographs(4), tmp_path, config=config, until="metric").metric
+    CALLS.clear()
+    shaken = perturbation.disturbed(config, stage, 1)
+    other = reconstruct(photographs(4), tmp_path, config=shaken, until="metric", overwrite=True).metric
+    assert still is not None
+    assert other is not None
+    assert any(call.startswith("detect") for call in CALLS) == (stage == "corners")
+    assert "tracks" in CALLS
+    moved = perturbation.compare(still, other)
+    assert moved.intrinsics_std == 0.0
+    assert moved.registered == 0
+
+
+def test_what_moved_is_told_in_standard_deviations():
+    still = _result()
+    further = replace(still.intrinsics[0]["focal_px"], value=100.5)
+    other = replace(still, intrinsics=({**still.intrinsics[0], "focal_px": further}, *still.intrinsics[1:]))
+    moved = perturbation.compare(still, other)
+    assert moved.intrinsics_std == pytest.approx(0.5)
+    assert moved.centres_rel == pytest.approx(0.0, abs=1e-9)
+    worst = {"corners": [moved], "matches": [replace(moved, intrinsics_std=1.5)], "tracks": [moved]}
+    row = perturbation.rows("a set", worst)[0]
+    assert (row.verdict, row.judged) == ("missed", "matches")
+    assert perturbation.rows("a set", {"corners": [moved]})[0].verdict == "reached"
+
+
+def _result():
+    from tests.fake_stages import FakeCalibrator, FakeMetric, FakeProjective, FakeTracks
+
+    features = [FakeDetector().detect(image) for image in photographs(4)]
+    rng = np.random.default_rng(0)
+    tracks = FakeTracks().build(features, (), rng)
+    projective = FakeProjective().reconstruct(tracks, (), np.full((4, 2), 90), rng=rng)
+
+    class Assumed:
+        mean, focal_known = np.zeros(4), np.zeros(4, dtype=bool)
+
+    calibration = FakeCalibrator().calibrate(projective, prior=Assumed(), rng=rng)
+    return FakeMetric().refine(projective, calibration, prior=Assumed(), rng=rng)
