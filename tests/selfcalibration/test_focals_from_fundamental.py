@@ -185,7 +185,7 @@ def test_whitened_residuals_square_to_the_chi_square():
 def test_fit_starts_anywhere_near_and_does_not_raise_the_cost():
     scene = make_scene(views=3, sigma_px=0.5, seed=7)
     rec = projective_reconstruction(scene, seed=7)
-    pairs = pair_geometries(normalized_frame(rec, prior_for(scene)), rec, refine=False)
+    pairs = pair_geometries(normalized_frame(rec, prior_for(scene)), rec, refit=False)
     fitted = pair_geometries(normalized_frame(rec, prior_for(scene)), rec)
     assert (np.abs(np.linalg.det(fitted.F)) < 1e-12).all()
     assert (np.abs(np.abs(np.einsum("mab,mab->m", pairs.F, fitted.F)) - 1.0) < 1e-3).all()

@@ -22,20 +22,20 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import orient_signs
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, require_finite
-from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_distances
+from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_sampson_residuals
 from thesisrecon.numerics.noise import noise_from_distances
-from thesisrecon.projective.growing import (
-    GrowingModel,
-    adjust,
-    finish,
-    onto_all_tracks,
-    retriangulate,
+from thesisrecon.projective.incremental import IncrementalProjective
+from thesisrecon.projective.initial_pair import NO_PARALLAX, rank_initial_pairs, require_pair_with_parallax
+from thesisrecon.projective.model import (
+    ProjectiveModel,
+    adjust_all,
+    expand_to_all_tracks,
+    retriangulate_points,
     select_tracks,
+    select_tracks_with_parallax,
     subset_tracks,
-    tracks_with_parallax,
+    to_reconstruction,
 )
-from thesisrecon.projective.incremental import GatedIncremental
-from thesisrecon.projective.initial_pair import NO_PARALLAX, rank_initial_pairs, require_parallax
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 _BALANCING = 10
@@ -45,7 +45,7 @@ _AT_REST = 1e-4
 
 @dataclass(frozen=True)
 class Factors:
-    """Cameras ``P`` (V, 3, 4) for pixels and points ``X`` (N, 4) of unit norm, found with the balanced
+    """Cameras ``P`` (V, 3, 4) for pixels and points ``X`` (N, 4) of unit norm, found with the balance_depths
     ``depths`` (V, N); ``residual_px`` (V, N) distances of the projections from the matches.
 
     ``gap`` is the fifth singular value over the fourth: 0 for exact matches and right depths.
@@ -89,7 +89,7 @@ def depths_from_fundamentals(
     return depths
 
 
-def balanced(depths: F64, sizes: F64) -> F64:
+def balance_depths(depths: F64, sizes: F64) -> F64:
     """Depths (V, N) rescaled by views and by points until every view and every point weighs the same.
 
     ``sizes`` (V, N) are the norms of the vectors that the depths multiply. Scales of views are those of
@@ -112,7 +112,7 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Fac
     depths : (V, N) projective depths to begin with (:func:`depths_from_fundamentals`); all equal where None,
         which is the affine camera and needs ``iterations``.
     iterations : most times that the depths are taken anew from the factors; 0 is Sturm and Triggs' own
-        algorithm. It ends when the rank-4 residual of the balanced matrix, an approximation of the
+        algorithm. It ends when the rank-4 residual of the balance_depths matrix, an approximation of the
         reprojection error, falls no more.
 
     Raises ``ValueError`` for fewer than two views or eight points, other shapes, and values that are not
@@ -130,7 +130,7 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Fac
     least, best, done = np.inf, depths, -1
     while done < iterations:
         done += 1
-        depths = balanced(depths, sizes)
+        depths = balance_depths(depths, sizes)
         fitted, residual = _rank_four(depths[:, :, None] * x)
         if residual < least:
             best = depths
@@ -191,7 +191,7 @@ class Factorization:
 
     core_points: int = 100
     iterations: int = 50
-    growth: GatedIncremental = field(default_factory=GatedIncremental)
+    growth: IncrementalProjective = field(default_factory=IncrementalProjective)
 
     def __post_init__(self) -> None:
         if self.core_points < _LEAST_POINTS or self.iterations < 0:
@@ -209,23 +209,23 @@ class Factorization:
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """As :meth:`GatedIncremental.reconstruct`; ``attempt`` grows the core from another pair."""
+        """As :meth:`IncrementalProjective.reconstruct`; ``attempt`` grows the core from another pair."""
         ranked = rank_initial_pairs(tracks, pairs)
-        require_parallax(pairs)
+        require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             raise StageFailure(
                 "no two photographs to begin a factorisation with",
                 f"accepted: {len(ranked)} of {counted(len(pairs), 'pair')}",
                 "take photographs that overlap by more than half and show texture",
             )
-        usable = tracks_with_parallax(tracks, pairs)
+        usable = select_tracks_with_parallax(tracks, pairs)
         keep = select_tracks(tracks, usable, points_per_view=self.growth.points_per_view)
         selected = subset_tracks(tracks, keep)
         model = self.begin(selected, pairs, ranked[attempt], sizes)
         self.growth.complete(model, pairs, rng)
-        return onto_all_tracks(finish(model), tracks, keep)
+        return expand_to_all_tracks(to_reconstruction(model), tracks, keep)
 
-    def begin(self, tracks: Tracks, pairs: Sequence[TwoView], start: TwoView, sizes: I64) -> GrowingModel:
+    def begin(self, tracks: Tracks, pairs: Sequence[TwoView], start: TwoView, sizes: I64) -> ProjectiveModel:
         """Cameras and points of the core, adjusted.
 
         ``StageFailure`` where the pair ``start`` itself shares too few tracks.
@@ -235,11 +235,11 @@ class Factorization:
         F = {(p.i, p.j): p.F for p in pairs} | {(p.j, p.i): p.F.T for p in pairs}
         tree = grow_core(np.isfinite(xy[:, :, 0]), pairs, start, least=self.core_points)
         sigma_px = max(start.sigma_px, self.growth.noise_floor_px)
-        table, edges = complete_table(xy, tree)
-        while len(tree) > 1 and on_one_plane(table, edges, _PLANE_SIGMAS * sigma_px):
+        table, edges = complete_tracks(xy, tree)
+        while len(tree) > 1 and is_planar(table, edges, _PLANE_SIGMAS * sigma_px):
             # Fewer views have more points in common.
             tree = tree[:-1]
-            table, edges = complete_table(xy, tree)
+            table, edges = complete_tracks(xy, tree)
         if table.shape[1] < _LEAST_POINTS:
             raise StageFailure(
                 "the photographs to begin with share too few tracks for a factorisation",
@@ -251,10 +251,10 @@ class Factorization:
 
     def _adjusted(
         self, tracks: Tracks, sizes: I64, views: list[int], factors: Factors, sigma_px: float
-    ) -> GrowingModel:
+    ) -> ProjectiveModel:
         """The core with all its points, those that only some of its views see included."""
         growth, early = self.growth, self.growth.outlier_sigmas[0]
-        model = GrowingModel.empty(tracks, sizes, sigma_px=sigma_px, noise_floor_px=growth.noise_floor_px)
+        model = ProjectiveModel.empty(tracks, sizes, sigma_px=sigma_px, noise_floor_px=growth.noise_floor_px)
         # Until the bundle has done its work, the residuals are those of the factors.
         model.sigma_px = max(model.sigma_px, noise_from_distances(factors.residual_px.ravel()))
         every = np.indices(factors.depths.shape).reshape(2, -1)
@@ -262,8 +262,8 @@ class Factorization:
         model.P[views] = factors.P * signs[:, None, None]
         model.registered[views] = True
         for _ in range(2):
-            retriangulate(model, early)
-            adjust(model, 2 * growth.bundle_iterations, early)
+            retriangulate_points(model, early)
+            adjust_all(model, 2 * growth.bundle_iterations, early)
         return model
 
 
@@ -296,7 +296,7 @@ def grow_core(seen: B8, pairs: Sequence[TwoView], start: TwoView, *, least: int)
         common &= seen[view]
 
 
-def complete_table(xy: F64, tree: Sequence[Edge]) -> tuple[F64, list[Edge]]:
+def complete_tracks(xy: F64, tree: Sequence[Edge]) -> tuple[F64, list[Edge]]:
     """The tracks (V', N', 2) that all views of the tree see, of xy (V, N, 2), and its edges renumbered."""
     views = _views(tree)
     table = xy[views]
@@ -304,7 +304,7 @@ def complete_table(xy: F64, tree: Sequence[Edge]) -> tuple[F64, list[Edge]]:
     return table[:, np.isfinite(table).all(axis=(0, 2))], [(place[i], place[j]) for i, j in tree]
 
 
-def on_one_plane(xy: F64, edges: Sequence[Edge], gate_px: float) -> bool:
+def is_planar(xy: F64, edges: Sequence[Edge], gate_px: float) -> bool:
     """Whether a homography explains nearly all points of xy (V, N, 2) in every pair of views of ``edges``.
 
     Then they lie on one plane (or the camera only turned), which determines no projective camera: rank 4
@@ -317,7 +317,7 @@ def on_one_plane(xy: F64, edges: Sequence[Edge], gate_px: float) -> bool:
         within = np.ones(xy.shape[1], dtype=bool)
         for _ in range(3):
             H = estimate_homography(xy[i, within], xy[j, within])
-            distance = np.linalg.norm(homography_distances(H, xy[i], xy[j]), axis=1)
+            distance = np.linalg.norm(homography_sampson_residuals(H, xy[i], xy[j]), axis=1)
             within = distance <= max(gate_px, 2.0 * float(np.median(distance)))
         shares.append(np.mean(distance <= gate_px))
     return bool(min(shares) >= NO_PARALLAX)

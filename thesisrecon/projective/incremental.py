@@ -28,30 +28,34 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry.homogeneous import whitening_transform
 from thesisrecon.geometry.resection import resect_linear
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
-from thesisrecon.numerics.observations import whitening_transform
-from thesisrecon.numerics.separate_refinement import refine_camera
-from thesisrecon.projective.growing import (
-    LOSS_SIGMAS,
-    GrowingModel,
-    adjust,
-    adjust_around,
-    finish,
-    onto_all_tracks,
-    retriangulate,
-    select_tracks,
-    spread_of_views,
-    subset_tracks,
-    tracks_with_parallax,
+from thesisrecon.numerics.partial_bundle import refine_camera
+from thesisrecon.projective.initial_pair import (
+    initial_cameras,
+    rank_initial_pairs,
+    require_pair_with_parallax,
 )
-from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs, require_parallax
+from thesisrecon.projective.model import (
+    LOSS_SIGMAS,
+    ProjectiveModel,
+    adjust_all,
+    adjust_locally,
+    coverage_of_views,
+    expand_to_all_tracks,
+    retriangulate_points,
+    select_tracks,
+    select_tracks_with_parallax,
+    subset_tracks,
+    to_reconstruction,
+)
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 _SAMPLE = 6
 
 
-def resect_robust(
+def resect_ransac(
     X: F64, xy: F64, *, threshold_px: float, rng: np.random.Generator, batch: int = 64, max_batches: int = 12
 ) -> tuple[F64 | None, B8]:
     """RANSAC over six-point samples with a truncated-quadratic score; X (M, 4), xy (M, 2) px.
@@ -111,7 +115,7 @@ def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
     return np.where((xh[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
 
 
-def predicted_spread_px(P: F64, covariance: F64, X: F64) -> F64:
+def projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
     """Standard deviation (px) of the projection of each point under the camera's covariance.
 
     P (3, 4), covariance (12, 12) of its row-major entries, X (N, 4) -> (N,): root of half the trace of J C
@@ -129,7 +133,7 @@ def predicted_spread_px(P: F64, covariance: F64, X: F64) -> F64:
     return np.where(np.isfinite(spread), spread, np.inf)
 
 
-def epipolar_agreement(P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float) -> F64:
+def epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float) -> F64:
     """Share of the verified matches of each pair within ``gate_px`` (Sampson) of the cameras' F; -> (M,).
 
     P (V, 3, 4). NaN for pairs that are not accepted, of which a view is not registered, or whose cameras
@@ -149,7 +153,7 @@ def epipolar_agreement(P: F64, registered: B8, pairs: Sequence[TwoView], *, gate
     return shares
 
 
-def contradicted_view(
+def find_inconsistent_view(
     P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float, least: float
 ) -> tuple[int, float] | None:
     """The registered view that agrees least with its pairs, and its share; None where all reach ``least``.
@@ -157,7 +161,7 @@ def contradicted_view(
     A view's share is that of all its verified matches with other registered views. One view at a time: the
     partners of a wrong camera look worse than they are as long as it is there.
     """
-    shares = epipolar_agreement(P, registered, pairs, gate_px=gate_px)
+    shares = epipolar_inlier_ratios(P, registered, pairs, gate_px=gate_px)
     total, agreed = np.zeros(len(P)), np.zeros(len(P))
     for pair, share in zip(pairs, shares, strict=True):
         if np.isfinite(share):
@@ -175,7 +179,7 @@ QUANTILE = 0.8
 
 
 @dataclass(frozen=True)
-class GatedIncremental:
+class IncrementalProjective:
     """Incremental projective reconstruction behind a covariance gate.
 
     Parameters
@@ -185,9 +189,9 @@ class GatedIncremental:
     min_points : matches a resection needs: twice the six that always agree; the gate judges their worth.
     outlier_sigmas : residual gates in noise sigmas of the early and the late rounds.
     noise_floor_px : the noise is never taken to be below this (localisation of corners).
-    max_spread : gate on a camera: the 80 % quantile of its predicted spread over all points, as a share of
+    max_projection_std_rel : gate on a camera: the 80 % quantile of its predicted spread over all points, as a share of
         the long side of the image. None lets every camera in.
-    min_agreement : share of a camera's verified matches that must lie on the epipolar lines of the finished
+    min_epipolar_inlier_ratio : share of a camera's verified matches that must lie on the epipolar lines of the finished
         model.
     bundle_iterations, final_rounds : Levenberg-Marquardt steps after each camera; rounds of re-triangulation,
         adjustment and filtering at the end.
@@ -200,13 +204,13 @@ class GatedIncremental:
     min_points: int = 12
     outlier_sigmas: tuple[float, float] = (12.0, 7.0)
     noise_floor_px: float = 0.3
-    max_spread: float | None = 0.01
-    min_agreement: float = 0.5
+    max_projection_std_rel: float | None = 0.01
+    min_epipolar_inlier_ratio: float = 0.5
     bundle_iterations: int = 4
     final_rounds: int = 3
-    adjust_growth: float = 1.2
-    neighbours: int = 4
-    restarts: int = 3
+    global_bundle_growth: float = 1.2
+    local_bundle_views: int = 4
+    max_initial_pairs: int = 3
 
     def reconstruct(
         self,
@@ -229,16 +233,16 @@ class GatedIncremental:
                 f"none of {counted(len(pairs), 'pair')} was accepted",
                 "take photographs that overlap by more than half and show texture",
             )
-        require_parallax(pairs)
+        require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             raise StageFailure(
                 "no other pair of photographs to begin with", f"{len(ranked)} accepted pairs, all tried"
             )
-        usable = tracks_with_parallax(tracks, pairs)
+        usable = select_tracks_with_parallax(tracks, pairs)
         keep = select_tracks(tracks, usable, points_per_view=self.points_per_view)
         selected = subset_tracks(tracks, keep)
         best = self._best_start(selected, pairs, sizes, ranked[attempt:], rng)
-        return onto_all_tracks(finish(best), tracks, keep)
+        return expand_to_all_tracks(to_reconstruction(best), tracks, keep)
 
     def _best_start(
         self,
@@ -247,14 +251,14 @@ class GatedIncremental:
         sizes: I64,
         starts: Sequence[TwoView],
         rng: np.random.Generator,
-    ) -> GrowingModel:
+    ) -> ProjectiveModel:
         """The model with most cameras, then most explained observations, over the initial pairs tried.
 
         Another pair is tried only where it may give more: one with a view that is out and that was not
         merely postponed by the gate; and once half of the views are in, no other part of them is larger.
         """
         best, left, half = None, list(starts), len(sizes) // 2 + 1
-        for tried in range(self.restarts):
+        for tried in range(self.max_initial_pairs):
             found = self._from_pair(tracks, pairs, left.pop(0), sizes, rng)
             if best is None or _rank(found) > _rank(best):
                 best = found
@@ -272,50 +276,54 @@ class GatedIncremental:
         start: TwoView,
         sizes: I64,
         rng: np.random.Generator,
-    ) -> GrowingModel:
+    ) -> ProjectiveModel:
         model = self.begin(tracks, start, sizes)
         self.complete(model, pairs, rng)
         return model
 
-    def complete(self, model: GrowingModel, pairs: Sequence[TwoView], rng: np.random.Generator) -> None:
+    def complete(self, model: ProjectiveModel, pairs: Sequence[TwoView], rng: np.random.Generator) -> None:
         """Add, in place, what views can be added to a model begun in any way; discard what proves wrong."""
         self._grow(model, rng)
         while self._discard_camera(model, pairs):
-            adjust(model, self.bundle_iterations, self.outlier_sigmas[0])
+            adjust_all(model, self.bundle_iterations, self.outlier_sigmas[0])
             self._grow(model, rng)
 
-    def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> GrowingModel:
+    def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> ProjectiveModel:
         """Cameras (3.42) and points of the first two views."""
-        model = GrowingModel.empty(tracks, sizes, sigma_px=pair.sigma_px, noise_floor_px=self.noise_floor_px)
+        model = ProjectiveModel.empty(
+            tracks, sizes, sigma_px=pair.sigma_px, noise_floor_px=self.noise_floor_px
+        )
         views = [pair.i, pair.j]
         model.P[views] = initial_cameras(pair, sizes[views])
         model.registered[views] = True
         for _ in range(2):
-            retriangulate(model, self.outlier_sigmas[0])
-            adjust(model, 2 * self.bundle_iterations, self.outlier_sigmas[0])
+            retriangulate_points(model, self.outlier_sigmas[0])
+            adjust_all(model, 2 * self.bundle_iterations, self.outlier_sigmas[0])
         return model
 
-    def _grow(self, model: GrowingModel, rng: np.random.Generator) -> None:
+    def _grow(self, model: ProjectiveModel, rng: np.random.Generator) -> None:
         """Camera after camera, with a bundle adjustment after each; then the final rounds."""
         early, late = self.outlier_sigmas
         adjusted = int(model.registered.sum())
         while (view := self.add_next_camera(model, rng)) is not None:
-            if model.registered.sum() >= self.adjust_growth * adjusted:
-                adjust(model, self.bundle_iterations, early)
+            if model.registered.sum() >= self.global_bundle_growth * adjusted:
+                adjust_all(model, self.bundle_iterations, early)
                 adjusted = int(model.registered.sum())
             else:
-                adjust_around(model, view, self.bundle_iterations, early, neighbours=self.neighbours)
+                adjust_locally(
+                    model, view, self.bundle_iterations, early, local_bundle_views=self.local_bundle_views
+                )
         for round_number in range(self.final_rounds):
-            adjust(model, 2 * self.bundle_iterations, late if round_number else early)
+            adjust_all(model, 2 * self.bundle_iterations, late if round_number else early)
 
-    def add_next_camera(self, model: GrowingModel, rng: np.random.Generator) -> int | None:
+    def add_next_camera(self, model: ProjectiveModel, rng: np.random.Generator) -> int | None:
         """Resect the view that sees most of the model, widest spread, and passes the gate; None when none
         does."""
         t = model.tracks
         ready = model.valid[t.point_index]
         counts = np.bincount(t.view_index[ready], minlength=t.n_views)
         waiting = ~model.registered & ~model.rejected
-        spread = np.where(waiting, spread_of_views(model.cell, ready, t.n_views), 0.0)
+        spread = np.where(waiting, coverage_of_views(model.cell, ready, t.n_views), 0.0)
         for view in np.argsort(-spread, kind="stable"):
             if spread[view] <= 0.0:
                 return None
@@ -327,11 +335,11 @@ class GatedIncremental:
                 return int(view)
         return None
 
-    def _try_camera(self, model: GrowingModel, view: int, rng: np.random.Generator) -> bool:
+    def _try_camera(self, model: ProjectiveModel, view: int, rng: np.random.Generator) -> bool:
         t, early = model.tracks, self.outlier_sigmas[0]
         k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
         X, xy = model.X[t.point_index[k]], t.xy[k]
-        P, inlier = resect_robust(X, xy, threshold_px=early * model.sigma_px, rng=rng)
+        P, inlier = resect_ransac(X, xy, threshold_px=early * model.sigma_px, rng=rng)
         if P is None or inlier.sum() < self.min_points or inlier.mean() < MIN_SHARE:
             model.reasons[view] = (
                 f"only {int(inlier.sum())} of {len(k)} points of the model agree with one camera"
@@ -345,19 +353,19 @@ class GatedIncremental:
         model.reasons[view] = ""
         seen = np.zeros(t.n_points, dtype=bool)
         seen[t.point_index[t.view_index == view]] = True
-        retriangulate(model, early, points=seen)
+        retriangulate_points(model, early, points=seen)
         return True
 
-    def _gate(self, model: GrowingModel, view: int, P: F64, X: F64, xy: F64) -> tuple[bool, F64]:
+    def _gate(self, model: ProjectiveModel, view: int, P: F64, X: F64, xy: F64) -> tuple[bool, F64]:
         """Whether the camera must wait, and the camera refined, oriented so that its points have positive
         depth."""
         refined = refine_camera(P, X, xy, loss_px=LOSS_SIGMAS * model.sigma_px, iterations=20)
         P = refined.P * np.sign(np.median(X @ refined.P[2]))
-        if self.max_spread is None:
+        if self.max_projection_std_rel is None:
             return False, P
         covariance = refined.covariance * model.sigma_px**2
-        spread = predicted_spread_px(refined.P, covariance, model.X[model.valid])
-        limit = self.max_spread * float(model.sizes[view].max())
+        spread = projection_std_px(refined.P, covariance, model.X[model.valid])
+        limit = self.max_projection_std_rel * float(model.sizes[view].max())
         quantile = float(np.quantile(spread, QUANTILE))
         if quantile < limit:
             return False, P
@@ -367,7 +375,7 @@ class GatedIncremental:
         )
         return True, P
 
-    def _discard_camera(self, model: GrowingModel, pairs: Sequence[TwoView]) -> bool:
+    def _discard_camera(self, model: ProjectiveModel, pairs: Sequence[TwoView]) -> bool:
         """Take out, for good, a camera that proved wrong; False where all hold, or too few are left."""
         if model.registered.sum() <= 2:
             return False
@@ -376,9 +384,9 @@ class GatedIncremental:
         view = int(np.argmin(shares))
         reason = f"the finished model explains only {counts[view]} of its points ({shares[view]:.0%})"
         if shares[view] >= MIN_SHARE:
-            found = contradicted_view(
+            found = find_inconsistent_view(
                 model.P, model.registered, pairs,
-                gate_px=self.outlier_sigmas[0] * model.sigma_px, least=self.min_agreement,
+                gate_px=self.outlier_sigmas[0] * model.sigma_px, least=self.min_epipolar_inlier_ratio,
             )  # fmt: skip
             if found is None:
                 return False
@@ -387,9 +395,9 @@ class GatedIncremental:
         model.registered[view] = False
         model.rejected[view] = True
         model.reasons[view] = reason
-        retriangulate(model, self.outlier_sigmas[0])
+        retriangulate_points(model, self.outlier_sigmas[0])
         return True
 
 
-def _rank(model: GrowingModel) -> tuple[int, int]:
+def _rank(model: ProjectiveModel) -> tuple[int, int]:
     return int(model.registered.sum()), int(model.used.sum())

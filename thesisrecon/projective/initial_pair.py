@@ -15,7 +15,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.triangulation import triangulate_linear
-from thesisrecon.geometry.two_view import canonical_cameras, rotation_planes
+from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
 from thesisrecon.records import Tracks, TwoView
 
 # Share of a pair's matches that one homography explains beyond which the pair shows no parallax: what is left
@@ -62,7 +62,7 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
     return ranked
 
 
-def require_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> None:
+def require_pair_with_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> None:
     """``StageFailure`` where every accepted pair was found to show a plane or a camera that only turned, or
     where one homography explains at least the share ``most`` of every one.
 
@@ -75,11 +75,11 @@ def require_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> 
     shares = [pair.homography_inlier_ratio for pair in accepted]
     kinds = Counter(pair.configuration for pair in accepted)
     if min(shares) >= most or all(kind in NO_PARALLAX_BECAUSE for kind in kinds):
-        told = NO_PARALLAX_BECAUSE.get(
+        meaning = NO_PARALLAX_BECAUSE.get(
             kinds.most_common(1)[0][0], "the camera only turns, hardly moves, or sees one plane"
         )
         raise StageFailure(
-            f"the photographs show no parallax: {told}",
+            f"the photographs show no parallax: {meaning}",
             f"in the least planar of {counted(len(shares), 'pair')} a homography explains "
             f"{min(shares):.0%} of all",
             "walk around the scene between photographs, and have things at different depths in the picture",
@@ -97,7 +97,7 @@ def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:
     T1, T2 = pixel_from_unit(sizes)
     F = T2.T @ pair.F @ T1
     best, most = None, -1.0
-    for plane in rotation_planes(F):
+    for plane in quasi_euclidean_planes(F):
         P1, P2 = canonical_cameras(F, plane=plane)
         P = np.stack([T1 @ P1, T2 @ P2])
         X = triangulate_linear(P, np.stack([pair.xy1, pair.xy2]))

@@ -9,9 +9,9 @@ import numpy as np
 
 from thesisrecon.arrays import I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.projective.growing import adjust, finish
-from thesisrecon.projective.incremental import GatedIncremental
-from thesisrecon.projective.initial_pair import require_parallax
+from thesisrecon.projective.incremental import IncrementalProjective
+from thesisrecon.projective.initial_pair import require_pair_with_parallax
+from thesisrecon.projective.model import adjust_all, to_reconstruction
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 
@@ -36,24 +36,24 @@ class SequentialProjective:
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """As :meth:`GatedIncremental.reconstruct`; ``attempt`` takes the next best pair of neighbours."""
-        require_parallax(pairs)
-        neighbours = [p for p in pairs if p.accepted and p.j == p.i + 1]
-        candidates = neighbours or [p for p in pairs if p.accepted]
+        """As :meth:`IncrementalProjective.reconstruct`; ``attempt`` takes the next best pair of neighbours."""
+        require_pair_with_parallax(pairs)
+        local_bundle_views = [p for p in pairs if p.accepted and p.j == p.i + 1]
+        candidates = local_bundle_views or [p for p in pairs if p.accepted]
         candidates = sorted(candidates, key=lambda p: (-p.inliers, p.i, p.j))
         if attempt >= len(candidates):
             raise StageFailure(
                 "no pair of photographs to begin with", f"{counted(len(candidates), 'pair')} accepted"
             )
-        engine = GatedIncremental(
+        engine = IncrementalProjective(
             min_points=self.min_points,
             outlier_sigmas=(self.outlier_sigmas, self.outlier_sigmas),
-            max_spread=None,
+            max_projection_std_rel=None,
             bundle_iterations=0,
             final_rounds=0,
         )
         state = engine.begin(tracks, candidates[attempt], sizes)
         while engine.add_next_camera(state, rng) is not None:
             pass
-        adjust(state, 10, self.outlier_sigmas)
-        return finish(state)
+        adjust_all(state, 10, self.outlier_sigmas)
+        return to_reconstruction(state)

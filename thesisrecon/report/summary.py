@@ -58,14 +58,14 @@ def summarize(result: RunResult) -> dict[str, Any]:
 
 def _motion(result: RunResult) -> dict[str, Any] | None:
     """The critical motion that the cameras come nearest to, and the measures behind it."""
-    verdict = None if result.calibration is None else result.calibration.verdict
-    if verdict is None:
+    identifiability = None if result.calibration is None else result.calibration.identifiability
+    if identifiability is None:
         return None
     return {
-        "nearest_critical": verdict.motion,
-        "critical": verdict.critical,
-        "evidence": dict(verdict.evidence),
-        "sentences": list(verdict.sentences),
+        "nearest_critical": identifiability.motion,
+        "critical": identifiability.critical,
+        "evidence": dict(identifiability.evidence),
+        "sentences": list(identifiability.sentences),
     }
 
 

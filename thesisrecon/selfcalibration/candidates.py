@@ -1,7 +1,8 @@
-"""What every method of chapter 7 ends with: answers are turned into upgrades, checked and judged.
+"""Candidates of self-calibration: from plane and calibrations to the selected upgrade.
 
-A method gives a plane at infinity and calibrations; here the scene is put in front of the cameras, answers
-that cannot are dropped, and the verdict on the motion is asked for.
+Every method of chapter 7 proposes planes at infinity with calibrations. Here each candidate becomes an
+upgrade with most points in front of the cameras, or is rejected; the best ones are kept, and the
+identifiability of the motion is checked.
 """
 
 from __future__ import annotations
@@ -17,31 +18,59 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.records import Reconstruction, SelfCalibration, Upgrade
 from thesisrecon.selfcalibration.frame import ReferenceFrame, metric_from_calibration
-from thesisrecon.selfcalibration.identifiability import check_identifiability, verdict_without_an_answer
+from thesisrecon.selfcalibration.identifiability import (
+    check_identifiability,
+    identifiability_without_calibration,
+)
 from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std
 
 P = ParamSpec("P")
 
-SAME_ANSWER = 0.03
-"""Answers whose log focals differ by less than this are one."""
+# Candidates whose log focal lengths differ by less than this are the same.
+SAME_LOG_FOCAL = 0.03
 
 MAX_LOG_STD = 1e3
 
+# Focal lengths in long sides of the image: fields of view from 178 to 0.3 degrees.
 FOCAL_LIMITS = (0.02, 200.0)
-"""No lens has a focal length outside of these, in long sides of the image: 178 deg to 0.3 deg of view."""
 
 
-def log_focals_of(frame: ReferenceFrame, K: F64) -> F64:
-    """Log focals (G,) of the camera groups of calibrations K (R, 3, 3), each the median of its views."""
+def group_log_focals(frame: ReferenceFrame, K: F64) -> F64:
+    """Return the median log focal length of each camera group.
+
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    K : ndarray (R, 3, 3)
+        Unit-free calibrations.
+
+    Returns
+    -------
+    ndarray (G,)
+        Log focal lengths.
+    """
     log_f = 0.5 * np.log(K[:, 0, 0] * K[:, 1, 1])
     return np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A plane at infinity (3,) and unit-free calibrations ``K`` (R, 3, 3) in a reference frame, the ``cost``
-    by which answers are ordered, the ``method`` they come from, and the deviations ``K_std`` (R, 3, 3) of K,
-    None where the method has none."""
+class Candidate:
+    """One self-calibration in a reference frame.
+
+    Attributes
+    ----------
+    plane : ndarray (3,)
+        Plane at infinity.
+    K : ndarray (R, 3, 3)
+        Unit-free calibrations.
+    cost : float
+        Cost by which candidates are ordered.
+    method : str
+        Name of the method.
+    K_std : ndarray (R, 3, 3), optional
+        Standard deviations of the entries of K.
+    """
 
     plane: F64
     K: F64
@@ -50,14 +79,35 @@ class Answer:
     K_std: F64 | None = None
 
     def log_focals(self, frame: ReferenceFrame) -> F64:
-        """Log focals (G,) of the camera groups, each the median of its views."""
-        return log_focals_of(frame, self.K)
+        """Return the median log focal length of each camera group.
+
+        Parameters
+        ----------
+        frame : ReferenceFrame
+            Cameras.
+
+        Returns
+        -------
+        ndarray (G,)
+            Log focal lengths.
+        """
+        return group_log_focals(frame, self.K)
 
 
-def guarded(calibrate: Callable[P, SelfCalibration]) -> Callable[P, SelfCalibration]:
-    """A ``calibrate`` whose decompositions end in a ``StageFailure`` where they do not converge.
+def as_stage_failure(calibrate: Callable[P, SelfCalibration]) -> Callable[P, SelfCalibration]:
+    """Wrap a ``calibrate`` method so that a failed decomposition raises ``StageFailure``.
 
-    Numbers that overflow on the way make hypotheses without a finite cost, which never win; they warn nobody.
+    Overflow is silenced: it gives hypotheses of non-finite cost, which are never selected.
+
+    Parameters
+    ----------
+    calibrate : callable
+        Method of a self-calibrator.
+
+    Returns
+    -------
+    callable
+        Wrapped method.
     """
 
     @wraps(calibrate)
@@ -67,38 +117,82 @@ def guarded(calibrate: Callable[P, SelfCalibration]) -> Callable[P, SelfCalibrat
                 return calibrate(*args, **kwargs)
             except np.linalg.LinAlgError as error:
                 raise StageFailure(
-                    "the projective cameras are not such that they can be calibrated",
-                    f"a decomposition failed: {error}",
-                    "photograph the scene from different places",
+                    "the projective cameras cannot be calibrated",
+                    f"a matrix decomposition failed: {error}",
+                    "take images from different positions",
                 ) from error
 
     return inner
 
 
 def require_cameras(reconstruction: Reconstruction) -> None:
-    """``StageFailure`` below three registered cameras."""
+    """Raise an error if fewer than three cameras are registered.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+
+    Raises
+    ------
+    StageFailure
+        If fewer than three cameras are registered.
+    """
     n = int(reconstruction.registered.sum())
     if n < 3:
         raise StageFailure(
-            "self-calibration needs at least 3 photographs that are tied together",
-            f"{n} could be registered",
-            "add photographs with more overlap",
+            "self-calibration needs at least 3 registered images",
+            f"{n} were registered",
+            "add images with more overlap",
         )
 
 
-def square_calibrations(log_f: F64) -> F64:
-    """Unit-free K (..., 3, 3) = diag(f, f, 1) of log focals (...)."""
+def square_pixel_calibrations(log_f: F64) -> F64:
+    """Return K = diag(f, f, 1).
+
+    Parameters
+    ----------
+    log_f : ndarray (...)
+        Log focal lengths.
+
+    Returns
+    -------
+    ndarray (..., 3, 3)
+        Unit-free calibrations.
+    """
     K = np.zeros((*np.shape(log_f), 3, 3))
     K[..., 0, 0] = K[..., 1, 1] = np.exp(log_f)
     K[..., 2, 2] = 1.0
     return K
 
 
-def focals_of_groups(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
-    """Log focals (B, G) that suit planes p (B, 3) and reference focals (B,).
+def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
+    """Compute the log focal lengths that planes at infinity imply.
 
     From w*_i = H_i K_r K_r' H_i': f_i^2 = (w11 + w22) / (2 w33); a group takes the median of its cameras, the
-    reference camera's group its own focal.
+    group of the reference camera its own focal length.
+
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    p : ndarray (B, 3)
+        Planes at infinity.
+    f_reference : ndarray (B,)
+        Unit-free focal lengths of the reference camera.
+
+    Returns
+    -------
+    ndarray (B, G)
+        Log focal lengths.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.selfcalibration.frame import _example_frame
+    >>> frame, p = _example_frame(f=1.2)
+    >>> np.round(np.exp(group_focals_from_planes(frame, p[None], np.array([1.2]))), 6)
+    array([[1.2]])
     """
     f = np.clip(f_reference, *FOCAL_LIMITS)
     H = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
@@ -113,153 +207,229 @@ def focals_of_groups(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
     return groups
 
 
-def answers_from_theta(frame: ReferenceFrame, theta: F64, cost: F64, method: str) -> list[Answer]:
-    """Answers of rows theta (B, 3 + G) = (plane, log focals) with their costs (B,)."""
-    K = square_calibrations(theta[:, 3:][:, frame.group])
-    return [Answer(t[:3], k, float(c), method) for t, k, c in zip(theta, K, cost, strict=True)]
+def candidates_from_parameters(frame: ReferenceFrame, theta: F64, cost: F64, method: str) -> list[Candidate]:
+    """Build candidates with square pixels from parameter vectors.
+
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    theta : ndarray (B, 3 + G)
+        Planes and log focal lengths.
+    cost : ndarray (B,)
+        Costs.
+    method : str
+        Name of the method.
+
+    Returns
+    -------
+    list of Candidate
+        One candidate per row.
+    """
+    K = square_pixel_calibrations(theta[:, 3:][:, frame.group])
+    return [Candidate(t[:3], k, float(c), method) for t, k, c in zip(theta, K, cost, strict=True)]
 
 
-def distinct_answers(frame: ReferenceFrame, answers: Sequence[Answer], most: int) -> list[Answer]:
-    """At most ``most`` answers of finite cost whose log focals or planes differ, the best first."""
+def distinct_candidates(
+    frame: ReferenceFrame, candidates: Sequence[Candidate], max_candidates: int
+) -> list[Candidate]:
+    """Select the best candidates whose focal lengths or planes differ.
 
-    def same(one: Answer, other: Answer) -> bool:
-        apart = np.linalg.norm(one.plane - other.plane) > SAME_ANSWER * np.linalg.norm(one.plane)
-        return not apart and np.abs(one.log_focals(frame) - other.log_focals(frame)).max() < SAME_ANSWER
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    candidates : sequence of Candidate
+        Candidates in any order.
+    max_candidates : int
+        Maximum number to return.
 
-    chosen: list[Answer] = []
-    for answer in sorted(answers, key=lambda a: a.cost):
-        if len(chosen) == most or not np.isfinite(answer.cost):
+    Returns
+    -------
+    list of Candidate
+        Candidates of finite cost, best first.
+    """
+
+    def same(one: Candidate, other: Candidate) -> bool:
+        apart = np.linalg.norm(one.plane - other.plane) > SAME_LOG_FOCAL * np.linalg.norm(one.plane)
+        return not apart and np.abs(one.log_focals(frame) - other.log_focals(frame)).max() < SAME_LOG_FOCAL
+
+    chosen: list[Candidate] = []
+    for candidate in sorted(candidates, key=lambda a: a.cost):
+        if len(chosen) == max_candidates or not np.isfinite(candidate.cost):
             break
-        if not any(same(answer, other) for other in chosen):
-            chosen.append(answer)
+        if not any(same(candidate, other) for other in chosen):
+            chosen.append(candidate)
     return chosen
 
 
-def conclude(
+def select_candidate(
     frame: ReferenceFrame,
     reconstruction: Reconstruction,
     criterion: RotationCriterion,
-    answers: Sequence[Answer],
+    candidates: Sequence[Candidate],
     *,
-    kept: int,
-    min_positive: float,
+    max_candidates: int,
+    min_in_front_ratio: float,
 ) -> SelfCalibration:
-    """The ``kept`` best distinct answers with at least the share ``min_positive`` of the points in front of
-    the cameras, and the verdict on the motion under ``frame.assumed``; ``StageFailure`` where none is left.
+    """Select the best candidates with enough points in front and check their identifiability.
+
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Frame of :func:`~thesisrecon.selfcalibration.frame.normalized_frame`.
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    criterion : RotationCriterion
+        Criterion for the standard deviations of the focal lengths.
+    candidates : sequence of Candidate
+        Candidates in any order.
+    max_candidates : int
+        Maximum number of upgrades to return.
+    min_in_front_ratio : float
+        Required share of observations with positive depth.
+
+    Returns
+    -------
+    SelfCalibration
+        Best upgrade, the others, and the identifiability report.
+
+    Raises
+    ------
+    StageFailure
+        If no candidate places enough points in front of the cameras.
     """
-    if frame.assumed is None:
-        raise ValueError("a conclusion needs a frame that knows what is assumed: see assumed_frame")
-    chosen = _distinct_upgrades(frame, reconstruction, answers, kept, min_positive)
+    if frame.prior is None:
+        raise ValueError("select_candidate needs a frame with a prior (normalized_frame)")
+    chosen = _distinct_upgrades(frame, reconstruction, candidates, max_candidates, min_in_front_ratio)
     if not chosen:
-        raise _nothing_in_front(frame, reconstruction, len(answers))
-    answer, best = chosen[0]
-    theta = np.concatenate([answer.plane, answer.log_focals(frame)])
+        raise _no_candidate_failure(frame, reconstruction, len(candidates))
+    candidate, best = chosen[0]
+    theta = np.concatenate([candidate.plane, candidate.log_focals(frame)])
     std_log_f, _ = focal_std(criterion, frame, theta)
-    verdict = check_identifiability(reconstruction, best, frame.assumed)
-    K_std = _deviations(frame, best.K, answer, np.minimum(std_log_f[frame.group], MAX_LOG_STD))
+    report = check_identifiability(reconstruction, best, frame.prior)
+    K_std = _calibration_std(frame, best.K, candidate, np.minimum(std_log_f[frame.group], MAX_LOG_STD))
     return SelfCalibration(
-        best.metric_from_projective, best.K, K_std, verdict.identifiable,
-        () if verdict.identifiable else verdict.sentences, tuple(upgrade for _, upgrade in chosen), verdict,
+        best.metric_from_projective, best.K, K_std, report.identifiable,
+        () if report.identifiable else report.sentences, tuple(upgrade for _, upgrade in chosen), report,
     )  # fmt: skip
 
 
-def _nothing_in_front(frame: ReferenceFrame, reconstruction: Reconstruction, tried: int) -> StageFailure:
-    """The failure of a method none of whose answers can be carried out."""
-    assert frame.assumed is not None
-    evidence = f"{counted(tried, 'answer')} tried over {counted(len(frame.views), 'camera')}"
-    given = frame.views[frame.assumed.focal_known[frame.views]]
+def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction, tried: int) -> StageFailure:
+    """Return the failure of a method that has no acceptable candidate."""
+    assert frame.prior is not None
+    evidence = (
+        f"none of {counted(tried, 'candidate calibration')} of {counted(len(frame.views), 'view')} places "
+        "the points in front of the cameras"
+    )
+    given = frame.views[frame.prior.focal_known[frame.views]]
     if len(given):
-        # All answers were drawn to it: whoever gave a focal length cannot mend this by giving one.
-        focal = frame.assumed.mean[given, 0]
-        few = f"{focal.min():.0f}" if np.ptp(focal) < 0.5 else f"{focal.min():.0f} to {focal.max():.0f}"
+        # The prior drew all candidates towards it, so that "give the focal length" is no advice here.
+        focal = frame.prior.mean[given, 0]
+        values = f"{focal.min():.0f}" if np.ptp(focal) < 0.5 else f"{focal.min():.0f} to {focal.max():.0f}"
         return StageFailure(
-            "no calibration near the focal length that was given puts the scene in front of all cameras",
-            f"{few} px (+- {frame.assumed.std[given, 0].max():.1%}) at working size was given; {evidence}",
-            "the photographs contradict it: leave it out, or give it a larger focal_std_rel",
+            "self-calibration failed near the focal length that was given",
+            f"{values} px (+- {frame.prior.std[given, 0].max():.1%}) at working size was given; {evidence}",
+            "the images contradict it: omit it, or set a larger focal_std_rel",
         )
-    said = verdict_without_an_answer(reconstruction, frame.assumed).sentences
+    sentences = identifiability_without_calibration(reconstruction, frame.prior).sentences
     return StageFailure(
-        "no camera calibration puts the scene in front of all cameras",
+        "self-calibration failed",
         evidence,
-        "; ".join(said) or "photograph the scene from more directions, turning the camera between shots",
+        "; ".join(sentences) or "take images from more directions and rotate the camera between them",
     )
 
 
-def _deviations(frame: ReferenceFrame, K: F64, answer: Answer, focal_std: F64) -> F64:
-    """(V, 3, 3) deviations of K (V, 3, 3): those of the answer; else those of the focals and of what was
-    assumed, where nothing but the focals was solved for; else NaN."""
-    if answer.K_std is not None:
+def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_std: F64) -> F64:
+    """Return the standard deviations (V, 3, 3) of K: the candidate's, else of focal lengths and prior.
+
+    NaN for entries without either.
+    """
+    if candidate.K_std is not None:
         unit = frame.pixel_from_unit[frame.views]
         K_std = np.zeros_like(K)
-        # The last row of K is known, so that rows of the answer are rows of K in other units.
-        K_std[frame.views] = np.diagonal(unit, axis1=1, axis2=2)[:, :, None] * answer.K_std
+        # The last row of K is known, so rows only change their unit.
+        K_std[frame.views] = np.diagonal(unit, axis1=1, axis2=2)[:, :, None] * candidate.K_std
         return K_std
-    K_std = square_std(frame, K, focal_std)
-    focals_only = np.allclose(answer.K, square_calibrations(np.log(answer.K[:, 0, 0])), atol=1e-12)
+    K_std = focal_only_std(frame, K, focal_std)
+    focals_only = np.allclose(
+        candidate.K, square_pixel_calibrations(np.log(candidate.K[:, 0, 0])), atol=1e-12
+    )
     if not focals_only:
         K_std[frame.views[:, None], (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)] = np.nan
     return K_std
 
 
-def square_std(frame: ReferenceFrame, K: F64, focal_std: F64) -> F64:
-    """(V, 3, 3) deviations of calibrations K (V, 3, 3) of which the focals alone were solved for.
+def focal_only_std(frame: ReferenceFrame, K: F64, focal_std: F64) -> F64:
+    """Return the standard deviations of calibrations whose focal lengths alone were estimated.
 
-    ``focal_std`` (R,) of the log focals; the rest has the deviation that was assumed of it, NaN where nothing
-    was.
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Frame with a prior.
+    K : ndarray (V, 3, 3)
+        Calibrations in pixels.
+    focal_std : ndarray (R,)
+        Standard deviations of the log focal lengths.
+
+    Returns
+    -------
+    ndarray (V, 3, 3)
+        Standard deviations; entries other than focal lengths take those of the prior, NaN without one.
     """
-    if frame.assumed is None:
-        raise ValueError("deviations need a frame that knows what is assumed: see assumed_frame")
+    if frame.prior is None:
+        raise ValueError("focal_only_std needs a frame with a prior (normalized_frame)")
     K_std, rows = np.zeros_like(K), frame.views
-    assumed = np.where(np.isfinite(frame.assumed.std), frame.assumed.std, np.nan)[rows]
+    prior = np.where(np.isfinite(frame.prior.std), frame.prior.std, np.nan)[rows]
     K_std[rows, 0, 0] = K[rows, 0, 0] * focal_std
-    K_std[rows, 1, 1] = K[rows, 1, 1] * np.hypot(focal_std, assumed[:, 1] / frame.assumed.mean[rows, 1])
-    K_std[rows, 0, 1], K_std[rows, 0, 2], K_std[rows, 1, 2] = assumed[:, 2:5].T
+    K_std[rows, 1, 1] = K[rows, 1, 1] * np.hypot(focal_std, prior[:, 1] / frame.prior.mean[rows, 1])
+    K_std[rows, 0, 1], K_std[rows, 0, 2], K_std[rows, 1, 2] = prior[:, 2:5].T
     return K_std
 
 
 def _distinct_upgrades(
     frame: ReferenceFrame,
     reconstruction: Reconstruction,
-    answers: Sequence[Answer],
-    kept: int,
-    min_positive: float,
-) -> list[tuple[Answer, Upgrade]]:
-    """The ``kept`` best answers of different focals that can be carried out, with their upgrades."""
-    chosen: list[tuple[Answer, Upgrade]] = []
-    for answer in sorted(answers, key=lambda a: a.cost):
-        if len(chosen) == kept or not np.isfinite(answer.cost):
+    candidates: Sequence[Candidate],
+    max_candidates: int,
+    min_in_front_ratio: float,
+) -> list[tuple[Candidate, Upgrade]]:
+    """Return the best candidates of different focal lengths with their upgrades."""
+    chosen: list[tuple[Candidate, Upgrade]] = []
+    for candidate in sorted(candidates, key=lambda a: a.cost):
+        if len(chosen) == max_candidates or not np.isfinite(candidate.cost):
             break
-        log_f = answer.log_focals(frame)
-        if any(np.abs(log_f - other.log_focals(frame)).max() < SAME_ANSWER for other, _ in chosen):
+        log_f = candidate.log_focals(frame)
+        if any(np.abs(log_f - other.log_focals(frame)).max() < SAME_LOG_FOCAL for other, _ in chosen):
             continue
-        upgrade = upgrade_from_answer(frame, reconstruction, answer, min_positive)
+        upgrade = _upgrade_of_candidate(frame, reconstruction, candidate, min_in_front_ratio)
         if upgrade is not None:
-            chosen.append((answer, upgrade))
+            chosen.append((candidate, upgrade))
     return chosen
 
 
-def upgrade_from_answer(
-    frame: ReferenceFrame, reconstruction: Reconstruction, answer: Answer, min_positive: float
+def _upgrade_of_candidate(
+    frame: ReferenceFrame, reconstruction: Reconstruction, candidate: Candidate, min_in_front_ratio: float
 ) -> Upgrade | None:
-    """The upgrade of an answer, mirrored where most points are behind; None where it is singular or leaves
-    less than ``min_positive`` of the observations in front."""
-    K_reference = answer.K[frame.reference]
-    if not (np.isfinite(answer.plane).all() and np.isfinite(answer.K).all()):
+    """Return the upgrade, mirrored if most points are behind; None if singular or with too few in front."""
+    K_reference = candidate.K[frame.reference]
+    if not (np.isfinite(candidate.plane).all() and np.isfinite(candidate.K).all()):
         return None
-    G = metric_from_calibration(answer.plane, K_reference) @ frame.reference_from_projective
+    G = metric_from_calibration(candidate.plane, K_reference) @ frame.reference_from_projective
     if not np.isfinite(G).all() or abs(np.linalg.det(G)) < 1e-300:
         return None
     share = _share_in_front(reconstruction, G)
     if share < 0.5:
         G, share = np.diag([-1.0, -1.0, -1.0, 1.0]) @ G, 1.0 - share
-    if share < min_positive:
+    if share < min_in_front_ratio:
         return None
     K = np.zeros((len(reconstruction.P), 3, 3))
-    K[frame.views] = frame.pixel_from_unit[frame.views] @ answer.K
-    return Upgrade(G, K, answer.cost, answer.method)
+    K[frame.views] = frame.pixel_from_unit[frame.views] @ candidate.K
+    return Upgrade(G, K, candidate.cost, candidate.method)
 
 
 def _share_in_front(reconstruction: Reconstruction, G: F64) -> float:
+    """Return the share of inlier observations with positive depth after the upgrade G (4, 4)."""
     keep = reconstruction.inlier
     view, point = reconstruction.tracks.view_index[keep], reconstruction.tracks.point_index[keep]
     P = reconstruction.P @ np.linalg.inv(G)

@@ -27,14 +27,9 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs
 from thesisrecon.records import Reconstruction
 from thesisrecon.selfcalibration.frame import ReferenceFrame
-from thesisrecon.selfcalibration.hartley import (
-    ConicKnowledge,
-    ConicScan,
-    infinite_homographies,
-    scan_conics,
-    square_knowledge,
-)
-from thesisrecon.selfcalibration.refinement import descend
+from thesisrecon.selfcalibration.hartley import ConicBatch, infinite_homographies, solve_conic_batch
+from thesisrecon.selfcalibration.refinement import minimize_batch
+from thesisrecon.selfcalibration.unknowns import ConicConstraints, square_pixel_constraints
 
 
 @dataclass(frozen=True)
@@ -43,7 +38,7 @@ class ProjectiveScene:
 
     reconstruction: Reconstruction
     frame: ReferenceFrame
-    knowledge: ConicKnowledge
+    knowledge: ConicConstraints
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ SAME_PLANE = 1e-3
 
 
 @dataclass(frozen=True)
-class Polytope:
+class CheiralityPolytope:
     """Planes v with ``rows`` (M, 4) v > 0, in a quasi-affine frame where all of them are (v1, v2, v3, 1).
 
     ``quasi_affine`` (4, 4) takes points of the reference frame there; ``box`` (3, 2) bounds of v1, v2, v3.
@@ -101,13 +96,13 @@ class Polytope:
 
 
 @dataclass(frozen=True)
-class PlaneRegion:
+class CheiralityRegion:
     """The polytopes of both orientations that are not empty, and the inequalities of all points (M, 4) and
     centres (R, 4) in the reference frame."""
 
     points: F64
     centres: F64
-    polytopes: tuple[Polytope, ...]
+    polytopes: tuple[CheiralityPolytope, ...]
 
     @classmethod
     def of(
@@ -117,7 +112,7 @@ class PlaneRegion:
         *,
         max_points: int,
         rng: np.random.Generator,
-    ) -> PlaneRegion:
+    ) -> CheiralityRegion:
         """The region of a reconstruction; without polytopes where fewer than eight points are of use."""
         X, C = cheirality_inequalities(frame, reconstruction, max_points=max_points, rng=rng)
         found = [polytope_of(X, sign * C) for sign in (1.0, -1.0)] if len(X) >= 8 else []
@@ -131,7 +126,7 @@ class PlaneRegion:
         share = -(-n // len(self.polytopes))
         return np.concatenate([p.reference_planes(p.sample(share, rng)) for p in self.polytopes])[:n]
 
-    def share_outside(self, planes: F64) -> F64:
+    def wrong_side_ratio(self, planes: F64) -> F64:
         """Share (B,) of points and cameras on the wrong side of planes p (B, 3), for the better signs."""
         v = np.column_stack([planes, np.ones(len(planes))])
         behind = (v @ self.points.T <= 0).sum(axis=1), (v @ self.centres.T <= 0).sum(axis=1)
@@ -140,7 +135,7 @@ class PlaneRegion:
         return np.asarray(wrong / max(n + m, 1))
 
 
-def polytope_of(X: F64, C: F64) -> Polytope | None:
+def polytope_of(X: F64, C: F64) -> CheiralityPolytope | None:
     """The polytope of oriented points (N, 4) and centres (R, 4), by linear programs; None where empty."""
     v = deepest_plane(X, C)
     if v is None:
@@ -148,7 +143,7 @@ def polytope_of(X: F64, C: F64) -> Polytope | None:
     T = quasi_affine_frame(X, v)
     rows = _unit_rows(np.concatenate([X, C]) @ T.T)
     box = plane_box(rows[: len(X)], rows[len(X) :])
-    return None if box is None else Polytope(rows, T, box)
+    return None if box is None else CheiralityPolytope(rows, T, box)
 
 
 def distinct_planes(planes: F64, cost: F64) -> list[int]:
@@ -169,8 +164,8 @@ def cheirality_inequalities(
     Only points of three or more views take part: one wrong two-view point, which nothing contradicts, would
     cut the true plane away. Points that the orientation cannot satisfy in every view are left out.
     """
-    tracks, keep = reconstruction.tracks, reconstruction.inlier
-    view, point = tracks.view_index[keep], tracks.point_index[keep]
+    tracks, max_candidates = reconstruction.tracks, reconstruction.inlier
+    view, point = tracks.view_index[max_candidates], tracks.point_index[max_candidates]
     views, points, _ = orient_signs(reconstruction.P, reconstruction.X, view, point)
     P = reconstruction.P * views[:, None, None]
     X = reconstruction.X * points[:, None]
@@ -246,8 +241,8 @@ class CheiralitySearch:
     """
 
     steps: int = 16
-    keep: int = 10
-    descent: int = 15
+    max_candidates: int = 10
+    refine_iterations: int = 15
     max_points: int = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
@@ -265,41 +260,41 @@ class CheiralitySearch:
         self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
     ) -> tuple[F64, F64]:
         """Planes p (B, 3) and reference focals (B,) for square pixels, best first; possibly none."""
-        planes, focals, _ = self._search(frame, reconstruction, square_knowledge(frame), rng)
+        planes, focals, _ = self._search(frame, reconstruction, square_pixel_constraints(frame), rng)
         return planes, focals
 
     def _search(
         self,
         frame: ReferenceFrame,
         reconstruction: Reconstruction,
-        knowledge: ConicKnowledge,
+        knowledge: ConicConstraints,
         rng: np.random.Generator,
     ) -> tuple[F64, F64, F64]:
-        region = PlaneRegion.of(frame, reconstruction, max_points=self.max_points, rng=rng)
+        region = CheiralityRegion.of(frame, reconstruction, max_points=self.max_points, rng=rng)
         parts = [self._minima(frame, knowledge, polytope) for polytope in region.polytopes]
         if not parts:
             return np.zeros((0, 3)), np.zeros(0), np.zeros(0)
         planes, f2, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
-        kept = distinct_planes(planes, scores)[: self.keep]
+        kept = distinct_planes(planes, scores)[: self.max_candidates]
         return planes[kept], np.sqrt(f2[kept]), scores[kept]
 
     def _minima(
-        self, frame: ReferenceFrame, knowledge: ConicKnowledge, polytope: Polytope
+        self, frame: ReferenceFrame, knowledge: ConicConstraints, polytope: CheiralityPolytope
     ) -> tuple[F64, F64, F64]:
         """Local minima of the score over the grid, each followed to where it ends."""
 
-        def scan(v: F64) -> ConicScan:
-            found = scan_conics(infinite_homographies(frame, polytope.reference_planes(v)), knowledge)
+        def scan(v: F64) -> ConicBatch:
+            found = solve_conic_batch(infinite_homographies(frame, polytope.reference_planes(v)), knowledge)
             outside = ~polytope.contains(v)
-            return ConicScan(found.f2, np.where(outside[:, None], np.nan, found.residuals))
+            return ConicBatch(found.f2, np.where(outside[:, None], np.nan, found.residuals))
 
         axes = [np.linspace(low, high, self.steps + 2)[1:-1] for low, high in polytope.box]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        best = local_minima(scan(grid.reshape(-1, 3)).score.reshape(grid.shape[:3]))[: self.keep]
+        best = local_minima(scan(grid.reshape(-1, 3)).score.reshape(grid.shape[:3]))[: self.max_candidates]
         v = grid.reshape(-1, 3)[best]
         if len(v):
             # The score is flat along valleys that no finer grid along the axes would follow.
-            v = descend(lambda x: scan(x).residuals, v, iterations=self.descent)[0]
+            v = minimize_batch(lambda x: scan(x).residuals, v, iterations=self.refine_iterations)[0]
         found = scan(v)
         return polytope.reference_planes(v), found.f2, found.score
 

@@ -26,13 +26,13 @@ from thesisrecon.arrays import F64
 
 MAX_FOCAL_STD = 0.15
 """A focal length that is not known to this relative deviation is not known."""
-MIN_SIGNIFICANCE = 4.0
+MIN_ROTATION_SIGNIFICANCE = 4.0
 """Noise alone turns cameras that did not turn, and what it feigns looks like information: a turn counts where
 it stands out of its own deviation by so much."""
-MOST_NOISE = 3.0
+MAX_NOISE_RATIO = 3.0
 """Metric cameras leave this much more noise than the projective ones where they are not what was seen: a
 principal point or distortion that the projective cameras took in costs less."""
-LEAST_MOVE = 0.003
+MIN_INFINITY_SHIFT = 0.003
 """Of the picture of infinity, in long sides. What no lens model holds (a raster that was resampled, a lens
 that breathes) moves pictures by 1e-4 or so, alike in all parts of a scene, so that no covariance knows of it.
 A turn that moves the picture by s tells the focal length by its part of second order, s (x / f)^2, about a
@@ -48,34 +48,41 @@ PLANAR = "planar motion"
 PARALLEL_AXES = "parallel rotation axes"
 
 TOLERANCES: Mapping[str, float] = {
-    "scene_thickness": 0.02,
-    "travel_over_distance": 0.03,
-    "image_shift": 0.08,
-    "image_shift_beyond_roll": 0.08,
-    "turn_rms_deg": 3.5,
-    "tilt_rms_deg": 3.5,
-    "axis_spread_deg": 3.0,
-    "axis_line_over_distance": 0.05,
-    "climb_over_distance": 0.025,
+    "scene_planarity_ratio": 0.02,
+    "centre_spread_over_distance": 0.03,
+    "infinity_shift": 0.08,
+    "infinity_shift_beyond_roll": 0.08,
+    "rotation_rms_deg": 3.5,
+    "optical_axis_rms_deg": 3.5,
+    "rotation_axis_spread_deg": 3.0,
+    "turntable_residual_over_distance": 0.05,
+    "axial_translation_over_distance": 0.025,
 }
 """What a photographer who wants the critical motion cannot avoid: a hand turns by a degree about each axis
 (between two photographs twice as far, all in all), and keeps a place to a hundredth of the distance."""
 
-FARTHEST_SHIFT = 10.0
+MAX_INFINITY_SHIFT = 10.0
 """Long sides; what turns behind the camera counts as this."""
 
 _NAMED_BY: Mapping[str, tuple[str, ...]] = {
-    PLANE: ("scene_thickness",),
-    ROTATION: ("travel_over_distance",),
-    TRANSLATION: ("image_shift",),
-    OPTICAL_AXIS: ("image_shift_beyond_roll",),
-    TURNTABLE: ("axis_spread_deg", "axis_line_over_distance", "climb_over_distance"),
-    PLANAR: ("axis_spread_deg", "climb_over_distance"),
-    PARALLEL_AXES: ("axis_spread_deg",),
+    PLANE: ("scene_planarity_ratio",),
+    ROTATION: ("centre_spread_over_distance",),
+    TRANSLATION: ("infinity_shift",),
+    OPTICAL_AXIS: ("infinity_shift_beyond_roll",),
+    TURNTABLE: (
+        "rotation_axis_spread_deg",
+        "turntable_residual_over_distance",
+        "axial_translation_over_distance",
+    ),
+    PLANAR: ("rotation_axis_spread_deg", "axial_translation_over_distance"),
+    PARALLEL_AXES: ("rotation_axis_spread_deg",),
 }
 """From what leaves most open to what leaves least; a motion is near where all its measures are."""
 
-_OR: Mapping[str, str] = {"image_shift": "turn_rms_deg", "image_shift_beyond_roll": "tilt_rms_deg"}
+_OR: Mapping[str, str] = {
+    "infinity_shift": "rotation_rms_deg",
+    "infinity_shift_beyond_roll": "optical_axis_rms_deg",
+}
 """A hand turns a long lens as far as a short one, which moves its picture further: either measure may be
 small. Where the focal is open the angle depends on the answer, the shift does not."""
 
@@ -110,19 +117,19 @@ class UpgradedCameras:
 
 def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
     """The measures of ``TOLERANCES`` and the largest turn, by name."""
-    axis, turn, spread = common_axis(metric.R)
+    axis, turn, spread = _common_rotation_axis(metric.R)
     H = metric.infinite_homographies()
     return {
-        "scene_thickness": thickness(metric.X),
-        "travel_over_distance": travel(metric.C) / metric.distance,
-        "image_shift": infinity_shift(H, roll=False),
-        "image_shift_beyond_roll": infinity_shift(H, roll=True),
-        "largest_turn_deg": turn,
-        "turn_rms_deg": rms_turn(metric.R),
-        "tilt_rms_deg": rms_tilt(metric.R),
-        "axis_spread_deg": spread,
-        "axis_line_over_distance": axis_line_residual(metric, axis) / metric.distance,
-        "climb_over_distance": climb(metric.C, axis) / metric.distance,
+        "scene_planarity_ratio": planarity_ratio(metric.X),
+        "centre_spread_over_distance": centre_spread_rms(metric.C) / metric.distance,
+        "infinity_shift": infinite_homography_shift(H, roll=False),
+        "infinity_shift_beyond_roll": infinite_homography_shift(H, roll=True),
+        "largest_rotation_deg": turn,
+        "rotation_rms_deg": _rotation_rms_deg(metric.R),
+        "optical_axis_rms_deg": _optical_axis_rms_deg(metric.R),
+        "rotation_axis_spread_deg": spread,
+        "turntable_residual_over_distance": _turntable_residual(metric, axis) / metric.distance,
+        "axial_translation_over_distance": axial_translation_rms(metric.C, axis) / metric.distance,
     }
 
 
@@ -150,7 +157,7 @@ def _nearness(measures: Mapping[str, float], key: str) -> float:
     return min(measures[k] / TOLERANCES[k] for k in keys)
 
 
-def infinity_shift(H: F64, *, roll: bool) -> float:
+def infinite_homography_shift(H: F64, *, roll: bool) -> float:
     """How far the picture of infinity moves between the views (rms over views and picture, in long sides)
     beyond zooming and, with ``roll``, turning in its plane.
 
@@ -167,7 +174,7 @@ def infinity_shift(H: F64, *, roll: bool) -> float:
     u, v = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.4, 0.4, 5))
     grid = np.stack([u.ravel(), v.ravel(), np.ones(25)])
     shift = np.sum((_dehomogenized(H @ grid) - _dehomogenized(template @ grid)) ** 2, axis=1)
-    return float(np.sqrt(np.mean(np.minimum(shift, FARTHEST_SHIFT**2))))
+    return float(np.sqrt(np.mean(np.minimum(shift, MAX_INFINITY_SHIFT**2))))
 
 
 def _dehomogenized(x: F64) -> F64:
@@ -176,8 +183,8 @@ def _dehomogenized(x: F64) -> F64:
     return np.asarray(x[:, :2] / np.where(np.abs(w) < 1e-9, 1e-9, w))
 
 
-def shifts_without_an_answer(A: F64, a: F64) -> dict[str, float]:
-    """``image_shift`` and ``image_shift_beyond_roll`` of projective cameras [A | a] (V, 3, 3), (V, 3), one of
+def projective_infinity_shifts(A: F64, a: F64) -> dict[str, float]:
+    """``infinity_shift`` and ``infinity_shift_beyond_roll`` of projective cameras [A | a] (V, 3, 3), (V, 3), one of
     them [I | 0], in unit-free pixels.
 
     Of all planes the one is taken that comes nearest to a camera that did not turn: A_i - a_i p' to be
@@ -189,18 +196,18 @@ def shifts_without_an_answer(A: F64, a: F64) -> dict[str, float]:
     identity[0, 0, 0] = identity[0, 1, 1] = identity[1, 2, 2] = identity[2, 1, 0] = 1.0
     identity[2, 0, 1] = -1.0
     shifts = {}
-    for name, kinds in (("image_shift", 2), ("image_shift_beyond_roll", 3)):
+    for name, kinds in (("infinity_shift", 2), ("infinity_shift_beyond_roll", 3)):
         rows = np.zeros((len(A), 9, 3 + kinds * len(A)))
         for k in range(3):
             rows[:, k::3, k] = a
         for i in range(len(A)):
             rows[i, :, 3 + kinds * i : 3 + kinds * (i + 1)] = identity[:kinds].reshape(kinds, 9).T
         p = np.linalg.lstsq(rows.reshape(9 * len(A), -1), A.reshape(-1), rcond=None)[0][:3]
-        shifts[name] = infinity_shift(A - a[:, :, None] * p, roll=kinds == 3)
+        shifts[name] = infinite_homography_shift(A - a[:, :, None] * p, roll=kinds == 3)
     return shifts
 
 
-def common_axis(R: F64) -> tuple[F64, float, float]:
+def _common_rotation_axis(R: F64) -> tuple[F64, float, float]:
     """The direction (3,) nearest to all rotation axes, the largest turn between two views, and the spread of
     the axes, both in degrees.
 
@@ -215,14 +222,14 @@ def common_axis(R: F64) -> tuple[F64, float, float]:
     return vector[:, 2], turn, float(np.degrees(np.sqrt(max(value[1], 0.0))))
 
 
-def rms_turn(R: F64) -> float:
+def _rotation_rms_deg(R: F64) -> float:
     """Rms angle (deg) of the turns between all pairs of views."""
     i, j = np.triu_indices(len(R), 1)
     angle = scipy.spatial.transform.Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).magnitude()
     return float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 
-def rms_tilt(R: F64) -> float:
+def _optical_axis_rms_deg(R: F64) -> float:
     """Rms angle (deg) between the optical axes of all pairs of views."""
     i, j = np.triu_indices(len(R), 1)
     cosine = np.einsum("ka,ka->k", R[i, 2], R[j, 2])
@@ -230,17 +237,17 @@ def rms_tilt(R: F64) -> float:
     return float(np.degrees(np.sqrt(np.mean(np.arctan2(sine, cosine) ** 2))))
 
 
-def travel(C: F64) -> float:
+def centre_spread_rms(C: F64) -> float:
     """Rms distance of the centres from their mean."""
     return float(np.sqrt(np.mean(np.sum((C - C.mean(axis=0)) ** 2, axis=1))))
 
 
-def climb(C: F64, axis: F64) -> float:
+def axial_translation_rms(C: F64, axis: F64) -> float:
     """Rms way of the centres along an axis."""
     return float(np.sqrt(np.mean(((C - C.mean(axis=0)) @ axis) ** 2)))
 
 
-def axis_line_residual(metric: UpgradedCameras, axis: F64) -> float:
+def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
     """Rms distance of the centres from where one line of this direction would turn them to.
 
     Seen along the line, a camera on a turntable keeps its place relative to itself: R_i (C_i - c) is the same
@@ -254,7 +261,7 @@ def axis_line_residual(metric: UpgradedCameras, axis: F64) -> float:
     return float(np.sqrt(np.mean(np.sum((right - coefficients @ c) ** 2, axis=1))))
 
 
-def thickness(X: F64, *, kept: float = 0.95) -> float:
+def planarity_ratio(X: F64, *, kept: float = 0.95) -> float:
     """Rms distance of the points from their best plane over their rms extent along it; the ``kept`` nearest
     to the centre and then to the plane count."""
     for _ in range(3):
@@ -274,16 +281,16 @@ def thickness(X: F64, *, kept: float = 0.95) -> float:
 
 _FOUND: Mapping[str, str] = {
     PLANE: (
-        "the points lie in one plane up to {scene_thickness:.1%} of its width: a planar scene, which leaves "
+        "the points lie in one plane up to {scene_planarity_ratio:.1%} of its width: a planar scene, which leaves "
         "the "
         "cameras hardly determined"
     ),
     ROTATION: (
-        "the camera turned about one point (it moved by {travel_over_distance:.1%} of the distance to the "
+        "the camera turned about one point (it moved by {centre_spread_over_distance:.1%} of the distance to the "
         "scene): close to a pure rotation, which tells the focal length but hardly any depth"
     ),
     TRANSLATION: (
-        "the camera moved and hardly turned (by {largest_turn_deg:.1f} degrees at most): close to a pure "
+        "the camera moved and hardly turned (by {largest_rotation_deg:.1f} degrees at most): close to a pure "
         "translation, which leaves the focal length open"
     ),
     OPTICAL_AXIS: (
@@ -292,17 +299,17 @@ _FOUND: Mapping[str, str] = {
         "length open, as a pure translation does"
     ),
     TURNTABLE: (
-        "all views turn about one axis (to within {axis_spread_deg:.1f} degrees), as on a turntable: this "
+        "all views turn about one axis (to within {rotation_axis_spread_deg:.1f} degrees), as on a turntable: this "
         "leaves "
         "the scale along the axis open unless the shape of the pixels is known"
     ),
     PLANAR: (
-        "the camera moved in a plane and turned about one direction (to within {axis_spread_deg:.1f} "
+        "the camera moved in a plane and turned about one direction (to within {rotation_axis_spread_deg:.1f} "
         "degrees), "
         "a planar motion: this leaves the scale across the plane open unless the shape of the pixels is known"
     ),
     PARALLEL_AXES: (
-        "all rotations have parallel axes (to within {axis_spread_deg:.1f} degrees): this leaves the scale "
+        "all rotations have parallel axes (to within {rotation_axis_spread_deg:.1f} degrees): this leaves the scale "
         "along "
         "the axes open unless the shape of the pixels is known"
     ),
@@ -311,11 +318,11 @@ _FOUND_WITHOUT_AN_ANSWER: Mapping[str, str] = {
     TRANSLATION: (
         "the projective cameras fit a camera that moved without turning, a pure translation, which leaves "
         "the "
-        "focal length open (the picture of infinity moves by {image_shift:.1%} of the image)"
+        "focal length open (the picture of infinity moves by {infinity_shift:.1%} of the image)"
     ),
     OPTICAL_AXIS: (
         "the projective cameras fit a camera that turned about its optical axis only, which leaves the focal "
-        "length open (the picture of infinity moves by {image_shift_beyond_roll:.1%} of the image)"
+        "length open (the picture of infinity moves by {infinity_shift_beyond_roll:.1%} of the image)"
     ),
 }
 _TURN_MORE = "turn the camera by 10 degrees and more between photographs, about the vertical and sideways"
@@ -341,10 +348,10 @@ def motion_sentences(
     is_critical = bool(motion) and evidence["nearness"] < 1.0
     answered = "focal_std_rel" in evidence
     told = []
-    if evidence["spare_equations"] < 0:
+    if evidence["excess_equations"] < 0:
         told.append(
             f"the photographs are too few for so little that is known of the cameras: "
-            f"{-evidence['spare_equations']:.0f} equations are missing; add photographs, or let them share "
+            f"{-evidence['excess_equations']:.0f} equations are missing; add photographs, or let them share "
             "one camera"
         )
     if is_critical:
@@ -353,7 +360,7 @@ def motion_sentences(
     if _bent(evidence):
         told.append(
             f"cameras as they are said to be explain the photographs with "
-            f"{evidence['noise_over_projective']:.1f} times the noise of projective ones: photographs were "
+            f"{evidence['noise_ratio_to_projective']:.1f} times the noise of projective ones: photographs were "
             "zoomed or cropped one by one, or belong to other cameras; let every photograph have its own "
             "(cameras = per-image)"
         )
@@ -390,11 +397,11 @@ def _what_fails(motion: str, evidence: Mapping[str, float], is_critical: bool, f
     if "focal_std_rel" not in evidence:
         return [advice]
     std = evidence["focal_std_rel_median"]
-    if evidence["turn_significance"] < MIN_SIGNIFICANCE and std < MAX_FOCAL_STD:
+    if evidence["rotation_significance"] < MIN_ROTATION_SIGNIFICANCE and std < MAX_FOCAL_STD:
         return [f"the turns cannot be told from noise, and no focal length can be had from them; {advice}"]
-    if evidence["image_shift_beyond_roll"] < LEAST_MOVE and std < MAX_FOCAL_STD:
+    if evidence["infinity_shift_beyond_roll"] < MIN_INFINITY_SHIFT and std < MAX_FOCAL_STD:
         return [
-            f"the turns move the picture by {evidence['image_shift_beyond_roll']:.2%} of its width, as "
+            f"the turns move the picture by {evidence['infinity_shift_beyond_roll']:.2%} of its width, as "
             f"little as what a lens model leaves out, and no focal length can be had from them; {advice}"
         ]
     if std >= MAX_FOCAL_STD:
@@ -404,7 +411,7 @@ def _what_fails(motion: str, evidence: Mapping[str, float], is_critical: bool, f
 
 
 def _bent(evidence: Mapping[str, float]) -> bool:
-    return evidence.get("noise_over_projective", 0.0) >= MOST_NOISE
+    return evidence.get("noise_ratio_to_projective", 0.0) >= MAX_NOISE_RATIO
 
 
 def _percent(share: float) -> str:

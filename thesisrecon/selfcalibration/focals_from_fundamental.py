@@ -37,16 +37,16 @@ from thesisrecon.selfcalibration.candidates import (
     square_pixel_calibrations,
 )
 from thesisrecon.selfcalibration.focal_scan import log_grid, planes_for_focals
-from thesisrecon.selfcalibration.frame import (
-    ReferenceFrame,
-    SolverUnknowns,
-    normalized_frame,
-    solver_unknowns,
-    weak_focal_prior,
+from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
+from thesisrecon.selfcalibration.kruppa import (
+    PairGeometry,
+    dual_conics,
+    kruppa_residuals,
+    pair_geometries,
+    require_pairs,
 )
-from thesisrecon.selfcalibration.kruppa import dual_images, kruppa_residuals, require_pairs
-from thesisrecon.selfcalibration.pair_geometry import PairGeometry, pair_geometries
-from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.selfcalibration.refinement import RotationCriterion, central_differences
+from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns, weak_focal_prior
 
 _ROOT2 = np.sqrt(2.0)
 
@@ -323,20 +323,20 @@ def refine_focals(
     the minimum from afar, then Cauchy's against wrong pairs.
     """
     unknown = unknown.with_focal_prior()
-    x, share = unknown.start(log_f[None])[0], independence_factor(pairs)
+    x, share = unknown.from_log_focals(log_f[None])[0], independence_factor(pairs)
     covariance = np.zeros((len(x), len(x)))
     for loss in ("soft_l1", "soft_l1", "cauchy", "cauchy") if len(x) else ():
-        whitening = kruppa_whitening(pairs, unknown.focals(x[None])[0], principal_std=principal_std)
+        whitening = kruppa_whitening(pairs, unknown.log_focals(x[None])[0], principal_std=principal_std)
         root = np.sqrt(share) * whitening
 
         def residuals(batch: F64, root: F64 = root) -> F64:
-            w = dual_images(unknown.calibrations(batch))
+            w = dual_conics(unknown.calibrations(batch))
             g = kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j])
             white = np.einsum("mac,bmc->bma", root, g).reshape(len(batch), -1)
             return np.concatenate([white, unknown.prior_residuals(batch)], axis=1)
 
         found = minimize_residuals(
-            lambda y: residuals(y[None])[0], x, jacobian=lambda y: _central(residuals, y), loss=loss,
+            lambda y: residuals(y[None])[0], x, jacobian=lambda y: central_differences(residuals, y, np.full(len(y), 1e-6)), loss=loss,
             loss_scale=3.0 * np.sqrt(share), max_iterations=40,
         )  # fmt: skip
         x = found.x
@@ -346,12 +346,7 @@ def refine_focals(
         contradiction = 2.0 * found.cost / (share * max(2 * len(pairs.i) - len(x), 1))
         covariance = found.covariance / max(variance, 1e-300) * max(contradiction, 1.0)
     variances = np.append(np.maximum(covariance.diagonal(), 0.0), 0.0)
-    return unknown.focals(x[None])[0], np.sqrt(variances[unknown.place[:, 0]])
-
-
-def _central(residuals: Callable[[F64], F64], x: F64) -> F64:
-    steps = np.diag(np.full(len(x), 1e-6))
-    return np.asarray(((residuals(x + steps) - residuals(x - steps)) / 2e-6).T)
+    return unknown.log_focals(x[None])[0], np.sqrt(variances[unknown.index[:, 0]])
 
 
 @dataclass(frozen=True)

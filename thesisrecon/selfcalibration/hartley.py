@@ -18,63 +18,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conics import calibration_from_image
-from thesisrecon.records import Assumptions
-from thesisrecon.selfcalibration.frame import ReferenceFrame, UnknownIntrinsics
+from thesisrecon.selfcalibration.frame import ReferenceFrame
 from thesisrecon.selfcalibration.quadric import dual_image_residuals
-from thesisrecon.selfcalibration.refinement import derivatives, descend
-
-NOISE = 0.01
-"""Error of a unit-free infinite homography, against which what is known roughly is weighed."""
+from thesisrecon.selfcalibration.refinement import minimize_batch, numerical_jacobian
+from thesisrecon.selfcalibration.unknowns import HOMOGRAPHY_NOISE, ConicConstraints, SolverUnknowns
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _ENTRY_WEIGHT = np.array([1.0 if a == b else np.sqrt(2.0) for a, b in _PAIRS])
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-
-
-@dataclass(frozen=True)
-class ConicKnowledge:
-    """What makes the image conic linear: ``std`` (R, 4) of skew, principal x, y and half the aspect, infinite
-    where nothing is known; ``first`` (R,) the place of the first camera of the same constant K (its own where
-    it is that one); ``reference`` the place of the reference view.
-    """
-
-    std: F64
-    first: I64
-    reference: int
-
-
-def conic_knowledge(frame: ReferenceFrame, assumed: Assumptions) -> ConicKnowledge:
-    """The assumptions in the coordinates of an ``assumed_frame``.
-
-    Known or roughly known intrinsics are equations weighed by their deviation; views that share or know all
-    five are one constant K.
-    """
-    rows = frame.views
-    unit = frame.pixel_from_unit[rows, 0, 0][:, None]
-    std = np.column_stack([assumed.std[rows, 2:5] / unit, assumed.std[rows, 1] / assumed.mean[rows, 1] / 2.0])
-    # A constant K is constant in unit-free coordinates only where these are the same for all its views.
-    known = np.where(assumed.std[rows, :5] == 0.0, assumed.mean[rows, :5], np.nan)
-    same_value = (known[:, None] == known[None]) | (
-        assumed.shared[rows, None, :5] == assumed.shared[None, rows, :5]
-    )
-    same_unit = np.isclose(frame.pixel_from_unit[rows, None], frame.pixel_from_unit[None, rows]).all(
-        axis=(2, 3)
-    )
-    first = (same_value.all(axis=2) & same_unit).argmax(axis=1).astype(np.int64)
-    return ConicKnowledge(std, first, frame.reference)
-
-
-SQUARE_PIXELS = (0.0, NOISE, NOISE, 0.0)
-"""Deviations of cameras without skew, with square pixels and the principal point near the middle."""
-
-
-def square_knowledge(frame: ReferenceFrame) -> ConicKnowledge:
-    """Square pixels and a central principal point for every camera, and no constancy."""
-    n = len(frame.views)
-    return ConicKnowledge(np.tile(SQUARE_PIXELS, (n, 1)), np.arange(n, dtype=np.int64), frame.reference)
 
 
 def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
@@ -89,7 +43,7 @@ def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
     return np.asarray(H / np.cbrt(det)[..., None, None])
 
 
-def dual_image_constant(H: F64) -> tuple[F64, F64]:
+def dual_conic_of_constant_camera(H: F64) -> tuple[F64, F64]:
     """w* ~ K K' (3, 3) of a constant K from homographies H (R, 3, 3) of determinant 1, and the six singular
     values of its equations w* = H w* H', largest first.
 
@@ -107,7 +61,7 @@ def _carried(M: F64) -> F64:
     return np.stack(terms, axis=-1)
 
 
-def conic_equations(H: F64, knowledge: ConicKnowledge, focals: F64) -> F64:
+def conic_equations(H: F64, knowledge: ConicConstraints, focals: F64) -> F64:
     """Rows (B, M, 6) in the entries 11, 12, 13, 22, 23, 33 of w in the reference view, scaled by the focals.
 
     H (B, R, 3, 3) of determinant 1 or NaN (then no row); ``focals`` (B, R) unit-free guesses: the unknown is
@@ -124,7 +78,7 @@ def conic_equations(H: F64, knowledge: ConicKnowledge, focals: F64) -> F64:
     carried[bad] = 0.0
     std = np.repeat(knowledge.std[None], len(H), axis=0)
     std[..., :3] /= focals[..., None]
-    weight = NOISE / np.hypot(std, NOISE)
+    weight = HOMOGRAPHY_NOISE / np.hypot(std, HOMOGRAPHY_NOISE)
     half_aspect = (carried[..., 0, :] - carried[..., 3, :]) / 2.0
     known = np.stack([carried[..., 1, :], carried[..., 2, :], carried[..., 4, :], half_aspect], axis=2)
     later = np.flatnonzero(knowledge.first != np.arange(H.shape[1]))
@@ -137,7 +91,7 @@ def conic_equations(H: F64, knowledge: ConicKnowledge, focals: F64) -> F64:
 
 
 @dataclass(frozen=True)
-class ConicScan:
+class ConicBatch:
     """The linear solutions for B planes: squared focals ``f2`` (B,) of the reference view, NaN where the
     conic is not that of a real camera; ``residuals`` (B, M) of the equations over their second smallest
     singular value, NaN there too."""
@@ -152,7 +106,7 @@ class ConicScan:
         return np.asarray(np.nan_to_num(np.linalg.norm(self.residuals, axis=1), nan=np.inf))
 
 
-def scan_conics(H: F64, knowledge: ConicKnowledge) -> ConicScan:
+def solve_conic_batch(H: F64, knowledge: ConicConstraints) -> ConicBatch:
     """The image conics of homographies H (B, R, 3, 3) at once, without reweighing."""
     A = conic_equations(H, knowledge, np.ones(H.shape[:2]))
     value, vector = np.linalg.eigh(np.einsum("bri,brj->bij", A, A))
@@ -161,7 +115,7 @@ def scan_conics(H: F64, knowledge: ConicKnowledge) -> ConicScan:
         f2 = 2.0 * w[:, 5] / (w[:, 0] + w[:, 3])
     bad = ~(f2 > 0) | ~np.isfinite(f2) | (w[:, 0] * w[:, 3] <= 0) | ~np.isfinite(H).all(axis=(1, 2, 3))
     residuals = np.einsum("brk,bk->br", A, w) / np.sqrt(np.maximum(value[:, 1:2], 1e-300))
-    return ConicScan(np.where(bad, np.nan, f2), np.where(bad[:, None], np.nan, residuals))
+    return ConicBatch(np.where(bad, np.nan, f2), np.where(bad[:, None], np.nan, residuals))
 
 
 @dataclass(frozen=True)
@@ -186,7 +140,7 @@ class ImageConic:
 
 
 def solve_conic(
-    H: F64, knowledge: ConicKnowledge, *, orthogonal: F64 | None = None, iterations: int = 4
+    H: F64, knowledge: ConicConstraints, *, orthogonal: F64 | None = None, iterations: int = 4
 ) -> ImageConic:
     """The image conic of homographies H (R, 3, 3), by SVD of equations reweighed by the focals found.
 
@@ -223,7 +177,7 @@ def _unit(w: F64) -> F64:
     return np.asarray(w / np.linalg.norm(w))
 
 
-def carried_conics(H: F64, w: F64) -> F64:
+def _transferred_conics(H: F64, w: F64) -> F64:
     """w_j = H_j^-T w H_j^-1 (R, 3, 3)."""
     inverse = np.linalg.inv(H)
     return np.asarray(inverse.swapaxes(-1, -2) @ w @ inverse)
@@ -233,7 +187,7 @@ def _focals(H: F64, w: F64) -> F64:
     """Unit-free focals (R,) of the carried conics, 1 where a homography is missing."""
     good = np.asarray(np.isfinite(H).all(axis=(1, 2)))
     usable = np.asarray(np.where(good[:, None, None], H, np.eye(3)), dtype=np.float64)
-    dual = np.linalg.inv(carried_conics(usable, w))
+    dual = np.linalg.inv(_transferred_conics(usable, w))
     centred = dual[:, [0, 1], [0, 1]] / dual[:, 2, 2, None] - (dual[:, :2, 2] / dual[:, 2, 2, None]) ** 2
     return np.where(good, np.sqrt(np.abs(np.prod(centred, axis=1)) ** 0.5), 1.0)
 
@@ -242,25 +196,25 @@ _DESCENTS = 3
 
 
 @dataclass(frozen=True)
-class Strata:
+class CalibrationProblem:
     """What the calibration of a plane at infinity starts from: the cameras, what is assumed of them, and
     vanishing points ``orthogonal`` (M, 2, 3) in the reference view of directions at right angles."""
 
     frame: ReferenceFrame
-    knowledge: ConicKnowledge
-    unknown: UnknownIntrinsics
+    knowledge: ConicConstraints
+    unknown: SolverUnknowns
     orthogonal: F64
 
 
 @dataclass(frozen=True)
-class HartleyLinear:
+class LinearAbsoluteConic:
     """Hartley's way: the image of the absolute conic by linear equations, K by Cholesky.
 
     Where nothing is known of any K but that it is constant these are w* = H w* H'; else the equations of
     :func:`~thesisrecon.selfcalibration.hartley.conic_equations`.
     """
 
-    def calibrations(self, strata: Strata, plane: F64) -> F64:
+    def calibrations(self, strata: CalibrationProblem, plane: F64) -> F64:
         """Unit-free K (R, 3, 3) under a plane at infinity (3,).
 
         ``StageFailure`` where the conic is not definite (the plane, or what is assumed of the cameras, is
@@ -270,7 +224,7 @@ class HartleyLinear:
         H = _homographies(frame, plane)
         one_camera = bool((knowledge.first == knowledge.first[0]).all())
         if one_camera and np.isinf(knowledge.std).all() and not len(strata.orthogonal):
-            dual, s = dual_image_constant(H)
+            dual, s = dual_conic_of_constant_camera(H)
             definite = bool((np.linalg.eigvalsh(dual) > 0).all())
             conic = ImageConic(np.asarray(np.linalg.inv(dual)) if definite else dual, s)
         else:
@@ -279,12 +233,12 @@ class HartleyLinear:
             raise _undetermined(frame, H, conic)
         if not conic.definite:
             raise _indefinite(conic)
-        K = np.array([calibration_from_image(w) for w in carried_conics(H, conic.w)])
-        return as_assumed(strata.unknown, K)
+        K = np.array([calibration_from_image(w) for w in _transferred_conics(H, conic.w)])
+        return _apply_known_values(strata.unknown, K)
 
 
 @dataclass(frozen=True)
-class PollefeysQuadric:
+class FixedPlaneQuadric:
     """Pollefeys' way: the criterion of the absolute dual quadric with its plane held fixed.
 
     min sum |K_i K_i' / |.| - H_i w* H_i' / |.||^2 (IJCV 32(1), 1999) over all unknown intrinsics, started at
@@ -294,24 +248,26 @@ class PollefeysQuadric:
     focal_range: tuple[float, float] = (0.3, 10.0)
     starts: int = 9
 
-    def calibrations(self, strata: Strata, plane: F64) -> F64:
+    def calibrations(self, strata: CalibrationProblem, plane: F64) -> F64:
         """Unit-free K (R, 3, 3) under a plane at infinity (3,); ``StageFailure`` where the criterion does not
         determine it."""
         unknown, frame = strata.unknown, strata.frame
         H = _homographies(frame, plane)
         focals = np.log(np.geomspace(*self.focal_range, self.starts))
-        starts = unknown.start(np.repeat(focals[:, None], len(H), axis=1))
+        starts = unknown.from_log_focals(np.repeat(focals[:, None], len(H), axis=1))
 
         def residuals(batch: F64) -> F64:
             K = unknown.calibrations(batch)
             data = dual_image_residuals(frame.A, frame.a, K, K[:, frame.reference], plane[None])
             data = data.reshape(len(batch), -1)
-            return np.asarray(np.concatenate([data, NOISE * unknown.deviations(batch)], axis=1))
+            return np.asarray(
+                np.concatenate([data, HOMOGRAPHY_NOISE * unknown.prior_residuals(batch)], axis=1)
+            )
 
         nearest = np.argsort(np.sum(residuals(starts) ** 2, axis=1), kind="stable")[:_DESCENTS]
-        found, cost = descend(residuals, starts[nearest], iterations=60, loss_scale=0.05)
+        found, cost = minimize_batch(residuals, starts[nearest], iterations=60, loss_scale=0.05)
         best = found[cost.argmin()]
-        s = np.linalg.svd(derivatives(residuals, best[None])[0], compute_uv=False)
+        s = np.linalg.svd(numerical_jacobian(residuals, best[None])[0], compute_uv=False)
         if len(s) and not s[-1] > 1e-5 * s[0]:
             raise _undetermined(frame, H, None)
         return np.asarray(unknown.calibrations(best[None])[0], dtype=np.float64)
@@ -327,20 +283,20 @@ def _homographies(frame: ReferenceFrame, plane: F64) -> F64:
     return np.asarray(H, dtype=np.float64)
 
 
-def as_assumed(unknown: UnknownIntrinsics, K: F64) -> F64:
+def _apply_known_values(unknown: SolverUnknowns, K: F64) -> F64:
     """Calibrations (R, 3, 3) brought to the assumptions: what is known takes its value, what is shared its
     mean."""
     f = K[:, 0, 0]
     values = np.column_stack([np.log(f), np.log(K[:, 1, 1] / f), K[:, 0, 1], K[:, 0, 2], K[:, 1, 2]])
     # Where the aspect is known the two focals are two measurements of one.
-    values[:, 0] += np.where(unknown.place[:, 1] < 0, (values[:, 1] - unknown.value[:, 1]) / 2.0, 0.0)
-    asked = unknown.place >= 0
-    total = np.bincount(unknown.place[asked], values[asked], minlength=len(unknown.mean))
-    count = np.bincount(unknown.place[asked], minlength=len(unknown.mean))
+    values[:, 0] += np.where(unknown.index[:, 1] < 0, (values[:, 1] - unknown.known[:, 1]) / 2.0, 0.0)
+    asked = unknown.index >= 0
+    total = np.bincount(unknown.index[asked], values[asked], minlength=len(unknown.mean))
+    count = np.bincount(unknown.index[asked], minlength=len(unknown.mean))
     return np.asarray(unknown.calibrations((total / np.maximum(count, 1))[None])[0])
 
 
-def turns(H: F64) -> tuple[float, F64]:
+def largest_rotation(H: F64) -> tuple[float, F64]:
     """Largest turn (deg) between the reference view and the others, and the vanishing point (3,) of its axis.
 
     An infinite homography of a constant K is conjugate to a rotation: its trace is 1 + 2 cos, its real
@@ -354,7 +310,7 @@ def turns(H: F64) -> tuple[float, F64]:
 
 
 def _undetermined(frame: ReferenceFrame, H: F64, conic: ImageConic | None) -> StageFailure:
-    angle, axis = turns(H)
+    angle, axis = largest_rotation(H)
     found = "the criterion has a flat direction"
     if conic is not None:
         s = conic.singular_values

@@ -25,14 +25,10 @@ from thesisrecon.selfcalibration.candidates import (
 )
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.focal_scan import focal_pairs, plane_from_focals
-from thesisrecon.selfcalibration.frame import (
-    ReferenceFrame,
-    SolverUnknowns,
-    normalized_frame,
-    solver_unknowns,
-)
+from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
 from thesisrecon.selfcalibration.quadric import minimize_quadric, quadric_hypotheses
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
+from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
 
 LOOSE = 0.02
 """Deviation of a principal point (long sides), an aspect or a skew beyond which focals alone do not do."""

@@ -17,12 +17,12 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.selfcalibration.cheirality import (
+    CheiralityRegion,
     PlaneCandidates,
-    PlaneRegion,
     ProjectiveScene,
     distinct_planes,
 )
-from thesisrecon.selfcalibration.refinement import descend
+from thesisrecon.selfcalibration.refinement import minimize_batch
 
 _SLACK = _LOSS_SCALE = 0.05
 
@@ -84,7 +84,7 @@ class ModulusConstraint:
 
     starts: int = 300
     keep: int = 21
-    max_outside: float = 0.02
+    max_wrong_side_ratio: float = 0.02
     max_points: int = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
@@ -97,15 +97,15 @@ class ModulusConstraint:
                 f"{counted(len(pairs), 'pair')} of views with all intrinsics in common",
                 "assume a constant camera, or use another way to the plane at infinity",
             )
-        region = PlaneRegion.of(frame, scene.reconstruction, max_points=self.max_points, rng=rng)
+        region = CheiralityRegion.of(frame, scene.reconstruction, max_points=self.max_points, rng=rng)
         starts = region.sample(self.starts, rng)
         coefficients = modulus_coefficients(frame.A, frame.a, pairs)
-        planes, cost = descend(
+        planes, cost = minimize_batch(
             lambda p: modulus_residuals(coefficients, p)[0], starts, iterations=60, loss_scale=_LOSS_SCALE
         )
         turning = np.abs(modulus_residuals(coefficients, planes)[1]) <= 3.0 + _SLACK
         fit = np.isfinite(cost) & (turning.mean(axis=1) >= 0.9)
-        fit[fit] = region.share_outside(planes[fit]) <= self.max_outside
+        fit[fit] = region.wrong_side_ratio(planes[fit]) <= self.max_wrong_side_ratio
         planes, cost = planes[fit], cost[fit]
         kept = distinct_planes(planes, cost)[: self.keep]
         if not len(planes):

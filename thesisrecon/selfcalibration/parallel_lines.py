@@ -22,10 +22,10 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import Image
-from thesisrecon.selfcalibration.cheirality import PlaneCandidates, PlaneRegion, ProjectiveScene
+from thesisrecon.selfcalibration.cheirality import CheiralityRegion, PlaneCandidates, ProjectiveScene
 from thesisrecon.selfcalibration.frame import ReferenceFrame
 from thesisrecon.selfcalibration.line_segments import LineSegments
-from thesisrecon.selfcalibration.refinement import descend
+from thesisrecon.selfcalibration.refinement import minimize_batch
 
 NEAR = 4.0
 """Segments within this many tolerances of a direction are not offered to another one."""
@@ -50,7 +50,7 @@ class SegmentSet:
         """The kept ones."""
         return SegmentSet(self.camera[keep], self.middle[keep], self.along[keep], self.half[keep])
 
-    def misses(self, v: F64) -> F64:
+    def endpoint_distances_px(self, v: F64) -> F64:
         """Distance (..., S) px by which a segment, turned about its middle to the points v (..., S, 3),
         misses its ends."""
         towards = v[..., :2] - v[..., 2:] * self.middle
@@ -59,7 +59,7 @@ class SegmentSet:
         return np.asarray(across / norm * self.half)
 
 
-def segment_set(frame: ReferenceFrame, segments: list[F64]) -> SegmentSet:
+def normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> SegmentSet:
     """Pixel segments (S_i, 4) of each registered camera in the frame's coordinates."""
     parts = []
     for place, pixels in enumerate(segments):
@@ -75,11 +75,11 @@ def segment_set(frame: ReferenceFrame, segments: list[F64]) -> SegmentSet:
 
 def support(segments: SegmentSet, v: F64, tolerance_px: float) -> F64:
     """Support (..., S) of points v (..., S, 3): length times how well it fits, 0 beyond the tolerance."""
-    miss = segments.misses(v) / tolerance_px
+    miss = segments.endpoint_distances_px(v) / tolerance_px
     return np.asarray(segments.half * np.maximum(1.0 - miss**2, 0.0))
 
 
-def propose_points(
+def propose_vanishing_points(
     segments: SegmentSet, *, keep: int, samples: int, tolerance_px: float, rng: np.random.Generator
 ) -> F64:
     """Vanishing points (K, 3) of one photograph, the best supported first: each is refined on its segments,
@@ -102,7 +102,7 @@ def propose_points(
             break
         best = _nearest_to_lines(lines[mine], left.half[mine])
         found.append(best)
-        left = left.subset(~mine & (np.abs(left.misses(best[None])) > NEAR * tolerance_px))
+        left = left.subset(~mine & (np.abs(left.endpoint_distances_px(best[None])) > NEAR * tolerance_px))
     return np.array(found).reshape(-1, 3)
 
 
@@ -124,10 +124,10 @@ def triangulate_directions(P: F64, v: F64) -> F64:
     return np.asarray(np.linalg.eigh(normal)[1][:, :, 0])
 
 
-def find_directions(
+def find_parallel_directions(
     frame: ReferenceFrame,
     segments: SegmentSet,
-    proposals: list[F64],
+    vanishing_points_per_image: list[F64],
     *,
     keep: int,
     tolerance_px: float,
@@ -139,7 +139,7 @@ def find_directions(
     so that the third confirms what two made.
     """
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
-    candidates = _triangulated_pairs(P, proposals)
+    candidates = _triangulated_pairs(P, vanishing_points_per_image)
     direction = np.full(len(segments.half), -1, dtype=np.int64)
     found: list[F64] = []
     while len(found) < keep and len(candidates):
@@ -156,22 +156,24 @@ def find_directions(
         direction[free[mine]] = len(found)
         found.append(X)
         # What nearly fits belongs to it too; left over, it would come up again as a direction of its own.
-        near = np.abs(left.misses((P @ X)[left.camera])) < NEAR * tolerance_px
+        near = np.abs(left.endpoint_distances_px((P @ X)[left.camera])) < NEAR * tolerance_px
         direction[free[near & ~mine]] = NEARLY
     return np.array(found).reshape(-1, 4), np.maximum(direction, -1)
 
 
-def _triangulated_pairs(P: F64, proposals: list[F64]) -> F64:
+def _triangulated_pairs(P: F64, vanishing_points_per_image: list[F64]) -> F64:
     """Points (B, 4) of every two vanishing points of different cameras that lie on each other's epipolar
     line to a few degrees."""
     i, j, v1, v2 = [], [], [], []
     for a in range(len(P)):
         for b in range(a + 1, len(P)):
-            first, second = np.indices((len(proposals[a]), len(proposals[b]))).reshape(2, -1)
+            first, second = np.indices(
+                (len(vanishing_points_per_image[a]), len(vanishing_points_per_image[b]))
+            ).reshape(2, -1)
             i.append(np.full(len(first), a))
             j.append(np.full(len(first), b))
-            v1.append(proposals[a][first])
-            v2.append(proposals[b][second])
+            v1.append(vanishing_points_per_image[a][first])
+            v2.append(vanishing_points_per_image[b][second])
     pair = np.column_stack([np.concatenate(i), np.concatenate(j)])
     v = np.stack([np.concatenate(v1), np.concatenate(v2)], axis=1)
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
@@ -189,10 +191,14 @@ def _refined_point(P: F64, segments: SegmentSet, X: F64, tolerance_px: float) ->
             break
         tangent = np.linalg.svd(X[None])[2][1:]
 
-        def misses(step: F64, X: F64 = X, tangent: F64 = tangent, mine: SegmentSet = mine) -> F64:
-            return mine.misses(np.einsum("sij,bj->bsi", P[mine.camera], X + step @ tangent))
+        def endpoint_distances_px(
+            step: F64, X: F64 = X, tangent: F64 = tangent, mine: SegmentSet = mine
+        ) -> F64:
+            return mine.endpoint_distances_px(np.einsum("sij,bj->bsi", P[mine.camera], X + step @ tangent))
 
-        step = descend(misses, np.zeros((1, 3)), iterations=10, loss_scale=tolerance_px / 2.0)[0][0]
+        step = minimize_batch(
+            endpoint_distances_px, np.zeros((1, 3)), iterations=10, loss_scale=tolerance_px / 2.0
+        )[0][0]
         X = X + step @ tangent
         X = X / np.linalg.norm(X)
     return X
@@ -211,9 +217,11 @@ def refine_plane(
     kept, noise = direction >= 0, _FIRST_NOISE_PX
     for _ in range(4):
         plane, v = _fit_plane(frame, segments.subset(kept), direction[kept], (plane, v), noise)
-        misses = np.abs(_plane_misses(frame, segments, np.maximum(direction, 0), plane[None], v[None])[0])
-        noise = max(1.4826 * float(np.median(misses[direction >= 0])), _LEAST_NOISE_PX)
-        trimmed = (direction >= 0) & (misses <= 2.5 * noise)
+        endpoint_distances_px = np.abs(
+            _plane_misses(frame, segments, np.maximum(direction, 0), plane[None], v[None])[0]
+        )
+        noise = max(1.4826 * float(np.median(endpoint_distances_px[direction >= 0])), _LEAST_NOISE_PX)
+        trimmed = (direction >= 0) & (endpoint_distances_px <= 2.5 * noise)
         counts = np.bincount(direction[trimmed], minlength=len(v))
         if counts.min() < _MIN_SEGMENTS:
             break
@@ -225,7 +233,9 @@ def _plane_misses(frame: ReferenceFrame, segments: SegmentSet, of: I64, plane: F
     """Misses (B, S) px of segments of directions ``of`` (S,) under planes (B, 3) and points v (B, D, 3)."""
     w, camera = v[:, of], segments.camera
     depth = np.einsum("bsi,bi->bs", w, plane)
-    return segments.misses(np.einsum("sij,bsj->bsi", frame.A[camera], w) - frame.a[camera] * depth[..., None])
+    return segments.endpoint_distances_px(
+        np.einsum("sij,bsj->bsi", frame.A[camera], w) - frame.a[camera] * depth[..., None]
+    )
 
 
 def _fit_plane(
@@ -237,7 +247,7 @@ def _fit_plane(
     def moved(x: F64) -> F64:
         return np.asarray(v + np.einsum("bdk,dki->bdi", x[:, 3:].reshape(len(x), len(v), 2), tangents))
 
-    x, _ = descend(
+    x, _ = minimize_batch(
         lambda x: _plane_misses(frame, segments, of, plane + x[:, :3], moved(x)),
         np.zeros((1, 3 + 2 * len(v))), iterations=30, loss_scale=noise,
     )  # fmt: skip
@@ -271,19 +281,19 @@ class ParallelLines:
     """
 
     points: VanishingPoints | None = field(default=None, metadata={"given": True})
-    photographs: tuple[Image, ...] = field(default=(), metadata={"given": True}, repr=False)
+    images: tuple[Image, ...] = field(default=(), metadata={"given": True}, repr=False)
     detector: LineSegments = field(default_factory=LineSegments)
-    right_angles: bool = False
-    proposals: int = 6
-    directions: int = 6
+    orthogonal_directions: bool = False
+    vanishing_points_per_image: int = 6
+    max_directions: int = 6
     samples: int = 400
     tolerance_px: float = 1.5
-    max_outside: float = 0.02
+    max_wrong_side_ratio: float = 0.02
     keep: int = 5
 
-    def with_images(self, photographs: Iterable[Image]) -> ParallelLines:
+    def with_images(self, images: Iterable[Image]) -> ParallelLines:
         """The same with the photographs to look at, one per view."""
-        return replace(self, photographs=tuple(photographs))
+        return replace(self, images=tuple(images))
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """One candidate from given points, one or more from photographs, the best supported first.
@@ -293,10 +303,10 @@ class ParallelLines:
         """
         if self.points is not None:
             return self._from_points(scene.frame, self.points)
-        if len(self.photographs) != len(scene.reconstruction.P):
+        if len(self.images) != len(scene.reconstruction.P):
             raise ValueError(
                 f"ParallelLines needs vanishing points, or a photograph for each of the "
-                f"{len(scene.reconstruction.P)} views; got {len(self.photographs)} photographs"
+                f"{len(scene.reconstruction.P)} views; got {len(self.images)} photographs"
             )
         return self._from_photographs(scene, rng)
 
@@ -307,28 +317,32 @@ class ParallelLines:
         return PlaneCandidates(plane[None], np.zeros(1), self._orthogonal(v))
 
     def _orthogonal(self, v: F64) -> F64:
-        pairs = list(combinations(range(3), 2)) if self.right_angles else []
+        pairs = list(combinations(range(3), 2)) if self.orthogonal_directions else []
         return np.array([[v[a], v[b]] for a, b in pairs]).reshape(-1, 2, 3)
 
     def _from_photographs(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         frame = scene.frame
-        pixels = [self.detector.detect(self.photographs[view].gray) for view in frame.views]
-        segments = segment_set(frame, pixels)
-        proposals = [
-            propose_points(
-                segments.subset(segments.camera == place), keep=self.proposals, samples=self.samples,
+        pixels = [self.detector.detect(self.images[view].gray) for view in frame.views]
+        segments = normalize_segments(frame, pixels)
+        vanishing_points_per_image = [
+            propose_vanishing_points(
+                segments.subset(segments.camera == place), keep=self.vanishing_points_per_image, samples=self.samples,
                 tolerance_px=self.tolerance_px, rng=rng,
             )
             for place in range(len(frame.views))
         ]  # fmt: skip
-        X, direction = find_directions(
-            frame, segments, proposals, keep=self.directions, tolerance_px=self.tolerance_px
+        X, direction = find_parallel_directions(
+            frame,
+            segments,
+            vanishing_points_per_image,
+            keep=self.max_directions,
+            tolerance_px=self.tolerance_px,
         )
-        region = PlaneRegion.of(frame, scene.reconstruction, max_points=2000, rng=rng)
+        region = CheiralityRegion.of(frame, scene.reconstruction, max_points=2000, rng=rng)
         return self._best_triples(frame, segments, region, X, direction)
 
     def _best_triples(
-        self, frame: ReferenceFrame, segments: SegmentSet, region: PlaneRegion, X: F64, direction: I64
+        self, frame: ReferenceFrame, segments: SegmentSet, region: CheiralityRegion, X: F64, direction: I64
     ) -> PlaneCandidates:
         """Planes of triples of directions that keep the scene on one side, the best supported triple first;
         each refined on all its segments."""
@@ -345,7 +359,7 @@ class ParallelLines:
             for k, old in enumerate(chosen):
                 renumbered[direction == old] = k
             plane, v, _ = refine_plane(frame, segments, renumbered, plane, v)
-            if region.share_outside(plane[None])[0] <= self.max_outside:
+            if region.wrong_side_ratio(plane[None])[0] <= self.max_wrong_side_ratio:
                 planes.append(plane)
                 scores.append(1.0 / float(counts[chosen].min()))
                 points.append(v)
@@ -356,7 +370,7 @@ class ParallelLines:
                 f"{len(frame.views)} photographs",
                 "give vanishing points, or use another way to the plane at infinity",
             )
-        order = np.argsort(scores, kind="stable")[: 1 if self.right_angles else self.keep]
+        order = np.argsort(scores, kind="stable")[: 1 if self.orthogonal_directions else self.keep]
         return PlaneCandidates(
             np.array(planes)[order], np.array(scores)[order], self._orthogonal(points[order[0]])
         )

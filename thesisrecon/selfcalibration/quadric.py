@@ -31,13 +31,9 @@ from thesisrecon.selfcalibration.candidates import (
     require_cameras,
     select_candidate,
 )
-from thesisrecon.selfcalibration.frame import (
-    ReferenceFrame,
-    SolverUnknowns,
-    normalized_frame,
-    solver_unknowns,
-)
-from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
+from thesisrecon.selfcalibration.refinement import RotationCriterion, central_differences
+from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
 
 _PAIRS = [(a, b) for a in range(4) for b in range(a, 4)]
 
@@ -199,7 +195,9 @@ def _conclude_best(
     answers = candidates_from_parameters(
         frame, np.concatenate([p, log_f], axis=1), criterion.cost(frame, p, log_f), "linear quadric"
     )
-    return select_candidate(frame, reconstruction, criterion, answers, max_candidates=1, min_in_front_ratio=0.5)
+    return select_candidate(
+        frame, reconstruction, criterion, answers, max_candidates=1, min_in_front_ratio=0.5
+    )
 
 
 _UPPER = np.triu_indices(3)
@@ -252,7 +250,7 @@ def minimize_quadric(
     """
     # Both sides also come together where all focals go to 0, which must cost more than the noise.
     unknown = unknown.with_focal_prior()
-    theta, noise = np.concatenate([plane, unknown.start(log_f[None])[0]]), 0.01
+    theta, noise = np.concatenate([plane, unknown.from_log_focals(log_f[None])[0]]), 0.01
     for _ in range(PASSES):
         supposed = noise
         theta, noise, covariance, cost = _minimize(frame, unknown, theta, noise, loss_scale)
@@ -273,14 +271,10 @@ def _minimize(
             [data.reshape(len(batch), -1), noise * unknown.prior_residuals(batch[:, 3:])], axis=1
         )
 
-    def jacobian(x: F64) -> F64:
-        steps = np.diag(1e-6 * (1.0 + np.abs(x)))
-        return np.asarray(
-            ((residuals(x + steps) - residuals(x - steps)) / (2.0 * steps.diagonal()[:, None])).T
-        )
-
     found = minimize_residuals(
-        lambda x: residuals(x[None])[0], theta, jacobian=jacobian, loss="huber", loss_scale=loss_scale,
+        lambda x: residuals(x[None])[0], theta,
+        jacobian=lambda x: central_differences(residuals, x, 1e-6 * (1.0 + np.abs(x))),
+        loss="huber", loss_scale=loss_scale,
         max_iterations=100, tolerance=1e-14,
     )  # fmt: skip
     data = found.residual[: 6 * len(frame.views)]

@@ -1,16 +1,15 @@
-"""Refinement of (plane at infinity, focals): one criterion for the hypotheses of every method.
+"""Criterion and batched Levenberg-Marquardt for hypotheses of (plane at infinity, focal lengths).
 
-With C_i = K_i^-1 (A_i - a_i p') K_r every right hypothesis makes C_i a scaled rotation. The residuals are
-the six entries of 3 C C' / tr(C C') - I, the nonlinear criterion of Pollefeys et al. (IJCV 32(1), 1999) in
-its scale-free form; the focals are log f per camera group. Many hypotheses are refined at once.
-
-Levenberg-Marquardt from many starts at once, for the few unknowns of a plane or a calibration.
+With C_i = K_i^-1 (A_i - a_i p') K_r a correct hypothesis makes every C_i a scaled rotation. The residuals are
+the six entries of 3 C C' / tr(C C') - I: the nonlinear criterion of Pollefeys et al. (IJCV 32(1), 1999) in
+scale-free form, with one log f per camera group.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,12 +22,30 @@ _ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
 
 @dataclass(frozen=True)
 class RotationCriterion:
-    """How far the upgraded cameras are from scaled rotations, robustly.
+    """Robust distance of the upgraded cameras from scaled rotations.
 
-    ``scale``: residual norm of a camera beyond which it counts linearly (soft L1). ``focal_log_mean`` and
-    ``focal_log_std`` with ``focal_weight``: a weak pull of every log focal (in long sides) of which nothing
-    is known; it keeps hypotheses out of the absurd and is far below the noise of a well-determined problem.
-    ``noise``: residual of a good camera, by which what is known of a focal weighs.
+    Parameters
+    ----------
+    scale : float
+        Residual norm of a camera beyond which it counts linearly (soft L1).
+    focal_log_mean, focal_log_std, focal_weight : float
+        Weak prior of log focal lengths (in long sides) without one of their own; far below the noise of a
+        well-determined problem, it excludes absurd hypotheses.
+    noise : float
+        Residual of a good camera, against which known focal lengths are weighted.
+
+    References
+    ----------
+    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.selfcalibration.frame import _example_frame
+    >>> frame, p = _example_frame(f=1.2)
+    >>> cost = RotationCriterion(focal_weight=0.0).cost(frame, np.array([p, 0 * p]), np.log([[1.2], [1.2]]))
+    >>> bool(cost[0] < 1e-12 < cost[1])
+    True
     """
 
     scale: float = 0.05
@@ -38,7 +55,22 @@ class RotationCriterion:
     noise: float = 0.01
 
     def camera_residuals(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
-        """p (B, 3), log_f (B, G) -> (B, R, 6) weighted entries of 3CC'/tr(CC') - I."""
+        """Compute the weighted entries of 3 C C' / tr(C C') - I.
+
+        Parameters
+        ----------
+        frame : ReferenceFrame
+            Cameras.
+        p : ndarray (B, 3)
+            Planes at infinity.
+        log_f : ndarray (B, G)
+            Log focal lengths of the camera groups.
+
+        Returns
+        -------
+        ndarray (B, R, 6)
+            Residuals of each camera.
+        """
         f = np.exp(log_f)[:, frame.group]
         C = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
         C[..., :2] *= f[:, frame.reference, None, None, None]
@@ -49,13 +81,28 @@ class RotationCriterion:
         return np.asarray(E[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT, dtype=np.float64)
 
     def cost(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
-        """Robust cost per camera of each hypothesis; (B,)."""
+        """Compute the robust cost per camera of each hypothesis.
+
+        Parameters
+        ----------
+        frame : ReferenceFrame
+            Cameras.
+        p : ndarray (B, 3)
+            Planes at infinity.
+        log_f : ndarray (B, G)
+            Log focal lengths of the camera groups.
+
+        Returns
+        -------
+        ndarray (B,)
+            Costs.
+        """
         norm2 = np.sum(self.camera_residuals(frame, p, log_f) ** 2, axis=-1)
         robust = 2.0 * self.scale**2 * (np.sqrt(1.0 + norm2 / self.scale**2) - 1.0)
-        pull = self._pull(frame, log_f)
+        pull = self._focal_prior_residuals(frame, log_f)
         return np.asarray((robust.sum(axis=1) + np.sum(pull**2, axis=1)) / len(frame.views), dtype=np.float64)
 
-    def _pull(self, frame: ReferenceFrame, log_f: F64) -> F64:
+    def _focal_prior_residuals(self, frame: ReferenceFrame, log_f: F64) -> F64:
         weak = self.focal_weight * (log_f - self.focal_log_mean) / self.focal_log_std
         if frame.focal_mean is None or frame.focal_std is None:
             return weak
@@ -63,71 +110,60 @@ class RotationCriterion:
         scale = np.where(known, frame.focal_std, 1.0)
         return np.where(known, self.noise * (log_f - np.where(known, frame.focal_mean, 0.0)) / scale, weak)
 
-    def weighted_residuals(self, frame: ReferenceFrame, theta: F64, weights: F64) -> F64:
-        """Residual vectors (B, 6 R + G) of theta = (p, log f) with fixed robust weights (B, R)."""
+    def _weighted_residuals(self, frame: ReferenceFrame, theta: F64, weights: F64) -> F64:
+        """Return residuals (B, 6 R + G) of cameras and focal priors with fixed robust weights (B, R)."""
         residuals = self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) * weights[..., None]
-        return np.concatenate([residuals.reshape(len(theta), -1), self._pull(frame, theta[:, 3:])], axis=1)
+        return np.concatenate(
+            [residuals.reshape(len(theta), -1), self._focal_prior_residuals(frame, theta[:, 3:])], axis=1
+        )
 
-    def weights(self, frame: ReferenceFrame, theta: F64) -> F64:
-        """Square roots of the soft-L1 weights of each camera, (B, R)."""
+    def _weights(self, frame: ReferenceFrame, theta: F64) -> F64:
+        """Return the square roots (B, R) of the soft-L1 weights of the cameras."""
         norm2 = np.sum(self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) ** 2, axis=-1)
         return np.asarray((1.0 + norm2 / self.scale**2) ** -0.25, dtype=np.float64)
 
 
-def _jacobian(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, weights: F64) -> F64:
-    n = theta.shape[1]
-    steps = 1e-6 * (1.0 + np.abs(theta))
-    columns = []
-    for k in range(n):
-        shifted_up, shifted_down = theta.copy(), theta.copy()
-        shifted_up[:, k] += steps[:, k]
-        shifted_down[:, k] -= steps[:, k]
-        difference = criterion.weighted_residuals(frame, shifted_up, weights) - criterion.weighted_residuals(
-            frame, shifted_down, weights
-        )
-        columns.append(difference / (2.0 * steps[:, k, None]))
-    return np.stack(columns, axis=-1)
+class _Schedule(NamedTuple):
+    """Damping of a descent; with ``skip_nonfinite`` rows of non-finite cost count as finished."""
+
+    damping: float
+    decrease: float
+    max_damping: float
+    tolerance: float
+    skip_nonfinite: bool
 
 
-def refine_hypotheses(
-    criterion: RotationCriterion,
-    frame: ReferenceFrame,
-    theta: F64,
-    *,
-    iterations: int = 25,
-    planes_only: bool = False,
+def _descend(
+    normal_equations: Callable[[F64], tuple[F64, F64]],
+    cost_of: Callable[[F64], F64],
+    project: Callable[[F64], F64],
+    x: F64,
+    iterations: int,
+    schedule: _Schedule,
 ) -> tuple[F64, F64]:
-    """Levenberg-Marquardt on every row of theta (B, 3 + G) at once; -> refined theta and cost (B,).
+    """Run Levenberg-Marquardt on all rows of x (B, D) until every row has finished; return x and costs (B,).
 
-    ``planes_only`` leaves the focals as they are.
+    ``normal_equations`` returns J'J (B, D, D) and the gradient (B, D); ``project`` moves a trial into bounds.
     """
-    theta = theta.copy()
-    damping = np.full(len(theta), 1e-3)
-    cost = criterion.cost(frame, theta[:, :3], theta[:, 3:])
+    cost, damping = cost_of(x), np.full(len(x), schedule.damping)
     for _ in range(iterations):
-        weights = criterion.weights(frame, theta)
-        r = criterion.weighted_residuals(frame, theta, weights)
-        J = _jacobian(criterion, frame, theta, weights)
-        if planes_only:
-            J[:, :, 3:] = 0.0
-        N = np.einsum("bri,brj->bij", J, J)
-        g = np.einsum("bri,br->bi", J, r)
+        N, g = normal_equations(x)
         diagonal = np.einsum("bii->bi", N)
-        N = N + damping[:, None, None] * np.eye(theta.shape[1]) * (diagonal + 1e-12)[:, None, :]
-        trial = theta - solve_guarded(N, g)
-        trial[:, 3:] = np.clip(trial[:, 3:], -4.0, 5.4)
-        trial_cost = criterion.cost(frame, trial[:, :3], trial[:, 3:])
+        N = N + damping[:, None, None] * np.eye(x.shape[1]) * (diagonal + 1e-12)[:, None, :]
+        trial = project(x - _solve_batch(N, g))
+        trial_cost = cost_of(trial)
         better = np.asarray(trial_cost < cost)
-        converged = better & (cost - trial_cost < 1e-10 * cost)
-        theta[better], cost[better] = trial[better], trial_cost[better]
-        damping = np.where(better, damping / 5.0, damping * 4.0)
-        if (converged | (damping > 1e8)).all():
+        finished = better & (cost - trial_cost <= schedule.tolerance * cost)
+        x, cost = np.where(better[:, None], trial, x), np.where(better, trial_cost, cost)
+        damping = np.where(better, damping / schedule.decrease, damping * 4.0)
+        finished |= damping > schedule.max_damping
+        if (finished | (schedule.skip_nonfinite & ~np.isfinite(cost))).all():
             break
-    return theta, cost
+    return x, cost
 
 
-def solve_guarded(N: F64, g: F64) -> F64:
-    """Solve symmetric positive systems N x = g (B, n, n), (B, n); singular or non-finite ones give 0."""
+def _solve_batch(N: F64, g: F64) -> F64:
+    """Solve N x = g for symmetric positive N (B, n, n); singular or non-finite systems give 0."""
     bad = np.asarray(~(np.isfinite(N).all(axis=(1, 2)) & np.isfinite(g).all(axis=1)))
     N = np.where(bad[:, None, None], np.eye(N.shape[1]), N)
     g = np.where(bad[:, None], 0.0, g)
@@ -139,16 +175,78 @@ def solve_guarded(N: F64, g: F64) -> F64:
         return np.zeros_like(g)
 
 
-def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> tuple[F64, float]:
-    """Standard deviations (G,) of log f at theta (3 + G,) and the noise of the residual entries.
+def refine_hypotheses(
+    criterion: RotationCriterion,
+    frame: ReferenceFrame,
+    theta: F64,
+    *,
+    iterations: int = 25,
+    planes_only: bool = False,
+) -> tuple[F64, F64]:
+    """Refine all hypotheses at once by Levenberg-Marquardt.
 
-    From J'J with the noise estimated from the residuals themselves (5 independent entries a camera, the
-    reference included, less the unknowns); infinite where J'J is singular to rounding.
+    Parameters
+    ----------
+    criterion : RotationCriterion
+        Criterion to minimize.
+    frame : ReferenceFrame
+        Cameras.
+    theta : ndarray (B, 3 + G)
+        Hypotheses (p, log f).
+    iterations : int
+        Maximum number of steps.
+    planes_only : bool
+        Keep the focal lengths fixed.
+
+    Returns
+    -------
+    theta : ndarray (B, 3 + G)
+        Refined hypotheses.
+    cost : ndarray (B,)
+        Their costs.
+    """
+
+    def normal_equations(x: F64) -> tuple[F64, F64]:
+        weights = criterion._weights(frame, x)
+        r = criterion._weighted_residuals(frame, x, weights)
+        J = numerical_jacobian(lambda t: criterion._weighted_residuals(frame, t, weights), x)
+        if planes_only:
+            J[:, :, 3:] = 0.0
+        return np.einsum("bri,brj->bij", J, J), np.einsum("bri,br->bi", J, r)
+
+    return _descend(
+        normal_equations,
+        lambda x: criterion.cost(frame, x[:, :3], x[:, 3:]),
+        lambda x: np.concatenate([x[:, :3], np.clip(x[:, 3:], -4.0, 5.4)], axis=1),
+        theta,
+        iterations,
+        _Schedule(1e-3, 5.0, 1e8, 1e-10, skip_nonfinite=False),
+    )
+
+
+def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> tuple[F64, float]:
+    """Estimate the standard deviations of the log focal lengths from the residuals.
+
+    Parameters
+    ----------
+    criterion : RotationCriterion
+        Criterion that was minimized.
+    frame : ReferenceFrame
+        Cameras.
+    theta : ndarray (3 + G,)
+        Minimum (p, log f).
+
+    Returns
+    -------
+    std : ndarray (G,)
+        Standard deviations from (J'J)^-1; inf if J'J is singular to rounding.
+    noise : float
+        Noise of a residual entry: five independent entries per camera, minus the unknowns.
     """
     row = theta[None]
-    weights = criterion.weights(frame, row)
-    r = criterion.weighted_residuals(frame, row, weights)[0]
-    J = _jacobian(criterion, frame, row, weights)[0]
+    weights = criterion._weights(frame, row)
+    r = criterion._weighted_residuals(frame, row, weights)[0]
+    J = numerical_jacobian(lambda t: criterion._weighted_residuals(frame, t, weights), row)[0]
     dof = max(5 * len(frame.views) - len(theta), 1)
     noise = float(np.sqrt(np.sum(r**2) / dof))
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
@@ -158,36 +256,46 @@ def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -
     return noise * np.sqrt(variance[3:]), noise
 
 
-_STEP = 1e-6
-
-
-def descend(
+def minimize_batch(
     residuals: Callable[[F64], F64], starts: F64, *, iterations: int, loss_scale: float = np.inf
 ) -> tuple[F64, F64]:
-    """Where descents from ``starts`` (B, D) end, and their costs (B,): the mean loss of a residual.
+    """Minimize from many starts at once by Levenberg-Marquardt.
 
-    ``residuals`` takes (B, D) to (B, M) row by row; a row with NaN is refused. Soft-L1 loss that turns at
-    ``loss_scale``, squares where it is infinite. Derivatives are central differences. No cost rises.
+    Parameters
+    ----------
+    residuals : callable
+        Maps (B, D) to residuals (B, M) row by row; a row with NaN is rejected.
+    starts : ndarray (B, D)
+        Starting points.
+    iterations : int
+        Maximum number of steps.
+    loss_scale : float
+        Residual beyond which the soft-L1 loss is linear; inf for least squares.
+
+    Returns
+    -------
+    x : ndarray (B, D)
+        Minima.
+    cost : ndarray (B,)
+        Mean loss of a residual; never above that of the start.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> x, cost = minimize_batch(lambda x: x**2 - 2.0, np.array([[1.0], [-3.0]]), iterations=20)
+    >>> np.round(x[:, 0], 6)
+    array([ 1.414214, -1.414214])
     """
-    x, r = starts.copy(), residuals(starts)
-    cost, damping = _cost(r, loss_scale), np.full(len(starts), 1e-2)
-    for _ in range(iterations):
-        J = derivatives(residuals, x)
+
+    def normal_equations(x: F64) -> tuple[F64, F64]:
+        r, J = residuals(x), numerical_jacobian(residuals, x)
         weight = (1.0 + (r / loss_scale) ** 2) ** -0.5
-        N = np.einsum("bmi,bm,bmj->bij", J, weight, J)
-        g = np.einsum("bmi,bm->bi", J, weight * r)
-        N += damping[:, None, None] * np.eye(x.shape[1]) * (np.einsum("bii->bi", N) + 1e-12)[:, None, :]
-        trial = x - solve_guarded(N, g)
-        r_trial = residuals(trial)
-        trial_cost = _cost(r_trial, loss_scale)
-        better = trial_cost < cost
-        settled = better & (cost - trial_cost <= 1e-14 * cost)
-        x, r = np.where(better[:, None], trial, x), np.where(better[:, None], r_trial, r)
-        cost = np.where(better, trial_cost, cost)
-        damping = np.where(better, damping / 6.0, damping * 4.0)
-        if (settled | (damping > 1e10) | ~np.isfinite(cost)).all():
-            break
-    return x, cost
+        return np.einsum("bmi,bm,bmj->bij", J, weight, J), np.einsum("bmi,bm->bi", J, weight * r)
+
+    schedule = _Schedule(1e-2, 6.0, 1e10, 1e-14, skip_nonfinite=True)
+    return _descend(
+        normal_equations, lambda x: _cost(residuals(x), loss_scale), lambda x: x, starts, iterations, schedule
+    )
 
 
 def _cost(r: F64, loss_scale: float) -> F64:
@@ -197,11 +305,45 @@ def _cost(r: F64, loss_scale: float) -> F64:
     return np.asarray(np.nan_to_num(squares.mean(axis=1), nan=np.inf))
 
 
-def derivatives(residuals: Callable[[F64], F64], x: F64) -> F64:
-    """Central differences (B, M, D) of residuals (B, M) at x (B, D)."""
-    steps = _STEP * (1.0 + np.abs(x))
+def numerical_jacobian(residuals: Callable[[F64], F64], x: F64) -> F64:
+    """Compute the Jacobian of a batch by central differences.
+
+    Parameters
+    ----------
+    residuals : callable
+        Maps (B, D) to (B, M).
+    x : ndarray (B, D)
+        Points.
+
+    Returns
+    -------
+    ndarray (B, M, D)
+        Derivatives.
+    """
+    steps = 1e-6 * (1.0 + np.abs(x))
     columns = []
     for k in range(x.shape[1]):
         shift = steps * (np.arange(x.shape[1]) == k)
         columns.append((residuals(x + shift) - residuals(x - shift)) / (2.0 * steps[:, k, None]))
     return np.stack(columns, axis=-1)
+
+
+def central_differences(residuals: Callable[[F64], F64], x: F64, steps: F64) -> F64:
+    """Compute the Jacobian at one point by central differences, in one call of the residuals.
+
+    Parameters
+    ----------
+    residuals : callable
+        Maps (B, D) to (B, M).
+    x : ndarray (D,)
+        Point.
+    steps : ndarray (D,)
+        Step of each coordinate.
+
+    Returns
+    -------
+    ndarray (M, D)
+        Derivatives.
+    """
+    shifts = np.diag(steps)
+    return np.asarray(((residuals(x + shifts) - residuals(x - shifts)) / (2.0 * steps[:, None])).T)

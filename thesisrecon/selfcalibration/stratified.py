@@ -18,22 +18,13 @@ from thesisrecon.selfcalibration.candidates import (
     select_candidate,
 )
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, PlaneCandidates, ProjectiveScene
-from thesisrecon.selfcalibration.frame import (
-    ReferenceFrame,
-    SolverUnknowns,
-    normalized_frame,
-    solver_unknowns,
-)
-from thesisrecon.selfcalibration.hartley import (
-    CalibrationProblem,
-    FixedPlaneQuadric,
-    LinearAbsoluteConic,
-    conic_constraints,
-)
+from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
+from thesisrecon.selfcalibration.hartley import CalibrationProblem, FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.quadric import dual_image_residuals, minimize_quadric
 from thesisrecon.selfcalibration.refinement import RotationCriterion
+from thesisrecon.selfcalibration.unknowns import SolverUnknowns, conic_constraints, solver_unknowns
 
 REFINED = 3
 """The best answers in closed form that are worth refining."""

@@ -1,21 +1,20 @@
-"""Chapters 6 and 7 on random subsets of real photographs: ``python -m validation.studies.subsets``.
+"""Chapters 6 and 7 on random subsets of real images.
 
-Each trial takes 5 to 8 of a set's cameras (``--views``), a random share of the tracks, another seed and
-another initial pair, and goes from tracks to metric cameras as the pipeline does, with its three attempts. A
-trial succeeds where the median focal length of its cameras is within 3 % of the truth; the self-check must
-flag what does not. Where a set has no truth, the answer from all of its photographs stands in. The nine views
-of the Cones, a camera that was shifted without turning, have no right answer but a refusal that says so.
+Each trial takes 5 to 8 cameras of a set (``--views``), a random share of the tracks, another seed and another
+initial pair, and goes from tracks to metric cameras as the pipeline does. A trial succeeds if the median
+focal length of its cameras is within 3 % of the truth; the self-check must flag the others. Without truth,
+the result of all images stands in. The nine views of the Cones come from a camera that moves without
+rotation: a refusal that says so is the only right answer.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
-import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -27,23 +26,31 @@ from thesisrecon.pipeline.cameras import ATTEMPTS
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from thesisrecon.runtime.run import stream
-from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_scene, load_real_scene
+from validation.scenes.real import REAL_SCENES, Scene
+from validation.studies.runner import SHIFTED, Part, Rows, scenes_here, text_table
 
 MODES = ("shared", "per-image")
 SUCCESS_PCT = 3.0
 LEAST_SUCCESS = 0.98
 MIN_VIEWS, MAX_VIEWS = 5, 8
-SHIFTED = "Cones9"
-SHIFTED_REASONS = ("pure translation", "leaves the focal length open", "at least 3 photographs")
+SHIFTED_REASONS = ("pure translation", "leaves the focal length open", "at least 3 registered images")
 LEAST_SHARE = 0.3
 LATEST_START = 4
 
 
 @dataclass(frozen=True)
 class Matched:
-    """A set after its front end: tracks, pairs, image ``sizes`` (V, 2), and the ``focal_px`` (V,) at working
-    size that the answers are held against; ``reasons`` one of which a refusal must give, empty where any
-    will do."""
+    """An image set after its front end.
+
+    Attributes
+    ----------
+    sizes : (V, 2)
+        Image sizes.
+    focal_px : (V,)
+        True focal lengths at working size.
+    reasons : tuple of str
+        Accepted reasons of a refusal; empty if any reason will do.
+    """
 
     name: str
     tracks: Tracks
@@ -54,17 +61,22 @@ class Matched:
 
 
 OUTCOMES = ("right", "open", "refused", "refused, another reason", "right, doubted", "wrong", "crash")
-"""Of a trial: within 3 % and trusted; farther off, but not farther than its 95 % interval; wrong or without
-an answer and not trusted, for the right reason or another; within 3 % and not trusted; wrong and trusted."""
+"""Outcomes: within 3 % and trusted; farther off but inside its 95 % interval; not trusted (wrong or without
+an answer) for an accepted reason or another one; within 3 % and not trusted; wrong and trusted."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One subset: its views, what came of it, and how long it took.
+    """One subset and its outcome.
 
-    ``median_pct`` and ``worst_pct`` are focal errors over the registered cameras, NaN where there is no
-    answer; ``failed_checks`` is empty where the answer is trusted; ``interval_pct`` is half of the median 95 %
-    interval of the focals; ``reasons`` as in :class:`Matched`.
+    Attributes
+    ----------
+    median_pct, worst_pct : float
+        Focal errors over the registered cameras, NaN without an answer.
+    failed_checks : tuple of str
+        Empty if the answer is trusted.
+    interval_pct : float
+        Half of the median 95 % interval of the focal lengths.
     """
 
     number: int
@@ -81,7 +93,7 @@ class Trial:
 
     @property
     def right(self) -> bool:
-        """Whether there is an answer whose median focal is within 3 %."""
+        """Whether there is an answer with a median focal error of at most 3 %."""
         return self.median_pct <= SUCCESS_PCT
 
     @property
@@ -92,14 +104,14 @@ class Trial:
         if self.right:
             return "right, doubted" if self.failed_checks else "right"
         if self.failed_checks:
-            told = "; ".join(self.failed_checks)
-            named = not self.reasons or any(reason in told for reason in self.reasons)
+            text = "; ".join(self.failed_checks)
+            named = not self.reasons or any(reason in text for reason in self.reasons)
             return "refused" if named else "refused, another reason"
         return "open" if self.median_pct <= self.interval_pct else "wrong"
 
 
 def match_scene(scene: Scene, work: Path, *, threads: int) -> Matched:
-    """The front end of a set, resumed from ``work`` where it was run before."""
+    """Run the front end of a set, or resume it in ``work``."""
     result = reconstruct(scene.image_paths, work / scene.name, until="metric", threads=threads)
     assert result.tracks is not None
     assert result.metric is not None
@@ -118,7 +130,7 @@ def match_scene(scene: Scene, work: Path, *, threads: int) -> Matched:
 
 
 def take_views(matched: Matched, views: I64, kept: B8) -> Matched:
-    """The set as if only these views had been taken, and only the tracks ``kept`` (N,) had been found."""
+    """Return the set as if only these views and only the ``kept`` (N,) tracks existed."""
     t, number = matched.tracks, np.full(matched.tracks.n_views, -1, dtype=np.int64)
     number[views] = np.arange(len(views))
     k = (number[t.view_index] >= 0) & kept[t.point_index]
@@ -138,9 +150,12 @@ def take_views(matched: Matched, views: I64, kept: B8) -> Matched:
 def solve(
     matched: Matched, config: PipelineConfig, *, seed: int, first: int
 ) -> tuple[MetricResult | None, tuple[str, ...], int]:
-    """From tracks to metric cameras; the answer, the failures' sentences, the number of attempts.
+    """Go from tracks to metric cameras with the attempts of the pipeline.
 
-    As the pipeline: up to three attempts, the first trusted answer, else the one with most cameras.
+    Returns
+    -------
+    tuple
+        The first trusted result, else the one with most cameras, or None; the failures; the number of attempts.
     """
     n = len(matched.sizes)
     sizes = [(int(width), int(height)) for width, height in matched.sizes]
@@ -185,7 +200,7 @@ def run_trial(
     chosen = np.sort(rng.choice(matched.tracks.n_views, count, replace=False))
     kept = rng.random(matched.tracks.n_points) < rng.uniform(LEAST_SHARE, 1.0)
     subset = take_views(matched, chosen, kept)
-    # Two photographs have one pair to begin with.
+    # Two images have a single pair.
     first = int(rng.integers(max(min(LATEST_START, sum(pair.accepted for pair in subset.pairs)), 1)))
     wish = IntrinsicsOptions(cameras="shared" if mode == "shared" else "per-image")
     start, names = time.perf_counter(), tuple(int(view) for view in chosen)
@@ -216,85 +231,46 @@ def run_trial(
     )
 
 
-def describe(trial: Trial) -> str:
-    """One line on a trial."""
-    verdict = f"{trial.outcome}: {trial.crash or '; '.join(trial.failed_checks) or 'trusted'}"
-    return (
-        f"{trial.number}: views {trial.views}, {trial.registered} registered, focal {trial.median_pct:.2f} % "
-        f"median {trial.worst_pct:.2f} % worst, {trial.attempts} attempts, {trial.seconds:.1f} s, {verdict}"
-    )
-
-
-def table_row(name: str, mode: str, trials: Sequence[Trial]) -> str:
-    """One row of the table of :func:`main`."""
+def table_row(name: str, mode: str, trials: Sequence[Trial]) -> list[object]:
+    """Return one row of the table."""
     errors = [trial.median_pct for trial in trials if np.isfinite(trial.median_pct)]
     worst = [t.worst_pct for t in trials if not t.failed_checks and np.isfinite(t.worst_pct)]
-    return (
-        f"| {name} | {mode} | {len(trials)} "
-        f"| {' | '.join(str(sum(t.outcome == kind for t in trials)) for kind in OUTCOMES)} "
-        f"| {f'{np.median(errors):.2f}' if errors else '-'} | {f'{max(worst):.2f}' if worst else '-'} "
-        f"| {np.median([trial.seconds for trial in trials]):.1f} |"
-    )
+    counts = [sum(t.outcome == kind for t in trials) for kind in OUTCOMES]
+    numbers = [f"{np.median(errors):.2f}" if errors else "-", f"{max(worst):.2f}" if worst else "-"]
+    return [name, mode, len(trials), *counts, *numbers, f"{np.median([t.seconds for t in trials]):.1f}"]
 
 
-HEAD = (
-    f"| set | cameras | trials | {' | '.join(OUTCOMES)} | median error, % "
-    "| worst camera of a trusted answer, % | median time, s |\n" + "| --- " * (len(OUTCOMES) + 6) + "|"
-)
+HEAD = ["set", "cameras", "trials", *OUTCOMES, "median error, %", "worst camera of a trusted answer, %"]
 
 
-def load_scene(name: str) -> Scene | None:
-    """A set by its name, None where it is not on this machine."""
-    if name == "courtyard":
-        return load_fixture_scene()
-    if name != SHIFTED:
-        return load_real_scene(name)
-    root = data_root()
-    paths = () if root is None else tuple(sorted((root / "stereo" / SHIFTED).glob("im*.png")))
-    return Scene(SHIFTED, paths) if paths else None
+def subsets_study(
+    out: Path,
+    scenes: Sequence[str] = (*REAL_SCENES, "courtyard", SHIFTED),
+    modes: Sequence[Literal["shared", "per-image"]] = MODES,
+    trials: int = 100,
+    views: Sequence[int] = (MIN_VIEWS, MAX_VIEWS),
+    threads: int = 2,
+) -> Iterator[Part]:
+    """Reconstruct random subsets of images and of tracks.
 
-
-def main(arguments: list[str] | None = None) -> int:
-    """Print every trial that is not right and trusted, and the table; 1 where a set misses the bounds."""
-    parser = argparse.ArgumentParser(prog="python -m validation.studies.subsets", description=__doc__)
-    scenes = [*REAL_SCENES, "courtyard", SHIFTED]
-    parser.add_argument("--scenes", nargs="*", default=scenes, choices=scenes)
-    parser.add_argument("--modes", nargs="*", default=list(MODES), choices=MODES)
-    parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument(
-        "--views", type=int, nargs=2, default=[MIN_VIEWS, MAX_VIEWS], metavar=("LEAST", "MOST")
-    )
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--work", type=Path, help="folder that keeps the matched photographs")
-    wishes = parser.parse_args(arguments)
-    with tempfile.TemporaryDirectory() as place:
-        matched = []
-        for name in wishes.scenes:
-            scene = load_scene(name)
-            if scene is None:
-                print(f"{name} is not on this machine")
-                continue
-            matched.append(match_scene(scene, wishes.work or Path(place), threads=wishes.threads))
-    return report(matched, wishes.modes, wishes.trials, tuple(wishes.views))
-
-
-def report(sets: Sequence[Matched], modes: Sequence[str], trials: int, views: tuple[int, int]) -> int:
-    """Run the trials, print them and the table; 1 where a set misses the bounds."""
-    rows, missed = [], False
-    for matched in sets:
+    Parameters
+    ----------
+    modes : sequence of str
+        One camera for all images, or one for each.
+    """
+    rows, judged = [], Rows("subsets", "share")
+    for scene in scenes_here(scenes):
+        matched = match_scene(scene, out, threads=threads)
         for mode in modes:
-            done = [run_trial(matched, mode, number, views=views) for number in range(trials)]
-            for trial in done:
-                if trial.outcome != "right":
-                    print(f"{matched.name}, {mode}, {describe(trial)}", flush=True)
+            done = [run_trial(matched, mode, number, views=(views[0], views[1])) for number in range(trials)]
+            for trial in (t for t in done if t.outcome != "right"):
+                print(f"{matched.name}, {mode}: {trial.outcome}: {trial}", file=sys.stderr, flush=True)
             rows.append(table_row(matched.name, mode, done))
             wanted = "refused" if matched.reasons else "right"
-            missed |= any(trial.outcome in ("wrong", "crash") for trial in done)
-            missed |= sum(trial.outcome == wanted for trial in done) < LEAST_SUCCESS * len(done)
-            print(rows[-1], flush=True)
-    print("\n".join([HEAD, *rows]))
-    return int(missed)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            share = sum(trial.outcome == wanted for trial in done) / len(done)
+            bad = sum(trial.outcome in ("wrong", "crash") for trial in done)
+            judged.add(f"{matched.name}, {mode}: {wanted}", share, at_least=LEAST_SUCCESS)
+            judged.add(f"{matched.name}, {mode}: wrong or crash", bad, at_most=0.0)
+    if rows:
+        yield text_table([*HEAD, "median time, s"], rows)
+        yield judged

@@ -14,11 +14,11 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry.homogeneous import whitening_transform
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.numerics.noise import noise_from_distances
-from thesisrecon.numerics.observations import whitening_transform
+from thesisrecon.numerics.partial_bundle import refine_points
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
-from thesisrecon.numerics.separate_refinement import refine_points
 from thesisrecon.projective.initial_pair import NO_PARALLAX
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
@@ -50,7 +50,7 @@ CELLS = 8
 """Of the grid over a view, along each side."""
 
 
-def tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> B8:
+def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> B8:
     """Tracks that are not seen from one standpoint only; -> (n_points,) bool.
 
     Two views whose matches one homography explains to the share ``most`` show a point without parallax, or on
@@ -96,7 +96,7 @@ def _first_in_turn(tracks: Tracks, k: I64, length: I64, cells: int) -> I64:
     return by_length[np.lexsort((by_length, -length[tracks.point_index[k]][by_length], turn))]
 
 
-def grid_cells(tracks: Tracks, *, cells: int = CELLS) -> I64:
+def observation_cells(tracks: Tracks, *, cells: int = CELLS) -> I64:
     """(K,) the cell of each observation in a grid of ``cells`` x ``cells`` of its view's extent, the cells of
     all views counted through."""
     low, high = np.full((2, tracks.n_views, 2), np.inf)
@@ -107,8 +107,8 @@ def grid_cells(tracks: Tracks, *, cells: int = CELLS) -> I64:
     return np.asarray((view * cells + cell[:, 0]) * cells + cell[:, 1], dtype=np.int64)
 
 
-def spread_of_views(cell: I64, chosen: B8, n_views: int, *, cells: int = CELLS) -> F64:
-    """How much of each view its ``chosen`` (K,) observations hold, from :func:`grid_cells`; -> (V,).
+def coverage_of_views(cell: I64, chosen: B8, n_views: int, *, cells: int = CELLS) -> F64:
+    """How much of each view its ``chosen`` (K,) observations hold, from :func:`observation_cells`; -> (V,).
 
     The sum over the grid of the root of their number in the cell: many points count, and points all over the
     picture count more than a crowd in a corner.
@@ -130,7 +130,7 @@ def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:
     )
 
 
-def onto_all_tracks(reconstruction: Reconstruction, tracks: Tracks, keep: B8) -> Reconstruction:
+def expand_to_all_tracks(reconstruction: Reconstruction, tracks: Tracks, keep: B8) -> Reconstruction:
     """A reconstruction of the tracks marked in ``keep``, told in the numbers of all ``tracks``."""
     X = np.zeros((tracks.n_points, 4))
     X[keep] = reconstruction.X
@@ -149,7 +149,7 @@ POINT_ITERATIONS = 4
 
 
 @dataclass
-class GrowingModel:
+class ProjectiveModel:
     """The reconstruction while it grows.
 
     ``P`` (V, 3, 4) and ``X`` (N, 4), zeros where there is none yet, their signs such that depths are
@@ -163,7 +163,7 @@ class GrowingModel:
     P: F64
     X: F64
     registered: B8
-    ok: B8
+    inlier: B8
     sigma_px: float
     noise_floor_px: float
     reasons: list[str] = field(default_factory=list)
@@ -172,19 +172,19 @@ class GrowingModel:
     cell: I64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @staticmethod
-    def empty(tracks: Tracks, sizes: I64, *, sigma_px: float, noise_floor_px: float) -> GrowingModel:
+    def empty(tracks: Tracks, sizes: I64, *, sigma_px: float, noise_floor_px: float) -> ProjectiveModel:
         """A model without cameras."""
         n = tracks.n_views
-        return GrowingModel(
+        return ProjectiveModel(
             tracks, sizes, np.zeros((n, 3, 4)), np.zeros((tracks.n_points, 4)), np.zeros(n, dtype=bool),
             np.zeros(len(tracks.xy), dtype=bool), max(sigma_px, noise_floor_px), noise_floor_px,
-            [""] * n, np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), grid_cells(tracks),
+            [""] * n, np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), observation_cells(tracks),
         )  # fmt: skip
 
     @property
     def used(self) -> B8:
         """(K,) observations of registered views that are explained."""
-        return self.ok & self.registered[self.tracks.view_index]
+        return self.inlier & self.registered[self.tracks.view_index]
 
     @property
     def valid(self) -> B8:
@@ -199,7 +199,7 @@ class GrowingModel:
         return counts, counts / np.maximum(np.bincount(t.view_index[ready], minlength=n), 1)
 
 
-def retriangulate(model: GrowingModel, sigmas: float, *, points: B8 | None = None) -> None:
+def retriangulate_points(model: ProjectiveModel, sigmas: float, *, points: B8 | None = None) -> None:
     """Points afresh from all observations in registered views (all, or those of ``points`` (N,) bool), then
     the gate of ``sigmas`` noise sigmas; a point with a wrong observation once more from those that agree.
     """
@@ -208,16 +208,16 @@ def retriangulate(model: GrowingModel, sigmas: float, *, points: B8 | None = Non
     if points is not None:
         near = near & points[t.point_index]
     _triangulate(model, near)
-    mark(model, sigmas)
-    spoiled = np.bincount(t.point_index[near & ~model.ok], minlength=t.n_points) > 0
+    update_inliers(model, sigmas)
+    spoiled = np.bincount(t.point_index[near & ~model.inlier], minlength=t.n_points) > 0
     spoiled &= np.bincount(t.point_index[near], minlength=t.n_points) >= 3
     if spoiled.any():
         again = near & spoiled[t.point_index]
-        _triangulate(model, again & agreeing_observations(model, again, sigmas * model.sigma_px))
-        mark(model, sigmas)
+        _triangulate(model, again & consistent_observations(model, again, sigmas * model.sigma_px))
+        update_inliers(model, sigmas)
 
 
-def _triangulate(model: GrowingModel, chosen: B8) -> None:
+def _triangulate(model: ProjectiveModel, chosen: B8) -> None:
     """Linear, then least reprojection, of the points with two of the ``chosen`` (K,) observations."""
     t = model.tracks
     view, point, xy = t.view_index[chosen], t.point_index[chosen], t.xy[chosen]
@@ -227,7 +227,7 @@ def _triangulate(model: GrowingModel, chosen: B8) -> None:
     model.X = np.where(found[:, None], X, model.X)
 
 
-def agreeing_observations(model: GrowingModel, chosen: B8, gate_px: float) -> B8:
+def consistent_observations(model: ProjectiveModel, chosen: B8, gate_px: float) -> B8:
     """Of the ``chosen`` (K,) observations those that agree with the best of ``HYPOTHESES`` two-view points.
 
     A wrong observation spoils a least-squares point, sometimes so far that its right ones look wrong: each
@@ -266,18 +266,18 @@ def _residuals(P: F64, X: F64, xy: F64) -> F64:
     return np.asarray(np.nan_to_num(distance, nan=np.inf))
 
 
-def mark(model: GrowingModel, sigmas: float) -> None:
+def update_inliers(model: ProjectiveModel, sigmas: float) -> None:
     """Signs of the points made those of their cameras, then ``ok`` = in front and within the gate (6.5)."""
     t = model.tracks
     chosen = model.registered[t.view_index] & (np.abs(model.X).sum(axis=1) > 0)[t.point_index]
     depth, distance = project_observations(model.P, model.X, t.view_index, t.point_index, t.xy, chosen)
     flip = np.where(np.bincount(t.point_index, np.sign(depth), minlength=t.n_points) < 0, -1.0, 1.0)
     model.X = model.X * flip[:, None]
-    model.ok = (distance < sigmas * model.sigma_px) & (depth * flip[t.point_index] > 0)
-    model.ok &= model.valid[t.point_index]
+    model.inlier = (distance < sigmas * model.sigma_px) & (depth * flip[t.point_index] > 0)
+    model.inlier &= model.valid[t.point_index]
 
 
-def adjust(model: GrowingModel, iterations: int, sigmas: float) -> None:
+def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
     """Bundle adjustment of everything (6.7), the noise estimated afresh, all points anew under the gate."""
     t, used = model.tracks, model.used
     if used.sum() < 2 * 8:
@@ -290,10 +290,12 @@ def adjust(model: GrowingModel, iterations: int, sigmas: float) -> None:
     norm = np.asarray(np.linalg.norm(result.residual_px, axis=1))
     # Two-view points carry less residual than noise: hence the floor.
     model.sigma_px = max(noise_from_distances(norm), model.noise_floor_px)
-    retriangulate(model, sigmas)
+    retriangulate_points(model, sigmas)
 
 
-def adjust_around(model: GrowingModel, view: int, iterations: int, sigmas: float, *, neighbours: int) -> None:
+def adjust_locally(
+    model: ProjectiveModel, view: int, iterations: int, sigmas: float, *, local_bundle_views: int
+) -> None:
     """Bundle adjustment of one view, the ``neighbours`` that share most points with it, and their points.
 
     The other cameras that see these points are held and hold the frame.
@@ -303,7 +305,7 @@ def adjust_around(model: GrowingModel, view: int, iterations: int, sigmas: float
     its[t.point_index[used & (t.view_index == view)]] = True
     shared = np.bincount(t.view_index[used & its[t.point_index]], minlength=t.n_views)
     free = np.zeros(t.n_views, dtype=bool)
-    free[np.argsort(-shared, kind="stable")[: neighbours + 1]] = True
+    free[np.argsort(-shared, kind="stable")[: local_bundle_views + 1]] = True
     free &= shared > 0
     local = np.zeros(t.n_points, dtype=bool)
     local[t.point_index[used & free[t.view_index]]] = True
@@ -315,10 +317,10 @@ def adjust_around(model: GrowingModel, view: int, iterations: int, sigmas: float
         loss_px=LOSS_SIGMAS * model.sigma_px, max_iterations=iterations, fixed_views=~free,
     )  # fmt: skip
     model.P, model.X = result.P, result.X
-    retriangulate(model, sigmas, points=local)
+    retriangulate_points(model, sigmas, points=local)
 
 
-def _whitened(P: F64, X: F64, model: GrowingModel) -> tuple[F64, F64]:
+def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
     """Keep the frame well-conditioned: sum XX' = I over the valid points, unit norms, signs kept."""
     T = whitening_transform(X[model.valid])
     X = X @ T.T
@@ -328,7 +330,7 @@ def _whitened(P: F64, X: F64, model: GrowingModel) -> tuple[F64, F64]:
     return P / np.where(norm > 0, norm, 1.0), X / np.where(length > 0, length, 1.0)
 
 
-def finish(model: GrowingModel) -> Reconstruction:
+def to_reconstruction(model: ProjectiveModel) -> Reconstruction:
     """The record of a grown model, with a reason for every view that is not in it."""
     for view in np.flatnonzero(~model.registered):
         if not model.reasons[view]:
