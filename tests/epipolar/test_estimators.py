@@ -240,7 +240,7 @@ def test_points_on_one_line_fail_with_a_sentence(estimator):
     line = np.linspace(0, 1000, 30)[:, None] * [1.0, 0.7] + 5.0
     point = np.full((30, 2), 7.0)
     for xy1, xy2, image in ((line, good, "first"), (good, line, "second"), (point, good, "first")):
-        with pytest.raises(StageFailure, match=f"one line in the {image} image"):
+        with pytest.raises(StageFailure, match=f"collinear in the {image} image"):
             estimator.estimate(xy1, xy2, rng)
 
 

@@ -19,7 +19,7 @@ import scipy
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar.degeneracy import (
     chance_of_agreement,
-    geometries_of_plane,
+    fundamentals_of_plane,
     log10_false_alarms,
     multiplicity_weights,
 )
@@ -28,7 +28,7 @@ from thesisrecon.epipolar.planes import find_dominant_plane, plane_covariance, r
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
 from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.geometry.two_view import homography_distances
+from thesisrecon.geometry.two_view import homography_sampson_residuals
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 from thesisrecon.numerics.noise import noise_scale, trimmed_noise_scale
 
@@ -40,7 +40,7 @@ CONSTRAINTS = 2
 ITERATIONS = 50
 
 
-def turned_camera(parameters: F64) -> F64:
+def rotation_homography(parameters: F64) -> F64:
     """K R K^-1 (3, 3) of log f, principal point and rotation vector (6,)."""
     f, (x, y) = float(np.exp(np.clip(parameters[0], -20.0, 20.0))), parameters[1:3]
     K = np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
@@ -49,7 +49,7 @@ def turned_camera(parameters: F64) -> F64:
     return H
 
 
-def turning_ratio(H: F64, xy1: F64, xy2: F64, *, risk: float) -> float:
+def rotation_homography_test(H: F64, xy1: F64, xy2: F64, *, risk: float) -> float:
     """Increase of the squared residuals from H to the best K R K^-1, over the limit that noise keeps to.
 
     ``H`` (3, 3) is the least-squares homography of matches (N > 4, 2) in coordinates about one centre for
@@ -58,11 +58,11 @@ def turning_ratio(H: F64, xy1: F64, xy2: F64, *, risk: float) -> float:
     """
 
     def residuals(parameters: F64) -> F64:
-        return homography_distances(turned_camera(parameters), xy1, xy2).ravel()
+        return homography_sampson_residuals(rotation_homography(parameters), xy1, xy2).ravel()
 
     starts = [_start(H, f) for f in FOCALS]
     costs = [float(np.sum(residuals(start) ** 2)) for start in starts]
-    rss = float(np.sum(homography_distances(H, xy1, xy2) ** 2))
+    rss = float(np.sum(homography_sampson_residuals(H, xy1, xy2) ** 2))
     degrees = 2 * len(xy1) - 8
     limit = (
         CONSTRAINTS * float(scipy.special.fdtri(CONSTRAINTS, degrees, 1.0 - risk)) * max(rss, 1e-24) / degrees
@@ -123,7 +123,7 @@ class Configuration(Enum):
 
 
 @dataclass(frozen=True)
-class Degeneracy:
+class ConfigurationReport:
     """The name and the evidence that it rests on.
 
     Attributes
@@ -135,10 +135,10 @@ class Degeneracy:
     off_homography : share of the inliers more than 4 sigma off it.
     off_homography_chance : log10 of how often chance has as many of the wrong matches agree with F; below -3
         they show relief.
-    turning_errors : |trace H - trace H^-1| (det H = 1), 0 for a rotation, in its standard errors.
-    turning_camera_ratio : increase of the squared residuals from the homography to that of a camera of square
+    rotation_errors : |trace H - trace H^-1| (det H = 1), 0 for a rotation, in its standard errors.
+    rotation_camera_ratio : increase of the squared residuals from the homography to that of a camera of square
         pixels that turned, over its limit; at most 1 for a rotation, NaN where the eigenvalues told already.
-    turn_deg : the angle of that rotation, NaN where the eigenvalues are not those of one.
+    rotation_deg : the angle of that rotation, NaN where the eigenvalues are not those of one.
     translation_ratio : increase of the squared residuals from F to [e]x, over its limit; at most 1 where F is
         that of a translation, inf where more matches leave [e]x than chance would have.
     """
@@ -148,9 +148,9 @@ class Degeneracy:
     homography_errors: float
     off_homography: float
     off_homography_chance: float
-    turning_errors: float
-    turning_camera_ratio: float
-    turn_deg: float
+    rotation_errors: float
+    rotation_camera_ratio: float
+    rotation_deg: float
     translation_ratio: float
 
     def __str__(self) -> str:
@@ -158,13 +158,13 @@ class Degeneracy:
             f"{self.kind.value}: noise {self.sigma_px:.2g} px, homography off by "
             f"{self.homography_errors:.1f} standard errors with {100.0 * self.off_homography:.0f} % of the "
             f"matches beyond it (10^{self.off_homography_chance:.0f} by chance), rotation "
-            f"off by {self.turning_errors:.1f}, translation at {self.translation_ratio:.2g} of its limit"
+            f"off by {self.rotation_errors:.1f}, translation at {self.translation_ratio:.2g} of its limit"
         )
 
 
 def classify_configuration(
     F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None, seed: int = 0
-) -> Degeneracy:
+) -> ConfigurationReport:
     """Name what the matches (N, 2) px that agree with F (3, 3) show.
 
     ``inliers`` (N,), at least 12, are those that agree, all of them where None. Given the wrong ones too it
@@ -217,7 +217,7 @@ def _scale(f: F64, points: F64) -> float:
     return max(trimmed_noise_scale(r, noise_scale(r)), 1e-12)
 
 
-def _classify(case: _Case, scale: float, seed: int) -> Degeneracy:
+def _classify(case: _Case, scale: float, seed: int) -> ConfigurationReport:
     sigma = case.sigma
     errors, off, chance, turning, angle, camera = np.inf, 1.0, -np.inf, np.inf, np.nan, np.nan
     plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
@@ -238,12 +238,12 @@ def _classify(case: _Case, scale: float, seed: int) -> Degeneracy:
         turned = turning < _turn_limit(int(near.sum())) and np.isfinite(angle)
         if turned:
             xy1, xy2 = case.points[near, :2], case.points[near, 2:]
-            camera = turning_ratio(plane.h.reshape(3, 3), xy1, xy2, risk=TURN_RISK)
+            camera = rotation_homography_test(plane.h.reshape(3, 3), xy1, xy2, risk=TURN_RISK)
             turned = camera <= 1.0
         kind = Configuration.ROTATION if turned else Configuration.PLANE
     elif ratio <= 1.0:
         kind = Configuration.TRANSLATION
-    return Degeneracy(kind, sigma / scale, errors, off, chance, turning, camera, angle, ratio)
+    return ConfigurationReport(kind, sigma / scale, errors, off, chance, turning, camera, angle, ratio)
 
 
 def _plane_noise(squared: F64) -> float:
@@ -338,7 +338,7 @@ def _fit_translation(points: F64, sigma: float) -> F64:
     some = points[rng.permutation(len(points))[:200]]
     pairs = rng.integers(0, len(some), (100, 2))
     weights = np.ones((1, len(some)))
-    F, _, found = geometries_of_plane(identity, some, weights, pairs, 4.0 * BAND * sigma)
+    F, _, found = fundamentals_of_plane(identity, some, weights, pairs, 4.0 * BAND * sigma)
     f: F64 = F[int(np.argmax(found[:, 0]))].copy()
     for gate in (4.0, 2.0, 1.5):
         _refine_translation(f, points, gate * 4.0 * sigma)

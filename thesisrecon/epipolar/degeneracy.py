@@ -34,7 +34,7 @@ NEIGHBOURS = 5
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def parallax_lines(h: F64, points: F64) -> F64:
+def _parallax_lines(h: F64, points: F64) -> F64:
     """(N, 3) lines x2 x H x1, in image 2 through a match and the place where the plane would have it."""
     lines = np.empty((len(points), 3))
     for k in range(len(points)):
@@ -47,7 +47,7 @@ def parallax_lines(h: F64, points: F64) -> F64:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def geometry_of_plane(h: F64, e2: F64, f: F64) -> None:
+def _fundamental_of_plane(h: F64, e2: F64, f: F64) -> None:
     """f = [e2]x H, unit norm."""
     for j in range(3):
         f[j] = e2[1] * h[6 + j] - e2[2] * h[3 + j]
@@ -57,7 +57,7 @@ def geometry_of_plane(h: F64, e2: F64, f: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
-def agreements(f: F64, columns: F64, gate: float, agree: F64) -> None:
+def _inlier_mask(f: F64, columns: F64, gate: float, agree: F64) -> None:
     """``agree`` (N,): 1 for the columns of (4, N) with a Sampson distance below the gate, else 0."""
     wide = gate * gate
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
@@ -72,25 +72,27 @@ def agreements(f: F64, columns: F64, gate: float, agree: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def geometries_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
+def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
     """[e2]x H with the epipole of every pair of matches off the plane, and the weight within the gate of it.
 
     ``points`` (N, 4) are matches off the plane, ``weights`` (M, N) several weights of each, ``pairs`` (S, 2)
     indices into them; -> F (S, 9), which agree (S, N) as 0 and 1, and the sums of the weights (S, M).
     """
     columns = np.ascontiguousarray(points.T)
-    lines = parallax_lines(h, points)
+    lines = _parallax_lines(h, points)
     F, agree, e2 = np.empty((len(pairs), 9)), np.empty((len(pairs), len(points))), np.empty(3)
     for s in range(len(pairs)):
         a, b = lines[pairs[s, 0]], lines[pairs[s, 1]]
         e2[0], e2[1], e2[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-        geometry_of_plane(h, e2, F[s])
-        agreements(F[s], columns, gate, agree[s])
+        _fundamental_of_plane(h, e2, F[s])
+        _inlier_mask(F[s], columns, gate, agree[s])
     return F, agree, agree @ weights.T
 
 
 @njit(cache=True, nogil=True)
-def unlike(order: I64, agree: F64, weights: F64, alike: float, chosen: I64, count: int, most: int) -> int:
+def _select_distinct(
+    order: I64, agree: F64, weights: F64, alike: float, chosen: I64, count: int, most: int
+) -> int:
     """Add the first of ``order`` to ``chosen`` that share at most ``alike`` of their weight with one chosen
     before, until ``most`` are; ``count`` are there already. Returns how many there are then."""
     for s in order:
@@ -114,7 +116,7 @@ def unlike(order: I64, agree: F64, weights: F64, alike: float, chosen: I64, coun
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def contradicted_shares(h: F64, points: F64, on_plane: B8, chosen: I64, near: float) -> F64:
+def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: float) -> F64:
     """Of the nearest neighbours of each chosen point, the share that lie on the plane and contradict it.
 
     A neighbour contradicts where the parallax differs by more than the two are apart in image 1: no opaque
@@ -192,7 +194,7 @@ def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:
     return min(1.0, float(2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300)))
 
 
-PAIRS, COMPETING_SUBSET, RIVALS, LOOKED_AT = 300, 400, 3, 100
+PAIRS, COMPETING_SUBSET, COMPETING, LOOKED_AT = 300, 400, 3, 100
 """Epipoles tried, matches off the plane that each is judged on, and how many of the best by all of these, and
 by those that the found F does not explain, are refined if they are unlike each other."""
 TYPICAL = 0.3
@@ -207,7 +209,7 @@ FAR = 20.0
 
 
 @dataclass(frozen=True)
-class CompetingModel:
+class _CompetingModel:
     """Another F: ``f`` (9,) in the frame, and how it differs from the one that was found.
 
     ``lost`` and ``gained`` are weights of matches that only the one or only the other explains; ``error`` is
@@ -227,9 +229,9 @@ class CompetingModel:
         return (self.lost - self.gained) / float(np.sqrt(max(self.lost + self.gained, 1.0)))
 
 
-def find_competing_models(
+def _find_competing_models(
     f: F64, points: F64, weights: F64, plane: DominantPlane, *, band: float, rng: Generator
-) -> tuple[list[CompetingModel], float]:
+) -> tuple[list[_CompetingModel], float]:
     """The rivals of ``f`` and the share of the matches off the plane that a geometry explains by chance.
 
     [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005), right or wrong, are judged
@@ -244,18 +246,18 @@ def find_competing_models(
         return [], 0.0
     off = off[rng.permutation(len(off))[:COMPETING_SUBSET]]
     w, mine = weights[off], inside[off]
-    F, agree, sums = geometries_of_plane(
+    F, agree, sums = fundamentals_of_plane(
         plane.h, points[off], np.stack([w, w * ~mine]), _pairs(mine, rng), WIDE * band
     )
     # The two matches that made a geometry agree with it always.
     beyond = np.maximum(sums[:, 0] - 2.0, 0.0) / max(float(w.sum()) - 2.0, 1.0)
     chance = float(np.quantile(beyond, TYPICAL)) / WIDE
-    chosen, count = np.empty(2 * RIVALS, dtype=np.int64), 0
+    chosen, count = np.empty(2 * COMPETING, dtype=np.int64), 0
     for k, value in enumerate((sums[:, 0], sums[:, 0] + sums[:, 1])):
         order = np.argsort(-value, kind="stable")
-        count = unlike(order[:LOOKED_AT], agree, w, ALIKE, chosen, count, (k + 1) * RIVALS)
+        count = _select_distinct(order[:LOOKED_AT], agree, w, ALIKE, chosen, count, (k + 1) * COMPETING)
     competing_models = [
-        _rival(_refined(F[s], points, band), points, weights, (distances, inside), band)
+        _competing_model(_refined(F[s], points, band), points, weights, (distances, inside), band)
         for s in chosen[:count]
     ]
     return competing_models, chance
@@ -278,26 +280,28 @@ def _refined(f: F64, points: F64, band: float) -> F64:
     return f
 
 
-def compare_competing_models(
+def _compare_competing_models(
     others: list[F64], f: F64, points: F64, weights: F64, *, band: float
-) -> list[CompetingModel]:
+) -> list[_CompetingModel]:
     """Other matrices (9,) in the frame as rivals of ``f``, each refined on all ``points`` (N, 4)."""
     distances = np.asarray(sampson_distances(f, points))
     found = (distances, distances < band)
-    return [_rival(_refined(other, points, band), points, weights, found, band) for other in others]
+    return [_competing_model(_refined(other, points, band), points, weights, found, band) for other in others]
 
 
-def _rival(f: F64, points: F64, weights: F64, found: tuple[F64, B8], band: float) -> CompetingModel:
+def _competing_model(
+    f: F64, points: F64, weights: F64, found: tuple[F64, B8], band: float
+) -> _CompetingModel:
     distances, inside = found
     own = np.asarray(sampson_distances(f, points))
     agreeing = own < band
     lost, gained = weights[inside & ~agreeing].sum(), weights[agreeing & ~inside].sum()
     if not agreeing.any() or not inside.any():
-        return CompetingModel(f, float(lost), float(gained), np.inf, np.inf)
+        return _CompetingModel(f, float(lost), float(gained), np.inf, np.inf)
     error, back = (
         np.sqrt(np.mean(np.minimum(d, FAR * band) ** 2)) for d in (distances[agreeing], own[inside])
     )
-    return CompetingModel(f, float(lost), float(gained), float(error), float(min(error, back)))
+    return _CompetingModel(f, float(lost), float(gained), float(error), float(min(error, back)))
 
 
 MINIMUM = 8
@@ -351,11 +355,11 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
             False, ("too few matches agree with the geometry",), expected_error_px=error_px
         )
     weights = multiplicity_weights(xy1, xy2)
-    competing_models, share = find_competing_models(
+    competing_models, share = _find_competing_models(
         f, points, weights, plane, band=band_px * frame.scale, rng=rng
     )
     ends = [frame.matrix_in_frame(F) for F in fit.competing_models]
-    competing_models += compare_competing_models(ends, f, points, weights, band=band_px * frame.scale)
+    competing_models += _compare_competing_models(ends, f, points, weights, band=band_px * frame.scale)
     support = _support(points, fit.inliers, weights, plane, 2.0 * sigma_px * frame.scale)
     by_chance = chance_of_agreement(xy1, xy2, band_px)
     chance = log10_false_alarms(
@@ -386,7 +390,7 @@ def _least_gain(support: _Support, chance: float) -> float:
     return float(max(LEAST_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
 
 
-def _differs(competing_model: CompetingModel, matters: float) -> bool:
+def _differs(competing_model: _CompetingModel, matters: float) -> bool:
     """Whether F is wrong if the rival is right; one that explains all that F does must explain much more, as
     a wrong match or two that it gains are far from F too."""
     return competing_model.apart > matters or (
@@ -399,7 +403,7 @@ def _support(points: F64, inliers: B8, weights: F64, plane: DominantPlane, near:
     chosen = np.flatnonzero(mine[inliers])
     # Every k-th: enough to know a share.
     chosen = chosen[:: max(1, len(chosen) // JUDGED)]
-    shares = contradicted_shares(plane.h, points[inliers], ~plane.off[inliers], chosen, near)
+    shares = _contradicted_ratios(plane.h, points[inliers], ~plane.off[inliers], chosen, near)
     some = weights[inliers][chosen]
     agreeing = float(weights[mine].sum())
     part = float(some[shares > CONTRADICTED].sum() / max(some.sum(), 1e-300))
@@ -417,7 +421,7 @@ def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
 def _reasons(
     support: _Support,
     chance: float,
-    competing_model: CompetingModel | None,
+    competing_model: _CompetingModel | None,
     error_px: float,
     matters_px: float,
 ) -> list[str]:

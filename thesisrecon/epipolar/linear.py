@@ -1,4 +1,13 @@
-"""module"""
+"""Section 5.2: F from linear equations: the eight-point and the seven-point algorithm.
+
+The seven-point algorithm exists twice. :func:`seven_point` solves one sample by a QR decomposition and is
+also exact for nearly degenerate samples. :func:`solve_seven_point_batch` solves LANES samples at once in the
+projective basis of four of the seven matches: there F has a zero diagonal and entries that sum to zero, and
+three equations leave a pencil by minors without pivoting. Its loop has no branches, so it vectorises and is
+four times faster; it may miss a double root, which random sampling tolerates.
+
+Points are rows (x1, y1, x2, y2) in a common frame; F is a row-major vector of 9 in the kernels.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +20,52 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
 from thesisrecon.geometry.two_view import enforce_rank_two, unit_norm
 
+# Ratio of the eighth to the first singular value below which F is undetermined.
 UNDETERMINED_REL = 1e-12
-"""Ratio of the eighth to the first singular value below which the matches leave F free."""
 
 
 def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_two: bool = True) -> F64:
-    """F (3, 3), unit norm, that minimises the algebraic residuals (5.2) over matches (N >= 8, 2) px.
+    """Estimate F from at least eight matches by the eight-point algorithm (5.2).
 
-    ``normalized`` conditions the pixels first (Hartley, "In defence of the eight-point algorithm", PAMI
-    1997); raw pixels, as the thesis has it, weight the entries of F unequally and are the worse the larger
-    the image. ``rank_two`` moves to the nearest singular matrix (in the frame it was solved in), which the
-    thesis' linear method does not.
+    Minimises the algebraic residuals x2' F x1 over unit vectors.
 
-    Raises ``ValueError`` for fewer than 8 matches, wrong shapes or coordinates that are not finite, and
-    ``StageFailure`` where the matches leave F free (all on a line, or on a plane without noise).
+    Parameters
+    ----------
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 8, px.
+    normalized : bool
+        Normalise the coordinates first [1]_. The thesis uses raw pixels, which weight the entries of F
+        unequally.
+    rank_two : bool
+        Replace F by the nearest singular matrix in the frame of the solution. The thesis' linear method does
+        not.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        F with x2' F x1 = 0, unit norm.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than 8 matches, or as :func:`~thesisrecon.epipolar.frame.as_matches`.
+    StageFailure
+        If the matches do not determine F (all collinear, or coplanar without noise).
+
+    References
+    ----------
+    .. [1] R. Hartley, "In defense of the eight-point algorithm", PAMI 19, 1997.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.geometry.two_view import sampson_residuals
+    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4], [5, 9]], dtype=float)
+    >>> depth = np.array([1, 2, 4, 2, 1, 4, 1, 2])
+    >>> xy2 = xy1 + np.array([[4.0, 2.0]]) / depth[:, None]
+    >>> F = estimate_eight_point(xy1, xy2)
+    >>> bool(np.abs(sampson_residuals(F, xy1, xy2)).max() < 1e-9)
+    True
     """
     xy1, xy2 = as_matches(xy1, xy2)
     if len(xy1) < 8:
@@ -38,21 +79,47 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
     _, s, Vt = np.linalg.svd(np.linalg.qr(A, mode="r"))
     if not s[7] > UNDETERMINED_REL * s[0] * (1.0 if normalized else 1e-4):
         raise StageFailure(
-            "the matches leave the fundamental matrix free",
+            "the matches do not determine the fundamental matrix",
             f"the equations of {len(xy1)} matches have rank below 8",
-            "matches on one plane do that; some off the plane are needed",
+            "add matches off the dominant plane",
         )
     F = Vt[8].reshape(3, 3)
     return unit_norm(T2.T @ (enforce_rank_two(F) if rank_two else F) @ T1)
 
 
 def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
-    """The fundamental matrices through exactly seven matches (7, 2) px; (k, 3, 3), k = 0 to 3, unit norm.
+    """Return all fundamental matrices through exactly seven matches.
 
-    The pencil f1, f2 of solutions of (5.1) is searched for its singular members; all directions count, also
-    F1 - F2, which alpha f1 + (1 - alpha) f2 of the thesis reaches only at infinity. Empty where the seven
-    matches are degenerate (their equations dependent, or every member singular). Raises ``ValueError`` for
-    other shapes or coordinates that are not finite.
+    Searches the pencil spanned by two solutions of (5.1) for singular members in all directions, also F1 -
+    F2, which alpha F1 + (1 - alpha) F2 of the thesis reaches only at infinity.
+
+    Parameters
+    ----------
+    xy1, xy2 : array_like (7, 2)
+        Matched points, px.
+
+    Returns
+    -------
+    ndarray (k, 3, 3)
+        The k = 0 to 3 solutions, unit norm; none for degenerate matches.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are not (7, 2), or as :func:`~thesisrecon.epipolar.frame.as_matches`.
+
+    References
+    ----------
+    Hartley and Zisserman, Multiple View Geometry, section 11.1.2.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4]], dtype=float)
+    >>> xy2 = xy1 + np.array([[4.0, 2.0]]) / np.array([1, 2, 4, 2, 1, 4, 1])[:, None]
+    >>> F = estimate_seven_point(xy1, xy2)
+    >>> 1 <= len(F) <= 3 and bool(np.abs(np.linalg.det(F)).max() < 1e-9)
+    True
     """
     xy1, xy2 = as_matches(xy1, xy2)
     if xy1.shape != (7, 2):
@@ -76,8 +143,8 @@ DIAGONAL = np.sqrt(0.5)
     fastmath={"reassoc", "contract"},
     forceinline=True,
 )
-def reflect(v: F64, start: int, scale: float, x: F64) -> None:
-    """x <- (I - scale v v') x, v zero before ``start``."""
+def _reflect(v: F64, start: int, scale: float, x: F64) -> None:
+    """Apply x <- (I - scale v v') x with v zero before ``start``."""
     dot = 0.0
     for r in range(start, 9):
         dot += v[r] * x[r]
@@ -87,10 +154,10 @@ def reflect(v: F64, start: int, scale: float, x: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
-def null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
-    """Two orthonormal vectors (``pencil`` (2, 9)) that span the null space of the seven equations (5.1).
+def _null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
+    """Compute an orthonormal basis ``pencil`` (2, 9) of the null space of the seven equations (5.1).
 
-    Householder QR of A' (9, 7): the last two columns of Q. False where the equations are dependent.
+    Householder QR of A' (9, 7): the last two columns of Q. False if the equations are dependent.
     """
     A = np.empty((7, 9))
     for k in range(7):
@@ -111,16 +178,16 @@ def null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
         A[k, k] += norm if A[k, k] >= 0.0 else -norm
         scales[k] = 1.0 / (norm * abs(A[k, k]))
         for c in range(k + 1, 7):
-            reflect(A[k], k, scales[k], A[c])
+            _reflect(A[k], k, scales[k], A[c])
     for k in range(6, -1, -1):
-        reflect(A[k], k, scales[k], pencil[0])
-        reflect(A[k], k, scales[k], pencil[1])
+        _reflect(A[k], k, scales[k], pencil[0])
+        _reflect(A[k], k, scales[k], pencil[1])
     return True
 
 
 @njit(cache=True, nogil=True)
-def det3(f: F64) -> float:
-    """Determinant of a 3x3 matrix given as a vector of 9."""
+def _det3(f: F64) -> float:
+    """Determinant of a 3 x 3 matrix given as a vector of 9."""
     value: float = (
         f[0] * (f[4] * f[8] - f[5] * f[7])
         - f[1] * (f[3] * f[8] - f[5] * f[6])
@@ -130,8 +197,8 @@ def det3(f: F64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def mixed_det3(f: F64, g: F64) -> float:
-    """trace(adj(f) g): the coefficient of a in det(f + a g)."""
+def _mixed_det3(f: F64, g: F64) -> float:
+    """trace(adj(f) g), the coefficient of a in det(f + a g)."""
     value: float = (
         (f[4] * f[8] - f[5] * f[7]) * g[0]
         + (f[5] * f[6] - f[3] * f[8]) * g[1]
@@ -147,12 +214,12 @@ def mixed_det3(f: F64, g: F64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def monic_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
-    """Real roots of x^3 + a x^2 + b x + c, a double root once; polished by Newton."""
+def _cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
+    """Real roots of x^3 + a x^2 + b x + c in closed form, double roots once, polished by Newton steps."""
     Q = (a * a - 3.0 * b) / 9.0
     R = (2.0 * a * a * a - 9.0 * a * b + 27.0 * c) / 54.0
     gap = R * R - Q * Q * Q
-    # What the rounding of a, b and c leaves of R^2 - Q^3: within it a double root is a double root.
+    # Rounding error of R^2 - Q^3: a smaller value counts as a double root.
     small = 1e-12 * (R * R + abs(Q * Q * Q))
     small += 4e-15 * (Q * Q * (a * a + abs(b)) + abs(R) * (abs(a * a * a) + abs(a * b) + abs(c)))
     count = 1
@@ -180,12 +247,23 @@ def monic_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
 
 @njit(cache=True, nogil=True)
 def singular_members(pencil: F64, F: F64) -> int:
-    """Members of the pencil with determinant 0, unit norm, into ``F`` (3, 9); how many (0 to 3).
+    """Compute the members with determinant 0 of a pencil of 3 x 3 matrices.
 
-    det is a homogeneous cubic of the pencil's coordinates. It cannot vanish in four directions unless it
-    vanishes everywhere, so the direction of the largest |det| of four is made the first basis vector: the
-    leading coefficient is then never small and no solution is lost at infinity, as (5.2)'s affine combination
-    loses one.
+    The determinant is a homogeneous cubic of the pencil coordinates. It cannot vanish in four directions
+    unless it vanishes everywhere, so the direction with the largest determinant of four becomes the first
+    basis vector: the leading coefficient is never small and no solution is lost at infinity.
+
+    Parameters
+    ----------
+    pencil : ndarray (2, 9)
+        Orthonormal basis of the pencil.
+    F : ndarray (3, 9)
+        Output: the members, unit norm.
+
+    Returns
+    -------
+    int
+        Number of members, 0 to 3.
     """
     best, c, s = -1.0, 1.0, 0.0
     trial = np.empty(9)
@@ -194,17 +272,17 @@ def singular_members(pencil: F64, F: F64) -> int:
         sk = (0.0, 1.0, DIAGONAL, -DIAGONAL)[k]
         for m in range(9):
             trial[m] = ck * pencil[0, m] + sk * pencil[1, m]
-        size = abs(det3(trial))
+        size = abs(_det3(trial))
         if size > best:
             best, c, s = size, ck, sk
     if best < 1e-14:
         return 0
     first = c * pencil[0] + s * pencil[1]
     second = c * pencil[1] - s * pencil[0]
-    lead = det3(first)
+    lead = _det3(first)
     roots = np.empty(3)
-    count = monic_cubic_roots(
-        mixed_det3(first, second) / lead, mixed_det3(second, first) / lead, det3(second) / lead, roots
+    count = _cubic_roots(
+        _mixed_det3(first, second) / lead, _mixed_det3(second, first) / lead, _det3(second) / lead, roots
     )
     for k in range(count):
         norm = np.sqrt(1.0 + roots[k] * roots[k])
@@ -215,9 +293,24 @@ def singular_members(pencil: F64, F: F64) -> int:
 
 @njit(cache=True, nogil=True)
 def seven_point(points: F64, sample: I64, F: F64) -> int:
-    """Fundamental matrices (``F`` (3, 9)) through seven matches; how many (0 where they are degenerate)."""
+    """Compute the fundamental matrices through seven matches.
+
+    Parameters
+    ----------
+    points : ndarray (N, 4)
+        Matches as rows (x1, y1, x2, y2) in a common frame.
+    sample : ndarray (7,)
+        Indices of the seven matches.
+    F : ndarray (3, 9)
+        Output: the solutions, unit norm.
+
+    Returns
+    -------
+    int
+        Number of solutions, 0 for degenerate matches.
+    """
     pencil = np.empty((2, 9))
-    if not null_pencil(points, sample, pencil):
+    if not _null_pencil(points, sample, pencil):
         return 0
     return singular_members(pencil, F)
 
@@ -229,17 +322,17 @@ Three = tuple[float, float, float]
 
 
 LANES = 32
+# Rows of a solved batch: 0 and 9 the transforms to the bases (9 each), 18 the orientation of the first three
+# matches, 21 and 30 the last three points of either image (9 each), 39 and 45 the two members (6 each) of
+# the pencil basis, 51 the three coefficients of the monic cubic.
 TO_BASIS_1, TO_BASIS_2, FIRST, SECOND, ROWS = 0, 9, 39, 45, 54
-"""Rows of a solved batch: from 0 and 9 the two transforms (9 each), from 18 the orientation of the first
-three matches, from 21 and 30 the last three points of either image (9 each), from 39 and 45 the two members
-(6 each) that span the pencil, from 51 the three coefficients of the monic cubic."""
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def basis_transform(
+def _basis_transform(
     xa: float, ya: float, xb: float, yb: float, xc: float, yc: float, xd: float, yd: float
 ) -> Nine:
-    """Rows of the T (3, 3) that takes four points to the projective basis; not finite for three on a line."""
+    """Rows of T (3, 3) from pixels to the basis of four points; not finite if three are collinear."""
     a0, a1, a2 = yb - yc, xc - xb, xb * yc - yb * xc
     b0, b1, b2 = yc - ya, xa - xc, xc * ya - yc * xa
     c0, c1, c2 = ya - yb, xb - xa, xa * yb - ya * xb
@@ -250,14 +343,14 @@ def basis_transform(
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def apply_transform(T: Nine, x: float, y: float) -> Three:
+def _apply_transform(T: Nine, x: float, y: float) -> Three:
     """T (x, y, 1)'."""
     return T[0] * x + T[1] * y + T[2], T[3] * x + T[4] * y + T[5], T[6] * x + T[7] * y + T[8]
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, float]:
-    """Coefficients of F13, F21, F23, F31, F32 in v' F u = 0, F12 being minus their sum."""
+def _basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, float]:
+    """Coefficients of F13, F21, F23, F31, F32 in v' F u = 0, with F12 minus their sum."""
     first = v[0] * u[1]
     return (
         v[0] * u[2] - first,
@@ -269,8 +362,8 @@ def basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, floa
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def triple(a: Three, b: Three, c: Three) -> float:
-    """The determinant with columns a, b, c."""
+def _determinant(a: Three, b: Three, c: Three) -> float:
+    """Determinant of the matrix with columns a, b, c."""
     value: float = (
         a[0] * (b[1] * c[2] - b[2] * c[1])
         + a[1] * (b[2] * c[0] - b[0] * c[2])
@@ -280,28 +373,35 @@ def triple(a: Three, b: Three, c: Three) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
-def solve_batch(X: F64, Y: F64) -> None:
-    """Pencils and cubics of LANES samples: ``X`` (28, LANES) holds x1, y1, x2, y2 of seven matches.
+def solve_seven_point_batch(X: F64, Y: F64) -> None:
+    """Compute the pencils and cubics of LANES samples side by side.
 
-    ``Y`` (ROWS, LANES) is laid out as said above. Lanes of degenerate samples get numbers that are not finite
-    or a cubic of no meaning.
+    With t p + q a member of a pencil, det(t p + q) = t^3 + ... has products of entries as coefficients, since
+    F12 F23 F31 + F13 F21 F32 is the determinant of a matrix with zero diagonal.
+
+    Parameters
+    ----------
+    X : ndarray (28, LANES)
+        x1, y1, x2, y2 of the seven matches of each sample.
+    Y : ndarray (ROWS, LANES)
+        Output, laid out as documented at ROWS; not finite or meaningless for degenerate samples.
     """
     for k in range(LANES):
-        S = basis_transform(X[0, k], X[1, k], X[4, k], X[5, k], X[8, k], X[9, k], X[12, k], X[13, k])
-        T = basis_transform(X[2, k], X[3, k], X[6, k], X[7, k], X[10, k], X[11, k], X[14, k], X[15, k])
+        S = _basis_transform(X[0, k], X[1, k], X[4, k], X[5, k], X[8, k], X[9, k], X[12, k], X[13, k])
+        T = _basis_transform(X[2, k], X[3, k], X[6, k], X[7, k], X[10, k], X[11, k], X[14, k], X[15, k])
         # T x_i is a positive or negative multiple of the basis vector e_i: the products over both images.
         side0 = (S[0] * X[0, k] + S[1] * X[1, k] + S[2]) * (T[0] * X[2, k] + T[1] * X[3, k] + T[2])
         side1 = (S[3] * X[4, k] + S[4] * X[5, k] + S[5]) * (T[3] * X[6, k] + T[4] * X[7, k] + T[5])
         side2 = (S[6] * X[8, k] + S[7] * X[9, k] + S[8]) * (T[6] * X[10, k] + T[7] * X[11, k] + T[8])
-        u, v = apply_transform(S, X[16, k], X[17, k]), apply_transform(T, X[18, k], X[19, k])
-        r, s = apply_transform(S, X[20, k], X[21, k]), apply_transform(T, X[22, k], X[23, k])
-        w, z = apply_transform(S, X[24, k], X[25, k]), apply_transform(T, X[26, k], X[27, k])
-        A, B, C = basis_equation(u, v), basis_equation(r, s), basis_equation(w, z)
+        u, v = _apply_transform(S, X[16, k], X[17, k]), _apply_transform(T, X[18, k], X[19, k])
+        r, s = _apply_transform(S, X[20, k], X[21, k]), _apply_transform(T, X[22, k], X[23, k])
+        w, z = _apply_transform(S, X[24, k], X[25, k]), _apply_transform(T, X[26, k], X[27, k])
+        A, B, C = _basis_equation(u, v), _basis_equation(r, s), _basis_equation(w, z)
         c0, c1, c2 = (A[0], B[0], C[0]), (A[1], B[1], C[1]), (A[2], B[2], C[2])
         c3, c4 = (A[3], B[3], C[3]), (A[4], B[4], C[4])
-        lead = triple(c0, c1, c2)
-        p1, p2, p3, p4 = -triple(c3, c1, c2), -triple(c0, c3, c2), -triple(c0, c1, c3), lead
-        q1, q2, q3, q5 = -triple(c4, c1, c2), -triple(c0, c4, c2), -triple(c0, c1, c4), lead
+        lead = _determinant(c0, c1, c2)
+        p1, p2, p3, p4 = -_determinant(c3, c1, c2), -_determinant(c0, c3, c2), -_determinant(c0, c1, c3), lead
+        q1, q2, q3, q5 = -_determinant(c4, c1, c2), -_determinant(c0, c4, c2), -_determinant(c0, c1, c4), lead
         p0, q0 = -(p1 + p2 + p3 + p4), -(q1 + q2 + q3 + q5)
         # det(t p + q), with p5 = q4 = 0.
         m3 = p0 * p3 * p4
@@ -322,11 +422,11 @@ def solve_batch(X: F64, Y: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
-def newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
-    """Real roots of x^3 + a x^2 + b x + c: one by Newton from outside, the others of the quadratic left.
+def _newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
+    """Real roots of x^3 + a x^2 + b x + c: one by Newton, the others from the remaining quadratic.
 
-    From beyond the turning point on the side of the root the iteration is monotone. A double root may be
-    missed, or found as two that are near; 0 roots where a coefficient is not finite.
+    The iteration starts beyond the turning point on the side of the root, where it is monotone. It may miss a
+    double root or find it as two close ones; no root if a coefficient is not finite.
     """
     centre = -a / 3.0
     Q = (a * a - 3.0 * b) / 9.0
@@ -354,11 +454,11 @@ def newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
-def oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
-    """Whether all seven matches of a lane can be in front of both cameras of the member ``g`` (6,).
+def _oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
+    """Return whether the seven matches of a lane can be in front of both cameras of the member ``g`` (6,).
 
-    The oriented epipolar constraint (Chum, Werner and Matas, ICPR 2004): e2 x x2 and F x1, parallel for an
-    exact match, agree in direction for all or for none.
+    Oriented epipolar constraint (Chum, Werner and Matas, ICPR 2004): e2 x x2 and F x1 are parallel for an
+    exact match and must agree in direction for all matches or for none.
     """
     g01, g02, g10, g12, g20, g21 = g
     # e2 is at right angles to the columns (0, g10, g20), (g01, 0, g21) and (g02, g12, 0).
@@ -382,8 +482,8 @@ def oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
-def leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
-    """F = T2' G T1 as a unit vector ``f`` (9,), G of the entries ``g`` (6,); False where it is not finite."""
+def _leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
+    """Write F = T2' G T1 as a unit vector ``f`` (9,), G from the entries ``g`` (6,); False if not finite."""
     norm = 0.0
     for j in range(3):
         s0, s1, s2 = Y[j, lane], Y[3 + j, lane], Y[6 + j, lane]
@@ -400,15 +500,29 @@ def leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def lane_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
-    """Fundamental matrices (``F`` (3, 9), unit norm) of one sample that keep its orientation; how many.
+def seven_point_batch_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
+    """Compute the fundamental matrices of one sample of a solved batch that satisfy the oriented constraint.
 
-    ``work`` (9,) is overwritten.
+    Parameters
+    ----------
+    Y : ndarray (ROWS, LANES)
+        Batch solved by :func:`solve_seven_point_batch`.
+    lane : int
+        Column of the sample.
+    work : ndarray (9,)
+        Scratch memory.
+    F : ndarray (3, 9)
+        Output: the solutions, unit norm.
+
+    Returns
+    -------
+    int
+        Number of solutions, 0 to 3.
     """
     roots, g, found = work[:3], work[3:], 0
-    for k in range(newton_cubic_roots(Y[51, lane], Y[52, lane], Y[53, lane], roots)):
+    for k in range(_newton_cubic_roots(Y[51, lane], Y[52, lane], Y[53, lane], roots)):
         for m in range(6):
             g[m] = roots[k] * Y[FIRST + m, lane] + Y[SECOND + m, lane]
-        if oriented_in_basis(g, Y, lane) and leave_basis(g, Y, lane, F[found]):
+        if _oriented_in_basis(g, Y, lane) and _leave_basis(g, Y, lane, F[found]):
             found += 1
     return found

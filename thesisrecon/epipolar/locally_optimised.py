@@ -1,4 +1,4 @@
-"""The default estimator of F: sampling that is refined where it succeeds, until several searches agree."""
+"""The default robust estimator of F: locally optimised RANSAC with repeated searches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.epipolar.refinement import SAMPSON, refine
-from thesisrecon.epipolar.sampling import sampson_distances, search, truncated_score
+from thesisrecon.epipolar.sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.errors import StageFailure
 from thesisrecon.numerics.noise import (
     NoiseMixture,
@@ -27,62 +27,72 @@ from thesisrecon.records import FundamentalFit
 BATCH = 512
 MINIMUM = 8
 PARAMETERS = 7
+# Linear solves of each refinement of a search and of its last, and the points of all but the last.
 START_STEPS, LAST_STEPS, START_POINTS = 5, 20, 500
-"""Solves of each refinement of a start and of its last, and the points that all but the last are on."""
-REFINEMENT_STEPS, SHARPENINGS = 15, 2
+REFINEMENT_STEPS, NOISE_REFINEMENTS = 15, 2
+# Width of Huber's loss in gates: wrong matches within the gate are not rare.
 KNEE = 0.25
-"""Where Huber's loss turns linear, in widths of the gate: wrong matches within the gate are not rare."""
+# Prior of wrong matrices: of 100 points 5 lie within the gate.
 PRIOR = (100.0, 5.0)
-"""What is thought of wrong matrices before the first was seen: of 100 points 5 lie within the gate."""
+# Smallest width of the loss in units of the frame, for matches without noise.
 EXACT = 1e-9
-"""Smallest width of the loss (in units of the spread of the points), for matches without noise."""
-SHARES = 6
-"""Starts that the least samples are shared by, and of which one sees a sample free of outliers."""
+# Searches that share the minimum number of samples; one of them sees a sample without outliers.
+SEARCHES = 6
+# Sums of truncated squares of N matches that differ by less than this times sqrt(N) are of one minimum.
 SAME_SCORE = 0.03
-"""Sums of truncated squares of N matches that differ by less than this times sqrt(N) are of one minimum."""
+# Prior spread of wrong matches in units of the frame.
 SPREAD = 1.0
-"""Of wrong matches before any was seen, in units of the spread of the points."""
+# The last loss is wider by 1 + 28 / (n - 7) for few matches, which pull the fit towards them.
 FEW_MATCHES = 28.0
-"""How much wider the last loss is for few matches: by 1 + 28 / (n - 7), as a fit bends to what it keeps."""
+# Standard deviations that contain nearly all noise.
 COVERED = 3.0
-"""Standard deviations within which nearly all noise lies."""
-RIVALS = 3
+COMPETING = 3
+# Gate of the second search, and width of the ring beyond the noise that is examined, in gates.
 WIDER, RING = 4.0, 15.0
-"""Gate of the second search, and how far beyond the noise is looked whether it goes on, in gates."""
+# Fraction of the inliers by which the ring must exceed the expected count to repeat the search.
 EXCESS = 0.25
-"""Share of the inliers that more matches than expected in the ring give reason to search again."""
 FEW_WRONG = 0.2
 
 
 @dataclass(frozen=True)
 class LocallyOptimisedRansac:
-    """Seven-point sampling with a truncated quadratic score, refined over rank-2 matrices.
+    """Seven-point RANSAC with a truncated quadratic score and refinement over rank-2 matrices.
 
-    A start draws samples until one free of outliers was seen; its best matrix is refined by
-    Levenberg-Marquardt on the gradient criterion (5.4) under Huber's loss at the ``gates`` (times the
-    threshold). Starts go on until ``starts`` of them ended at the best score: where one plane or a repeated
-    pattern has many inliers they disagree, and more are made (Torr and Zisserman, MLESAC, CVIU 2000; Chum,
-    Matas and Kittler, DAGM 2003).
+    A search draws samples until one without outliers is likely; its best F is refined by Levenberg-Marquardt
+    on the Sampson distances (5.4) with Huber's loss. Searches are repeated until ``starts`` of them end at
+    the best score: they disagree if a plane or a repeated pattern has many inliers, and then more are made.
 
-    The best matrix is refined once more with the loss that suits the noise its residuals show: a mixture of
-    noise, its heavier tail and wrong matches says where the noise ends, and Huber's loss is as wide as the
-    residuals say is best. Where more matches than wrong ones explain lie just beyond, the noise may be
-    larger than the threshold: the search is repeated with a wider gate, and the likelier of the two answers
-    taken, if it leaves few matches unexplained.
+    The best F is refined once more with a loss fitted to its residuals: a mixture of noise, its heavier tail
+    and wrong matches gives the inlier limit and the best width of Huber's loss. If more matches than expected
+    lie just beyond, the noise may exceed the threshold: the search is repeated with a wider gate, and the
+    likelier result is used if it leaves few matches unexplained.
 
     Parameters
     ----------
-    threshold_px : Sampson distance beyond which a match counts as wrong during the search.
-    confidence : probability that one of six starts sees a sample free of outliers; those that agree are sure.
-    starts : searches that must end at the same score.
-    max_starts : searches after which the best is taken though they disagree.
-    min_samples : samples of six starts, however many inliers were found: where most of the scene is one
-        plane, a wrong F has many too.
-    max_samples : samples of all starts together, whatever the confidence.
-    gates : widths of the loss in thresholds, one refinement each, in this order.
-    inlier_sigmas : a match is an inlier where noise is likelier than a wrong match, and within so many sigma
-        (infinite: the tail of the noise too); less where only precise matches are wanted.
-    inlier_floor_px : a match within this is always an inlier.
+    threshold_px : float
+        Sampson distance of an inlier during the search.
+    confidence : float
+        Probability that one of six searches sees a sample without outliers.
+    starts : int
+        Number of searches that must end at the same score.
+    max_starts : int
+        Maximum number of searches.
+    min_samples : int
+        Samples of six searches whatever the inlier ratio, since a wrong F of a dominant plane has many
+        inliers.
+    max_samples : int
+        Maximum number of samples of all searches.
+    gates : tuple of float
+        Gates of the successive refinements, in thresholds.
+    inlier_sigmas : float
+        Maximum residual of an inlier in standard deviations; infinite includes the tail of the noise.
+    inlier_floor_px : float
+        Residual up to which a match is always an inlier.
+
+    References
+    ----------
+    P. Torr and A. Zisserman, "MLESAC", CVIU 78, 2000. O. Chum, J. Matas and J. Kittler, "Locally optimized
+    RANSAC", DAGM 2003.
     """
 
     threshold_px: float = 1.0
@@ -102,23 +112,50 @@ class LocallyOptimisedRansac:
             raise ValueError(f"confidence must lie between 0 and 1; got {self.confidence}")
         if not 1 <= self.starts <= self.max_starts:
             raise ValueError(f"starts must lie in [1, max_starts]; got {self.starts} and {self.max_starts}")
-        if self.max_samples < SHARES or min(self.gates, default=0.0) <= 0.0:
+        if self.max_samples < SEARCHES or min(self.gates, default=0.0) <= 0.0:
             raise ValueError("a search needs at least six samples and gates above 0")
         if not self.inlier_sigmas > 0.0:
             raise ValueError(f"inlier_sigmas must be positive; got {self.inlier_sigmas}")
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
-        """F of matches (N >= 8, 2) px with its inliers, noise and covariance.
+        """Estimate F of matches with outliers.
 
-        Raises ``ValueError`` for wrong shapes or coordinates that are not finite, ``StageFailure`` for fewer
-        than 8 matches, points on one line, or where no F has 8 matches within the threshold. Always finite.
+        Parameters
+        ----------
+        xy1, xy2 : array_like (N, 2)
+            Matched points, N >= 8, px.
+        rng : numpy.random.Generator
+            Source of the samples.
+
+        Returns
+        -------
+        FundamentalFit
+            F, inliers, noise, covariance and competing models; always finite.
+
+        Raises
+        ------
+        ValueError
+            As :func:`~thesisrecon.epipolar.frame.as_matches`.
+        StageFailure
+            If there are too few or collinear matches, or no F has 8 matches within the threshold.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> xy1 = rng.uniform(0, 500, (60, 2))
+        >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
+        >>> xy2[:30] = rng.uniform(0, 500, (30, 2))
+        >>> fit = LocallyOptimisedRansac(threshold_px=1.0).estimate(xy1, xy2, rng)
+        >>> bool(fit.inliers[30:].all())
+        True
         """
         xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
         frame = PairFrame.of(xy1, xy2)
         points = frame.points(xy1, xy2)
         gate = self.threshold_px * frame.scale
         found = self._candidate(points, gate, rng)
-        if found.noise is None or _goes_on(found.residuals, found.noise, gate):
+        if found.noise is None or _noise_exceeds_gate(found.residuals, found.noise, gate):
             wide = self._candidate(points, WIDER * gate, rng)
             samples = found.samples + wide.samples
             found = replace(wide if wide.explains_more_than(found) else found, samples=samples)
@@ -126,12 +163,12 @@ class LocallyOptimisedRansac:
 
     def _candidate(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         ends, samples = self._starts(points, gate, rng)
-        f, competing_models = _best_and_rivals(ends, _chance_of_scores(points))
-        noise, loss = _sharpen(f, points, gate) if f.any() else (None, (0.0, 0.0))
+        f, competing_models = _best_and_competing(ends, _chance_of_scores(points))
+        noise, loss = _refine_to_noise(f, points, gate) if f.any() else (None, (0.0, 0.0))
         return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, competing_models)
 
     def _starts(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
-        """Score and matrix (9,) where each search ended, until enough agree; and the samples drawn."""
+        """Return the score and F (9,) of each search until enough agree, and the number of samples."""
         found: list[tuple[float, F64]] = []
         samples = 0
         for _ in range(self.max_starts):
@@ -156,12 +193,15 @@ class LocallyOptimisedRansac:
 
     def _search(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
-        least, most = self.min_samples // SHARES, self.max_samples // self.max_starts
-        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / SHARES)
+        least, most = self.min_samples // SEARCHES, self.max_samples // self.max_starts
+        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / SEARCHES)
         drawn = 0
         while drawn < most:
             uniforms = rng.random((min(BATCH, most - drawn), 7))
-            before, drawn = drawn, search(points, uniforms, gate, (drawn, least, confidence), state, f)
+            before, drawn = (
+                drawn,
+                search_fundamental(points, uniforms, gate, (drawn, least, confidence), state, f),
+            )
             if drawn < before + len(uniforms):
                 break
         return f, drawn
@@ -173,8 +213,8 @@ class LocallyOptimisedRansac:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
                 f"the best of {found.samples} samples has {near} of {len(points)} matches within "
-                f"{self.threshold_px:g} px, needed at least {MINIMUM}",
-                "the photographs may not overlap, or the matches are wrong",
+                f"{self.threshold_px:g} px; at least {MINIMUM} are needed",
+                "check that the images overlap and that the matches are correct",
             )
         limit = min(noise.limit, self.inlier_sigmas * noise.sigma)
         inliers = r < max(limit, self.inlier_floor_px * frame.scale)
@@ -192,10 +232,11 @@ class LocallyOptimisedRansac:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A matrix ``f`` (9,), the samples it took, its residuals (N,) and their noise, None for no F.
+    """Result of the searches with one gate.
 
-    ``loss`` is what it was fitted with: where matches stop to count and where Huber's loss turns linear.
-    ``rivals`` are where other searches ended.
+    ``f`` (9,), the samples drawn, the residuals (N,) and their noise (None without F). ``loss`` holds the
+    residual limit and the width of Huber's loss of the last refinement, ``competing_models`` the results of
+    other searches.
     """
 
     f: F64
@@ -205,54 +246,54 @@ class _Candidate:
     loss: tuple[float, float]
     competing_models: list[F64]
 
-    def explains_more_than(self, competing_model: _Candidate) -> bool:
-        """Whether this, found with a wider gate, is likelier and leaves few matches unexplained.
+    def explains_more_than(self, other: _Candidate) -> bool:
+        """Return whether this result of a wider gate is likelier and leaves few matches unexplained.
 
-        A wide gate finds wrong matrices that many wrong matches are near to; noise beyond the threshold is
-        believed only if it explains most of what the ``rival`` calls wrong, or nearly everything.
+        A wide gate finds wrong matrices that many wrong matches are near. It is accepted only if it explains
+        most of the matches that ``other`` rejects, or nearly all.
         """
-        if self.noise is None or competing_model.noise is None:
-            return competing_model.noise is None
+        if self.noise is None or other.noise is None:
+            return other.noise is None
         explained = int(np.count_nonzero(self.residuals < self.noise.limit))
-        more = explained - int(np.count_nonzero(competing_model.residuals < competing_model.noise.limit))
+        more = explained - int(np.count_nonzero(other.residuals < other.noise.limit))
         left = len(self.residuals) - explained
         few = left <= max(more, FEW_WRONG * len(self.residuals))
-        return few and self.noise.log_likelihood > competing_model.noise.log_likelihood
+        return few and self.noise.log_likelihood > other.noise.log_likelihood
 
 
 def _chance_of_scores(points: F64) -> float:
-    """By how much sums of truncated squares of the same minimum may differ."""
+    """Maximum difference between two sums of truncated squares of the same minimum."""
     return float(SAME_SCORE * len(points) ** 0.5)
 
 
-def _best_and_rivals(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:
-    """The matrix with the lowest score, 0 where there is none, and the next, each ``same`` or more above."""
+def _best_and_competing(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:
+    """Return the F with the lowest score (0 without any) and the next ones, each at least ``same`` worse."""
     best, last = np.zeros(9), -np.inf
     competing_models: list[F64] = []
     for score, f in sorted(ends, key=lambda end: end[0]):
         if last == -np.inf:
             best = f
-        elif score - last >= same and len(competing_models) < RIVALS:
+        elif score - last >= same and len(competing_models) < COMPETING:
             competing_models.append(f)
         last = score
     return best, competing_models
 
 
 def _noise(r: F64, gate: float) -> NoiseMixture | None:
-    """The noise of residuals (N,) in ascending order; None where too few are of it."""
+    """Fit the noise of residuals (N,) in ascending order; None if too few belong to it."""
     near = r[: np.searchsorted(r, noise_width(r, gate))]
     if len(near) < MINIMUM:
         return None
     return NoiseMixture.fit(r, max(noise_scale(near), EXACT), spread=SPREAD)
 
 
-def _sharpen(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
-    """Refine with the loss that suits the noise that the residuals show (in place); both are returned."""
+def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
+    """Refine ``f`` in place with the loss fitted to its residuals; return the noise and the loss."""
     loss = (0.0, 0.0)
-    for k in range(SHARPENINGS + 1):
+    for k in range(NOISE_REFINEMENTS + 1):
         r = np.sort(sampson_distances(f, points))
         noise = _noise(r, gate)
-        if noise is None or k == SHARPENINGS:
+        if noise is None or k == NOISE_REFINEMENTS:
             break
         limit = noise.limit
         if k > 0:
@@ -261,8 +302,7 @@ def _sharpen(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tup
             limit = min(limit, few * noise.core_limit)
         limit = max(limit, EXACT, 1.001 * float(r[MINIMUM - 1]))
         near = r[: np.searchsorted(r, limit)]
-        # The start bends to few of the matches: whether the noise is heavy-tailed cannot be seen before the
-        # first refinement.
+        # The start fits few matches: heavy tails cannot be detected before the first refinement.
         width = best_huber_width(near, noise.sigma, parameters=PARAMETERS) if k > 0 else np.inf
         width = min(max(width, EXACT), limit)
         refine(f, points, SAMPSON, limit, width, REFINEMENT_STEPS)
@@ -270,13 +310,13 @@ def _sharpen(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tup
     return noise, loss
 
 
-def _goes_on(r: F64, noise: NoiseMixture, gate: float) -> bool:
-    """Whether just beyond the noise that was found lie more residuals (N,) than wrong ones explain."""
+def _noise_exceeds_gate(r: F64, noise: NoiseMixture, gate: float) -> bool:
+    """Return whether more residuals (N,) lie just beyond the noise than wrong matches explain."""
     end = COVERED * noise.sigma
     inside = int(np.count_nonzero(r < end))
     beyond = len(r) - inside
     ring = int(np.count_nonzero(r < end + RING * gate)) - inside
-    # Of a half-normal distribution of unit spread, which wrong matches roughly have.
+    # Wrong matches are roughly half-normal with unit spread.
     expected = float(np.sqrt(2.0 / np.pi)) * beyond * RING * gate / SPREAD
     needed = inside * max(0.05, EXCESS * (1.0 - 3.0 * PARAMETERS / max(inside, 1)))
     return ring - expected > max(2.0 * float(np.sqrt(expected)), needed)
@@ -288,15 +328,48 @@ def estimate_fundamental(
     *,
     threshold_px: float = 1.0,
     seed: int = 0,
-    judge: bool = False,
+    check_degeneracy: bool = False,
 ) -> FundamentalFit:
-    """Robust F of matches xy1, xy2 (N >= 8, 2) px, x2' F x1 = 0, by :class:`LocallyOptimisedRansac`.
+    """Estimate the fundamental matrix of matches with outliers.
 
-    With ``judge`` the fit says whether the matches determine it, by
-    :func:`~thesisrecon.epipolar.degeneracy.assess_degeneracy`: many inliers alone do not.
-    The same seed gives the same answer. Raises ``ValueError`` for a wrong call and
-    :class:`~thesisrecon.errors.StageFailure` for matches that determine no F.
+    Uses :class:`LocallyOptimisedRansac`. The same seed gives the same result.
+
+    Parameters
+    ----------
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 8, px.
+    threshold_px : float
+        Sampson distance of an inlier during the search.
+    seed : int
+        Random seed.
+    check_degeneracy : bool
+        Also test whether the matches determine F
+        (:func:`~thesisrecon.epipolar.degeneracy.assess_degeneracy`); many inliers alone do not show it.
+
+    Returns
+    -------
+    FundamentalFit
+        F with x2' F x1 = 0, inliers, noise, covariance and, on request, the degeneracy report.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or coordinates are not finite.
+    StageFailure
+        If there are too few or collinear matches, or no F has 8 matches within the threshold.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import thesisrecon
+    >>> rng = np.random.default_rng(0)
+    >>> xy1 = rng.uniform(0, 500, (60, 2))
+    >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
+    >>> xy2[:20] = rng.uniform(0, 500, (20, 2))
+    >>> fit = thesisrecon.estimate_fundamental(xy1, xy2, check_degeneracy=True)
+    >>> bool(fit.inliers[20:].all()), fit.degeneracy.determined
+    (True, True)
     """
     rng = np.random.default_rng(seed)
     fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
-    return replace(fit, degeneracy=assess_degeneracy(fit, xy1, xy2, rng=rng)) if judge else fit
+    return replace(fit, degeneracy=assess_degeneracy(fit, xy1, xy2, rng=rng)) if check_degeneracy else fit

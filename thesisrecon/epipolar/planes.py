@@ -35,7 +35,7 @@ SAMPLES = 200
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) -> float:
+def _squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared distance of a match to the nearest exact match of x2 ~ H x1, to first order.
 
     c' (J J')^-1 c of the two equations c and their derivatives J by the four coordinates (Chum, Pajdla and
@@ -56,16 +56,16 @@ def squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) -
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plane_distances(h: F64, points: F64) -> F64:
+def _plane_distances(h: F64, points: F64) -> F64:
     """Squared distances (N,) of all points from a homography."""
     squared = np.empty(len(points))
     for k in range(len(points)):
-        squared[k] = squared_plane_distance(h, points[k, 0], points[k, 1], points[k, 2], points[k, 3])
+        squared[k] = _squared_plane_distance(h, points[k, 0], points[k, 1], points[k, 2], points[k, 3])
     return squared
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plane_of_triple(f: F64, e2: F64, points: F64, triple: I64, h: F64) -> bool:
+def _induced_homography(f: F64, e2: F64, points: F64, triple: I64, h: F64) -> bool:
     """H of the plane through three matches that agree with F: A - e2 v', A = [e2]x F (HZ, result 13.6).
 
     Each match has v . x1 = b with b = (x2 x A x1) . (x2 x e2) / |x2 x e2|^2. False for points near one line.
@@ -100,7 +100,7 @@ def plane_of_triple(f: F64, e2: F64, points: F64, triple: I64, h: F64) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
+def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
     """``G`` (9, 9) of the equations of x2 ~ H x1, each match weighted by (J J')^-1 and, within the gate, by
     (1 - d^2 / gate^2)^2 (Tukey); returns the sum of min(d^2 / gate^2, 1)."""
     G[:] = 0.0
@@ -108,7 +108,7 @@ def plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
     row = np.zeros((2, 9))
     for k in range(len(points)):
         x1, y1, x2, y2 = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
-        share = squared_plane_distance(h, x1, y1, x2, y2) / wide
+        share = _squared_plane_distance(h, x1, y1, x2, y2) / wide
         if not share < 1.0:
             total += 1.0
             continue
@@ -143,7 +143,7 @@ def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
     G = np.empty((9, 9))
     for _ in range(iterations):
         h /= np.sqrt(np.sum(h * h)) + 1e-300
-        plane_normal_equations(h, points, gate, G)
+        _plane_normal_equations(h, points, gate, G)
         vectors = np.linalg.eigh(G)[1]
         new = vectors[:, 0].copy()
         if np.sum(new * h) < 0.0:
@@ -156,7 +156,7 @@ def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F64) -> float:
+def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F64) -> float:
     """The homography (``h``) of a plane of F with the least truncated distances; their mean (1 for none).
 
     The plane of each triple is judged on all ``points`` (the matches that F fits, or some of them).
@@ -165,11 +165,11 @@ def dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F
     h[:] = 0.0
     wide = 1.0 / (gate * gate)
     for t in range(len(triples)):
-        if not plane_of_triple(f, e2, points, triples[t], trial):
+        if not _induced_homography(f, e2, points, triples[t], trial):
             continue
         total = 0.0
         for k in range(len(points)):
-            share = wide * squared_plane_distance(
+            share = wide * _squared_plane_distance(
                 trial, points[k, 0], points[k, 1], points[k, 2], points[k, 3]
             )
             total += share if share < 1.0 else 1.0
@@ -182,7 +182,7 @@ def dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
+def _count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
     """How many of the points (N, 2) each of the homographies (S, 3, 3) takes to within ``tolerance``."""
     counts = np.zeros(len(H), np.int64)
     for s in range(len(H)):
@@ -224,20 +224,20 @@ def find_dominant_plane(
     some = mine[:SUBSET]
     triples = rng.integers(0, len(some), (TRIPLES, 3))
     h = np.empty(9)
-    dominant_plane(f, e2, some, triples, GATE * sigma, h)
+    _search_dominant_plane(f, e2, some, triples, GATE * sigma, h)
     if not h.any():
         return None
     # A plane through three noisy matches is off elsewhere: the gate starts wide.
     refine_plane(h, some, 2.0 * GATE * sigma, SUBSET_STEPS)
     refine_plane(h, mine, GATE * sigma, ALL_STEPS)
-    squared = np.asarray(plane_distances(h, points)) / sigma**2
+    squared = np.asarray(_plane_distances(h, points)) / sigma**2
     return DominantPlane(h, squared) if (squared < GATE**2).any() else None
 
 
 def plane_covariance(h: F64, points: F64, sigma: float) -> F64:
     """Covariance (9, 9) of h, unit norm, from the points (N, 4) of the plane."""
     G = np.empty((9, 9))
-    plane_normal_equations(h, points, 1e6 * sigma, G)
+    _plane_normal_equations(h, points, 1e6 * sigma, G)
     values, vectors = np.linalg.eigh(G)
     # The least eigenvalue is the scale of H, which no distance sees.
     half = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-14 * values[-1]))
@@ -277,7 +277,7 @@ def homography_inlier_ratio(F: F64, xy1: F64, xy2: F64, *, tolerance_px: float, 
     planes = plane_homographies(F, xy1, xy2, triples)
     if not len(planes):
         return _refit_share(np.eye(3), xy1, xy2, tolerance_px)
-    counts = count_transferred(planes, xy1[chosen], xy2[chosen], tolerance_px)
+    counts = _count_transferred(planes, xy1[chosen], xy2[chosen], tolerance_px)
     best = planes[int(np.argmax(counts))]
     return _refit_share(best, xy1, xy2, tolerance_px)
 

@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame, as_matches, check_matches
-from thesisrecon.epipolar.refinement import SAMPSON, normal_equations, split, tangent
+from thesisrecon.epipolar.refinement import (
+    SAMPSON,
+    normal_equations,
+    orthonormal_from_fundamental,
+    orthonormal_tangent,
+)
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import epipoles, fundamental_from_cameras, unit_norm
@@ -31,8 +36,8 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
     """
     U, V, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((9, 7))
     G, h = np.empty((9, 9)), np.empty(9)
-    phi = split(f, U, V)
-    tangent(U, V, phi, B)
+    phi = orthonormal_from_fundamental(f, U, V)
+    orthonormal_tangent(U, V, phi, B)
     normal_equations(f, points, SAMPSON, np.inf, 1e150, G, h)
     values, vectors = np.linalg.eigh(B.T @ G @ B)
     half = B @ (vectors / np.sqrt(np.maximum(values, FLATTEST_REL * max(values[-1], 1e-300))))

@@ -1,14 +1,9 @@
-"""Section 5.4: the noise from the residuals, and the matches that are too far off to share it.
-
-Algorithm 2 of the thesis: seven-point samples, the most inliers, then the gradient criterion.
-
-Section 5.4: least median of squares, which needs no threshold but fewer than half of wrong matches.
-"""
+"""Section 5.4: RANSAC of the thesis (Algorithm 2), its inlier tests, and least median of squares."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.random import Generator
@@ -22,84 +17,174 @@ from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import epipolar_distances, sampson_residuals, symmetric_residuals
 from thesisrecon.numerics.noise import noise_scale
-from thesisrecon.numerics.ransac import SampleConsensus, draw_sample
+from thesisrecon.numerics.ransac import SampleConsensus
 from thesisrecon.records import FundamentalFit
 
+# 95 % quantiles of the chi-square distribution with one and two degrees of freedom.
 CHI2_1_95, CHI2_2_95 = 3.841458820694124, 5.991464547107979
-"""95 % of a chi-square variable with one or two degrees of freedom lies below."""
 MINIMUM = 8
+# Residuals below this are rounding errors, not noise.
 EXACT_PX = 1e-6
-"""Residuals below are rounding, not noise."""
 
 
 class InlierTest(Protocol):
-    """How far a match is from an F, and how far the right ones are."""
+    """Distance of a match to F and the limit of that distance for an inlier."""
 
     @property
     def ratio(self) -> float:
-        """The distance over the Sampson distance where both images weigh the same."""
+        """Ratio to the Sampson distance if both images have equal weight."""
 
     @property
     def limit(self) -> float:
-        """The squared distance up to which a match is right, in variances of one coordinate."""
+        """Maximum squared distance of an inlier, in variances of one coordinate."""
 
     def distances(self, F: F64, xy1: F64, xy2: F64) -> F64:
-        """px; (N,) >= 0."""
+        """Return the distances (N,) >= 0, px."""
 
 
 @dataclass(frozen=True)
 class SampsonTest:
-    """The Sampson distance against the chi-square of one degree of freedom: 95 % of the right ones pass."""
+    """Inlier test by the Sampson distance, chi-square with one degree of freedom: 95 % of right matches pass.
+
+    Parameters
+    ----------
+    ratio : float
+        Ratio to the Sampson distance.
+    limit : float
+        Maximum squared distance, in variances of one coordinate.
+    """
 
     ratio: float = 1.0
     limit: float = CHI2_1_95
 
     def distances(self, F: F64, xy1: F64, xy2: F64) -> F64:
-        """px; (N,) >= 0."""
+        """Compute the Sampson distances.
+
+        Parameters
+        ----------
+        F : ndarray (3, 3)
+            Fundamental matrix, px.
+        xy1, xy2 : ndarray (N, 2)
+            Matched points, px.
+
+        Returns
+        -------
+        ndarray (N,)
+            Distances >= 0, px.
+        """
         return np.abs(sampson_residuals(F, xy1, xy2))
 
 
 @dataclass(frozen=True)
-class BothLinesTest:
-    """The first test of section 5.4: both points within 1.96 sigma_d of their epipolar lines.
+class EpipolarDistanceTest:
+    """First test of section 5.4: both points within 1.96 sigma_d of their epipolar lines.
 
-    sigma_d, of the distance to a line, is root 2 times that of a coordinate where the images weigh the same;
-    then the two distances are equal and this is the test by Sampson's.
+    The standard deviation sigma_d of a distance to a line is sqrt(2) times that of a coordinate if the images
+    have equal weight; the two distances are then equal and the test is that of Sampson.
+
+    Parameters
+    ----------
+    ratio : float
+        Ratio to the Sampson distance.
+    limit : float
+        Maximum squared distance, in variances of one coordinate.
     """
 
     ratio: float = 1.4142135623730951
     limit: float = 2.0 * CHI2_1_95
 
     def distances(self, F: F64, xy1: F64, xy2: F64) -> F64:
-        """The larger one, px; (N,)."""
+        """Compute the larger of the two epipolar distances.
+
+        Parameters
+        ----------
+        F : ndarray (3, 3)
+            Fundamental matrix, px.
+        xy1, xy2 : ndarray (N, 2)
+            Matched points, px.
+
+        Returns
+        -------
+        ndarray (N,)
+            Distances >= 0, px.
+        """
         return np.asarray(epipolar_distances(F, xy1, xy2).max(axis=1))
 
 
 @dataclass(frozen=True)
-class SumOfLinesTest:
-    """The second test of section 5.4: the sum of both squared distances below 5.99 sigma_d^2.
+class SymmetricDistanceTest:
+    """Second test of section 5.4: sum of both squared epipolar distances below 5.99 sigma_d^2.
 
-    The thesis takes x_alpha from the chi-square of two degrees of freedom. The distances are multiples of one
-    residual, so the sum is 2 sigma_d^2 times a chi-square of one: 92 % of the right matches pass, not 95 %.
+    The thesis takes the limit from the chi-square distribution with two degrees of freedom. Both distances
+    are multiples of one residual, so the sum is 2 sigma_d^2 times a chi-square variable with one: 92 % of
+    right matches pass, not 95 %.
+
+    Parameters
+    ----------
+    ratio : float
+        Ratio to the Sampson distance.
+    limit : float
+        Maximum squared distance, in variances of one coordinate.
     """
 
     ratio: float = 2.0
     limit: float = 2.0 * CHI2_2_95
 
     def distances(self, F: F64, xy1: F64, xy2: F64) -> F64:
-        """The root of the sum of both squared, px; (N,)."""
+        """Compute the root of the sum of both squared epipolar distances.
+
+        Parameters
+        ----------
+        F : ndarray (3, 3)
+            Fundamental matrix, px.
+        xy1, xy2 : ndarray (N, 2)
+            Matched points, px.
+
+        Returns
+        -------
+        ndarray (N,)
+            Distances >= 0, px.
+        """
         return symmetric_residuals(F, xy1, xy2)
 
 
 def discard_outliers(
     F: F64, xy1: F64, xy2: F64, *, limit_px: float = np.inf, test: InlierTest | None = None
 ) -> tuple[float, B8]:
-    """sigma (px) by the median of the distances, and which matches (N,) pass the test with it.
+    """Estimate the noise from the median distance and test every match against it.
 
-    ``test`` is by Sampson's distance unless given. The median is over the matches within ``limit_px`` of
-    that distance (at least 8), r^2 <= 3.84 sigma^2 the test. Without a limit sigma is too large where more
-    than half of the matches are wrong. Raises ``ValueError`` for fewer than 8 matches and as
-    :func:`~thesisrecon.epipolar.frame.as_matches`.
+    Parameters
+    ----------
+    F : ndarray (3, 3)
+        Fundamental matrix, px.
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 8, px.
+    limit_px : float
+        The median is taken over matches with a Sampson distance up to this (at least 8). Without it sigma is
+        too large if more than half of the matches are wrong.
+    test : InlierTest, optional
+        :class:`SampsonTest` by default.
+
+    Returns
+    -------
+    sigma_px : float
+        Standard deviation of one coordinate.
+    inliers : ndarray (N,) of bool
+        Matches that pass.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than 8 matches, or as :func:`~thesisrecon.epipolar.frame.as_matches`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> F = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
+    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4], [5, 9], [6, 2]], dtype=float)
+    >>> xy2 = xy1 + [[3.0, 0.1]] * np.array([[1], [-1], [1], [-1], [1], [-1], [1], [-1], [90]])
+    >>> discard_outliers(F, xy1, xy2)[1].tolist()
+    [True, True, True, True, True, True, True, True, False]
     """
     xy1, xy2 = as_matches(xy1, xy2)
     test = SampsonTest() if test is None else test
@@ -113,23 +198,60 @@ def discard_outliers(
 
 
 SAMPSON_TEST = SampsonTest()
+INLIER_TESTS: dict[str, InlierTest] = {
+    "sampson": SAMPSON_TEST,
+    "epipolar-distance": EpipolarDistanceTest(),
+    "symmetric-distance": SymmetricDistanceTest(),
+}
 
 
 @dataclass(frozen=True)
 class SevenPointProblem:
-    """Minimal samples of matches: rows (x1, y1, x2, y2) of ``points`` (N, 4), in one frame."""
+    """Seven-point sampling of matches for :class:`~thesisrecon.numerics.ransac.SampleConsensus`.
+
+    Parameters
+    ----------
+    points : ndarray (N, 4)
+        Matches as rows (x1, y1, x2, y2) in a common frame.
+    sample_size : int
+        Size of a minimal sample.
+    test : InlierTest
+        Distance of a match to F.
+    """
 
     points: F64
     sample_size: int = 7
     test: InlierTest = SAMPSON_TEST
 
     def solve(self, sample: I64) -> list[F64]:
-        """The one to three matrices through seven matches, as vectors (9,)."""
+        """Compute the fundamental matrices through seven matches.
+
+        Parameters
+        ----------
+        sample : ndarray (7,)
+            Indices of the matches.
+
+        Returns
+        -------
+        list of ndarray (9,)
+            The solutions, none to three.
+        """
         solutions = np.empty((3, 9))
         return list(solutions[: seven_point(self.points, sample, solutions)])
 
     def residuals(self, model: F64) -> F64:
-        """Distances (N,) of the test in the units of the points, Sampson's where it has no other."""
+        """Compute the distances of all matches to F.
+
+        Parameters
+        ----------
+        model : ndarray (9,)
+            F in the frame.
+
+        Returns
+        -------
+        ndarray (N,)
+            Distances >= 0 in units of the frame.
+        """
         if isinstance(self.test, SampsonTest):
             return np.asarray(sampson_distances(model, self.points))
         return self.test.distances(model.reshape(3, 3), self.points[:, :2], self.points[:, 2:])
@@ -137,60 +259,99 @@ class SevenPointProblem:
 
 @dataclass(frozen=True)
 class ThesisRansac:
-    """Section 5.4 as it stands, its slips corrected.
+    """RANSAC as in section 5.4 of the thesis, with its slips corrected.
 
-    Draw ``samples`` samples of seven, or stop once a share ``enough_share`` of the matches are inliers; keep
-    the F with the most; estimate sigma by the median (1.4826 (1 + 5 / (n - 7)) median |d|; the text divides
-    by Phi(0.75) where Phi^-1(0.75) is meant) and discard the outliers; then ``rounds`` times minimise the
-    gradient criterion (5.4), or the distances to the epipolar lines (5.6) with ``epipolar_distance``, and
-    discard again.
+    Draw samples of seven, keep the F with the most inliers, estimate sigma from the median distance, discard
+    outliers, then refine and discard again ``rounds`` times. sigma = 1.4826 (1 + 5 / (n - 7)) median |d|; the
+    thesis divides by Phi(0.75) where Phi^-1(0.75) is meant.
 
-    Departures: a match is tested by its Sampson distance against the chi-square of one degree of freedom (the
-    two epipolar distances are multiples of one residual, so their sum is not a chi-square of two), unless
-    ``both_lines`` or ``sum_of_lines`` asks for the first or second test of the text; the search
-    counts inliers within a fixed ``threshold_px``, since the share within a multiple of the median is the
-    same for every F; the refinement runs over the orthonormal representation, which has no epipole it cannot
-    reach.
+    Departures: matches are tested by the Sampson distance unless ``inlier_test`` selects a test of the text;
+    the search counts inliers within a fixed threshold, since the fraction within a multiple of the median is
+    the same for every F; the refinement uses the orthonormal representation, which reaches every epipole.
+
+    Parameters
+    ----------
+    threshold_px : float
+        Sampson distance of an inlier during the search.
+    samples : int
+        Maximum number of samples.
+    stop_inlier_ratio : float
+        Inlier ratio at which sampling stops.
+    epipolar_distance : bool
+        Refine the distances to epipolar lines (5.6) instead of the Sampson distances (5.4).
+    rounds : int
+        Rounds of refinement.
+    inlier_test : {"sampson", "epipolar-distance", "symmetric-distance"}
+        Test of a match: the default, or the first or second test of section 5.4.
     """
 
     threshold_px: float = 1.0
     samples: int = 1000
-    enough_share: float = 0.95
+    stop_inlier_ratio: float = 0.95
     epipolar_distance: bool = False
     rounds: int = 2
-    both_lines: bool = False
-    sum_of_lines: bool = False
+    inlier_test: Literal["sampson", "epipolar-distance", "symmetric-distance"] = "sampson"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
-        if min(self.samples, self.rounds) < 1 or not 0.0 < self.enough_share <= 1.0:
-            raise ValueError("a search needs samples >= 1, rounds >= 1 and 0 < enough_share <= 1")
-        if self.both_lines and self.sum_of_lines:
-            raise ValueError("a match is tested by both_lines or by sum_of_lines, not by both")
+        if min(self.samples, self.rounds) < 1 or not 0.0 < self.stop_inlier_ratio <= 1.0:
+            raise ValueError("a search needs samples >= 1, rounds >= 1 and 0 < stop_inlier_ratio <= 1")
+        if self.inlier_test not in INLIER_TESTS:
+            raise ValueError(
+                f"inlier_test must be one of {', '.join(INLIER_TESTS)}; got {self.inlier_test!r}"
+            )
 
     @property
     def test(self) -> InlierTest:
-        """The test of a match."""
-        if self.both_lines:
-            return BothLinesTest()
-        return SumOfLinesTest() if self.sum_of_lines else SampsonTest()
+        """The inlier test."""
+        return INLIER_TESTS[self.inlier_test]
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
-        """F of matches (N >= 8, 2) px; raises as
-        :meth:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac.estimate`."""
+        """Estimate F of matches with outliers.
+
+        Parameters
+        ----------
+        xy1, xy2 : array_like (N, 2)
+            Matched points, N >= 8, px.
+        rng : numpy.random.Generator
+            Source of the samples.
+
+        Returns
+        -------
+        FundamentalFit
+            F, inliers, noise and covariance.
+
+        Raises
+        ------
+        ValueError
+            As :func:`~thesisrecon.epipolar.frame.as_matches`.
+        StageFailure
+            If there are too few or collinear matches, or no F has 8 inliers.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> xy1 = rng.uniform(0, 500, (60, 2))
+        >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
+        >>> xy2[:15] = rng.uniform(0, 500, (15, 2))
+        >>> fit = ThesisRansac().estimate(xy1, xy2, rng)
+        >>> bool(fit.inliers[15:].mean() > 0.9)
+        True
+        """
         xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
         frame = PairFrame.of(xy1, xy2)
         points = frame.points(xy1, xy2)
         test = self.test
         gate = test.ratio * self.threshold_px * frame.scale
-        loop = SampleConsensus(gate, max_samples=self.samples, enough_share=self.enough_share)
+        loop = SampleConsensus(gate, max_samples=self.samples, stop_inlier_ratio=self.stop_inlier_ratio)
         found = loop.search(SevenPointProblem(points, test=test), len(points), rng)
         if found is None or found.inliers.sum() < MINIMUM:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
-                f"{self.samples} samples, none with {MINIMUM} of {len(xy1)} matches close enough",
-                "the photographs may not overlap, or the matches are wrong",
+                f"none of {self.samples} samples has {MINIMUM} inliers among {len(xy1)} matches",
+                "check that the images overlap and that the matches are correct",
             )
         F, sigma = frame.matrix_in_pixels(found.model), 0.0
         _, inliers = discard_outliers(F, xy1, xy2, limit_px=self.threshold_px, test=test)
@@ -203,18 +364,30 @@ class ThesisRansac:
         return FundamentalFit(F, inliers, sigma, covariance, found.samples)
 
 
+# Matches over which the last rounds take the median; over all matches it grows with the wrong ones.
 NEAR_SIGMAS = 2.5
-"""The median of the last rounds is over matches this near, since that over all grows with the wrong ones."""
 
 
 @dataclass(frozen=True)
 class LeastMedianOfSquares:
-    """The F of ``samples`` samples of seven whose median squared Sampson distance is the least.
+    """F with the least median squared Sampson distance among random samples of seven.
 
-    Then sigma = 1.4826 (1 + 5 / (n - 7)) sqrt(median) and ``rounds`` times: discard what lies beyond the 95 %
-    limit, minimise the gradient criterion (5.4) over the rest, estimate sigma of those near (Rousseeuw 1984;
-    Zhang, IJCV 1998). 900 samples hold one free of outliers with 99.9 % where half of the matches are wrong;
-    with more than half wrong the median is of wrong matches and the answer means nothing.
+    Then sigma = 1.4826 (1 + 5 / (n - 7)) sqrt(median), and ``rounds`` times: discard matches beyond the 95 %
+    limit, minimise the Sampson distances (5.4) of the rest, and estimate sigma from the matches nearby. No
+    threshold is needed, but with more than half of the matches wrong the median belongs to wrong matches. 900
+    samples contain one without outliers with 99.9 % probability if half of the matches are wrong.
+
+    Parameters
+    ----------
+    samples : int
+        Number of samples.
+    rounds : int
+        Rounds of refinement.
+
+    References
+    ----------
+    P. Rousseeuw, "Least median of squares regression", JASA 79, 1984. Z. Zhang, "Determining the epipolar
+    geometry and its uncertainty", IJCV 27, 1998.
     """
 
     samples: int = 900
@@ -225,19 +398,50 @@ class LeastMedianOfSquares:
             raise ValueError(f"a search needs samples and rounds of 1; got {self.samples}, {self.rounds}")
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
-        """F of matches (N >= 8, 2) px; raises as
-        :meth:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac.estimate`."""
+        """Estimate F of matches with less than half of outliers.
+
+        Parameters
+        ----------
+        xy1, xy2 : array_like (N, 2)
+            Matched points, N >= 8, px.
+        rng : numpy.random.Generator
+            Source of the samples.
+
+        Returns
+        -------
+        FundamentalFit
+            F, inliers, noise and covariance.
+
+        Raises
+        ------
+        ValueError
+            As :func:`~thesisrecon.epipolar.frame.as_matches`.
+        StageFailure
+            If there are too few or collinear matches, or no sample determines an F.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> xy1 = rng.uniform(0, 500, (60, 2))
+        >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
+        >>> xy2[:15] = rng.uniform(0, 500, (15, 2))
+        >>> fit = LeastMedianOfSquares(samples=300).estimate(xy1, xy2, rng)
+        >>> bool(fit.inliers[15:].all())
+        True
+        """
         xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
         frame = PairFrame.of(xy1, xy2)
         points = frame.points(xy1, xy2)
-        found = self._search(points, rng)
+        loop = SampleConsensus(np.inf, max_samples=self.samples, least_median=True)
+        found = loop.search(SevenPointProblem(points), len(points), rng)
         if found is None:
             raise StageFailure(
                 "no epipolar geometry explains the matches",
-                f"none of {self.samples} samples of seven of {len(xy1)} matches determines one",
-                "the matches may be repeated or lie on few points",
+                f"none of {self.samples} seven-point samples of {len(xy1)} matches determines one",
+                "check for repeated matches or matches on few points",
             )
-        F = frame.matrix_in_pixels(found)
+        F = frame.matrix_in_pixels(found.model)
         sigma, inliers = discard_outliers(F, xy1, xy2)
         for _ in range(self.rounds):
             F = refine_sampson(F, xy1[inliers], xy2[inliers])
@@ -246,14 +450,3 @@ class LeastMedianOfSquares:
             frame, frame.matrix_in_frame(F), points[inliers], sigma * frame.scale
         )
         return FundamentalFit(F, inliers, sigma, covariance, self.samples)
-
-    def _search(self, points: F64, rng: Generator) -> F64 | None:
-        problem, sample = SevenPointProblem(points), np.empty(7, dtype=np.int64)
-        best, best_median, middle = None, np.inf, len(points) // 2
-        for _ in range(self.samples):
-            draw_sample(rng.random(7), len(points), sample)
-            for f in problem.solve(sample):
-                median = np.partition(problem.residuals(f), middle)[middle]
-                if median < best_median:
-                    best, best_median = f.copy(), median
-        return best

@@ -1,9 +1,10 @@
-"""Compiled refinement of F over its seven degrees of freedom: F = U diag(cos phi, sin phi, 0) V'.
+"""Section 5.3: minimise a geometric criterion over the seven degrees of freedom of F.
 
-Orthonormal representation of Bartoli and Sturm (IJCV 2004): singular by construction, without the thesis'
-special case of an epipole at infinity. Points are rows (x1, y1, x2, y2), F is a flat row-major vector of 9.
-
-Section 5.3: F that minimises a geometric criterion over the seven degrees of freedom it has.
+F = U diag(cos phi, sin phi, 0) V' is the orthonormal representation of Bartoli and Sturm (IJCV 2004): rank 2
+by construction, without the thesis' special case of an epipole at infinity. The criteria are the Sampson
+distance (5.4), which the thesis calls the gradient criterion, the distances to the epipolar lines (5.6) and
+the reprojection error (Hartley and Zisserman, algorithm 11.3). In the kernels points are rows (x1, y1, x2,
+y2) in a common frame and F is a row-major vector of 9.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from numba import njit
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
 
-SAMPSON, DISTANCE, REPROJECTION = 0, 1, 2
+SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
+# Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
 CORRECTIONS = 8
-"""Steps to the nearest exact match; each leaves some (noise / distance to the epipole)^2 of the last."""
 BLOCK = 128
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
-def weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta: float, D: F64) -> float:
-    """Derivatives of the residuals of at most BLOCK points by the entries of F: columns of ``D`` (11, BLOCK).
+def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta: float, D: F64) -> float:
+    """Compute the derivatives of the residuals of at most BLOCK points by F: columns of ``D`` (11, BLOCK).
 
-    Row 9 is the residual with its sign, row 10 the weight rho'(r) / r, 0 beyond the gate. Returns the cost.
-    One loop without branches over contiguous rows, which the compiler turns into vector instructions.
+    Row 9 is the signed residual, row 10 the weight rho'(r) / r, 0 beyond the gate. Returns the cost. The loop
+    has no branches and reads contiguous rows so that it vectorises.
     """
     X = np.empty((4, BLOCK))
     for k in range(len(points)):
@@ -73,11 +74,11 @@ def weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
-def reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: F64) -> float:
-    """As :func:`weighted_derivatives`, of the distances r of (x1, y1, x2, y2) to the nearest exact match.
+def _reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: F64) -> float:
+    """As :func:`_weighted_derivatives` for the distances r of (x1, y1, x2, y2) to the nearest exact match.
 
-    The nearest match p is found by the iteration of Kanatani, Sugaya and Niitsuma (BMVC 2008), and it need
-    not be moved with F: r is least there, so that dr = d(p2' F p1) / |gradient at p|.
+    The nearest match p comes from the iteration of Kanatani, Sugaya and Niitsuma (BMVC 2008). Since r is
+    minimal there, dr = d(p2' F p1) / |gradient at p| without the motion of p.
     """
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f
     outside = delta * (gate - 0.5 * delta)
@@ -111,11 +112,31 @@ def reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64) -> float:
-    """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by the entries of F.
+    """Compute the Gauss-Newton system of 1/2 sum rho(r) by the entries of F.
 
-    rho is Huber's loss of width ``delta``, constant beyond ``gate``; r the Sampson distance (5.4), the root
-    of the sum of the two squared epipolar distances (5.6), or the distance to the nearest exact match.
-    Returns the cost.
+    rho is Huber's loss of width ``delta``, constant beyond ``gate``.
+
+    Parameters
+    ----------
+    f : ndarray (9,)
+        F in the frame.
+    points : ndarray (N, 4)
+        Matches.
+    criterion : int
+        SAMPSON (5.4), EPIPOLAR_DISTANCE (5.6) or REPROJECTION.
+    gate : float
+        Residual beyond which a match has no weight.
+    delta : float
+        Width of Huber's loss.
+    G : ndarray (9, 9)
+        Output: Gauss-Newton matrix.
+    h : ndarray (9,)
+        Output: gradient.
+
+    Returns
+    -------
+    float
+        The cost.
     """
     G[:] = 0.0
     h[:] = 0.0
@@ -125,9 +146,9 @@ def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: fl
         m = min(BLOCK, len(points) - start)
         block = points[start : start + m]
         if criterion == REPROJECTION:
-            cost += reprojection_derivatives(f, block, gate, delta, D)
+            cost += _reprojection_derivatives(f, block, gate, delta, D)
         else:
-            cost += weighted_derivatives(f, block, criterion, gate, delta, D)
+            cost += _weighted_derivatives(f, block, criterion, gate, delta, D)
         for i in range(9):
             for k in range(m):
                 wd[k] = D[10, k] * D[i, k]
@@ -148,14 +169,31 @@ def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: fl
 
 @njit(cache=True, nogil=True)
 def residuals_and_derivatives(f: F64, points: F64, criterion: int) -> tuple[F64, F64]:
-    """Signed residuals (N,) of a criterion and their derivatives (N, 9) by the entries of F."""
+    """Compute the signed residuals of a criterion and their derivatives by the entries of F.
+
+    Parameters
+    ----------
+    f : ndarray (9,)
+        F in the frame.
+    points : ndarray (N, 4)
+        Matches.
+    criterion : int
+        SAMPSON, EPIPOLAR_DISTANCE or REPROJECTION.
+
+    Returns
+    -------
+    r : ndarray (N,)
+        Residuals.
+    J : ndarray (N, 9)
+        Derivatives.
+    """
     r, J, D = np.empty(len(points)), np.empty((len(points), 9)), np.empty((11, BLOCK))
     for start in range(0, len(points), BLOCK):
         block = points[start : start + BLOCK]
         if criterion == REPROJECTION:
-            reprojection_derivatives(f, block, np.inf, 1e150, D)
+            _reprojection_derivatives(f, block, np.inf, 1e150, D)
         else:
-            weighted_derivatives(f, block, criterion, np.inf, 1e150, D)
+            _weighted_derivatives(f, block, criterion, np.inf, 1e150, D)
         for k in range(len(block)):
             r[start + k] = D[9, k]
             for m in range(9):
@@ -164,8 +202,18 @@ def residuals_and_derivatives(f: F64, points: F64, criterion: int) -> tuple[F64,
 
 
 @njit(cache=True, nogil=True)
-def compose(U: F64, V: F64, phi: float, f: F64) -> None:
-    """F = U diag(cos phi, sin phi, 0) V': rank 2 and unit norm by construction."""
+def fundamental_from_orthonormal(U: F64, V: F64, phi: float, f: F64) -> None:
+    """Compute F = U diag(cos phi, sin phi, 0) V', rank 2 and unit norm.
+
+    Parameters
+    ----------
+    U, V : ndarray (3, 3)
+        Orthonormal matrices.
+    phi : float
+        Angle of the singular values.
+    f : ndarray (9,)
+        Output: F.
+    """
     c, s = np.cos(phi), np.sin(phi)
     for i in range(3):
         for j in range(3):
@@ -173,8 +221,18 @@ def compose(U: F64, V: F64, phi: float, f: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def tangent(U: F64, V: F64, phi: float, B: F64) -> None:
-    """Derivatives (``B`` (9, 7)) of F by rotations of U (3) and of V (3) about their own axes, and by phi."""
+def orthonormal_tangent(U: F64, V: F64, phi: float, B: F64) -> None:
+    """Compute the derivatives of F by rotations of U and V about their own axes and by phi.
+
+    Parameters
+    ----------
+    U, V : ndarray (3, 3)
+        Orthonormal matrices.
+    phi : float
+        Angle of the singular values.
+    B : ndarray (9, 7)
+        Output: columns for U (3), V (3) and phi.
+    """
     c, s = np.cos(phi), np.sin(phi)
     for i in range(3):
         for j in range(3):
@@ -189,8 +247,8 @@ def tangent(U: F64, V: F64, phi: float, B: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def rotate_columns(U: F64, a: F64, out: F64) -> None:
-    """out = U exp([a]x), by Rodrigues' formula."""
+def _rotate_columns(U: F64, a: F64, out: F64) -> None:
+    """Compute out = U exp([a]x) by Rodrigues' formula."""
     angle = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
     if angle < 1e-12:
         p, q = 1.0, 0.5
@@ -207,8 +265,8 @@ def rotate_columns(U: F64, a: F64, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
-    """Solve (H + damping diag H) step = -g by Cholesky; False where the matrix is not positive."""
+def _solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
+    """Solve (H + damping diag H) step = -g by Cholesky; False if the matrix is not positive definite."""
     n = len(g)
     L = np.zeros((n, n))
     floor = 0.0
@@ -242,8 +300,21 @@ def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def split(f: F64, U: F64, V: F64) -> float:
-    """U, V and phi of the nearest matrix of rank 2; phi = atan2 of the two largest singular values."""
+def orthonormal_from_fundamental(f: F64, U: F64, V: F64) -> float:
+    """Decompose the nearest matrix of rank 2 into U, V and phi.
+
+    Parameters
+    ----------
+    f : ndarray (9,)
+        F.
+    U, V : ndarray (3, 3)
+        Output: left and right singular vectors.
+
+    Returns
+    -------
+    float
+        phi = atan2 of the second and first singular value.
+    """
     u, s, vt = np.linalg.svd(f.reshape((3, 3)))
     U[:] = u
     V[:] = vt.T
@@ -254,30 +325,47 @@ def split(f: F64, U: F64, V: F64) -> float:
 def refine(
     f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int
 ) -> tuple[float, int]:
-    """Minimise the cost of :func:`normal_equations` from ``f`` (finite, changed in place); cost and steps.
+    """Minimise the cost of :func:`normal_equations` by Levenberg-Marquardt.
 
-    Levenberg-Marquardt with at most ``iterations`` solves; the cost never rises above that of the nearest
-    matrix of rank 2.
+    Parameters
+    ----------
+    f : ndarray (9,)
+        Finite start; overwritten by the result.
+    points : ndarray (N, 4)
+        Matches.
+    criterion : int
+        SAMPSON, EPIPOLAR_DISTANCE or REPROJECTION.
+    gate, delta : float
+        Gate and width of Huber's loss.
+    iterations : int
+        Maximum number of linear solves.
+
+    Returns
+    -------
+    cost : float
+        Final cost, never above that of the nearest rank-2 matrix of the start.
+    steps : int
+        Number of solves.
     """
     U, V, Un, Vn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    phi = split(f, U, V)
+    phi = orthonormal_from_fundamental(f, U, V)
     G, h, Gn, hn = np.empty((9, 9)), np.empty(9), np.empty((9, 9)), np.empty(9)
     B, step, trial = np.empty((9, 7)), np.empty(7), np.empty(9)
-    compose(U, V, phi, f)
+    fundamental_from_orthonormal(U, V, phi, f)
     cost = normal_equations(f, points, criterion, gate, delta, G, h)
     exact = 1e-26 * len(points)
     damping, steps = 1e-3, 0
     while steps < iterations and cost > exact:
-        tangent(U, V, phi, B)
+        orthonormal_tangent(U, V, phi, B)
         H = B.T @ (G @ B)
         g = B.T @ h
         accepted = False
         while steps < iterations and not accepted:
             steps += 1
-            if solve_damped(H, g, damping, step):
-                rotate_columns(U, step[0:3], Un)
-                rotate_columns(V, step[3:6], Vn)
-                compose(Un, Vn, phi + step[6], trial)
+            if _solve_damped(H, g, damping, step):
+                _rotate_columns(U, step[0:3], Un)
+                _rotate_columns(V, step[3:6], Vn)
+                fundamental_from_orthonormal(Un, Vn, phi + step[6], trial)
                 new_cost = normal_equations(trial, points, criterion, gate, delta, Gn, hn)
                 accepted = new_cost < cost
             damping = max(1e-9, 0.1 * damping) if accepted else 10.0 * damping
@@ -294,20 +382,61 @@ def refine(
     return cost, steps
 
 
+# Stands for an infinite width of the loss; its square is still finite.
 UNBOUNDED = 1e150
-"""Stands for an infinite width of the loss: its square is still a number."""
 
 
 def refine_sampson(
     F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50
 ) -> F64:
-    """F (3, 3), unit norm, rank 2, that minimises the Sampson distances of (5.4) from the start ``F``.
+    """Minimise the Sampson distances (5.4) from a start, the thesis' gradient criterion.
 
-    Levenberg-Marquardt on the orthonormal representation (Bartoli and Sturm, 2004) in place of the thesis'
-    third row as a combination of the others, whose left null vector [alpha beta -1] cannot be an epipole at
-    infinity; ``loss_px`` is the width of Huber's loss (least squares without). Optimal to first order in the
-    noise. Raises as :func:`~thesisrecon.epipolar.frame.check_matches` with 7 matches needed, ``ValueError``
-    for an F that is not a finite (3, 3) matrix of rank 2 or more.
+    Optimal to first order in the noise. The thesis writes the third row as a combination of the others, so
+    that the epipole (alpha, beta, -1) cannot lie at infinity; the orthonormal representation has no such
+    exception.
+
+    Parameters
+    ----------
+    F : array_like (3, 3)
+        Start, rank 2 or 3, px.
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 7, px.
+    loss_px : float
+        Width of Huber's loss; least squares by default.
+    max_iterations : int
+        Maximum number of linear solves.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        Refined F, rank 2, unit norm.
+
+    Raises
+    ------
+    ValueError
+        If F is not finite and of rank 2 or 3, or ``loss_px`` is not positive.
+    StageFailure
+        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+
+    References
+    ----------
+    A. Bartoli and P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal parameters", PAMI
+    26, 2004.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.geometry.two_view import sampson_residuals
+    >>> from thesisrecon.epipolar.linear import estimate_eight_point
+    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4], [5, 9], [6, 1]], dtype=float)
+    >>> depth = np.array([1, 2, 4, 2, 1, 4, 1, 2, 4])
+    >>> noise = np.array([[1, -1], [-1, 0], [0, 1], [1, 1], [-1, -1], [0, -1], [1, 0], [-1, 1], [0, 0]])
+    >>> xy2 = xy1 + np.array([[4.0, 2.0]]) / depth[:, None] + 0.01 * noise
+    >>> start = estimate_eight_point(xy1, xy2)
+    >>> F = refine_sampson(start, xy1, xy2)
+    >>> rms = [float(np.sqrt(np.mean(sampson_residuals(M, xy1, xy2) ** 2))) for M in (start, F)]
+    >>> rms[1] < rms[0]
+    True
     """
     return _refine(F, xy1, xy2, SAMPSON, loss_px, max_iterations)
 
@@ -315,17 +444,88 @@ def refine_sampson(
 def refine_epipolar_distance(
     F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50
 ) -> F64:
-    """As :func:`refine_sampson`, but for the squared distances to both epipolar lines (5.6)."""
-    return _refine(F, xy1, xy2, DISTANCE, loss_px, max_iterations)
+    """Minimise the squared distances to both epipolar lines (5.6) from a start.
+
+    Parameters
+    ----------
+    F : array_like (3, 3)
+        Start, rank 2 or 3, px.
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 7, px.
+    loss_px : float
+        Width of Huber's loss; least squares by default.
+    max_iterations : int
+        Maximum number of linear solves.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        Refined F, rank 2, unit norm.
+
+    Raises
+    ------
+    ValueError
+        As :func:`refine_sampson`.
+    StageFailure
+        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4], [5, 9]], dtype=float)
+    >>> xy2 = xy1 + np.array([[4.0, 2.0]]) / np.array([1, 2, 4, 2, 1, 4, 1, 2])[:, None]
+    >>> start = np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.9], [-0.4, 0.9, 0.0]])
+    >>> F = refine_epipolar_distance(start, xy1, xy2)
+    >>> float(np.round(np.abs(F[0, 2] / F[1, 2]), 6))
+    0.5
+    """
+    return _refine(F, xy1, xy2, EPIPOLAR_DISTANCE, loss_px, max_iterations)
 
 
 def refine_reprojection(
     F: F64, xy1: F64, xy2: F64, *, loss_px: float = UNBOUNDED, max_iterations: int = 50
 ) -> F64:
-    """As :func:`refine_sampson`, but for the distances of the matches to the nearest exact ones.
+    """Minimise the reprojection error from a start, the gold standard method.
 
-    The gold standard (HZ, algorithm 11.3): the maximum likelihood of F and of all points under Gaussian
-    noise. Each point is eliminated by its optimal correction, so that seven parameters are left.
+    The maximum likelihood of F and of all points for Gaussian noise. Each point is eliminated by its optimal
+    correction, so that seven parameters remain.
+
+    Parameters
+    ----------
+    F : array_like (3, 3)
+        Start, rank 2 or 3, px.
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 7, px.
+    loss_px : float
+        Width of Huber's loss; least squares by default.
+    max_iterations : int
+        Maximum number of linear solves.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        Refined F, rank 2, unit norm.
+
+    Raises
+    ------
+    ValueError
+        As :func:`refine_sampson`.
+    StageFailure
+        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+
+    References
+    ----------
+    Hartley and Zisserman, Multiple View Geometry, algorithm 11.3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4], [5, 9]], dtype=float)
+    >>> xy2 = xy1 + np.array([[4.0, 2.0]]) / np.array([1, 2, 4, 2, 1, 4, 1, 2])[:, None]
+    >>> start = np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.9], [-0.4, 0.9, 0.0]])
+    >>> F = refine_reprojection(start, xy1, xy2)
+    >>> float(np.round(np.abs(F[0, 2] / F[1, 2]), 6))
+    0.5
     """
     return _refine(F, xy1, xy2, REPROJECTION, loss_px, max_iterations)
 

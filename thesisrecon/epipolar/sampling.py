@@ -1,7 +1,7 @@
-"""Compiled loops of chapter 5: minimal solver, orientation, score and the search that joins them.
+"""Scoring of F and the seven-point search of :mod:`thesisrecon.epipolar.locally_optimised`.
 
-Points are rows (x1, y1, x2, y2) in one frame in which both images are scaled alike, so that Sampson distances
-are pixels times that scale. F is a flat row-major vector of 9.
+Points are rows (x1, y1, x2, y2) in a common frame that scales both images alike, so Sampson distances are
+pixels times that scale. F is a row-major vector of 9.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar.linear import LANES, ROWS, lane_solutions, solve_batch
+from thesisrecon.epipolar.linear import LANES, ROWS, seven_point_batch_solutions, solve_seven_point_batch
 from thesisrecon.epipolar.refinement import SAMPSON, refine
 from thesisrecon.numerics.ransac import draw_sample, required_samples
 
@@ -22,7 +22,7 @@ LARGEST = 1 << 40
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float:
+def _squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared Sampson distance, the summand of (5.4)."""
     a0 = f[0] * x1 + f[1] * y1 + f[2]
     a1 = f[3] * x1 + f[4] * y1 + f[5]
@@ -35,18 +35,31 @@ def squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sampson_distances(f: F64, points: F64) -> F64:
-    """Sampson distances (N,) >= 0 of all points, in their units."""
+    """Compute the Sampson distances of all points.
+
+    Parameters
+    ----------
+    f : ndarray (9,)
+        F in the frame.
+    points : ndarray (N, 4)
+        Matches.
+
+    Returns
+    -------
+    ndarray (N,)
+        Distances >= 0 in units of the frame.
+    """
     r = np.empty(len(points))
     for k in range(len(points)):
-        r[k] = np.sqrt(squared_sampson(f, points[k, 0], points[k, 1], points[k, 2], points[k, 3]))
+        r[k] = np.sqrt(_squared_sampson(f, points[k, 0], points[k, 1], points[k, 2], points[k, 3]))
     return r
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
-def block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
-    """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and how many have r < gate.
+def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
+    """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and the number with r < gate.
 
-    Without branches and over contiguous rows, so that the compiler makes vector instructions of it.
+    No branches and contiguous rows, so that the loop vectorises.
     """
     total, inside, wide = 0.0, 0.0, gate * gate
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
@@ -67,19 +80,44 @@ def block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tupl
 def truncated_score(
     f: F64, columns: F64, gate: float, give_up: float, evidence: tuple[float, float]
 ) -> tuple[float, int, int]:
-    """Mean of min(r^2 / gate^2, 1) over all columns (4, N), how many have r < gate, and how many were seen.
+    """Compute the truncated quadratic score of F, stopping early for a bad F.
 
-    Given up (score 1) as soon as the sum passes ``give_up`` times the number of points, since it cannot win,
-    as the running mean is three standard errors above it, or as Wald's sequential test says so (Matas and
-    Chum, ICCV 2005): ``evidence`` are the logarithms of the ratio of the likelihoods of "wrong" and "right"
-    for a point within the gate and for one beyond. The order of the points must be random.
+    The evaluation stops with score 1 if the sum exceeds ``give_up`` times the number of points, if the
+    running mean is three standard errors above it, or by Wald's sequential test. The points must be in random
+    order.
+
+    Parameters
+    ----------
+    f : ndarray (9,)
+        F in the frame.
+    columns : ndarray (4, N)
+        Matches as columns.
+    gate : float
+        Distance at which the score is truncated.
+    give_up : float
+        Score to beat.
+    evidence : tuple of float
+        Log likelihood ratios "wrong" to "right" of a point inside and outside the gate.
+
+    Returns
+    -------
+    score : float
+        Mean of min(r^2 / gate^2, 1).
+    inliers : int
+        Number of points with r < gate.
+    seen : int
+        Number of points evaluated.
+
+    References
+    ----------
+    J. Matas and O. Chum, "Randomized RANSAC with sequential probability ratio test", ICCV 2005.
     """
     n = columns.shape[1]
     total, inliers = 0.0, 0.0
     spread = 3.0 * np.sqrt(give_up * max(1.0 - give_up, 0.01))
     for start in range(0, n, STRIDE):
         end = min(start + STRIDE, n)
-        part, inside = block_score(f, columns, start, end, gate)
+        part, inside = _block_score(f, columns, start, end, gate)
         total += part
         inliers += inside
         doubt = inliers * evidence[0] + (end - inliers) * evidence[1]
@@ -89,11 +127,11 @@ def truncated_score(
 
 
 @njit(cache=True, nogil=True)
-def log_ratios(right: float, wrong: float) -> tuple[float, float]:
-    """Logarithms of the likelihood ratios wrong : right for a point inside and outside the gate.
+def _log_likelihood_ratios(right: float, wrong: float) -> tuple[float, float]:
+    """Log likelihood ratios wrong : right of a point inside and outside the gate.
 
-    ``right`` and ``wrong`` are the shares of points within the gate of a right and of a wrong matrix. Zeros
-    (never give up) where the two are too near to be told apart.
+    ``right`` and ``wrong`` are the fractions of points inside the gate of a right and of a wrong F. Zeros
+    (never stop early) if the two are too close.
     """
     right = min(right, 0.99)
     if not right > 1.5 * wrong:
@@ -102,8 +140,8 @@ def log_ratios(right: float, wrong: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def draw_batch(points: F64, uniforms: F64, X: F64) -> None:
-    """Samples of the rows of ``uniforms`` (B <= LANES, 7) as columns of ``X`` (28, LANES)."""
+def _draw_batch(points: F64, uniforms: F64, X: F64) -> None:
+    """Write the samples of the rows of ``uniforms`` (B <= LANES, 7) as columns of ``X`` (28, LANES)."""
     sample = np.empty(7, np.int64)
     for lane in range(len(uniforms)):
         draw_sample(uniforms[lane], len(points), sample)
@@ -113,10 +151,10 @@ def draw_batch(points: F64, uniforms: F64, X: F64) -> None:
 
 
 @njit(cache=True, nogil=True, forceinline=True)
-def improve(points: F64, columns: F64, gate: float, state: F64, F: F64) -> None:
-    """Refine the best matrix a little (on at most 300 points, with a gate twice as wide) and keep the better.
+def _refine_best(points: F64, columns: F64, gate: float, state: F64, F: F64) -> None:
+    """Refine the best F on at most 300 points with twice the gate and keep the better of the two.
 
-    A minimal sample spreads its noise over the image. ``state`` and ``F`` as in :func:`search`.
+    A minimal sample spreads its noise over the image. ``state`` and ``F`` as in :func:`search_fundamental`.
     """
     f = F.copy()
     refine(f, points[:SUBSET], SAMPSON, 2.0 * gate, gate, 4)
@@ -127,13 +165,32 @@ def improve(points: F64, columns: F64, gate: float, state: F64, F: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def search(points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64) -> int:
-    """Draw one sample per row of ``uniforms`` (B, 7) until enough were drawn; number of samples drawn in all.
+def search_fundamental(
+    points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64
+) -> int:
+    """Draw and score one seven-point sample per row of ``uniforms`` until enough samples were drawn.
 
-    ``stop`` are the samples drawn before, the least number to draw and the probability of one free of
-    outliers that is enough. ``state`` (4,) holds the best score, its share of inliers, and of all matrices
-    given up the points seen and those of them within the gate; ``F`` (9,) is the best matrix: both are read
-    and updated. A new best of a batch is improved before it sets the number of samples still needed.
+    Each new best F of a batch is refined before it sets the number of samples still required.
+
+    Parameters
+    ----------
+    points : ndarray (N, 4)
+        Matches in random order.
+    uniforms : ndarray (B, 7)
+        Uniform random numbers in [0, 1).
+    gate : float
+        Distance at which the score is truncated.
+    stop : tuple
+        Samples drawn before, minimum number to draw, probability of a sample without outliers.
+    state : ndarray (4,)
+        In and out: best score, its inlier ratio, points seen and points inside the gate of rejected models.
+    F : ndarray (9,)
+        In and out: best F.
+
+    Returns
+    -------
+    int
+        Number of samples drawn in total.
     """
     columns = np.ascontiguousarray(points.T)
     done, least, confidence = stop
@@ -144,12 +201,12 @@ def search(points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float]
             break
         batch = uniforms[start : start + LANES]
         done += len(batch)
-        draw_batch(points, batch, X)
-        solve_batch(X, Y)
-        evidence = log_ratios(state[1], state[3] / state[2])
+        _draw_batch(points, batch, X)
+        solve_seven_point_batch(X, Y)
+        evidence = _log_likelihood_ratios(state[1], state[3] / state[2])
         before = state[0]
         for lane in range(len(batch)):
-            for k in range(lane_solutions(Y, lane, work, solutions)):
+            for k in range(seven_point_batch_solutions(Y, lane, work, solutions)):
                 score, inliers, seen = truncated_score(solutions[k], columns, gate, state[0], evidence)
                 if score < state[0]:
                     state[0], state[1] = score, inliers / len(points)
@@ -158,5 +215,5 @@ def search(points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float]
                     state[2] += seen
                     state[3] += inliers
         if state[0] < before:
-            improve(points, columns, gate, state, F)
+            _refine_best(points, columns, gate, state, F)
     return done

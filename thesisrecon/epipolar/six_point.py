@@ -22,7 +22,7 @@ WIDTHS = (1.0, 0.25, 0.0625)
 
 
 @njit(cache=True, nogil=True)
-def cross(a: F64, b: F64, out: F64) -> float:
+def _cross(a: F64, b: F64, out: F64) -> float:
     """out = a x b; the squared length."""
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
@@ -32,11 +32,11 @@ def cross(a: F64, b: F64, out: F64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def null_vector(M: F64, out: F64) -> bool:
+def _null_vector(M: F64, out: F64) -> bool:
     """Null vector (3,), unit norm, of a matrix (3, 3) of rank 2: its longest product of two rows."""
     best, trial = 0.0, np.empty(3)
     for k in range(3):
-        squared = cross(M[k], M[(k + 1) % 3], trial)
+        squared = _cross(M[k], M[(k + 1) % 3], trial)
         if squared > best:
             best = squared
             out[:] = trial
@@ -47,13 +47,13 @@ def null_vector(M: F64, out: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def basis_matrix(track: F64, sample: I64, view: int, B: F64) -> bool:
+def _basis_matrix(track: F64, sample: I64, view: int, B: F64) -> bool:
     """B (3, 3) that takes e_1, e_2, e_3, (1, 1, 1) to the first four points of a sample; False if none."""
     M, adjugate = np.ones((3, 3)), np.empty((3, 3))
     for k in range(3):
         M[k, 0], M[k, 1] = track[sample[k], 2 * view], track[sample[k], 2 * view + 1]
     for k in range(3):
-        cross(M[(k + 1) % 3], M[(k + 2) % 3], adjugate[k])
+        _cross(M[(k + 1) % 3], M[(k + 2) % 3], adjugate[k])
     det = M[0, 0] * adjugate[0, 0] + M[0, 1] * adjugate[0, 1] + M[0, 2] * adjugate[0, 2]
     if not abs(det) > DEPENDENT:
         return False
@@ -68,18 +68,18 @@ def basis_matrix(track: F64, sample: I64, view: int, B: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def in_basis(B: F64, x: float, y: float, out: F64) -> None:
+def _in_basis(B: F64, x: float, y: float, out: F64) -> None:
     """B^-1 (x, y, 1) as a unit vector."""
     columns = B.T
     area = np.empty(3)
     for k in range(3):
-        cross(columns[(k + 1) % 3], columns[(k + 2) % 3], area)
+        _cross(columns[(k + 1) % 3], columns[(k + 2) % 3], area)
         out[k] = area[0] * x + area[1] * y + area[2]
     out /= np.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
 
 
 @njit(cache=True, nogil=True)
-def reduced_pencil(five: F64, six: F64, pencil: F64) -> bool:
+def _reduced_pencil(five: F64, six: F64, pencil: F64) -> bool:
     """Orthonormal span (2, 9) of the matrices G, zero on the diagonal and of sum 0, with x6'G x5 = 0.
 
     ``five`` and ``six`` (3, 3) are the unit vectors of the fifth and sixth point in the basis of the others,
@@ -114,18 +114,18 @@ def reduced_pencil(five: F64, six: F64, pencil: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def sixth_point(G: F64, X: F64) -> bool:
+def _sixth_point(G: F64, X: F64) -> bool:
     """The sixth point (4,), where the others are E_1, ..., E_4 and (1, 1, 1, 1), of a singular G (3, 3).
 
     G = [u]x diag(X, Y, Z) with u = (X - W, Y - W, Z - W), its left null vector; the right one is u / X.
     """
     right, left, M, mix = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    if not (null_vector(G, right) and null_vector(G.T.copy(), left)):
+    if not (_null_vector(G, right) and _null_vector(G.T.copy(), left)):
         return False
     for k in range(3):
         # X = W - m u, put into X v = n u.
         M[k, 0], M[k, 1], M[k, 2] = right[k], -left[k] * right[k], -left[k]
-    if not null_vector(M, mix):
+    if not _null_vector(M, mix):
         return False
     X[0], X[1], X[2] = mix[0] - mix[1] * left[0], mix[0] - mix[1] * left[1], mix[0] - mix[1] * left[2]
     X[3] = mix[0]
@@ -137,13 +137,13 @@ def sixth_point(G: F64, X: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def reduced_camera(B: F64, five: F64, six: F64, X: F64, P: F64) -> bool:
+def _reduced_camera(B: F64, five: F64, six: F64, X: F64, P: F64) -> bool:
     """P (3, 4) = B [a 0 0 d; 0 b 0 d; 0 0 c d], unit norm, that shows (1, 1, 1, 1) and X where they are."""
     M, mix = np.empty((3, 3)), np.empty(3)
     for k in range(3):
         # a = s x5 - d and its like, put into a X + d W = t x6.
         M[k, 0], M[k, 1], M[k, 2] = five[k] * X[k], X[3] - X[k], -six[k]
-    if not null_vector(M, mix):
+    if not _null_vector(M, mix):
         return False
     for r in range(3):
         P[r, 3] = 0.0
@@ -167,27 +167,27 @@ def six_point(track: F64, sample: I64, P: F64) -> int:
     """
     B, five, six = np.empty((3, 3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for v in range(3):
-        if not basis_matrix(track, sample, v, B[v]):
+        if not _basis_matrix(track, sample, v, B[v]):
             return 0
-        in_basis(B[v], track[sample[4], 2 * v], track[sample[4], 2 * v + 1], five[v])
-        in_basis(B[v], track[sample[5], 2 * v], track[sample[5], 2 * v + 1], six[v])
+        _in_basis(B[v], track[sample[4], 2 * v], track[sample[4], 2 * v + 1], five[v])
+        _in_basis(B[v], track[sample[5], 2 * v], track[sample[5], 2 * v + 1], six[v])
     pencil, G, X = np.empty((2, 9)), np.empty((3, 9)), np.empty(4)
-    if not reduced_pencil(five, six, pencil):
+    if not _reduced_pencil(five, six, pencil):
         return 0
     count = 0
     for k in range(singular_members(pencil, G)):
-        if not sixth_point(G[k].reshape(3, 3), X):
+        if not _sixth_point(G[k].reshape(3, 3), X):
             continue
         good = True
         for v in range(3):
-            good = good and reduced_camera(B[v], five[v], six[v], X, P[count, v])
-        if good and in_front(P[count], X):
+            good = good and _reduced_camera(B[v], five[v], six[v], X, P[count, v])
+        if good and _in_front(P[count], X):
             count += 1
     return count
 
 
 @njit(cache=True, nogil=True)
-def in_front(P: F64, X6: F64) -> bool:
+def _in_front(P: F64, X6: F64) -> bool:
     """Whether the six points can be in front of all three cameras, in some frame and with some signs.
 
     The depths of every two views have the same sign for all points, or opposite ones for all.
@@ -212,11 +212,11 @@ def in_front(P: F64, X6: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def first_ray(P1: F64, C: F64, D: F64) -> bool:
+def _first_ray(P1: F64, C: F64, D: F64) -> bool:
     """Centre ``C`` (4,) by minors (3.24) and ``D`` (4, 3) = P1^+, with D x on the rays; False if none."""
     gram, inverse = P1 @ P1.T, np.empty((3, 3))
     for k in range(3):
-        cross(gram[(k + 1) % 3], gram[(k + 2) % 3], inverse[k])
+        _cross(gram[(k + 1) % 3], gram[(k + 2) % 3], inverse[k])
     det = gram[0, 0] * inverse[0, 0] + gram[0, 1] * inverse[0, 1] + gram[0, 2] * inverse[0, 2]
     if not det > 0.0:
         return False
@@ -225,7 +225,7 @@ def first_ray(P1: F64, C: F64, D: F64) -> bool:
     for left_out in range(4):
         for c in range(3):
             M[c] = P1[:, c if c < left_out else c + 1]
-        det = cross(M[0], M[1], inverse[0])
+        det = _cross(M[0], M[1], inverse[0])
         det = inverse[0] @ M[2]
         C[left_out] = det if left_out % 2 == 1 else -det
     C /= np.sqrt(C @ C)
@@ -233,7 +233,7 @@ def first_ray(P1: F64, C: F64, D: F64) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def start_on_ray(C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> None:
+def _start_on_ray(C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> None:
     """X (4,) on the ray of the first image, where the lines through the others see it best.
 
     The lines run across the epipolar lines, so a point of the plane of the three centres is no exception.
@@ -259,13 +259,13 @@ def start_on_ray(C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def squared_distance(P: F64, C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> float:
+def _squared_distance(P: F64, C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> float:
     """Sum over three views of the squared distances of a track to the reprojection of its best point X (4,).
 
     ``A`` (2, 3, 3) = P2 D, P3 D and ``e`` (2, 3) = P2 C, P3 C. From :func:`start_on_ray`, two steps of Gauss
     and Newton.
     """
-    start_on_ray(C, D, A, e, track, X)
+    _start_on_ray(C, D, A, e, track, X)
     H, g = np.empty((4, 4)), np.empty(4)
     cost = np.inf
     for step in range(STEPS + 1):
@@ -290,13 +290,13 @@ def squared_distance(P: F64, C: F64, D: F64, A: F64, e: F64, track: F64, X: F64)
                         H[row, 1] += jr * j1
                         H[row, 2] += jr * j2
                         H[row, 3] += jr * j3
-        if step < STEPS and not step_towards_images(H, g, X):
+        if step < STEPS and not _gauss_newton_step(H, g, X):
             break
     return cost if cost >= 0.0 else np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def step_towards_images(H: F64, g: F64, X: F64) -> bool:
+def _gauss_newton_step(H: F64, g: F64, X: F64) -> bool:
     """X -= (H + t X X')^-1 g by Cholesky; H lacks the rank along X, to which the step is orthogonal."""
     trace = H[0, 0] + H[1, 1] + H[2, 2] + H[3, 3]
     for r in range(4):
@@ -329,18 +329,18 @@ def step_towards_images(H: F64, g: F64, X: F64) -> bool:
 def reprojection_distances(P: F64, track: F64, distances: F64) -> None:
     """Root of the sum over three views of a track's squared distances to its reprojection; (N,)."""
     C, D, X = np.empty(4), np.empty((4, 3)), np.empty(4)
-    if not first_ray(P[0], C, D):
+    if not _first_ray(P[0], C, D):
         distances[:] = np.inf
         return
     A, e = np.empty((2, 3, 3)), np.empty((2, 3))
     for v in range(2):
         A[v], e[v] = P[v + 1] @ D, P[v + 1] @ C
     for n in range(len(track)):
-        distances[n] = np.sqrt(squared_distance(P, C, D, A, e, track[n], X))
+        distances[n] = np.sqrt(_squared_distance(P, C, D, A, e, track[n], X))
 
 
 @njit(cache=True, nogil=True)
-def gain(squared: float, inverse: float) -> float:
+def _gain(squared: float, inverse: float) -> float:
     """What a track adds to the score: the mean over three widths of 1 - d^2 / width^2 where that is positive.
 
     ``inverse`` is that of the squared threshold.
@@ -352,10 +352,10 @@ def gain(squared: float, inverse: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def score(P: F64, track: F64, inverse: float, bar: float) -> float:
+def _score(P: F64, track: F64, inverse: float, bar: float) -> float:
     """Sum of the gains of all tracks, 0 as soon as it cannot come above ``bar`` any more."""
     C, D, X = np.empty(4), np.empty((4, 3)), np.empty(4)
-    if not first_ray(P[0], C, D):
+    if not _first_ray(P[0], C, D):
         return 0.0
     A, e = np.empty((2, 3, 3)), np.empty((2, 3))
     for v in range(2):
@@ -364,7 +364,7 @@ def score(P: F64, track: F64, inverse: float, bar: float) -> float:
     for n in range(len(track)):
         if not total + left > bar:
             return 0.0
-        total += gain(squared_distance(P, C, D, A, e, track[n], X), inverse)
+        total += _gain(_squared_distance(P, C, D, A, e, track[n], X), inverse)
         left -= 1.0
     return total
 
@@ -379,7 +379,7 @@ def draw_samples(uniforms: F64, n: int) -> I64:
 
 
 @njit(cache=True, nogil=True)
-def search(track: F64, samples: I64, judges: F64, threshold: float, bar: float, best: F64) -> float:
+def search_trifocal(track: F64, samples: I64, scored: F64, threshold: float, bar: float, best: F64) -> float:
     """The best score over ``judges`` above ``bar`` of ``samples`` (S, 6) of tracks, its cameras in ``best``.
 
     ``bar`` itself, with ``best`` untouched, where none is better.
@@ -387,7 +387,7 @@ def search(track: F64, samples: I64, judges: F64, threshold: float, bar: float, 
     P = np.empty((3, 3, 3, 4))
     for s in range(len(samples)):
         for k in range(six_point(track, samples[s], P)):
-            value = score(P[k], judges, 1.0 / threshold**2, bar)
+            value = _score(P[k], scored, 1.0 / threshold**2, bar)
             if value > bar:
                 bar = value
                 best[:] = P[k]

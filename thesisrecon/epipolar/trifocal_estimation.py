@@ -42,7 +42,7 @@ from thesisrecon.numerics.losses import LOSSES
 
 
 @dataclass(frozen=True)
-class TrifocalState:
+class _State:
     """Conditioned cameras (3, 3, 4), unit points (N, 4), lines (M, 2, 4) by two orthonormal points."""
 
     P: F64
@@ -51,7 +51,7 @@ class TrifocalState:
 
 
 @dataclass(frozen=True)
-class TrifocalStep:
+class _Step:
     """Moves of P2 and P3 (24,), of points (N, 3) and lines (M, 4) in their tangent spaces."""
 
     cameras: F64
@@ -60,7 +60,7 @@ class TrifocalStep:
 
 
 @dataclass(frozen=True)
-class FeatureBlock:
+class _FeatureBlock:
     """Normal equations of one kind of feature: with the cameras W (n, 24, f), alone V (n, f, f), h (n, f)."""
 
     W: F64
@@ -82,13 +82,13 @@ class FeatureBlock:
 
 
 @dataclass(frozen=True)
-class TrifocalSystem:
+class _System:
     """[[H, W], [W', V]] of the cameras and both kinds of features, which are eliminated."""
 
     cost: float
     H: F64
     g: F64
-    blocks: tuple[FeatureBlock, FeatureBlock]
+    blocks: tuple[_FeatureBlock, _FeatureBlock]
 
     def reduced(self, damping: float) -> tuple[F64, F64, list[tuple[F64, F64]]]:
         """The damped system S c = b of the cameras alone, with each block's part of the way back."""
@@ -100,7 +100,7 @@ class TrifocalSystem:
             b = b + np.einsum("nif,nf->i", block.W, z)
         return S, b, solved
 
-    def solve(self, damping: float) -> tuple[TrifocalStep, float] | None:
+    def solve(self, damping: float) -> tuple[_Step, float] | None:
         """The damped step and the gain it promises."""
         S, b, solved = self.reduced(damping)
         cameras = solve_positive(S, b)
@@ -111,11 +111,11 @@ class TrifocalSystem:
         moves = [-(z + Y @ cameras) for Y, z in solved]
         for block, move in zip(self.blocks, moves, strict=True):
             promised += float(np.sum(move * (block.diagonal(damping) * move - block.h)))
-        return TrifocalStep(cameras, moves[0], moves[1]), 0.5 * promised
+        return _Step(cameras, moves[0], moves[1]), 0.5 * promised
 
 
 @dataclass(frozen=True)
-class TrifocalReprojection:
+class _ReprojectionProblem:
     """points (N, 3, 2) and ends (M, 3, 2, 3), conditioned; ``scale`` (3,) conditioned units per pixel."""
 
     points: F64
@@ -124,21 +124,21 @@ class TrifocalReprojection:
     loss_px: float
 
     @classmethod
-    def of(cls, points: F64, segments: F64, transforms: F64, loss_px: float) -> TrifocalReprojection:
+    def of(cls, points: F64, segments: F64, transforms: F64, loss_px: float) -> _ReprojectionProblem:
         x = homogenize(points) @ transforms.swapaxes(1, 2)
         y = homogenize(segments) @ transforms.swapaxes(1, 2)[:, None]
         return cls(x[:, :, :2].swapaxes(0, 1), y.swapaxes(0, 1), transforms[:, 0, 0], loss_px)
 
-    def start(self, T: F64) -> TrifocalState:
+    def start(self, T: F64) -> _State:
         """Cameras of a conditioned tensor, points by triangulation, lines as the meet of their planes."""
         P = np.stack(cameras_from_tensor(T))
         P[1:] /= np.linalg.norm(P[1:], axis=(1, 2), keepdims=True)
         X = _off_principal_planes(triangulate_linear(P, self.points.swapaxes(0, 1)), P)
         seen = unit_normals(line_through(self.ends[:, :, 0], self.ends[:, :, 1]))
         planes = np.einsum("mva,vab->mvb", seen, P)
-        return TrifocalState(P, X, np.linalg.svd(planes)[2][:, 2:])
+        return _State(P, X, np.linalg.svd(planes)[2][:, 2:])
 
-    def linearize(self, state: TrifocalState) -> TrifocalSystem:
+    def linearize(self, state: _State) -> _System:
         """Normal equations with Huber's weights, in pixels."""
         residual = self.residual(state)
         rho, weight = LOSSES["huber"](np.sum(residual**2, axis=2), self.loss_px)
@@ -152,11 +152,11 @@ class TrifocalReprojection:
             H += np.einsum("nri,nrj->ij", A, A)
             g += np.einsum("nri,nr->i", A, r)
             At, Bt = A.swapaxes(1, 2), B.swapaxes(1, 2)
-            blocks.append(FeatureBlock(At @ B, Bt @ B, (Bt @ r[:, :, None])[:, :, 0]))
+            blocks.append(_FeatureBlock(At @ B, Bt @ B, (Bt @ r[:, :, None])[:, :, 0]))
             first += n
-        return TrifocalSystem(0.5 * float(rho.sum()), H, g, (blocks[0], blocks[1]))
+        return _System(0.5 * float(rho.sum()), H, g, (blocks[0], blocks[1]))
 
-    def retract(self, state: TrifocalState, step: TrifocalStep) -> TrifocalState:
+    def retract(self, state: _State, step: _Step) -> _State:
         """Cameras and points of unit norm, lines orthonormal again."""
         P = state.P.copy()
         P[1:] += step.cameras.reshape(2, 3, 4)
@@ -164,16 +164,16 @@ class TrifocalReprojection:
         X = state.X + np.einsum("nf,nfa->na", step.points, _complement(state.X[:, None]))
         X /= np.linalg.norm(X, axis=1, keepdims=True)
         lines = state.lines + step.lines.reshape(-1, 2, 2) @ _complement(state.lines)
-        return TrifocalState(P, X, np.linalg.qr(lines.swapaxes(1, 2))[0].swapaxes(1, 2))
+        return _State(P, X, np.linalg.qr(lines.swapaxes(1, 2))[0].swapaxes(1, 2))
 
-    def cost(self, state: TrifocalState) -> float:
+    def cost(self, state: _State) -> float:
         """1/2 sum rho, px^2; inf where a point falls on a principal plane."""
         residual = self.residual(state)
         if not np.isfinite(residual).all():
             return np.inf
         return 0.5 * float(LOSSES["huber"](np.sum(residual**2, axis=2), self.loss_px)[0].sum())
 
-    def residual(self, state: TrifocalState) -> F64:
+    def residual(self, state: _State) -> F64:
         """Offsets of the points, then distances of the segments' ends; (N + M, 3 views, 2) px."""
         p = np.einsum("vab,nb->nva", state.P, state.X)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -181,7 +181,7 @@ class TrifocalReprojection:
             distance = self._line_distances(*self._line_images(state))
         return np.concatenate([offset, distance]) / self.scale[:, None]
 
-    def _line_images(self, state: TrifocalState) -> tuple[F64, F64]:
+    def _line_images(self, state: _State) -> tuple[F64, F64]:
         """Images (M, 3, 3) of the two points that stand for each line."""
         ends = np.einsum("vab,meb->mvea", state.P, state.lines)
         return ends[:, :, 0], ends[:, :, 1]
@@ -190,7 +190,7 @@ class TrifocalReprojection:
         """Signed distances (M, 3, 2) of the segments' ends to the lines through p and q, conditioned."""
         return np.asarray(np.einsum("mvea,mva->mve", self.ends, unit_normals(line_through(p, q))))
 
-    def _point_jacobian(self, state: TrifocalState) -> tuple[F64, F64]:
+    def _point_jacobian(self, state: _State) -> tuple[F64, F64]:
         """By the cameras (N, 3, 2, 24) and the points (N, 3, 2, 3), px."""
         p = np.einsum("vab,nb->nva", state.P, state.X)
         by_image = np.zeros((*p.shape[:2], 2, 3))
@@ -200,7 +200,7 @@ class TrifocalReprojection:
         by_point = np.einsum("nvra,vab,nfb->nvrf", by_image, state.P, _complement(state.X[:, None]))
         return _camera_columns(np.einsum("nvra,nb->nvrab", by_image, state.X)), by_point
 
-    def _line_jacobian(self, state: TrifocalState) -> tuple[F64, F64]:
+    def _line_jacobian(self, state: _State) -> tuple[F64, F64]:
         """By the cameras (M, 3, 2, 24) and the lines (M, 3, 2, 4), px: d = l.y / |(l_1, l_2)|, l = p x q."""
         p, q = self._line_images(state)
         l = line_through(p, q)
@@ -276,7 +276,7 @@ class TrifocalFit:
     iterations: int
 
 
-def minimize_algebraic_error(equations: TensorEquations, start: F64) -> F64:
+def _minimize_algebraic_error(equations: TensorEquations, start: F64) -> F64:
     """T (3, 3, 3), unit norm, that has cameras and the least |A t|, near a tensor ``start`` (HZ 16.2).
 
     Both in the equations' conditioned coordinates. The epipoles are the six parameters; all other entries
@@ -326,19 +326,19 @@ def estimate_trifocal(
             f"{n} points and {m} lines in a special position",
             "use matches that do not lie on one plane",
         ) from error
-    T = equations.in_pixels(minimize_algebraic_error(equations, start))
+    T = equations.in_pixels(_minimize_algebraic_error(equations, start))
     fit = refine_trifocal(T, points, segments, loss_px=loss_px, max_iterations=max_iterations)
-    refuse_undetermined(fit, equations, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
+    require_determined(fit, equations, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
     return fit
 
 
-def refuse_undetermined(fit: TrifocalFit, equations: TensorEquations, xy: F64, *, weak: float = WEAK) -> None:
+def require_determined(fit: TrifocalFit, equations: TensorEquations, xy: F64, *, weak: float = WEAK) -> None:
     """``StageFailure`` where the noise alone decides the fit; xy (3, K, 2) all points and ends, in px.
 
     Three kinds of evidence: noise like that of the fit explains many solutions of the linear equations; the
     covariance of the fit; the matches are of one line of an image.
     """
-    family = int(np.sum(equations.explained_px() <= SAME_NOISE * fit.sigma_px))
+    family = int(np.sum(equations.noise_levels_px() <= SAME_NOISE * fit.sigma_px))
     across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
     if not (family < FAMILY and fit.weakness <= weak and narrowest > 3.0 * fit.sigma_px):
@@ -364,7 +364,7 @@ def refine_trifocal(
     if T.shape != (3, 3, 3) or not np.isfinite(T).all() or not T.any():
         raise ValueError(f"the refinement starts from a finite tensor (3, 3, 3) that is not 0; got {T.shape}")
     transforms = tensor_equations(points, segments).transforms
-    problem = TrifocalReprojection.of(points, segments, transforms, loss_px)
+    problem = _ReprojectionProblem.of(points, segments, transforms, loss_px)
     solution = run_levenberg_marquardt(
         problem,
         problem.start(transform_tensor(T, *transforms)),
@@ -403,7 +403,7 @@ def _pixel_cameras(P: F64, transforms: F64) -> tuple[F64, F64]:
     return np.asarray(np.linalg.inv(transforms) @ P @ np.linalg.inv(G)), G
 
 
-def _tensor_and_root(problem: TrifocalReprojection, state: TrifocalState) -> tuple[F64, F64]:
+def _tensor_and_root(problem: _ReprojectionProblem, state: _State) -> tuple[F64, F64]:
     """Flat T (27,), unit norm, conditioned, and a root (27, 18) of its covariance for unit noise in px."""
     P2, P3 = state.P[1:]
     # T is linear in either camera, so its derivatives are the tensors of single entries.

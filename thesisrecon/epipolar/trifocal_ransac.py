@@ -14,12 +14,18 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.epipolar.six_point import SAMPLE, WIDTHS, draw_samples, reprojection_distances, search
+from thesisrecon.epipolar.six_point import (
+    SAMPLE,
+    WIDTHS,
+    draw_samples,
+    reprojection_distances,
+    search_trifocal,
+)
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_SEGMENTS,
     TrifocalFit,
     refine_trifocal,
-    refuse_undetermined,
+    require_determined,
 )
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
@@ -104,7 +110,7 @@ class TrifocalRansac:
         p, s = points[:, inliers], segments[:, line_inliers]
         self._refuse_a_plane(p, fit.sigma_px)
         xy = np.concatenate([p, s.reshape(3, -1, 2)], axis=1)
-        refuse_undetermined(fit, tensor_equations(p, s), xy, weak=WEAK)
+        require_determined(fit, tensor_equations(p, s), xy, weak=WEAK)
         return RobustTrifocal(fit, inliers, line_inliers, samples)
 
     def _search(self, frame: _Frame, points: F64, rng: Generator) -> tuple[F64, int]:
@@ -116,7 +122,7 @@ class TrifocalRansac:
         while drawn < needed:
             count = min(CHUNK, needed - drawn)
             samples = draw_samples(rng.random((count, SAMPLE)), len(track))
-            found = search(track, samples, track, threshold, bar, best)
+            found = search_trifocal(track, samples, track, threshold, bar, best)
             drawn += count
             if found > bar:
                 best, bar = self._improve(frame, track, best, found)
@@ -145,7 +151,9 @@ class TrifocalRansac:
         better = best.copy()
         # The solver's frame is of the first five, no four of which may be of one plane. Judged by the others
         # alone: on the plane no sample is as good as what was refined there.
-        found = search(track, np.concatenate([two, four], axis=1), track[off], threshold, 0.0, better)
+        found = search_trifocal(
+            track, np.concatenate([two, four], axis=1), track[off], threshold, 0.0, better
+        )
         if not found > 0.0:
             return best, bar
         better, found = self._improve(frame, track, better, 0.0)
@@ -190,14 +198,14 @@ class TrifocalRansac:
         for _ in range(2):
             now, sigma = self._judge(frame, frame.cameras_in_frame(fit.P), frame.tracks(points))
             # The noise of lines need not be that of points.
-            lines = line_distances_px(fit.P, segments) <= LINE_INSIDE * max(sigma, self.threshold_px / 2.0)
+            lines = _line_distances_px(fit.P, segments) <= LINE_INSIDE * max(sigma, self.threshold_px / 2.0)
             fit = refine_trifocal(fit.T, points[:, now], segments[:, lines], loss_px=HUBER * sigma)
         return fit, now, lines
 
     def _judge(self, frame: _Frame, P: F64, track: F64) -> tuple[B8, float]:
         """Which tracks are right, and their noise in px; ``StageFailure`` where they may be so by chance."""
         distances_px = _distances(P, track) / frame.scale
-        sigma = noise_of_tracks(distances_px, self.threshold_px, frame.width_px)
+        sigma = _track_noise(distances_px, self.threshold_px, frame.width_px)
         right = distances_px <= INSIDE * sigma
         found = int(right.sum())
         if found < NEEDED or _by_chance(found, len(track), INSIDE * sigma / frame.width_px):
@@ -296,7 +304,7 @@ def _refined(P: F64, xy: F64, threshold: float) -> F64:
     return np.asarray(fit.P / np.linalg.norm(fit.P, axis=(1, 2), keepdims=True))
 
 
-def noise_of_tracks(distances_px: F64, threshold_px: float, width_px: float) -> float:
+def _track_noise(distances_px: F64, threshold_px: float, width_px: float) -> float:
     """Standard deviation of a coordinate of the right tracks, by expectation and maximisation; px.
 
     distances_px (N,) are roots of sums over three views, those of right tracks sigma times a chi variable of
@@ -323,7 +331,7 @@ def noise_of_tracks(distances_px: F64, threshold_px: float, width_px: float) -> 
     return sigma
 
 
-def line_distances_px(P: F64, segments: F64) -> F64:
+def _line_distances_px(P: F64, segments: F64) -> F64:
     """Root of the sum of squared distances of six segment ends to a reprojected line; (M,) px.
 
     P (3, 3, 4) and segments (3, M, 2, 2) in px; the line of space is that nearest to the three planes of its

@@ -30,19 +30,19 @@ class PairVerification:
     Parameters
     ----------
     min_inliers : verified matches a pair needs.
-    min_share : share of the matches that must be verified.
+    min_inlier_ratio : share of the matches that must be verified.
     homography_px : distance within which a homography explains a match, or 4.3 sigma where that is more.
     """
 
     min_inliers: int = 60
-    min_share: float = 0.25
+    min_inlier_ratio: float = 0.25
     homography_px: float = 2.0
 
     def __post_init__(self) -> None:
         if self.min_inliers < 8:
             raise ValueError(f"min_inliers must be at least 8; got {self.min_inliers}")
-        if not 0.0 <= self.min_share <= 1.0 or not self.homography_px > 0.0:
-            raise ValueError("min_share must lie in [0, 1] and homography_px be positive")
+        if not 0.0 <= self.min_inlier_ratio <= 1.0 or not self.homography_px > 0.0:
+            raise ValueError("min_inlier_ratio must lie in [0, 1] and homography_px be positive")
 
     def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
         """The pair with its verified matches and the decision.
@@ -56,7 +56,7 @@ class PairVerification:
         tolerance = max(self.homography_px, HOMOGRAPHY_SIGMAS * fit.sigma_px)
         share = homography_inlier_ratio(fit.F, xy1, xy2, tolerance_px=tolerance, rng=rng)
         reason = self._objection(len(xy1), len(kept))
-        configuration, degeneracy = judge_pair(matches, fit, rng)
+        configuration, degeneracy = _assess_pair(matches, fit, rng)
         return TwoView(
             i=matches.i,
             j=matches.j,
@@ -81,15 +81,15 @@ class PairVerification:
                 f"only {verified} of {counted(candidates, 'match')} agree with one epipolar geometry; "
                 f"{self.min_inliers} are needed to tell it from chance and repeated patterns"
             )
-        if verified < self.min_share * candidates:
+        if verified < self.min_inlier_ratio * candidates:
             return (
                 f"only {100.0 * verified / candidates:.0f} % of {counted(candidates, 'match')} agree with "
-                f"one epipolar geometry; {100.0 * self.min_share:.0f} % are needed"
+                f"one epipolar geometry; {100.0 * self.min_inlier_ratio:.0f} % are needed"
             )
         return ""
 
 
-def judge_pair(
+def _assess_pair(
     matches: Matches, fit: FundamentalFit, rng: np.random.Generator
 ) -> tuple[str, DegeneracyReport | None]:
     """The name of what the matches show and whether they determine F; ("", None) below 12 inliers."""

@@ -72,16 +72,28 @@ class Consensus(Generic[Model]):
 
 @dataclass(frozen=True)
 class SampleConsensus:
-    """Algorithm 2: draw ``max_samples`` samples, or stop once the share of inliers is above ``enough_share``.
+    """Random sample consensus (Algorithm 2 of the thesis; Fischler and Bolles, 1981).
 
-    The model with the most data within ``threshold`` wins; of two with as many, the one whose inliers have
-    the lower standard deviation (Fischler and Bolles, 1981). Trying every sample instead would take
-    n! / (s! (n - s)!) of them, s being its size (the thesis' text has n! / s!).
+    The model with the most residuals within ``threshold`` wins; of two with equal counts, the one whose
+    inliers have the lower standard deviation. Trying every sample would take n! / (s! (n - s)!) samples of
+    size s (the thesis has n! / s!).
+
+    Parameters
+    ----------
+    threshold : float
+        Residual below which a datum is an inlier.
+    max_samples : int
+        Maximum number of samples.
+    stop_inlier_ratio : float
+        Sampling stops once the inlier ratio exceeds this.
+    least_median : bool
+        Rank models by their median residual instead (Rousseeuw, 1984); ``threshold`` is then not used.
     """
 
     threshold: float
     max_samples: int = 1000
-    enough_share: float = 1.0
+    stop_inlier_ratio: float = 1.0
+    least_median: bool = False
 
     def search(self, problem: SampledProblem[Model], n: int, rng: Generator) -> Consensus[Model] | None:
         """The best model of ``n`` data, or None where no sample gave one.
@@ -91,7 +103,7 @@ class SampleConsensus:
         if n < problem.sample_size:
             raise ValueError(f"sampling needs at least {problem.sample_size} data; got {n}")
         best: Consensus[Model] | None = None
-        best_rank = (-1, 0.0)
+        best_rank = (-np.inf, 0.0)
         sample = np.empty(problem.sample_size, dtype=np.int64)
         for drawn in range(1, self.max_samples + 1):
             draw_sample(rng.random(problem.sample_size), n, sample)
@@ -99,11 +111,14 @@ class SampleConsensus:
                 rank, inliers = self._rank(problem.residuals(model))
                 if rank > best_rank:
                     best, best_rank = Consensus(model, inliers, drawn), rank
-            if best is not None and best_rank[0] > self.enough_share * n:
+            if best is not None and best_rank[0] > self.stop_inlier_ratio * n:
                 break
         return None if best is None else Consensus(best.model, best.inliers, drawn)
 
-    def _rank(self, residuals: F64) -> tuple[tuple[int, float], B8]:
+    def _rank(self, residuals: F64) -> tuple[tuple[float, float], B8]:
+        if self.least_median:
+            median = float(np.partition(residuals, len(residuals) // 2)[len(residuals) // 2])
+            return (-median, 0.0), residuals <= median
         inliers = np.abs(residuals) < self.threshold
         spread = float(np.sqrt(np.mean(residuals[inliers] ** 2))) if inliers.any() else 0.0
         return (int(inliers.sum()), -spread), inliers
