@@ -1,47 +1,41 @@
-"""From uncalibrated photographs to metric cameras and points: the classical algorithms, from scratch.
-
-The front doors are loaded when they are first used, so that importing the package costs next to nothing.
-"""
+"""Metric 3D reconstruction from uncalibrated images by the classical algorithms of multiple-view geometry."""
 
 from __future__ import annotations
 
-# Not of typing, which takes longer to load than all of this.
+# Not from typing, whose import takes longer than that of this package.
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from typing import Any
 
-    from thesisrecon.api import match_pair, match_rectified, self_calibrate
-    from thesisrecon.camera import Camera
-    from thesisrecon.config import PipelineConfig
-    from thesisrecon.epipolar.locally_optimised import estimate_fundamental
-    from thesisrecon.geometry.triangulation import triangulate
-    from thesisrecon.pipeline.outputs import upgrade_affine
-    from thesisrecon.pipeline.reconstruction import reconstruct
-    from thesisrecon.view_interpolation import interpolate_view
-    from thesisrecon.view_synthesis import synthesize_view
-    from thesisrecon.views.render import render
+    from thesisrecon.api import (
+        Camera,
+        Image,
+        PipelineConfig,
+        Reconstruction,
+        StageFailure,
+        Tracks,
+        estimate_fundamental,
+        interpolate_view,
+        match_pair,
+        match_rectified,
+        reconstruct,
+        render,
+        self_calibrate,
+        synthesize_view,
+        triangulate,
+        upgrade_affine,
+    )
 
 __version__ = "0.1.0"
 
-_HOME_OF = {
-    "Camera": "camera",
-    "PipelineConfig": "config",
-    "estimate_fundamental": "epipolar.locally_optimised",
-    "interpolate_view": "view_interpolation",
-    "match_pair": "api",
-    "match_rectified": "api",
-    "reconstruct": "pipeline.reconstruction",
-    "render": "views.render",
-    "self_calibrate": "api",
-    "synthesize_view": "view_synthesis",
-    "triangulate": "geometry.triangulation",
-    "upgrade_affine": "pipeline.outputs",
-}
-
 __all__ = [
     "Camera",
+    "Image",
     "PipelineConfig",
+    "Reconstruction",
+    "StageFailure",
+    "Tracks",
     "__version__",
     "estimate_fundamental",
     "interpolate_view",
@@ -57,11 +51,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
+    if name not in __all__:
         raise AttributeError(f"module 'thesisrecon' has no attribute {name!r}")
+    # Imported on first use, so that `import thesisrecon` takes no time.
     from importlib import import_module
 
-    return getattr(import_module(f"thesisrecon.{_HOME_OF[name]}"), name)
+    return getattr(import_module("thesisrecon.api"), name)
 
 
 def __dir__() -> list[str]:

@@ -1,53 +1,95 @@
-"""One stage at a time: the front doors beside :func:`thesisrecon.reconstruct`."""
+"""The public functions: :func:`reconstruct` runs the whole pipeline, the others one stage each."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from thesisrecon.config import PipelineConfig, with_images
+from thesisrecon.arrays import F64
+from thesisrecon.camera import Camera
+from thesisrecon.config import PipelineConfig, SelfCalibrator, with_images
+from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.io.images import read_image
-from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
-from thesisrecon.records import DisparityMap, Image, Reconstruction, SelfCalibration, TwoView
+from thesisrecon.pipeline.features_to_tracks import ImageInput, match_pair
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import DisparityMap, Image, Reconstruction, SelfCalibration, Tracks
 from thesisrecon.runtime.run import stream
+from thesisrecon.selfcalibration.affine import upgrade_to_affine
+from thesisrecon.selfcalibration.stratified import Stratified
+from thesisrecon.view_interpolation import interpolate_view
+from thesisrecon.view_synthesis import synthesize_view
+from thesisrecon.views.render import render
 
-
-def match_pair(image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0) -> TwoView:
-    """Verified matches and F of two photographs (files or uint8 arrays), in pixels at working size.
-
-    Raises :class:`StageFailure` where one of them cannot be read or they do not match.
-    """
-    config = config or PipelineConfig()
-    photographs = [
-        read_image(image, max_size_px=config.images.max_size_px).images[0] for image in (image1, image2)
-    ]
-    views = [config.matching.prepare(image, detect_features(config, image)) for image in photographs]
-    pair = match_views(config, views[0], views[1], (0, 1), seed)
-    if not pair.accepted:
-        raise StageFailure("the two photographs do not match", pair.reason)
-    return pair
+__all__ = [
+    "Camera",
+    "Image",
+    "PipelineConfig",
+    "Reconstruction",
+    "StageFailure",
+    "Tracks",
+    "estimate_fundamental",
+    "interpolate_view",
+    "match_pair",
+    "match_rectified",
+    "reconstruct",
+    "render",
+    "self_calibrate",
+    "synthesize_view",
+    "triangulate",
+    "upgrade_affine",
+]
 
 
 def match_rectified(
-    left: Any, right: Any, *, max_disparity_px: float, config: PipelineConfig | None = None
+    left: ImageInput,
+    right: ImageInput,
+    *,
+    max_disparity_px: float,
+    config: PipelineConfig | None = None,
 ) -> DisparityMap:
-    """Disparities of a rectified pair: files, or arrays (H, W) or (H, W, 3) of levels 0 to 255, NaN = no
-    pixel.
+    """Compute the disparity map of a rectified pair (2.5).
 
-    By the matcher of ``config.dense.pairs``; x_right = x_left - d with d from 0 to ``max_disparity_px``.
-    Files are taken at their own size. Raises :class:`StageFailure` for a file that cannot be read,
-    ``ValueError`` for sizes that differ.
+    Parameters
+    ----------
+    left, right : path or ndarray (H, W) or (H, W, 3)
+        Files (read at full size), or grey levels 0 to 255 with NaN for missing pixels.
+    max_disparity_px : float
+        Largest disparity; x_right = x_left - d with d from 0 to this.
+    config : PipelineConfig, optional
+        The matcher is ``config.dense.pairs``; None: the preset ``default``.
+
+    Returns
+    -------
+    DisparityMap
+        Disparity and confidence of each pixel of the left image, NaN where unknown.
+
+    Raises
+    ------
+    StageFailure
+        If a file cannot be read.
+    ValueError
+        If the sizes differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import match_rectified
+    >>> from scipy.ndimage import gaussian_filter
+    >>> texture = gaussian_filter(128 + 300 * np.random.default_rng(0).uniform(-1, 1, (60, 90)), 1.0)
+    >>> found = match_rectified(texture[:, :80], texture[:, 6:86], max_disparity_px=10)
+    >>> round(float(np.nanmedian(found.disparity)), 1)
+    6.0
     """
     images = [side if isinstance(side, np.ndarray) else _full_size(side) for side in (left, right)]
     dense = (config or PipelineConfig()).dense
     return dense.match_rectified(images[0], images[1], max_disparity_px=max_disparity_px)
 
 
-def _full_size(path: Any) -> Any:
+def _full_size(path: ImageInput) -> np.ndarray:
     return read_image(path, max_size_px=np.iinfo(np.int32).max).images[0].rgb
 
 
@@ -55,19 +97,129 @@ def self_calibrate(
     reconstruction: Reconstruction,
     *,
     config: PipelineConfig | None = None,
-    photographs: Sequence[Image] = (),
+    images: Sequence[Image] = (),
     seed: int = 0,
 ) -> SelfCalibration:
-    """The metric frame and the intrinsics of a projective reconstruction (chapter 7).
+    """Estimate the metric frame and the intrinsics of a projective reconstruction (chapter 7).
 
-    Cameras of one image size are taken for one camera, unless ``config.intrinsics.cameras`` says otherwise.
-    ``photographs``, one per view, are what a variant looks at that finds parallel lines in them. Raises
-    ``ValueError`` for a reconstruction of another stratum, :class:`StageFailure` where the views do not
-    determine a calibration.
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction of at least three views.
+    config : PipelineConfig, optional
+        ``config.selfcalibration`` is the method, ``config.intrinsics`` the prior knowledge; by default images
+        of one size share one camera.
+    images : sequence of Image
+        The images, one per view, for methods that detect parallel lines.
+    seed : int
+        Random seed.
+
+    Returns
+    -------
+    SelfCalibration
+        ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) with standard deviations, and all candidates.
+
+    Raises
+    ------
+    ValueError
+        If the reconstruction is not projective.
+    StageFailure
+        If the views do not determine a calibration.
+
+    Examples
+    --------
+    Six views of a cloud of points by one camera of unknown focal length:
+
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> from thesisrecon import Camera, Reconstruction, Tracks, self_calibrate
+    >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
+    >>> angles = np.radians([[0, -30, 5], [25, -15, 0], [-5, 0, 20], [15, 15, 0], [-20, 25, 5], [5, 40, -15]])
+    >>> R = Rotation.from_euler("xyz", angles).as_matrix()
+    >>> cameras = [Camera(K, r, np.array([0.0, 0, 5]), (640, 480)) for r in R]
+    >>> X = np.random.default_rng(0).uniform(-1, 1, (80, 3))
+    >>> xy = np.stack([camera.project(X) for camera in cameras], axis=1).reshape(-1, 2)
+    >>> tracks = Tracks(np.tile(np.arange(6), 80), np.repeat(np.arange(80), 6), xy, 6, 80)
+    >>> H = np.random.default_rng(1).normal(size=(4, 4))
+    >>> projective = Reconstruction(
+    ...     stratum="projective",
+    ...     P=np.array([camera.P for camera in cameras]) @ np.linalg.inv(H),
+    ...     X=np.column_stack([X, np.ones(80)]) @ H.T,
+    ...     registered=np.ones(6, bool),
+    ...     valid=np.ones(80, bool),
+    ...     inlier=np.ones(480, bool),
+    ...     tracks=tracks,
+    ...     sizes=np.tile([640, 480], (6, 1)),
+    ...     sigma_px=0.5,
+    ...     reasons=("",) * 6,
+    ... )
+    >>> round(self_calibrate(projective).K[0, 0, 0])
+    800
     """
     if reconstruction.stratum != "projective":
         raise ValueError(f"self_calibrate takes a projective reconstruction; got {reconstruction.stratum}")
     config = config or PipelineConfig()
-    variant = with_images(config.selfcalibration, photographs) if photographs else config.selfcalibration
     prior = prior_for(reconstruction, config.intrinsics)
-    return variant.calibrate(reconstruction, prior=prior, rng=stream(seed, "selfcalibration"))
+    return _method(config, images).calibrate(reconstruction, prior=prior, rng=stream(seed, "selfcalibration"))
+
+
+def upgrade_affine(
+    reconstruction: Reconstruction,
+    plane: F64 | None = None,
+    *,
+    config: PipelineConfig | None = None,
+    images: Sequence[Image] = (),
+    seed: int = 0,
+) -> Reconstruction:
+    """Upgrade a projective reconstruction to an affine one (3.3, chapter 7).
+
+    Parallel lines and ratios of lengths along them are then those of the scene.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    plane : ndarray (4,), optional
+        Plane at infinity in the projective frame. None: located by the first step of the method if
+        ``config.selfcalibration`` is :class:`~thesisrecon.selfcalibration.stratified.Stratified` (no
+        calibration needed), else taken from :func:`self_calibrate`.
+    config, images, seed
+        As for :func:`self_calibrate`.
+
+    Returns
+    -------
+    Reconstruction
+        The same cameras and points in an affine frame.
+
+    Raises
+    ------
+    StageFailure
+        If the plane at infinity cannot be located.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import Reconstruction, Tracks, upgrade_affine
+    >>> none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), 1, 2)
+    >>> projective = Reconstruction(
+    ...     "projective", np.eye(3, 4)[None], np.array([[1.0, 2, 4, 3], [0, 1, 2, 1]]), np.ones(1, bool),
+    ...     np.ones(2, bool), np.zeros(0, bool), none, np.array([[640, 480]]), 1.0, ("",),
+    ... )
+    >>> affine = upgrade_affine(projective, plane=np.array([0.0, 0, 0.5, 0]))
+    >>> affine.stratum, bool((affine.X[:, 3] == 1).all())
+    ('affine', True)
+    """
+    if plane is None:
+        config = config or PipelineConfig()
+        method = _method(config, images)
+        rng = stream(seed, "selfcalibration")
+        prior = prior_for(reconstruction, config.intrinsics)
+        if isinstance(method, Stratified):
+            plane = method.locate(reconstruction, prior=prior, rng=rng)
+        else:
+            plane = method.calibrate(reconstruction, prior=prior, rng=rng).plane_at_infinity
+    return upgrade_to_affine(reconstruction, plane)
+
+
+def _method(config: PipelineConfig, images: Sequence[Image]) -> SelfCalibrator:
+    return with_images(config.selfcalibration, images) if images else config.selfcalibration

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.api import match_pair
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.geometry.two_view import epipoles, require_parallax
+from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
 from thesisrecon.io.images import read_image
+from thesisrecon.pipeline.features_to_tracks import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
     check_monotonicity,
-    other_side,
-    pair_of_rectified,
-    unsure,
+    disparity_of_right,
+    pair_from_rectified,
+    with_full_confidence,
 )
 
 _COARSE = 4
@@ -85,8 +85,8 @@ def interpolate_view(
     Returns
     -------
     ndarray (H, W, 3) uint8
-        The view of a camera on the baseline, with an interpolated focal length. Near surfaces occlude far ones
-        where the scene violates monotonicity; regions that neither image shows are filled from behind.
+        The view of a camera on the baseline, with an interpolated focal length. Near surfaces occlude far
+        ones where the scene violates monotonicity; regions that neither image shows are filled from behind.
 
     Raises
     ------
@@ -151,8 +151,8 @@ def prepare_rectified_pair(
     elif isinstance(disparity, tuple):
         maps = _as_map(disparity[0]), _as_map(disparity[1])
     else:
-        maps = _as_map(disparity), other_side(_as_map(disparity))
-    return pair_of_rectified(images[0], images[1], maps)
+        maps = _as_map(disparity), disparity_of_right(_as_map(disparity))
+    return pair_from_rectified(images[0], images[1], maps)
 
 
 def _pixels(side: Any) -> U8:
@@ -169,7 +169,7 @@ def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
     disparity = np.asarray(disparity, dtype=np.float32)
     if disparity.ndim != 2:
         raise ValueError(f"disparities must be (H, W), or a tuple of two such maps; got {disparity.shape}")
-    return unsure(disparity)
+    return with_full_confidence(disparity)
 
 
 def _matched_both_ways(left: U8, right: U8, config: PipelineConfig) -> tuple[DisparityMap, DisparityMap]:
@@ -270,7 +270,7 @@ def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None
         x, y = e[:2] / e[2]
         if -0.5 <= x <= size[0] - 0.5 and -0.5 <= y <= size[1] - 0.5:
             # Without parallax F is not unique, and neither are its epipoles.
-            require_parallax(pair.F, pair.xy1, pair.xy2)
+            require_parallax_of_matches(pair.F, pair.xy1, pair.xy2)
             raise StageFailure(
                 "there is no view between the images: the camera moved towards the scene or away from it",
                 f"the epipole lies at ({x:.0f}, {y:.0f}) px, inside {image.name}",
@@ -340,8 +340,8 @@ def interpolated_sequence(
         ", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights
     )
     notes = tuple(
-        f"{100.0 * leg.known:.0f} % of the pixels have a correspondence; {100.0 * share:.1f} % of these violate "
-        "monotonicity, where near surfaces occlude far ones"
+        f"{100.0 * leg.known:.0f} % of the pixels have a correspondence; {100.0 * share:.1f} % of these "
+        "violate monotonicity, where near surfaces occlude far ones"
         for share, leg in zip(violations, legs, strict=True)
     )
     return ViewSequence(captions, draw, notes, metadata, tuple({"weights": list(w)} for w in weights))

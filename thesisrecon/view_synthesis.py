@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from thesisrecon.api import match_pair
 from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.intrinsics import prior_from_options
 from thesisrecon.io.images import read_image
+from thesisrecon.pipeline.features_to_tracks import match_pair
 from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.view_interpolation import ViewSequence
@@ -160,8 +160,8 @@ def synthesize_view(
     --------
     >>> import numpy as np
     >>> import thesisrecon
-    >>> scaling = 2.0 * np.eye(3)
-    >>> thesisrecon.synthesize_view("a.jpg", "b.jpg", scaling, np.zeros(3))  # doctest: +IGNORE_EXCEPTION_DETAIL
+    >>> R, t = 2.0 * np.eye(3), np.zeros(3)
+    >>> thesisrecon.synthesize_view("a.jpg", "b.jpg", R, t)  # doctest: +IGNORE_EXCEPTION_DETAIL
     Traceback (most recent call last):
         ...
     ValueError: the rotation is not orthogonal

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.io.images import read_image
 from thesisrecon.pipeline.state import PreparedViews, Work, batches_of_pairs, near_in_pairs
 from thesisrecon.records import Features, Image, PairChoice, TwoView
 from thesisrecon.runtime.run import Batch, stream
@@ -49,6 +51,7 @@ def _detect_all(config: PipelineConfig, images: Sequence[Image]) -> list[Feature
 
 
 def detect_features(config: PipelineConfig, image: Image) -> Features:
+    """Detect the features of one image (4.2.1)."""
     return config.features.detect(image)
 
 
@@ -131,6 +134,56 @@ def _match_all(
     config: PipelineConfig, views: Sequence[Any], pairs: Sequence[tuple[int, int]], seed: int
 ) -> list[TwoView]:
     return [match_views(config, views[i], views[j], (i, j), seed) for i, j in pairs]
+
+
+ImageInput = str | Path | np.ndarray | Image
+"""A file, a uint8 array (H, W) or (H, W, 3), or an :class:`Image`."""
+
+
+def match_pair(
+    image1: ImageInput, image2: ImageInput, *, config: PipelineConfig | None = None, seed: int = 0
+) -> TwoView:
+    """Match two images and estimate their fundamental matrix (4.2 and chapter 5).
+
+    Parameters
+    ----------
+    image1, image2 : path, ndarray (H, W) or (H, W, 3) uint8, or Image
+        The two images.
+    config : PipelineConfig, optional
+        Settings; None: the preset ``default``.
+    seed : int
+        Random seed.
+
+    Returns
+    -------
+    TwoView
+        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels at working size
+        (``config.images.max_size_px``).
+
+    Raises
+    ------
+    StageFailure
+        If an image cannot be read or the images do not match.
+
+    Examples
+    --------
+    >>> from thesisrecon import PipelineConfig, match_pair
+    >>> from thesisrecon.config import ImageOptions
+    >>> from thesisrecon.io.pair_list import demo_images
+    >>> first, second = demo_images()[:2]
+    >>> pair = match_pair(first, second, config=PipelineConfig(images=ImageOptions(max_size_px=640)))
+    >>> pair.F.shape, len(pair.xy1) > 60
+    ((3, 3), True)
+    """
+    config = config or PipelineConfig()
+    images = [
+        read_image(image, max_size_px=config.images.max_size_px).images[0] for image in (image1, image2)
+    ]
+    views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
+    pair = match_views(config, views[0], views[1], (0, 1), seed)
+    if not pair.accepted:
+        raise StageFailure("the two images do not match", pair.reason)
+    return pair
 
 
 def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:

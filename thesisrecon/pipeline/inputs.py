@@ -7,7 +7,7 @@ from typing import Any
 from thesisrecon.config import tables_from_config
 from thesisrecon.errors import UsageError
 from thesisrecon.intrinsics import camera_numbers, check_sizes, prior_warnings
-from thesisrecon.io.images import ImageSource, ImageSet, read_images
+from thesisrecon.io.images import ImageSet, ImageSource, read_images
 from thesisrecon.records import RunResult
 from thesisrecon.runtime.run import Run
 

@@ -18,7 +18,7 @@ from thesisrecon.pipeline.state import Work
 from thesisrecon.records import DepthMap, HeldOut, Image, PinholeView, Reconstruction, TexturedMesh
 from thesisrecon.runtime.run_folder import code_key
 from thesisrecon.stereo.depth import MultiViewScene
-from thesisrecon.views.image_similarity import match_exposure, psnr_db, ssim, covered_pixels
+from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 
 FEWEST_VIEWS = 3
