@@ -56,20 +56,20 @@ def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities
 
 def test_wrong_calls_of_the_front_door_are_refused(wall):
     left, right = wall
-    with pytest.raises(ValueError, match="from 0"):
+    with pytest.raises(ValueError, match="between 0"):
         thesisrecon.interpolate_view(left, right, 1.5)
     with pytest.raises(ValueError, match="one size"):
         thesisrecon.interpolate_view(left, right[:-3], 0.5)
     with pytest.raises(ValueError, match="uint8"):
         thesisrecon.interpolate_view(left.astype(float), right, 0.5)
-    with pytest.raises(ValueError, match="shape of the photographs"):
+    with pytest.raises(ValueError, match="shape of the images"):
         thesisrecon.interpolate_view(left, right, 0.5, disparity=np.zeros((3, 4), np.float32))
     d = np.zeros(left.shape[:2], np.float32)
     odd: Any
     for odd in ([d, d], d[..., None]):
         with pytest.raises(ValueError, match=r"\(H, W\), or a tuple"):
             thesisrecon.interpolate_view(left, right, 0.5, disparity=odd)
-    with pytest.raises(UsageError, match="no photograph"):
+    with pytest.raises(UsageError, match="no image file"):
         thesisrecon.interpolate_view(Path("nowhere.png"), right, 0.5)
 
 
@@ -79,7 +79,7 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monke
         between.prepare_pair(a, Image("0.jpg", a.rgb.copy(), a.size))
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
         between.prepare_pair(a, photograph(2, (40, 20)))
-    with pytest.raises(UsageError, match="same photograph"):
+    with pytest.raises(UsageError, match="same image"):
         between.interpolated_sequence([a, b, a], 3)
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
         between.interpolated_sequence([a, b, photograph(2, (40, 20))], 3)
@@ -90,7 +90,7 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monke
     pair = SimpleNamespace(F=cross_matrix(np.append(e, 1.0)), xy1=xy, xy2=ahead)
     monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
     with pytest.raises(
-        StageFailure, match=r"moved towards what they show, or away; .*\(21, 14\) px of the first"
+        StageFailure, match=r"moved towards the scene or away from it; .*\(21, 14\) px, inside 0\.jpg"
     ):
         between.prepare_pair(a, b)
     # A photograph and a copy of it, saved anew: this F is as good as any.

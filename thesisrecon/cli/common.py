@@ -1,9 +1,7 @@
-"""What the commands have in common: options, the libraries they start, bars of progress.
+"""Options, thread limits, progress bars and exit codes shared by all commands.
 
-NumPy is imported only inside the commands, after the number of its threads is set: linear algebra on one
-thread gives the same bytes however many workers there are, and the workers are the parallelism.
-
-How a command ends: an exit code, and one sentence where it did not do what it was told.
+NumPy is imported only inside the commands, after the number of its threads is set: single-threaded linear
+algebra gives the same bytes for any number of workers.
 """
 
 from __future__ import annotations
@@ -19,49 +17,90 @@ from typing import Annotated, Any
 import typer
 
 from thesisrecon.errors import DISK, OutputError, StageFailure, UsageError
-from thesisrecon.io.files import printable, shortened, without_middle
+from thesisrecon.io.files import printable, shorten_middle, shortened
 from thesisrecon.runtime.executors import available_threads
 from thesisrecon.runtime.signals import CODES, REASONS, advised
 
-MOST_THREADS = 1024
-PICTURE_BLOCKS = "64m"
-STAGE_WORDS = {
+DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
+DEBUG_VARIABLE = "THESISRECON_DEBUG"
+_STAGE_LABELS = {
     "features": "corners",
-    "pairs": "choice of pairs",
-    "matches": "pairs of photographs",
+    "pairs": "pair selection",
+    "matches": "image pairs",
     "projective": "projective cameras",
     "selfcalibration": "self-calibration",
     "metric": "metric refinement",
     "dense": "depth maps",
     "model": "surface and texture",
-    "correspondence": "which pixels correspond",
+    "correspondence": "dense correspondence",
     "views": "views",
 }
+_NO_KERNEL_CACHE = (
+    "compiled kernels can be cached neither beside the code nor in the user's cache folder; set the variable "
+    "NUMBA_CACHE_DIR to a writable folder"
+)
 
-Threads = Annotated[
-    int, typer.Option("--threads", min=0, max=MOST_THREADS, help="Workers; 0 = one per processor.")
-]
 
+def parse_folder(text: str | Path) -> Path:
+    """Parse a folder argument; an empty name would silently mean the current folder.
 
-def named_folder(text: str | Path) -> Path:
-    """A folder as the user names it: an empty name would silently mean the current folder."""
+    Parameters
+    ----------
+    text : str or Path
+        The argument.
+
+    Returns
+    -------
+    Path
+        The folder, which need not exist.
+
+    Raises
+    ------
+    typer.BadParameter
+        If the name is blank.
+    """
     if not str(text).strip():
         raise typer.BadParameter("the folder has no name; write . for the current one")
     return Path(text)
 
 
+Threads = Annotated[
+    int, typer.Option("--threads", min=0, max=1024, help="Number of workers; 0 = one per processor.")
+]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
+MaxSize = Annotated[
+    int | None,
+    typer.Option("--max-size", help="Long side (px) to which larger images are reduced (default: 1600)."),
+]
+OutputFolder = Annotated[
+    Path, typer.Option("-o", "--out", parser=parse_folder, metavar="FOLDER", help="Output folder.")
+]
+
+
 def cap_threads(threads: int) -> None:
-    """The one setting that caps every kind of thread; must run before NumPy and Pillow are imported."""
+    """Limit every kind of thread; must run before NumPy and Pillow are imported.
+
+    Parameters
+    ----------
+    threads : int
+        Number of workers; 0 = one per processor.
+    """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
         os.environ[name] = "1"
     os.environ["NUMBA_NUM_THREADS"] = str(threads or available_threads())
-    # Pillow keeps pictures in blocks; of large ones nothing stays with the thread that read the picture.
-    os.environ.setdefault("PILLOW_BLOCK_SIZE", PICTURE_BLOCKS)
+    # With large blocks Pillow returns the memory of an image when the image is freed.
+    os.environ.setdefault("PILLOW_BLOCK_SIZE", "64m")
 
 
 @contextmanager
 def progress_bars() -> Iterator[Any]:
-    """A bar per stage on a terminal; silence elsewhere."""
+    """Show one progress bar per stage on a terminal, nothing elsewhere.
+
+    Yields
+    ------
+    callable or None
+        Receives (stage, done, total).
+    """
     if not sys.stderr.isatty():
         yield None
         return
@@ -72,75 +111,84 @@ def progress_bars() -> Iterator[Any]:
     tasks: dict[str, Any] = {}
     with Progress(*columns, console=Console(stderr=True)) as bars:
 
-        def hear(stage: str, done: int, total: int) -> None:
+        def update(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
-                tasks[stage] = bars.add_task(STAGE_WORDS.get(stage, stage), total=total)
+                tasks[stage] = bars.add_task(_STAGE_LABELS.get(stage, stage), total=total)
             bars.update(tasks[stage], completed=done, total=total)
 
-        yield hear
+        yield update
 
 
-DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
-DEBUG_VARIABLE = "THESISRECON_DEBUG"
-NO_CACHE = (
-    "the compiled kernels can be kept neither beside the code nor in the user's cache folder; name a folder "
-    "that can be written in the variable NUMBA_CACHE_DIR"
-)
-"""numba's own words for that name one of our functions and no remedy."""
-
-
-class Interrupted(Exception):
-    """Ctrl-C in a command."""
+class _Interrupted(Exception):
+    """Ctrl-C in a command; the parser would print a message of its own for a ``KeyboardInterrupt``."""
 
 
 @contextmanager
 def interruptible(advice: str) -> Iterator[None]:
-    """What is advised where the block is interrupted; the parser has words of its own for a
-    ``KeyboardInterrupt``."""
+    """Print this advice if the block is interrupted.
+
+    Parameters
+    ----------
+    advice : str
+        How to continue after the interruption.
+
+    Yields
+    ------
+    None
+        Nothing.
+    """
     try:
         with advised(advice):
             yield
     except KeyboardInterrupt as stop:
-        raise Interrupted(*stop.args) from None
+        raise _Interrupted(*stop.args) from None
 
 
 def exit_code_of(command: Callable[[], object]) -> int:
-    """Carry out a command: its exit code; errors become one sentence on stderr."""
+    """Run a command and turn errors into one sentence on stderr and an exit code.
+
+    Parameters
+    ----------
+    command : callable
+        Takes no arguments; an int that it returns is the exit code.
+
+    Returns
+    -------
+    int
+        0 = done, 1 = internal error, 2 = usage, 3 = data that cannot be reconstructed, 130 = interrupted.
+    """
     try:
         code = command()
         return code if isinstance(code, int) else DONE
     except UsageError as error:
-        return _say(str(error), USAGE)
+        return _report(str(error), USAGE)
     except StageFailure as failure:
-        return _say(str(failure), IMPOSSIBLE)
-    except (Interrupted, KeyboardInterrupt) as stop:
-        # Where somebody else's program runs the command: ours is ended by `obey_signals`.
-        return _say("; ".join((REASONS[SIGINT], *map(str, stop.args))), CODES[SIGINT])
+        return _report(str(failure), IMPOSSIBLE)
+    except (_Interrupted, KeyboardInterrupt) as stop:
+        # Only if another program called us: the installed command leaves in `obey_signals`.
+        return _report("; ".join((REASONS[SIGINT], *map(str, stop.args))), CODES[SIGINT])
     except MemoryError:
-        return _say("out of memory; try a smaller --max-size or fewer --threads", IMPOSSIBLE)
+        return _report("out of memory; try a smaller --max-size or fewer --threads", IMPOSSIBLE)
     except OSError as error:
         if error.errno in DISK:
-            # Kernels are kept on a disk too, and what is printed may go to a file.
-            return _say(str(OutputError(error.filename or "what the command writes", error)), USAGE)
+            # The kernel cache and redirected output can fill a disk too.
+            return _report(str(OutputError(error.filename or "the output", error)), USAGE)
         if os.environ.get(DEBUG_VARIABLE):
             raise
         place = f"{shortened(str(error.filename))}: " if error.filename is not None else ""
-        return _say(f"{place}{error.strerror or error}", USAGE)
+        return _report(f"{place}{error.strerror or error}", USAGE)
     except Exception as error:
-        # The parser's own errors carry their sentence, in some versions with all that was given; its classes
-        # differ between its versions.
+        # The parser's error classes differ between its versions; all have this method.
         if hasattr(error, "format_message"):
-            return _say(f"{without_middle(error.format_message())} (see thesisrecon --help)", USAGE)
+            return _report(f"{shorten_middle(error.format_message())} (see thesisrecon --help)", USAGE)
         if os.environ.get(DEBUG_VARIABLE):
             raise
         if "no locator available" in str(error):
-            return _say(NO_CACHE, USAGE)
-        return _say(
-            f"an error in the program: {type(error).__name__}: {error}; {DEBUG_VARIABLE}=1 shows where",
-            INTERNAL,
-        )
+            return _report(_NO_KERNEL_CACHE, USAGE)
+        sentence = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 for a traceback"
+        return _report(sentence, INTERNAL)
 
 
-def _say(sentence: str, code: int) -> int:
+def _report(sentence: str, code: int) -> int:
     typer.echo(f"thesisrecon: {printable(' '.join(sentence.split()))}", err=True)
     return code

@@ -1,67 +1,98 @@
-"""The summary of a run in lines of text, for a terminal."""
+"""The command ``inspect``: print the summary of a run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from thesisrecon.errors import counted
-from thesisrecon.io.files import printable
+import typer
+
+from thesisrecon.cli.common import parse_folder
+from thesisrecon.errors import UsageError, counted
+from thesisrecon.io.files import printable, read_json
+
+
+def inspect(
+    out: Annotated[Path, typer.Argument(parser=parse_folder, metavar="OUT", help="Output folder of a run.")],
+) -> None:
+    """Print the summary of a run."""
+    summary = read_json(out / "summary.json")
+    if not isinstance(summary, dict):
+        raise UsageError(f"{out} holds no summary.json; no run has finished in this folder")
+    try:
+        text = summary_text(summary, out)
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError, RecursionError):
+        raise UsageError(f"{out / 'summary.json'} is not a summary written by thesisrecon") from None
+    typer.echo(text)
 
 
 def summary_text(summary: Mapping[str, Any], out: Path) -> str:
-    """What the command says of a run whose folder is ``out``, a fact a line.
+    """Format the summary of a run for a terminal, one fact per line.
 
-    ``summary`` is what ``summary.json`` holds; ``KeyError`` or ``TypeError`` where it is something else.
+    Parameters
+    ----------
+    summary : mapping
+        Content of ``summary.json``.
+    out : Path
+        Folder of the run.
+
+    Returns
+    -------
+    str
+        Lines without control characters.
+
+    Raises
+    ------
+    KeyError, TypeError
+        If ``summary`` is not a summary.
     """
-    lines = [_found(summary)]
+    lines = [_result(summary)]
     if summary["reprojection_rms_px"] is not None:
         lines.append(
             f"reprojection residual {summary['reprojection_rms_px']:.3f} px RMS, "
             f"{summary['reprojection_median_px']:.3f} px median"
         )
-    lines += intrinsic_lines(summary["cameras"])
+    lines += _intrinsic_lines(summary["cameras"])
     if summary.get("model"):
-        lines.append(f"model of {counted(summary['model']['faces'], 'triangle')}: {out / 'model.glb'}")
-    lines += [f"refused: {refused['name']}: {refused['reason']}" for refused in summary["refused"]]
+        lines.append(f"model with {counted(summary['model']['faces'], 'triangle')}: {out / 'model.glb'}")
+    lines += [f"not registered: {refused['name']}: {refused['reason']}" for refused in summary["refused"]]
     lines += [f"warning: {warning}" for warning in summary["warnings"]]
     if summary["failure"]:
         lines.append(f"failed: {summary['failure']}")
-    lines.append(f"{time_taken(summary)}; the page is {out / 'report.html'}")
+    lines.append(f"{_duration(summary)}; report: {out / 'report.html'}")
     return "\n".join(printable(line) for line in lines)
 
 
-def time_taken(summary: Mapping[str, Any]) -> str:
-    """What this run took; where stages were kept, also what all of them took when they were computed."""
+def _duration(summary: Mapping[str, Any]) -> str:
+    """Time of this run and, if stages were cached, the computing time of all of them."""
     total = summary["seconds"]["total"]
-    took = f"{summary.get('elapsed_seconds', total):.1f} s"
-    return f"{took} ({total:.1f} s with what was kept of an earlier run)" if summary["resumed"] else took
+    elapsed = f"{summary.get('elapsed_seconds', total):.1f} s"
+    return f"{elapsed} ({total:.1f} s including cached stages)" if summary["resumed"] else elapsed
 
 
-def _found(summary: Mapping[str, Any]) -> str:
-    """What the last stage that found something found."""
+def _result(summary: Mapping[str, Any]) -> str:
+    """Result of the last stage that has one."""
     images, pairs = summary["images"], summary["pairs"]
     if summary["stratum"] is not None:
         kind = " in projective cameras" if summary["stratum"] == "projective" else ""
-        found = f"{summary['registered']} of {counted(images, 'photograph')} registered"
-        return f"{found}{kind}, {counted(summary['points'], 'point')}"
+        registered = f"{summary['registered']} of {counted(images, 'image')} registered"
+        return f"{registered}{kind}, {counted(summary['points'], 'point')}"
     if pairs["matched"]:
         possible = pairs.get("possible", pairs["matched"])
         chosen = f" ({possible} are possible)" if possible > pairs["matched"] else ""
         return (
-            f"{pairs['accepted']} of {counted(pairs['matched'], 'pair')} of photographs accepted{chosen}, "
+            f"{pairs['accepted']} of {counted(pairs['matched'], 'image pair')} accepted{chosen}, "
             f"{counted(pairs['verified_matches'], 'verified match')}"
         )
     corners = [view["corners"] for view in summary["cameras"] if view["corners"] is not None]
     if corners:
-        return f"{counted(sum(corners), 'corner')} in {counted(len(corners), 'photograph')}"
-    return f"{len(summary['cameras'])} of {counted(images, 'photograph')} read"
+        return f"{counted(sum(corners), 'corner')} in {counted(len(corners), 'image')}"
+    return f"{len(summary['cameras'])} of {counted(images, 'image')} read"
 
 
-def intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
-    """One line per camera: focal length, principal point and what else of K was estimated, with their
-    standard deviations."""
+def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
+    """One line per camera: the estimated entries of K with their standard deviations."""
     lines: dict[tuple[int, float], str] = {}
     for view in views:
         if "focal_px" not in view:
@@ -69,19 +100,18 @@ def intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
         focal, x, y = (view[name] for name in ("focal_px", "principal_x_px", "principal_y_px"))
         lines.setdefault(
             (view["camera"], focal["value"]),
-            f"camera {view['camera']}: "
-            f"focal {focal['value']:.1f} +- {focal['std']:.1f} px ({focal['source']}), "
-            f"principal point ({x['value']:.1f} +- {x['std']:.1f}, {y['value']:.1f} +- {y['std']:.1f}) px"
-            + _shape_of_pixels(view),
+            f"camera {view['camera']}: focal length {focal['value']:.1f} ± {focal['std']:.1f} px "
+            f"({focal['source']}), principal point ({x['value']:.1f} ± {x['std']:.1f}, "
+            f"{y['value']:.1f} ± {y['std']:.1f}) px" + _aspect_and_skew(view),
         )
     return list(lines.values())
 
 
-def _shape_of_pixels(view: Mapping[str, Any]) -> str:
-    """Aspect and skew, where they were estimated."""
-    words = ""
-    for name, text, digits, unit in (("aspect", "aspect", 5, ""), ("skew_px", "skew", 2, " px")):
+def _aspect_and_skew(view: Mapping[str, Any]) -> str:
+    """Aspect ratio and skew, each only if it was estimated."""
+    text = ""
+    for name, label, digits, unit in (("aspect", "aspect ratio", 5, ""), ("skew_px", "skew", 2, " px")):
         interval = view.get(name)
         if interval is not None and interval["std"] != 0.0:
-            words += f", {text} {interval['value']:.{digits}f} +- {interval['std']:.{digits}f}{unit}"
-    return words
+            text += f", {label} {interval['value']:.{digits}f} ± {interval['std']:.{digits}f}{unit}"
+    return text

@@ -26,7 +26,7 @@ from thesisrecon.report.page import strip_page
 from thesisrecon.runtime.executors import Workers
 from thesisrecon.settings import in_words, unknown_word
 from thesisrecon.view_interpolation import ViewSequence
-from thesisrecon.views.paths import interpolate_cameras, orbit, sample_surface, estimate_up
+from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
 from thesisrecon.views.render import Light, Shading, render
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
@@ -304,9 +304,7 @@ def interpolate_images(
     config = PipelineConfig()
     if options.max_size_px is not None:
         config = replace(config, images=ImageOptions(options.max_size_px))
-    images = [
-        read_image(path, max_size_px=config.images.max_size_px).images[0] for path in options.images
-    ]
+    images = [read_image(path, max_size_px=config.images.max_size_px).images[0] for path in options.images]
     report, count = progress or (lambda *_: None), options.frames
     report("correspondence", 0, 1)
     module, name = METHODS[options.method]

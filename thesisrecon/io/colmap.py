@@ -1,8 +1,8 @@
-"""COLMAP sparse models in and out: the only place that knows COLMAP's conventions.
+"""Conversion between reconstructions and COLMAP sparse models: the only place with COLMAP's conventions.
 
-COLMAP puts the centre of the top-left pixel at (0.5, 0.5), numbers things from 1, and keeps a camera apart
-from the images it took. Its SIMPLE_RADIAL distortion is the one used here, x (1 + k1 r^2) on normalised
-points, and FULL_OPENCV where a lens has k2 and k3.
+COLMAP puts the centre of the top-left pixel at (0.5, 0.5), numbers from 1, and separates cameras from images.
+Its SIMPLE_RADIAL distortion is the one used here, x (1 + k1 r^2) on normalized points; FULL_OPENCV adds
+k2 and k3.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from thesisrecon.io.colmap_model import NO_POINT, ColmapCamera, ColmapImage, Col
 from thesisrecon.records import Reconstruction, Tracks
 
 _PIXEL_CENTRE = 0.5
-SKEW_REL = 1e-9
-"""Skew below this share of the focal length is rounding."""
+_SKEW_REL = 1e-9
+"""Skew below this fraction of the focal length is rounding."""
 
 
 def colmap_from_reconstruction(
@@ -34,25 +34,36 @@ def colmap_from_reconstruction(
     scales: F64,
     original_sizes: I64 | None = None,
 ) -> ColmapModel:
-    """The metric reconstruction as a COLMAP model in the pixels of the original photographs.
+    """Convert a metric reconstruction to a COLMAP model in original pixels.
 
-    Registered views are written, and the valid points with at least two inlier observations in them; view i
-    is image i + 1 and point j is point j + 1. A point's error is its mean distance in original pixels.
+    It contains the registered views and the valid points with at least two inlier observations in them; view
+    i is image i + 1 and point j is point j + 1. The error of a point is its mean distance in original pixels.
 
     Parameters
     ----------
-    reconstruction : in the metric stratum, with K; sizes (V, 2) are (width, height) at working size.
-    names : V file names.
-    colors : (N, 3) uint8 RGB of the points.
-    groups : (V,) views of one group share a camera, as far as their intrinsics and sizes are the same.
-    scales : (V,) or (V, 2) for x and y apart: original over working size.
-    original_sizes : (V, 2) width and height of the photographs; without it, working size times scale, which
-        can miss the last row where a resize cut it off.
+    reconstruction : Reconstruction
+        Metric, with K; its sizes (V, 2) are (width, height) at working size.
+    names : sequence of str
+        V file names.
+    colors : ndarray (N, 3) uint8
+        RGB of the points.
+    groups : ndarray (V,)
+        Views of one group share a camera if their intrinsics and sizes are equal.
+    scales : ndarray (V,) or (V, 2)
+        Original over working size, for x and y.
+    original_sizes : ndarray (V, 2), optional
+        (width, height) of the originals; by default working size times scale, which can miss a cut last row.
+
+    Returns
+    -------
+    ColmapModel
+        A consistent model.
 
     Raises
     ------
-    ValueError : another stratum, arrays of other lengths, a K with skew (COLMAP has no camera for it), or a P
-        that is not K [R t].
+    ValueError
+        For another stratum, arrays of other lengths, a K with skew (COLMAP has no camera for it), or a P that
+        is not K [R t].
     """
     _check_export(reconstruction, names, colors, groups, scales)
     scales = np.broadcast_to(scales.reshape(len(names), -1), (len(names), 2))
@@ -69,11 +80,27 @@ def colmap_from_reconstruction(
 
 
 def skewed_views(reconstruction: Reconstruction) -> I64:
-    """Numbers of the registered views whose K has skew, for which COLMAP has no camera."""
+    """Find the registered views whose K has skew, for which COLMAP has no camera.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Metric, with K.
+
+    Returns
+    -------
+    ndarray (S,)
+        Numbers of the views.
+
+    Raises
+    ------
+    ValueError
+        If the reconstruction has no K.
+    """
     if reconstruction.K is None:
-        raise ValueError(f"skew is in K, and this {reconstruction.stratum} reconstruction has none")
+        raise ValueError(f"skewed_views needs K; this {reconstruction.stratum} reconstruction has none")
     K = reconstruction.K
-    return np.flatnonzero(reconstruction.registered & (np.abs(K[:, 0, 1]) > SKEW_REL * K[:, 0, 0]))
+    return np.flatnonzero(reconstruction.registered & (np.abs(K[:, 0, 1]) > _SKEW_REL * K[:, 0, 0]))
 
 
 def _check_export(
@@ -105,12 +132,12 @@ def _kept_observations(reconstruction: Reconstruction) -> tuple[I64, I64, F64]:
 
 
 def _pose(reconstruction: Reconstruction, i: int) -> tuple[F64, F64]:
-    """R (3, 3) and t (3,) of P = K [R t], whatever the positive scale of P."""
+    """R (3, 3) and t (3,) of P = s K [R t] with s > 0."""
     assert reconstruction.K is not None
     pose = np.linalg.solve(reconstruction.K[i], reconstruction.P[i])
     pose /= np.cbrt(np.linalg.det(pose[:, :3]))
     if not np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-6):
-        raise ValueError(f"P of view {i} is not K [R t]: its left part is no rotation after K is taken off")
+        raise ValueError(f"P of view {i} is not K [R t]: inv(K) P contains no rotation")
     return pose[:, :3], pose[:, 3]
 
 
@@ -138,7 +165,7 @@ def _lens(reconstruction: Reconstruction) -> F64:
 def _cameras(
     reconstruction: Reconstruction, groups: I64, scales: F64, sizes: I64
 ) -> tuple[tuple[ColmapCamera, ...], dict[int, int]]:
-    """One camera for each group and set of intrinsics in it, and the camera's number of each view."""
+    """One camera per group and set of intrinsics, and the camera number of each view."""
     assert reconstruction.K is not None
     lens = _lens(reconstruction)
     cameras: dict[tuple[object, ...], ColmapCamera] = {}
@@ -153,17 +180,17 @@ def _cameras(
 
 
 def _camera_params(K: F64, distortion: F64, scale: F64) -> tuple[str, tuple[float, ...]]:
-    """The smallest COLMAP model that holds K and (k1, k2, k3), and its parameters in original pixels."""
-    if abs(K[0, 1]) > SKEW_REL * K[0, 0]:
+    """Return the smallest COLMAP camera model for K and (k1, k2, k3), with parameters in original pixels."""
+    if abs(K[0, 1]) > _SKEW_REL * K[0, 0]:
         raise ValueError(
-            f"COLMAP has no camera with skew; K has {K[0, 1]:.3g} px, set it to 0 before the export"
+            f"COLMAP has no camera model with skew; K has {K[0, 1]:.3g} px, set it to 0 before the export"
         )
     fx, fy = float(K[0, 0] * scale[0]), float(K[1, 1] * scale[1])
     centre = tuple(float(value) for value in (K[:2, 2] + _PIXEL_CENTRE) * scale)
     k1, k2, k3 = distortion.tolist()
     if k2 or k3:
         return "FULL_OPENCV", (fx, fy, *centre, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)
-    # Relative, and so small that taking one focal length for both moves no pixel by more than rounding.
+    # One focal length for both moves no pixel by more than rounding.
     same_focal = abs(fx - fy) <= 1e-12 * fx
     if same_focal:
         return ("SIMPLE_RADIAL", (fx, *centre, k1)) if k1 else ("SIMPLE_PINHOLE", (fx, *centre))
@@ -176,7 +203,7 @@ def _images(
     camera_ids: dict[int, int],
     observations: tuple[I64, I64, F64],
 ) -> tuple[tuple[ColmapImage, ...], I64]:
-    """The images, and for each observation its row among the points of its image."""
+    """Return the images, and the row of each observation in its image."""
     view, point, xy = observations
     row = np.zeros(len(view), dtype=np.int64)
     images = []
@@ -206,25 +233,28 @@ def _points(
 
 
 def reconstruction_from_colmap(model: ColmapModel, *, names: Sequence[str] | None = None) -> Reconstruction:
-    """A COLMAP model as a metric reconstruction in the pixels of its photographs.
+    """Convert a COLMAP model to a metric reconstruction in the pixels of its images.
 
     Parameters
     ----------
-    model : any consistent model whose cameras are pinhole with at most one radial coefficient.
-    names : the photographs, whose order numbers the views; those the model lacks become views that are not
-        registered. Without it, the images of the model in the order of their names.
+    model : ColmapModel
+        Consistent, with pinhole cameras and at most three radial coefficients.
+    names : sequence of str, optional
+        File names that number the views; those without an image are not registered. By default the images of
+        the model, sorted by name.
 
     Returns
     -------
-    Reconstruction : points in the model's order, all valid, all observations inliers; ``sigma_px`` is
-    estimated
-        from the residuals (1.4826 times the median size of a coordinate). Where COLMAP sees a point twice in
-        one image the first observation is kept.
+    Reconstruction
+        Points in the order of the model, all valid; all observations inliers. If an image sees a point twice,
+        the first observation is used. ``sigma_px`` is 1.4826 times the median absolute coordinate residual.
 
     Raises
     ------
-    StageFailure : a camera model or distortion that has no equal here, or two images of one name.
-    ValueError : an image of the model is not among ``names``.
+    StageFailure
+        For an unsupported camera model or distortion, or two images of one name.
+    ValueError
+        If an image of the model is not among ``names``.
     """
     by_name = {image.name: image for image in model.images}
     if len(by_name) < len(model.images):
@@ -235,7 +265,7 @@ def reconstruction_from_colmap(model: ColmapModel, *, names: Sequence[str] | Non
     unknown = sorted(set(by_name) - set(names))
     if unknown or len(set(names)) < len(names):
         raise ValueError(
-            f"names must hold each image of the model once; missing or doubled: {unknown[:3] or names[:3]}"
+            f"names must hold each image of the model once; missing or repeated: {unknown[:3] or names[:3]}"
         )
     cameras = {camera.camera_id: camera for camera in model.cameras}
     K, distortion = np.zeros((len(names), 3, 3)), np.zeros((len(names), 3))
@@ -277,7 +307,7 @@ def _with_observations(
         K=K,
         distortion=distortion,
     )
-    # A model from elsewhere may hold points in a camera's plane, or so far away that their squares overflow.
+    # Foreign models may hold points in a camera's principal plane, or so distant that squares overflow.
     with np.errstate(all="ignore"):
         seen = _reproject(reconstruction, poses, tracks.view_index, tracks.point_index)
         size = np.abs(seen - tracks.xy)
@@ -303,13 +333,13 @@ def _tracks(model: ColmapModel, names: Sequence[str]) -> Tracks:
 
 
 def _intrinsics(camera: ColmapCamera) -> tuple[F64, F64]:
-    """K (3, 3) and (k1, k2, k3) in our pixels; refuses every other distortion that is not zero."""
+    """K (3, 3) and (k1, k2, k3) in our pixels; any other nonzero distortion is refused."""
     params = camera.params
     single = camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     if not single and camera.model not in ("PINHOLE", "OPENCV", "FULL_OPENCV"):
         raise StageFailure(
-            f"camera {camera.camera_id} of the COLMAP model is of the kind {camera.model}",
-            "three radial coefficients are all that is supported",
+            f"camera {camera.camera_id} of the COLMAP model has the model {camera.model}",
+            "only three radial coefficients are supported",
             "undistort the images, or reconstruct with SIMPLE_RADIAL",
         )
     focal, rest = ((params[0], params[0]), params[1:]) if single else ((params[0], params[1]), params[2:])

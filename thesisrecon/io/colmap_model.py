@@ -1,21 +1,16 @@
-"""The records of a COLMAP sparse model, and the rules that make one consistent.
+"""Records of a COLMAP sparse model, and the rules of a consistent one.
 
-The numbers are COLMAP's own here: pixel (0.5, 0.5) is the centre of the top-left pixel, quaternions are
-(w, x, y, z), poses take world to camera, -1 marks an image point that belongs to no space point.
-
-What both forms of COLMAP's files share: the refusal of a broken file and the columns of points.
+COLMAP's conventions: pixel (0.5, 0.5) is the centre of the top-left pixel, quaternions are (w, x, y, z),
+poses are world-to-camera, and -1 marks an image point without a space point.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64, I64, U8
-from thesisrecon.errors import StageFailure
 
 MODEL_NUMBERS = {
     "SIMPLE_PINHOLE": 0,
@@ -46,7 +41,19 @@ NO_POINT = -1
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """One camera: ``model`` is a name of :data:`MODEL_NUMBERS`, ``params`` as COLMAP orders them."""
+    """One camera.
+
+    Parameters
+    ----------
+    camera_id : int
+        Unique number.
+    model : str
+        A key of :data:`MODEL_NUMBERS`.
+    width, height : int
+        Image size (px).
+    params : tuple of float
+        In COLMAP's order.
+    """
 
     camera_id: int
     model: str
@@ -59,7 +66,20 @@ class ColmapCamera:
 class ColmapImage:
     """One registered image: x_camera = R(quaternion_wxyz) X + translation.
 
-    ``xy`` (N, 2) image points in COLMAP's pixels, ``point_ids`` (N,) the space point of each, -1 for none.
+    Parameters
+    ----------
+    image_id : int
+        Unique number.
+    quaternion_wxyz, translation : ndarray (4,) and (3,)
+        Pose.
+    camera_id : int
+        Its camera.
+    name : str
+        File name.
+    xy : ndarray (N, 2)
+        Image points in COLMAP's pixels.
+    point_ids : ndarray (N,)
+        Space point of each, -1 = none.
     """
 
     image_id: int
@@ -73,10 +93,22 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapPoints:
-    """All space points, by columns: ``ids`` (N,), ``xyz`` (N, 3), ``rgb`` (N, 3) uint8, ``error`` (N,) px.
+    """All space points, by columns.
 
-    Point n is seen by the entries ``track_start[n]:track_start[n + 1]`` of ``track_image`` (an image's id)
-    and ``track_xy`` (the row of that image's ``xy``); ``track_start`` (N + 1,) begins with 0.
+    Parameters
+    ----------
+    ids : ndarray (N,)
+        Unique numbers.
+    xyz : ndarray (N, 3)
+        Positions.
+    rgb : ndarray (N, 3) uint8
+        Colours.
+    error : ndarray (N,)
+        Mean reprojection error (px).
+    track_start : ndarray (N + 1,)
+        Point n has the track entries ``track_start[n]:track_start[n + 1]``.
+    track_image, track_xy : ndarray (M,)
+        Image number and row of its ``xy`` of each track entry.
     """
 
     ids: I64
@@ -90,7 +122,15 @@ class ColmapPoints:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A sparse model: cameras, the images that see through them, and the points they see."""
+    """A sparse model.
+
+    Parameters
+    ----------
+    cameras, images : tuple
+        Records.
+    points : ColmapPoints
+        Space points.
+    """
 
     cameras: tuple[ColmapCamera, ...]
     images: tuple[ColmapImage, ...]
@@ -98,10 +138,20 @@ class ColmapModel:
 
 
 def inconsistency(model: ColmapModel) -> str:
-    """The first rule that ``model`` breaks, as a clause; empty where it breaks none.
+    """Find the first rule that a model breaks.
 
-    Ids must be unique and in range, references must exist both ways (image point to space point and back),
-    numbers must be finite, and names must be something a file can hold.
+    Numbers must be unique and in range, references must exist in both directions (image point to space point
+    and back), values must be finite, and names must fit into a file.
+
+    Parameters
+    ----------
+    model : ColmapModel
+        Any model.
+
+    Returns
+    -------
+    str
+        A clause, or empty if the model is consistent.
     """
     return _camera_problem(model) or _image_problem(model) or _point_problem(model) or _track_problem(model)
 
@@ -134,16 +184,16 @@ def _image_problem(model: ColmapModel) -> str:
         if not 0 <= image.image_id <= MAX_ID:
             return f"{what} has a number out of range"
         if image.camera_id not in known:
-            return f"{what} is seen through camera {image.camera_id}, which does not exist"
+            return f"{what} uses camera {image.camera_id}, which does not exist"
         if not image.name or any(mark in image.name for mark in "\0\n\r"):
-            return f"{what} has an empty name or one of several lines"
+            return f"{what} has an empty name or a name with a line break"
         numbers = (image.quaternion_wxyz, image.translation, image.xy)
         if [part.shape for part in numbers] != [(4,), (3,), (len(image.point_ids), 2)]:
             return f"{what} has arrays of the wrong shape"
         if not all(np.isfinite(part).all() for part in numbers):
             return f"{what} has a pose or an image point that is not finite"
         if not 1e-6 < float(np.abs(image.quaternion_wxyz).max()) < 1e6:
-            return f"{what} has a quaternion that is no rotation"
+            return f"{what} has an invalid quaternion"
     return ""
 
 
@@ -163,18 +213,18 @@ def _track_problem(model: ColmapModel) -> str:
     points, images = model.points, model.images
     lengths = np.diff(points.track_start)
     if points.track_start[0] != 0 or points.track_start[-1] != len(points.track_image) or (lengths < 0).any():
-        return "the tracks of the points do not add up"
+        return "the track lengths are inconsistent"
     counts = np.array([len(image.xy) for image in images], dtype=np.int64)
     start = np.concatenate([[0], np.cumsum(counts)])
     if not images:
-        return "a point is seen by an image that does not exist" if len(points.track_image) else ""
+        return "a track refers to an image that does not exist" if len(points.track_image) else ""
     ids = np.array([image.image_id for image in images], dtype=np.int64)
     order = np.argsort(ids)
     place = order[np.minimum(np.searchsorted(ids[order], points.track_image), len(ids) - 1)]
     if (ids[place] != points.track_image).any():
-        return "a point is seen by an image that does not exist"
+        return "a track refers to an image that does not exist"
     if ((points.track_xy < 0) | (points.track_xy >= counts[place])).any():
-        return "a point is seen at an image point that does not exist"
+        return "a track refers to an image point that does not exist"
     owners = np.concatenate([image.point_ids for image in images])
     seen = start[place] + points.track_xy
     if (owners[seen] != np.repeat(points.ids, lengths)).any() or len(np.unique(seen)) < len(seen):
@@ -182,29 +232,3 @@ def _track_problem(model: ColmapModel) -> str:
     if np.count_nonzero(owners != NO_POINT) != len(seen):
         return "an image point refers to a point that does not list it"
     return ""
-
-
-TRACK_ENTRY = np.dtype([("image", "<u4"), ("xy", "<u4")])
-
-
-def broken_file(path: Path, what: str) -> StageFailure:
-    """The refusal of a file with the reason."""
-    return StageFailure(f"{path} is not a sound COLMAP file", what, "export the model again")
-
-
-def points_of_records(
-    heads: list[tuple[int | float, ...]], entries: NDArray[np.void], path: Path
-) -> ColmapPoints:
-    """Columns of points; ``heads`` hold (id, x, y, z, r, g, b, error, track length)."""
-    if any(head[0] >= 2**63 for head in heads):
-        raise broken_file(path, "a point has a number out of range")
-    lengths = np.array([head[8] for head in heads], dtype=np.int64)
-    return ColmapPoints(
-        ids=np.array([head[0] for head in heads], dtype=np.int64),
-        xyz=np.array([head[1:4] for head in heads], dtype=np.float64).reshape(-1, 3),
-        rgb=np.array([head[4:7] for head in heads], dtype=np.uint8).reshape(-1, 3),
-        error=np.array([head[7] for head in heads], dtype=np.float64),
-        track_start=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-        track_image=entries["image"].astype(np.int64),
-        track_xy=entries["xy"].astype(np.int64),
-    )

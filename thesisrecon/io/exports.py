@@ -1,7 +1,4 @@
-"""Coloured points as a PLY file that every viewer opens.
-
-The cameras of a finished run, read from its ``cameras.json``.
-"""
+"""Point clouds as PLY, and the cameras of a finished run from its ``cameras.json``."""
 
 from __future__ import annotations
 
@@ -17,14 +14,29 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io.files import read_json, write_atomically
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+_MAX_SIDE_PX = 2**24
+_ROUNDING = 1e-4
+"""Tolerance for numbers that were rounded in the file."""
 
 
 def write_point_cloud(path: Path, xyz: F64, rgb: NDArray[np.uint8]) -> None:
-    """Write points ``xyz`` (N, 3) with colours ``rgb`` (N, 3) uint8 as binary little-endian PLY.
+    """Write coloured points as binary little-endian PLY with float32 coordinates.
 
-    Coordinates are stored as float32, about their own origin, as viewers expect. The file appears whole or
-    not at all. Raises ``ValueError`` for other shapes and for coordinates that are not finite in float32,
-    :class:`~thesisrecon.errors.OutputError` where it cannot be written.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    xyz : ndarray (N, 3)
+        Points.
+    rgb : ndarray (N, 3) uint8
+        Colours.
+
+    Raises
+    ------
+    ValueError
+        For other shapes, or coordinates that are not finite in float32.
+    OutputError
+        If the file cannot be written.
     """
     if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape or rgb.dtype != np.uint8:
         raise ValueError(
@@ -46,38 +58,47 @@ def write_point_cloud(path: Path, xyz: F64, rgb: NDArray[np.uint8]) -> None:
     write_atomically(path, "".join(f"{line}\n" for line in header).encode("ascii") + vertices.tobytes())
 
 
-LARGEST_SIDE = 2**24
-"""px; far above what any photograph has."""
-ROUNDING = 1e-4
-"""Of the numbers of a file that somebody has shortened."""
-
-
 def read_cameras(path: Path) -> dict[str, Camera]:
-    """Name -> camera of every registered photograph in the order of the file, in original pixels.
+    """Read the registered cameras of a run, in original pixels and without lens distortion.
 
-    The lens' distortion is left out: these are the cameras of the photographs after their distortion was
-    removed. Raises :class:`UsageError` where the file is absent, damaged or without cameras, and where a K
-    has no positive focal lengths or an R is no rotation.
+    Parameters
+    ----------
+    path : Path
+        A ``cameras.json``.
+
+    Returns
+    -------
+    dict
+        File name -> camera of the undistorted image, in the order of the file.
+
+    Raises
+    ------
+    UsageError
+        If the file is absent, damaged or empty, or a K or R is invalid.
     """
     if not path.is_file():
-        raise UsageError(f"there is no {path.name} in {path.parent}; has a run ended there?")
+        raise UsageError(f"there is no {path.name} in {path.parent}; no run has finished in this folder")
     content = read_json(path)
     try:
         cameras = {str(entry["name"]): _camera(entry) for entry in content["cameras"]}
     except (TypeError, KeyError, ValueError, OverflowError):
-        raise UsageError(f"{path} does not hold cameras of this program") from None
+        raise UsageError(f"{path} does not hold valid cameras written by thesisrecon") from None
     if not cameras:
-        raise UsageError(f"{path} holds no camera; no photograph of this run was registered")
+        raise UsageError(f"{path} holds no camera; no image of this run was registered")
     return cameras
 
 
 def _camera(entry: Any) -> Camera:
     K, R, t = (np.array(entry[name], dtype=np.float64) for name in ("K", "R", "t"))
     camera = Camera(K, R, t, (int(entry["width"]), int(entry["height"])))
-    if max(camera.size) > LARGEST_SIDE:
-        raise ValueError(f"a photograph is no larger than {LARGEST_SIDE} px")
-    if (np.diag(K) <= 0).any() or (np.abs(np.tril(K, -1)) > ROUNDING).any() or abs(K[2, 2] - 1.0) > ROUNDING:
-        raise ValueError("K is upper triangular and has positive focal lengths")
-    if not np.allclose(R @ R.T, np.eye(3), atol=ROUNDING) or np.linalg.det(R) < 0:
-        raise ValueError("R is a rotation")
+    if max(camera.size) > _MAX_SIDE_PX:
+        raise ValueError(f"an image side must be at most {_MAX_SIDE_PX} px")
+    if (
+        (np.diag(K) <= 0).any()
+        or (np.abs(np.tril(K, -1)) > _ROUNDING).any()
+        or abs(K[2, 2] - 1.0) > _ROUNDING
+    ):
+        raise ValueError("K must be upper triangular with positive focal lengths")
+    if not np.allclose(R @ R.T, np.eye(3), atol=_ROUNDING) or np.linalg.det(R) < 0:
+        raise ValueError("R must be a rotation")
     return camera

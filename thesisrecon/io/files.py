@@ -1,8 +1,6 @@
-"""Small files of the user as text, and text that is safe to show.
+"""Text, JSON and atomic file output: a file appears under its name only when it is complete.
 
-Files that appear under their name when they are whole: every file of this project is written here.
-
-Whoever ends the program in between, in whatever way, leaves the old file or the new one.
+If the program is killed at any moment, the old file or the new one is there.
 """
 
 from __future__ import annotations
@@ -20,68 +18,133 @@ from typing import Any
 
 from thesisrecon.errors import OutputError, UsageError
 
-LARGEST_TEXT = 2**26
-"""Bytes of the largest text that is read: far above any list of pairs, and far below what fills a memory."""
+MAX_TEXT_BYTES = 2**26
+"""Far above any list of pairs, far below the memory of a computer."""
+SPECIAL_FILE = "a pipe, a device or a socket"
 
-NO_FILE = "a pipe, a device or a socket"
-"""What has a name like a file and is none."""
-
-_CONTROLS = ("Cc", "Zl", "Zp")
-"""Unicode's categories of control characters and of what ends lines and paragraphs."""
-_TURNS = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
-"""Marks that turn the direction of whatever is written after them."""
+_CONTROL_CATEGORIES = ("Cc", "Zl", "Zp")
+"""Unicode categories of control characters, line and paragraph separators."""
+_BIDI_MARKS = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+"""Characters that change the direction of the text after them."""
+_PARTIAL = ".partial"
 
 
 def printable(name: str) -> str:
-    """A file name as text that can be shown anywhere, in one line and in its own order: bytes that are no
-    UTF-8, line ends, other control characters and turns of the direction become their codes.
+    """Escape a file name for display in one line.
+
+    Invalid UTF-8, line ends, other control characters and direction marks become their codes.
+
+    Parameters
+    ----------
+    name : str
+        File name, possibly with surrogate escapes.
+
+    Returns
+    -------
+    str
+        Valid Unicode.
     """
     text = name.encode("utf-8", "surrogateescape" if _from_bytes(name) else "backslashreplace")
-    return "".join(_shown(c) for c in text.decode("utf-8", "backslashreplace"))
+    return "".join(_escaped(c) for c in text.decode("utf-8", "backslashreplace"))
 
 
 def _from_bytes(name: str) -> bool:
-    """Whether the halves of characters in a text are bytes of a file name, if there are any."""
+    """Whether all surrogates in a text, if any, are bytes of a file name."""
     return all("\udc80" <= c <= "\udcff" for c in name if "\ud800" <= c <= "\udfff")
 
 
-def _shown(c: str) -> str:
-    if unicodedata.category(c) not in _CONTROLS and c not in _TURNS:
+def _escaped(c: str) -> str:
+    if unicodedata.category(c) not in _CONTROL_CATEGORIES and c not in _BIDI_MARKS:
         return c
     return f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}"
 
 
 def shortened(text: str, longest: int = 60) -> str:
-    """The text, or its beginning where it is long."""
+    """Cut the end of a long text.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+    longest : int
+        Characters to keep.
+
+    Returns
+    -------
+    str
+        At most ``longest`` characters.
+    """
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
-def without_middle(text: str, longest: int = 600) -> str:
-    """The text, or where it is long its beginning and its end, which often tells the rule."""
+def shorten_middle(text: str, longest: int = 600) -> str:
+    """Cut the middle of a long text; its end often states the rule.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+    longest : int
+        Characters to keep.
+
+    Returns
+    -------
+    str
+        At most ``longest`` characters.
+    """
     if len(text) <= longest:
         return text
     return f"{text[: longest - longest // 4 - 5]} ... {text[-(longest // 4) :]}"
 
 
-def read_bytes(path: Path, *, largest: int = LARGEST_TEXT) -> bytes:
-    """The content of a regular file of at most ``largest`` bytes.
+def read_bytes(path: Path, *, largest: int = MAX_TEXT_BYTES) -> bytes:
+    """Read a regular file.
 
-    Nothing else is waited for: a pipe may never speak and a device never end. Raises ``OSError`` whose
-    ``strerror`` says why not.
+    Parameters
+    ----------
+    path : Path
+        The file; reading a pipe or a device may never end, so they are refused.
+    largest : int
+        Limit in bytes.
+
+    Returns
+    -------
+    bytes
+        The content.
+
+    Raises
+    ------
+    OSError
+        With the reason in ``strerror``.
     """
     found = path.stat()
     if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
-        raise OSError(0, f"it is {NO_FILE}, not a file", str(path))
+        raise OSError(0, f"it is {SPECIAL_FILE}, not a file", str(path))
     if found.st_size > largest:
         raise OSError(0, f"it is larger than {largest / 2**20:.0f} MiB", str(path))
     with path.open("rb") as file:
-        # Files of the system claim no size, and some of them have no end.
+        # Files in /proc and /sys report size 0, and some have no end.
         return file.read(found.st_size or largest)
 
 
 def read_text(path: Path) -> str:
-    """The text of a UTF-8 file, without the mark some editors begin it with; :class:`UsageError` where it
-    cannot be read."""
+    """Read a UTF-8 text, without a byte order mark.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    str
+        The text.
+
+    Raises
+    ------
+    UsageError
+        If the file cannot be read or is not UTF-8.
+    """
     try:
         return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -90,23 +153,41 @@ def read_text(path: Path) -> str:
         raise UsageError(f"{path} cannot be read: {error.strerror}") from None
 
 
-_PARTIAL = ".partial"
-
-
 def is_partial(name: str) -> bool:
-    """Whether a file of this name is what a kill left of one that was being written."""
+    """Return whether a file is the remainder of an interrupted write.
+
+    Parameters
+    ----------
+    name : str
+        File name without folder.
+
+    Returns
+    -------
+    bool
+        True for names made by :func:`write_atomically` and :func:`link`.
+    """
     return name.startswith(".") and name.endswith(_PARTIAL)
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, and on the disk when this returns; its folder is made where absent.
+    """Write a file completely or not at all, and flush it to the disk.
 
-    Raises :class:`OutputError` where the place cannot be written; what stood there before stays.
+    Parameters
+    ----------
+    path : Path
+        The file; its folder is created if necessary.
+    content : bytes
+        The content.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; an existing file stays.
     """
     partial = path.with_name(f".{path.name}{_PARTIAL}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # What stands there may be a link to something else, which must not be written over.
+        # A link of this name must not be followed.
         partial.unlink(missing_ok=True)
         with partial.open("xb") as file:
             file.write(content)
@@ -120,23 +201,49 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text as UTF-8; what cannot be told in it (half a character of a file name) becomes a question
-    mark."""
+    """Write a text as UTF-8; surrogates become question marks.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    text : str
+        The text.
+    """
     write_atomically(path, text.encode("utf-8", "replace"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON for people and machines; NaN and infinity become null."""
+    """Write indented JSON; NaN and infinity become null.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    value : Any
+        Mappings, sequences, numbers, text and NumPy arrays.
+    """
     write_text(path, json.dumps(_finite(value), indent=2, ensure_ascii=False, default=_number) + "\n")
 
 
 def as_read(value: Any) -> Any:
-    """What :func:`read_json` finds where this was written."""
+    """Convert a value to the one that :func:`read_json` returns after :func:`write_json`.
+
+    Parameters
+    ----------
+    value : Any
+        As in :func:`write_json`.
+
+    Returns
+    -------
+    Any
+        Dicts, lists, numbers, text and None.
+    """
     return json.loads(json.dumps(_finite(value), default=_number))
 
 
 def _number(value: Any) -> Any:
-    # NumPy takes long to import: `thesisrecon --help` does without.
+    # No NumPy here: `thesisrecon --help` should start fast.
     if hasattr(value, "tolist"):
         return _finite(value.tolist())
     raise TypeError(f"{type(value).__name__} is not JSON")
@@ -151,7 +258,18 @@ def _finite(value: Any) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file, None where it is absent, damaged, no regular file or too large."""
+    """Read a JSON file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    Any
+        The content; None if the file is absent, damaged, too large or not regular.
+    """
     try:
         return json.loads(read_bytes(path).decode("utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -159,11 +277,23 @@ def read_json(path: Path) -> Any:
 
 
 def link(source: Path, target: Path) -> None:
-    """The file under a second name, whole or not at all: files are only ever replaced, never changed.
+    """Give a file a second name, by a hard link if possible, else by a copy.
 
-    Raises :class:`OutputError` where the place cannot be written.
+    Files of a run are only replaced, never changed in place, so that sharing them is safe.
+
+    Parameters
+    ----------
+    source : Path
+        An existing file.
+    target : Path
+        The second name.
+
+    Raises
+    ------
+    OutputError
+        If the target cannot be written.
     """
-    # Several programs may give a file the same name in a shared folder at one time.
+    # Several programs may link the same target in a shared folder at one time.
     partial = target.with_name(f".{target.name}.{os.getpid()}{_PARTIAL}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -176,6 +306,6 @@ def link(source: Path, target: Path) -> None:
     except OSError as error:
         raise OutputError(target, error) from None
     finally:
-        # Renaming one name of a file to another name of it does nothing at all.
+        # POSIX rename does nothing if both names are links to one file.
         with suppress(OSError):
             partial.unlink()

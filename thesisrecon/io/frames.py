@@ -1,4 +1,4 @@
-"""Pictures in a row as files: one PNG each, and one animated file of all."""
+"""Image sequences as files: one PNG per frame, and one animated file."""
 
 from __future__ import annotations
 
@@ -14,71 +14,109 @@ from numpy.typing import NDArray
 from thesisrecon.errors import UsageError
 from thesisrecon.io.files import write_atomically
 
-WEBP_QUALITY = 85
-"""Of animated WebP: lossy (38 dB on frames with much texture), an eighth of the size of APNG and, with all
-colours, a quarter of that of GIF."""
-
-WEBP_METHOD = 2
-"""Effort of the encoder, 0 to 6; more buys a few percent for twice the time."""
-
-PNG_LEVEL = 3
-"""Effort of the compressor, 0 to 9; 6 buys two percent for three times the time."""
+_WEBP_QUALITY = 85
+"""Lossy (38 dB on textured frames): an eighth of the size of APNG, a quarter of GIF with all colours."""
+_WEBP_METHOD = 2
+"""Encoder effort, 0 to 6; more saves a few percent for twice the time."""
+_PNG_LEVEL = 3
+"""Compression effort, 0 to 9; 6 saves two percent for three times the time."""
 
 
 def frame_name(number: int) -> str:
-    """``frame-0001.png`` is the first, number 1."""
+    """Return the file name of a frame.
+
+    Parameters
+    ----------
+    number : int
+        From 1.
+
+    Returns
+    -------
+    str
+        As ``frame-0001.png``.
+    """
     return f"frame-{number:04d}.png"
 
 
 def write_frame(folder: Path, number: int, rgb: NDArray[np.uint8]) -> Path:
-    """Write picture ``rgb`` (H, W, 3) as frame ``number``, counted from 1, whole or not at all.
+    """Write one frame as PNG.
 
-    Raises :class:`UsageError` where it cannot be written.
+    Parameters
+    ----------
+    folder : Path
+        Output folder.
+    number : int
+        From 1.
+    rgb : ndarray (H, W, 3) uint8
+        The pixels.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    UsageError
+        If it cannot be written.
     """
-    picture = io.BytesIO()
-    PIL.Image.fromarray(rgb).save(picture, "PNG", compress_level=PNG_LEVEL)
+    encoded = io.BytesIO()
+    PIL.Image.fromarray(rgb).save(encoded, "PNG", compress_level=_PNG_LEVEL)
     path = folder / frame_name(number)
-    write_atomically(path, picture.getvalue())
+    write_atomically(path, encoded.getvalue())
     return path
 
 
 def animation_suffix() -> str:
-    """``.webp``, or ``.png`` (APNG, lossless and larger) where Pillow was built without WebP."""
+    """Return the suffix of animations that this Pillow can write.
+
+    Returns
+    -------
+    str
+        ``.webp``, or ``.png`` (APNG, lossless and larger) if Pillow lacks WebP.
+    """
     return ".webp" if PIL.features.check("webp") else ".png"
 
 
 def write_animation(path: Path, frames: Sequence[Path], *, milliseconds: int = 40) -> Path:
-    """Write the pictures of the files ``frames``, of equal size, as one that moves, each shown for
-    ``milliseconds``, over and over; the same pictures give the same bytes.
+    """Write an endless animation of frames; equal frames give equal bytes.
 
-    The format is that of the ending of ``path``: .webp or .png. One picture is in memory at a time for the
-    former. Raises ``ValueError`` for other endings and without frames, :class:`UsageError` where a frame
-    cannot be read or the file not written.
+    Parameters
+    ----------
+    path : Path
+        Ends in ``.webp`` (one frame in memory at a time) or ``.png``.
+    frames : sequence of Path
+        Image files of one size.
+    milliseconds : int
+        Time per frame.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    ValueError
+        For another suffix, or without frames.
+    UsageError
+        If a frame cannot be read or the file cannot be written.
     """
     if path.suffix not in (".webp", ".png"):
         raise ValueError(f"an animation is written as .webp or .png; got {path.name}")
     if not frames:
         raise ValueError("an animation needs at least one frame")
-    moving = io.BytesIO()
-    film = _Film(frames)
-    if path.suffix == ".webp":
-        film.save(
-            moving,
-            "WEBP",
-            save_all=True,
-            duration=milliseconds,
-            loop=0,
-            quality=WEBP_QUALITY,
-            method=WEBP_METHOD,
-        )
-    else:
-        film.save(moving, "PNG", save_all=True, duration=milliseconds, loop=0)
-    write_atomically(path, moving.getvalue())
+    encoded = io.BytesIO()
+    sequence = _Sequence(frames)
+    lossy = {"quality": _WEBP_QUALITY, "method": _WEBP_METHOD} if path.suffix == ".webp" else {}
+    kind = "WEBP" if path.suffix == ".webp" else "PNG"
+    sequence.save(encoded, kind, save_all=True, duration=milliseconds, loop=0, **lossy)
+    write_atomically(path, encoded.getvalue())
     return path
 
 
-class _Film(PIL.Image.Image):
-    """The frames as one picture of Pillow's that is read from its files as it is played."""
+class _Sequence(PIL.Image.Image):
+    """A multi-frame Pillow image that reads its frames from files on demand."""
 
     def __init__(self, frames: Sequence[Path]) -> None:
         super().__init__()
@@ -100,7 +138,7 @@ class _Film(PIL.Image.Image):
 
 def _read(path: Path) -> PIL.Image.Image:
     try:
-        with PIL.Image.open(path) as picture:
-            return picture.convert("RGB")
+        with PIL.Image.open(path) as image:
+            return image.convert("RGB")
     except OSError as error:
         raise UsageError(f"the frame {path} cannot be read: {error.strerror or error}") from None

@@ -1,7 +1,7 @@
-"""Photographs in: every common file as 8-bit RGB at working size, and a reason for each that cannot be read.
+"""Image input: common file formats as 8-bit RGB at working size, and a reason for each unreadable file.
 
-Resizing keeps one exact scale s along both axes, (x + 0.5) s - 0.5, so that square pixels stay square: the
-last row of a photograph may be cut by less than a working pixel for it.
+Resizing uses one exact scale s along both axes, (x + 0.5) s - 0.5, so that square pixels stay square; the
+last row may be cut by less than a working pixel.
 """
 
 from __future__ import annotations
@@ -23,49 +23,58 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.files import NO_FILE, printable
+from thesisrecon.io.files import SPECIAL_FILE, printable
 from thesisrecon.io.pixels import (
-    AS_STORED,
-    TURNS,
-    Picture,
-    Refused,
-    Room,
-    Turn,
-    at_working_size,
-    bytes_to_decode,
-    picture_from_array,
+    EXIF_TRANSFORMS,
+    STORED,
+    ExifTransform,
+    MemoryBudget,
+    StoredImage,
+    UnusableImage,
+    decoding_bytes,
+    image_from_array,
+    resized_to,
 )
 from thesisrecon.records import Image
 
 ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
 
-# What a photograph may be called. Raw and HEIC files are listed so that they are refused by name, not
-# overlooked.
+# Raw and HEIC files are listed so that they are refused by name, not overlooked.
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".jp2", ".avif"),
     *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2"),
 )
-COMMON_NAMES = ("images", "photographs", "photos", "pictures", "dcim")
-LARGEST_FILE = 2**31
-"""Bytes; the largest sensors without any compression stay below half of it."""
-LARGEST_DECODED = 3 * 2**29
-"""Bytes that one photograph may take while it is decoded, and several together that are read at one time: 151
-megapixels, the largest sensors, in the costliest kind of JPEG."""
+_GENERIC_FOLDERS = ("images", "photographs", "photos", "pictures", "dcim")
+MAX_FILE_BYTES = 2**31
+"""Uncompressed images of the largest sensors take less than half of it."""
+MAX_DECODED_BYTES = 3 * 2**29
+"""Memory of all images decoded at one time: enough for 151 megapixels of progressive JPEG."""
 MIN_SIDE = 64
 BLANK_RANGE = 8
-READ = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "GIF", "JPEG2000", "AVIF", "HEIF", "PPM")
-"""What Pillow may take a file for, whatever it is called: some of its other readers start programs."""
+FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "GIF", "JPEG2000", "AVIF", "HEIF", "PPM")
+"""Formats that Pillow may recognize: some of its other readers start programs."""
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _WIDTH_35MM = 36.0
-_FOCALS_35MM = (1.0, 1e5)
-"""mm; what a header says beyond is a mistake."""
-_room = Room(LARGEST_DECODED)
+_FOCAL_RANGE_35MM = (1.0, 1e5)
+"""mm; values outside are mistakes."""
+_budget = MemoryBudget(MAX_DECODED_BYTES)
 
 
 @dataclass(frozen=True)
-class Photograph:
-    """A photograph that was read: the ``image``, a ``digest`` of its content, what EXIF says of the focal
-    length (original px, NaN = nothing), and a ``note`` the user should see (empty: none)."""
+class DecodedImage:
+    """An image that was read.
+
+    Parameters
+    ----------
+    image : Image
+        Pixels at working size.
+    digest : str
+        Hash of the pixels and the original size.
+    exif_focal_px : float
+        Focal length from EXIF in original pixels, NaN = unknown.
+    note : str
+        Warning for the user, or empty.
+    """
 
     image: Image
     digest: str
@@ -74,33 +83,53 @@ class Photograph:
 
 
 @dataclass(frozen=True)
-class PhotographSet:
-    """The photographs that were read, sorted by name, and the others: name -> why not."""
+class ImageSet:
+    """The images of a run.
 
-    photographs: tuple[Photograph, ...]
+    Parameters
+    ----------
+    decoded : tuple of DecodedImage
+        Usable images, sorted by name.
+    refused : dict
+        Name -> reason of the other files.
+    """
+
+    decoded: tuple[DecodedImage, ...]
     refused: dict[str, str]
 
     @property
     def images(self) -> tuple[Image, ...]:
-        """The V views."""
-        return tuple(p.image for p in self.photographs)
+        """The V images."""
+        return tuple(d.image for d in self.decoded)
 
     @property
     def exif_focal_px(self) -> F64:
-        """(V,) original px, NaN = not said."""
-        return np.array([p.exif_focal_px for p in self.photographs])
+        """Focal lengths (V,) from EXIF in original pixels, NaN = unknown."""
+        return np.array([d.exif_focal_px for d in self.decoded])
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Photographs of a folder by the ending of their name, sorted by name; hidden files and sub-folders are
-    left out.
+    """List the image files of a folder by suffix, without hidden files and sub-folders.
 
-    Raises :class:`UsageError` where there is no such folder or it cannot be read.
+    Parameters
+    ----------
+    folder : Path
+        A folder.
+
+    Returns
+    -------
+    list of Path
+        Sorted by name.
+
+    Raises
+    ------
+    UsageError
+        If the folder does not exist or cannot be read.
     """
     if not folder.exists():
         raise UsageError(f"there is no folder {folder}")
     if not folder.is_dir():
-        raise UsageError(f"{folder} is not a folder; give the folder that holds the photographs")
+        raise UsageError(f"{folder} is not a folder; give the folder of the images")
     try:
         entries = sorted(folder.iterdir(), key=lambda path: path.name)
     except OSError as error:
@@ -111,65 +140,101 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def scene_name(folder: Path) -> str:
-    """What to call the scene of a folder of photographs: its name, or that of the folder above it where its
-    own says only what it holds.
+    """Name a scene after its image folder, or after the parent of a folder called "images" or similar.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the images.
+
+    Returns
+    -------
+    str
+        Printable name.
     """
     folder = folder.resolve()
-    return printable(folder.parent.name if folder.name.lower() in COMMON_NAMES else folder.name)
+    return printable(folder.parent.name if folder.name.lower() in _GENERIC_FOLDERS else folder.name)
 
 
-def read_photograph(source: Any, *, max_size_px: int) -> PhotographSet:
-    """One file, array or record as a set of one; arguments as in :func:`read_photographs`.
+def read_image(source: Any, *, max_size_px: int) -> ImageSet:
+    """Read one image.
 
-    Raises :class:`StageFailure` where it cannot be read.
+    Parameters
+    ----------
+    source : str, Path, ndarray (H, W) or (H, W, 3) uint8, or Image
+        The image.
+    max_size_px : int
+        Long side to which larger images are reduced.
+
+    Returns
+    -------
+    ImageSet
+        A set of one image.
+
+    Raises
+    ------
+    UsageError
+        If the file does not exist.
+    StageFailure
+        If the image is unusable.
+    ValueError
+        If an array has another shape or type.
     """
-    found = read_photographs([source], max_size_px=max_size_px)
+    if isinstance(source, str | Path) and not Path(source).is_file():
+        raise UsageError(f"there is no image file {source}")
+    found = read_images([source], max_size_px=max_size_px)
     for name, reason in found.refused.items():
         raise StageFailure(f"{name} {reason}")
     return found
 
 
-def read_photographs(
+def read_images(
     source: ImageSource,
     *,
     max_size_px: int,
     map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
-) -> PhotographSet:
-    """All photographs of a folder, or of a list of files and arrays, at working size.
+) -> ImageSet:
+    """Read all images of a folder or a list, at working size.
 
     Parameters
     ----------
-    source : a folder; or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and :class:`Image` records.
-    max_size_px : a longer long side is reduced to this.
-    map_all : runs the reading of each, in order; a thread pool's ``map`` reads several at once.
+    source : str, Path or sequence
+        A folder; or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and :class:`Image` records.
+    max_size_px : int
+        Long side to which larger images are reduced.
+    map_all : callable
+        Ordered map; that of a thread pool reads several images at one time.
 
     Returns
     -------
-    PhotographSet : what was read, sorted by name; what cannot be decoded, is blank, too small, or has the
-        very pixels of an earlier one stands under ``refused``. Files are called what :func:`printable` shows
-        of their names, and numbered where two would be called alike.
+    ImageSet
+        Files that cannot be decoded, are blank, too small or duplicates are refused. Names are printable;
+        equal names are numbered.
 
     Raises
     ------
-    UsageError : no such folder. ValueError : an array of another shape or type.
+    UsageError
+        If the folder does not exist.
+    ValueError
+        If an array has another shape or type.
     """
     items = _named_items(source)
 
-    def read(item: tuple[str, Any]) -> Photograph | str:
+    def read(item: tuple[str, Any]) -> DecodedImage | str:
         try:
             return _read(*item, max_size_px)
-        except Refused as refusal:
+        except UnusableImage as refusal:
             return str(refusal)
 
-    read_items = list(map_all(read, items))
-    refused = {name: r for (name, _), r in zip(items, read_items, strict=True) if isinstance(r, str)}
-    kept: dict[str, Photograph] = {}
-    for photograph in (r for r in read_items if not isinstance(r, str)):
-        twin = kept.setdefault(photograph.digest, photograph)
-        if twin is not photograph:
-            refused[photograph.image.name] = f"has the same pixels as {twin.image.name}"
-    return PhotographSet(
-        tuple(sorted(kept.values(), key=lambda p: p.image.name)), dict(sorted(refused.items()))
+    results = list(map_all(read, items))
+    refused = {name: r for (name, _), r in zip(items, results, strict=True) if isinstance(r, str)}
+    distinct: dict[str, DecodedImage] = {}
+    for decoded in (r for r in results if not isinstance(r, str)):
+        first = distinct.setdefault(decoded.digest, decoded)
+        if first is not decoded:
+            refused[decoded.image.name] = f"has the same pixels as {first.image.name}"
+    return ImageSet(
+        tuple(sorted(distinct.values(), key=lambda d: d.image.name)), dict(sorted(refused.items()))
     )
 
 
@@ -178,7 +243,7 @@ def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
         paths = list_images(Path(source))
         return sorted(zip(_names(path.name for path in paths), paths, strict=True), key=lambda pair: pair[0])
     paths = [Path(item) for item in source if isinstance(item, str | Path)]
-    # Files of one name from several folders are told apart by their whole path.
+    # Files of one name from several folders are distinguished by their paths.
     full = len({path.name for path in paths}) < len(paths)
     names = iter(_names(str(path) if full else path.name for path in paths))
     width = len(str(len(source)))
@@ -194,107 +259,111 @@ def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
 
 
 def _names(names: Iterable[str]) -> list[str]:
-    """What the files are called in print: those that would look alike there are numbered."""
+    """Make names printable; equal results are numbered."""
     taken: dict[str, None] = {}
     for name in map(printable, names):
-        alike = (f"{name} ({n})" for n in count(2))
-        taken[next(one for one in chain([name], alike) if one not in taken)] = None
+        numbered = (f"{name} ({n})" for n in count(2))
+        taken[next(one for one in chain([name], numbered) if one not in taken)] = None
     return list(taken)
 
 
-def _read(name: str, item: Any, max_size_px: int) -> Photograph:
+def _read(name: str, item: Any, max_size_px: int) -> DecodedImage:
     if isinstance(item, Image):
-        return _finish(Photograph(item, ""))
+        return _finish(DecodedImage(item, ""))
     if isinstance(item, Path):
         return _finish(_decode(name, item, max_size_px))
-    picture = picture_from_array(item)
-    return _finish(Photograph(Image(name, at_working_size(picture, max_size_px), picture.size), ""))
+    stored = image_from_array(item)
+    return _finish(DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), ""))
 
 
-def _finish(photograph: Photograph) -> Photograph:
-    """Refuse what shows nothing, and name the content by its hash."""
-    rgb = photograph.image.rgb
+def _finish(decoded: DecodedImage) -> DecodedImage:
+    """Refuse small and blank images, and hash the content."""
+    rgb = decoded.image.rgb
     if min(rgb.shape[:2]) < MIN_SIDE:
-        raise Refused(
-            f"is only {rgb.shape[1]} x {rgb.shape[0]} pixels; {MIN_SIDE} x {MIN_SIDE} are the least"
+        raise UnusableImage(
+            f"has only {rgb.shape[1]} x {rgb.shape[0]} pixels; the minimum is {MIN_SIDE} x {MIN_SIDE}"
         )
     if np.ptp(rgb.reshape(-1, 3), axis=0).max() < BLANK_RANGE:
-        raise Refused("is blank: all its pixels have nearly the same colour")
-    content = hashlib.sha256(repr((rgb.shape, photograph.image.original_size)).encode())
+        raise UnusableImage("is blank: all its pixels have nearly the same colour")
+    content = hashlib.sha256(repr((rgb.shape, decoded.image.original_size)).encode())
     content.update(np.ascontiguousarray(rgb).data)
-    return replace(photograph, digest=content.hexdigest()[:32])
+    return replace(decoded, digest=content.hexdigest()[:32])
 
 
-def _decode(name: str, path: Path, max_size_px: int) -> Photograph:
+def _decode(name: str, path: Path, max_size_px: int) -> DecodedImage:
     _require_file(path)
     try:
-        # Opened here, since Pillow does not close what it cannot read.
+        # Opened here, since Pillow does not close files that it cannot read.
         with path.open("rb") as stream, PIL.Image.open(stream, formats=_formats()) as file:
-            needed = bytes_to_decode(file)
-            if needed > LARGEST_DECODED:
-                raise Refused(_too_large(file, needed))
-            with _room.taken(needed), closing(file):
-                return _photograph(name, file, max_size_px)
-    except Refused:
+            needed = decoding_bytes(file)
+            if needed > MAX_DECODED_BYTES:
+                raise UnusableImage(_too_large(file, needed))
+            with _budget.reserve(needed), closing(file):
+                return _decode_open_file(name, file, max_size_px)
+    except UnusableImage:
         raise
     except PIL.Image.DecompressionBombError:
         limit = 2 * (PIL.Image.MAX_IMAGE_PIXELS or 0) // 10**6
-        raise Refused(f"claims more than {limit} megapixels, which no photograph has") from None
+        raise UnusableImage(f"claims more than {limit} megapixels") from None
     except PIL.UnidentifiedImageError:
-        raise Refused("is not an image of a known format") from None
+        raise UnusableImage("is not an image of a known format") from None
     except MemoryError:
-        raise Refused("does not fit in memory") from None
+        raise UnusableImage("does not fit in memory") from None
     except Exception as error:
-        # Decoders raise whatever they stumble over in a damaged file; the other photographs go on.
-        raise Refused(
+        # Decoders raise errors of any kind on damaged files; the other images are still read.
+        raise UnusableImage(
             f"cannot be decoded: {printable(getattr(error, 'strerror', None) or str(error))}"
         ) from None
 
 
-def _photograph(name: str, file: PIL.Image.Image, max_size_px: int) -> Photograph:
-    note = "only its first frame is used" if getattr(file, "n_frames", 1) > 1 else ""
-    focal_35mm, turn = _exif(file)
+def _decode_open_file(name: str, file: PIL.Image.Image, max_size_px: int) -> DecodedImage:
+    # Cameras store a preview as a second frame of a JPEG (MPO).
+    several = getattr(file, "n_frames", 1) > 1 and file.format not in ("JPEG", "MPO")
+    focal_35mm, transform = _exif(file)
     file.load()
-    picture = Picture(file, turn)
-    said = _FOCALS_35MM[0] <= focal_35mm <= _FOCALS_35MM[1]
-    focal = focal_35mm / _WIDTH_35MM * max(picture.size) if said else math.nan
-    return Photograph(Image(name, at_working_size(picture, max_size_px), picture.size), "", focal, note)
+    stored = StoredImage(file, transform)
+    known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
+    focal = focal_35mm / _WIDTH_35MM * max(stored.size) if known else math.nan
+    image = Image(name, resized_to(stored, max_size_px), stored.size)
+    return DecodedImage(image, "", focal, "only the first frame is used" if several else "")
 
 
 def _too_large(file: PIL.Image.Image, needed: int) -> str:
-    kind = "JPEG in several scans" if file.format == "JPEG" else file.format
+    kind = "progressive JPEG" if file.format == "JPEG" else file.format
     return (
-        f"has {file.size[0] * file.size[1] / 1e6:.0f} megapixels, and reading a {kind} of that size takes "
-        f"{needed / 2**30:.1f} GiB of memory, where one photograph may have {LARGEST_DECODED / 2**30:.1f}; "
+        f"has {file.size[0] * file.size[1] / 1e6:.0f} megapixels; decoding a {kind} of this size takes "
+        f"{needed / 2**30:.1f} GiB of memory, more than the limit of {MAX_DECODED_BYTES / 2**30:.1f} GiB; "
         "save it as PNG or TIFF"
     )
 
 
 def _require_file(path: Path) -> None:
-    """Refuse what is no regular file: reading a pipe waits for ever, a device never ends."""
+    """Refuse special files: reading a pipe or a device may never end."""
     try:
         found = path.stat()
     except OSError as error:
-        raise Refused(f"cannot be read: {error.strerror}") from None
+        raise UnusableImage(f"cannot be read: {error.strerror}") from None
     if not stat.S_ISREG(found.st_mode):
-        raise Refused(f"is {NO_FILE}, not a file")
-    if found.st_size > LARGEST_FILE:
-        raise Refused(f"is a file of {found.st_size / 2**30:.1f} GiB, which no photograph is")
+        raise UnusableImage(f"is {SPECIAL_FILE}, not a file")
+    if found.st_size > MAX_FILE_BYTES:
+        raise UnusableImage(
+            f"is a file of {found.st_size / 2**30:.1f} GiB; the limit is {MAX_FILE_BYTES / 2**30:.0f} GiB"
+        )
 
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Those of ``READ`` that this Pillow knows."""
+    """Formats of ``FORMATS`` that this Pillow supports."""
     PIL.Image.init()
-    return tuple(name for name in READ if name in PIL.Image.OPEN)
+    return tuple(name for name in FORMATS if name in PIL.Image.OPEN)
 
 
-def _exif(file: PIL.Image.Image) -> tuple[float, Turn]:
-    """The 35 mm focal length (0 = not said) and what puts the photograph upright."""
+def _exif(file: PIL.Image.Image) -> tuple[float, ExifTransform]:
+    """Return the 35 mm focal length (0 = unknown) and the transform to the upright image."""
     try:
         exif = file.getexif()
         orientation, focal = exif.get(_ORIENTATION), float(exif.get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
     except Exception:
-        # A damaged header says nothing; the pixels may still be good.
-        return 0.0, AS_STORED
-    return focal, TURNS.get(orientation, AS_STORED) if isinstance(orientation, int) else AS_STORED
+        # The pixels may be good even if the header is damaged.
+        return 0.0, STORED
+    return focal, EXIF_TRANSFORMS.get(orientation, STORED) if isinstance(orientation, int) else STORED

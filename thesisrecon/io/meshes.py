@@ -1,9 +1,7 @@
-"""What a GLB of strangers may hold before a parser is let loose on it.
+"""Mesh files: GLB for browsers, OBJ with MTL and PNG for modelling programs, PLY with vertex colours.
 
-Meshes as files: GLB for browsers, OBJ with MTL and PNG for modelling programs, PLY with vertex colours.
-
-A GLB can be read again. trimesh is imported where it is used: it takes longer to import than the rest of the
-package that surrounds it, and not every run has a mesh.
+A GLB can be read again; its structure is checked before it is parsed. trimesh is imported on demand: it takes
+longer to import than the rest of the package.
 """
 
 from __future__ import annotations
@@ -23,135 +21,153 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io.files import read_bytes, write_atomically
 from thesisrecon.records import TexturedMesh
 
-TEXTURES = ("JPEG", "PNG")
-LARGEST_TEXTURE = 2**26
-"""Texels: many times what a run writes, and no more than Pillow decodes without a warning."""
+_TEXTURE_FORMATS = ("JPEG", "PNG")
+_MAX_TEXELS = 2**26
+"""Many times the size of a run's texture, and within the limit of Pillow."""
+_JPEG_QUALITY = 92
+"""Of the texture in a GLB: a quarter of the size of PNG without visible differences."""
+_MAX_MESH_BYTES = 2**31
+_HALF_TURN = np.array([1.0, -1.0, -1.0])
+"""Rotation by 180 degrees about x, between the camera axes and those of glTF; its own inverse."""
 
 _HEAD = struct.Struct("<4sIIII")
 _JSON = 0x4E4F534A
 
 
-def require_plain_glb(content: bytes) -> None:
-    """Refuse a file that names other files, claims more numbers than it has bytes, shows one mesh many times
-    or has parts that hold each other: whoever follows these reads what he should not, or never ends.
-
-    One mesh of one piece is left, as a run writes it. Raises ``ValueError``.
-    """
+def _require_plain_glb(content: bytes) -> None:
+    """Require a GLB as a run writes it: one mesh, no external files, no false counts, no cyclic nodes."""
     header, start = _header(content)
     for part in (*_list(header, "buffers"), *_list(header, "images")):
         if "uri" in part:
-            raise ValueError("it names another file")
+            raise ValueError("it refers to another file")
     for accessor in _list(header, "accessors"):
         count = accessor.get("count")
         if not isinstance(count, int) or not 0 <= count <= len(content) or "bufferView" not in accessor:
-            raise ValueError(f"it claims {count} numbers in {len(content)} bytes")
+            raise ValueError(f"it claims {count} elements in {len(content)} bytes")
     for image in _list(header, "images"):
         _require_texture(_viewed(header, image, content[start:]))
     nodes, meshes = _list(header, "nodes"), _list(header, "meshes")
     if len(meshes) != 1 or len(_list(meshes[0], "primitives")) != 1:
-        raise ValueError("it is not one mesh of one piece")
+        raise ValueError("it must hold one mesh with one primitive")
     if sum("mesh" in node for node in nodes) > 1:
-        raise ValueError("it shows one mesh many times")
+        raise ValueError("it instantiates its mesh several times")
     _require_tree([_children(node) for node in nodes])
 
 
 def _header(content: bytes) -> tuple[dict[str, Any], int]:
-    """The JSON that a GLB begins with, and where its numbers start."""
+    """Return the JSON header of a GLB, and the offset of its data."""
     if len(content) < _HEAD.size:
         raise ValueError(f"it ends after {len(content)} bytes")
     magic, version, _, size, kind = _HEAD.unpack_from(content)
     if magic != b"glTF" or version != 2 or kind != _JSON:
-        raise ValueError("it is no GLB of version 2")
+        raise ValueError("it is not a GLB of version 2")
     try:
         header = json.loads(content[_HEAD.size : _HEAD.size + size].decode("utf-8"))
     except (ValueError, RecursionError):
         raise ValueError("its header is not JSON") from None
     if not isinstance(header, dict):
-        raise ValueError("its header is no table")
+        raise ValueError("its header is not a JSON object")
     return header, _HEAD.size + size + 8
 
 
 def _viewed(header: dict[str, Any], image: dict[str, Any], data: bytes) -> bytes:
-    """The bytes of an image in the file."""
+    """Return the encoded bytes of an image in the file."""
     views, number = _list(header, "bufferViews"), image.get("bufferView")
     if not isinstance(number, int) or not 0 <= number < len(views):
-        raise ValueError("its texture is not there")
+        raise ValueError("its texture is missing")
     start, size = views[number].get("byteOffset", 0), views[number].get("byteLength", 0)
     if not isinstance(start, int) or not isinstance(size, int) or not 0 <= start <= start + size <= len(data):
-        raise ValueError("its texture is not there")
+        raise ValueError("its texture is missing")
     return data[start : start + size]
 
 
 def _require_texture(blob: bytes) -> None:
     try:
-        with PIL.Image.open(io.BytesIO(blob), formats=TEXTURES) as picture:
+        with PIL.Image.open(io.BytesIO(blob), formats=_TEXTURE_FORMATS) as picture:
             texels = math.prod(picture.size)
     except (PIL.UnidentifiedImageError, PIL.Image.DecompressionBombError):
-        texels = LARGEST_TEXTURE + 1
-    if texels > LARGEST_TEXTURE:
-        raise ValueError(f"its texture is no JPEG or PNG of at most {LARGEST_TEXTURE >> 20} megapixels")
+        texels = _MAX_TEXELS + 1
+    if texels > _MAX_TEXELS:
+        raise ValueError(f"its texture is not a JPEG or PNG of at most {_MAX_TEXELS >> 20} megapixels")
 
 
 def _list(header: dict[str, Any], name: str) -> list[dict[str, Any]]:
     found = header.get(name, [])
     if not isinstance(found, list) or not all(isinstance(part, dict) for part in found):
-        raise ValueError(f"its {name} are no list of tables")
+        raise ValueError(f"its {name} are not a list of JSON objects")
     return found
 
 
 def _children(node: dict[str, Any]) -> list[int]:
     children = node.get("children", [])
     if not isinstance(children, list) or not all(isinstance(child, int) for child in children):
-        raise ValueError("its nodes are no tree")
+        raise ValueError("its nodes are not a tree")
     return children
 
 
 def _require_tree(children: list[list[int]]) -> None:
-    """Every node is held by one other at most, and none holds itself."""
+    """Require at most one parent per node and no cycles."""
     held = [child for own in children for child in own]
     if len(set(held)) < len(held) or not all(0 <= child < len(children) for child in held):
-        raise ValueError("its nodes are no tree")
+        raise ValueError("its nodes are not a tree")
     waiting, reached = sorted(set(range(len(children))) - set(held)), 0
     while waiting:
         waiting += children[waiting.pop()]
         reached += 1
     if reached < len(children):
-        raise ValueError("its nodes hold each other")
-
-
-JPEG_QUALITY = 92
-"""Of the texture inside a GLB: a quarter of the size of PNG, and no difference that one sees."""
-
-FORMATS = ("glb", "obj", "ply")
-LARGEST_MESH = 2**31
-"""Bytes of a file that is read: many times what a run writes."""
-
-TURN = np.array([1.0, -1.0, -1.0])
-"""Half a turn about x, between the axes of cameras and those of glTF; its own inverse."""
+        raise ValueError("its nodes are cyclic")
 
 
 def write_mesh(path: Path, mesh: TexturedMesh) -> None:
-    """Write a mesh in the format that the ending of ``path`` names: .glb, .obj or .ply.
+    """Write a mesh with float32 coordinates in the format of its suffix.
 
-    GLB and OBJ hold the texture, or the colours of the vertices where there is no texture; OBJ writes
-    ``NAME.mtl`` and ``NAME.png`` beside it. PLY holds colours of vertices only. Coordinates are float32.
-    Those of a GLB are given half a turn about x, since the y axis of glTF points up and that of cameras
-    down: so the scene stands upright in viewers. Raises ``ValueError`` for other endings.
+    GLB and OBJ hold the texture, or the vertex colours if there is none; OBJ adds ``NAME.mtl`` and
+    ``NAME.png``. PLY holds vertex colours only. A GLB is rotated by 180 degrees about x, since the y axis of
+    glTF points up and that of cameras down.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in ``.glb``, ``.obj`` or ``.ply``.
+    mesh : TexturedMesh
+        The mesh.
+
+    Raises
+    ------
+    ValueError
+        For another suffix.
+    OutputError
+        If the file cannot be written.
     """
     kind = path.suffix.lower().lstrip(".")
-    if kind not in FORMATS:
+    writers = {"glb": _write_glb, "obj": _write_obj, "ply": _write_ply}
+    if kind not in writers:
         raise ValueError(f"a mesh is written as .glb, .obj or .ply; got {path.name}")
-    {"glb": _write_glb, "obj": _write_obj, "ply": _write_ply}[kind](path, mesh)
+    writers[kind](path, mesh)
 
 
 def read_mesh(path: Path) -> TexturedMesh:
-    """The mesh of a GLB that :func:`write_mesh` wrote, in the coordinates that it had.
+    """Read a GLB of :func:`write_mesh`, in its original coordinates.
 
-    Vertices that differ in their place in the texture alone are one again, in their old order, without those
-    that no face names; coordinates have the precision of float32, and the texture went through JPEG. Which
-    faces no view had seen is not kept. Raises ``ValueError`` for other endings, :class:`UsageError` where the
-    file is absent, damaged, names other files, or holds no mesh; memory stays within a multiple of its size
-    and that of its texture.
+    Vertices that were split at texture seams are merged again, in their old order; unused ones are dropped.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in ``.glb``.
+
+    Returns
+    -------
+    TexturedMesh
+        The mesh.
+
+    Raises
+    ------
+    ValueError
+        For another suffix.
+    UsageError
+        If the file is absent, damaged, refers to other files or holds no mesh; memory stays within a multiple
+        of the sizes of the file and its texture.
     """
     if path.suffix.lower() != ".glb":
         raise ValueError(f"a mesh is read from .glb; got {path.name}")
@@ -160,31 +176,31 @@ def read_mesh(path: Path) -> TexturedMesh:
     import trimesh
 
     try:
-        content = read_bytes(path, largest=LARGEST_MESH)
-        require_plain_glb(content)
-        return _turned_back(trimesh.load(io.BytesIO(content), file_type="glb", process=False, force="mesh"))
+        content = read_bytes(path, largest=_MAX_MESH_BYTES)
+        _require_plain_glb(content)
+        return _mesh_of(trimesh.load(io.BytesIO(content), file_type="glb", process=False, force="mesh"))
     except OSError as error:
         raise UsageError(f"the mesh {path} cannot be read: {error.strerror or error}") from None
     except Exception as error:
-        # What a damaged file makes the parser raise is of any kind.
+        # The parser raises errors of any kind on damaged files.
         raise UsageError(f"the mesh {path} cannot be read: {error}") from None
 
 
-def _turned_back(loaded: Any) -> TexturedMesh:
-    """The mesh of trimesh's record; ``ValueError`` where that is not sound."""
-    vertices = np.asarray(loaded.vertices, dtype=np.float64) * TURN
+def _mesh_of(loaded: Any) -> TexturedMesh:
+    """Convert a mesh of trimesh; ``ValueError`` if it is invalid."""
+    vertices = np.asarray(loaded.vertices, dtype=np.float64) * _HALF_TURN
     faces = np.asarray(loaded.faces, dtype=np.int64)
     if len(faces) == 0 or not np.isfinite(vertices).all():
         raise ValueError("it holds no surface")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError("its faces name vertices that it does not have")
+        raise ValueError("its faces refer to missing vertices")
     uv = getattr(loaded.visual, "uv", None)
     image = getattr(getattr(loaded.visual, "material", None), "baseColorTexture", None)
     if uv is not None and image is not None:
         texture = np.asarray(image.convert("RGB"))
         corners = _texels(np.asarray(uv, dtype=np.float64), texture)[faces]
         if not np.isfinite(corners).all():
-            raise ValueError("its places in the texture are not finite")
+            raise ValueError("its texture coordinates are not finite")
         vertices, faces = _merged(vertices, faces)
         return TexturedMesh(vertices, faces, uv=corners, texture=texture)
     colors = None
@@ -194,7 +210,7 @@ def _turned_back(loaded: Any) -> TexturedMesh:
 
 
 def _merged(vertices: F64, faces: I64) -> tuple[F64, I64]:
-    """One vertex for each place (N, 3), in the order in which they first stand, and the faces of those."""
+    """Merge equal vertices (N, 3), in the order of first use, and renumber the faces."""
     used = np.unique(faces)
     _, first, number = np.unique(vertices[used], axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -205,9 +221,8 @@ def _merged(vertices: F64, faces: I64) -> tuple[F64, I64]:
     return vertices[used[first[order]]], of_vertex[faces]
 
 
-def unmerged(mesh: TexturedMesh) -> tuple[F64, I64, F64]:
-    """Vertices (N, 3), faces (M, 3) and one texture coordinate each (N, 2) in texels: a vertex on a seam
-    stands once for each of its places in the texture."""
+def _split_seams(mesh: TexturedMesh) -> tuple[F64, I64, F64]:
+    """Return vertices (N, 3), faces (M, 3) and texels (N, 2); vertices on seams are repeated."""
     assert mesh.uv is not None
     corners = np.column_stack([mesh.faces.reshape(-1, 1), mesh.uv.reshape(-1, 2)])
     unique, number = np.unique(corners, axis=0, return_inverse=True)
@@ -216,7 +231,7 @@ def unmerged(mesh: TexturedMesh) -> tuple[F64, I64, F64]:
 
 
 def _normalized(uv: F64, texture: np.ndarray) -> F64:
-    """Texels, y down, as shares of the picture, v up."""
+    """Convert texels, y down, to texture coordinates in [0, 1], v up."""
     height, width = texture.shape[:2]
     return np.column_stack([(uv[:, 0] + 0.5) / width, 1.0 - (uv[:, 1] + 0.5) / height])
 
@@ -227,22 +242,22 @@ def _texels(uv: F64, texture: np.ndarray) -> F64:
     return np.column_stack([uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5])
 
 
-def _trimesh(mesh: TexturedMesh, *, turned: bool) -> Any:
+def _trimesh(mesh: TexturedMesh, *, gltf_axes: bool) -> Any:
     import trimesh
     from trimesh.visual import material as materials
     from trimesh.visual import texture as textures
 
-    turn = TURN if turned else np.ones(3)
+    turn = _HALF_TURN if gltf_axes else np.ones(3)
     if mesh.texture is None or mesh.uv is None:
         colors = None
         if mesh.colors is not None:
             colors = np.column_stack([mesh.colors, np.full(len(mesh.colors), 255, dtype=np.uint8)])
         return trimesh.Trimesh(mesh.vertices * turn, mesh.faces, vertex_colors=colors, process=False)
-    vertices, faces, uv = unmerged(mesh)
+    vertices, faces, uv = _split_seams(mesh)
     image = PIL.Image.fromarray(mesh.texture)
-    if turned:
+    if gltf_axes:
         packed = io.BytesIO()
-        image.save(packed, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+        image.save(packed, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
         image = cast(PIL.Image.Image, PIL.Image.open(packed))
     # trimesh gives these no types.
     new_material: Any = materials.PBRMaterial
@@ -253,18 +268,18 @@ def _trimesh(mesh: TexturedMesh, *, turned: bool) -> Any:
 
 
 def _write_glb(path: Path, mesh: TexturedMesh) -> None:
-    write_atomically(path, _trimesh(mesh, turned=True).export(file_type="glb"))
+    write_atomically(path, _trimesh(mesh, gltf_axes=True).export(file_type="glb"))
 
 
 def _write_ply(path: Path, mesh: TexturedMesh) -> None:
     bare = TexturedMesh(mesh.vertices, mesh.faces, colors=mesh.colors)
-    write_atomically(path, _trimesh(bare, turned=False).export(file_type="ply"))
+    write_atomically(path, _trimesh(bare, gltf_axes=False).export(file_type="ply"))
 
 
 def _write_obj(path: Path, mesh: TexturedMesh) -> None:
     lines = [f"mtllib {path.stem}.mtl", "usemtl model"] if mesh.texture is not None else []
     if mesh.texture is not None and mesh.uv is not None:
-        vertices, faces, uv = unmerged(mesh)
+        vertices, faces, uv = _split_seams(mesh)
         lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices]
         lines += [f"vt {u:.7f} {v:.7f}" for u, v in _normalized(uv, mesh.texture)]
         lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in faces + 1]

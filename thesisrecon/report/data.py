@@ -28,7 +28,7 @@ from thesisrecon.records import (
 
 
 @dataclass(frozen=True)
-class Photograph:
+class ReportImage:
     """One view as the page shows it.
 
     ``rgb`` (H, W, 3) uint8 of any size with the photograph's aspect, or None (a long side of 800 px is
@@ -84,7 +84,7 @@ class ReportData:
     """
 
     title: str
-    photographs: tuple[Photograph, ...]
+    photographs: tuple[ReportImage, ...]
     reports: tuple[StageReport, ...]
     config_text: str
     summary: Mapping[str, object]

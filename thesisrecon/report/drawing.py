@@ -15,7 +15,7 @@ from PIL import ImageDraw, ImageFont
 
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.records import HeldOut, TwoView
-from thesisrecon.report.data import Photograph
+from thesisrecon.report.data import ReportImage
 
 THUMBNAIL_BYTES = 2_000_000
 PANEL_LONG_SIDE = 640
@@ -50,7 +50,7 @@ class EmbeddedPicture:
     height: int
 
 
-def thumbnail(photograph: Photograph, how_many: int) -> EmbeddedPicture | None:
+def thumbnail(photograph: ReportImage, how_many: int) -> EmbeddedPicture | None:
     """A small JPEG of a photograph; all ``how_many`` of them together take about ``THUMBNAIL_BYTES``.
 
     None where the pixels are not known.
@@ -77,7 +77,7 @@ def embed_jpeg(picture: PillowImage.Image, *, quality: int) -> EmbeddedPicture:
     return EmbeddedPicture(f"data:image/jpeg;base64,{text}", picture.width, picture.height)
 
 
-def draw_pair(pair: TwoView, first: Photograph, second: Photograph) -> EmbeddedPicture | None:
+def draw_pair(pair: TwoView, first: ReportImage, second: ReportImage) -> EmbeddedPicture | None:
     """Both photographs side by side, with their verified matches and epipolar lines.
 
     Every match is a dot; a few spread ones are numbered and come with their partner's epipolar line: F x1
@@ -127,7 +127,7 @@ def clip_line(
     return min(inside), max(inside)
 
 
-def _draw_half(photograph: Photograph, xy: F64, chosen: I64, lines: F64) -> PillowImage.Image:
+def _draw_half(photograph: ReportImage, xy: F64, chosen: I64, lines: F64) -> PillowImage.Image:
     """One photograph with dots, numbers and lines; drawn twice as large and shrunk, which smooths edges."""
     assert photograph.rgb is not None
     picture, s = _faded(photograph)
@@ -160,7 +160,7 @@ def _write_number(
     draw.text((x, y), str(number), font=font, fill="white", stroke_width=3, stroke_fill="#101418")
 
 
-def _faded(photograph: Photograph) -> tuple[PillowImage.Image, float]:
+def _faded(photograph: ReportImage) -> tuple[PillowImage.Image, float]:
     """The photograph at twice the panel's size, paler and darker, and the scale from working pixels."""
     assert photograph.rgb is not None
     width, height = photograph.size

@@ -1,15 +1,13 @@
-"""The readers of COLMAP's binary files beside made-up ones: ``python -m validation.studies.fuzz_colmap``.
+"""Fuzzing of the readers of COLMAP's binary files.
 
-Inputs are the three files of a model in one; the reader may make a model of them that is consistent, or
-refuse them with :class:`StageFailure`. Whatever else it does (another error, a warning of NumPy's, more than
-``--memory`` MB, more than ten seconds for one input) is a finding. With atheris (``pip install atheris``) new
-inputs are led by what the reader's code did with the ones before, and those that went new ways are kept in
-``--corpus``; without it, good files are changed at random. The exit code is 1 where something was found.
+An input holds the three files of a model. The reader may return a consistent model or refuse with
+:class:`StageFailure`. Any other error, a NumPy warning, more than ``--memory`` MB or more than ten seconds
+for one input is a finding. With atheris (``pip install atheris``) the branches that earlier inputs reached
+guide new ones, which are kept in ``--corpus``; without it, valid files are changed at random.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import re
 import resource
@@ -20,6 +18,7 @@ import tempfile
 import time
 import traceback
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +26,7 @@ import numpy as np
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_binary import ENCODERS, read_cameras, read_images, read_points
+from thesisrecon.io.colmap_files import decode_model, encode_model
 from thesisrecon.io.colmap_model import (
     MODEL_NUMBERS,
     NO_POINT,
@@ -38,9 +37,10 @@ from thesisrecon.io.colmap_model import (
     ColmapPoints,
     inconsistency,
 )
+from validation.studies.runner import Part, Rows
 
 LENGTHS = struct.Struct("<HH")
-"""Before the files of an input: bytes of the cameras and of the images; the rest are points."""
+"""Header of an input: bytes of the cameras and of the images; the rest are points."""
 LARGEST_INPUT = 4096
 GUIDED = """
 import sys, warnings
@@ -51,13 +51,24 @@ warnings.simplefilter("error")
 atheris.Setup(sys.argv, read_input)
 atheris.Fuzz()
 """
-"""A program of its own: libFuzzer ends its process."""
+"""Program of its own, because libFuzzer ends its process."""
 
 
 @dataclass(frozen=True)
 class Findings:
-    """How many inputs were read, how many were kept as new (with their branches, 0 = nobody counted), and
-    what was found (empty: nothing)."""
+    """Result of one run.
+
+    Attributes
+    ----------
+    how : str
+        Random or guided.
+    inputs, kept : int
+        Inputs that were read, and new inputs that were kept.
+    branches : int
+        Branches of the reader that were reached; 0 if not counted.
+    found : str
+        Traceback and input of a finding; empty if there is none.
+    """
 
     how: str
     inputs: int
@@ -67,7 +78,7 @@ class Findings:
 
 
 def small_model(views: int, points: int, *, kind: str = "SIMPLE_RADIAL", name: str = "{}.jpg") -> ColmapModel:
-    """Every view sees every point, and one more place that is no point."""
+    """Make a model in which every view sees every point and one feature without a point."""
     ids = np.arange(points, dtype=np.int64) + 1
     params = (600.0, *(50.0 if k < 3 else 0.0 for k in range(1, PARAMETER_COUNTS[kind])))
     xy = np.column_stack([np.arange(points + 1.0), np.arange(points + 1.0) + 0.25])
@@ -89,13 +100,14 @@ def small_model(views: int, points: int, *, kind: str = "SIMPLE_RADIAL", name: s
 
 
 def input_of(model: ColmapModel) -> bytes:
-    """The three files in one."""
-    cameras, images, points = (ENCODERS[name](model) for name in ("cameras", "images", "points3D"))
+    """Return the three files of a model as one input."""
+    files = encode_model(model)
+    cameras, images, points = (files[name] for name in ("cameras", "images", "points3D"))
     return LENGTHS.pack(len(cameras), len(images)) + cameras + images + points
 
 
-def corpus() -> list[bytes]:
-    """Good inputs of our own writer: every camera model, no views, no points, names of many letters."""
+def valid_inputs() -> list[bytes]:
+    """Return valid inputs: every camera model, no views, no points, long and non-ASCII names."""
     models = [small_model(1, 1, kind=kind) for kind in MODEL_NUMBERS]
     models += [small_model(0, 0), small_model(2, 0), small_model(2, 3), small_model(4, 8)]
     models += [small_model(1, 2, name="größe 写真 \udcff{}.jpg"), small_model(1, 1, name="x" * 300)]
@@ -103,15 +115,13 @@ def corpus() -> list[bytes]:
 
 
 def read_input(data: bytes) -> None:
-    """Read the files of an input, be they a model or refused; raises a finding."""
+    """Read the files of one input; any exception but ``StageFailure`` is a finding."""
     first, second = LENGTHS.unpack_from(data.ljust(LENGTHS.size, b"\0"))
     rest = data[LENGTHS.size :]
     try:
-        model = ColmapModel(
-            read_cameras(rest[:first], Path("cameras.bin")),
-            read_images(rest[first : first + second], Path("images.bin")),
-            read_points(rest[first + second :], Path("points3D.bin")),
-        )
+        parts = (rest[:first], rest[first : first + second], rest[first + second :])
+        names = (Path("cameras.bin"), Path("images.bin"), Path("points3D.bin"))
+        model = decode_model(dict(zip(names, parts, strict=True)))
         if not inconsistency(model):
             reconstruction_from_colmap(model)
     except StageFailure:
@@ -119,7 +129,7 @@ def read_input(data: bytes) -> None:
 
 
 def changed(rng: np.random.Generator, whole: bytes) -> bytes:
-    """An input with up to eight of its bytes, numbers or stretches changed."""
+    """Change up to eight bytes, numbers or stretches of an input."""
     data = bytearray(whole)
     for _ in range(int(rng.integers(1, 9))):
         at, size = int(rng.integers(0, len(data) + 1)), int(rng.integers(1, 17))
@@ -134,8 +144,8 @@ ODD = (np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 0.0, -1.0)
 
 
 def fuzz_at_random(seconds: float, seed: int) -> Findings:
-    """Good inputs changed at random, for so many seconds or until one is a finding."""
-    good, rng, count = corpus(), np.random.default_rng(seed), 0
+    """Change valid inputs at random, until the time is over or there is a finding."""
+    good, rng, count = valid_inputs(), np.random.default_rng(seed), 0
     end = time.monotonic() + seconds
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -150,49 +160,51 @@ def fuzz_at_random(seconds: float, seed: int) -> Findings:
 
 
 def fuzz_guided(seconds: int, seed: int, folder: Path, memory_mb: int) -> Findings:
-    """Inputs led by the branches that those before them took, by atheris; those of ``folder`` go first."""
+    """Let atheris choose inputs by the branches that earlier ones reached; ``folder`` keeps them."""
     folder.mkdir(parents=True, exist_ok=True)
-    for n, data in enumerate(corpus()):
+    for n, data in enumerate(valid_inputs()):
         (folder / f"good-{n:02d}").write_bytes(data)
-    wishes = [f"-max_total_time={seconds}", f"-max_len={LARGEST_INPUT}", f"-seed={seed + 1}", "-timeout=10"]
-    wishes += [f"-rss_limit_mb={memory_mb}", f"-artifact_prefix={folder}.found-", "-print_final_stats=1"]
-    program = [sys.executable, "-c", GUIDED, str(folder), *wishes]
+    flags = [f"-max_total_time={seconds}", f"-max_len={LARGEST_INPUT}", f"-seed={seed + 1}", "-timeout=10"]
+    flags += [f"-rss_limit_mb={memory_mb}", f"-artifact_prefix={folder}.found-", "-print_final_stats=1"]
+    program = [sys.executable, "-c", GUIDED, str(folder), *flags]
     done = subprocess.run(program, capture_output=True, text=True, errors="replace", check=False)
-    told = done.stderr
-    branches = [int(n) for n in re.findall(r"cov: (\d+)", told)]
-    inputs = [int(n) for n in re.findall(r"^#(\d+)", told, flags=re.MULTILINE)]
+    said = done.stderr
+    branches = [int(n) for n in re.findall(r"cov: (\d+)", said)]
+    inputs = [int(n) for n in re.findall(r"^#(\d+)", said, flags=re.MULTILINE)]
     kept = sum(1 for path in folder.iterdir() if not path.name.startswith("good-"))
-    found = "" if done.returncode == 0 else f"{done.stdout[-4000:]}\n{told[-4000:]}"
+    found = "" if done.returncode == 0 else f"{done.stdout[-4000:]}\n{said[-4000:]}"
     return Findings("guided by atheris", max(inputs, default=0), kept, max(branches, default=0), found)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """1 where an input was a finding."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=int, default=600)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--memory", type=int, default=1024, help="MB that the reader's process may take")
-    parser.add_argument(
-        "--corpus", type=Path, help="a folder whose inputs are gone on with (made where absent)"
-    )
-    parser.add_argument("--plain", action="store_true", help="without atheris, though it is there")
-    told = parser.parse_args(arguments)
-    if told.plain or importlib.util.find_spec("atheris") is None:
-        findings = fuzz_at_random(told.seconds, told.seed)
+def fuzz_colmap_study(
+    seconds: int = 600, seed: int = 0, memory: int = 1024, corpus: Path | None = None, plain: bool = False
+) -> Iterator[Part]:
+    """Fuzz the reader of COLMAP's binary files.
+
+    Parameters
+    ----------
+    seconds : int
+        Duration.
+    memory : int
+        Limit of the reader's process in MB.
+    corpus : Path
+        Folder of inputs that are continued.
+    plain : bool
+        Do not use atheris even if it is installed.
+    """
+    if plain or importlib.util.find_spec("atheris") is None:
+        findings = fuzz_at_random(seconds, seed)
     else:
         with tempfile.TemporaryDirectory() as place:
-            folder = told.corpus or Path(place) / "corpus"
-            findings = fuzz_guided(told.seconds, told.seed, folder, told.memory)
-    own = resource.RUSAGE_SELF if findings.branches == 0 else resource.RUSAGE_CHILDREN
-    peak_mb = resource.getrusage(own).ru_maxrss / 2**10
-    print(
-        f"{findings.how}: {findings.inputs} inputs in {told.seconds} s, {findings.branches} branches, "
-        f"{len(corpus())} good inputs and {findings.kept} kept, peak {peak_mb:.0f} MB, "
-        f"{'nothing' if not findings.found else 'something'} found"
+            findings = fuzz_guided(seconds, seed, corpus or Path(place) / "corpus", memory)
+    who = resource.RUSAGE_SELF if findings.branches == 0 else resource.RUSAGE_CHILDREN
+    peak_mb = resource.getrusage(who).ru_maxrss / 2**10
+    yield (
+        f"{findings.how}: {findings.inputs} inputs in {seconds} s, {findings.branches} branches, "
+        f"{len(valid_inputs())} valid inputs and {findings.kept} kept, peak {peak_mb:.0f} MB, "
+        f"{'something' if findings.found else 'nothing'} found"
     )
-    print(findings.found, end="")
-    return int(bool(findings.found))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    yield findings.found
+    rows = Rows("fuzzing", "ours")
+    rows.add("findings", bool(findings.found), at_most=0.0)
+    yield rows

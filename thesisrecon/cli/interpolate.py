@@ -1,0 +1,65 @@
+"""The command ``interpolate``: views between two or three images, without a model."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thesisrecon.cli.common import (
+    MaxSize,
+    Seed,
+    Threads,
+    cap_threads,
+    interruptible,
+    parse_folder,
+    progress_bars,
+)
+from thesisrecon.errors import UsageError
+from thesisrecon.io.files import printable
+from thesisrecon.runtime.executors import available_threads
+
+
+class _Method(StrEnum):
+    interpolation = "interpolation"
+    tensor = "tensor"
+
+
+def interpolate(
+    images: Annotated[
+        list[Path],
+        typer.Argument(parser=parse_folder, metavar="IMAGE IMAGE [IMAGE]", help="Two or three image files."),
+    ],
+    method: Annotated[
+        _Method,
+        typer.Option("--method", help="Image interpolation (section 1.2) or trilinear tensor (1.3)."),
+    ] = _Method.interpolation,
+    frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 21,
+    seed: Seed = 0,
+    max_size: MaxSize = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", parser=parse_folder, metavar="FOLDER", help="Output folder (views/METHOD)."
+        ),
+    ] = None,
+    threads: Threads = 0,
+) -> None:
+    """Compute views between two or three images, as frames, an animation and a page."""
+    cap_threads(threads)
+    if max_size is not None and max_size < 64:
+        raise UsageError(f"--max-size takes at least 64 px; got {max_size}")
+    from thesisrecon.cli.view_files import STRIP, InterpolateOptions, interpolate_images
+
+    options = InterpolateOptions(tuple(images), method.value, frames, seed, max_size)
+    with interruptible("repeat the command to compute all frames"), progress_bars() as progress:
+        written = interpolate_images(
+            folder or Path("views") / method.value,
+            options,
+            threads=threads or available_threads(),
+            progress=progress,
+        )
+    typer.echo(str(written))
+    typer.echo(f"page: {printable(str(written.folder / STRIP))}")
