@@ -4,17 +4,16 @@
 section               module
 ===================== ============================================================================
 3.2                   ``homogeneous``, ``lines_and_planes``
-3.3, 3.4.1-3.4.5      ``strata`` (table of transforms, the four groups, upgrades), ``invariants``
-3.4.6, (3.1)-(3.15)   ``conics``, ``absolute_conic``
-3.5.1, (3.16)-(3.26)  ``camera``
-3.5.2, (3.27)         ``cheirality``
-3.6.1, (3.28)-(3.32)  ``homographies``
-3.6.2, (3.33)-(3.35)  ``multiview``
-3.6.3                 ``trifocal``, ``trifocal_linear``
-3.6.4, (3.36)-(3.42)  ``homographies``, ``multiview``
-6.3, 6.4              ``triangulation``, ``optimal_triangulation``, ``resection``
+3.3, 3.4.1-3.4.5      ``strata``: transforms of every entity, the four groups, their invariants
+3.4.6, (3.1)-(3.15)   ``conics``: conics, quadrics, the absolute conic
+3.5, (3.16)-(3.27)    ``camera_matrix``: P = K [R t], projection, distortion, cheirality
+3.6.1, 3.6.4          ``homographies``
+3.6.2, (3.33)-(3.35)  ``two_view``: fundamental matrix, epipoles, residuals, canonical cameras
+3.6.3                 ``three_view``: the trifocal tensor
+6.3                   ``triangulation``, ``optimal_triangulation`` (two views)
+6.4                   ``resection``
 ===================== ============================================================================
 
-``kernels`` and ``two_view`` are compiled triangulation. ``alignment`` compares two metric models, ``raster``
-resamples images.
+``similarity`` aligns two metric models, ``raster`` resamples images, ``zbuffer`` renders meshes. Arguments
+are ordered transform or camera first, then points: ``project(P, X)``.
 """

@@ -1,10 +1,8 @@
-"""Section 3.5: the projective camera P = K [R t], its parts and its centre.
+"""Section 3.5: the projective camera P = K [R t], its parts, projection, lens distortion and cheirality.
 
-The thesis writes R for camera-to-world (3.21); here R is world-to-camera, its transpose.
-
-Section 3.5.2: which side of a camera a point is on, and signs that put every point in front.
-
-Hartley, "Chirality", IJCV 26(1), 1998. The thesis' (3.27) is his chi; its magnitude is an inverse depth.
+The thesis writes R for camera-to-world (3.21); here R is world-to-camera, its transpose. Cheirality (3.5.2)
+says on which side of a camera a point is: Hartley, "Chirality", IJCV 26(1), 1998. The thesis' (3.27) is his
+chi; its magnitude is an inverse depth.
 """
 
 from __future__ import annotations
@@ -15,19 +13,52 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 
 SETTLED = 1e-9
-"""Relative step after which Newton's method has no digit left to find: the next error is its square."""
+"""Relative step at which Newton's method has converged to rounding: the next error is its square."""
 
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:
-    """P = K [R t]; K, R (..., 3, 3), t (..., 3) -> (..., 3, 4)."""
+    """Return P = K [R t].
+
+    Parameters
+    ----------
+    K, R : ndarray (..., 3, 3), calibration matrix and rotation world-to-camera
+    t : ndarray (..., 3), translation
+
+    Returns
+    -------
+    ndarray (..., 3, 4), camera matrices
+
+    Examples
+    --------
+    >>> compose_camera(np.diag([2.0, 2.0, 1.0]), np.eye(3), np.array([0.0, 0.0, 5.0])).tolist()
+    [[2.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 1.0, 5.0]]
+    """
     return np.asarray(K @ np.concatenate([R, t[..., None]], axis=-1))
 
 
 def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
-    """K, R, t of P (3.21), with K33 = 1, positive focals and det R = 1.
+    """Decompose P of any scale and sign into K, R and t (3.21).
 
-    P (3, 4) may have any scale and sign. Raises ``ValueError`` where the left 3x3 part is singular (a camera
-    at infinity has no K).
+    Parameters
+    ----------
+    P : ndarray (3, 4), camera matrix
+
+    Returns
+    -------
+    K : ndarray (3, 3), calibration matrix with K33 = 1 and positive focal lengths
+    R : ndarray (3, 3), rotation world-to-camera, det R = 1
+    t : ndarray (3,), translation
+
+    Raises
+    ------
+    ValueError
+        The left 3x3 part of P is singular: a camera at infinity has no K.
+
+    Examples
+    --------
+    >>> K, R, t = decompose_camera(-3.0 * np.hstack([np.diag([2.0, 2.0, 1.0]), [[0.0], [0.0], [5.0]]]))
+    >>> np.allclose(K, np.diag([2.0, 2.0, 1.0])), np.allclose(R, np.eye(3)), np.allclose(t, [0.0, 0.0, 5.0])
+    (True, True, True)
     """
     P = P * np.sign(_left_determinant(P, "decompose_camera"))
     K, R = rq(P[:, :3])
@@ -36,11 +67,27 @@ def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
 
 
 def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: float = 0.0) -> F64:
-    """K (3, 3) of (3.17): [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]], all in px.
+    """Return K of (3.17): [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]].
 
-    f_u = f / p_x and f_v = f / p_y, the focal length over the pixel's width and height; skew = f_v tan(alpha)
-    with the angle alpha by which the pixel's sides differ from a right one (table 3.1). Raises ``ValueError``
-    for a focal that is not positive.
+    Parameters
+    ----------
+    f_u, f_v : float, focal length over the width and the height of a pixel, px
+    u_0, v_0 : float, principal point, px
+    skew : float, f_v tan(alpha), px, for pixel sides that deviate from a right angle by alpha (table 3.1)
+
+    Returns
+    -------
+    ndarray (3, 3), calibration matrix
+
+    Raises
+    ------
+    ValueError
+        A focal length is not positive.
+
+    Examples
+    --------
+    >>> calibration_matrix(800.0, 820.0, 320.0, 240.0).tolist()
+    [[800.0, 0.0, 320.0], [0.0, 820.0, 240.0], [0.0, 0.0, 1.0]]
     """
     if not (f_u > 0.0 and f_v > 0.0):
         raise ValueError(f"calibration_matrix needs positive focals; got {f_u} and {f_v}")
@@ -48,16 +95,37 @@ def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: 
 
 
 def camera_from_centre(K: F64, R: F64, centre: F64) -> F64:
-    """P = K [R, -R centre] (3.21), the thesis' K [R' | -R' C]; K, R (..., 3, 3), centre (..., 3)."""
+    """Return P = K [R, -R centre] (3.21), the thesis' K [R' | -R' C].
+
+    Parameters
+    ----------
+    K, R : ndarray (..., 3, 3), calibration matrix and rotation world-to-camera
+    centre : ndarray (..., 3), camera centre
+
+    Returns
+    -------
+    ndarray (..., 3, 4), camera matrices
+    """
     return compose_camera(K, R, -np.einsum("...ij,...j->...i", R, centre))
 
 
 def normalize_camera(P: F64) -> F64:
-    """P scaled such that det M = 1 (definition 3.5.1): then the centre of (3.24) has the last entry 1.
+    """Scale P such that det M = 1 (definition 3.5.1).
 
-    P (..., 3, 4) of any scale and sign; points in front have t > 0 in P X (proposition 3.5.1). The thesis
-    divides by det M^(1/3), whose real value also turns the sign. Raises ``ValueError`` for a camera at
-    infinity, det M = 0.
+    The centre of (3.24) then has the last entry 1, and points in front have t > 0 in P X (proposition 3.5.1).
+
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4), camera matrices of any scale and sign
+
+    Returns
+    -------
+    ndarray (..., 3, 4), P / det(M)^(1/3), whose real value also corrects the sign
+
+    Raises
+    ------
+    ValueError
+        A camera is at infinity (det M = 0) or not finite.
     """
     det = _left_determinant(P, "normalize_camera")
     return np.asarray(P / np.cbrt(det)[..., None, None])
@@ -74,32 +142,77 @@ def _left_determinant(P: F64, caller: str) -> F64:
 
 
 def principal_plane(P: F64) -> F64:
-    """The last row of P, the plane of the centre that is parallel to the image (3.23); (..., 4).
+    """Return the last row of P: the plane of the centre parallel to the image (3.23).
 
-    Its points project to (u, v, 0) (3.22).
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4), camera matrices
+
+    Returns
+    -------
+    ndarray (..., 4), planes; their points project to (u, v, 0) (3.22)
     """
     return P[..., 2, :]
 
 
 def principal_ray(P: F64) -> F64:
-    """Unit direction (..., 3) of the optical axis, pointing to the front: det(M) m_3, normalised (3.23).
+    """Return the direction of the optical axis towards the front: det(M) m_3, normalised (3.23).
 
-    Without det M the last row's sign depends on that of P. Meaningful in a metric frame.
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4), camera matrices of a metric frame, of any sign
+
+    Returns
+    -------
+    ndarray (..., 3), unit vectors
     """
     axis = np.linalg.det(P[..., :3])[..., None] * P[..., 2, :3]
     return np.asarray(axis / np.linalg.norm(axis, axis=-1, keepdims=True))
 
 
 def principal_point(P: F64) -> F64:
-    """Pixel (..., 2) where the principal ray meets the image, M m_3 in a metric frame (HZ 6.2)."""
+    """Return the pixel of the principal ray, M m_3 in a metric frame (HZ 6.2).
+
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4), camera matrices
+
+    Returns
+    -------
+    ndarray (..., 2), principal points, px
+
+    Examples
+    --------
+    >>> principal_point(calibration_matrix(800.0, 820.0, 320.0, 240.0) @ np.eye(3, 4)).tolist()
+    [320.0, 240.0]
+    """
     return dehomogenize(np.einsum("...ij,...j->...i", P[..., :3], P[..., 2, :3]))
 
 
 def back_project(P: F64, xy: F64) -> F64:
-    """Points at infinity (..., 4) on the rays of pixels (..., 2): (M^-1 (u, v, 1), 0), the ray's direction.
+    """Return the points at infinity (M^-1 (u, v, 1), 0) of the rays of pixels.
 
-    With the centre they span the ray. In a projective frame they are points of the plane W = 0, which is no
-    special one. Raises ``ValueError`` for a camera P (3, 4) at infinity.
+    With the centre they span the ray. In a projective frame they lie on the plane W = 0, which has no special
+    meaning there.
+
+    Parameters
+    ----------
+    P : ndarray (3, 4), camera matrix
+    xy : ndarray (..., 2), pixels
+
+    Returns
+    -------
+    ndarray (..., 4), homogeneous points: the directions of the rays
+
+    Raises
+    ------
+    ValueError
+        The camera is at infinity.
+
+    Examples
+    --------
+    >>> back_project(np.eye(3, 4), np.array([0.5, 0.25])).tolist()
+    [0.5, 0.25, 1.0, 0.0]
     """
     _left_determinant(P, "back_project")
     direction = np.linalg.solve(P[:, :3], homogenize(xy)[..., None])[..., 0]
@@ -107,7 +220,17 @@ def back_project(P: F64, xy: F64) -> F64:
 
 
 def rq(M: F64) -> tuple[F64, F64]:
-    """M = K R, K upper triangular with positive diagonal, R orthogonal (a rotation where det M > 0)."""
+    """Factor M = K R with K upper triangular and R orthogonal.
+
+    Parameters
+    ----------
+    M : ndarray (3, 3), matrix
+
+    Returns
+    -------
+    K : ndarray (3, 3), upper triangular, positive diagonal
+    R : ndarray (3, 3), orthogonal, a rotation if det M > 0
+    """
     Q, U = np.linalg.qr(M[::-1].T)
     K = U.T[::-1, ::-1]
     R = Q.T[::-1]
@@ -117,32 +240,88 @@ def rq(M: F64) -> tuple[F64, F64]:
 
 
 def camera_centre(P: F64) -> F64:
-    """Centre by minors (3.24): the signed homogeneous 4-vector C with P C = 0; (..., 3, 4) -> (..., 4)."""
+    """Return the centre C with P C = 0, by minors (3.24).
+
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4), camera matrices
+
+    Returns
+    -------
+    ndarray (..., 4), homogeneous centres with the sign of the minors
+
+    Examples
+    --------
+    >>> C = camera_centre(compose_camera(np.eye(3), np.eye(3), np.array([-1.0, -2.0, 5.0])))
+    >>> (C / C[3]).round(9).tolist()
+    [1.0, 2.0, -5.0, 1.0]
+    """
     columns = [0, 1, 2, 3]
     minors = [np.linalg.det(P[..., [c for c in columns if c != k]]) for k in columns]
     return np.stack([-minors[0], minors[1], -minors[2], minors[3]], axis=-1)
 
 
 def project(P: F64, X: F64) -> F64:
-    """Pixels of space points: P (3, 4), X (N, 3) or homogeneous (N, 4) -> (N, 2)."""
+    """Project space points to pixels.
+
+    Parameters
+    ----------
+    P : ndarray (3, 4), camera matrix
+    X : ndarray (N, 3) or (N, 4), points, Euclidean or homogeneous
+
+    Returns
+    -------
+    ndarray (N, 2), pixels; inf or NaN for points of the principal plane
+
+    Examples
+    --------
+    >>> project(np.eye(3, 4), np.array([[1.0, 2.0, 4.0]])).tolist()
+    [[0.25, 0.5]]
+    """
     Xh = homogenize(X) if X.shape[-1] == 3 else X
     return dehomogenize(Xh @ P.T)
 
 
 def distort(xy_normalized: F64, distortion: float | F64) -> F64:
-    """(x, y) (1 + k1 r^2 + k2 r^4 + ...): radial distortion of normalised image points (N, 2).
+    """Apply radial distortion (x, y) (1 + k1 r^2 + k2 r^4 + ...).
 
-    ``radial`` is k1, or coefficients (C,) or (N, C), those of higher powers last.
+    Parameters
+    ----------
+    xy_normalized : ndarray (N, 2), normalised image points
+    distortion : float or ndarray (C,) or (N, C), k1, or the coefficients k1, k2, ..
+
+    Returns
+    -------
+    ndarray (N, 2), distorted normalised points
+
+    Examples
+    --------
+    >>> distort(np.array([[1.0, 0.0]]), 0.1).tolist()
+    [[1.1, 0.0]]
     """
     r2 = np.sum(xy_normalized**2, axis=-1, keepdims=True)
     return np.asarray(xy_normalized * _radial_factor(distortion, r2))
 
 
 def undistort(xy_normalized: F64, distortion: float | F64, *, iterations: int = 20) -> F64:
-    """Inverse of :func:`distort`, exact to rounding wherever the distortion grows with the radius.
+    """Invert :func:`distort` by Newton's method on r^2 (1 + k1 r^2 + ...)^2 = r_d^2.
 
-    Newton's method on r^2 (1 + k1 r^2 + ...)^2 = r_d^2, from r = r_d, for all points until none moves.
-    Points beyond the largest radius that the distortion reaches have no inverse; they stay where they are.
+    Parameters
+    ----------
+    xy_normalized : ndarray (N, 2), distorted normalised points
+    distortion : float or ndarray (C,) or (N, C), k1, or the coefficients k1, k2, ..
+    iterations : int, maximum number of Newton steps
+
+    Returns
+    -------
+    ndarray (N, 2)
+        Points exact to rounding where the distortion grows with the radius. Points beyond the largest radius
+        that the distortion reaches have no inverse and are returned unchanged.
+
+    Examples
+    --------
+    >>> undistort(np.array([[1.1, 0.0]]), 0.1).round(9).tolist()
+    [[1.0, 0.0]]
     """
     distorted = np.sum(xy_normalized**2, axis=-1, keepdims=True)
     k = np.atleast_1d(distortion)
@@ -170,34 +349,96 @@ def _radial_factor(distortion: float | F64, r2: F64) -> F64:
 
 
 def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 0.0) -> F64:
-    """Pixels (N, 2) of X (N, 3) seen by a metric camera with the ``radial`` distortion of :func:`distort`."""
+    """Project space points with a metric camera and radial distortion.
+
+    Parameters
+    ----------
+    K, R : ndarray (3, 3), calibration matrix and rotation world-to-camera
+    t : ndarray (3,), translation
+    X : ndarray (N, 3), points
+    distortion : float or ndarray (C,) or (N, C), coefficients of :func:`distort`
+
+    Returns
+    -------
+    ndarray (N, 2), pixels
+
+    Examples
+    --------
+    >>> K = calibration_matrix(100.0, 100.0, 50.0, 40.0)
+    >>> project_camera(K, np.eye(3), np.zeros(3), np.array([[1.0, 0.0, 2.0]]), distortion=0.4).tolist()
+    [[105.0, 40.0]]
+    """
     normalized = dehomogenize(X @ R.T + t)
     return distort(normalized, distortion) @ K[:2, :2].T + K[:2, 2]
 
 
-def cheirality(X: F64, P: F64) -> F64:
-    """chi(X, P) = det(M)^(1/3) W / t (3.27): positive in front of the camera, 0 on the plane at infinity.
+def cheirality(P: F64, X: F64) -> F64:
+    """Return chi = det(M)^(1/3) W / t (3.27), positive in front of the camera.
 
-    X (N, 4), P (3, 4) -> (N,); does not change when X or P is scaled, by a negative number either. Only its
-    sign is that of the depth: its magnitude is an inverse depth, which for a camera not normalised has no
-    unit; :func:`depth` measures.
+    Parameters
+    ----------
+    P : ndarray (3, 4), camera matrix
+    X : ndarray (N, 4), homogeneous points
+
+    Returns
+    -------
+    ndarray (N,)
+        chi, 0 on the plane at infinity. It does not change if X or P is scaled, also by a negative factor.
+        Its magnitude is an inverse depth, without a unit if P is not normalised; :func:`depth` measures.
+
+    Examples
+    --------
+    >>> X = np.array([[0.0, 0.0, 2.0, 1.0], [0.0, 0.0, -2.0, 1.0]])
+    >>> cheirality(np.eye(3, 4), X).round(9).tolist()
+    [0.5, -0.5]
     """
     t = X @ P[2]
     return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / t)
 
 
-def depth(X: F64, P: F64) -> F64:
-    """Signed distance of X (N, 4) from the principal plane of P (3, 4), in units of space (HZ 6.15)."""
+def depth(P: F64, X: F64) -> F64:
+    """Return the signed distance of points from the principal plane (HZ 6.15).
+
+    Parameters
+    ----------
+    P : ndarray (3, 4), camera matrix of any scale and sign
+    X : ndarray (N, 4), homogeneous points
+
+    Returns
+    -------
+    ndarray (N,), depth, in units of space
+
+    Examples
+    --------
+    >>> depth(-2.0 * np.eye(3, 4), np.array([[0.0, 0.0, 2.0, 1.0]])).round(9).tolist()
+    [2.0]
+    """
     M = P[:, :3]
     return np.asarray(np.sign(np.linalg.det(M)) * (X @ P[2]) / (X[:, 3] * np.linalg.norm(M[2])))
 
 
 def orient_signs(P: F64, X: F64, view: I64, point: I64, *, sweeps: int = 20) -> tuple[F64, F64, float]:
-    """Signs of cameras and points that make the projective depths w of P_i X_j = w (u, v, 1) positive.
+    """Choose signs of cameras and points that make the projective depths positive.
 
-    P (V, 3, 4), X (N, 4), observations (view, point) (K,). Returns signs (V,), (N,) of +-1 and the share of
-    observations they satisfy. For a reconstruction of real points the share is 1 up to wrong matches
-    (Hartley 1998, theorem 17); votes of the neighbours decide, so a few wrong ones do not spread.
+    The depths w are those of P_i X_j = w (u, v, 1). Votes of the neighbours decide, so that a few wrong
+    matches do not spread.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    X : ndarray (N, 4), homogeneous points
+    view, point : ndarray (K,) of int, view and point of each observation
+    sweeps : int, maximum number of passes
+
+    Returns
+    -------
+    views : ndarray (V,), signs +-1 of the cameras
+    points : ndarray (N,), signs +-1 of the points
+    ratio : float, fraction of the observations with positive depth: 1 up to wrong matches for real points
+
+    References
+    ----------
+    Hartley, "Chirality", IJCV 26(1), 1998, theorem 17.
     """
     w = np.sign(np.einsum("kj,kj->k", P[view, 2], X[point]))
     views = np.zeros(len(P))

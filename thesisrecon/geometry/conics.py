@@ -1,14 +1,12 @@
-"""Section 3.4.6: conics and dual conics of a plane, quadrics and dual quadrics of space.
+"""Section 3.4.6: conics, quadrics, their duals, and the absolute conic.
 
-One algebra serves both: C stands for a conic (3, 3) with the points x'C x = 0 (3.1) or a quadric (4, 4) with
-X'Q X = 0 (3.8), ``dual`` for l'C* l = 0 (3.3) or Pi'Q* Pi = 0 (3.9). All are symmetric and of any scale; how
-they are transformed stands in :mod:`~thesisrecon.geometry.strata`.
+One algebra serves both dimensions: C is a conic (3, 3) of the points x'C x = 0 (3.1) or a quadric (4, 4) with
+X'Q X = 0 (3.8); its dual has l'C* l = 0 (3.3) or Pi'Q* Pi = 0 (3.9). All are symmetric and of any scale. How
+they transform: :mod:`~thesisrecon.geometry.strata`.
 
-Section 3.4.6: the absolute conic, the absolute dual quadric, their images, and what they measure.
-
-The absolute conic Omega is x'x = 0 on the plane at infinity (3.2); its tangent planes are the absolute dual
-quadric. The image of Omega depends on K alone, not on the place of the camera (3.11-3.13): it is the
-calibration object that is always in sight, and it measures angles.
+The absolute conic Omega is x'x = 0 on the plane at infinity (3.2); its tangent planes form the absolute dual
+quadric. The image of Omega depends on K alone, not on the pose (3.11-3.13): it calibrates and measures
+angles.
 """
 
 from __future__ import annotations
@@ -16,26 +14,70 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import inverse_of, require_finite, unit_of
+from thesisrecon.geometry.homogeneous import checked_inverse, checked_unit, require_finite
 
 
-def form(C: F64, x: F64, y: F64) -> F64:
-    """S(x, y) = x'C y (3.5) of points (..., d) and a conic or quadric (..., d, d); (...)."""
+def bilinear_form(C: F64, x: F64, y: F64) -> F64:
+    """Return S(x, y) = x'C y (3.5).
+
+    Parameters
+    ----------
+    C : ndarray (..., d, d), conics or quadrics
+    x, y : ndarray (..., d), homogeneous points
+
+    Returns
+    -------
+    ndarray (...), values of the form
+    """
     return np.asarray(np.einsum("...i,...ij,...j->...", x, C, y))
 
 
 def incidence_residual(C: F64, x: F64) -> F64:
-    """|x'C x| / (|C| |x|^2), in [0, 1]: 0 on the conic or quadric (3.1, 3.8), or for duals (3.3, 3.9)."""
+    """Return |x'C x| / (|C| |x|^2), 0 on the conic or quadric (3.1, 3.8).
+
+    Parameters
+    ----------
+    C : ndarray (..., d, d), conics or quadrics, or their duals (3.3, 3.9)
+    x : ndarray (..., d), points, or lines or planes for duals
+
+    Returns
+    -------
+    ndarray (...), residuals in [0, 1]
+
+    Examples
+    --------
+    >>> circle = np.diag([1.0, 1.0, -1.0])
+    >>> float(incidence_residual(circle, np.array([1.0, 0.0, 1.0])))
+    0.0
+    """
     size = np.linalg.norm(C, axis=(-2, -1)) * np.sum(x**2, axis=-1)
-    return np.asarray(np.abs(form(C, x, x)) / np.maximum(size, 1e-300))
+    return np.asarray(np.abs(bilinear_form(C, x, x)) / np.maximum(size, 1e-300))
 
 
 def dual(C: F64) -> F64:
-    """C* ~ C^-1 (3.4), Q* ~ Q^-1 (3.10): tangents of a conic (3, 3), tangent planes of a quadric (4, 4).
+    """Return the dual C* ~ C^-1 (3.4) or Q* ~ Q^-1 (3.10): tangent lines or tangent planes.
 
-    The adjugate, from the singular values, so that a conic of rank 2 (two lines) has a dual as well: the
-    point they share, twice. Zero for lower rank. The dual of the dual is the conic where that has full rank.
-    Raises ``ValueError`` for entries that are not finite.
+    It is the adjugate, by singular values, so that a conic of rank 2 (two lines) has a dual too: their common
+    point, twice. Lower ranks give zero. The dual of the dual is the conic if that has full rank.
+
+    Parameters
+    ----------
+    C : ndarray (3, 3) or (4, 4), conic or quadric
+
+    Returns
+    -------
+    ndarray, dual conic or quadric, of the shape of ``C``
+
+    Raises
+    ------
+    ValueError
+        An entry is not finite.
+
+    Examples
+    --------
+    >>> C = dual(np.diag([1.0, 1.0, -4.0]))
+    >>> np.allclose(C / C[2, 2], np.diag([-4.0, -4.0, 1.0]))
+    True
     """
     require_finite("dual", C)
     U, s, Vt = np.linalg.svd(C)
@@ -45,31 +87,80 @@ def dual(C: F64) -> F64:
 
 
 def tangent(C: F64, x: F64) -> F64:
-    """Tangent line C x (3.7), or tangent plane Q X, at points (..., d) of the conic or quadric (d, d).
+    """Return the tangent line C x (3.7) or tangent plane Q X.
 
-    For points elsewhere it is their polar: the line or plane of the points where tangents through them touch.
+    For points off the conic or quadric it is their polar: the line or plane through the points of tangency.
+
+    Parameters
+    ----------
+    C : ndarray (d, d), conic or quadric
+    x : ndarray (..., d), homogeneous points
+
+    Returns
+    -------
+    ndarray (..., d), lines or planes
+
+    Examples
+    --------
+    >>> tangent(np.diag([1.0, 1.0, -1.0]), np.array([0.0, 1.0, 1.0])).tolist()
+    [0.0, 1.0, -1.0]
     """
     return np.asarray(x @ C)
 
 
 def tangency_discriminant(C: F64, x: F64, y: F64) -> F64:
-    """S(x, y)^2 - S(x) S(y) (3.6): 0 where the line of x and y touches, positive where it cuts.
+    """Return S(x, y)^2 - S(x) S(y) (3.6), 0 if the line of x and y is tangent, positive if it intersects.
 
-    x, y (..., d), C (d, d). (3.6) lost its square in the text.
+    Parameters
+    ----------
+    C : ndarray (d, d), conic or quadric
+    x, y : ndarray (..., d), two homogeneous points of the line
+
+    Returns
+    -------
+    ndarray (...), discriminants
+
+    Notes
+    -----
+    The square is missing in (3.6) of the thesis' text.
     """
-    return np.asarray(form(C, x, y) ** 2 - form(C, x, x) * form(C, y, y))
+    return np.asarray(bilinear_form(C, x, y) ** 2 - bilinear_form(C, x, x) * bilinear_form(C, y, y))
 
 
-def meet_line(C: F64, x: F64, y: F64) -> F64:
-    """The real points (0, 1 or 2; d) where the line of points x, y (d,) meets a conic or quadric (3.5).
+def intersect_line(C: F64, x: F64, y: F64) -> F64:
+    """Intersect a conic or quadric with the line of two points (3.5).
 
-    Roots (a, b) of a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y: in homogeneous form, so
-    that x and y themselves are found. A discriminant of 0 to rounding is one point. Empty as well where the
-    line lies on the quadric altogether. Raises ``ValueError`` for a point or conic that is zero or not
-    finite.
+    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y, in homogeneous form, so that x
+    and y themselves can be solutions.
+
+    Parameters
+    ----------
+    C : ndarray (d, d), conic or quadric
+    x, y : ndarray (d,), homogeneous points
+
+    Returns
+    -------
+    ndarray (0, d), (1, d) or (2, d)
+        Real points; one for a tangent (discriminant 0 to rounding), none for a line that lies on the quadric.
+
+    Raises
+    ------
+    ValueError
+        A point or the conic is zero or not finite.
+
+    Examples
+    --------
+    >>> circle = np.diag([1.0, 1.0, -1.0])
+    >>> X = intersect_line(circle, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+    >>> np.sort(X[:, 0] / X[:, 2]).round(9).tolist()
+    [-1.0, 1.0]
     """
-    x, y, C = (unit_of(array, "meet_line") for array in (x, y, C))
-    sxx, sxy, syy = float(form(C, x, x)), float(form(C, x, y)), float(form(C, y, y))
+    x, y, C = (checked_unit(array, "intersect_line") for array in (x, y, C))
+    sxx, sxy, syy = (
+        float(bilinear_form(C, x, x)),
+        float(bilinear_form(C, x, y)),
+        float(bilinear_form(C, y, y)),
+    )
     size = max(abs(sxx), abs(sxy), abs(syy))
     # Each of the three forms is known to some 1e-15, being of unit vectors.
     discriminant, rounding = sxy**2 - sxx * syy, 1e-14 * size
@@ -84,21 +175,51 @@ def meet_line(C: F64, x: F64, y: F64) -> F64:
 
 
 def tangents_from(C: F64, x: F64) -> F64:
-    """The real tangent lines (0, 1 or 2; 3) of a conic (3, 3) of full rank through an image point (3,).
+    """Return the real tangents of a conic through an image point.
 
-    They touch where the polar of x meets the conic; a point of the conic has one tangent. Raises as
-    :func:`meet_line`.
+    They touch where the polar of x meets the conic.
+
+    Parameters
+    ----------
+    C : ndarray (3, 3), conic of full rank
+    x : ndarray (3,), homogeneous image point
+
+    Returns
+    -------
+    ndarray (0, 3), (1, 3) or (2, 3), lines; one for a point of the conic
+
+    Raises
+    ------
+    ValueError
+        The point or the conic is zero or not finite.
     """
     require_finite("tangents_from", C, x)
     basis = np.linalg.svd(tangent(C, x)[None])[2][1:]
-    return tangent(C, meet_line(C, basis[0], basis[1]))
+    return tangent(C, intersect_line(C, basis[0], basis[1]))
 
 
 def conic_through(x: F64) -> F64:
-    """Conic (3, 3), unit norm, with the least sum of squared x'C x over N >= 5 points (N, 3).
+    """Fit the conic with the least sum of squared x'C x to points.
 
-    Exact for five points. Raises ``ValueError`` for fewer points or points that leave more than one conic
-    (four on a line, or equal ones).
+    Parameters
+    ----------
+    x : ndarray (N, 3), N >= 5 homogeneous points; exact for 5
+
+    Returns
+    -------
+    ndarray (3, 3), conic of unit norm
+
+    Raises
+    ------
+    ValueError
+        There are fewer points, or they leave more than one conic (four on a line, or equal points).
+
+    Examples
+    --------
+    >>> x = np.array([[1.0, 0, 1], [-1.0, 0, 1], [0, 1.0, 1], [0, -1.0, 1], [0.6, 0.8, 1]])
+    >>> C = conic_through(x)
+    >>> np.allclose(C / C[0, 0], np.diag([1.0, 1.0, -1.0]))
+    True
     """
     if x.ndim != 2 or x.shape[1] != 3 or len(x) < 5 or not np.isfinite(x).all():
         raise ValueError(f"conic_through needs finite points (N >= 5, 3); got {x.shape}")
@@ -115,22 +236,50 @@ def conic_through(x: F64) -> F64:
 
 
 def curvature_sign(Q: F64) -> int:
-    """Sign of the Gaussian curvature on a quadric (4, 4) of real points: -sign(det Q), projective.
+    """Return the sign of the Gaussian curvature of a quadric's real points, a projective invariant.
 
-    1 for ellipsoids, elliptic paraboloids and hyperboloids of two sheets, -1 for saddles, 0 for cones,
-    cylinders and planes. K = -det Q / |grad|^4 up to a positive factor, and det(G^-T Q G^-1)
-    has the sign of det Q.
+    K = -det Q / |grad|^4 up to a positive factor, and det(G^-T Q G^-1) has the sign of det Q.
+
+    Parameters
+    ----------
+    Q : ndarray (4, 4), quadric
+
+    Returns
+    -------
+    int
+        1 for ellipsoids, elliptic paraboloids and hyperboloids of two sheets, -1 for saddles, 0 for cones,
+        cylinders and planes.
+
+    Raises
+    ------
+    ValueError
+        The quadric is zero or not finite.
     """
-    scaled = unit_of(Q, "curvature_sign")
+    scaled = checked_unit(Q, "curvature_sign")
     det = float(np.linalg.det(scaled))
     return 0 if abs(det) < 1e-14 else -int(np.sign(det))
 
 
 def project_dual_quadric(P: F64, dual_quadric: F64) -> F64:
-    """C* = P Q* P' (..., 3, 3): the dual conic of a quadric's outline in cameras (..., 3, 4) (HZ 8.5).
+    """Project a dual quadric to the dual conic of its outline: C* = P Q* P' (HZ 8.5).
 
-    A line is a tangent of the outline where the plane P'l is tangent to the quadric. For the absolute dual
-    quadric it is (3.14).
+    A line is tangent to the outline if its plane P'l is tangent to the quadric. (3.14) is the case of the
+    absolute dual quadric.
+
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4), cameras
+    dual_quadric : ndarray (4, 4), dual quadric
+
+    Returns
+    -------
+    ndarray (..., 3, 3), dual conics
+
+    Examples
+    --------
+    >>> P = np.diag([800.0, 800.0, 1.0]) @ np.eye(3, 4)
+    >>> np.diag(project_dual_quadric(P, ABSOLUTE_DUAL_QUADRIC)).tolist()
+    [640000.0, 640000.0, 1.0]
     """
     return np.asarray(P @ dual_quadric @ np.swapaxes(P, -1, -2))
 
@@ -143,21 +292,64 @@ ABSOLUTE_DUAL_QUADRIC = np.diag([1.0, 1.0, 1.0, 0.0])
 
 
 def image_of_absolute_conic(K: F64) -> F64:
-    """omega = K^-T K^-1 (3.13) of calibration matrices (..., 3, 3); ``ValueError`` for singular ones."""
-    inverse = inverse_of(K, "image_of_absolute_conic")
+    """Return omega = K^-T K^-1 (3.13).
+
+    Parameters
+    ----------
+    K : ndarray (..., 3, 3), calibration matrices
+
+    Returns
+    -------
+    ndarray (..., 3, 3), images of the absolute conic
+
+    Raises
+    ------
+    ValueError
+        A matrix is singular or not finite.
+
+    Examples
+    --------
+    >>> image_of_absolute_conic(np.diag([2.0, 2.0, 1.0])).tolist()
+    [[0.25, 0.0, 0.0], [0.0, 0.25, 0.0], [0.0, 0.0, 1.0]]
+    """
+    inverse = checked_inverse(K, "image_of_absolute_conic")
     return np.asarray(np.swapaxes(inverse, -1, -2) @ inverse)
 
 
 def dual_image_of_absolute_conic(K: F64) -> F64:
-    """omega* = K K' (3.14), the inverse of omega (3.15); (..., 3, 3)."""
+    """Return omega* = K K' (3.14), the inverse of omega (3.15).
+
+    Parameters
+    ----------
+    K : ndarray (..., 3, 3), calibration matrices
+
+    Returns
+    -------
+    ndarray (..., 3, 3), dual images of the absolute conic
+    """
     return np.asarray(K @ np.swapaxes(K, -1, -2))
 
 
 def calibration_from_dual_image(dual_image: F64) -> F64:
-    """K (3, 3), upper triangular with positive focals and K33 = 1, of omega* ~ K K' of any scale and sign.
+    """Recover K from omega* ~ K K' by the Cholesky factor taken from the last row up.
 
-    The Cholesky factor taken from the last row up. Raises ``ValueError`` where omega* is not definite: no
-    real camera has such an image.
+    Parameters
+    ----------
+    dual_image : ndarray (3, 3), omega* of any scale and sign
+
+    Returns
+    -------
+    ndarray (3, 3), K, upper triangular, positive focal lengths, K33 = 1
+
+    Raises
+    ------
+    ValueError
+        omega* is not definite: no real camera has this image.
+
+    Examples
+    --------
+    >>> calibration_from_dual_image(-np.diag([9.0, 4.0, 1.0])).round(9).tolist()
+    [[3.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]
     """
     symmetric = (dual_image + dual_image.T) / 2.0
     if symmetric[2, 2] == 0.0 or not np.isfinite(symmetric).all():
@@ -171,34 +363,78 @@ def calibration_from_dual_image(dual_image: F64) -> F64:
 
 
 def calibration_from_image(image: F64) -> F64:
-    """K (3, 3) of omega ~ K^-T K^-1 of any scale and sign; refuses as :func:`calibration_from_dual_image`."""
+    """Recover K from omega ~ K^-T K^-1.
+
+    Parameters
+    ----------
+    image : ndarray (3, 3), omega of any scale and sign
+
+    Returns
+    -------
+    ndarray (3, 3), K, upper triangular, positive focal lengths, K33 = 1
+
+    Raises
+    ------
+    ValueError
+        omega is singular or not definite.
+    """
     if not np.isfinite(image).all() or not np.linalg.cond(image) < 1e15:
         raise ValueError("calibration_from_image needs a finite invertible conic")
     return calibration_from_dual_image(np.asarray(np.linalg.inv(image), dtype=np.float64))
 
 
 def image_of_infinity(P: F64) -> F64:
-    """M (..., 3, 3) of cameras (..., 3, 4): takes points (x, 0) of the plane at infinity to the image (3.11).
+    """Return M of P = [M m], which maps points (x, 0) of the plane at infinity to the image (3.11).
 
-    K R in a metric frame; the centre has no part in it.
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4), cameras
+
+    Returns
+    -------
+    ndarray (..., 3, 3), M, equal to K R in a metric frame; the centre has no effect
     """
     return P[..., :3]
 
 
 def dual_quadric_of_plane(K: F64, plane: F64) -> F64:
-    """Absolute dual quadric (4, 4) in a projective frame whose first camera is [I 0].
+    """Return Q* of a projective frame whose first camera is [I 0].
 
-    [[K K', -K K'p], [-p'K K', p'K K'p]] for the plane at infinity (p, 1), p (3,), and the calibration K
-    (3, 3) of the first camera (Triggs 1997; HZ 19.2).
+    Q* = [[K K', -K K'p], [-p'K K', p'K K'p]] (Triggs 1997; HZ 19.2).
+
+    Parameters
+    ----------
+    K : ndarray (3, 3), calibration of the first camera
+    plane : ndarray (3,), p of the plane at infinity (p, 1)
+
+    Returns
+    -------
+    ndarray (4, 4), absolute dual quadric
     """
     lift = np.vstack([np.eye(3), -plane])
     return np.asarray(lift @ dual_image_of_absolute_conic(K) @ lift.T)
 
 
 def plane_at_infinity(dual_quadric: F64) -> F64:
-    """Unit null vector (4,) of the absolute dual quadric (4, 4): the plane at infinity of its frame.
+    """Return the plane at infinity: the null vector of the absolute dual quadric.
 
-    Raises ``ValueError`` for entries that are not finite.
+    Parameters
+    ----------
+    dual_quadric : ndarray (4, 4), absolute dual quadric of any frame
+
+    Returns
+    -------
+    ndarray (4,), unit plane
+
+    Raises
+    ------
+    ValueError
+        An entry is not finite.
+
+    Examples
+    --------
+    >>> np.abs(plane_at_infinity(ABSOLUTE_DUAL_QUADRIC)).tolist()
+    [0.0, 0.0, 0.0, 1.0]
     """
     require_finite("plane_at_infinity", dual_quadric)
     s, V = np.linalg.eigh((dual_quadric + dual_quadric.T) / 2.0)
@@ -206,20 +442,42 @@ def plane_at_infinity(dual_quadric: F64) -> F64:
 
 
 def angle_between_pixels(image: F64, x: F64, y: F64) -> F64:
-    """Angle (rad) between the rays of image points x, y (..., 3) in a camera with omega ``image`` (3, 3).
+    """Return the angle between the rays of pixels, cos = x'omega y / root(x'omega x . y'omega y) (HZ 8.6).
 
-    cos = x'omega y / root(x'omega x . y'omega y) (HZ 8.6); between vanishing points it is that of directions.
-    ``image`` positive definite.
+    Parameters
+    ----------
+    image : ndarray (3, 3), positive definite image of the absolute conic omega
+    x, y : ndarray (..., 3), homogeneous image points; vanishing points give the angle between directions
+
+    Returns
+    -------
+    ndarray (...), angles, rad
+
+    Examples
+    --------
+    >>> omega = image_of_absolute_conic(np.diag([500.0, 500.0, 1.0]))
+    >>> x, y = np.array([0.0, 0.0, 1.0]), np.array([500.0, 0.0, 1.0])
+    >>> round(float(np.degrees(angle_between_pixels(omega, x, y))), 9)
+    45.0
     """
-    cosine = form(image, x, y) / np.sqrt(form(image, x, x) * form(image, y, y))
+    cosine = bilinear_form(image, x, y) / np.sqrt(bilinear_form(image, x, x) * bilinear_form(image, y, y))
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def angle_between_planes(dual_quadric: F64, plane1: F64, plane2: F64) -> F64:
-    """Angle (rad) between the normals of planes (..., 4) by the absolute dual quadric (4, 4) of any frame.
+    """Return the angle between the normals of planes in any frame.
 
-    cos = Pi'Q* Psi / root(Pi'Q* Pi . Psi'Q* Psi) (HZ 3.7), which no projective transform changes.
+    cos = Pi'Q* Psi / root(Pi'Q* Pi . Psi'Q* Psi) (HZ 3.7), a projective invariant.
+
+    Parameters
+    ----------
+    dual_quadric : ndarray (4, 4), absolute dual quadric of the frame
+    plane1, plane2 : ndarray (..., 4), planes
+
+    Returns
+    -------
+    ndarray (...), angles, rad
     """
     Q = dual_quadric * np.sign(np.trace(dual_quadric))
-    product = form(Q, plane1, plane1) * form(Q, plane2, plane2)
-    return np.asarray(np.arccos(np.clip(form(Q, plane1, plane2) / np.sqrt(product), -1.0, 1.0)))
+    product = bilinear_form(Q, plane1, plane1) * bilinear_form(Q, plane2, plane2)
+    return np.asarray(np.arccos(np.clip(bilinear_form(Q, plane1, plane2) / np.sqrt(product), -1.0, 1.0)))

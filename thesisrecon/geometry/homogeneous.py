@@ -1,4 +1,4 @@
-"""Section 3.2: homogeneous coordinates and the small helpers every chapter uses."""
+"""Section 3.2: homogeneous coordinates, conditioning transforms and argument checks."""
 
 from __future__ import annotations
 
@@ -9,13 +9,39 @@ from thesisrecon.arrays import F64
 
 
 def require_finite(caller: str, *arrays: F64) -> None:
-    """``ValueError`` that names ``caller`` where an entry is NaN or infinite: decompositions fail there."""
+    """Raise ``ValueError`` if an entry is NaN or infinite.
+
+    Parameters
+    ----------
+    caller : str, name of the public function, for the message
+    *arrays : ndarray, arrays of any shape
+
+    Raises
+    ------
+    ValueError
+        An entry is not finite.
+    """
     if not all(np.isfinite(array).all() for array in arrays):
         raise ValueError(f"{caller} needs finite numbers; some are NaN or infinite")
 
 
-def inverse_of(G: F64, caller: str) -> F64:
-    """G^-1 (..., d, d); ``ValueError`` that names ``caller`` where G is singular or not finite."""
+def checked_inverse(G: F64, caller: str) -> F64:
+    """Invert matrices.
+
+    Parameters
+    ----------
+    G : ndarray (..., d, d), matrices
+    caller : str, name of the public function, for the message
+
+    Returns
+    -------
+    ndarray (..., d, d), the inverses
+
+    Raises
+    ------
+    ValueError
+        A matrix is singular or not finite.
+    """
     require_finite(caller, G)
     try:
         return np.asarray(np.linalg.inv(G), dtype=np.float64)
@@ -23,8 +49,23 @@ def inverse_of(G: F64, caller: str) -> F64:
         raise ValueError(f"{caller} needs an invertible matrix; got a singular one of {G.shape}") from error
 
 
-def unit_of(array: F64, caller: str) -> F64:
-    """An array of any shape with Frobenius norm 1; ``ValueError`` where it is zero or not finite."""
+def checked_unit(array: F64, caller: str) -> F64:
+    """Scale an array to unit Frobenius norm.
+
+    Parameters
+    ----------
+    array : ndarray, array of any shape
+    caller : str, name of the public function, for the message
+
+    Returns
+    -------
+    ndarray, the array over its norm
+
+    Raises
+    ------
+    ValueError
+        The array is zero or not finite.
+    """
     require_finite(caller, array)
     norm = float(np.linalg.norm(array))
     if not norm > 0.0:
@@ -33,27 +74,91 @@ def unit_of(array: F64, caller: str) -> F64:
 
 
 def homogenize(x: F64) -> F64:
-    """Append a 1 to each row: (..., d) -> (..., d + 1)."""
+    """Append a coordinate 1 to each point.
+
+    Parameters
+    ----------
+    x : ndarray (..., d), points
+
+    Returns
+    -------
+    ndarray (..., d + 1), homogeneous points
+
+    Examples
+    --------
+    >>> homogenize(np.array([[2.0, 3.0]])).tolist()
+    [[2.0, 3.0, 1.0]]
+    """
     return np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
 
 
 def dehomogenize(xh: F64) -> F64:
-    """Divide by the last coordinate: (..., d + 1) -> (..., d); points at infinity give inf or NaN."""
+    """Divide homogeneous points by their last coordinate.
+
+    Parameters
+    ----------
+    xh : ndarray (..., d + 1), homogeneous points
+
+    Returns
+    -------
+    ndarray (..., d), points; inf or NaN for points at infinity
+
+    Examples
+    --------
+    >>> dehomogenize(np.array([[4.0, 6.0, 2.0]])).tolist()
+    [[2.0, 3.0]]
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         return xh[..., :-1] / xh[..., -1:]
 
 
 def cross_matrix(a: F64) -> F64:
-    """[a]x with ``cross_matrix(a) @ b == cross(a, b)``; (..., 3) -> (..., 3, 3)."""
+    """Return the skew-symmetric matrix [a]x of the cross product.
+
+    Parameters
+    ----------
+    a : ndarray (..., 3), vectors
+
+    Returns
+    -------
+    ndarray (..., 3, 3), [a]x with [a]x b = a x b
+
+    Examples
+    --------
+    >>> a, b = np.array([1.0, 2.0, 3.0]), np.array([0.0, 1.0, 0.0])
+    >>> (cross_matrix(a) @ b).tolist() == np.cross(a, b).tolist()
+    True
+    """
     z = np.zeros(a.shape[:-1])
     rows = [z, -a[..., 2], a[..., 1], a[..., 2], z, -a[..., 0], -a[..., 1], a[..., 0], z]
     return np.stack(rows, axis=-1).reshape(*a.shape[:-1], 3, 3)
 
 
 def normalizing_transform(xy: F64) -> F64:
-    """Hartley's conditioning: centroid to 0, mean distance to sqrt(2); (N, 2) -> (3, 3).
+    """Return Hartley's normalisation: centroid to 0, mean distance to sqrt(2).
 
-    Raises ``ValueError`` where all points are equal (no scale exists) and where one is not finite.
+    Parameters
+    ----------
+    xy : ndarray (N, 2), image points, px
+
+    Returns
+    -------
+    ndarray (3, 3), similarity transform of homogeneous image points
+
+    Raises
+    ------
+    ValueError
+        All points are equal, or one is not finite.
+
+    References
+    ----------
+    Hartley, "In Defense of the Eight-Point Algorithm", PAMI 19(6), 1997.
+
+    Examples
+    --------
+    >>> T = normalizing_transform(np.array([[0.0, 0.0], [4.0, 0.0]]))
+    >>> (T @ [4.0, 0.0, 1.0]).round(3).tolist()
+    [1.414, 0.0, 1.0]
     """
     require_finite("normalizing_transform", xy)
     centroid = xy.mean(axis=0)
@@ -65,9 +170,17 @@ def normalizing_transform(xy: F64) -> F64:
 
 
 def pixel_from_unit(sizes: NDArray[np.int64]) -> F64:
-    """Transforms (V, 3, 3) from unit-free to pixel coordinates of images of ``sizes`` (V, 2) width, height.
+    """Return the transforms from unit-free to pixel coordinates.
 
-    The origin of unit-free coordinates is the image centre, their unit the long side.
+    The origin of unit-free coordinates is the image centre, their unit the longer image side.
+
+    Parameters
+    ----------
+    sizes : ndarray (V, 2) of int, image width and height, px
+
+    Returns
+    -------
+    ndarray (V, 3, 3), transforms of homogeneous image points
     """
     scale = sizes.max(axis=1).astype(np.float64)
     T = np.zeros((len(sizes), 3, 3))
@@ -78,10 +191,15 @@ def pixel_from_unit(sizes: NDArray[np.int64]) -> F64:
 
 
 def pixel_conditioning(xy: F64) -> F64:
-    """T (3, 3) that moves the middle of xy (K, 2) to 0 and its half-diagonal to 1; isotropic, so residuals
-    scale.
+    """Return the transform of the pixels' bounding box to centre 0 and half-diagonal 1.
 
-    The identity's scale stands in where all pixels are equal.
+    Parameters
+    ----------
+    xy : ndarray (K, 2), pixels
+
+    Returns
+    -------
+    ndarray (3, 3), isotropic transform, so that residuals only scale; scale 1 if all pixels are equal
     """
     if len(xy) == 0:
         return np.eye(3)
@@ -93,9 +211,16 @@ def pixel_conditioning(xy: F64) -> F64:
 
 
 def scene_frame(X: F64) -> tuple[F64, float]:
-    """Middle (3,) and inverse size of points X (N, 3) by medians, so that far points do not matter.
+    """Return a robust centre and inverse size of a point set.
 
-    (0, 1) without points; the scale is 1 where all points are equal.
+    Parameters
+    ----------
+    X : ndarray (N, 3), points
+
+    Returns
+    -------
+    origin : ndarray (3,), median of each coordinate; 0 without points
+    scale : float, 1 / median distance from the origin; 1 if all points are equal
     """
     if len(X) == 0:
         return np.zeros(3), 1.0
@@ -105,12 +230,23 @@ def scene_frame(X: F64) -> tuple[F64, float]:
 
 
 def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
-    """M (4, 4) for which the unit vectors x = M X / |M X| have sum x x' proportional to I; X (N, 4)
-    homogeneous.
+    """Return M for which the unit vectors x = M X / |M X| have sum x x' proportional to I.
 
-    Fixed-point iteration of Tyler (Annals of Statistics 1987): every point counts as a direction, so neither
-    the homogeneous scales nor a few far points matter. Directions without extent (all points on a plane) are
-    stretched by at most 1e6. det M > 0, hence orientations are kept; points of norm 0 are left out.
+    Every point counts as a direction, so neither homogeneous scales nor a few far points matter. Directions
+    without extent (points on a plane) are stretched by at most 1e6. Points of norm 0 are ignored.
+
+    Parameters
+    ----------
+    X : ndarray (N, 4), homogeneous points
+    rounds : int, fixed-point iterations
+
+    Returns
+    -------
+    ndarray (4, 4), M with det M > 0, which keeps orientations; I for fewer than 4 points
+
+    References
+    ----------
+    Tyler, "A distribution-free M-estimator of multivariate scatter", Annals of Statistics, 1987.
     """
     M = np.eye(4)
     norms = np.linalg.norm(X, axis=1)

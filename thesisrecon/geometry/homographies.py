@@ -1,4 +1,4 @@
-"""Sections 3.6.1 and 3.6.4: homographies between views, and what they have to do with F and the cameras."""
+"""Sections 3.6.1 and 3.6.4: homographies between views and their relation to F and the cameras."""
 
 from __future__ import annotations
 
@@ -6,16 +6,26 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, unit_of
+from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix, require_finite
 from thesisrecon.geometry.two_view import epipoles, unit_norm
 
 
 def image_from_plane(P: F64, plane: F64) -> F64:
-    """H_Pi = M - m pi' (3.29): takes the point (x, -pi'x) of the plane (pi, 1) to its image; (3, 3).
+    """Return H_Pi = M - m pi' (3.29), which maps the point (x, -pi'x) of the plane (pi, 1) to its image.
 
-    P (3, 4); ``plane`` (4,) with any fourth entry but 0. Singular where the plane holds the camera's centre.
-    Raises ``ValueError`` for a plane through the origin, which x cannot coordinate:
-    :func:`plane_homography` takes such a plane, too.
+    Parameters
+    ----------
+    P : ndarray (3, 4), camera
+    plane : ndarray (4,), plane with a non-zero fourth entry
+
+    Returns
+    -------
+    ndarray (3, 3), homography, singular if the plane contains the camera centre
+
+    Raises
+    ------
+    ValueError
+        The plane contains the origin, so that x is no coordinate; use :func:`plane_homography`.
     """
     if not abs(plane[3]) > 1e-14 * np.linalg.norm(plane):
         raise ValueError("image_from_plane needs a plane that does not hold the origin")
@@ -23,15 +33,34 @@ def image_from_plane(P: F64, plane: F64) -> F64:
 
 
 def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
-    """H (3, 3), unit norm, that takes the image in P1 of every point of a plane (4,) to its image in P2.
+    """Return the homography between two images induced by a plane.
 
-    H = P2 ((Pi'C) I - C Pi') P1^+ with the centre C of P1: the ray of a pixel meets the plane, and the point
-    is seen again. It equals H_Pi2 H_Pi1^-1 (3.30), without its exception of planes through the origin.
-    Singular where the plane holds the second centre; raises ``ValueError`` where it holds the first one, and
-    for cameras and planes that are zero or not finite.
+    H = P2 ((Pi'C) I - C Pi') P1^+ with the centre C of P1: the ray of a pixel meets the plane and the point
+    is projected. It equals H_Pi2 H_Pi1^-1 (3.30), also for planes through the origin.
+
+    Parameters
+    ----------
+    P1, P2 : ndarray (3, 4), cameras
+    plane : ndarray (4,), plane
+
+    Returns
+    -------
+    ndarray (3, 3), H of unit norm, x2 ~ H x1; singular if the plane contains the second centre
+
+    Raises
+    ------
+    ValueError
+        The plane contains the first centre, or an argument is zero or not finite.
+
+    Examples
+    --------
+    >>> P1, P2 = np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])
+    >>> H = plane_homography(P1, P2, np.array([0.0, 0.0, 1.0, -2.0]))
+    >>> np.allclose(H / H[2, 2], [[1.0, 0.0, -0.5], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    True
     """
-    P1, P2, plane = (unit_of(array, "plane_homography") for array in (P1, P2, plane))
-    centre = unit_of(camera_centre(P1), "plane_homography, for the centre of its first camera,")
+    P1, P2, plane = (checked_unit(array, "plane_homography") for array in (P1, P2, plane))
+    centre = checked_unit(camera_centre(P1), "plane_homography, for the centre of its first camera,")
     if not abs(plane @ centre) > 1e-14:
         raise ValueError("plane_homography needs a plane that does not hold the first camera's centre")
     meet = (plane @ centre) * np.eye(4) - np.outer(centre, plane)
@@ -39,11 +68,31 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
 
 
 def infinite_homography(P1: F64, P2: F64) -> F64:
-    """H = M2 M1^-1 (3.31), unit norm, for the plane (0, 0, 0, 1); (3, 4), (3, 4) -> (3, 3).
+    """Return H = M2 M1^-1 (3.31), the homography of the plane (0, 0, 0, 1).
 
-    K2 R2 R1' K1^-1 in a metric frame (3.28, where the thesis' R are transposed), whatever the centres are;
-    in an affine one it still is the homography of the plane at infinity, in a projective one that of a plane
-    like others. Raises ``ValueError`` for a first camera at infinity and for entries that are not finite.
+    K2 R2 R1' K1^-1 in a metric frame (3.28, where the thesis' R are transposed), for any centres. In an
+    affine frame it is still the homography of the plane at infinity, in a projective frame that of an
+    ordinary plane.
+
+    Parameters
+    ----------
+    P1, P2 : ndarray (3, 4), cameras
+
+    Returns
+    -------
+    ndarray (3, 3), H of unit norm
+
+    Raises
+    ------
+    ValueError
+        The first camera is at infinity, or an entry is not finite.
+
+    Examples
+    --------
+    >>> P1, P2 = np.eye(3, 4), np.hstack([np.diag([2.0, 2.0, 1.0]), [[1.0], [2.0], [3.0]]])
+    >>> H = infinite_homography(P1, P2)
+    >>> (H / H[2, 2]).round(9).tolist()
+    [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]
     """
     require_finite("infinite_homography", P1, P2)
     if not np.linalg.cond(P1[:, :3]) < 1e14:
@@ -53,21 +102,47 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
 
 
 def fundamental_from_homography(H: F64, e2: F64) -> F64:
-    """F = [e2]x H, unit norm, of the homography (3, 3) of any plane and the epipole e2 (3,) in view 2 (3.37).
+    """Return F = [e2]x H of the homography of any plane and the epipole (3.37).
 
-    The line of x is that of its epipole and its place H x. Raises ``ValueError`` for a zero epipole.
+    Parameters
+    ----------
+    H : ndarray (3, 3), homography, x2 ~ H x1
+    e2 : ndarray (3,), epipole in view 2
+
+    Returns
+    -------
+    ndarray (3, 3), F of unit norm
+
+    Raises
+    ------
+    ValueError
+        The epipole is zero: equal centres have none.
+
+    Examples
+    --------
+    >>> F = fundamental_from_homography(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    >>> (F * np.sqrt(2.0)).round(9).tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
     """
     if not np.linalg.norm(e2) > 0.0:
         raise ValueError("fundamental_from_homography needs an epipole; equal centres have none")
     return unit_norm(cross_matrix(e2 / np.linalg.norm(e2)) @ H)
 
 
-def homographies_of_fundamental(F: F64, *, plane: F64 | None = None) -> F64:
-    """H = -[e2]x F / |e2|^2 + e2 v' of all planes, v (3,) = ``plane`` free (3.39, 3.41); (3, 3).
+def homography_from_fundamental(F: F64, *, plane: F64 | None = None) -> F64:
+    """Return H = -[e2]x F / |e2|^2 + e2 v', the homography of a plane for any v (3.39, 3.41).
 
-    (3.41) is the member v = 0, without its sign and scale: the plane through the second centre whose image
-    there is the line e2, hence singular. Here [e2]x H = F exactly, with the sign, for unit e2 and F of unit
-    norm.
+    (3.41) is the member v = 0, up to sign and scale: the plane through the second centre whose image is the
+    line e2, hence singular.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+    plane : ndarray (3,), optional, v; 0 by default
+
+    Returns
+    -------
+    ndarray (3, 3), H with [e2]x H = F, also in sign, for unit e2 and F of unit norm
     """
     F = unit_norm(F)
     _, e2 = epipoles(F)
@@ -76,37 +151,85 @@ def homographies_of_fundamental(F: F64, *, plane: F64 | None = None) -> F64:
 
 
 def homography_through_line(F: F64, line2: F64) -> F64:
-    """H = [l]x F (proof of (3.41)): x goes to where its epipolar line meets a line (3,) of view 2; (3, 3).
+    """Return H = [l]x F, which maps x to the intersection of its epipolar line with a line (proof of 3.41).
 
-    The homography of the plane that view 2 sees as that line. Of rank 2; rank 1 where the line holds e2.
+    It is the homography of the plane that view 2 sees as the line.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+    line2 : ndarray (3,), line l of view 2
+
+    Returns
+    -------
+    ndarray (3, 3), H of rank 2; rank 1 if the line contains e2
     """
     return np.asarray(cross_matrix(line2) @ F)
 
 
 def compatibility_residual(H: F64, F: F64) -> float:
-    """|H'F + F'H| / (|H| |F|): 0 where H is the homography of some plane for the pair (HZ 13.3).
+    """Return |H'F + F'H| / (|H| |F|), 0 if H is the homography of a plane for the pair (HZ 13.3).
 
-    x' = H x lies on F x for every x exactly where H'F is antisymmetric.
+    x2 = H x1 lies on F x1 for every x1 exactly if H'F is antisymmetric.
+
+    Parameters
+    ----------
+    H : ndarray (3, 3), homography
+    F : ndarray (3, 3), fundamental matrix
+
+    Returns
+    -------
+    float, residual >= 0
     """
     S = H.T @ F
     return float(np.linalg.norm(S + S.T) / (np.linalg.norm(H) * np.linalg.norm(F)))
 
 
-def second_camera(H: F64, e2: F64, *, plane: F64 | None = None) -> F64:
-    """P2 = [H + e2 pi', e2] (3.40) beside P1 = [I 0]; H (3, 3), e2 (3,), pi (3,) = ``plane`` -> (3, 4).
+def camera_from_homography(H: F64, e2: F64, *, plane: F64 | None = None) -> F64:
+    """Return P2 = [H + e2 pi', e2] (3.40) beside P1 = [I 0].
 
-    H is the homography of the plane (pi, 1) of the frame, that of W = 0 where ``plane`` is None (3.37). H and
-    e2 must have their true ratio of scales, up to one common factor of e2 that the frame absorbs.
+    H and e2 must have their true ratio of scales, up to one common factor of e2 that the frame absorbs.
+
+    Parameters
+    ----------
+    H : ndarray (3, 3), homography of the plane (pi, 1) of the frame
+    e2 : ndarray (3,), epipole in view 2
+    plane : ndarray (3,), optional, pi; by default the plane is W = 0 (3.37)
+
+    Returns
+    -------
+    ndarray (3, 4), second camera
     """
     M = H if plane is None else H + np.outer(e2, plane)
     return np.hstack([M, e2[:, None]])
 
 
 def plane_of_homography(H: F64, P2: F64) -> tuple[F64, float]:
-    """Plane (4,), unit norm, of the homography H (3, 3) between P1 = [I 0] and P2 (3, 4), and its residual.
+    """Return the plane of a homography between P1 = [I 0] and P2.
 
-    Least squares of s H = M - m pi' over s and pi (3.38); the residual |s H - M + m pi'| / |M| is 0 for
-    a true homography. Raises ``ValueError`` where the cameras share their centre (m = 0).
+    Least squares of s H = M - m pi' over s and pi (3.38).
+
+    Parameters
+    ----------
+    H : ndarray (3, 3), homography
+    P2 : ndarray (3, 4), second camera [M m]
+
+    Returns
+    -------
+    plane : ndarray (4,), plane of unit norm
+    residual : float, |s H - M + m pi'| / |M|, 0 for a true homography
+
+    Raises
+    ------
+    ValueError
+        The cameras share their centre (m = 0).
+
+    Examples
+    --------
+    >>> P2 = np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])
+    >>> plane, residual = plane_of_homography(np.array([[1.0, 0, -0.5], [0, 1.0, 0], [0, 0, 1.0]]), P2)
+    >>> np.allclose(plane / plane[2], [0.0, 0.0, 1.0, -2.0])
+    True
     """
     M, m = P2[:, :3], P2[:, 3]
     squared = float(m @ m)

@@ -1,16 +1,16 @@
-"""The best pair of epipolar lines for a match: the polynomial of degree 6 of section 6.3.3, compiled.
+"""Section 6.3.3: the polynomial method, optimal triangulation from two views.
 
-All epipolar planes are q0 A + q1 B; their lines in the two images are ``L1 q`` and ``L2 q``, L (3, 2). The
-distance of x = (x, y, 1) from a line is the root of n^2 / (q'Bq) with n = (x'L) q linear in q and B =
-L[:2]'L[:2] of the pair alone, so that a point enters by four numbers. Hartley and Sturm (CVIU 68(2), 1997)
-turn and shift both images instead; here the line through the point and its B-orthogonal companion take that
-part, which needs no epipole in a finite place. Forms B are stored as (B00, B01, B11).
+The pair of points nearest to the measured one that satisfies the epipolar constraint is the best of at most
+six stationary points of a one-parameter cost, the roots of a polynomial of degree 6. Their rays intersect
+exactly. The parameter is the epipolar plane.
 
-Section 6.3.3: the polynomial method, the optimal triangulation from two views.
+All epipolar planes are q0 A + q1 B; their lines in the two images are L1 q and L2 q, L (3, 2). The distance
+of x = (x, y, 1) from a line is the root of n^2 / (q'Bq) with n = (x'L) q linear in q and B = L[:2]'L[:2] of
+the pair alone, so that a point enters by four numbers. Hartley and Sturm rotate and shift both images
+instead; here the line through the point and its B-orthogonal companion take that role, which needs no finite
+epipole. Forms B are stored as (B00, B01, B11).
 
-Hartley and Sturm, "Triangulation", CVIU 68(2), 1997: the pair of points nearest to the measured one that
-satisfies the epipolar constraint is the best of at most six stationary points of a one-parameter cost, the
-roots of a polynomial of degree 6. Their rays meet exactly. The parameter is the epipolar plane.
+References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, unit_of
+from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix, require_finite
 
 Two = tuple[float, float]
 Four = tuple[float, float, float, float]
 
 DEGREE = 6
 MONOTONE = 3.0
-"""Where the linear coefficient outweighs the derivative of the others so often, Newton's steps contract."""
+"""If the linear coefficient exceeds the derivative of the others by this factor, Newton's steps contract."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def horner(c: F64, x: float) -> tuple[float, float]:
-    """Value and derivative of the polynomial c (7,), lowest power first."""
+def _horner(c: F64, x: float) -> tuple[float, float]:
+    """Return value and derivative of the polynomial c (7,), lowest power first."""
     value, slope = c[DEGREE], 0.0
     for k in range(DEGREE - 1, -1, -1):
         slope = slope * x + value
@@ -44,12 +44,11 @@ def horner(c: F64, x: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def root_between(c: F64, low: float, high: float, rising: bool) -> float:
-    """The root of c (7,) in [low, high] where it changes its sign: Newton, halving where that leaves the
-    bracket."""
+def _root_between(c: F64, low: float, high: float, rising: bool) -> float:
+    """Return the root of c (7,) in [low, high] by Newton's method, or bisection outside the bracket."""
     x = 0.5 * (low + high)
     for _ in range(100):
-        value, slope = horner(c, x)
+        value, slope = _horner(c, x)
         if value == 0.0:
             break
         if (value > 0.0) == rising:
@@ -68,9 +67,18 @@ def root_between(c: F64, low: float, high: float, rising: bool) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def roots_in_unit_interval(c: F64, roots: F64) -> int:
-    """Fill in the real roots in [-1, 1] at which the polynomial c (7,) changes sign; -> how many.
+    """Find the real roots in [-1, 1] at which a polynomial changes sign.
 
-    The roots of each derivative cut the interval into pieces on which the next lower one is monotone.
+    The roots of each derivative divide the interval into pieces on which the next lower one is monotone.
+
+    Parameters
+    ----------
+    c : ndarray (7,), coefficients, lowest power first
+    roots : ndarray (8,), output
+
+    Returns
+    -------
+    int, number of roots
     """
     d = np.empty(DEGREE + 1)
     cuts = np.empty(DEGREE + 2)
@@ -87,11 +95,11 @@ def roots_in_unit_interval(c: F64, roots: F64) -> int:
             cuts[k + 1] = roots[k]
         cuts[found + 1] = 1.0
         pieces, found = found + 1, 0
-        left, _ = horner(d, -1.0)
+        left, _ = _horner(d, -1.0)
         for k in range(pieces):
-            right, _ = horner(d, cuts[k + 1])
+            right, _ = _horner(d, cuts[k + 1])
             if (left < 0.0 < right) or (right < 0.0 < left):
-                roots[found] = root_between(d, cuts[k], cuts[k + 1], left < 0.0)
+                roots[found] = _root_between(d, cuts[k], cuts[k + 1], left < 0.0)
                 found += 1
             elif right == 0.0 and k + 1 < pieces:
                 roots[found] = cuts[k + 1]
@@ -101,14 +109,14 @@ def roots_in_unit_interval(c: F64, roots: F64) -> int:
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def form(B: F64, p0: float, p1: float, q0: float, q1: float) -> float:
-    """p'Bq."""
+def _form(B: F64, p0: float, p1: float, q0: float, q1: float) -> float:
+    """Return p'Bq."""
     value: float = p0 * (B[0] * q0 + B[1] * q1) + p1 * (B[1] * q0 + B[2] * q1)
     return value
 
 
-class PencilCost(NamedTuple):
-    """The cost G x^2 / (1 + kappa x^2) + (n0 + n1 x)^2 / (E0 + 2 E1 x + E2 x^2) of a member x of a pencil."""
+class _PencilCost(NamedTuple):
+    """Cost G x^2 / (1 + kappa x^2) + (n0 + n1 x)^2 / (E0 + 2 E1 x + E2 x^2) of a member x of a pencil."""
 
     n0: float
     n1: float
@@ -120,8 +128,8 @@ class PencilCost(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stationary_polynomial(cost: PencilCost, c: F64) -> None:
-    """Half the numerator of the derivative of the cost as a polynomial c (7,)."""
+def _stationary_polynomial(cost: _PencilCost, c: F64) -> None:
+    """Fill c (7,) with half the numerator of the derivative of the cost."""
     n0, n1, E0, E1, E2, G, kappa = cost
     m0, m1 = n1 * E0 - n0 * E1, n1 * E1 - n0 * E2
     s0, s1, s2 = n0 * m0, n0 * m1 + n1 * m0, n1 * m1
@@ -135,9 +143,8 @@ def stationary_polynomial(cost: PencilCost, c: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def least_stationary(pencil: PencilCost, c: F64, whole: bool) -> float:
-    """The x of least cost among the real roots of c in [-1, 1], or on the ``whole`` line, infinity
-    included; NaN where there is none."""
+def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
+    """Return the root of c of least cost in [-1, 1], or on the ``whole`` line with infinity; or NaN."""
     n0, n1, E0, E1, E2, G, kappa = pencil
     roots, backward = np.empty(DEGREE + 2), np.empty(DEGREE + 1)
     best, least = math.nan, math.inf
@@ -161,12 +168,12 @@ def least_stationary(pencil: PencilCost, c: F64, whole: bool) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def turn_from(own: Two, B: F64, Q: float, D: float, other: Two, E: F64, most: float, c: F64) -> Four:
-    """The best member q of the pencil, counted from the line through one image's point; -> q, and n of both.
+def _best_in_sector(own: Two, B: F64, Q: float, D: float, other: Two, E: F64, most: float, c: F64) -> Four:
+    """Return the best member q of the pencil and n of both images.
 
-    The first image has x'L = ``own``, the form B, Q = q'Bq of the line q through its point, and D = det B;
-    the second ``other`` and E. ``most`` is a bound on the cost, which keeps the search to the sector of lines
-    that pass the first point within its root.
+    q is counted from the line through one image's point. That image has x'L = ``own``, the form B, Q = q'Bq
+    of the line through its point and D = det B; the second ``other`` and E. ``most``, a bound on the cost,
+    restricts the search to the sector of lines within its root of the point.
     """
     a, b = own
     q0, q1 = b, -a
@@ -175,60 +182,57 @@ def turn_from(own: Two, B: F64, Q: float, D: float, other: Two, E: F64, most: fl
     proper = Q - most * D > 0.5 * Q
     h = math.sqrt(most / (Q - most * D)) if proper else 1.0 / math.sqrt(D)
     n1 *= h
-    E0, E1, E2 = form(E, q0, q1, q0, q1), h * form(E, q0, q1, p0, p1), h * h * form(E, p0, p1, p0, p1)
+    E0, E1, E2 = _form(E, q0, q1, q0, q1), h * _form(E, q0, q1, p0, p1), h * h * _form(E, p0, p1, p0, p1)
     G, kappa = Q * h * h, D * h * h
-    cost = PencilCost(n0, n1, E0, E1, E2, G, kappa)
-    stationary_polynomial(cost, c)
+    cost = _PencilCost(n0, n1, E0, E1, E2, G, kappa)
+    _stationary_polynomial(cost, c)
     bend = 2.0 * abs(c[2]) + 3.0 * abs(c[3]) + 4.0 * abs(c[4]) + 5.0 * abs(c[5]) + 6.0 * abs(c[6])
     if proper and c[1] > MONOTONE * bend:
         # A monotone derivative: the only stationary point of the sector is the global minimum.
         x = 0.0
         for _ in range(30):
-            value, slope = horner(c, x)
+            value, slope = _horner(c, x)
             before = x
             x = min(max(x - value / slope, -1.0), 1.0)
             if abs(x - before) <= 4e-16 * abs(x):
                 break
     else:
-        x = least_stationary(cost, c, not proper)
+        x = _least_stationary(cost, c, not proper)
     if math.isinf(x):
         return p0, p1, -Q, n1 / h
     return q0 + h * x * p0, q1 + h * x * p1, -h * x * Q, n0 + n1 * x
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64, c: F64) -> Four:
-    """q of least n1^2 / (q'B1q) + n2^2 / (q'B2q) with n = a q0 + b q1; -> q0, q1, n1, n2.
-
-    c (7,) is scratch.
-    """
+def _best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64, c: F64) -> Four:
+    """Return q0, q1, n1, n2 of least n1^2 / (q'B1q) + n2^2 / (q'B2q), n = a q0 + b q1; c (7,) is scratch."""
     cross = a2 * b1 - b2 * a1
-    Q1, Q2 = form(B1, b1, -a1, b1, -a1), form(B2, b2, -a2, b2, -a2)
+    Q1, Q2 = _form(B1, b1, -a1, b1, -a1), _form(B2, b2, -a2, b2, -a2)
     if cross == 0.0:
         # The match is exact, or a point is its epipole, through which every line goes.
         if a1 == 0.0 and b1 == 0.0:
             return (b2, -a2, 0.0, 0.0) if Q2 > 0.0 else (1.0, 0.0, 0.0, 0.0)
         return b1, -a1, 0.0, 0.0
-    through1 = cross * cross / form(B2, b1, -a1, b1, -a1)
-    through2 = cross * cross / form(B1, b2, -a2, b2, -a2)
+    through1 = cross * cross / _form(B2, b1, -a1, b1, -a1)
+    through2 = cross * cross / _form(B1, b2, -a2, b2, -a2)
     most = min(through1, through2)
     D1, D2 = max(B1[0] * B1[2] - B1[1] ** 2, 0.0), max(B2[0] * B2[2] - B2[1] ** 2, 0.0)
     # Q / D is the squared distance of a point from its epipole: the farther one gives the narrower sector.
     if Q1 * D2 > Q2 * D1 or (D1 == 0.0 and D2 == 0.0):
-        q0, q1, n1, n2 = turn_from((a1, b1), B1, Q1, D1, (a2, b2), B2, most, c)
+        q0, q1, n1, n2 = _best_in_sector((a1, b1), B1, Q1, D1, (a2, b2), B2, most, c)
     else:
-        q0, q1, n2, n1 = turn_from((a2, b2), B2, Q2, D2, (a1, b1), B1, most, c)
-    cost = n1 * n1 / form(B1, q0, q1, q0, q1) + n2 * n2 / form(B2, q0, q1, q0, q1)
+        q0, q1, n2, n1 = _best_in_sector((a2, b2), B2, Q2, D2, (a1, b1), B1, most, c)
+    cost = n1 * n1 / _form(B1, q0, q1, q0, q1) + n2 * n2 / _form(B2, q0, q1, q0, q1)
     if not cost <= most:
         return (b1, -a1, 0.0, cross) if through1 <= through2 else (b2, -a2, -cross, 0.0)
     return q0, q1, n1, n2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, pencil: F64) -> None:
-    """Move every match (N, 2), (N, 2) to its nearest exact one, in place; ``pencil`` (N, 2) tells q.
+def _correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, pencil: F64) -> None:
+    """Move every match (N, 2), (N, 2) to its nearest exact one, in place; fill ``pencil`` (N, 2) with q.
 
-    Matches with a NaN are left alone and have q = 0.
+    Matches with a NaN are skipped and have q = 0.
     """
     c = np.empty(DEGREE + 1)
     for k in range(len(xy1)):
@@ -238,7 +242,7 @@ def correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, p
             continue
         a1, b1 = L1[0, 0] * x1 + L1[1, 0] * y1 + L1[2, 0], L1[0, 1] * x1 + L1[1, 1] * y1 + L1[2, 1]
         a2, b2 = L2[0, 0] * x2 + L2[1, 0] * y2 + L2[2, 0], L2[0, 1] * x2 + L2[1, 1] * y2 + L2[2, 1]
-        q0, q1, n1, n2 = best_of_pencil(a1, b1, a2, b2, B1, B2, c)
+        q0, q1, n1, n2 = _best_of_pencil(a1, b1, a2, b2, B1, B2, c)
         size = 1.0 / math.sqrt(q0 * q0 + q1 * q1)
         q0, q1, n1, n2 = q0 * size, q1 * size, n1 * size, n2 * size
         pencil[k, 0], pencil[k, 1] = q0, q1
@@ -251,8 +255,8 @@ def correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, p
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def point_of_planes(a: F64, b: F64, c: F64, X: F64) -> float:
-    """Fill X (4,) with the common point of three planes, by minors; -> its norm over those of the planes."""
+def _intersect_planes(a: F64, b: F64, c: F64, X: F64) -> float:
+    """Fill X (4,) with the common point of three planes, by minors; return its relative norm."""
     s01, s02, s03 = b[0] * c[1] - b[1] * c[0], b[0] * c[2] - b[2] * c[0], b[0] * c[3] - b[3] * c[0]
     s12, s13, s23 = b[1] * c[2] - b[2] * c[1], b[1] * c[3] - b[3] * c[1], b[2] * c[3] - b[3] * c[2]
     X[0] = a[1] * s23 - a[2] * s13 + a[3] * s12
@@ -264,12 +268,12 @@ def point_of_planes(a: F64, b: F64, c: F64, X: F64) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def meet_in_pencil(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: F64) -> None:
-    """Fill X (M, 4), unit norm: where the rays of exact matches meet in their epipolar planes N q.
+def _intersect_rays(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: F64) -> None:
+    """Fill X (M, 4), unit norm, with the intersections of the rays of exact matches.
 
     P (2, 3, 4) cameras, L (2, 3, 2) the epipolar lines of the two images, xy (2, M, 2), ``pencil`` (M, 2) q.
-    Each ray is the epipolar plane's meet with the plane of the line across it, so nothing has to be solved. N
-    (4, 3) ends with the sum of the centres, which stands for the baseline where both points are on their
+    Each ray is the epipolar plane N q intersected with the plane of the perpendicular line, so nothing is
+    solved. N (4, 3) ends with the sum of the centres, which represents the baseline if both points are
     epipoles. ``back`` (4, 4) takes the point to the caller's frame. q = 0 gives a zero point.
     """
     P1, P2, L1, L2, xy1, xy2 = P[0], P[1], L[0], L[1], xy[0], xy[1]
@@ -287,7 +291,7 @@ def meet_in_pencil(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: F
             plane[m] = N[m, 0] * q0 + N[m, 1] * q1
             across1[m] = -v * P1[0, m] + u * P1[1, m] + w * P1[2, m]
             across2[m] = -s * P2[0, m] + r * P2[1, m] + t * P2[2, m]
-        if not point_of_planes(plane, across1, across2, Y) > 1e-14:
+        if not _intersect_planes(plane, across1, across2, Y) > 1e-14:
             for m in range(4):
                 Y[m] = N[m, 2]
         norm = 0.0
@@ -300,19 +304,19 @@ def meet_in_pencil(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: F
 
 
 _RANK = 1e-13
-"""Singular values below this share of the largest are zero."""
+"""Singular values below this fraction of the largest are zero."""
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """Pixels moved to the middle of a view's points and scaled alike in both views, so that costs compare."""
+    """Pixels centred on a view's points and scaled equally in both views, so that costs compare."""
 
     scale: float
     centre: F64
 
     @property
     def to(self) -> F64:
-        """(2, 3, 3) conditioned from pixel coordinates."""
+        """Transforms from pixels to conditioned coordinates; (2, 3, 3)."""
         T = np.zeros((2, 3, 3))
         T[:, 0, 0] = T[:, 1, 1] = self.scale
         T[:, :2, 2] = -self.scale * self.centre
@@ -337,9 +341,9 @@ def _frame(xy: F64) -> _Frame:
 
 
 def _balanced(L: F64) -> tuple[F64, F64, F64]:
-    """Lines L (2, 3, 2) of a pencil in a basis of like weight, its change (2, 2), and the forms (2, 3).
+    """Return lines L (2, 3, 2) of a pencil in a balanced basis, its change (2, 2) and the forms (2, 3).
 
-    A pencil of (nearly) parallel lines in both images keeps the line at infinity for its second member.
+    A pencil of (nearly) parallel lines in both images keeps the line at infinity as second member.
     """
     B = np.einsum("vka,vkb->vab", L[:, :2], L[:, :2])
     traces = np.maximum(np.trace(B, axis1=1, axis2=2), 1e-300)
@@ -351,26 +355,38 @@ def _balanced(L: F64) -> tuple[F64, F64, F64]:
 
 
 def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
-    """Nearest pairs with x2' F x1 = 0 to measured pairs (N, 2), (N, 2): least sum of squared distances.
+    """Move matches to the nearest pairs with x2' F x1 = 0: least sum of squared distances.
+
+    The minimum is global: every stationary point is evaluated if more than one may exist (near an epipole),
+    infinity included. A match with a point on its epipole is exact with every partner and is not moved.
 
     Parameters
     ----------
-    F : (3, 3) of rank 2, any scale. xy1, xy2 : (N, 2) px.
+    F : ndarray (3, 3), fundamental matrix of rank 2, any scale
+    xy1, xy2 : ndarray (N, 2), matches, px
 
     Returns
     -------
-    Two (N, 2) arrays, px. The minimum is global: every stationary point is looked at where more than one may
-    exist (near an epipole), infinity included. Of a match with a point on its epipole, which is exact with
-    every partner, the points stay where they are.
+    xy1, xy2 : ndarray (N, 2), corrected matches, px
 
-    Raises ``ValueError`` for a F of rank below 2, for wrong shapes and for numbers that are not finite.
+    Raises
+    ------
+    ValueError
+        F has a rank below 2, a shape is wrong, or a number is not finite.
+
+    Examples
+    --------
+    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    >>> xy1, xy2 = correct_matches(F, np.array([[10.0, 20.0]]), np.array([[5.0, 22.0]]))
+    >>> xy1.round(6).tolist(), xy2.round(6).tolist()
+    ([[10.0, 21.0]], [[5.0, 21.0]])
     """
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
     if xy1.ndim != 2 or xy1.shape[1:] != (2,) or xy1.shape != xy2.shape or np.shape(F) != (3, 3):
         shapes = f"{np.shape(F)}, {xy1.shape} and {xy2.shape}"
         raise ValueError(f"correct_matches needs F (3, 3) and two (N, 2) arrays; got {shapes}")
     require_finite("correct_matches", xy1, xy2)
-    F = unit_of(np.asarray(F, dtype=np.float64), "correct_matches")
+    F = checked_unit(np.asarray(F, dtype=np.float64), "correct_matches")
     xy = np.stack([xy1, xy2])
     frame = _frame(xy)
     back = np.linalg.inv(frame.to)
@@ -381,18 +397,18 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     lines2 = (U[:, :2] * s[:2]) @ Vt[:2] @ cross_matrix(Vt[2]) @ lines1
     L, _, B = _balanced(np.stack([lines1, lines2]))
     moved = frame.conditioned(xy)
-    correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], np.empty((len(xy1), 2)))
+    _correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], np.empty((len(xy1), 2)))
     moved = frame.pixels(moved)
     return moved[0], moved[1]
 
 
 @dataclass(frozen=True)
 class _Pencil:
-    """Two cameras in a frame of their own: ``P`` (2, 3, 4) with P1'P1 + P2'P2 = I in conditioned pixels.
+    """Two cameras in a frame with P1'P1 + P2'P2 = I in conditioned pixels: the centres are orthonormal.
 
-    The centres are then orthonormal. ``planes`` (4, 3): two that span the epipolar pencil, and the sum of
-    the centres; ``lines`` (2, 3, 2) the images of the planes, ``forms`` (2, 3), ``back`` (4, 4) to the
-    caller's frame of space.
+    ``P`` (2, 3, 4); ``planes`` (4, 3): two that span the epipolar pencil, and the sum of the centres;
+    ``lines`` (2, 3, 2) the images of the planes, ``forms`` (2, 3), ``back`` (4, 4) to the caller's frame of
+    space.
     """
 
     P: F64
@@ -424,16 +440,33 @@ def _pencil(P: F64, to: F64) -> _Pencil:
 
 
 def triangulate_polynomial(P: F64, xy: F64) -> F64:
-    """Optimal triangulation from two views (6.3.3): P (2, 3, 4), xy (2, N, 2) px; -> X (N, 4) unit norm.
+    """Triangulate optimally from two views (6.3.3).
 
-    Every match is moved to the nearest pair of points whose rays meet (:func:`correct_matches`), and X is
-    where they do: the sum of squared distances of its images from the measured points is the least there is,
-    in any frame, projective ones included. Nothing keeps X in front of the cameras.
+    Every match is moved to the nearest pair of points whose rays intersect (:func:`correct_matches`): the sum
+    of squared reprojection errors is the global minimum in any frame. Points behind a camera are possible.
 
-    NaN = not seen: such points come out as zeros. A match whose nearest exact pair has one point on an
-    epipole belongs to the centre of the other camera, where no image exists; one with both there to some
-    point of the baseline. Raises ``ValueError`` for another number of cameras, for cameras with one centre or
-    of a rank below 3, and for wrong shapes.
+    Parameters
+    ----------
+    P : ndarray (2, 3, 4), cameras
+    xy : ndarray (2, N, 2), pixels; NaN for not observed
+
+    Returns
+    -------
+    ndarray (N, 4)
+        Points of unit norm; zeros if not observed twice. A match whose nearest exact pair has one point on an
+        epipole gives the centre of the other camera; with both there, some point of the baseline.
+
+    Raises
+    ------
+    ValueError
+        The number of cameras is not two, they share a centre or have a rank below 3, or a shape is wrong.
+
+    Examples
+    --------
+    >>> P = np.stack([np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])])
+    >>> X = triangulate_polynomial(P, np.array([[[0.0, 0.01]], [[-0.5, -0.01]]]))
+    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
+    True
     """
     if P.shape != (2, 3, 4):
         raise ValueError(f"the polynomial method needs exactly two cameras; got P of shape {P.shape}")
@@ -444,6 +477,6 @@ def triangulate_polynomial(P: F64, xy: F64) -> F64:
     p, moved = _pencil(P, frame.to), frame.conditioned(xy)
     q, X = np.empty((xy.shape[1], 2)), np.empty((xy.shape[1], 4))
     L, B = p.lines, p.forms
-    correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], q)
-    meet_in_pencil(p.P, L, p.planes, p.back, moved, q, X)
+    _correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], q)
+    _intersect_rays(p.P, L, p.planes, p.back, moved, q, X)
     return X

@@ -1,10 +1,7 @@
-"""Compiled loops over pixels; every one has a NumPy twin in the tests.
+"""Smoothing, resizing and cubic interpolation of float32 images in the project's pixel frame.
 
-Pixels: smoothing and resizing of float32 images in the project's pixel frame.
-
-Resizing by s takes x to (x + 0.5) s - 0.5, so that the corners of the image area stay where they are.
-
-The weights of an interpolation, for the loops that read images between their pixels.
+Resizing by s maps x to (x + 0.5) s - 0.5, so that the corners of the image area stay fixed. The compiled
+loops have NumPy twins in the tests.
 """
 
 from __future__ import annotations
@@ -22,8 +19,8 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def convolve_separable(image: F32, taps: F32) -> F32:
-    """Convolve (H, W) with the symmetric ``taps`` (2 r + 1,) along both axes, the border repeated."""
+def _convolve_separable(image: F32, taps: F32) -> F32:
+    """Convolve (H, W) with symmetric taps (2 r + 1,) along both axes, the border repeated."""
     height, width = image.shape
     radius = taps.size // 2
     out = np.zeros_like(image)
@@ -46,8 +43,8 @@ def convolve_separable(image: F32, taps: F32) -> F32:
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def halve_image(image: F32) -> F32:
-    """(H, W) -> (H // 2, W // 2) with the taps (1, 3, 3, 1) / 8, centred between the pixels they merge."""
+def _halve_image(image: F32) -> F32:
+    """Downsample to (H // 2, W // 2) with the taps (1, 3, 3, 1) / 8, centred between the merged pixels."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     out = np.empty((height, width), np.float32)
     row = np.empty(image.shape[1], np.float32)
@@ -65,16 +62,16 @@ def halve_image(image: F32) -> F32:
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def resample_image(image: F32, width: int, height: int) -> F32:
-    """Bilinear samples of (H, W) at the pixel centres of a ``height`` x ``width`` grid over the same area."""
+def _resample_image(image: F32, width: int, height: int) -> F32:
+    """Sample (H, W) bilinearly at the pixel centres of a ``height`` x ``width`` grid over the same area."""
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
     out = np.empty((height, width), np.float32)
     left = np.empty(width, np.int64)
-    share = np.empty(width, np.float32)
+    fraction = np.empty(width, np.float32)
     for x in range(width):
         u = min(max((x + 0.5) * scale_x - 0.5, 0.0), image.shape[1] - 1.0)
         left[x] = min(int(u), max(image.shape[1] - 2, 0))
-        share[x] = np.float32(u - left[x])
+        fraction[x] = np.float32(u - left[x])
     step = 1 if image.shape[1] > 1 else 0
     for y in range(height):
         v = min(max((y + 0.5) * scale_y - 0.5, 0.0), image.shape[0] - 1.0)
@@ -83,7 +80,7 @@ def resample_image(image: F32, width: int, height: int) -> F32:
         b = np.float32(v - top)
         a = np.float32(1.0) - b
         for x in range(width):
-            u0, u1, s = left[x], left[x] + step, share[x]
+            u0, u1, s = left[x], left[x] + step, fraction[x]
             near = a * image[top, u0] + b * image[below, u0]
             far = a * image[top, u1] + b * image[below, u1]
             out[y, x] = near + s * (far - near)
@@ -91,7 +88,16 @@ def resample_image(image: F32, width: int, height: int) -> F32:
 
 
 def gaussian_taps(sigma_px: float) -> F32:
-    """Samples of a Gaussian over three sigma to each side, sum 1; (2 r + 1,)."""
+    """Return samples of a Gaussian over three sigma to each side.
+
+    Parameters
+    ----------
+    sigma_px : float, standard deviation, px
+
+    Returns
+    -------
+    ndarray (2 r + 1,) of float32, weights of sum 1
+    """
     radius = max(1, int(np.ceil(3.0 * sigma_px)))
     x = np.arange(-radius, radius + 1)
     taps = np.exp(-0.5 * (x / sigma_px) ** 2)
@@ -100,35 +106,88 @@ def gaussian_taps(sigma_px: float) -> F32:
 
 
 def smooth(image: F32, sigma_px: float) -> F32:
-    """Gaussian smoothing of (H, W), sigma in pixels, the border pixel repeated."""
-    return convolve_separable(image, gaussian_taps(sigma_px))
+    """Smooth an image with a Gaussian, the border pixels repeated.
+
+    Parameters
+    ----------
+    image : ndarray (H, W) of float32, image
+    sigma_px : float, standard deviation, px
+
+    Returns
+    -------
+    ndarray (H, W) of float32, smoothed image
+    """
+    return _convolve_separable(image, gaussian_taps(sigma_px))
 
 
 def halve(image: F32) -> F32:
-    """Half the size (rounded down), low-passed by (1, 3, 3, 1) / 8: x goes to (x + 0.5) / 2 - 0.5 exactly.
+    """Reduce an image to half its size (rounded down), low-passed by (1, 3, 3, 1) / 8.
 
-    Raises ``ValueError`` for an image narrower or lower than two pixels.
+    Parameters
+    ----------
+    image : ndarray (H, W) of float32, image
+
+    Returns
+    -------
+    ndarray (H // 2, W // 2) of float32, x is mapped to (x + 0.5) / 2 - 0.5
+
+    Raises
+    ------
+    ValueError
+        The image has fewer than 2 x 2 pixels.
+
+    Examples
+    --------
+    >>> halve(np.ones((4, 6), np.float32)).shape
+    (2, 3)
     """
     if min(image.shape) < 2:
         raise ValueError(f"halve needs at least 2 x 2 pixels; got shape {image.shape}")
-    return halve_image(image)
+    return _halve_image(image)
 
 
 def resample(image: F32, width: int, height: int) -> F32:
-    """(H, W) -> (height, width), bilinear; the caller smooths first where the image shrinks."""
+    """Resize an image by bilinear interpolation; smooth it before if it shrinks.
+
+    Parameters
+    ----------
+    image : ndarray (H, W) of float32, image
+    width, height : int, new size, px
+
+    Returns
+    -------
+    ndarray (height, width) of float32, resized image
+
+    Raises
+    ------
+    ValueError
+        The new size is below 1 x 1.
+
+    Examples
+    --------
+    >>> resample(np.array([[0.0, 4.0]], np.float32), 4, 1).tolist()
+    [[0.0, 1.0, 3.0, 4.0]]
+    """
     if width < 1 or height < 1:
         raise ValueError(f"resample needs a size of at least 1 x 1; got {width} x {height}")
-    return resample_image(image, width, height)
+    return _resample_image(image, width, height)
 
 
 @njit(cache=True, nogil=True)
-def cubic_weights(share: float, weights: NDArray[Any]) -> None:
-    """Weights of four pixels at ``share`` in [0, 1] between the second and third: Keys 1981, a = -1/2.
+def cubic_weights(fraction: float, weights: NDArray[Any]) -> None:
+    """Fill in the weights of four pixels for cubic convolution with a = -1/2.
 
+    Parameters
+    ----------
+    fraction : float, position between the second and third pixel, in [0, 1]
+    weights : ndarray (>= 4,), output; the first four entries are overwritten
+
+    References
+    ----------
     Keys, "Cubic convolution interpolation for digital image processing", IEEE Transactions on Acoustics,
-    Speech, and Signal Processing 29, 1981. ``weights`` is overwritten; it may have more places.
+    Speech, and Signal Processing 29, 1981.
     """
-    weights[0] = ((-0.5 * share + 1.0) * share - 0.5) * share
-    weights[1] = (1.5 * share - 2.5) * share * share + 1.0
-    weights[2] = ((-1.5 * share + 2.0) * share + 0.5) * share
-    weights[3] = (0.5 * share - 0.5) * share * share
+    weights[0] = ((-0.5 * fraction + 1.0) * fraction - 0.5) * fraction
+    weights[1] = (1.5 * fraction - 2.5) * fraction * fraction + 1.0
+    weights[2] = ((-1.5 * fraction + 2.0) * fraction + 0.5) * fraction
+    weights[3] = (0.5 * fraction - 0.5) * fraction * fraction

@@ -12,7 +12,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import normalizing_transform, require_finite
 
 
-def resection_rows(X: F64, xy: F64) -> F64:
+def _dlt_rows(X: F64, xy: F64) -> F64:
     """DLT rows, X (..., M, 4), xy (..., M, 2) -> (..., 2 M, 12): u p3'X - p1'X and v p3'X - p2'X."""
     zero = np.zeros_like(X)
     first = np.concatenate([-X, zero, xy[..., :1] * X], axis=-1)
@@ -21,10 +21,30 @@ def resection_rows(X: F64, xy: F64) -> F64:
 
 
 def resect_linear(X: F64, xy: F64) -> F64:
-    """Cameras P (..., 3, 4) of unit norm that minimise the algebraic residual.
+    """Estimate cameras by the direct linear transform, least algebraic residual.
 
-    X (..., M, 4) homogeneous, best with whitened unit rows; xy (..., M, 2) px, M >= 6. Coplanar points leave
-    a family: some member of it comes back, and the covariance of the refined camera tells.
+    Parameters
+    ----------
+    X : ndarray (..., M, 4), M >= 6 homogeneous points, best as whitened unit vectors
+    xy : ndarray (..., M, 2), their pixels
+
+    Returns
+    -------
+    ndarray (..., 3, 4)
+        P of unit norm. Coplanar points leave a family; some member is returned and the covariance of the
+        refined camera shows it.
+
+    Raises
+    ------
+    ValueError
+        There are fewer than 6 points, or a value is not finite.
+
+    Examples
+    --------
+    >>> X = np.array([[x, y, z, 1.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (4.0, 6.0)])
+    >>> P = resect_linear(X, X[:, :2] / X[:, 2:3])
+    >>> np.allclose(P / P[2, 2], np.eye(3, 4))
+    True
     """
     if X.shape[-2] < 6:
         raise ValueError(f"resect_linear needs at least 6 points; got {X.shape[-2]}")
@@ -32,19 +52,36 @@ def resect_linear(X: F64, xy: F64) -> F64:
     flat = xy.reshape(-1, 2)
     T = normalizing_transform(flat)
     conditioned = xy * T[0, 0] + T[:2, 2]
-    A = resection_rows(X, conditioned)
+    A = _dlt_rows(X, conditioned)
     p = np.linalg.eigh(A.swapaxes(-1, -2) @ A)[1][..., 0]
     P = np.linalg.inv(T) @ p.reshape(*p.shape[:-1], 3, 4)
     return np.asarray(P / np.linalg.norm(P, axis=(-2, -1), keepdims=True))
 
 
 def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
-    """All poses of a calibrated camera that sees three points along three rays (P3P).
+    """Return all poses of calibrated cameras that see three points along three rays (P3P).
 
-    X (B, 3, 3) space points, rays (B, 3, 3) unit directions in the camera frame. Returns R (C, 3, 3), t (C,
-    3) and the sample number (C,) each candidate belongs to; up to four a sample, possibly none. With side
-    lengths a = |X2 - X3|, b = |X1 - X3|, c = |X1 - X2| and the angles between the rays, the ratio v = s3 /
-    s1 of the distances solves Grunert's quartic. Collinear points and coinciding rays give nothing.
+    With side lengths a = |X2 - X3|, b = |X1 - X3|, c = |X1 - X2| and the angles between the rays, the ratio v
+    = s3 / s1 of the distances is a root of Grunert's quartic.
+
+    Parameters
+    ----------
+    X : ndarray (B, 3, 3), samples of three points
+    rays : ndarray (B, 3, 3), unit directions in the camera frame
+
+    Returns
+    -------
+    R : ndarray (C, 3, 3)
+        Rotations world-to-camera, up to four a sample; none for collinear points or equal rays.
+    t : ndarray (C, 3), translations
+    sample : ndarray (C,) of int, sample of each candidate
+
+    Examples
+    --------
+    >>> X = np.array([[[0.0, 0.0, 4.0], [1.0, 0.0, 5.0], [0.0, 1.0, 6.0]]])
+    >>> R, t, sample = pose_from_three_points(X, X / np.linalg.norm(X, axis=2, keepdims=True))
+    >>> bool(np.any(np.abs(t).max(axis=1) < 1e-6))
+    True
     """
     a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
     ca, cb, cc = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))

@@ -1,4 +1,4 @@
-"""Similarity alignment of point sets (Umeyama, PAMI 1991): how two metric models are compared."""
+"""Similarity transforms between point sets: how two metric models are compared."""
 
 from __future__ import annotations
 
@@ -12,19 +12,35 @@ from thesisrecon.geometry.homogeneous import require_finite
 
 @dataclass(frozen=True)
 class Similarity:
-    """y = scale R x + t."""
+    """The similarity y = scale R x + t.
+
+    Attributes
+    ----------
+    scale : float, positive factor
+    R : ndarray (3, 3), rotation
+    t : ndarray (3,), translation
+    """
 
     scale: float
     R: F64
     t: F64
 
     def apply(self, X: F64) -> F64:
-        """Move points (N, 3)."""
+        """Transform points.
+
+        Parameters
+        ----------
+        X : ndarray (N, 3), points
+
+        Returns
+        -------
+        ndarray (N, 3), transformed points
+        """
         return self.scale * X @ self.R.T + self.t
 
     @property
     def matrix(self) -> F64:
-        """The (4, 4) transform of homogeneous points."""
+        """Transform of homogeneous points; ndarray (4, 4)."""
         G = np.eye(4)
         G[:3, :3] = self.scale * self.R
         G[:3, 3] = self.t
@@ -32,10 +48,32 @@ class Similarity:
 
 
 def estimate_similarity(source: F64, target: F64) -> Similarity:
-    """Least-squares similarity that takes ``source`` (N, 3) to ``target`` (N, 3).
+    """Estimate the least-squares similarity that takes ``source`` to ``target``.
 
-    Raises ``ValueError`` for fewer than 3 points, points on a line (the rotation about it is free) and
-    coordinates that are not finite.
+    Parameters
+    ----------
+    source, target : ndarray (N, 3), N >= 3 corresponding points
+
+    Returns
+    -------
+    Similarity, transform from ``source`` to ``target``
+
+    Raises
+    ------
+    ValueError
+        There are fewer than 3 points, they are collinear (the rotation about the line is free) or not finite.
+
+    References
+    ----------
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
+    1991.
+
+    Examples
+    --------
+    >>> source = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+    >>> similarity = estimate_similarity(source, 2.0 * source + [1.0, 2.0, 3.0])
+    >>> round(similarity.scale, 9), similarity.t.round(9).tolist()
+    (2.0, [1.0, 2.0, 3.0])
     """
     if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) < 3:
         raise ValueError(

@@ -1,15 +1,12 @@
-"""Sections 3.3 and 3.4: how each entity is transformed, and the four strata with their groups of transforms.
+"""Sections 3.3 and 3.4: how entities transform, the four strata, their groups and their invariants.
 
-A transform G (4, 4) acts on points as X -> G X; a singular one is none and a ``ValueError`` where its inverse
-is needed. The matrices of 3.4.2 to 3.4.5 in the thesis' text have
-their zeros in the fourth column: they act on rows, X' -> X' G, and are the transposes of the ones here, which
-follow its table in 3.3.
+A transform G (4, 4) maps points X -> G X. The matrices of 3.4.2 to 3.4.5 in the thesis' text have their zeros
+in the fourth column: they act on rows, X' -> X' G, and are the transposes of those here, which follow the
+thesis' table in 3.3.
 
-Section 3.4: what each stratum keeps.
-
-Projective: the cross-ratio (and incidence, tangency, the sign of the Gaussian curvature, in ``conics``).
-Affine: parallelism, ratios of volumes and of lengths along a line, centroids. Metric: angles and ratios of
-all lengths. Euclidean: lengths. Points are homogeneous (..., 4); their scales never matter.
+Invariants: projective - the cross-ratio (and incidence, tangency, the sign of the Gaussian curvature, see
+``conics``); affine - parallelism, ratios of volumes and of lengths along a line, centroids; metric - angles
+and ratios of lengths; Euclidean - lengths. Points are homogeneous (..., 4) of any scale.
 """
 
 from __future__ import annotations
@@ -20,50 +17,134 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import dehomogenize, inverse_of, require_finite
+from thesisrecon.geometry.homogeneous import checked_inverse, dehomogenize, require_finite
 
 Group = Literal["projective", "affine", "metric", "euclidean"]
 
 DEGREES_OF_FREEDOM: dict[Group, int] = {"projective": 15, "affine": 12, "metric": 7, "euclidean": 6}
-"""From the largest set of transforms, with the fewest invariants, to the smallest."""
+"""Ordered from the largest group, with the fewest invariants, to the smallest."""
 
 PLANE_AT_INFINITY = np.array([0.0, 0.0, 0.0, 1.0])
-"""Its canonical position in the affine and all later strata (3.4.3)."""
+"""Canonical position in the affine and all later strata (3.4.3)."""
 
 
 def transform_points(G: F64, X: F64) -> F64:
-    """X -> G X; (4, 4), (..., 4), and image points (..., 3) under a homography (3, 3)."""
+    """Transform points: X -> G X.
+
+    Parameters
+    ----------
+    G : ndarray (4, 4) or (3, 3), transform of space, or homography
+    X : ndarray (..., 4) or (..., 3), homogeneous points of space, or of the image
+
+    Returns
+    -------
+    ndarray, transformed points, of the shape of ``X``
+
+    Examples
+    --------
+    >>> transform_points(np.diag([2.0, 2.0, 2.0, 1.0]), np.array([1.0, 2.0, 3.0, 1.0])).tolist()
+    [2.0, 4.0, 6.0, 1.0]
+    """
     return np.asarray(X @ G.T)
 
 
 def transform_cameras(G: F64, P: F64) -> F64:
-    """P -> P G^-1; (4, 4), (..., 3, 4). The images P X stay what they are."""
-    return np.asarray(P @ inverse_of(G, "transform_cameras"))
+    """Transform cameras: P -> P G^-1, which keeps the images P X.
+
+    Parameters
+    ----------
+    G : ndarray (4, 4), transform of space
+    P : ndarray (..., 3, 4), cameras
+
+    Returns
+    -------
+    ndarray (..., 3, 4), transformed cameras
+
+    Raises
+    ------
+    ValueError
+        G is singular or not finite.
+
+    Examples
+    --------
+    >>> transform_cameras(np.diag([2.0, 2.0, 2.0, 1.0]), np.eye(3, 4)).tolist()
+    [[0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.0]]
+    """
+    return np.asarray(P @ checked_inverse(G, "transform_cameras"))
 
 
 def transform_planes(G: F64, plane: F64) -> F64:
-    """Pi' -> Pi' G^-1; (4, 4), (..., 4), and image lines (..., 3) under a homography (3, 3)."""
-    return np.asarray(plane @ inverse_of(G, "transform_planes"))
+    """Transform planes or image lines: Pi' -> Pi' G^-1.
+
+    Parameters
+    ----------
+    G : ndarray (4, 4) or (3, 3), transform of space, or homography
+    plane : ndarray (..., 4) or (..., 3), planes, or image lines
+
+    Returns
+    -------
+    ndarray, transformed planes or lines, of the shape of ``plane``
+
+    Raises
+    ------
+    ValueError
+        G is singular or not finite.
+    """
+    return np.asarray(plane @ checked_inverse(G, "transform_planes"))
 
 
 def transform_conics(G: F64, C: F64) -> F64:
-    """C -> G^-T C G^-1 and Q -> G^-T Q G^-1: conics (3, 3), (..., 3, 3) and quadrics (4, 4), (..., 4, 4)."""
-    inverse = inverse_of(G, "transform_conics")
+    """Transform conics or quadrics: C -> G^-T C G^-1.
+
+    Parameters
+    ----------
+    G : ndarray (3, 3) or (4, 4), homography, or transform of space
+    C : ndarray (..., 3, 3) or (..., 4, 4), conics, or quadrics; also Pluecker matrices L* of planes
+
+    Returns
+    -------
+    ndarray, transformed conics or quadrics, of the shape of ``C``
+
+    Raises
+    ------
+    ValueError
+        G is singular or not finite.
+    """
+    inverse = checked_inverse(G, "transform_conics")
     return np.asarray(inverse.T @ C @ inverse)
 
 
 def transform_dual_conics(G: F64, C: F64) -> F64:
-    """C* -> G C* G' and Q* -> G Q* G': dual conics (3, 3), (..., 3, 3) and dual quadrics (4, 4), (..., 4, 4).
+    """Transform dual conics or quadrics: C* -> G C* G'.
 
-    Also the rule of a Pluecker matrix L of points; that of planes L* follows :func:`transform_conics`.
+    Parameters
+    ----------
+    G : ndarray (3, 3) or (4, 4), homography, or transform of space
+    C : ndarray (..., 3, 3) or (..., 4, 4), dual conics, or dual quadrics; also Pluecker matrices L of points
+
+    Returns
+    -------
+    ndarray, transformed dual conics or quadrics, of the shape of ``C``
     """
     return np.asarray(G @ C @ G.T)
 
 
 def affine_transform(A: F64, t: F64) -> F64:
-    """The (4, 4) transform X -> A X + t of 12 degrees of freedom; A (3, 3) invertible, t (3,).
+    """Return the transform X -> A X + t of 12 degrees of freedom.
 
-    With A = s R it is metric (7), with A = R Euclidean (6). Raises ``ValueError`` for a singular A.
+    Parameters
+    ----------
+    A : ndarray (3, 3), invertible matrix; s R makes the transform metric (7), R Euclidean (6)
+    t : ndarray (3,), translation
+
+    Returns
+    -------
+    ndarray (4, 4), transform
+
+    Raises
+    ------
+    ValueError
+        A is singular or not finite.
     """
     require_finite("affine_transform", A, t)
     if not np.linalg.cond(A) < 1e14:
@@ -74,7 +155,18 @@ def affine_transform(A: F64, t: F64) -> F64:
 
 
 def random_transform(group: Group, rng: np.random.Generator) -> F64:
-    """A well-conditioned (4, 4) member of a group that belongs to no smaller one."""
+    """Draw a well-conditioned transform that belongs to no smaller group.
+
+    Parameters
+    ----------
+    group : {"projective", "affine", "metric", "euclidean"}
+        Group of the transform.
+    rng : numpy.random.Generator, source of randomness
+
+    Returns
+    -------
+    ndarray (4, 4), transform
+    """
     if group == "projective":
         return np.eye(4) + _shift_of_norm(rng, (4, 4), 0.5)
     t, scale = rng.normal(size=3), float(np.exp(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 1.0)))
@@ -91,12 +183,33 @@ def _shift_of_norm(rng: np.random.Generator, shape: tuple[int, int], norm: float
 
 
 def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
-    """The smallest group that a transform (4, 4) of any scale belongs to.
+    """Return the smallest group that a transform belongs to.
 
-    Affine: the last row is a multiple of (0, 0, 0, 1), so the plane at infinity is fixed; metric: A'A is also
-    a multiple of I and det A > 0 after W is set to 1, so the absolute conic is fixed (a reflection is only
-    affine here); Euclidean: the multiple is 1. ``tolerance`` is relative. Raises ``ValueError`` for a matrix
-    that is not finite, (4, 4) and invertible.
+    Affine: the plane at infinity is fixed, the last row is a multiple of (0, 0, 0, 1). Metric: the absolute
+    conic is fixed too, A'A is a multiple of I and det A > 0 for W = 1 (a reflection is only affine here).
+    Euclidean: the multiple is 1.
+
+    Parameters
+    ----------
+    G : ndarray (4, 4), transform of any scale
+    tolerance : float, relative tolerance
+
+    Returns
+    -------
+    {"projective", "affine", "metric", "euclidean"}
+        Name of the group.
+
+    Raises
+    ------
+    ValueError
+        G is not finite, (4, 4) and invertible.
+
+    Examples
+    --------
+    >>> group_of(np.diag([2.0, 2.0, 2.0, 1.0]))
+    'metric'
+    >>> group_of(np.diag([1.0, 2.0, 2.0, 1.0]))
+    'affine'
     """
     if G.shape != (4, 4) or not np.isfinite(G).all() or not np.linalg.cond(G) < 1e14:
         raise ValueError(f"group_of needs a finite invertible (4, 4) matrix; got shape {G.shape}")
@@ -111,11 +224,30 @@ def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
 
 
 def affine_from_projective(plane: F64) -> F64:
-    """G_PA (4, 4), which takes the plane at infinity (4,) of a projective frame to (0, 0, 0, 1) (3.4.3).
+    """Return G_PA, which moves the plane at infinity of a projective frame to (0, 0, 0, 1) (3.4.3).
 
     The identity with the last row (Pi1/Pi4, Pi2/Pi4, Pi3/Pi4, 1). That row does not exist for a plane through
-    the origin; where Pi4 is below 1e-6 of the plane's norm the smallest rotation that takes the plane there
-    stands in its place. Raises ``ValueError`` for a zero plane.
+    the origin; if Pi4 is below 1e-6 of the plane's norm, the smallest rotation that moves the plane there is
+    used.
+
+    Parameters
+    ----------
+    plane : ndarray (4,), plane at infinity in the projective frame
+
+    Returns
+    -------
+    ndarray (4, 4), transform to an affine frame
+
+    Raises
+    ------
+    ValueError
+        The plane is zero or not finite.
+
+    Examples
+    --------
+    >>> plane = np.array([0.5, 0.0, 0.0, 2.0])
+    >>> transform_planes(affine_from_projective(plane), plane).tolist()
+    [0.0, 0.0, 0.0, 2.0]
     """
     norm = float(np.linalg.norm(plane))
     if plane.shape != (4,) or not np.isfinite(norm) or norm == 0.0:
@@ -131,10 +263,27 @@ def affine_from_projective(plane: F64) -> F64:
 
 
 def metric_from_affine(absolute_conic: F64) -> F64:
-    """G_AM (4, 4), which takes the absolute conic (3, 3) of an affine frame to the identity (3.4.4).
+    """Return G_AM, which moves the absolute conic of an affine frame to the identity (3.4.4).
 
     With Omega = A'A (Cholesky) the points of the plane at infinity move by A. Determined up to a similarity.
-    Raises ``ValueError`` for a conic that is not definite.
+
+    Parameters
+    ----------
+    absolute_conic : ndarray (3, 3), definite conic on the plane at infinity, of any sign
+
+    Returns
+    -------
+    ndarray (4, 4), transform to a metric frame
+
+    Raises
+    ------
+    ValueError
+        The conic is not definite.
+
+    Examples
+    --------
+    >>> metric_from_affine(np.diag([4.0, 4.0, 4.0])).round(9).tolist() == np.eye(4).tolist()
+    True
     """
     sign = 1.0 if np.trace(absolute_conic) > 0.0 else -1.0
     try:
@@ -145,10 +294,30 @@ def metric_from_affine(absolute_conic: F64) -> F64:
 
 
 def metric_from_projective(dual_quadric: F64) -> F64:
-    """G_PM (4, 4), which takes the absolute dual quadric (4, 4) to diag(1, 1, 1, 0), det G_PM > 0.
+    """Return G_PM, which moves the absolute dual quadric to diag(1, 1, 1, 0), det G_PM > 0.
 
-    Q* = V diag(s1, s2, s3, s4) V' with |s4| least, which is taken for 0; G_PM^-1 = V diag(root s1, root s2,
-    root s3, 1). Raises ``ValueError`` where the other three do not have one sign.
+    Q* = V diag(s1, s2, s3, s4) V' with |s4| least, which is set to 0; G_PM^-1 = V diag(root s1, root s2, root
+    s3, 1).
+
+    Parameters
+    ----------
+    dual_quadric : ndarray (4, 4), absolute dual quadric of a projective frame, of any sign
+
+    Returns
+    -------
+    ndarray (4, 4), transform to a metric frame
+
+    Raises
+    ------
+    ValueError
+        The three largest eigenvalues do not have one sign.
+
+    Examples
+    --------
+    >>> Q = np.diag([4.0, 4.0, 4.0, 0.0])
+    >>> G = metric_from_projective(Q)
+    >>> transform_dual_conics(G, Q).round(9).tolist() == np.diag([1.0, 1.0, 1.0, 0.0]).tolist()
+    True
     """
     s, V = np.linalg.eigh((dual_quadric + dual_quadric.T) / 2.0)
     order = np.argsort(-np.abs(s))
@@ -161,12 +330,27 @@ def metric_from_projective(dual_quadric: F64) -> F64:
 
 
 def cross_ratio(X: F64, *, tolerance: float = 1e-6) -> float:
-    """(l1 - l3)(l2 - l4) / ((l1 - l4)(l2 - l3)) of four points X_i ~ X + l_i X' of a line (3.4.2).
+    """Return (l1 - l3)(l2 - l4) / ((l1 - l4)(l2 - l3)) of four collinear points X_i ~ X + l_i X' (3.4.2).
 
-    X (4, d), d = 2, 3 or 4, with any scales; a point may be the base point X' itself, whose l is infinite,
-    since the differences are taken as determinants. inf where X1 = X4 or X2 = X3. Raises ``ValueError`` for
-    points that are not on one line to ``tolerance`` (the third singular value of the unit vectors) or of
-    which three are one point, where the ratio does not exist.
+    Parameters
+    ----------
+    X : ndarray (4, d)
+        Homogeneous points of any scale, d = 2, 3 or 4; a point may be the base point X' itself (l infinite).
+    tolerance : float, largest third singular value of the unit vectors
+
+    Returns
+    -------
+    float, cross-ratio, inf if X1 = X4 or X2 = X3
+
+    Raises
+    ------
+    ValueError
+        The points are not collinear, or three of them are equal.
+
+    Examples
+    --------
+    >>> round(cross_ratio(np.array([[0.0, 1.0], [1.0, 1.0], [2.0, 1.0], [3.0, 1.0]])), 9)
+    1.333333333
     """
     if X.ndim != 2 or X.shape[0] != 4 or not np.isfinite(X).all():
         raise ValueError(f"cross_ratio needs four finite points (4, d); got {X.shape}")
@@ -184,9 +368,17 @@ def cross_ratio(X: F64, *, tolerance: float = 1e-6) -> float:
 
 
 def parallelism_sine(plane1: F64, plane2: F64) -> F64:
-    """Sine of the angle between the normals of two planes (..., 4): 0 for parallel planes.
+    """Return the sine of the angle between the normals of two planes.
 
-    Zero is kept by affine transforms, other values by metric ones only.
+    Zero is invariant to affine transforms, other values only to metric ones.
+
+    Parameters
+    ----------
+    plane1, plane2 : ndarray (..., 4), planes
+
+    Returns
+    -------
+    ndarray (...), sines, 0 for parallel planes
     """
     a, b = plane1[..., :3], plane2[..., :3]
     size = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
@@ -194,43 +386,117 @@ def parallelism_sine(plane1: F64, plane2: F64) -> F64:
 
 
 def volume(X: F64) -> float:
-    """Signed volume of the tetrahedron of four finite points (4, 4), in cubic units of space."""
+    """Return the signed volume of a tetrahedron.
+
+    Parameters
+    ----------
+    X : ndarray (4, 4), four finite homogeneous points
+
+    Returns
+    -------
+    float, volume, cubic units of space
+    """
     corners = dehomogenize(X)
     return float(np.linalg.det(corners[1:] - corners[0])) / 6.0
 
 
 def volume_ratio(X: F64, Y: F64) -> float:
-    """Ratio of the signed volumes of two tetrahedra (4, 4): affine. inf where Y is flat."""
+    """Return the ratio of the signed volumes of two tetrahedra, an affine invariant.
+
+    Parameters
+    ----------
+    X, Y : ndarray (4, 4), four finite homogeneous points each
+
+    Returns
+    -------
+    float, ratio, inf if Y is flat
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.float64(volume(X)) / np.float64(volume(Y)))
 
 
 def centroid(X: F64) -> F64:
-    """Centroid (4,) of finite points (N, 4), with W = 1; affine transforms move it with the points."""
+    """Return the centroid of points, which affine transforms move with the points.
+
+    Parameters
+    ----------
+    X : ndarray (N, 4), finite homogeneous points
+
+    Returns
+    -------
+    ndarray (4,), centroid with W = 1
+    """
     return np.append(dehomogenize(X).mean(axis=0), 1.0)
 
 
 def segment_ratio(X: F64, Y: F64, Z: F64) -> float:
-    """l with Z = X + l (Y - X) for three finite points (4,) of a line: affine.
+    """Return l with Z = X + l (Y - X) of three collinear points, an affine invariant.
 
-    The cross-ratio of the three and the line's point at infinity. A Z off the line is taken at its foot.
+    It is the cross-ratio of the points and the line's point at infinity.
+
+    Parameters
+    ----------
+    X, Y, Z : ndarray (4,), finite homogeneous points; a Z off the line is projected onto it
+
+    Returns
+    -------
+    float, position of Z
+
+    Examples
+    --------
+    >>> X, Y, Z = np.array([[0.0, 0, 0, 1], [1.0, 0, 0, 1], [3.0, 0, 0, 1]])
+    >>> segment_ratio(X, Y, Z)
+    3.0
     """
     x, y, z = (dehomogenize(point) for point in (X, Y, Z))
     return float((z - x) @ (y - x) / ((y - x) @ (y - x)))
 
 
 def length(X: F64, Y: F64) -> F64:
-    """Distance of finite points (..., 4), in units of space: Euclidean."""
+    """Return the distance of points, a Euclidean invariant.
+
+    Parameters
+    ----------
+    X, Y : ndarray (..., 4), finite homogeneous points
+
+    Returns
+    -------
+    ndarray (...), distances, units of space
+    """
     return np.asarray(np.linalg.norm(dehomogenize(X) - dehomogenize(Y), axis=-1))
 
 
 def length_ratio(X: F64, Y: F64, Z: F64) -> F64:
-    """|XY| / |XZ| of finite points (..., 4) in any directions: metric."""
+    """Return |XY| / |XZ|, a metric invariant.
+
+    Parameters
+    ----------
+    X, Y, Z : ndarray (..., 4), finite homogeneous points
+
+    Returns
+    -------
+    ndarray (...), ratios
+    """
     return np.asarray(length(X, Y) / length(X, Z))
 
 
 def angle(apex: F64, X: F64, Y: F64) -> F64:
-    """Angle (rad) at ``apex`` between the directions to X and Y, finite points (..., 4): metric."""
+    """Return the angle at ``apex`` between the directions to X and Y, a metric invariant.
+
+    Parameters
+    ----------
+    apex, X, Y : ndarray (..., 4), finite homogeneous points
+
+    Returns
+    -------
+    ndarray (...), angles, rad
+
+    Examples
+    --------
+    >>> apex, X, Y = np.array([[0.0, 0, 0, 1], [2.0, 0, 0, 1], [0.0, 3, 0, 1]])
+    >>> float(np.degrees(angle(apex, X, Y)))
+    90.0
+    """
     a, b = (dehomogenize(point) - dehomogenize(apex) for point in (X, Y))
     sine = np.linalg.norm(np.cross(a, b), axis=-1)
     return np.asarray(np.arctan2(sine, np.sum(a * b, axis=-1)))

@@ -1,18 +1,13 @@
-"""Section 3.6.3: the trifocal tensor, all that three views of points and lines have in common.
+"""Section 3.6.3: the trifocal tensor of three views, and its linear estimation.
 
-T (3, 3, 3) is indexed T[i, j, k] = T_i^jk: i a coordinate of a point of view 1, j and k of lines of views 2
-and 3 (Hartley 1997; Hartley and Zisserman, chapter 15). For a point x of view 1 and lines l2, l3 of the
-others through its matches, sum x^i l2_j l3_k T_i^jk = 0: every relation of points and lines is this one, with
-the right points and lines put in.
+T (3, 3, 3) is indexed T[i, j, k] = T_i^jk: i is a coordinate of a point of view 1, j and k of lines of views
+2 and 3 (Hartley 1997; Hartley and Zisserman, chapter 15). A point x of view 1 and lines l2, l3 through its
+matches satisfy sum x^i l2_j l3_k T_i^jk = 0; every relation of points and lines follows from this one.
 
-Section 3.6.3: the trifocal tensor from points and lines by linear equations.
-
-Every match is brought into one form, a point x of view 1 and lines l2, l3 of the others with
-sum x^i l2_j l3_k T_i^jk = 0 (HZ table 15.1): a triplet of points gives four such equations, the two
-axis-parallel lines through x2 with those through x3; a triplet of lines two, for the two ends of its segment
-in view 1.
-The 27 entries of the solution are not those of any cameras; algorithm 15.2 of Hartley and Zisserman, here
-:meth:`TensorEquations.solve_with_epipoles`, restores the constraints.
+Linear estimation brings every match into this form (HZ table 15.1): a triplet of points gives four equations,
+the two axis-parallel lines through x2 with those through x3; a triplet of lines gives two, for the two ends
+of its segment in view 1. The 27 entries found are not those of any cameras;
+:meth:`TensorEquations.solve_with_epipoles` restores the constraints (HZ algorithm 16.2).
 """
 
 from __future__ import annotations
@@ -23,13 +18,13 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import (
+    checked_inverse,
+    checked_unit,
     cross_matrix,
     dehomogenize,
     homogenize,
-    inverse_of,
     normalizing_transform,
     require_finite,
-    unit_of,
 )
 from thesisrecon.geometry.lines_and_planes import unit_normals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
@@ -37,18 +32,47 @@ from thesisrecon.geometry.two_view import unit_norm
 
 
 def unit_tensor(T: F64) -> F64:
-    """T with norm 1 (zeros stay zeros); (3, 3, 3)."""
+    """Scale a tensor to unit norm.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor; zeros stay zeros
+
+    Returns
+    -------
+    ndarray (3, 3, 3), scaled tensor
+    """
     norm = float(np.linalg.norm(T))
     return T / norm if norm > 0.0 else T
 
 
 def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
-    """T_i^jk = (-1)^i det [P1 without row i; row j of P2; row k of P3], unit norm (HZ 17.12), i from 0.
+    """Return T_i^jk = (-1)^i det [P1 without row i; row j of P2; row k of P3] (HZ 17.12), i from 0.
 
-    For P1 = [I 0], P2 = [A a], P3 = [B b] it is A_ji b_k - a_j B_ki. Cameras (3, 4) of any frame and scales.
-    Zero where all three centres coincide. Raises ``ValueError`` for cameras that are zero or not finite.
+    For P1 = [I 0], P2 = [A a], P3 = [B b] it is A_ji b_k - a_j B_ki.
+
+    Parameters
+    ----------
+    P1, P2, P3 : ndarray (3, 4), cameras of any frame and scale
+
+    Returns
+    -------
+    ndarray (3, 3, 3), T of unit norm; zero if all three centres coincide
+
+    Raises
+    ------
+    ValueError
+        A camera is zero or not finite.
+
+    Examples
+    --------
+    >>> P1, P2, P3 = (np.hstack([np.eye(3), [[x], [0.0], [0.0]]]) for x in (0.0, 1.0, 2.0))
+    >>> T = tensor_from_cameras(P1, P2, P3)
+    >>> X = np.array([0.3, 0.4, 2.0, 1.0])
+    >>> np.allclose(point_residuals(T, P1 @ X, P2 @ X, P3 @ X), 0.0)
+    True
     """
-    P1, P2, P3 = (unit_of(P, "tensor_from_cameras") for P in (P1, P2, P3))
+    P1, P2, P3 = (checked_unit(P, "tensor_from_cameras") for P in (P1, P2, P3))
     T = np.empty((3, 3, 3))
     for i in range(3):
         rows = np.empty((3, 3, 4, 4))
@@ -58,36 +82,87 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
     return unit_tensor(T)
 
 
-def incidences(T: F64, x1: F64, l2: F64, l3: F64) -> F64:
-    """sum x^i l2_j l3_k T_i^jk of points (..., 3) of view 1 and lines (..., 3) of views 2 and 3; (...)."""
+def trifocal_incidence(T: F64, x1: F64, l2: F64, l3: F64) -> F64:
+    """Return sum x^i l2_j l3_k T_i^jk.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    x1 : ndarray (..., 3), points of view 1
+    l2, l3 : ndarray (..., 3), lines of views 2 and 3
+
+    Returns
+    -------
+    ndarray (...), values, 0 for corresponding points and lines
+    """
     return np.asarray(np.einsum("...i,...j,...k,ijk->...", x1, l2, l3, T))
 
 
 def point_residuals(T: F64, x1: F64, x2: F64, x3: F64) -> F64:
-    """[x2]x (sum x^i T_i) [x3]x (..., 3, 3): 0 for the images (..., 3) of one point (HZ 15.7).
+    """Return [x2]x (sum x^i T_i) [x3]x (HZ 15.7), nine equations of which four are independent.
 
-    Nine equations of which four are independent.
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    x1, x2, x3 : ndarray (..., 3), homogeneous points of the three views
+
+    Returns
+    -------
+    ndarray (..., 3, 3), residuals, 0 for the images of one point
     """
     middle = np.einsum("...i,ijk->...jk", x1, T)
     return np.asarray(cross_matrix(x2) @ middle @ cross_matrix(x3))
 
 
 def line_residuals(T: F64, l1: F64, l2: F64, l3: F64) -> F64:
-    """l1 x (l2'T_i l3) (..., 3): 0 for the images (..., 3) of one line of space; two are independent."""
+    """Return l1 x (l2'T_i l3), three equations of which two are independent.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    l1, l2, l3 : ndarray (..., 3), lines of the three views
+
+    Returns
+    -------
+    ndarray (..., 3), residuals, 0 for the images of one line of space
+    """
     return np.cross(l1, transfer_lines_to_first(T, l2, l3))
 
 
 def transfer_lines_to_first(T: F64, l2: F64, l3: F64) -> F64:
-    """Lines l_i = l2_j l3_k T_i^jk of view 1 (..., 3); zero for lines of one epipolar plane of views 2, 3."""
+    """Transfer lines of views 2 and 3 to view 1: l_i = l2_j l3_k T_i^jk.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    l2, l3 : ndarray (..., 3), lines of views 2 and 3
+
+    Returns
+    -------
+    ndarray (..., 3), lines; zero for lines of one epipolar plane of views 2 and 3
+    """
     return np.asarray(np.einsum("...j,...k,ijk->...i", l2, l3, T))
 
 
 def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
-    """Lines of view 3 (..., 3), unit vectors, of the lines l1, l2 (..., 3) in views 1 and 2 (figure 3.15).
+    """Transfer lines of views 1 and 2 to view 3 (figure 3.15).
 
-    The planes of both lines meet in the line that view 3 sees: l3 is the null vector of [l1]x (l2_j T_i^jk),
-    for which l1 and the line transferred back are parallel vectors. Not determined where both lines belong to
-    one epipolar plane of views 1 and 2. Raises ``ValueError`` for entries that are not finite.
+    The planes of both lines meet in the line that view 3 sees: l3 is the null vector of [l1]x (l2_j T_i^jk).
+    It is undetermined if both lines belong to one epipolar plane of views 1 and 2.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    l1, l2 : ndarray (..., 3), lines of views 1 and 2
+
+    Returns
+    -------
+    ndarray (..., 3), unit lines of view 3
+
+    Raises
+    ------
+    ValueError
+        An entry is not finite.
     """
     require_finite("transfer_lines", T, l1, l2)
     M = np.einsum("...j,ijk->...ik", l2, T)
@@ -96,17 +171,43 @@ def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
 
 
 def point_transfer_homography(T: F64, l2: F64) -> F64:
-    """H (..., 3, 3) = l2_j T_i^jk from view 1 to view 3 through the plane that view 2 sees as l2 (..., 3)."""
+    """Return H = l2_j T_i^jk from view 1 to view 3 through the plane that view 2 sees as l2.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    l2 : ndarray (..., 3), lines of view 2
+
+    Returns
+    -------
+    ndarray (..., 3, 3), homographies
+    """
     return np.asarray(np.einsum("...j,ijk->...ki", l2, T))
 
 
 def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
-    """Pixels (N, 2) in view 3 of matches (N, 2), (N, 2) of views 1 and 2 (figure 3.14).
+    """Transfer matches of views 1 and 2 to view 3 (figure 3.14).
 
-    The matches are first moved to the nearest pair that satisfies the epipolar constraint (6.3.3); then the
-    line through x2 across its epipolar line transfers x1 (HZ 15.3), so the result does not hang on the choice
-    of that line. Unlike the meet of two epipolar lines it also serves points of the plane of the three
-    centres; only points of the line through the centres of views 1 and 2 have no transfer (inf or NaN).
+    The matches are moved to the nearest pair that satisfies the epipolar constraint (6.3.3); then the line
+    through x2 perpendicular to its epipolar line transfers x1 (HZ 15.3), so that the result does not depend
+    on the choice of the line. Unlike the intersection of two epipolar lines this is valid for points of the
+    plane of the three centres.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    xy1, xy2 : ndarray (N, 2), matches of views 1 and 2, px
+
+    Returns
+    -------
+    ndarray (N, 2), pixels of view 3; inf or NaN for points of the line through the centres of views 1 and 2
+
+    Examples
+    --------
+    >>> P1, P2, P3 = (np.hstack([np.eye(3), [[x], [0.0], [0.0]]]) for x in (0.0, 1.0, 2.0))
+    >>> T = tensor_from_cameras(P1, P2, P3)
+    >>> transfer_points(T, np.array([[0.15, 0.2]]), np.array([[0.65, 0.2]])).round(6).tolist()
+    [[1.15, 0.2]]
     """
     F21, _ = fundamentals_from_tensor(T)
     xy1, xy2 = correct_matches(F21, xy1, xy2)
@@ -117,19 +218,39 @@ def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
 
 
 def transfer_by_epipolar_lines(F31: F64, F32: F64, xy1: F64, xy2: F64) -> F64:
-    """Pixels (N, 2) in view 3 where the epipolar lines of x1 and x2 meet (section 3.6.3); for comparison.
+    """Transfer matches of views 1, 2 to the intersection of their epipolar lines in view 3 (3.6.3).
 
-    F31, F32 (3, 3) take points of views 1 and 2 to lines of view 3. inf or NaN where the lines coincide,
-    which they do for every point of the plane of the three centres.
+    Parameters
+    ----------
+    F31, F32 : ndarray (3, 3), fundamental matrices from views 1 and 2 to view 3
+    xy1, xy2 : ndarray (N, 2), matches of views 1 and 2, px
+
+    Returns
+    -------
+    ndarray (N, 2)
+        Pixels of view 3; inf or NaN if the lines coincide, as for points of the plane of the three centres.
     """
     return dehomogenize(np.cross(homogenize(xy1) @ F31.T, homogenize(xy2) @ F32.T))
 
 
 def tensor_epipoles(T: F64) -> tuple[F64, F64]:
-    """Unit epipoles e2, e3 (3,) of the first camera in views 2 and 3 (HZ algorithm 15.1).
+    """Return the epipoles of the first camera in views 2 and 3 (HZ algorithm 15.1).
 
-    e2 is orthogonal to the three left null vectors u_i of the T_i (u_i'T_i = 0), e3 to the right ones.
-    Least squares where T has noise. Raises ``ValueError`` for entries that are not finite.
+    e2 is orthogonal to the left null vectors u_i of the T_i (u_i'T_i = 0), e3 to the right ones; least
+    squares for a noisy T.
+
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+
+    Returns
+    -------
+    e2, e3 : ndarray (3,), unit epipoles
+
+    Raises
+    ------
+    ValueError
+        An entry is not finite.
     """
     require_finite("tensor_epipoles", T)
     U, _, Vt = np.linalg.svd(T)
@@ -137,9 +258,23 @@ def tensor_epipoles(T: F64) -> tuple[F64, F64]:
 
 
 def fundamentals_from_tensor(T: F64) -> tuple[F64, F64]:
-    """F21 = [e2]x [T_1, T_2, T_3] e3 and F31 = [e3]x [T_1', T_2', T_3'] e2, unit norm (HZ 15.1).
+    """Return F21 = [e2]x [T_1, T_2, T_3] e3 and F31 = [e3]x [T_1', T_2', T_3'] e2 (HZ 15.1).
 
-    x2'F21 x1 = 0, x3'F31 x1 = 0. The third, of views 2 and 3, follows from the cameras.
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+
+    Returns
+    -------
+    F21, F31 : ndarray (3, 3)
+        Unit norm, x2'F21 x1 = 0 and x3'F31 x1 = 0. F32 follows from the cameras.
+
+    Examples
+    --------
+    >>> P1, P2, P3 = (np.hstack([np.eye(3), [[x], [0.0], [0.0]]]) for x in (0.0, 1.0, 2.0))
+    >>> F21, F31 = fundamentals_from_tensor(tensor_from_cameras(P1, P2, P3))
+    >>> np.abs(F21 * np.sqrt(2.0)).round(9).tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
     """
     e2, e3 = tensor_epipoles(T)
     F21 = cross_matrix(e2) @ np.einsum("ijk,k->ji", T, e3)
@@ -148,10 +283,16 @@ def fundamentals_from_tensor(T: F64) -> tuple[F64, F64]:
 
 
 def cameras_from_tensor(T: F64) -> tuple[F64, F64, F64]:
-    """P1 = [I 0], P2 = [[T_1, T_2, T_3] e3, e2], P3 = [(e3 e3' - I) [T_1', T_2', T_3'] e2, e3] (HZ 15.1).
+    """Return [I 0], [[T_1, T_2, T_3] e3, e2] and [(e3 e3' - I) [T_1', T_2', T_3'] e2, e3] (HZ 15.1).
 
-    Three cameras (3, 4) of one projective frame whose tensor is T (3, 3, 3), where T is that of cameras at
-    all; the epipoles have unit norm, which the formula of P3 needs.
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor of cameras
+
+    Returns
+    -------
+    P1, P2, P3 : ndarray (3, 4)
+        Cameras of one projective frame with tensor T; the epipoles have unit norm, which P3 needs.
     """
     e2, e3 = tensor_epipoles(T)
     A = np.einsum("ijk,k->ji", T, e3)
@@ -160,21 +301,44 @@ def cameras_from_tensor(T: F64) -> tuple[F64, F64, F64]:
 
 
 def transform_tensor(T: F64, H1: F64, H2: F64, H3: F64) -> F64:
-    """T in image coordinates x' = H x of the three views (3, 3): H1^-1 on points, H2 and H3 on T's others.
+    """Transform a tensor to image coordinates x' = H x: T'_i^jk = (H1^-1)^r_i H2^j_s H3^k_t T_r^st.
 
-    Tensor rule T'_i^jk = (H1^-1)^r_i H2^j_s H3^k_t T_r^st; unit norm. ``ValueError`` for a singular H1.
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    H1, H2, H3 : ndarray (3, 3), transforms of the three images
+
+    Returns
+    -------
+    ndarray (3, 3, 3), tensor of unit norm
+
+    Raises
+    ------
+    ValueError
+        H1 is singular.
     """
-    return unit_tensor(np.einsum("ri,js,kt,rst->ijk", inverse_of(H1, "transform_tensor"), H2, H3, T))
+    return unit_tensor(np.einsum("ri,js,kt,rst->ijk", checked_inverse(H1, "transform_tensor"), H2, H3, T))
 
 
-def reordered_tensor(T: F64, order: tuple[int, int, int]) -> F64:
-    """The tensor (3, 3, 3) of the same views in another order, 0-based, e.g. (2, 0, 1) puts view 3 first.
+def reorder_tensor(T: F64, order: tuple[int, int, int]) -> F64:
+    """Return the tensor of the same views in another order.
 
-    Swapping views 2 and 3 only swaps indices; a new first view goes through the cameras. Raises
-    ``ValueError`` for an order that is not one of 0, 1, 2.
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3), tensor
+    order : tuple of int, permutation of 0, 1, 2; (2, 0, 1) puts view 3 first
+
+    Returns
+    -------
+    ndarray (3, 3, 3), tensor
+
+    Raises
+    ------
+    ValueError
+        The order is no permutation of 0, 1, 2.
     """
     if sorted(order) != [0, 1, 2]:
-        raise ValueError(f"reordered_tensor needs an order of 0, 1, 2; got {order}")
+        raise ValueError(f"reorder_tensor needs an order of 0, 1, 2; got {order}")
     if order[0] == 0:
         return T if order[1] == 1 else np.swapaxes(T, 1, 2)
     P = cameras_from_tensor(T)
@@ -182,7 +346,7 @@ def reordered_tensor(T: F64, order: tuple[int, int, int]) -> F64:
 
 
 LARGEST_PX = 1e15
-"""Beyond, squares of squares overflow, and a double has no fraction of a pixel left."""
+"""Largest coordinate: beyond, fourth powers overflow and a double resolves no fraction of a pixel."""
 
 NEEDED_EQUATIONS = 26
 """Seven points, thirteen lines, or a mixture (HZ 16.1)."""
@@ -190,11 +354,15 @@ NEEDED_EQUATIONS = 26
 
 @dataclass(frozen=True)
 class TensorEquations:
-    """A t = 0 for the entries t of the tensor, in conditioned coordinates of each image.
+    """Linear equations A t = 0 of the tensor entries t, in conditioned image coordinates.
 
-    ``A`` (27, 27) is the triangular factor of all equations, with the same |A t|; ``noise`` (27, 27) that of
-    their derivatives by the pixels: |noise t|^2 is the mean of |A t|^2 for the true t and noise of 1 px;
-    ``transforms`` (3, 3, 3) take pixels to the conditioned coordinates.
+    Attributes
+    ----------
+    A : ndarray (27, 27), triangular factor of all equations, with the same |A t|
+    noise : ndarray (27, 27)
+        Triangular factor of their derivatives by the pixels: |noise t|^2 is the mean of |A t|^2 for the true
+        t and noise of 1 px.
+    transforms : ndarray (3, 3, 3), from pixels to conditioned coordinates
     """
 
     A: F64
@@ -202,9 +370,16 @@ class TensorEquations:
     transforms: F64
 
     def solve(self) -> F64:
-        """T (3, 3, 3), unit norm, conditioned, with least |A t|; raises ``ValueError`` where it is not one.
+        """Return the tensor of least |A t|.
 
-        Coplanar points, and lines that all meet one line, leave a family of tensors.
+        Returns
+        -------
+        ndarray (3, 3, 3), T of unit norm, in conditioned coordinates
+
+        Raises
+        ------
+        ValueError
+            The solution is not unique, as for coplanar points or lines that all meet one line.
         """
         _, s, Vt = np.linalg.svd(self.A)
         if not s[25] > 1e-10 * s[0]:
@@ -213,22 +388,38 @@ class TensorEquations:
             )
         return np.asarray(Vt[26].reshape(3, 3, 3))
 
-    def explained_px(self) -> F64:
-        """The noise that would explain each of 27 solutions of the equations, px, the best one first; (27,).
+    def noise_levels_px(self) -> F64:
+        """Return the noise that would explain each of 27 solutions of the equations, the best first.
 
-        Roots of the eigenvalues of A'A relative to those of unit noise (renormalisation: Kanatani 1996).
-        Where the matches leave a family of tensors, as those of a plane, a rotation or parallel lines, as
-        many as the family has dimensions are their noise or less, at any noise.
+        Roots of the eigenvalues of A'A relative to those of unit noise. If the matches leave a family of
+        tensors (a plane, a rotation, parallel lines), as many values as the family has dimensions are at or
+        below the noise.
+
+        Returns
+        -------
+        ndarray (27,), standard deviations, px
+
+        References
+        ----------
+        Kanatani, "Statistical Optimization for Geometric Computation" (renormalisation), 1996.
         """
         values, vectors = np.linalg.eigh(self.noise.T @ self.noise)
         whitening = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
         return np.asarray(np.linalg.svd(self.A @ whitening, compute_uv=False)[::-1])
 
     def solve_with_epipoles(self, e2: F64, e3: F64) -> F64:
-        """T (3, 3, 3), unit norm, of cameras with given epipoles (3,) and least |A t| (HZ 16.3).
+        """Return the tensor of cameras with given epipoles and least |A t| (HZ 16.3).
 
         T_i^jk = a_i^j e3^k - e2^j b_i^k is linear in the other entries of the cameras: t = E (a, b). E (27,
         18) has rank 15, and t is sought in its range.
+
+        Parameters
+        ----------
+        e2, e3 : ndarray (3,), epipoles in views 2 and 3
+
+        Returns
+        -------
+        ndarray (3, 3, 3), T of unit norm, in conditioned coordinates
         """
         eye = np.eye(3)
         left = np.einsum("ri,sj,k->ijkrs", eye, eye, e3).reshape(27, 9)
@@ -238,16 +429,36 @@ class TensorEquations:
         return np.asarray((basis @ best).reshape(3, 3, 3))
 
     def in_pixels(self, T: F64) -> F64:
-        """A conditioned tensor in pixels, unit norm."""
+        """Transform a conditioned tensor to pixels.
+
+        Parameters
+        ----------
+        T : ndarray (3, 3, 3), tensor in conditioned coordinates
+
+        Returns
+        -------
+        ndarray (3, 3, 3), tensor of unit norm in pixels
+        """
         H1, H2, H3 = np.linalg.inv(self.transforms)
         return transform_tensor(T, H1, H2, H3)
 
 
 def tensor_equations(points: F64, segments: F64) -> TensorEquations:
-    """Equations of N points (3, N, 2) px and M line segments (3, M, 2, 2) px, by their ends, in three views.
+    """Set up the linear equations of point and line matches in three views.
 
-    The ends of a line's segments need not match each other. Raises ``ValueError`` for fewer than 26
-    equations, 4 N + 2 M, and as :func:`check_triplets`.
+    Parameters
+    ----------
+    points : ndarray (3, N, 2), point matches, px
+    segments : ndarray (3, M, 2, 2), ends of line matches, px; the ends of different views need not correspond
+
+    Returns
+    -------
+    TensorEquations, 4 N + 2 M equations
+
+    Raises
+    ------
+    ValueError
+        There are fewer than 26 equations, or :func:`check_triplets` rejects the matches.
     """
     points, segments = check_triplets(points, segments)
     count = 4 * points.shape[1] + 2 * segments.shape[1]
@@ -303,10 +514,21 @@ def _line_moves(ends: F64) -> F64:
 
 
 def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
-    """Matches of three views as float64 arrays, points (3, N, 2) and segments (3, M, 2, 2) by their ends.
+    """Check matches of three views and return them as float64 arrays.
 
-    Raises ``ValueError`` for other shapes, values that are not finite or beyond 1e15, and segments of no
-    length.
+    Parameters
+    ----------
+    points : ndarray (3, N, 2), point matches, px
+    segments : ndarray (3, M, 2, 2), ends of line matches, px
+
+    Returns
+    -------
+    points, segments : ndarray, checked arrays
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, values that are not finite or exceed 1e15, or a segment of length 0.
     """
     if np.iscomplexobj(points) or np.iscomplexobj(segments):
         raise ValueError("points and segments must be real numbers; got complex ones")
@@ -319,9 +541,7 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
     if not (np.isfinite(points).all() and np.isfinite(segments).all()):
         raise ValueError("points and segments must be finite; some are NaN or infinite")
     if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > LARGEST_PX:
-        raise ValueError(
-            f"points and segments must be pixels of a photograph; some are beyond {LARGEST_PX:g}"
-        )
+        raise ValueError(f"points and segments must be pixels of an image; some exceed {LARGEST_PX:g}")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
     return points, segments
@@ -336,11 +556,23 @@ def _axis_parallel_lines(x: F64) -> F64:
 
 
 def estimate_tensor_linear(points: F64, segments: F64) -> F64:
-    """T (3, 3, 3), unit norm, in pixels, with the least algebraic error over all tensors (HZ algorithm 16.1).
+    """Estimate T with the least algebraic error over all tensors (HZ algorithm 16.1).
 
-    points (3, N, 2) px, segments (3, M, 2, 2) px, either may be empty; 4 N + 2 M >= 26. Exact on exact data;
-    with noise a start for the refinement, not a tensor of cameras. Raises as :func:`tensor_equations` and
-    :meth:`TensorEquations.solve`.
+    Exact for exact data; with noise a start for the refinement, not a tensor of cameras.
+
+    Parameters
+    ----------
+    points : ndarray (3, N, 2), point matches, px; N may be 0
+    segments : ndarray (3, M, 2, 2), ends of line matches, px; M may be 0, 4 N + 2 M >= 26
+
+    Returns
+    -------
+    ndarray (3, 3, 3), T of unit norm, in pixels
+
+    Raises
+    ------
+    ValueError
+        There are too few matches, or they do not determine T.
     """
     equations = tensor_equations(points, segments)
     return unit_tensor(equations.in_pixels(equations.solve()))

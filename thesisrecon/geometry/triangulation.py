@@ -1,21 +1,20 @@
-"""Triangulation from any number of views, compiled: linear, iterated linear, mid-point, least reprojection.
-
-Observations are sorted by point; ``start`` (N + 1,) says where each point's begin. Points with fewer than two
-observations come out as zeros, all others with unit norm (mid-points with X4 = 1).
-
-Section 6.3: space points from their images, by five methods behind one door.
+"""Section 6.3: triangulation of space points by five methods with one entry point, :func:`triangulate`.
 
 ============== ===== ================================== ==================================================
-method         views what it makes least                use
+method         views criterion                          use
 ============== ===== ================================== ==================================================
-``linear``     any   an algebraic residual              starts; fast, good enough where noise is small
-``iterated``   any   nearly the reprojection error      as linear, no longer depending on cameras' scales
-``midpoint``   any   distances of rays in space         metric frames only
-``polynomial`` two   the reprojection error, globally   the best for two views, in any frame
-``optimal``    any   the reprojection error, locally    the best for more views, in any frame
+``linear``     any   algebraic residual                 starting values; sufficient for small noise
+``iterated``   any   nearly the reprojection error      as linear, independent of the scales of cameras
+``midpoint``   any   distances to the rays in space     metric frames only
+``polynomial`` two   reprojection error, global minimum best for two views, in any frame
+``optimal``    any   reprojection error, local minimum  best for more views, in any frame
 ============== ===== ================================== ==================================================
 
-Hartley and Sturm, "Triangulation", CVIU 68(2), 1997. docs/triangulation.md compares them.
+The compiled loops take observations sorted by point; ``start`` (N + 1,) is the first observation of each
+point. Points with fewer than two observations are zeros, all others have unit norm (mid-points X4 = 1). See
+docs/triangulation.md for a comparison.
+
+References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ from numba import njit
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import require_finite
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
+from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
 PASSES = 10
-"""Of the iterated linear method; Hartley and Sturm found that those that converge have done so by then."""
+"""Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""
 
 
-class Sightings(NamedTuple):
-    """Observations sorted by point: the number of the ``view`` (K,), the pixels ``xy`` (K, 2), and the
-    ``weight`` (K,) of the two equations of each."""
+class _WeightedObservations(NamedTuple):
+    """Observations sorted by point and the weight of their two equations."""
 
     view: I64
     xy: F64
@@ -44,8 +43,8 @@ class Sightings(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def list_seen(xy: F64, start: I64, view: I64, seen: F64) -> int:
-    """The observations of xy (V, N, 2) that are not NaN, point by point; -> how many."""
+def _list_observations(xy: F64, start: I64, view: I64, seen: F64) -> int:
+    """List the observations of xy (V, N, 2) that are not NaN, point by point; return their number."""
     count = 0
     for j in range(xy.shape[1]):
         start[j] = count
@@ -60,8 +59,8 @@ def list_seen(xy: F64, start: I64, view: I64, seen: F64) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def insert_row(R: F64, row: F64) -> None:
-    """Givens rotations that take one more row (4,) into the triangle R (4, 4); R'R grows by row row'."""
+def _insert_row(R: F64, row: F64) -> None:
+    """Rotate one more row (4,) into the triangle R (4, 4) (Givens); R'R grows by row row'."""
     for c in range(4):
         if row[c] == 0.0:
             continue
@@ -75,10 +74,10 @@ def insert_row(R: F64, row: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def least_singular_vector(R: F64, x: F64) -> None:
-    """Fill x (4,) with the unit vector that makes |R x| least, R (4, 4) upper triangular.
+def _least_singular_vector(R: F64, x: F64) -> None:
+    """Fill x (4,) with the unit vector of least |R x|, R (4, 4) upper triangular.
 
-    Inverse iteration; where the two least singular values are near each other, Jacobi's rotations.
+    Inverse iteration; Jacobi rotations if the two least singular values are close.
     """
     largest = max(abs(R[0, 0]), abs(R[1, 1]), abs(R[2, 2]), abs(R[3, 3]))
     floor = max(1e-16 * largest, 1e-300)
@@ -108,7 +107,13 @@ def least_singular_vector(R: F64, x: F64) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def jacobi_least(R: F64, x: F64) -> None:
-    """As :func:`least_singular_vector` by one-sided Jacobi rotations (Hestenes): slow and sure."""
+    """Fill in the unit vector of least |R x| by one-sided Jacobi rotations (Hestenes): slow and safe.
+
+    Parameters
+    ----------
+    R : ndarray (4, 4), upper triangular matrix
+    x : ndarray (4,), output
+    """
     A, V = R.copy(), np.eye(4)
     for i in range(1, 4):
         A[i, :i] = 0.0
@@ -140,23 +145,24 @@ def jacobi_least(R: F64, x: F64) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def least_algebraic(P: F64, sightings: Sightings, first: int, last: int, R: F64, row: F64, x: F64) -> None:
-    """x (4,) of least sum of (weight (u p3'x - p1'x))^2 + (weight (v p3'x - p2'x))^2 over k = first..last; R
-    (4, 4) and row (4,) are scratch."""
-    view, xy, weight = sightings
+def _least_algebraic(
+    P: F64, obs: _WeightedObservations, first: int, last: int, R: F64, row: F64, x: F64
+) -> None:
+    """Fill x (4,) with the least sum of (w (u p3'x - p1'x))^2 + (w (v p3'x - p2'x))^2; R, row are scratch."""
+    view, xy, weight = obs
     R[:] = 0.0
     for k in range(first, last):
         p, w = P[view[k]], weight[k]
         for i in range(2):
             for c in range(4):
                 row[c] = w * (xy[k, i] * p[2, c] - p[i, c])
-            insert_row(R, row)
-    least_singular_vector(R, x)
+            _insert_row(R, row)
+    _least_singular_vector(R, x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64) -> float:
-    """Sum of squared distances of one point's images, infinite or NaN in a focal plane."""
+def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64) -> float:
+    """Return the sum of squared reprojection errors of one point, infinite or NaN in a focal plane."""
     cost = 0.0
     for k in range(first, last):
         p = P[view[k]]
@@ -168,18 +174,18 @@ def reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def triangulate_linearly(
+def _triangulate_each_linear(
     P: F64, scale: F64, start: I64, view: I64, xy: F64, passes: int, tolerance: float, X: F64
 ) -> None:
-    """Fill X (N, 4) by the linear method, a view's rows times its ``scale`` (V,).
+    """Fill X (N, 4) by the linear method, the rows of a view times its ``scale`` (V,).
 
-    ``passes`` > 0: then anew with each row over the depth p3'X of the pass before, until no depth changes by
-    more than ``tolerance`` of itself. Where they do not come to rest, the last and the linear answer are
-    compared by reprojection.
+    ``passes`` > 0: repeat with each row over the depth p3'X of the last pass until no depth changes by more
+    than ``tolerance``, relative. Without convergence the better reprojection of the last and the linear
+    answer is kept.
     """
     R, row, x, y = np.zeros((4, 4)), np.empty(4), np.empty(4), np.empty(4)
     weight = np.empty(len(xy))
-    sightings = Sightings(view, xy, weight)
+    obs = _WeightedObservations(view, xy, weight)
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
         X[j] = 0.0
@@ -187,7 +193,7 @@ def triangulate_linearly(
             continue
         for k in range(first, last):
             weight[k] = scale[view[k]]
-        least_algebraic(P, sightings, first, last, R, row, x)
+        _least_algebraic(P, obs, first, last, R, row, x)
         X[j] = x
         y[:] = x
         rest = False
@@ -201,21 +207,22 @@ def triangulate_linearly(
             rest = n > 0 and change < tolerance
             if rest or not math.isfinite(weight[first:last].sum()):
                 break
-            least_algebraic(P, sightings, first, last, R, row, y)
+            _least_algebraic(P, obs, first, last, R, row, y)
         if passes > 0 and (
             rest
-            or reprojection_cost(P, y, first, last, view, xy) < reprojection_cost(P, x, first, last, view, xy)
+            or _reprojection_cost(P, y, first, last, view, xy)
+            < _reprojection_cost(P, x, first, last, view, xy)
         ):
             X[j] = y
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def triangulate_midpoints(
+def _triangulate_each_midpoint(
     inverses: F64, centres: F64, start: I64, view: I64, xy: F64, least_det: float, X: F64
 ) -> None:
     """Fill X (N, 4) with the points nearest to all rays; ``inverses`` (V, 3, 3) of M, ``centres`` (V, 3).
 
-    Zeros where the determinant of the sum of I - d d' is not above ``least_det``: parallel rays.
+    Zeros for parallel rays, a determinant of the sum of I - d d' below ``least_det``.
     """
     A, b, d, r = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for j in range(len(start) - 1):
@@ -254,113 +261,40 @@ def triangulate_midpoints(
         X[j, 3] = 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def reprojection_normal(P: F64, x: F64, first: int, last: int, view: I64, xy: F64, H: F64, g: F64) -> None:
-    """Fill H (4, 4) = J'J, lower part, and g (4,) = J'r of one point; both have no part along x."""
-    H[:] = 0.0
-    g[:] = 0.0
-    J = np.empty((2, 4))
-    for k in range(first, last):
-        p = P[view[k]]
-        w = 1.0 / (p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3])
-        u = w * (p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3])
-        v = w * (p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3])
-        du, dv = u - xy[k, 0], v - xy[k, 1]
-        for c in range(4):
-            J[0, c], J[1, c] = w * (p[0, c] - u * p[2, c]), w * (p[1, c] - v * p[2, c])
-            g[c] += J[0, c] * du + J[1, c] * dv
-        for c in range(4):
-            for m in range(c + 1):
-                H[c, m] += J[0, c] * J[0, m] + J[1, c] * J[1, m]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve_damped(H: F64, x: F64, damping: float, g: F64, L: F64, step: F64) -> bool:
-    """Fill step (4,) = -(H + damping diag(H) + t x x')^-1 g by Cholesky; False where it is not positive.
-
-    x, a unit vector, spans the kernel of H; t, the trace of H, gives it the size of the rest.
-    """
-    trace = H[0, 0] + H[1, 1] + H[2, 2] + H[3, 3]
-    for c in range(4):
-        for m in range(c + 1):
-            value = H[c, m] + trace * x[c] * x[m]
-            if m == c:
-                value += damping * H[c, c]
-            for n in range(m):
-                value -= L[c, n] * L[m, n]
-            if m < c:
-                L[c, m] = value / L[m, m]
-            elif value > 0.0:
-                L[c, c] = math.sqrt(value)
-            else:
-                return False
-    for c in range(4):
-        value = -g[c]
-        for n in range(c):
-            value -= L[c, n] * step[n]
-        step[c] = value / L[c, c]
-    for c in range(3, -1, -1):
-        value = step[c]
-        for n in range(c + 1, 4):
-            value -= L[n, c] * step[n]
-        step[c] = value / L[c, c]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def reduce_reprojection(P: F64, start: I64, view: I64, xy: F64, iterations: int, X: F64) -> None:
-    """Levenberg-Marquardt on every unit point of X (N, 4), in place, until no step lowers its cost."""
-    H, L, g = np.empty((4, 4)), np.zeros((4, 4)), np.empty(4)
-    step, moved = np.empty(4), np.empty(4)
-    for j in range(len(start) - 1):
-        first, last = start[j], start[j + 1]
-        x = X[j]
-        if last - first < 2 or (x[0] == 0.0 and x[1] == 0.0 and x[2] == 0.0 and x[3] == 0.0):
-            continue
-        cost = reprojection_cost(P, x, first, last, view, xy)
-        damping, still, fresh = 1e-4, 0, True
-        for _ in range(iterations):
-            if fresh:
-                reprojection_normal(P, x, first, last, view, xy, H, g)
-            if solve_damped(H, x, damping, g, L, step):
-                for c in range(4):
-                    moved[c] = x[c] + step[c]
-                size = 1.0 / math.sqrt(moved @ moved)
-                for c in range(4):
-                    moved[c] *= size
-                candidate = reprojection_cost(P, moved, first, last, view, xy)
-            else:
-                candidate = math.inf
-            fresh = candidate < cost
-            if fresh:
-                # Twice without a gain above rounding: the first may have been a lucky step.
-                still = still + 1 if cost - candidate <= 1e-14 * cost else 0
-                cost = candidate
-                x[:] = moved
-                damping = max(0.1 * damping, 1e-12)
-            else:
-                damping *= 10.0
-            if still == 2 or damping > 1e12 or cost == 0.0:
-                break
-
-
 Method = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
-Listed = tuple[I64, I64, F64]
-"""Observations sorted by point: where each point's begin (N + 1,), their views (K,) and pixels (K, 2)."""
+_SortedPixels = tuple[I64, I64, F64]
+"""Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
 
 _AT_REST = 1e-6
-"""Relative change of all depths at which the iterated linear method has come to rest."""
+"""Relative change of all depths at which the iterated linear method has converged."""
 _PARALLEL = 1e-14
 """Determinant of the mid-point system below which rays are parallel: about 2 sin^2 of the angle of two."""
-_ITERATIONS = 200
-"""Most steps of the n-view method; the median point takes three or four."""
 
 
 def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:
-    """Linear triangulation of all points of an observation list; -> (n_points, 4) with unit norm.
+    """Triangulate a list of observations by the linear method.
 
-    P (V, 3, 4); view, point (K,), xy (K, 2) px, in any order, fastest where sorted by point. The criterion is
-    that of :func:`triangulate_linear`. Points with fewer than two observations come out as zeros.
+    The criterion is that of :func:`triangulate_linear`.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    view, point : ndarray (K,) of int
+        View and point of each observation, in any order; sorted by point is fastest.
+    xy : ndarray (K, 2), pixels
+    n_points : int, number of points
+
+    Returns
+    -------
+    ndarray (n_points, 4), points of unit norm; zeros for fewer than two observations
+
+    Examples
+    --------
+    >>> P = np.stack([np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])])
+    >>> xy = np.array([[0.0, 0.0], [-0.5, 0.0]])
+    >>> X = triangulate_observations(P, np.array([0, 1]), np.array([0, 0]), xy, 1)
+    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
+    True
     """
     if not (point[1:] >= point[:-1]).all():
         order = np.argsort(point, kind="stable")
@@ -371,38 +305,75 @@ def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: i
 
 
 def triangulate_linear(P: F64, xy: F64) -> F64:
-    """Linear triangulation (6.3.1), P (V, 3, 4), xy (V, N, 2) px, NaN = not seen; -> X (N, 4) unit norm.
+    """Triangulate by the linear method (6.3.1).
 
     Least sum of squares of u p3'X - p1'X and v p3'X - p2'X over unit X. Of Hartley's normalisation the shift
-    changes nothing here, for these rows do not see it, and the scale is the weight of a view: each view's
-    rows are divided by the norm of M's first two, the pixels' origin in the middle of its points. In a metric
-    frame that is the focal length, so that rows are depths times angles. The answer changes with the
-    projective frame. Points seen in fewer than two views come out as zeros. Raises ``ValueError`` as
-    :func:`triangulate` does.
+    has no effect on these rows; its scale is the weight of a view: the rows are divided by the norm of M's
+    first two, with the pixel origin in the middle of the view's points. In a metric frame that is the focal
+    length, so that rows are depths times angles. The result depends on the projective frame.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    xy : ndarray (V, N, 2), pixels; NaN for not observed
+
+    Returns
+    -------
+    ndarray (N, 4), points of unit norm; zeros if observed in fewer than two views
+
+    Raises
+    ------
+    ValueError
+        As :func:`triangulate`.
     """
     P, xy = _checked(P, xy)
     return _linear(P, _listed(xy), 0)
 
 
 def triangulate_iterated(P: F64, xy: F64) -> F64:
-    """Iterated linear triangulation (Hartley and Sturm's Iterative-LS); arguments as in
-    :func:`triangulate_linear`.
+    """Triangulate by the iterated linear method (Iterative-LS of Hartley and Sturm).
 
-    The rows are divided by the depth p3'X of the pass before, which makes them the reprojection residuals at
-    rest, and solved again, ten times at most; where the depths do not come to rest, the last or the linear
-    answer stands, whichever reprojects better. The limit is near the least reprojection error, not at it: the
-    depths count as constants.
+    The rows are divided by the depth p3'X of the last pass, which makes them reprojection residuals at
+    convergence, and solved again, at most ten times; without convergence the better of the last and the
+    linear answer is kept. The limit is near the least reprojection error, not at it, because depths count as
+    constants.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    xy : ndarray (V, N, 2), pixels; NaN for not observed
+
+    Returns
+    -------
+    ndarray (N, 4), points of unit norm; zeros if observed in fewer than two views
+
+    Raises
+    ------
+    ValueError
+        As :func:`triangulate`.
     """
     P, xy = _checked(P, xy)
     return _linear(P, _listed(xy), PASSES)
 
 
 def triangulate_midpoint(P: F64, xy: F64) -> F64:
-    """Point nearest to all rays (6.3.2); P (V, 3, 4), xy (V, N, 2) px, NaN = not seen; -> X (N, 4), X4 = 1.
+    """Triangulate by the point nearest to all rays (6.3.2).
 
-    Sum of squared distances in space. Meaningful in a metric frame only: distances do not exist in a
-    projective one, and the answer changes with it, for the worse. Parallel rays and points seen once come out
-    as zeros. Raises ``ValueError`` for a camera whose centre is at infinity, which has no rays in this sense.
+    Least sum of squared distances in space: meaningful in a metric frame only.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    xy : ndarray (V, N, 2), pixels; NaN for not observed
+
+    Returns
+    -------
+    ndarray (N, 4), points with X4 = 1; zeros for parallel rays and for fewer than two views
+
+    Raises
+    ------
+    ValueError
+        As :func:`triangulate`, and if the centre of a camera is at infinity.
     """
     P, xy = _checked(P, xy)
     M = P[:, :, :3]
@@ -411,58 +382,75 @@ def triangulate_midpoint(P: F64, xy: F64) -> F64:
     inverses = np.linalg.inv(M)
     centres = np.ascontiguousarray(-np.einsum("vab,vb->va", inverses, P[:, :, 3]))
     X = np.empty((xy.shape[1], 4))
-    triangulate_midpoints(np.ascontiguousarray(inverses), centres, *_listed(xy), _PARALLEL, X)
+    _triangulate_each_midpoint(np.ascontiguousarray(inverses), centres, *_listed(xy), _PARALLEL, X)
     return X
 
 
 def triangulate_optimal(P: F64, xy: F64) -> F64:
-    """Least reprojection error from any number of views; P (V, 3, 4), xy (V, N, 2) px, NaN = not seen; -> X
-    (N, 4) unit norm.
+    """Triangulate by least reprojection error from any number of views.
 
-    Levenberg-Marquardt from the linear answer until no step lowers the sum of squared distances any more, in
-    a frame in which the cameras' rows are orthonormal; the same point in every projective frame. The minimum
-    is a local one: with two views beside an epipole :func:`triangulate_polynomial` may know a lower. No
-    robust loss: wrong observations count in full. Points seen in fewer than two views come out as zeros.
+    Levenberg-Marquardt from the linear result to the minimum of the sum of squared distances: the same point
+    in every projective frame. The minimum is a local one; near an epipole :func:`triangulate_polynomial` may
+    find a lower one for two views. There is no robust loss: wrong observations count in full.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    xy : ndarray (V, N, 2), pixels; NaN for not observed
+
+    Returns
+    -------
+    ndarray (N, 4), points of unit norm; zeros if observed in fewer than two views
+
+    Raises
+    ------
+    ValueError
+        As :func:`triangulate`.
+
+    Examples
+    --------
+    >>> P = np.stack([np.hstack([np.eye(3), [[-x], [0.0], [0.0]]]) for x in (0.0, 1.0, 2.0)])
+    >>> X = triangulate_optimal(P, np.array([[[0.0, 0.0]], [[-0.5, 0.0]], [[-1.0, 0.0]]]))
+    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
+    True
     """
     P, xy = _checked(P, xy)
-    listed = start, view, seen = _listed(xy)
-    X = _linear(P, listed, 0)
-    if len(view) == 0:
-        return X
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    centre, scale = 0.5 * (low + high), 2.0 / max(float((high - low).max()), 1e-12)
-    moved = np.concatenate([scale * (P[:, :2] - centre[:, None] * P[:, 2:]), P[:, 2:]], axis=1)
-    moved /= np.linalg.norm(moved, axis=(1, 2), keepdims=True)
-    Q, R = np.linalg.qr(moved.reshape(-1, 4))
-    if not np.abs(np.diag(R)).min() > 1e-13 * np.abs(R).max():
-        Q, R = moved.reshape(-1, 4), np.eye(4)
-    Y = np.ascontiguousarray(X @ R.T)
-    sizes = np.linalg.norm(Y, axis=1, keepdims=True)
-    Y /= np.where(sizes > 0.0, sizes, 1.0)
-    cameras = np.ascontiguousarray(Q).reshape(-1, 3, 4)
-    reduce_reprojection(cameras, start, view, scale * (seen - centre), _ITERATIONS, Y)
-    X = np.linalg.solve(R, Y.T).T
+    start, view, pixels = listed = _listed(xy)
+    point = np.repeat(np.arange(xy.shape[1]), np.diff(start))
+    X = minimize_reprojection(P, _linear(P, listed, 0), view, point, pixels)
     sizes = np.linalg.norm(X, axis=1, keepdims=True)
     return np.asarray(X / np.where(sizes > 0.0, sizes, 1.0))
 
 
 def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
-    """Space points from their images by one of the methods of section 6.3.
+    """Triangulate space points by one of the methods of section 6.3.
 
     Parameters
     ----------
-    P : (V, 3, 4) cameras of any scale, V >= 2.
-    xy : (V, N, 2) px, NaN = not seen.
-    method : "polynomial" (optimal, exactly two views), "linear", "midpoint" (metric frames only), "iterated"
-        (linear) or "optimal" (least reprojection error from any number of views).
+    P : ndarray (V, 3, 4), cameras of any scale, V >= 2
+    xy : ndarray (V, N, 2), pixels; NaN for not observed
+    method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}
+        "polynomial": optimal for exactly two views; "linear" and "iterated": algebraic; "midpoint": metric
+        frames only; "optimal": least reprojection error from any number of views.
 
     Returns
     -------
-    X (N, 4) homogeneous, in the frame of the cameras; zeros where a point is seen in fewer than two views or
-    its rays do not fix it.
+    ndarray (N, 4)
+        Homogeneous points in the frame of the cameras; zeros if a point is observed in fewer than two views
+        or its rays do not determine it.
 
-    Raises ``ValueError`` for an unknown method, wrong shapes, infinite pixels, and cameras that are zero, not
-    finite, fewer than two or not for the method.
+    Raises
+    ------
+    ValueError
+        Unknown method, wrong shapes, infinite pixels, or cameras that are zero, not finite, fewer than two or
+        unsuitable for the method.
+
+    Examples
+    --------
+    >>> P = np.stack([np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])])
+    >>> X = triangulate(P, np.array([[[0.0, 0.0]], [[-0.5, 0.0]]]))
+    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
+    True
     """
     methods = {
         "polynomial": triangulate_polynomial,
@@ -477,9 +465,25 @@ def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
 
 
 def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: int) -> F64:
-    """Largest angle (rad) between a point's rays, against the ray of its first observation; -> (n_points,).
+    """Return the largest angle between a point's rays and the ray of its first observation.
 
-    centres (V, 3), X (n_points, 3); a point without observations gets 0.
+    Parameters
+    ----------
+    centres : ndarray (V, 3), camera centres
+    view, point : ndarray (K,) of int, view and point of each observation
+    X : ndarray (n_points, 3), points
+    n_points : int, number of points
+
+    Returns
+    -------
+    ndarray (n_points,), angles, rad; 0 without observations
+
+    Examples
+    --------
+    >>> centres, X = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]])
+    >>> angles = triangulation_angles(centres, np.array([0, 1]), np.array([0, 0]), X, 1)
+    >>> np.degrees(angles).round(6).tolist()
+    [45.0]
     """
     rays = X[point] - centres[view]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
@@ -492,7 +496,7 @@ def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: 
 
 
 def _checked(P: F64, xy: F64) -> tuple[F64, F64]:
-    """Cameras and pixels as contiguous float64 arrays, or ``ValueError``."""
+    """Check cameras and pixels and return them as contiguous float64 arrays."""
     if np.iscomplexobj(P) or np.iscomplexobj(xy):
         raise ValueError("triangulate needs real numbers; got complex ones")
     P, xy = np.ascontiguousarray(P, dtype=np.float64), np.ascontiguousarray(xy, dtype=np.float64)
@@ -508,16 +512,16 @@ def _checked(P: F64, xy: F64) -> tuple[F64, F64]:
     return P, xy
 
 
-def _listed(xy: F64) -> Listed:
+def _listed(xy: F64) -> _SortedPixels:
     views, points = xy.shape[:2]
     start, view = np.empty(points + 1, dtype=np.int64), np.empty(views * points, dtype=np.int64)
     seen = np.empty((views * points, 2))
-    count = list_seen(xy, start, view, seen)
+    count = _list_observations(xy, start, view, seen)
     return start, view[:count], seen[:count]
 
 
-def _linear(P: F64, listed: Listed, passes: int) -> F64:
-    """The linear answer, and with ``passes`` the iterated one."""
+def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
+    """Solve by the linear method, iterated if ``passes`` > 0."""
     start, view, xy = listed
     P = np.ascontiguousarray(P, dtype=np.float64)
     counts = np.maximum(np.bincount(view, minlength=len(P)), 1)
@@ -525,5 +529,5 @@ def _linear(P: F64, listed: Listed, passes: int) -> F64:
     # The fourth column would bring in where the origin of space lies.
     size = np.linalg.norm(P[:, :2, :3] - middle[:, :, None] * P[:, 2:, :3], axis=(1, 2))
     X = np.empty((len(start) - 1, 4))
-    triangulate_linearly(P, 1.0 / np.where(size > 0.0, size, 1.0), start, view, xy, passes, _AT_REST, X)
+    _triangulate_each_linear(P, 1.0 / np.where(size > 0.0, size, 1.0), start, view, xy, passes, _AT_REST, X)
     return X

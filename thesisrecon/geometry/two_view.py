@@ -1,8 +1,6 @@
-"""Section 3.6: what two views share: F, epipoles and lines, residuals, homographies, canonical cameras.
+"""Section 3.6: two views: F, epipoles and epipolar lines, residuals, homographies, canonical cameras.
 
 x2' F x1 = 0; the epipolar line in image 2 is F x1, in image 1 F' x2; F e1 = 0, F' e2 = 0.
-
-Whether two photographs show any depth (section 5.5: what a turning camera or a plane leaves of F).
 """
 
 from __future__ import annotations
@@ -13,17 +11,26 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import (
+    checked_unit,
     cross_matrix,
     dehomogenize,
     homogenize,
     normalizing_transform,
     require_finite,
-    unit_of,
 )
 
 
 def unit_norm(F: F64) -> F64:
-    """F with Frobenius norm 1 (zeros stay zeros); (..., 3, 3)."""
+    """Scale matrices to unit Frobenius norm.
+
+    Parameters
+    ----------
+    F : ndarray (..., 3, 3), matrices; zeros stay zeros
+
+    Returns
+    -------
+    ndarray (..., 3, 3), scaled matrices
+    """
     norm = np.sqrt(np.sum(F**2, axis=(-2, -1), keepdims=True))
     return F / np.where(norm > 0.0, norm, 1.0)
 
@@ -35,32 +42,87 @@ def _check(F: F64, caller: str) -> None:
 
 
 def enforce_rank_two(F: F64) -> F64:
-    """The nearest matrix of rank 2 (Frobenius norm), scaled to unit norm; (3, 3), else ``ValueError``."""
+    """Return the nearest matrix of rank 2 (Frobenius norm), scaled to unit norm.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), matrix
+
+    Returns
+    -------
+    ndarray (3, 3), matrix of rank 2
+
+    Raises
+    ------
+    ValueError
+        Wrong shape, or an entry that is not finite.
+
+    Examples
+    --------
+    >>> np.diag(enforce_rank_two(np.diag([4.0, 3.0, 0.1]))).round(9).tolist()
+    [0.8, 0.6, 0.0]
+    """
     _check(F, "enforce_rank_two")
     U, s, Vt = np.linalg.svd(F)
     return unit_norm((U[:, :2] * s[:2]) @ Vt[:2])
 
 
 def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
-    """F = [e2]x P2 P1^+ of two cameras (3, 4) with different centres, unit norm; e2 = P2 C1 (3.33).
+    """Return F = [e2]x P2 P1^+ of two cameras, e2 = P2 C1 (3.33).
 
     The line of x joins e2 and the image of P1^+ x, another point of its ray; F has rank 2 (3.35).
 
-    Raises ``ValueError`` where the centres coincide: the views are then related by a homography, not by an F;
-    and for cameras that are zero, not finite or of a rank below 3, which have no centre.
+    Parameters
+    ----------
+    P1, P2 : ndarray (3, 4), cameras with different centres
+
+    Returns
+    -------
+    ndarray (3, 3), F of unit norm
+
+    Raises
+    ------
+    ValueError
+        The centres coincide (the views are related by a homography), or a camera is zero, not finite or of a
+        rank below 3.
+
+    Examples
+    --------
+    >>> F = fundamental_from_cameras(np.eye(3, 4), np.hstack([np.eye(3), [[1.0], [0.0], [0.0]]]))
+    >>> np.abs(F * np.sqrt(2.0)).round(9).tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
     """
-    P1, P2 = unit_of(P1, "fundamental_from_cameras"), unit_of(P2, "fundamental_from_cameras")
-    e2 = P2 @ unit_of(camera_centre(P1), "fundamental_from_cameras, for the centre of its first camera,")
+    P1, P2 = checked_unit(P1, "fundamental_from_cameras"), checked_unit(P2, "fundamental_from_cameras")
+    e2 = P2 @ checked_unit(camera_centre(P1), "fundamental_from_cameras, for the centre of its first camera,")
     if not np.linalg.norm(e2) > 1e-12:
         raise ValueError("fundamental_from_cameras needs cameras with different centres")
     return unit_norm(cross_matrix(e2) @ P2 @ np.linalg.pinv(P1))
 
 
 def epipoles(F: F64) -> tuple[F64, F64]:
-    """Unit vectors e1, e2 (3,) with F e1 = 0 and F' e2 = 0, of the nearest matrix of rank 2 (3.34, 3.35).
+    """Return the epipoles, F e1 = 0 and F' e2 = 0, of the nearest matrix of rank 2 (3.34, 3.35).
 
-    e2 is the thesis' e_ij, the image of the first centre, e1 its e_ji (section 5.3 exchanges the two). Raises
-    ``ValueError`` for another shape and entries that are not finite.
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+
+    Returns
+    -------
+    e1 : ndarray (3,)
+        Unit epipole in image 1, the image of the second centre: the thesis' e_ji (section 5.3 exchanges the
+        two).
+    e2 : ndarray (3,), unit epipole in image 2, the thesis' e_ij
+
+    Raises
+    ------
+    ValueError
+        Wrong shape, or an entry that is not finite.
+
+    Examples
+    --------
+    >>> e1, e2 = epipoles(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
+    >>> np.abs(e1).tolist(), np.abs(e2).tolist()
+    ([1.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     """
     _check(F, "epipoles")
     U, _, Vt = np.linalg.svd(F)
@@ -68,9 +130,22 @@ def epipoles(F: F64) -> tuple[F64, F64]:
 
 
 def epipolar_lines(F: F64, xy1: F64) -> F64:
-    """Lines (N, 3) in image 2 of points (N, 2) of image 1, unit normals: l . (x, y, 1) is a distance in px.
+    """Return the epipolar lines F x1 with unit normals, so that l . (x, y, 1) is a distance in px.
 
-    For lines in image 1 of points of image 2 pass F'. The line of an epipole is zero.
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix; F' for the lines in image 1 of points of image 2
+    xy1 : ndarray (N, 2), pixels
+
+    Returns
+    -------
+    ndarray (N, 3), lines; zero for an epipole
+
+    Examples
+    --------
+    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    >>> epipolar_lines(F, np.array([[10.0, 20.0]])).tolist()
+    [[0.0, -1.0, 20.0]]
     """
     lines = homogenize(xy1) @ F.T
     norm = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
@@ -78,9 +153,22 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
 
 
 def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Distances (N, 2) in px of x1 to the epipolar line F' x2 and of x2 to F x1 (5.5).
+    """Return the distances of x1 to the line F' x2 and of x2 to F x1 (5.5).
 
-    Both are multiples of the one residual x2' F x1: small together, large together.
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+    xy1, xy2 : ndarray (N, 2), matches, px
+
+    Returns
+    -------
+    ndarray (N, 2), distances in images 1 and 2, px; both are multiples of x2' F x1
+
+    Examples
+    --------
+    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    >>> epipolar_distances(F, np.array([[10.0, 20.0]]), np.array([[5.0, 23.0]])).tolist()
+    [[3.0, 3.0]]
     """
     of_first = np.sum(homogenize(xy1) * epipolar_lines(F.T, xy2), axis=1)
     of_second = np.sum(homogenize(xy2) * epipolar_lines(F, xy1), axis=1)
@@ -88,7 +176,17 @@ def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
 
 
 def algebraic_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
-    """x2' F x1 of (5.2); (N,)."""
+    """Return the residuals x2' F x1 of (5.2).
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+    xy1, xy2 : ndarray (N, 2), matches, px
+
+    Returns
+    -------
+    ndarray (N,), residuals
+    """
     residuals: F64 = np.einsum("na,ab,nb->n", homogenize(xy2), F, homogenize(xy1))
     return residuals
 
@@ -100,25 +198,68 @@ def _gradients(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
 
 def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Signed Sampson distances in px (5.4); (N,).
+    """Return the signed Sampson distances (5.4).
 
-    To first order the distance of (x1, y1, x2, y2) to the nearest exact match; its standard deviation is that
-    of one image coordinate: the residual's own, sigma |grad r| (5.3), divides it.
+    To first order the distance of (x1, y1, x2, y2) to the nearest exact match. Its standard deviation is that
+    of one image coordinate: the residual is divided by its own, sigma |grad r| (5.3).
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+    xy1, xy2 : ndarray (N, 2), matches, px
+
+    Returns
+    -------
+    ndarray (N,), distances, px
+
+    Examples
+    --------
+    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    >>> sampson_residuals(F, np.array([[10.0, 20.0]]), np.array([[5.0, 23.0]])).round(3).tolist()
+    [-2.121]
     """
     g2, g1 = _gradients(F, xy1, xy2)
     return algebraic_residuals(F, xy1, xy2) / np.sqrt(g1 + g2)
 
 
 def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Root of the sum of the two squared distances to the epipolar lines (5.6), px; (N,) >= 0."""
+    """Return the root of the sum of the two squared distances to the epipolar lines (5.6).
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+    xy1, xy2 : ndarray (N, 2), matches, px
+
+    Returns
+    -------
+    ndarray (N,), distances >= 0, px
+    """
     g2, g1 = _gradients(F, xy1, xy2)
     return np.abs(algebraic_residuals(F, xy1, xy2)) * np.sqrt(1.0 / g1 + 1.0 / g2)
 
 
 def estimate_homography(xy1: F64, xy2: F64) -> F64:
-    """H (3, 3), unit norm, with x2 ~ H x1 of N >= 4 matches by the normalised linear transform (HZ 4.2).
+    """Estimate the homography x2 ~ H x1 by normalised DLT (HZ algorithm 4.2).
 
-    Raises ``ValueError`` for fewer than 4 matches, wrong shapes or points that are all equal.
+    Parameters
+    ----------
+    xy1, xy2 : ndarray (N, 2), N >= 4 matches, px
+
+    Returns
+    -------
+    ndarray (3, 3), H of unit norm
+
+    Raises
+    ------
+    ValueError
+        There are fewer than 4 matches, a shape is wrong, or all points are equal.
+
+    Examples
+    --------
+    >>> xy = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    >>> H = estimate_homography(xy, 2.0 * xy + 1.0)
+    >>> np.allclose(H / H[2, 2], [[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [0.0, 0.0, 1.0]])
+    True
     """
     if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2 or len(xy1) < 4:
         raise ValueError(f"estimate_homography needs two (N >= 4, 2) arrays; got {xy1.shape} and {xy2.shape}")
@@ -131,23 +272,49 @@ def estimate_homography(xy1: F64, xy2: F64) -> F64:
 
 
 def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
-    """Distances |x2 - H x1| in image 2, px; (N,), inf for points that H sends to infinity."""
+    """Return the distances |x2 - H x1| in image 2.
+
+    Parameters
+    ----------
+    H : ndarray (3, 3), homography
+    xy1, xy2 : ndarray (N, 2), matches, px
+
+    Returns
+    -------
+    ndarray (N,), distances, px; inf for points that H maps to infinity
+    """
     moved = dehomogenize(homogenize(xy1) @ H.T)
     with np.errstate(invalid="ignore"):
         distance = np.linalg.norm(xy2 - moved, axis=1)
     return np.where(np.isfinite(distance), distance, np.inf)
 
 
-def homography_distances(H: F64, xy1: F64, xy2: F64) -> F64:
-    """Whitened residuals (N, 2) of x2 ~ H x1: to first order the two parts of the distance to the nearest
-    exact match, each with the standard deviation of one coordinate (Sampson; Chum, Pajdla and Sturm 2005)."""
+def homography_sampson_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
+    """Return whitened residuals of x2 ~ H x1 (Sampson distance).
+
+    To first order the two parts of the distance to the nearest exact match, each with the standard deviation
+    of one image coordinate.
+
+    Parameters
+    ----------
+    H : ndarray (3, 3), homography
+    xy1, xy2 : ndarray (N, 2), matches, px
+
+    Returns
+    -------
+    ndarray (N, 2), residuals, px
+
+    References
+    ----------
+    Chum, Pajdla and Sturm, "The geometric error for homographies", CVIU 97(1), 2005.
+    """
     x1 = homogenize(xy1)
     u, v, w = (x1 @ H.T).T
     c = np.stack([u - w * xy2[:, 0], v - w * xy2[:, 1]], axis=1)
     J = np.zeros((len(x1), 2, 4))
     J[:, :, :2] = H[None, :2, :2] - xy2[:, :, None] * H[2, :2]
     J[:, 0, 2] = J[:, 1, 3] = -w
-    # Cholesky of J J' by hand: two by two.
+    # Cholesky factor of J J' (2 x 2).
     a, b, d = (np.sum(J[:, i] * J[:, j], axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
     l11 = np.sqrt(a + 1e-300)
     l21 = b / l11
@@ -156,15 +323,27 @@ def homography_distances(H: F64, xy1: F64, xy2: F64) -> F64:
     return np.stack([first, (c[:, 1] - l21 * first) / l22], axis=1)
 
 
-def rotation_planes(F: F64) -> F64:
-    """The two v (2, 3) for which the left part of :func:`canonical_cameras` comes nearest to a rotation.
+def quasi_euclidean_planes(F: F64) -> F64:
+    """Return the two v that make the left part of P2 (:func:`canonical_cameras`) nearest to a rotation.
 
-    With the singular values s1 >= s2 of F and unit epipoles, v = +-(s1 + s2) / 2 e1 makes -[e2]x F + e2 v'
-    have the singular values s1, (s1 + s2) / 2, s2: the nearest multiple of a rotation that any v gives (least
-    squares). In pixels that make the calibration near the identity, the plane v plays infinity well, so that
-    the frame is near a metric one (quasi-Euclidean; Beardsley, Zisserman and Murray, IJCV 23, 1997). The two
-    differ by half a turn about the baseline, as the two rotations of an essential matrix do; the one that
-    turns less comes first, and only matches can tell.
+    With the singular values s1 >= s2 of F and unit epipoles, v = +-(s1 + s2) / 2 e1 gives -[e2]x F + e2 v'
+    the singular values s1, (s1 + s2) / 2, s2: the nearest multiple of a rotation for any v (least squares).
+    In pixels in which the calibration is near the identity, v is near the plane at infinity and the frame
+    near a metric one. The two differ by half a turn about the baseline, like the rotations of an essential
+    matrix; only matches decide.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+
+    Returns
+    -------
+    ndarray (2, 3), v, that of the smaller rotation first
+
+    References
+    ----------
+    Beardsley, Zisserman and Murray, "Sequential Updating of Projective and Affine Structure from Motion",
+    IJCV 23, 1997.
     """
     F = unit_norm(F)
     e1, e2 = epipoles(F)
@@ -175,32 +354,67 @@ def rotation_planes(F: F64) -> F64:
 
 
 def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -> tuple[F64, F64]:
-    """P1 = [I 0], P2 = [-[e2]x F + e2 v'  scale e2] (3.42): two cameras of a projective frame that have F.
+    """Return P1 = [I 0], P2 = [-[e2]x F + e2 v'  scale e2] (3.42), two cameras with fundamental matrix F.
 
-    ``plane`` v (3,) are the free coordinates of the plane that plays the part of infinity. With v = 0 the
-    left part of P2 is singular; without a plane v is the first of :func:`rotation_planes`, for which its
-    condition number is s1 / s2, the ratio of the singular values of F. ``scale`` is the last of the four free
-    parameters and must not be 0.
+    With v = 0 the left part of P2 is singular; with the default v its condition number is s1 / s2, the ratio
+    of the singular values of F.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+    plane : ndarray (3,), optional
+        v, the coordinates of the plane taken as infinity; by default the first of
+        :func:`quasi_euclidean_planes`.
+    scale : float, last of the four free parameters, not 0
+
+    Returns
+    -------
+    P1, P2 : ndarray (3, 4), cameras of a projective frame
+
+    Raises
+    ------
+    ValueError
+        The scale is 0 or not finite.
+
+    Examples
+    --------
+    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    >>> P1, P2 = canonical_cameras(F)
+    >>> np.allclose(fundamental_from_cameras(P1, P2), unit_norm(F))
+    True
     """
     if scale == 0.0 or not np.isfinite(scale):
         raise ValueError(f"canonical_cameras needs a finite scale other than 0; got {scale}")
     F = unit_norm(F)
     _, e2 = epipoles(F)
-    plane = rotation_planes(F)[0] if plane is None else plane
+    plane = quasi_euclidean_planes(F)[0] if plane is None else plane
     P2 = np.hstack([-cross_matrix(e2) @ F + np.outer(e2, plane), scale * e2[:, None]])
     return np.hstack([np.eye(3), np.zeros((3, 1))]), P2
 
 
 PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
-"""Displacements that no homography explains, 90 % quantile, over the distances from the epipolar lines."""
+"""Least displacement not explained by a homography (90 % quantile): over the epipolar distances, and in px."""
 
 
-def require_parallax(F: F64, xy1: F64, xy2: F64, *, at_infinity: F64 | None = None, advice: str = "") -> None:
-    """Refuse matches that one homography takes to each other: F is then any, and no depth is to be had.
+def require_parallax_of_matches(
+    F: F64, xy1: F64, xy2: F64, *, at_infinity: F64 | None = None, advice: str = ""
+) -> None:
+    """Raise ``StageFailure`` if one homography explains the matches (section 5.5).
 
-    ``F`` (3, 3) and N >= 4 of its inliers (N, 2), (N, 2) px; ``at_infinity`` (3, 3) the homography of the
-    plane at infinity, where the cameras are known: then a plane of the scene has parallax. ``advice`` goes on
-    after that of taking photographs from places farther apart. Raises ``StageFailure``.
+    F is then arbitrary and the images contain no depth: the camera only rotated, or the scene is a plane.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3), fundamental matrix
+    xy1, xy2 : ndarray (N, 2), N >= 4 inliers of F, px
+    at_infinity : ndarray (3, 3), optional
+        Homography of the plane at infinity of known cameras; a plane of the scene then has parallax.
+    advice : str, text appended to the advice of the failure
+
+    Raises
+    ------
+    StageFailure
+        The images show no parallax.
     """
     noise = float(np.quantile(np.abs(sampson_residuals(F, xy1, xy2)), 0.9))
     if at_infinity is None:
@@ -212,17 +426,17 @@ def require_parallax(F: F64, xy1: F64, xy2: F64, *, at_infinity: F64 | None = No
         return
     what = "one homography" if at_infinity is None else "a scene at infinity"
     raise StageFailure(
-        "the photographs show no parallax: the camera only turned, or the scene is a plane or too far away",
-        f"{what} explains 90 % of {len(xy1)} matches to {parallax:.2g} px, the noise being {noise:.2g} px",
-        f"take photographs from places farther apart{advice}",
+        "the images show no parallax: the camera only rotated, or the scene is a plane or too far away",
+        f"{what} explains 90 % of {len(xy1)} matches to {parallax:.2g} px; the noise is {noise:.2g} px",
+        f"take images from positions farther apart{advice}",
     )
 
 
 def _homography_residuals(xy1: F64, xy2: F64) -> F64:
-    """Of the homography of most matches: least squares, twice more without the worst tenth."""
-    kept, residuals = np.ones(len(xy1), dtype=bool), np.zeros(len(xy1))
+    """Residuals of the homography of most matches: least squares, repeated twice without the worst tenth."""
+    inliers, residuals = np.ones(len(xy1), dtype=bool), np.zeros(len(xy1))
     for _ in range(3):
-        H = estimate_homography(xy1[kept], xy2[kept])
+        H = estimate_homography(xy1[inliers], xy2[inliers])
         residuals = homography_residuals(H, xy1, xy2)
-        kept = residuals <= np.quantile(residuals, 0.9)
+        inliers = residuals <= np.quantile(residuals, 0.9)
     return residuals

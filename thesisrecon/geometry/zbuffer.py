@@ -1,6 +1,6 @@
-"""Compiled loops of the z-buffer; each has a plain twin in the tests.
+"""Z-buffer: the mesh face that each pixel of a camera sees, exact in perspective.
 
-Which face of a mesh each pixel of a camera sees: a z-buffer, exact in perspective.
+The compiled loops have plain twins in the tests.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 
 SLACK = 1e-7
-"""Pixels by which a triangle reaches beyond its edges, so that no rounding opens a crack between two."""
+"""Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
 
 
 @njit(cache=True, nogil=True)
 def _inverse(p: F64, inverse: F64) -> bool:
-    """Inverse (3, 3) of the matrix whose columns are the rows of p (3, 3); False where it is singular."""
+    """Invert the matrix whose columns are the rows of p (3, 3); False if it is singular."""
     for i in range(3):
         a, b = p[(i + 1) % 3], p[(i + 2) % 3]
         inverse[i, 0] = a[1] * b[2] - a[2] * b[1]
@@ -42,7 +42,7 @@ def _inverse(p: F64, inverse: F64) -> bool:
 
 @njit(cache=True, nogil=True)
 def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int]:
-    """First and last + 1 pixel of row y in which all barycentric coordinates and the depth are positive."""
+    """Return the first and last + 1 pixel of row y with positive barycentric coordinates and depth."""
     low, high = 0.0, width - 1.0
     slope_sum, constant_sum = 0.0, 0.0
     for i in range(4):
@@ -67,13 +67,24 @@ def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int
 def rasterize_rows(
     corners: F64, near: float, rows: tuple[int, int], depth: F32, face: I64, weights: F32
 ) -> None:
-    """Draw triangles into rows [first, last) of a z-buffer.
+    """Draw triangles into a strip of rows of a z-buffer.
 
-    ``corners`` (M, 3, 3): of each face its three image points K (R X + t), whose last entry is their depth.
-    With these as the columns of M, the barycentric coordinates of the point seen at (x, y), each over its
-    depth, are M^-1 (x, y, 1): linear in the pixel, right in perspective, and without clipping at the near
-    plane (Olano and Greer 1997). ``depth`` (H, W) inf where nothing is, ``face`` (H, W) int64, ``weights``
-    (H, W, 2) the coordinates of corners 1 and 2; of equal depths the first face stays.
+    With the image points of a face as the columns of M, the barycentric coordinates of the point seen at (x,
+    y), each over its depth, are M^-1 (x, y, 1): linear in the pixel, exact in perspective, without clipping
+    at the near plane. Of equal depths the first face stays.
+
+    Parameters
+    ----------
+    corners : ndarray (M, 3, 3), three image points K (R X + t) of each face; the last entry is the depth
+    near : float, nearest depth
+    rows : tuple of int, first and last + 1 row
+    depth : ndarray (H, W) of float32, depth, updated; inf if empty
+    face : ndarray (H, W) of int, face numbers, updated
+    weights : ndarray (H, W, 2) of float32, barycentric coordinates of corners 1 and 2, updated
+
+    References
+    ----------
+    Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997.
     """
     width = depth.shape[1]
     inverse = np.empty((3, 3))
@@ -114,7 +125,15 @@ def rasterize_rows(
 
 @njit(cache=True, nogil=True)
 def interpolate_corners(face: I64, weights: F32, values: F32, out: F32) -> None:
-    """Values (M, 3, C) of the corners of faces at each pixel (H, W, C); pixels without a face stay."""
+    """Interpolate values of face corners at each pixel; pixels without a face keep their value.
+
+    Parameters
+    ----------
+    face : ndarray (H, W) of int, face of each pixel, -1 for none
+    weights : ndarray (H, W, 2) of float32, barycentric coordinates of corners 1 and 2
+    values : ndarray (M, 3, C) of float32, values of the corners
+    out : ndarray (H, W, C) of float32, output
+    """
     for y in range(face.shape[0]):
         for x in range(face.shape[1]):
             m = face[y, x]
@@ -128,8 +147,16 @@ def interpolate_corners(face: I64, weights: F32, values: F32, out: F32) -> None:
 
 @njit(cache=True, nogil=True)
 def interpolate_vertices(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> None:
-    """Values (N, C) of the vertices of ``faces`` (M, 3) at each pixel (H, W, C); pixels without a face
-    stay."""
+    """Interpolate values of mesh vertices at each pixel; pixels without a face keep their value.
+
+    Parameters
+    ----------
+    face : ndarray (H, W) of int, face of each pixel, -1 for none
+    weights : ndarray (H, W, 2) of float32, barycentric coordinates of corners 1 and 2
+    faces : ndarray (M, 3) of int, vertices of each face
+    values : ndarray (N, C) of float32, values of the vertices
+    out : ndarray (H, W, C) of float32, output
+    """
     for y in range(face.shape[0]):
         for x in range(face.shape[1]):
             m = face[y, x]
@@ -144,7 +171,15 @@ def interpolate_vertices(face: I64, weights: F32, faces: I64, values: F32, out: 
 
 @njit(cache=True, nogil=True)
 def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
-    """Bilinear texels (H, W, 3) at uv (H, W, 2) where ``drawn`` >= 0; beyond the border its own texel."""
+    """Sample a texture bilinearly, clamped to its border.
+
+    Parameters
+    ----------
+    texture : ndarray (TH, TW, 3), texture, uint8 or float32
+    uv : ndarray (H, W, 2) of float32, texture coordinates of each pixel, px
+    drawn : ndarray (H, W) of int, pixels with values >= 0 are filled
+    out : ndarray (H, W, 3) of float32, output
+    """
     height, width = texture.shape[:2]
     for y in range(uv.shape[0]):
         for x in range(uv.shape[1]):
@@ -164,41 +199,83 @@ def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
 
 
 NEAR = 1e-6
-"""Nearest depth that is drawn, in units of the distance from the camera to the farthest vertex."""
+"""Nearest depth that is drawn, relative to the depth of the farthest vertex."""
 
 
 @dataclass(frozen=True)
 class Raster:
-    """What a camera sees of a mesh before it has colours: ``depth`` (H, W) float32, inf where nothing is;
-    ``face`` (H, W) int64, -1 where none; ``weights`` (H, W, 2) float32, the barycentric coordinates of the
-    face's corners 1 and 2."""
+    """Visible faces of a mesh.
+
+    Attributes
+    ----------
+    depth : ndarray (H, W) of float32, depth, inf for none
+    face : ndarray (H, W) of int64, face of each pixel, -1 for none
+    weights : ndarray (H, W, 2) of float32, barycentric coordinates of the face's corners 1 and 2
+    """
 
     depth: F32
     face: I64
     weights: F32
 
     def interpolate(self, values: F64 | F32) -> F32:
-        """Values (M, 3, C) of the corners of all faces, at every pixel (H, W, C); 0 where no face is."""
+        """Interpolate values of face corners.
+
+        Parameters
+        ----------
+        values : ndarray (M, 3, C), values of the corners of all faces
+
+        Returns
+        -------
+        ndarray (H, W, C) of float32, value of each pixel, 0 without a face
+        """
         out = np.zeros((*self.face.shape, values.shape[2]), dtype=np.float32)
         interpolate_corners(self.face, self.weights, np.ascontiguousarray(values, dtype=np.float32), out)
         return out
 
     def interpolate_vertices(self, faces: I64, values: F32) -> F32:
-        """Values (N, C) of the vertices of the faces (M, 3), at every pixel (H, W, C); 0 where no face is."""
+        """Interpolate values of mesh vertices.
+
+        Parameters
+        ----------
+        faces : ndarray (M, 3) of int, vertices of each face
+        values : ndarray (N, C) of float32, values of the vertices
+
+        Returns
+        -------
+        ndarray (H, W, C) of float32, value of each pixel, 0 without a face
+        """
         out = np.zeros((*self.face.shape, values.shape[1]), dtype=np.float32)
         interpolate_vertices(self.face, self.weights, faces, values, out)
         return out
 
     def rows(self, first: int, last: int) -> Raster:
-        """Rows [first, last) alone."""
+        """Return a strip of rows.
+
+        Parameters
+        ----------
+        first, last : int, first and last + 1 row
+
+        Returns
+        -------
+        Raster, the strip, without a copy
+        """
         return Raster(self.depth[first:last], self.face[first:last], self.weights[first:last])
 
 
 def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) -> Raster:
-    """Which face is seen at the centre of each pixel.
+    """Find the face seen at the centre of each pixel.
 
-    ``vertices`` (N, 3), ``faces`` (M, 3); both sides of a face are seen. ``threads`` draw strips of rows: the
-    result is the same whatever their number.
+    Parameters
+    ----------
+    vertices : ndarray (N, 3), mesh vertices
+    faces : ndarray (M, 3) of int, mesh faces; both sides are visible
+    camera : Camera, camera with the image size
+    threads : int
+        Threads; each draws a strip of rows. The result does not depend on their number.
+
+    Returns
+    -------
+    Raster, visible faces
     """
     if not camera.is_pinhole:
         raise ValueError(
@@ -220,7 +297,14 @@ def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) ->
 
 
 def run_in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
-    """Call ``work`` with the first and last + 1 row of as many strips as there are threads, one in each."""
+    """Call a function for strips of rows in parallel.
+
+    Parameters
+    ----------
+    work : callable, called with (first, last + 1) row of each strip
+    height : int, number of rows
+    threads : int, number of strips and threads
+    """
     edges = np.linspace(0, height, max(threads, 1) + 1).round().astype(int)
     strips = [(int(a), int(b)) for a, b in pairwise(edges)]
     if len(strips) == 1:

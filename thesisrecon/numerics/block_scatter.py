@@ -17,15 +17,14 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics import metric_cameras as kernels
 from thesisrecon.numerics.covariance import gauge_directions, invert_in_inner_gauge
-from thesisrecon.numerics.intrinsic_unknowns import IntrinsicValues, number_values
+from thesisrecon.numerics.intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.numerics.losses import LOSS_CODES
-from thesisrecon.numerics.metric_cameras import POSE_DOF, MetricCameras, MetricModel
-from thesisrecon.numerics.observations import Jacobians, Observations, Seen, Weighing
+from thesisrecon.numerics.metric_cameras import POSE_DOF, MetricCameras, MetricModel, linearize_metric
+from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
 
 # Unknowns of poses that take part in the judgement beside all of the intrinsics.
-POSES_JUDGED = 30
+MAX_POSES = 30
 
 
 @dataclass(frozen=True)
@@ -33,21 +32,21 @@ class BlockScatter:
     """Variances of the intrinsics after a bundle adjustment and how far the data contradict them.
 
     ``model`` (G, C) as the information matrix has it for noise of the given sigma, the focal's relative;
-    ``tied`` (C,) the same were one camera behind all photographs, 0 for what does not move;
+    ``shared_variance`` (C,) the same were one camera behind all photographs, 0 for what does not move;
     ``ratio`` (G, C) by how much the scatter between blocks of points exceeds it, NaN for what does not move;
     ``contradiction`` how much larger the scatter between blocks is, over all unknowns, than that between
     single points lets expect: 1 where the noise of different points is independent, whatever its
     distribution. ``blocks`` how many blocks speak.
     """
 
-    model: F64
-    tied: F64
+    variance: F64
+    shared_variance: F64
     ratio: F64
-    contradiction: float
+    overdispersion: float
     blocks: int
 
     @property
-    def typical_ratio(self) -> float:
+    def median_ratio(self) -> float:
         """The median of the ratios, 1 where there is none."""
         known = self.ratio[np.isfinite(self.ratio)]
         return float(np.median(known)) if len(known) else 1.0
@@ -103,16 +102,16 @@ def block_scatter(
     The matrix of all cameras is dense here: meant for a few hundred of them.
     """
     o, group = observations, np.asarray(cameras.group)
-    seen = np.bincount(o.view_index, minlength=len(group)) > 0
-    used = np.bincount(group[seen], minlength=len(cameras.intrinsics)) > 0
-    values = number_values(cameras, used, np.asarray(free, dtype=bool), prior)[0]
-    views, first = np.flatnonzero(seen), POSE_DOF * int(seen.sum())
+    observed = np.bincount(o.view_index, minlength=len(group)) > 0
+    used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
+    values = number_unknowns(cameras, used, np.asarray(free, dtype=bool), prior)[0]
+    views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
     frame = _centred(cameras, X, o)
-    found = _linearise(*frame, o, (values, np.where(seen, np.cumsum(seen) - 1, -1)), noise)
+    found = _linearise(*frame, o, (values, np.where(observed, np.cumsum(observed) - 1, -1)), noise)
     S = (found.J.T @ found.J).toarray() - (found.taken.T @ found.taken).toarray()
-    S[first:, first:] += values.links.information(values.size)
+    S[first:, first:] += values.terms.information(values.size)
     C = _covariance(S, frame[0], views)
-    poses = np.arange(0, first, max(first // POSES_JUDGED, 1))
+    poses = np.arange(0, first, max(first // MAX_POSES, 1))
     chosen = np.concatenate([poses, np.arange(first, len(C))])
     block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
     curvature = _loss_correction(found.residual.reshape(-1, 2), noise[1] / noise[0])
@@ -141,18 +140,18 @@ def _linearise(
     cameras: MetricCameras,
     X: F64,
     o: Observations,
-    columns: tuple[IntrinsicValues, I64],
+    columns: tuple[IntrinsicUnknowns, I64],
     noise: tuple[float, float],
 ) -> _Linearised:
     values, place = columns
     K, width, (sigma, loss) = len(o.xy), cameras.intrinsics.shape[1], noise
     model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
-    seen, weighing = (
-        Seen(o.view_index, o.point_index, o.xy),
-        Weighing(sigma, LOSS_CODES["huber"], loss / sigma),
+    obs, weighting = (
+        Observations(o.view_index, o.point_index, o.xy),
+        Weighting(sigma, LOSS_CODES["huber"], loss / sigma),
     )
     weighted, none = Jacobians.empty(K, POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
-    kernels.linearize_metric(model, seen, weighing, np.arange(width), none, weighted)
+    linearize_metric(model, obs, weighting, np.arange(width), none, weighted)
     first = POSE_DOF * (int(place.max()) + 1)
     number = values.number[cameras.group[o.view_index]]
     column = np.concatenate(
@@ -193,13 +192,13 @@ def _covariance(S: F64, cameras: MetricCameras, views: I64) -> F64:
     return invert_in_inner_gauge(S, N)
 
 
-def _tied_variances(S: F64, values: IntrinsicValues, cameras: MetricCameras, views: I64) -> F64:
+def _tied_variances(S: F64, values: IntrinsicUnknowns, cameras: MetricCameras, views: I64) -> F64:
     """(C,) variances of the intrinsics were all cameras one."""
     first = len(S) - values.size
-    column = values.column[: values.seen]
+    column = values.column[: values.n_table]
     T = np.zeros((len(S), first + values.number.shape[1]))
     T[np.arange(first), np.arange(first)] = 1.0
-    T[first + np.arange(values.seen), first + column] = 1.0
+    T[first + np.arange(values.n_table), first + column] = 1.0
     moves = np.concatenate([np.ones(first, dtype=bool), np.isin(np.arange(values.number.shape[1]), column)])
     C = _covariance(T[:, moves].T @ S @ T[:, moves], cameras, views)
     tied = np.zeros(T.shape[1])

@@ -21,7 +21,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics.observations import Jacobians
 
 
-class Places(NamedTuple):
+class BlockIndex(NamedTuple):
     """Where observations, sorted by point, go.
 
     ``start`` (N + 1,) the first of each point; ``view_index`` (K,); ``block`` (V,) number of the view's
@@ -35,7 +35,7 @@ class Places(NamedTuple):
     common: I64
 
 
-class Sums(NamedTuple):
+class ReducedSums(NamedTuple):
     """The reduced system: ``blocks`` (n, C, C), ``border`` (b, C, e), ``corner`` (e, e), ``rhs`` (D,) with
     D = b C + e; and, before elimination, ``diagonal`` (D,) of J'J and ``gradient`` (D,)."""
 
@@ -56,7 +56,7 @@ class PointSums(NamedTuple):
     diagonal: F64
 
 
-class _Left(NamedTuple):
+class _Elimination(NamedTuple):
     """What the steps of their points leave: ``Bt`` (k, 2, 3) = B~ and ``residual`` (k, 2) of the observations
     from ``first`` on, ``g`` (n, 3) = L^-1 h of the points."""
 
@@ -68,20 +68,26 @@ class _Left(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def eliminate_points(
-    first: int, last: int, damping: float, J: Jacobians, places: Places, sums: Sums, points: PointSums
+    first: int,
+    last: int,
+    damping: float,
+    J: Jacobians,
+    index: BlockIndex,
+    sums: ReducedSums,
+    points: PointSums,
 ) -> None:
     """Add the points first..last, eliminated, to ``sums``; fill their ``points``.
 
     The diagonal of a point's J'J is multiplied by 1 + damping; a point whose block is not positive stays
     where it is.
     """
-    k = places.start[first]
-    n = places.start[last] - k
-    left = _Left(k, np.empty((n, 2, 3)), np.empty((n, 2)), np.empty((last - first, 3)))
-    sum_points(first, last, damping, J, places, points, left)
-    add_views(first, last, J, places, sums, left)
+    k = index.start[first]
+    n = index.start[last] - k
+    left = _Elimination(k, np.empty((n, 2, 3)), np.empty((n, 2)), np.empty((last - first, 3)))
+    sum_points(first, last, damping, J, index, points, left)
+    add_views(first, last, J, index, sums, left)
     if len(sums.corner) > 0:
-        add_common(first, last, J, places, sums, left)
+        add_common(first, last, J, index, sums, left)
 
 
 # A call costs more than a point, for all the arrays that go with it: the loops over the points are inside.
@@ -89,13 +95,19 @@ def eliminate_points(
 
 @njit(cache=True, nogil=True)
 def sum_points(
-    first: int, last: int, damping: float, J: Jacobians, places: Places, points: PointSums, left: _Left
+    first: int,
+    last: int,
+    damping: float,
+    J: Jacobians,
+    index: BlockIndex,
+    points: PointSums,
+    left: _Elimination,
 ) -> None:
     """J'J and J'r of each point, its inverse, B~ and the residuals that its own step leaves."""
     M, more = np.empty((3, 3)), 1.0 + damping
     for j in range(first, last):
         v00 = v01 = v02 = v11 = v12 = v22 = h0 = h1 = h2 = 0.0
-        s, e = places.start[j], places.start[j + 1]
+        s, e = index.start[j], index.start[j + 1]
         for k in range(s, e):
             for i in range(2):
                 b0, b1, b2, r = J.B[k, i, 0], J.B[k, i, 1], J.B[k, i, 2], J.residual[k, i]
@@ -145,12 +157,14 @@ def inverse_root(v00: float, v01: float, v02: float, v11: float, v12: float, v22
 
 
 @njit(cache=True, nogil=True, forceinline=True)
-def add_views(first: int, last: int, J: Jacobians, places: Places, sums: Sums, left: _Left) -> None:
+def add_views(
+    first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
+) -> None:
     """The blocks of all pairs of views that see a point, and the views' part of the right-hand side."""
     C = J.A.shape[2]
     for j in range(first, last):
-        for k in range(places.start[j], places.start[j + 1]):
-            v = places.block[places.view_index[k]]
+        for k in range(index.start[j], index.start[j + 1]):
+            v = index.block[index.view_index[k]]
             if v < 0:
                 continue
             r0, r1 = J.residual[k, 0], J.residual[k, 1]
@@ -161,8 +175,8 @@ def add_views(first: int, last: int, J: Jacobians, places: Places, sums: Sums, l
                 sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
                 sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
             b = left.Bt[k - left.first]
-            for m in range(k, places.start[j + 1]):
-                w = places.block[places.view_index[m]]
+            for m in range(k, index.start[j + 1]):
+                w = index.block[index.view_index[m]]
                 if w < 0:
                     continue
                 c = left.Bt[m - left.first]
@@ -171,7 +185,7 @@ def add_views(first: int, last: int, J: Jacobians, places: Places, sums: Sums, l
                 q01 = -b[0, 0] * c[1, 0] - b[0, 1] * c[1, 1] - b[0, 2] * c[1, 2]
                 q10 = -b[1, 0] * c[0, 0] - b[1, 1] * c[0, 1] - b[1, 2] * c[0, 2]
                 q11 = same - b[1, 0] * c[1, 0] - b[1, 1] * c[1, 1] - b[1, 2] * c[1, 2]
-                S = sums.blocks[places.pair[v, w]]
+                S = sums.blocks[index.pair[v, w]]
                 add_block(S, J.A[k], J.A[m], q00, q01, q10, q11)
                 if v == w and m > k:
                     add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
@@ -189,7 +203,9 @@ def add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float,
 
 
 @njit(cache=True, nogil=True)
-def add_common(first: int, last: int, J: Jacobians, places: Places, sums: Sums, left: _Left) -> None:
+def add_common(
+    first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
+) -> None:
     """Border, corner and right-hand side of the columns that views have in common.
 
     Those of one point side by side are E (2m, n). With p = B~' E the point's own step leaves T = E - B~ p of
@@ -197,15 +213,15 @@ def add_common(first: int, last: int, J: Jacobians, places: Places, sums: Sums, 
     """
     most, C = 1, J.A.shape[2]
     for j in range(first, last):
-        most = max(most, places.start[j + 1] - places.start[j])
-    wide = min(len(sums.corner), most * places.common.shape[1])
+        most = max(most, index.start[j + 1] - index.start[j])
+    wide = min(len(sums.corner), most * index.common.shape[1])
     E, T, p = np.empty((most, 2, wide)), np.empty((2, wide)), np.empty((3, wide))
     column, slot = np.empty(wide, np.int64), np.full(len(sums.corner), -1)
     edge = C * sums.border.shape[0]
     ends = (sums.corner, sums.rhs[edge:], sums.diagonal[edge:], sums.gradient[edge:])
     for j in range(first, last):
-        s, e = places.start[j], places.start[j + 1]
-        n = gather_common(s, e, J.E, places.view_index, places.common, E, column, slot)
+        s, e = index.start[j], index.start[j + 1]
+        n = gather_common(s, e, J.E, index.view_index, index.common, E, column, slot)
         p[:, :n] = 0.0
         for i in range(e - s):
             for x in range(2):
@@ -215,7 +231,7 @@ def add_common(first: int, last: int, J: Jacobians, places: Places, sums: Sums, 
                     p[1, c] += b[1] * E[i, x, c]
                     p[2, c] += b[2] * E[i, x, c]
         for i in range(e - s):
-            v = places.block[places.view_index[s + i]]
+            v = index.block[index.view_index[s + i]]
             if v < 0:
                 continue
             for x in range(2):
@@ -280,24 +296,24 @@ def add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[F
 
 @njit(cache=True, nogil=True)
 def substitute_points(
-    first: int, last: int, camera_step: F64, J: Jacobians, places: Places, points: PointSums, step: F64
+    first: int, last: int, camera_step: F64, J: Jacobians, index: BlockIndex, points: PointSums, step: F64
 ) -> None:
     """Steps of the points first..last (N, 3) for a step of the cameras (D,): -V^-1 (h + B' J step)."""
-    C, F = J.A.shape[2], places.common.shape[1]
-    border = len(places.pair) * C
+    C, F = J.A.shape[2], index.common.shape[1]
+    border = len(index.pair) * C
     for j in range(first, last):
         h = points.gradient[j]
         t0, t1, t2 = h[0], h[1], h[2]
-        for k in range(places.start[j], places.start[j + 1]):
+        for k in range(index.start[j], index.start[j + 1]):
             e0 = e1 = 0.0
-            view = places.view_index[k]
-            v = places.block[view] * C
+            view = index.view_index[k]
+            v = index.block[view] * C
             if v >= 0:
                 for c in range(C):
                     e0 += J.A[k, 0, c] * camera_step[v + c]
                     e1 += J.A[k, 1, c] * camera_step[v + c]
             for f in range(F):
-                column = places.common[view, f]
+                column = index.common[view, f]
                 if column >= 0:
                     e0 += J.E[k, 0, f] * camera_step[border + column]
                     e1 += J.E[k, 1, f] * camera_step[border + column]
@@ -342,7 +358,7 @@ def mark_pairs(start: I64, view: I64, block: I64, seen: NDArray[np.bool_]) -> No
 
 
 @njit(cache=True, nogil=True)
-def revert_cheirality_violations(
+def revert_crossing_points(
     start: I64, view_index: I64, row_before: F64, row_after: F64, X_before: F64, X_after: F64
 ) -> None:
     """Put back the points whose step takes them through the focal plane of a view that sees them.

@@ -1,7 +1,7 @@
 """The distinct unknown values behind a table of intrinsics, and Gaussian knowledge about them.
 
 The unknowns are numbered so that rows of the table that share a value name the same one; the focal is
-unknown as log f. Everything that is known of them is a list of links, w (x_a - x_b - c)^2 / 2, where either
+unknown as log f. Everything that is known of them is a list of terms, w (x_a - x_b - c)^2 / 2, where either
 end may be missing. The mean of a population is an unknown like the others, seen by no photograph: with it
 the prior stays sparse, and marginalising it is left to the linear algebra.
 """
@@ -22,7 +22,7 @@ MAX_LOG_STEP = 3.0
 
 
 @dataclass(frozen=True)
-class Links:
+class PriorTerms:
     """Terms w (x_first - x_second - offset)^2 / 2; ``second`` -1 where a term binds one value to a number."""
 
     first: I64
@@ -30,17 +30,17 @@ class Links:
     offset: F64
     weight: F64
 
-    def deviation(self, x: F64) -> F64:
+    def residual(self, x: F64) -> F64:
         """(L,) x_first - x_second - offset."""
         return np.asarray(x[self.first] - np.where(self.second >= 0, x[self.second], 0.0) - self.offset)
 
     def cost(self, x: F64) -> float:
         """The sum of all terms."""
-        return 0.5 * float(self.weight @ self.deviation(x) ** 2) if len(self.first) else 0.0
+        return 0.5 * float(self.weight @ self.residual(x) ** 2) if len(self.first) else 0.0
 
     def gradient(self, x: F64) -> F64:
         """(n,) derivative of the cost."""
-        pull = self.weight * self.deviation(x) if len(self.first) else np.zeros(0)
+        pull = self.weight * self.residual(x) if len(self.first) else np.zeros(0)
         both = self.second >= 0
         g = np.bincount(self.first, pull, minlength=len(x))
         return np.asarray(g - np.bincount(self.second[both], pull[both], minlength=len(x)))
@@ -58,14 +58,14 @@ class Links:
 
 
 @dataclass(frozen=True)
-class IntrinsicValues:
+class IntrinsicUnknowns:
     """``number`` (G, C) names the unknown of every entry, -1 where it does not move; ``column`` (n,) says
     which intrinsic an unknown is; ``seen`` of the n stand in the table, the rest are means of populations."""
 
     number: I64
     column: I64
-    seen: int
-    links: Links
+    n_table: int
+    terms: PriorTerms
 
     @property
     def size(self) -> int:
@@ -86,9 +86,9 @@ class IntrinsicValues:
         return np.asarray(x + np.clip(step, -limit, limit))
 
 
-def number_values(
+def number_unknowns(
     cameras: MetricCameras, used: B8, free: B8, prior: IntrinsicsPrior | None
-) -> tuple[IntrinsicValues, F64, F64]:
+) -> tuple[IntrinsicUnknowns, F64, F64]:
     """The unknowns of a problem, where they start (n,), and the table (G, C) with what is known put in.
 
     ``used`` (G,) rows that a photograph speaks of. A value starts at the mean of the used rows that share it;
@@ -118,16 +118,16 @@ def number_values(
     table[:, FOCAL] = np.exp(table[:, FOCAL])
     table = np.where(np.asarray(free), table, cameras.intrinsics)
     column = np.array(parts.column, dtype=np.int64)
-    return IntrinsicValues(number, column, seen, parts.collect()), np.array(parts.start), table
+    return IntrinsicUnknowns(number, column, seen, parts.collect()), np.array(parts.start), table
 
 
 @dataclass(frozen=True)
 class _Parts:
-    """Unknowns and links while they are gathered."""
+    """Unknowns and terms while they are gathered."""
 
     column: list[int]
     start: list[float]
-    links: list[tuple[I64, I64, F64, F64]]
+    terms: list[tuple[I64, I64, F64, F64]]
 
     def bind_population(self, c: int, number: I64, at: F64, spread: float) -> None:
         """One more unknown, the population's mean, and a link from every distinct value to it."""
@@ -137,15 +137,15 @@ class _Parts:
         mean = len(self.start)
         first, second = np.where(moves, number, mean), np.where(moves, mean, NONE)
         offset, weight = np.where(moves, 0.0, at), np.full(len(number), spread**-2.0)
-        self.links.append((first, second, offset, weight))
+        self.terms.append((first, second, offset, weight))
         self.column.append(c)
         self.start.append(float(at.mean()))
 
-    def collect(self) -> Links:
-        """All links in one table."""
+    def collect(self) -> PriorTerms:
+        """All terms in one table."""
         none = (np.zeros(0, dtype=np.int64),) * 2 + (np.zeros(0),) * 2
-        first, second, offset, weight = (np.concatenate(a) for a in zip(none, *self.links, strict=True))
-        return Links(first, second, offset, weight)
+        first, second, offset, weight = (np.concatenate(a) for a in zip(none, *self.terms, strict=True))
+        return PriorTerms(first, second, offset, weight)
 
 
 def _number_column(
@@ -164,7 +164,7 @@ def _number_column(
     own = np.where(still, NONE, len(parts.start) + np.cumsum(~still) - 1)
     bound = np.isfinite(width) & ~still
     none = np.full(np.count_nonzero(bound), NONE)
-    parts.links.append((own[bound], none, mean[bound], width[bound] ** -2.0))
+    parts.terms.append((own[bound], none, mean[bound], width[bound] ** -2.0))
     start = np.where(known, mean, average)
     parts.start.extend(start[~still].tolist())
     parts.column.extend([c] * int(np.count_nonzero(~still)))
@@ -202,8 +202,8 @@ class IntrinsicColumns:
         return np.append(self.place, NONE)[number]
 
 
-def place_intrinsics(
-    values: IntrinsicValues, group: I64, free: I64, seen: B8, free_views: B8
+def assign_columns(
+    values: IntrinsicUnknowns, group: I64, free: I64, seen: B8, free_views: B8
 ) -> IntrinsicColumns:
     """Share the unknowns of the views (``group`` (V,) their rows) out to blocks and border.
 

@@ -20,9 +20,9 @@ from thesisrecon.numerics.covariance import (
 from thesisrecon.numerics.elimination import sum_leverages
 from thesisrecon.numerics.intrinsic_unknowns import (
     IntrinsicColumns,
-    IntrinsicValues,
-    number_values,
-    place_intrinsics,
+    IntrinsicUnknowns,
+    assign_columns,
+    number_unknowns,
 )
 from thesisrecon.numerics.levenberg_marquardt import Solution, run_levenberg_marquardt
 from thesisrecon.numerics.losses import LossName, loss_code
@@ -40,9 +40,8 @@ from thesisrecon.numerics.metric_cameras import (
 from thesisrecon.numerics.observations import (
     Jacobians,
     Observations,
-    Seen,
     SortedObservations,
-    Weighing,
+    Weighting,
     sort_observations,
 )
 from thesisrecon.numerics.schur import (
@@ -50,14 +49,13 @@ from thesisrecon.numerics.schur import (
     BundleStep,
     BundleSystem,
     CameraPrior,
-    hold_flipping,
-    lay_out,
+    build_layout,
 )
 
 # Where a robust loss bends, this share of the curvature along a residual is kept once the gain of a step has
-# fallen below CLOSE of the cost. Reweighting goes safely towards the minimum, but near it Newton is faster.
-LEAST, CLOSE = 0.3, 1e-3
-BENDING = ("huber", "soft_l1", "cauchy")
+# fallen below NEWTON_GAIN of the cost. Reweighting goes safely towards the minimum, but near it Newton is faster.
+MIN_CURVATURE, NEWTON_GAIN = 0.3, 1e-3
+CURVED_LOSSES = ("huber", "soft_l1", "cauchy")
 
 
 @dataclass(frozen=True)
@@ -132,30 +130,30 @@ class _MetricProblem:
     layout: BundleLayout
     columns: IntrinsicColumns
     free_views: B8
-    values: IntrinsicValues
-    weighing: Weighing
+    values: IntrinsicUnknowns
+    weighting: Weighting
     jacobians: Jacobians
 
     def linearize(self, state: _State) -> BundleSystem:
         J, c = self.jacobians, self.columns
 
-        def work(which: slice, seen: Seen) -> float:
+        def work(which: slice, obs: Observations) -> float:
             part = J.part(which.start, which.stop)
-            return float(linearize_metric(state.model, seen, self.weighing, c.own, c.common, part))
+            return float(linearize_metric(state.model, obs, self.weighting, c.own, c.common, part))
 
-        cost = sum(self.layout.over_observations(work)) + self.values.links.cost(state.values)
+        cost = sum(self.layout.over_observations(work)) + self.values.terms.cost(state.values)
         if c.pinned.any():
             J.A[:] = np.where(c.pinned[self.layout.observations.view_index][:, None], 0.0, J.A)
         return BundleSystem(cost, self.layout, J, self._prior(state))
 
     def _prior(self, state: _State) -> CameraPrior | None:
-        links, place = self.values.links, self.columns.place
-        if not len(links.first):
+        terms, place = self.values.terms, self.columns.place
+        if not len(terms.first):
             return None
         gradient = np.zeros(self.layout.size)
-        gradient[place] = links.gradient(state.values)
+        gradient[place] = terms.gradient(state.values)
         return CameraPrior(
-            self.columns.of(links.first), self.columns.of(links.second), links.weight, gradient
+            self.columns.of(terms.first), self.columns.of(terms.second), terms.weight, gradient
         )
 
     def retract(self, state: _State, step: BundleStep) -> _State:
@@ -163,14 +161,14 @@ class _MetricProblem:
         n_own = layout.size - layout.border
         poses = np.zeros((len(m.t), POSE_DOF))
         poses[self.free_views] = step.cameras[:n_own].reshape(-1, layout.width)[
-            layout.places.block[self.free_views], :POSE_DOF
+            layout.index.block[self.free_views], :POSE_DOF
         ]
         R, t = np.empty_like(m.R), np.empty_like(m.t)
         move_poses(m.R, m.t, poses, R, t)
         values = self.values.step(state.values, step.cameras[self.columns.place])
         X = m.X + step.points
         before, after = np.column_stack([m.R[:, 2], m.t[:, 2]]), np.column_stack([R[:, 2], t[:, 2]])
-        hold_flipping(layout, before, after, m.X, X)
+        layout.revert_cheirality_violations(before, after, m.X, X)
         return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
 
     def residual(self, state: _State) -> F64:
@@ -178,8 +176,8 @@ class _MetricProblem:
         K = len(self.layout.observations.xy)
         residual, depth = np.empty((K, 2)), np.empty(K)
 
-        def work(which: slice, seen: Seen) -> None:
-            project_metric(state.model, seen, residual[which], depth[which])
+        def work(which: slice, obs: Observations) -> None:
+            project_metric(state.model, obs, residual[which], depth[which])
 
         self.layout.over_observations(work)
         return residual
@@ -194,10 +192,10 @@ class _MetricProblem:
         return robust_sigma(residual, leverage, poses + self.values.size - (0 if held else SIMILARITY_DOF))
 
     def cost(self, state: _State) -> float:
-        def work(_: slice, seen: Seen) -> float:
-            return float(metric_cost(state.model, seen, self.weighing))
+        def work(_: slice, obs: Observations) -> float:
+            return float(metric_cost(state.model, obs, self.weighting))
 
-        return sum(self.layout.over_observations(work)) + self.values.links.cost(state.values)
+        return sum(self.layout.over_observations(work)) + self.values.terms.cost(state.values)
 
 
 def refine_metric_bundle(
@@ -278,13 +276,15 @@ def _refined(cameras: MetricCameras, moved: B8, end: MetricModel, origin: F64, s
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Solution[_State]:
     """Down to the minimum, by reweighting first and nearly Newton's steps at the end."""
-    if options.loss not in BENDING:
+    if options.loss not in CURVED_LOSSES:
         return run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations)
-    far = run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations, tolerance=CLOSE)
+    far = run_levenberg_marquardt(
+        problem, state, max_iterations=options.max_iterations, tolerance=NEWTON_GAIN
+    )
     left = options.max_iterations - far.iterations
     if left < 1:
         return far
-    near = replace(problem, weighing=problem.weighing._replace(least=LEAST))
+    near = replace(problem, weighting=problem.weighting._replace(min_curvature=MIN_CURVATURE))
     end = run_levenberg_marquardt(near, far.state, max_iterations=left)
     return replace(end, initial_cost=far.initial_cost, iterations=far.iterations + end.iterations)
 
@@ -298,15 +298,15 @@ def _metric_problem(
 ) -> tuple[_MetricProblem, F64, F64]:
     """The problem, where its intrinsic values start, and the table of intrinsics they are put into."""
     group = np.asarray(cameras.group, dtype=np.int64)
-    seen = np.bincount(o.view_index, minlength=len(group)) > 0
-    used = np.bincount(group[seen], minlength=len(cameras.intrinsics)) > 0
-    values, start, table = number_values(cameras, used, free, prior)
+    observed = np.bincount(o.view_index, minlength=len(group)) > 0
+    used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
+    values, start, table = number_unknowns(cameras, used, free, prior)
     fixed = np.zeros(len(group), bool) if options.fixed_views is None else np.asarray(options.fixed_views)
     if fixed.shape != group.shape:
         raise ValueError(f"fixed_views is one flag for each of {len(group)} views; got shape {fixed.shape}")
-    free_views = seen & ~fixed.astype(bool)
-    columns = place_intrinsics(values, group, np.flatnonzero(free), seen, free_views)
-    layout = lay_out(
+    free_views = observed & ~fixed.astype(bool)
+    columns = assign_columns(values, group, np.flatnonzero(free), observed, free_views)
+    layout = build_layout(
         o,
         columns.block,
         width=POSE_DOF + len(columns.own),
@@ -314,21 +314,21 @@ def _metric_problem(
         border=columns.n_border,
         threads=options.threads,
     )
-    weighing = Weighing(
+    weighting = Weighting(
         options.sigma_px, loss_code(options.loss, options.loss_px), options.loss_px / options.sigma_px
     )
-    problem = _MetricProblem(layout, columns, free_views, values, weighing, layout.jacobians())
+    problem = _MetricProblem(layout, columns, free_views, values, weighting, layout.jacobians())
     return problem, start, table
 
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
     """Covariances of intrinsics (G, C, C) and poses (V, 6, 6) for the noise found, t in the caller's unit."""
-    w = problem.weighing
-    problem = replace(problem, weighing=Weighing(sigma_px, w.code, w.delta))
+    w = problem.weighting
+    problem = replace(problem, weighting=Weighting(sigma_px, w.code, w.delta))
     reduced, _, _ = problem.linearize(state).reduce(1e-10)
     layout, m = problem.layout, state.model
     held = not problem.free_views[layout.observations.view_index].all()
-    block = np.where(problem.free_views, layout.places.block, -1)
+    block = np.where(problem.free_views, layout.index.block, -1)
     found = CovarianceInput(reduced, block, m.R, m.t, held)
     number = problem.columns.of(problem.values.number)
     return bundle_covariances(found, number, m.intrinsics[:, 0], scale)

@@ -15,7 +15,7 @@ from numba import njit
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.losses import loss_curvature, loss_value, loss_weight
-from thesisrecon.numerics.observations import Jacobians, Seen, Weighing
+from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
 from thesisrecon.numerics.small_solvers import away_from_zero
 
 
@@ -52,27 +52,27 @@ def image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def project_metric(model: MetricModel, seen: Seen, residual: F64, depth: F64) -> None:
+def project_metric(model: MetricModel, obs: Observations, residual: F64, depth: F64) -> None:
     """Fill residual (K, 2) px, projection minus observation, and depth (K,)."""
-    for k in range(len(seen.xy)):
-        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+    for k in range(len(obs.xy)):
+        v, x = obs.view_index[k], model.X[obs.point_index[k]]
         x0, x1, x2 = in_camera(model.R[v], model.t[v], x)
         px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
         depth[k] = x2
-        residual[k, 0] = px - seen.xy[k, 0]
-        residual[k, 1] = py - seen.xy[k, 1]
+        residual[k, 0] = px - obs.xy[k, 0]
+        residual[k, 1] = py - obs.xy[k, 1]
 
 
 @njit(cache=True, nogil=True)
-def metric_cost(model: MetricModel, seen: Seen, weighing: Weighing) -> float:
+def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> float:
     """1/2 sum rho of the residuals."""
     cost = 0.0
-    for k in range(len(seen.xy)):
-        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+    for k in range(len(obs.xy)):
+        v, x = obs.view_index[k], model.X[obs.point_index[k]]
         x0, x1, x2 = in_camera(model.R[v], model.t[v], x)
         px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
-        e0, e1 = (px - seen.xy[k, 0]) / weighing.sigma, (py - seen.xy[k, 1]) / weighing.sigma
-        cost += loss_value(weighing.code, e0 * e0 + e1 * e1, weighing.delta)
+        e0, e1 = (px - obs.xy[k, 0]) / weighting.sigma, (py - obs.xy[k, 1]) / weighting.sigma
+        cost += loss_value(weighting.code, e0 * e0 + e1 * e1, weighting.delta)
     return 0.5 * cost
 
 
@@ -99,7 +99,7 @@ def move_poses(R: F64, t: F64, step: F64, R_out: F64, t_out: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def linearize_metric(
-    model: MetricModel, seen: Seen, weighing: Weighing, own: I64, common: I64, J: Jacobians
+    model: MetricModel, obs: Observations, weighting: Weighting, own: I64, common: I64, J: Jacobians
 ) -> float:
     """Fill J with weighted residuals in units of sigma and the Jacobians; returns the cost.
 
@@ -108,19 +108,19 @@ def linearize_metric(
     """
     cost = 0.0
     D = np.empty((2, 10))
-    for k in range(len(seen.xy)):
-        v, x = seen.view_index[k], model.X[seen.point_index[k]]
+    for k in range(len(obs.xy)):
+        v, x = obs.view_index[k], model.X[obs.point_index[k]]
         r, q = model.R[v], model.intrinsics[model.group[v]]
         x0, x1, x2 = in_camera(r, model.t[v], x)
         w = away_from_zero(x2)
         px, py = image_of(q, x0, x1, w)
-        e0, e1 = (px - seen.xy[k, 0]) / weighing.sigma, (py - seen.xy[k, 1]) / weighing.sigma
+        e0, e1 = (px - obs.xy[k, 0]) / weighting.sigma, (py - obs.xy[k, 1]) / weighting.sigma
         s = e0 * e0 + e1 * e1
-        cost += loss_value(weighing.code, s, weighing.delta)
-        root = np.sqrt(loss_weight(weighing.code, s, weighing.delta))
+        cost += loss_value(weighting.code, s, weighting.delta)
+        root = np.sqrt(loss_weight(weighting.code, s, weighting.delta))
         a, b = x0 / w, x1 / w
-        fill_columns(q, a, b, root / weighing.sigma, D)
-        kept = max(loss_curvature(weighing.code, s, weighing.delta), weighing.least)
+        fill_columns(q, a, b, root / weighting.sigma, D)
+        kept = max(loss_curvature(weighting.code, s, weighting.delta), weighting.min_curvature)
         if kept < 1.0:
             # (I - (1 - sqrt(kept)) e e' / s) J with the residual over sqrt(kept): the gradient is the same.
             kept = np.sqrt(kept)
@@ -182,7 +182,7 @@ class MetricCameras:
 
     ``R`` (V, 3, 3) world-to-camera, ``t`` (V, 3); ``intrinsics`` (G, C) rows [focal_px, aspect fy/fx,
     skew_px, cx_px, cy_px, k1] (C = 6), with k2 and k3 after them where the lens needs these (C = 8);
-    ``group`` (V,) the row of each view. A normalised point (x, y) is seen at (x, y) (1 + k1 r^2 + k2 r^4 + k3
+    ``group`` (V,) the row of each view. A normalised point (x, y) is obs at (x, y) (1 + k1 r^2 + k2 r^4 + k3
     r^6), then at K = [[f, skew, cx], [0, aspect f, cy], [0, 0, 1]]. ``shared`` (G, C): rows with equal
     numbers in a column hold one and the same value there; None: every row has values of its own.
     """

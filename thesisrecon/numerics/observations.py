@@ -16,14 +16,16 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import F64, I64
 
 
-@dataclass(frozen=True)
-class Observations:
-    """What the photographs show: observation k is point ``point_index[k]`` in view ``view_index[k]`` at
-    ``xy[k]`` px; (K,), (K,) and (K, 2) in any order, sorted by point is fastest."""
+class Observations(NamedTuple):
+    """Image observations of scene points, in any order; sorted by point is fastest."""
 
     view_index: I64
     point_index: I64
     xy: F64
+
+    def part(self, first: int, last: int) -> Observations:
+        """Return observations ``first`` to ``last`` without a copy."""
+        return Observations(self.view_index[first:last], self.point_index[first:last], self.xy[first:last])
 
 
 @dataclass(frozen=True)
@@ -92,19 +94,7 @@ class Jacobians(NamedTuple):
         return Jacobians(*(a[first:last] for a in self))
 
 
-class Seen(NamedTuple):
-    """Observations: ``view_index`` and ``point_index`` (K,), ``xy`` (K, 2) px."""
-
-    view_index: I64
-    point_index: I64
-    xy: F64
-
-    def part(self, first: int, last: int) -> Seen:
-        """Observations first..last, without a copy."""
-        return Seen(self.view_index[first:last], self.point_index[first:last], self.xy[first:last])
-
-
-class Weighing(NamedTuple):
+class Weighting(NamedTuple):
     """Residuals are counted in units of ``sigma`` under loss number ``code``, which turns at ``delta``.
 
     ``least`` is the share of the curvature along a residual that is kept at least where its loss bends
@@ -115,7 +105,7 @@ class Weighing(NamedTuple):
     sigma: float
     code: int
     delta: float
-    least: float = 1.0
+    min_curvature: float = 1.0
 
 
 _MORTON_BITS = 31

@@ -21,7 +21,13 @@ from thesisrecon.numerics.metric_cameras import (
     move_poses,
     project_metric,
 )
-from thesisrecon.numerics.observations import Jacobians, Seen, Weighing, sort_observations
+from thesisrecon.numerics.observations import (
+    Jacobians,
+    Observations,
+    SortedObservations,
+    Weighting,
+    sort_observations,
+)
 from thesisrecon.numerics.projective_bundle import (
     UnitState,
     linearize_projective,
@@ -32,11 +38,22 @@ from thesisrecon.numerics.projective_bundle import (
 )
 from thesisrecon.numerics.small_solvers import away_from_zero, invert_positive_3x3
 
-Loss = tuple[int, float]
-"""Number of a robust loss, and where it turns."""
+MAX_ITERATIONS = 200
+"""Iterations of :func:`minimize_reprojection`; the median point takes three or four."""
 
 
-class Sightings(NamedTuple):
+class PointOptions(NamedTuple):
+    """Huber or another loss (number, turning point) and when the refinement of a point ends."""
+
+    loss_code: int
+    delta: float
+    iterations: int
+    tolerance: float
+    patience: int
+    keep_cheirality: bool
+
+
+class PointObservations(NamedTuple):
     """Observations ``first`` to ``last`` of one point, among all sorted by point: ``view_index`` (K,), ``xy``
     (K, 2)."""
 
@@ -47,10 +64,10 @@ class Sightings(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def point_cost(P: F64, x: F64, sightings: Sightings, loss: Loss) -> tuple[float, int]:
+def _point_cost(P: F64, x: F64, obs: PointObservations, options: PointOptions) -> tuple[float, int]:
     """1/2 sum rho of one point's observations, and how many of them lie behind their camera."""
-    first, last, view_index, xy = sightings
-    code, delta = loss
+    first, last, view_index, xy = obs
+    code, delta = options.loss_code, options.delta
     cost, behind = 0.0, 0
     for k in range(first, last):
         p = P[view_index[k]]
@@ -66,14 +83,14 @@ def point_cost(P: F64, x: F64, sightings: Sightings, loss: Loss) -> tuple[float,
 
 
 @njit(cache=True, nogil=True)
-def linearize_point(
-    P: F64, x: F64, tangent: tuple[F64, float], sightings: Sightings, loss: Loss, H: F64, g: F64
+def _linearize_point(
+    P: F64, x: F64, tangent: tuple[F64, float], obs: PointObservations, options: PointOptions, H: F64, g: F64
 ) -> None:
     """Fill J'J (3, 3) and J'r (3,) of one unit point in its ``tangent`` space (Householder vector v, factor
     beta)."""
     v, beta = tangent
-    first, last, view_index, xy = sightings
-    code, delta = loss
+    first, last, view_index, xy = obs
+    code, delta = options.loss_code, options.delta
     H[:] = 0.0
     g[:] = 0.0
     J = np.empty((2, 4))
@@ -102,11 +119,8 @@ def linearize_point(
 
 
 @njit(cache=True, nogil=True)
-def refine_each_point(
-    P: F64, X: F64, start: I64, view_index: I64, xy: F64, code: int, delta: float, iterations: int
-) -> None:
-    """Damped Gauss-Newton on every unit point of X (N, 4), in place; steps that cross a focal plane are
-    refused."""
+def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, options: PointOptions) -> None:
+    """Refine every unit point of X (N, 4) in place by Levenberg-Marquardt in its tangent space."""
     H, M, Mi = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     g, step = np.empty(3), np.empty((1, 3))
     v, beta, moved = np.empty((1, 4)), np.empty(1), np.empty((1, 4))
@@ -117,34 +131,36 @@ def refine_each_point(
         x = X[j : j + 1]
         if x[0, 0] == 0.0 and x[0, 1] == 0.0 and x[0, 2] == 0.0 and x[0, 3] == 0.0:
             continue
-        sightings, loss = Sightings(first, last, view_index, xy), (code, delta)
-        cost, behind = point_cost(P, x[0], sightings, loss)
-        damping = 1e-4
-        fresh = True
-        for _ in range(iterations):
-            if fresh:
+        obs = PointObservations(first, last, view_index, xy)
+        cost, behind = _point_cost(P, x[0], obs, options)
+        damping, small_gains, accepted = 1e-4, 0, True
+        for _ in range(options.iterations):
+            if accepted:
                 tangent_reflectors(x, v, beta)
-                linearize_point(P, x[0], (v[0], beta[0]), sightings, loss, H, g)
+                _linearize_point(P, x[0], (v[0], beta[0]), obs, options, H, g)
             for m in range(3):
                 for n in range(3):
                     M[m, n] = H[m, n]
                 M[m, m] *= 1.0 + damping
-            if not invert_positive_3x3(M, Mi):
-                break
-            for m in range(3):
-                step[0, m] = -(Mi[m, 0] * g[0] + Mi[m, 1] * g[1] + Mi[m, 2] * g[2])
-            tangent_step(x, v, beta, step, moved)
-            candidate, flipped = point_cost(P, moved[0], sightings, loss)
-            fresh = candidate < cost and flipped == behind
-            if fresh:
+            accepted = invert_positive_3x3(M, Mi)
+            if accepted:
+                for m in range(3):
+                    step[0, m] = -(Mi[m, 0] * g[0] + Mi[m, 1] * g[1] + Mi[m, 2] * g[2])
+                tangent_step(x, v, beta, step, moved)
+                candidate, flipped = _point_cost(P, moved[0], obs, options)
+                accepted = candidate < cost and (flipped == behind or not options.keep_cheirality)
+            if accepted:
                 x[0] = moved[0]
                 gain = cost - candidate
-                cost = candidate
+                cost, behind = candidate, flipped
                 damping = max(damping * 0.2, 1e-9)
-                if gain <= 1e-9 * cost:
+                small_gains = small_gains + 1 if gain <= options.tolerance * cost else 0
+                if small_gains == options.patience:
                     break
             else:
                 damping *= 10.0
+                if damping > 1e12:
+                    break
 
 
 @dataclass(frozen=True)
@@ -191,34 +207,57 @@ def refine_points(
     loss_px: float = 1.0,
     iterations: int = 5,
 ) -> F64:
-    """Minimise each point's own sum of rho(|x - P X|^2), cameras held, rho = Huber's loss at ``loss_px``.
-
-    P (V, 3, 4) cameras; X (N, 4) homogeneous starts; view_index, point_index (K,), xy (K, 2) px -> (N, 4)
-    with the norms and signs of the starts. Damped Gauss-Newton in the tangent space of the whitened unit
-    4-vector; no point's cost rises and none crosses the focal plane of a view that sees it. Points that are
-    all zero or not finite, and points with fewer than two observations, come back untouched. Raises
-    ``ValueError`` for wrong shapes.
-    """
-    P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
-    if P.ndim != 3 or P.shape[1:] != (3, 4) or X.ndim != 2 or X.shape[1] != 4:
-        raise ValueError(f"refine_points needs (V, 3, 4) cameras and (N, 4) points; got {P.shape}, {X.shape}")
-    o = sort_observations(view_index, point_index, xy, len(P), len(X))
-    code = loss_code("huber", loss_px)
-    norms = np.linalg.norm(X, axis=1)
-    used = np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2)
+    """Refine each point with the cameras fixed (structure-only bundle adjustment)."""
+    P, X, o = _checked_points("refine_points", P, X, (view_index, point_index, xy))
+    used = _observed_twice(X, o)
     if not used.any():
         return X
-    T, M = pixel_conditioning(o.xy), whitening_transform(X[used])
+    options = PointOptions(loss_code("huber", loss_px), loss_px, iterations, 1e-9, 1, True)
+    return _refine_in_frame(P, X, o, used, whitening_transform(X[used]), options)
+
+
+def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy: F64) -> F64:
+    """Run each point to its least sum of squared reprojection errors."""
+    P, X, o = _checked_points("minimize_reprojection", P, X, (view_index, point_index, xy))
+    used = _observed_twice(X, o)
+    if not used.any():
+        return X
+    cameras = pixel_conditioning(o.xy) @ P
+    norms = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
+    M = np.asarray(np.linalg.qr((cameras / np.where(norms > 0.0, norms, 1.0)).reshape(-1, 4))[1])
+    # Two cameras with one centre leave a direction of space without images.
+    if len(M) < 4 or not np.abs(np.diag(M)).min() > 1e-13 * np.abs(M).max():
+        M = np.eye(4)
+    options = PointOptions(loss_code("squared", 1.0), 1.0, MAX_ITERATIONS, 1e-14, 2, False)
+    return _refine_in_frame(P, X, o, used, M, options)
+
+
+def _checked_points(
+    caller: str, P: F64, X: F64, observations: tuple[I64, I64, F64]
+) -> tuple[F64, F64, SortedObservations]:
+    P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
+    if P.ndim != 3 or P.shape[1:] != (3, 4) or X.ndim != 2 or X.shape[1] != 4:
+        raise ValueError(f"{caller} needs (V, 3, 4) cameras and (N, 4) points; got {P.shape}, {X.shape}")
+    return P, X, sort_observations(*observations, len(P), len(X))
+
+
+def _observed_twice(X: F64, o: SortedObservations) -> B8:
+    norms = np.linalg.norm(X, axis=1)
+    return np.asarray(np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2))
+
+
+def _refine_in_frame(P: F64, X: F64, o: SortedObservations, used: B8, M: F64, options: PointOptions) -> F64:
+    """Refine the ``used`` points in conditioned pixels and the space M X; norms and signs are kept."""
+    norms, T = np.linalg.norm(X, axis=1), pixel_conditioning(o.xy)
     # The scale of a camera does not change its projections, but it must not push depths below rounding.
     cameras = T @ P @ np.linalg.inv(M)
     sizes = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
     cameras = np.ascontiguousarray(cameras / np.where(sizes > 0.0, sizes, 1.0))
     moved = np.where(used[:, None], X, 0.0) @ M.T
     moved[used] /= np.linalg.norm(moved[used], axis=1, keepdims=True)
-    xy_conditioned = o.xy * T[0, 0] + T[:2, 2]
-    refine_each_point(
-        cameras, moved, o.start, o.view_index, xy_conditioned, code, loss_px * float(T[0, 0]), iterations
-    )
+    xy = o.xy * T[0, 0] + T[:2, 2]
+    options = options._replace(delta=options.delta * float(T[0, 0]))
+    _refine_each_point(cameras, moved, o.start, o.view_index, xy, options)
     back = moved @ np.linalg.inv(M).T
     lengths = np.linalg.norm(back, axis=1, keepdims=True)
     back *= norms[:, None] / np.where(lengths > 0.0, lengths, 1.0)
@@ -230,12 +269,12 @@ class _CameraProblem:
     """One unit camera (1, 12) against whitened unit points, conditioned pixels."""
 
     X: F64
-    seen: Seen
-    weighing: Weighing
+    obs: Observations
+    weighting: Weighting
 
     def linearize(self, state: F64) -> DenseSystem:
         J = Jacobians.empty(len(self.X), 11, 0)
-        cost = linearize_projective(UnitState.at(state, self.X), self.seen, self.weighing, J)
+        cost = linearize_projective(UnitState.at(state, self.X), self.obs, self.weighting, J)
         return _dense_system(cost, J)
 
     def retract(self, state: F64, step: F64) -> F64:
@@ -245,16 +284,16 @@ class _CameraProblem:
 
     def residual(self, state: F64) -> F64:
         residual, depth = np.empty((len(self.X), 2)), np.empty(len(self.X))
-        project_projective(state.reshape(1, 3, 4), self.X, self.seen, residual, depth)
+        project_projective(state.reshape(1, 3, 4), self.X, self.obs, residual, depth)
         return residual
 
     def cost(self, state: F64) -> float:
-        return float(projective_cost(UnitState.at(state, self.X), self.seen, self.weighing))
+        return float(projective_cost(UnitState.at(state, self.X), self.obs, self.weighting))
 
 
-def _seen_by_one(xy: F64) -> Seen:
+def _one_view_observations(xy: F64) -> Observations:
     """Every point once, by the only view."""
-    return Seen(np.zeros(len(xy), dtype=np.int64), np.arange(len(xy)), np.ascontiguousarray(xy))
+    return Observations(np.zeros(len(xy), dtype=np.int64), np.arange(len(xy)), np.ascontiguousarray(xy))
 
 
 def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
@@ -284,8 +323,8 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     start = (T @ P @ np.linalg.inv(M)).reshape(1, 12)
     scale = float(T[0, 0])
-    weighing = Weighing(1.0, loss_code("huber", loss_px), loss_px * scale)
-    problem = _CameraProblem(points, _seen_by_one(xy * scale + T[:2, 2]), weighing)
+    weighting = Weighting(1.0, loss_code("huber", loss_px), loss_px * scale)
+    problem = _CameraProblem(points, _one_view_observations(xy * scale + T[:2, 2]), weighting)
     solution = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations)
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
     back = np.kron(np.linalg.inv(T), M.T)
@@ -316,13 +355,13 @@ def _camera_covariance(problem: _CameraProblem, state: F64) -> F64:
 class _PoseProblem:
     """One calibrated camera against points held still; a state's model has one view and one row."""
 
-    seen: Seen
+    obs: Observations
     free: I64
-    weighing: Weighing
+    weighting: Weighting
 
     def linearize(self, state: MetricModel) -> DenseSystem:
         J = Jacobians.empty(len(state.X), 6 + len(self.free), 0)
-        cost = linearize_metric(state, self.seen, self.weighing, self.free, self.free[:0], J)
+        cost = linearize_metric(state, self.obs, self.weighting, self.free, self.free[:0], J)
         return _dense_system(cost, J)
 
     def retract(self, state: MetricModel, step: F64) -> MetricModel:
@@ -335,12 +374,12 @@ class _PoseProblem:
         return state._replace(R=R, t=t, intrinsics=intrinsics)
 
     def residual(self, state: MetricModel) -> F64:
-        residual, depth = np.empty_like(self.seen.xy), np.empty(len(self.seen.xy))
-        project_metric(state, self.seen, residual, depth)
+        residual, depth = np.empty_like(self.obs.xy), np.empty(len(self.obs.xy))
+        project_metric(state, self.obs, residual, depth)
         return residual
 
     def cost(self, state: MetricModel) -> float:
-        return float(metric_cost(state, self.seen, self.weighing))
+        return float(metric_cost(state, self.obs, self.weighting))
 
 
 def refine_pose(
@@ -374,8 +413,8 @@ def refine_pose(
     origin = X.mean(axis=0)
     size = float(np.linalg.norm(X - origin, axis=1).mean())
     scale = 1.0 / size if size > 0.0 else 1.0
-    weighing = Weighing(1.0, loss_code("huber", loss_px), loss_px)
-    problem = _PoseProblem(_seen_by_one(xy), columns, weighing)
+    weighting = Weighting(1.0, loss_code("huber", loss_px), loss_px)
+    problem = _PoseProblem(_one_view_observations(xy), columns, weighting)
     moved = scale * (t + R @ origin)
     group = np.zeros(1, dtype=np.int64)
     start = MetricModel(R[None], moved[None], q[None], group, np.ascontiguousarray(scale * (X - origin)))

@@ -15,8 +15,14 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
 from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.numerics.losses import loss_code, loss_value, loss_weight
-from thesisrecon.numerics.observations import Jacobians, Seen, SortedObservations, Weighing, sort_observations
-from thesisrecon.numerics.schur import BundleLayout, BundleStep, BundleSystem, hold_flipping, lay_out
+from thesisrecon.numerics.observations import (
+    Jacobians,
+    Observations,
+    SortedObservations,
+    Weighting,
+    sort_observations,
+)
+from thesisrecon.numerics.schur import BundleLayout, BundleStep, BundleSystem, build_layout
 from thesisrecon.numerics.small_solvers import away_from_zero
 
 VIEW_DOF = 11
@@ -77,28 +83,28 @@ def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def project_projective(P: F64, X: F64, seen: Seen, residual: F64, depth: F64) -> None:
+def project_projective(P: F64, X: F64, obs: Observations, residual: F64, depth: F64) -> None:
     """Fill residual (K, 2) = projection - xy and depth (K,) = third row of P X; P (V, 3, 4), X (N, 4)."""
-    for k in range(len(seen.xy)):
-        p, x = P[seen.view_index[k]], X[seen.point_index[k]]
+    for k in range(len(obs.xy)):
+        p, x = P[obs.view_index[k]], X[obs.point_index[k]]
         z0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]
         z1 = p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]
         z2 = p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3]
         w = away_from_zero(z2)
         depth[k] = z2
-        residual[k, 0] = z0 / w - seen.xy[k, 0]
-        residual[k, 1] = z1 / w - seen.xy[k, 1]
+        residual[k, 0] = z0 / w - obs.xy[k, 0]
+        residual[k, 1] = z1 / w - obs.xy[k, 1]
 
 
 @njit(cache=True, nogil=True)
-def linearize_projective(state: UnitState, seen: Seen, weighing: Weighing, J: Jacobians) -> float:
+def linearize_projective(state: UnitState, obs: Observations, weighting: Weighting, J: Jacobians) -> float:
     """Fill J with weighted residuals, A (K, 2, 11) and B (K, 2, 3) in the tangent spaces; returns the cost.
 
-    With u = P X: d pi = (1 / u2) [[1, 0, -x], [0, 1, -y]] du (methods 6.7). ``weighing.sigma`` is not used.
+    With u = P X: d pi = (1 / u2) [[1, 0, -x], [0, 1, -y]] du (methods 6.7). ``weighting.sigma`` is not used.
     """
     cost = 0.0
-    for k in range(len(seen.xy)):
-        i, j = seen.view_index[k], seen.point_index[k]
+    for k in range(len(obs.xy)):
+        i, j = obs.view_index[k], obs.point_index[k]
         p, x, v, y = state.P[i], state.X[j], state.vP[i], state.vX[j]
         bP, bX = state.bP[i], state.bX[j]
         A, B = J.A[k], J.B[k]
@@ -106,10 +112,10 @@ def linearize_projective(state: UnitState, seen: Seen, weighing: Weighing, J: Ja
         u1 = p[4] * x[0] + p[5] * x[1] + p[6] * x[2] + p[7] * x[3]
         w = away_from_zero(p[8] * x[0] + p[9] * x[1] + p[10] * x[2] + p[11] * x[3])
         a, b = u0 / w, u1 / w
-        r0, r1 = a - seen.xy[k, 0], b - seen.xy[k, 1]
+        r0, r1 = a - obs.xy[k, 0], b - obs.xy[k, 1]
         s = r0 * r0 + r1 * r1
-        cost += loss_value(weighing.code, s, weighing.delta)
-        root = np.sqrt(loss_weight(weighing.code, s, weighing.delta))
+        cost += loss_value(weighting.code, s, weighting.delta)
+        root = np.sqrt(loss_weight(weighting.code, s, weighting.delta))
         J.residual[k, 0], J.residual[k, 1] = root * r0, root * r1
         f = root / w
         e0 = x[0] * v[0] + x[1] * v[1] + x[2] * v[2] + x[3] * v[3]
@@ -137,16 +143,16 @@ def linearize_projective(state: UnitState, seen: Seen, weighing: Weighing, J: Ja
 
 
 @njit(cache=True, nogil=True)
-def projective_cost(state: UnitState, seen: Seen, weighing: Weighing) -> float:
+def projective_cost(state: UnitState, obs: Observations, weighting: Weighting) -> float:
     """1/2 sum rho of the residuals."""
     cost = 0.0
-    for k in range(len(seen.xy)):
-        p, x = state.P[seen.view_index[k]], state.X[seen.point_index[k]]
+    for k in range(len(obs.xy)):
+        p, x = state.P[obs.view_index[k]], state.X[obs.point_index[k]]
         u0 = p[0] * x[0] + p[1] * x[1] + p[2] * x[2] + p[3] * x[3]
         u1 = p[4] * x[0] + p[5] * x[1] + p[6] * x[2] + p[7] * x[3]
         w = away_from_zero(p[8] * x[0] + p[9] * x[1] + p[10] * x[2] + p[11] * x[3])
-        r0, r1 = u0 / w - seen.xy[k, 0], u1 / w - seen.xy[k, 1]
-        cost += loss_value(weighing.code, r0 * r0 + r1 * r1, weighing.delta)
+        r0, r1 = u0 / w - obs.xy[k, 0], u1 / w - obs.xy[k, 1]
+        cost += loss_value(weighting.code, r0 * r0 + r1 * r1, weighting.delta)
     return 0.5 * cost
 
 
@@ -170,40 +176,40 @@ class _ProjectiveProblem:
     """Reprojection in conditioned pixels; states hold unit vectors, steps lie in their tangent spaces."""
 
     layout: BundleLayout
-    weighing: Weighing
+    weighting: Weighting
     jacobians: Jacobians
 
     def linearize(self, state: UnitState) -> BundleSystem:
-        def work(which: slice, seen: Seen) -> float:
+        def work(which: slice, obs: Observations) -> float:
             part = self.jacobians.part(which.start, which.stop)
-            return float(linearize_projective(state, seen, self.weighing, part))
+            return float(linearize_projective(state, obs, self.weighting, part))
 
         cost = sum(self.layout.over_observations(work))
         return BundleSystem(cost, self.layout, self.jacobians)
 
     def retract(self, state: UnitState, step: BundleStep) -> UnitState:
-        block = self.layout.places.block
+        block = self.layout.index.block
         views = np.zeros((len(state.P), VIEW_DOF))
         views[block >= 0] = step.cameras.reshape(-1, VIEW_DOF)
         P, X = np.empty_like(state.P), np.empty_like(state.X)
         tangent_step(state.P, state.vP, state.bP, views, P)
         tangent_step(state.X, state.vX, state.bX, step.points, X)
-        hold_flipping(self.layout, state.P[:, 8:], P[:, 8:], state.X, X)
+        self.layout.revert_cheirality_violations(state.P[:, 8:], P[:, 8:], state.X, X)
         return UnitState.at(P, X)
 
     def residual(self, state: UnitState) -> F64:
         K = len(self.layout.observations.xy)
         residual, depth = np.empty((K, 2)), np.empty(K)
 
-        def work(which: slice, seen: Seen) -> None:
-            project_projective(state.P.reshape(-1, 3, 4), state.X, seen, residual[which], depth[which])
+        def work(which: slice, obs: Observations) -> None:
+            project_projective(state.P.reshape(-1, 3, 4), state.X, obs, residual[which], depth[which])
 
         self.layout.over_observations(work)
         return residual
 
     def cost(self, state: UnitState) -> float:
-        def work(_: slice, seen: Seen) -> float:
-            return float(projective_cost(state, seen, self.weighing))
+        def work(_: slice, obs: Observations) -> float:
+            return float(projective_cost(state, obs, self.weighting))
 
         return sum(self.layout.over_observations(work))
 
@@ -240,12 +246,12 @@ def refine_projective_bundle(
             f"a projective bundle needs (V, 3, 4) cameras and (N, 4) points; got {P.shape}, {X.shape}"
         )
     observations = sort_observations(view_index, point_index, xy, len(P), len(X))
-    seen = np.bincount(observations.view_index, minlength=len(P)) > 0
+    observed = np.bincount(observations.view_index, minlength=len(P)) > 0
     seen_points = np.diff(observations.start) > 0
-    free = seen & ~(np.zeros(len(P), bool) if fixed_views is None else np.asarray(fixed_views, bool))
+    free = observed & ~(np.zeros(len(P), bool) if fixed_views is None else np.asarray(fixed_views, bool))
 
     T, M = pixel_conditioning(observations.xy), whitening_transform(X[seen_points])
-    conditioned, P_norms = _unit_rows((T @ P @ np.linalg.inv(M)).reshape(-1, 12), seen, "camera")
+    conditioned, P_norms = _unit_rows((T @ P @ np.linalg.inv(M)).reshape(-1, 12), observed, "camera")
     points, X_norms = _unit_rows(X @ M.T, seen_points, "point")
     problem = _projective_problem(observations, T, free, loss_px)
     start = UnitState.at(conditioned, points)
@@ -273,9 +279,9 @@ def _projective_problem(
     conditioned = replace(observations, xy=observations.xy * T[0, 0] + T[:2, 2])
     block = np.where(free, np.cumsum(free) - 1, -1)
     none = np.zeros((len(free), 0), dtype=np.int64)
-    layout = lay_out(conditioned, block, width=VIEW_DOF, common=none, border=0)
-    weighing = Weighing(1.0, loss_code("huber", loss_px), loss_px * float(T[0, 0]))
-    return _ProjectiveProblem(layout, weighing, layout.jacobians())
+    layout = build_layout(conditioned, block, width=VIEW_DOF, common=none, border=0)
+    weighting = Weighting(1.0, loss_code("huber", loss_px), loss_px * float(T[0, 0]))
+    return _ProjectiveProblem(layout, weighting, layout.jacobians())
 
 
 def _unit_rows(rows: F64, used: B8, what: str) -> tuple[F64, F64]:

@@ -17,7 +17,7 @@ import scipy
 from numba import njit
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.numerics.elimination import Sums
+from thesisrecon.numerics.elimination import ReducedSums
 from thesisrecon.numerics.levenberg_marquardt import solve_positive
 
 
@@ -114,7 +114,7 @@ class ReducedSystem:
 
     row: I64
     column: I64
-    sums: Sums
+    sums: ReducedSums
 
     def dense(self) -> F64:
         """The matrix (D, D), upper triangle."""

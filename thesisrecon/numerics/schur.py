@@ -18,16 +18,16 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics.elimination import (
-    Places,
+    BlockIndex,
     PointSums,
-    Sums,
+    ReducedSums,
     eliminate_points,
     mark_pairs,
-    revert_cheirality_violations,
+    revert_crossing_points,
     substitute_points,
 )
 from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
-from thesisrecon.numerics.observations import Jacobians, Seen, SortedObservations
+from thesisrecon.numerics.observations import Jacobians, Observations, SortedObservations
 from thesisrecon.numerics.reduced_solvers import ReducedSolver, ReducedSystem, add_diagonal, choose_solver
 
 Result = TypeVar("Result")
@@ -47,7 +47,7 @@ class BundleLayout:
     """
 
     observations: SortedObservations
-    places: Places
+    index: BlockIndex
     width: int
     border: int
     row: I64
@@ -59,7 +59,7 @@ class BundleLayout:
     @property
     def size(self) -> int:
         """Unknowns of the cameras, D."""
-        return len(self.places.pair) * self.width + self.border
+        return len(self.index.pair) * self.width + self.border
 
     def over_chunks(self, work: Callable[[int, int], Result]) -> list[Result]:
         """work(first, last) for every range of points, in their order."""
@@ -68,28 +68,38 @@ class BundleLayout:
         with ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(lambda chunk: work(*chunk), self.chunks))
 
-    def over_observations(self, work: Callable[[slice, Seen], Result]) -> list[Result]:
+    def over_observations(self, work: Callable[[slice, Observations], Result]) -> list[Result]:
         """work(which, they) for the observations of every range of points, in their order."""
         start, o = self.observations.start, self.observations
-        seen = Seen(o.view_index, o.point_index, o.xy)
+        obs = Observations(o.view_index, o.point_index, o.xy)
 
         def run(first: int, last: int) -> Result:
-            return work(slice(start[first], start[last]), seen.part(start[first], start[last]))
+            return work(slice(start[first], start[last]), obs.part(start[first], start[last]))
 
         return self.over_chunks(run)
 
+    def revert_cheirality_violations(self, before: F64, after: F64, X_before: F64, X_after: F64) -> None:
+        """Undo the steps of points that cross the focal plane of a view that observes them."""
+        start, view = self.observations.start, self.observations.view_index
+
+        def work(first: int, last: int) -> None:
+            rows = start[first : last + 1]
+            revert_crossing_points(rows, view, before, after, X_before[first:last], X_after[first:last])
+
+        self.over_chunks(work)
+
     def jacobians(self) -> Jacobians:
         """Buffers of one linearisation."""
-        return Jacobians.empty(len(self.observations.xy), self.width, self.places.common.shape[1])
+        return Jacobians.empty(len(self.observations.xy), self.width, self.index.common.shape[1])
 
-    def sums(self) -> Sums:
+    def sums(self) -> ReducedSums:
         """A reduced system of zeros."""
-        C, b, e, D = self.width, len(self.places.pair), self.border, self.size
+        C, b, e, D = self.width, len(self.index.pair), self.border, self.size
         shapes = [(len(self.row), C, C), (b, C, e), (e, e), (D,), (D,), (D,)]
-        return Sums(*(np.zeros(shape) for shape in shapes))
+        return ReducedSums(*(np.zeros(shape) for shape in shapes))
 
 
-def lay_out(
+def build_layout(
     observations: SortedObservations,
     block: I64,
     *,
@@ -116,8 +126,8 @@ def lay_out(
     bounds = np.searchsorted(o.start, np.linspace(0, len(o.xy), count + 1)[1:-1])
     ends = [0, *bounds.tolist(), len(o.start) - 1]
     chunks = tuple(itertools.pairwise(ends))
-    places = Places(o.start, o.view_index, block, pair, np.ascontiguousarray(common))
-    return BundleLayout(o, places, width, border, row, column, chunks, solver, threads)
+    index = BlockIndex(o.start, o.view_index, block, pair, np.ascontiguousarray(common))
+    return BundleLayout(o, index, width, border, row, column, chunks, solver, threads)
 
 
 @dataclass(frozen=True)
@@ -153,9 +163,9 @@ class BundleSystem:
         N, layout = len(self.layout.observations.start) - 1, self.layout
         points = PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
 
-        def eliminate(first: int, last: int) -> Sums:
+        def eliminate(first: int, last: int) -> ReducedSums:
             sums = layout.sums()
-            eliminate_points(first, last, damping, self.jacobians, layout.places, sums, points)
+            eliminate_points(first, last, damping, self.jacobians, layout.index, sums, points)
             return sums
 
         total, *rest = layout.over_chunks(eliminate)
@@ -179,7 +189,7 @@ class BundleSystem:
         moves = np.zeros_like(points.gradient)
 
         def substitute(first: int, last: int) -> None:
-            substitute_points(first, last, cameras, self.jacobians, self.layout.places, points, moves)
+            substitute_points(first, last, cameras, self.jacobians, self.layout.index, points, moves)
 
         self.layout.over_chunks(substitute)
         if not np.isfinite(moves).all():
@@ -189,7 +199,7 @@ class BundleSystem:
         return BundleStep(cameras, moves), 0.5 * (stiff - slope)
 
 
-def _add_prior(layout: BundleLayout, total: Sums, prior: CameraPrior) -> None:
+def _add_prior(layout: BundleLayout, total: ReducedSums, prior: CameraPrior) -> None:
     """The prior's information and gradient."""
     first, second, w, edge = prior.first, prior.second, prior.weight, layout.size - layout.border
     total.rhs[:] -= prior.gradient
@@ -207,21 +217,6 @@ def _add_prior(layout: BundleLayout, total: Sums, prior: CameraPrior) -> None:
     np.add.at(flat, (first[~inside], second[~inside]), -w[~inside])
 
 
-def _add_diagonal(layout: BundleLayout, total: Sums, values: F64) -> None:
+def _add_diagonal(layout: BundleLayout, total: ReducedSums, values: F64) -> None:
     """values (D,) on the diagonal of the reduced matrix."""
-    add_diagonal(total.blocks, layout.places.pair, total.corner, values)
-
-
-def hold_flipping(layout: BundleLayout, before: F64, after: F64, X_before: F64, X_after: F64) -> None:
-    """Put back the points whose step takes them through the focal plane of a view that sees them.
-
-    ``before``, ``after`` (V, 4) third rows of the cameras; X (N, 4), or (N, 3) with a fourth coordinate 1.
-    """
-    start, view = layout.observations.start, layout.observations.view_index
-
-    def work(first: int, last: int) -> None:
-        revert_cheirality_violations(
-            start[first : last + 1], view, before, after, X_before[first:last], X_after[first:last]
-        )
-
-    layout.over_chunks(work)
+    add_diagonal(total.blocks, layout.index.pair, total.corner, values)
