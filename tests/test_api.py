@@ -13,7 +13,7 @@ from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.records import Image, Reconstruction, TexturedMesh, Tracks
-from thesisrecon.report.summary import original_from_working, point_colours
+from thesisrecon.report.summary import _original_from_working, point_colors
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 
@@ -101,7 +101,7 @@ def test_points_take_the_mean_colour_of_where_they_are_seen():
         rgb = np.zeros((height, width, 3), np.uint8)
         rgb[..., 0], rgb[..., 1] = np.arange(width)[None, :], np.arange(height)[:, None]
         images.append(Image("x", rgb, (width, height)))
-    colours = point_colours(small_reconstruction(), tuple(images))
+    colours = point_colors(small_reconstruction(), tuple(images))
     assert colours.tolist() == [[2, 1, 0], [0, 0, 0], [128, 128, 128]]
 
 
@@ -109,7 +109,7 @@ def test_pixels_go_back_to_the_original_as_they_came():
     scale = 0.4
     original = np.array([123.0, 45.0])
     working = (original + 0.5) * scale - 0.5
-    np.testing.assert_allclose(original_from_working(scale) @ [*working, 1.0], [*original, 1.0])
+    np.testing.assert_allclose(_original_from_working(scale) @ [*working, 1.0], [*original, 1.0])
 
 
 def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path):

@@ -162,7 +162,7 @@ def test_another_kind_on_the_command_line_drops_the_settings_of_the_kind_in_the_
     assert kept.features.levels == 4
 
 
-def test_text_that_is_no_toml_and_stages_that_are_no_tables_are_refused():
+def test_invalid_toml_and_stages_that_are_not_tables_are_rejected():
     with pytest.raises(UsageError, match="not TOML"):
         config_from_toml("features: harris")
     with pytest.raises(UsageError, match="takes a table"):
@@ -253,7 +253,7 @@ def test_a_zooming_camera_keeps_the_rest():
     assert strange.shared[:, 3].tolist() == [0, 1, 2]
 
 
-def test_the_header_speaks_where_it_is_wanted():
+def test_exif_is_used_on_request():
     wish = IntrinsicsOptions(exif=True, focal_std_rel=0.2)
     got = stages_view(wish, exif=(3000.0, np.nan, 4000.0))
     assert got.focal_known.tolist() == [True, False, True]
@@ -263,7 +263,7 @@ def test_the_header_speaks_where_it_is_wanted():
     assert known.focal_known.all()
 
 
-def test_a_known_focal_that_no_header_names_is_constant_and_said():
+def test_a_known_focal_without_exif_is_constant_and_reported():
     wish = IntrinsicsOptions(focal="known", exif=True)
     silent = np.full(3, np.nan)
     got = stages_view(wish)
@@ -277,7 +277,7 @@ def test_a_known_focal_that_no_header_names_is_constant_and_said():
     assert stages_view(each).group.tolist() == [0, 1, 2]
 
 
-def test_headers_that_speak_for_some_leave_the_others_to_share_one_focal():
+def test_images_without_exif_share_one_focal():
     wish = IntrinsicsOptions(focal="known", exif=True)
     sizes = [(4000, 3000)] * 5
     exif = np.array([3000.0, np.nan, 3000.0, np.nan, 3500.0])
@@ -327,6 +327,6 @@ def test_presets_survive_their_own_text(name):
         ({"k1": "known", "k1_std": 0.1}, "has no effect with k1 = known"),
     ],
 )
-def test_wishes_that_contradict_themselves_are_refused(wish, words):
+def test_contradictory_options_are_rejected(wish, words):
     with pytest.raises(ValueError, match=words):
         IntrinsicsOptions(**wish)

@@ -140,14 +140,14 @@ def test_no_depths_are_one_sentence_and_the_cameras_stay(name, base, tmp_path):
     assert (tmp_path / "report.html").exists()
 
 
-def test_who_asks_for_the_model_is_refused(tmp_path):
+def test_a_requested_model_without_depths_is_a_failure(tmp_path):
     with pytest.raises(StageFailure, match="no depths were found"):
         run("no texture", tmp_path, until="model")
     assert "no depths" in summary(tmp_path)["failure"]
 
 
 @pytest.mark.parametrize(("name", "base"), [*((n, "default") for n in PARTLY), ("a fence", "thesis")])
-def test_what_can_be_seen_becomes_a_model(name, base, tmp_path):
+def test_partly_visible_scenes_become_models(name, base, tmp_path):
     result = run(name, tmp_path, base)
     assert result.mesh is not None
     assert len(result.mesh.faces) > 100

@@ -53,7 +53,7 @@ def kept_bytes(out):
     return {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
 
 
-def test_a_run_leaves_everything_it_promises(tmp_path):
+def test_a_run_writes_all_documented_files(tmp_path):
     result = run(tmp_path / "out")
     out = tmp_path / "out"
     assert result.metric is not None
@@ -183,7 +183,7 @@ def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path):
     assert "no depths" in read(tmp_path / "summary.json")["failure"]
 
 
-def test_who_asks_for_no_surface_by_name_is_content_with_the_cameras(tmp_path):
+def test_cameras_suffice_when_no_surface_is_requested(tmp_path):
     config = fake_config(dense=fakes.FakeDense(confirmed=False))
     result = run(tmp_path, until=None, config=config)
     assert result.mesh is None
@@ -195,7 +195,7 @@ def test_who_asks_for_no_surface_by_name_is_content_with_the_cameras(tmp_path):
     )
 
 
-def test_the_end_is_a_model_unless_told_otherwise(tmp_path):
+def test_a_run_ends_with_a_model_by_default(tmp_path):
     result = run(tmp_path, until=None)
     assert result.mesh is not None
     summary = read(tmp_path / "summary.json")
@@ -207,7 +207,7 @@ def test_the_end_is_a_model_unless_told_otherwise(tmp_path):
     assert 0.5 < result.held_out.share <= 1.0
     assert summary["model"]["held_out"]["psnr_db"] == pytest.approx(result.held_out.psnr_db)
     assert 'id="held-out"' in (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert [m["share_known"] for m in summary["depth_maps"]] == [
+    assert [m["known_fraction"] for m in summary["depth_maps"]] == [
         pytest.approx(np.isfinite(m.depth).mean()) for m in result.depth_maps
     ]
 
@@ -246,7 +246,7 @@ def test_the_seed_matters_and_streams_are_apart(tmp_path):
     assert len(draws) == 12
 
 
-def test_another_run_is_refused_and_overwrite_keeps_what_is_the_same(tmp_path):
+def test_another_run_is_rejected_and_overwrite_keeps_equal_records(tmp_path):
     run(tmp_path)
     CALLS.clear()
     changed = fake_config(
@@ -350,7 +350,7 @@ def test_a_distrusted_result_is_tried_from_other_pairs(tmp_path):
     assert any("2 initial pairs" in warning for warning in result.warnings)
 
 
-def test_a_result_that_nobody_trusts_is_written_with_its_warning(tmp_path):
+def test_an_untrusted_result_is_written_with_its_warning(tmp_path):
     result = run(tmp_path, config=fake_config(metric=fakes.FakeMetric(trusted_from=9)))
     assert sum(c.startswith("projective") for c in CALLS) == 3
     assert any("not to be trusted: odd focal" in warning for warning in result.warnings)
@@ -359,7 +359,7 @@ def test_a_result_that_nobody_trusts_is_written_with_its_warning(tmp_path):
     assert "odd focal" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_every_doubt_is_said_once(tmp_path):
+def test_every_failed_check_is_reported_once(tmp_path):
     doubted = fake_config(
         metric=fakes.FakeMetric(trusted_from=9, failed_checks=("odd focal", "the camera only rotates")),
         selfcalibration=fakes.FakeCalibrator(identifiable=False),
@@ -374,7 +374,7 @@ def test_a_failed_attempt_is_followed_by_another(tmp_path):
     assert result.metric is not None
 
 
-def test_a_failure_keeps_what_was_computed_and_says_why(tmp_path):
+def test_a_failure_keeps_results_and_states_the_reason(tmp_path):
     config = fake_config(projective=fakes.FakeProjective(fail_below=9))
     with pytest.raises(StageFailure, match=r"the initial pair is bad; attempt 0"):
         run(tmp_path, config=config)
@@ -408,7 +408,7 @@ def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path):
     assert "calibrate prior=True" in CALLS
 
 
-def test_a_wish_for_exif_that_no_photograph_grants_is_answered(tmp_path):
+def test_a_request_for_exif_without_exif_data_is_reported(tmp_path):
     wish = IntrinsicsOptions(exif=True, focal_std_rel=0.1)
     result = run(tmp_path, config=fake_config(intrinsics=wish))
     assert "calibrate prior=False" in CALLS
@@ -426,7 +426,7 @@ def test_a_wish_for_exif_that_no_photograph_grants_is_answered(tmp_path):
         (IntrinsicsOptions(), [np.nan, np.nan], None),
     ],
 )
-def test_only_an_unanswered_wish_is_worth_a_warning(wish, focal_px, words):
+def test_only_an_ignored_option_gives_a_warning(wish, focal_px, words):
     warnings = prior_warnings(wish, np.array(focal_px))
     assert [words in warning for warning in warnings] == ([True] if words else [])
 
@@ -457,7 +457,7 @@ class NamelessDetector(fakes.FakeDetector):
         ({"seed": -1}, "at least 0"),
     ],
 )
-def test_wrong_wishes_get_a_sentence_before_anything_is_made(tmp_path, options, words):
+def test_wrong_options_are_rejected_before_any_output(tmp_path, options, words):
     with pytest.raises(UsageError, match=words):
         run(tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()

@@ -99,7 +99,7 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monke
         between.prepare_pair(a, b)
 
 
-def test_what_cannot_be_rectified_is_told_without_the_library_s_other_ways(monkeypatch):
+def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
     class Dense:
         failure = StageFailure("too distorted", "a number", "rectify in polar coordinates")
 
@@ -257,7 +257,7 @@ def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_
     assert not out.exists()
 
 
-def test_wishes_name_what_is_wrong(tmp_path):
+def test_option_errors_name_the_fault(tmp_path):
     photographs = (COURTYARD / "0004.jpg", COURTYARD / "0005.jpg")
     with pytest.raises(UsageError, match="unknown method"):
         InterpolateOptions(photographs, method="guessing")

@@ -56,7 +56,7 @@ def test_at_their_own_places_the_photographs_are_seen_again(found):
     assert np.mean(first != found.images[0].rgb) < 1e-3
 
 
-def test_what_is_told_of_the_focal_length_is_taken(found):
+def test_a_given_focal_length_is_used(found):
     told = replace(SMALL, intrinsics=IntrinsicsOptions(focal="known", focal_px=900.0))
     assert prepare_trilinear_views(found, config=told).pair.K1[0, 0] == 450.0
 
@@ -86,7 +86,7 @@ def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
 def test_cameras_in_one_place_show_no_parallax():
     """As of one camera with another principal point."""
     picture = _photograph(6)
-    with pytest.raises(StageFailure, match="show no parallax: the camera only turned"):
+    with pytest.raises(StageFailure, match="show no parallax: the camera only rotated"):
         match_images(picture[:, :-32].copy(), picture[:, 32:].copy(), config=SMALL)
 
 

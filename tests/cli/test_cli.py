@@ -118,14 +118,14 @@ def truth_focal(truth):
     return float(np.array(first["K"] if "K" in first else truth["K"])[0][0])
 
 
-def test_inspect_prints_what_was_found(killed_and_resumed, capsys):
+def test_inspect_prints_the_results(killed_and_resumed, capsys):
     assert run_command(["inspect", str(killed_and_resumed[0])]) == 0
     printed = capsys.readouterr().out
     assert f"{VIEWS} of {VIEWS} images registered" in printed
     assert "camera 0: focal length" in printed
 
 
-def test_an_early_end_prints_what_its_stage_found(photographs, tmp_path, capsys):
+def test_an_early_end_prints_the_results_of_its_stage(photographs, tmp_path, capsys):
     few, out = tmp_path / "few", tmp_path / "out"
     few.mkdir()
     for path in sorted(photographs.iterdir())[:2]:
@@ -195,7 +195,7 @@ def test_a_wrong_command_gets_one_sentence_and_exit_2(arguments, words, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_focal_length_is_given_as_the_readme_says(photographs, tmp_path, monkeypatch):
+def test_the_focal_length_is_given_as_in_the_readme(photographs, tmp_path, monkeypatch):
     words = "--set intrinsics.focal_px=1200 --set intrinsics.focal_std_rel=0.05"
     assert f"`{words}`" in (ROOT / "README.md").read_text(encoding="utf-8")
     asked = []
@@ -210,14 +210,14 @@ def test_the_focal_length_is_given_as_the_readme_says(photographs, tmp_path, mon
     assert (asked[0].focal_px, asked[0].focal_std_rel) == (1200.0, 0.05)
 
 
-def test_the_last_line_tells_the_time_of_this_run():
+def test_the_last_line_states_the_time_of_this_run():
     whole = {"seconds": {"total": 40.0}, "elapsed_seconds": 41.5, "resumed": []}
     assert _duration(whole) == "41.5 s"
     again = {**whole, "elapsed_seconds": 1.5, "resumed": ["features"]}
     assert _duration(again) == "1.5 s (40.0 s including cached stages)"
 
 
-def test_every_camera_has_a_line_with_what_was_estimated_of_it():
+def test_every_camera_has_a_line_with_its_estimates():
     def view(camera, focal, **more):
         values = {"focal_px": focal, "principal_x_px": 5.0, "principal_y_px": 4.0, **more}
         return {"camera": camera} | {
@@ -233,7 +233,7 @@ def test_every_camera_has_a_line_with_what_was_estimated_of_it():
     assert lines[1].endswith("aspect ratio 1.20000 ± 0.50000, skew 2.00 ± 0.50 px")
 
 
-def test_ctrl_c_says_how_to_go_on(photographs, tmp_path, monkeypatch, capsys):
+def test_ctrl_c_states_how_to_resume(photographs, tmp_path, monkeypatch, capsys):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
@@ -266,13 +266,13 @@ def test_help_and_version(capsys):
         assert option in printed
 
 
-def test_the_demo_without_its_photographs_says_where_they_were_looked_for(monkeypatch, tmp_path, capsys):
+def test_the_demo_without_images_states_the_searched_folders(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(demo, "files", lambda _: tmp_path / "thesisrecon")
     assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
     assert str(tmp_path / "thesisrecon" / "courtyard") in capsys.readouterr().err
 
 
-def test_kernels_that_can_be_kept_nowhere_are_told_with_the_remedy(monkeypatch, tmp_path, capsys):
+def test_kernels_without_a_cache_folder_are_reported_with_advice(monkeypatch, tmp_path, capsys):
     def refuse(*_):
         raise RuntimeError("cannot cache function 'f': no locator available for file 'g'")
 
@@ -288,7 +288,7 @@ def test_the_pairs_of_the_command_are_those_of_the_settings(wish, kind):
     assert cli._config(None, None, cli._option_tables(None, None, wish), []).pairs == kind
 
 
-def test_a_list_of_pairs_is_read_matched_and_told(photographs, tmp_path, capsys):
+def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, capsys):
     names = sorted(path.name for path in photographs.iterdir())
     wish, out = tmp_path / "pairs.txt", tmp_path / "out"
     wish.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
@@ -296,7 +296,7 @@ def test_a_list_of_pairs_is_read_matched_and_told(photographs, tmp_path, capsys)
     assert run_command([*given, "--pairs", str(wish)]) == 0
     assert "of 2 image pairs accepted (15 are possible)" in capsys.readouterr().out
     pairs = json.loads((out / "summary.json").read_text(encoding="utf-8"))["pairs"]
-    assert (pairs["matched"], pairs["possible"], pairs["chosen_by"]) == (2, 15, "the listed pairs")
+    assert (pairs["matched"], pairs["possible"], pairs["selection"]) == (2, 15, "the listed pairs")
     assert "2 of 15 pairs were tried: the listed pairs." in (out / "report.html").read_text(encoding="utf-8")
     for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is none"), ("", "leaves no pair")):
         wish.write_text(line, encoding="utf-8")
@@ -310,7 +310,7 @@ def test_a_list_of_pairs_is_read_matched_and_told(photographs, tmp_path, capsys)
     assert (out / "report.html").is_file()
 
 
-def test_a_list_of_pairs_that_was_mended_needs_no_overwriting(photographs, tmp_path):
+def test_a_corrected_list_of_pairs_needs_no_overwrite(photographs, tmp_path):
     names = sorted(path.name for path in photographs.iterdir())
     wish, out = tmp_path / "pairs.txt", tmp_path / "out"
     given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]

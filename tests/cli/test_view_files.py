@@ -134,7 +134,7 @@ def test_light_changes_the_colours_and_a_bare_model_is_lit(run, tmp_path):
     assert len(np.unique(shown)) > 5
 
 
-def test_a_shorter_command_leaves_none_of_the_frames_before(run):
+def test_a_shorter_command_removes_the_earlier_frames(run):
     small = ["render", str(run), "--size", "40x30", "-o", str(run / "film"), "--frames"]
     assert run_command([*small, "4"]) == 0
     assert run_command([*small, "2", "--path", "interpolate"]) == 0
@@ -165,7 +165,7 @@ def test_wrong_options_get_one_sentence(options, words, run, capsys):
     assert not (run / "views").exists()
 
 
-def test_what_is_missing_is_named(run, tmp_path, capsys):
+def test_missing_arguments_are_named(run, tmp_path, capsys):
     def told(out):
         assert run_command(["render", str(out)]) == 2
         said = capsys.readouterr().err
@@ -198,7 +198,7 @@ def test_a_folder_of_photographs_is_not_written_over(run, capsys):
     assert "cannot be used" in capsys.readouterr().err
 
 
-def test_progress_is_told_to_its_end(run):
+def test_progress_is_reported_to_the_end(run):
     heard = []
     options = RenderOptions(frames=3, size=(40, 30))
     written = render_run(run, run / "film", options, threads=2, progress=lambda *step: heard.append(step))

@@ -102,7 +102,7 @@ def test_the_angle_of_a_rotation_is_found_without_the_camera():
 
 
 @pytest.mark.parametrize("focal", [0.8, 3.0])
-def test_a_turned_camera_is_told_from_a_homography_with_the_eigenvalues_of_a_rotation(focal):
+def test_a_rotated_camera_is_distinguished_from_a_homography_with_rotation_eigenvalues(focal):
     """H = A R A^-1 has those eigenvalues for every A; only for an A of square pixels is it a rotation's."""
     rng = np.random.default_rng(1)
     xy1 = rng.uniform(-1.2, 1.2, (100, 2))

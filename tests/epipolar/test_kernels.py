@@ -13,6 +13,7 @@ from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import algebraic_residuals, sampson_residuals, symmetric_residuals
 from thesisrecon.numerics.ransac import draw_sample
+from thesisrecon.numerics.small_solvers import solve_damped
 
 seeds = st.integers(0, 2**31)
 
@@ -206,14 +207,14 @@ def test_damped_solve_equals_numpy(seed, damping):
     J, g = rng.normal(size=(20, 7)), rng.normal(size=7)
     H = J.T @ J
     step = np.empty(7)
-    assert rank2._solve_damped(H, g, damping, step)
+    assert solve_damped(H, g, damping, step)
     expected = np.linalg.solve(H + damping * np.diag(np.diag(H)), -g)
     np.testing.assert_allclose(step, expected, rtol=1e-7)
 
 
-def test_damped_solve_refuses_what_is_not_positive():
-    assert not rank2._solve_damped(-np.eye(7), np.ones(7), 1e-3, np.empty(7))
-    assert not rank2._solve_damped(np.full((7, 7), np.nan), np.ones(7), 1e-3, np.empty(7))
+def test_damped_solve_rejects_indefinite_matrices():
+    assert not solve_damped(-np.eye(7), np.ones(7), 1e-3, np.empty(7))
+    assert not solve_damped(np.full((7, 7), np.nan), np.ones(7), 1e-3, np.empty(7))
 
 
 @settings(max_examples=20, deadline=None)

@@ -69,7 +69,7 @@ def test_little_noise_gives_the_first_order_interval():
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31), st.floats(1e-3, 30.0))
-def test_the_ends_of_an_interval_are_as_many_deviations_away_as_it_says(seed, scale):
+def test_interval_ends_have_the_stated_number_of_stds(seed, scale):
     rng = np.random.default_rng(seed)
     e, A = rng.normal(size=3), rng.normal(size=(3, 3))
     e /= np.linalg.norm(e)

@@ -116,7 +116,7 @@ def test_the_least_error_does_not_hang_on_the_signs_of_singular_vectors():
 
 
 @pytest.mark.parametrize(("n", "m"), [(50, 0), (0, 50), (30, 30)])
-def test_each_step_comes_nearer_to_the_truth_and_the_noise_is_told(n, m):
+def test_each_step_approaches_the_truth_and_reports_the_noise(n, m):
     errors, sigmas = [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -158,7 +158,7 @@ def test_the_covariance_is_that_of_the_errors(n, m):
     assert 0.85 < np.mean(ratios) < 1.2
 
 
-def test_the_covariance_tells_of_points_near_a_plane():
+def test_the_covariance_reflects_points_near_a_plane():
     spreads, weaknesses = [], []
     for depth in (1.0, 0.03):
         rng = np.random.default_rng(1)

@@ -89,7 +89,7 @@ def six_point_numpy(track):
 
 
 @holds_for_every()
-def test_six_tracks_determine_the_cameras_up_to_three_answers(rng):
+def test_six_tracks_determine_the_cameras_up_to_three_solutions(rng):
     P = three_cameras(rng)
     track = tracks(matches(P, rng, 30, 0, 0.0)[0])
     answers = np.empty((3, 3, 3, 4))
@@ -101,7 +101,7 @@ def test_six_tracks_determine_the_cameras_up_to_three_answers(rng):
 
 
 @holds_for_every(examples=20)
-def test_the_compiled_solver_finds_what_plain_numpy_finds(rng):
+def test_the_compiled_solver_equals_numpy(rng):
     track = tracks(matches(three_cameras(rng), rng, SAMPLE, 0, 2.0)[0])
     answers, plain = np.empty((3, 3, 3, 4)), six_point_numpy(track)
     for answer in answers[: six_point(track, np.arange(SAMPLE), answers)]:
@@ -111,7 +111,7 @@ def test_the_compiled_solver_finds_what_plain_numpy_finds(rng):
 
 
 @pytest.mark.parametrize("kind", ["equal", "two equal", "collinear"])
-def test_degenerate_samples_have_no_answer_or_finite_ones(kind):
+def test_degenerate_samples_have_no_or_finite_solutions(kind):
     rng = np.random.default_rng(0)
     track = tracks(matches(three_cameras(rng), rng, SAMPLE, 0, 0.0)[0])
     if kind == "equal":
@@ -151,7 +151,7 @@ def test_distances_are_those_of_the_least_reprojection_error():
     assert _score(cameras, track, 1e4, plain + 1.0) == 0.0
 
 
-def test_the_search_keeps_the_best_and_what_is_better_already():
+def test_the_search_keeps_the_best_model():
     rng = np.random.default_rng(2)
     track = tracks(matches(three_cameras(rng), rng, 60, 0, 0.3)[0])
     best, samples = np.zeros((3, 3, 4)), draw_samples(rng.random((50, SAMPLE)), 60)
@@ -181,7 +181,7 @@ def planted(rng, n, share, sigma):
 
 @pytest.mark.parametrize("share", [0.3, 0.5])
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
-def test_the_right_tracks_give_what_they_give_alone(share, sigma):
+def test_wrong_tracks_do_not_change_the_result_of_right_ones(share, sigma):
     errors = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -350,7 +350,7 @@ def test_merton_college_with_wrong_tracks(share):
     assert np.median(line_transfer_px(found.fit.T, segments)) <= 1.0
 
 
-def test_a_start_on_a_principal_plane_is_no_division_by_zero():
+def test_a_start_on_a_principal_plane_does_not_divide_by_zero():
     P = np.stack([np.eye(3, 4), *np.random.default_rng(0).normal(size=(2, 3, 4))])
     X = _off_principal_planes(np.array([[1.0, 2.0, 0.0, 0.5], [1.0, 2.0, 3.0, 0.5]]), P)
     assert (np.einsum("va,na->nv", P[:, 2], X) != 0.0).all()

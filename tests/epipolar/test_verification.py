@@ -47,7 +47,7 @@ def test_a_good_pair_keeps_its_inliers_and_is_accepted():
     assert pair.degeneracy is not None
 
 
-def test_a_plane_is_accepted_and_says_so():
+def test_a_plane_is_accepted_and_reported():
     pair, _, _ = verified(make_pair(300, np.random.default_rng(1), planar=True), outliers=0.2)
     assert pair.accepted
     assert pair.homography_inlier_ratio > 0.97

@@ -84,7 +84,7 @@ def test_patches_equal_their_numpy_twin():
         assert np.abs(patch.reshape(8, 8) - twin).max() < 1e-2
 
 
-def test_kept_corners_are_apart_and_nobody_is_dropped_without_reason():
+def test_selected_corners_are_apart_and_none_is_dropped_without_reason():
     xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
     kept = keep_apart(xy, np.arange(400), 6.0)
     distance = np.linalg.norm(xy[:, None] - xy[kept][None], axis=2)

@@ -193,7 +193,7 @@ def test_3_14_the_dual_quadric_of_a_projective_frame_projects_to_every_calibrati
 
 
 @holds_for_every()
-def test_3_9_the_absolute_dual_quadric_knows_its_plane_and_angles_in_any_frame(rng):
+def test_3_9_the_absolute_dual_quadric_gives_its_plane_and_angles_in_any_frame(rng):
     G = random_transform("projective", rng)
     Q = transform_dual_conics(G, ABSOLUTE_DUAL_QUADRIC)
     infinity = transform_planes(G, np.array([0.0, 0.0, 0.0, 1.0]))

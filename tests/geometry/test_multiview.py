@@ -181,7 +181,7 @@ def test_nearest_matrix_of_rank_two():
     assert angle_between(enforce_rank_two(F), F) < 1e-12
 
 
-def test_canonical_cameras_project_what_the_true_cameras_see():
+def test_canonical_cameras_project_as_the_true_cameras():
     pair = make_pair(30, np.random.default_rng(5))
     P1, P2 = canonical_cameras(pair.F)
     A = np.concatenate(

@@ -38,7 +38,7 @@ def test_resampling_keeps_the_image_area_in_place(width, height):
     assert np.abs(small - expected).max() < 1e-3
 
 
-def test_halving_takes_a_pixel_to_the_place_the_convention_says():
+def test_halving_follows_the_pixel_convention():
     y, x = np.mgrid[0:40, 0:40].astype(np.float32)
     half = halve(x + 10.0 * y)
     # Pixel 5 of the half image lies at (5 + 0.5) 2 - 0.5 = 10.5 of the full one.
@@ -94,7 +94,7 @@ def camera_at(rng, distance=0.0):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("distance", [0.0, -4.5], ids=["before", "within"])
-def test_what_is_seen_is_what_rays_meet(seed, distance):
+def test_visible_points_are_those_that_rays_meet(seed, distance):
     rng = np.random.default_rng(seed)
     vertices, faces = soup(rng)
     camera = camera_at(rng, distance)

@@ -308,7 +308,7 @@ def test_observations_in_any_order_give_the_same_points():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_refuses_what_it_cannot_take(method):
+def test_every_method_rejects_invalid_input(method):
     P, X = two_views("general", np.random.default_rng(0))
     xy = images(P, X)
 
@@ -325,7 +325,7 @@ def test_every_method_refuses_what_it_cannot_take(method):
     refused(P.astype(complex), xy, "real")
 
 
-def test_what_single_methods_refuse():
+def test_single_methods_reject_their_own_failures():
     P, X = two_views("general", np.random.default_rng(0))
     xy = images(P, X)
     with pytest.raises(ValueError, match="different centres"):
@@ -446,7 +446,7 @@ def test_undistortion_inverts_distortion():
     np.testing.assert_allclose(undistort(distort(xy, each), each), xy, atol=1e-14)
 
 
-def test_what_no_distortion_reaches_stays_where_it_is():
+def test_pixels_beyond_the_distortion_model_stay_unchanged():
     # r - 0.3 r^3 is never above 0.703.
     far = np.array([[3.0, 0.0], [0.6, 0.6], [0.0, 0.0]])
     np.testing.assert_array_equal(undistort(far, -0.3), far)

@@ -47,7 +47,7 @@ WISHES = [
 
 
 @pytest.mark.parametrize(("arguments", "make", "words"), [w[1:] for w in WISHES], ids=[w[0] for w in WISHES])
-def test_wishes_that_cannot_be_granted(arguments, make, words, tmp_path, told, monkeypatch):
+def test_impossible_options_are_rejected(arguments, make, words, tmp_path, told, monkeypatch):
     files.folder_of(tmp_path, "in")
     make(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -108,7 +108,7 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("words", "text"), PAIRS, ids=[str(k) for k in range(len(PAIRS))])
-def test_lists_of_pairs_that_are_none(words, text, tmp_path, told):
+def test_invalid_lists_of_pairs_are_rejected(words, text, tmp_path, told):
     folder = files.folder_of(tmp_path, "in")
     (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
     writes(text)(tmp_path / "pairs.txt")

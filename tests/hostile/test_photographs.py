@@ -50,7 +50,7 @@ NO_PHOTOGRAPHS = [
 
 
 @pytest.mark.parametrize(("name", "make", "words"), NO_PHOTOGRAPHS, ids=[name for name, *_ in NO_PHOTOGRAPHS])
-def test_what_is_no_photograph_is_refused(name, make, words, tmp_path, told):
+def test_files_that_are_not_images_are_rejected(name, make, words, tmp_path, told):
     (tmp_path / "in").mkdir()
     make(tmp_path / "in" / name)
     said = told(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
@@ -196,7 +196,7 @@ NAMES = [
 ]
 
 
-def test_names_are_told_apart_and_shown_in_one_line(tmp_path, told):
+def test_names_are_distinguished_and_shown_in_one_line(tmp_path, told):
     (tmp_path / "in").mkdir()
     for k, name in enumerate(NAMES):
         (tmp_path / "in" / name).write_bytes(files.encoded("PNG", picture(k)))

@@ -75,7 +75,7 @@ REWRITTEN = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in RECORDS], ids=[name for name, _ in RECORDS])
-def test_a_record_that_is_none_is_computed_again_or_refused(make, tmp_path, told):
+def test_an_invalid_record_is_recomputed_or_rejected(make, tmp_path, told):
     command, out = finished_run(tmp_path, told)
     (record,) = (out / "01-features").glob("*.npz")
     whole = record.read_bytes()
@@ -124,7 +124,7 @@ MANIFESTS = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in MANIFESTS], ids=[name for name, _ in MANIFESTS])
-def test_a_manifest_that_is_none_is_written_again(make, tmp_path, told):
+def test_an_invalid_manifest_is_rewritten(make, tmp_path, told):
     command, out = finished_run(tmp_path, told)
     make(out / "01-features" / "manifest.json")
     told(command, 0)
@@ -154,7 +154,7 @@ def test_the_folder_of_another_version(make, words, tmp_path, told):
 
 
 @pytest.mark.parametrize("make", [pipe, links("/dev/zero"), writes(files.deep_json()), sparse(10**13)])
-def test_a_run_file_that_is_none_is_another_run(make, tmp_path, told):
+def test_an_invalid_run_file_counts_as_another_run(make, tmp_path, told):
     """What names no run may be replaced: nothing of a run stands beside it."""
     folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
     out.mkdir()
@@ -210,7 +210,7 @@ SUMMARIES = [
 
 
 @pytest.mark.parametrize(("make", "words"), [s[1:] for s in SUMMARIES], ids=[s[0] for s in SUMMARIES])
-def test_inspect_refuses_what_is_no_summary(make, words, tmp_path, told):
+def test_inspect_rejects_invalid_summaries(make, words, tmp_path, told):
     make(tmp_path / "summary.json")
     assert words in told(["inspect", str(tmp_path)], 2)
 

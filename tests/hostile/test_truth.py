@@ -71,7 +71,7 @@ def test_a_truth_of_wrong_types_is_refused(text, tmp_path, validated):
 
 
 @pytest.mark.parametrize("make", [pipe, links("/dev/zero"), sparse(10**13), writes(files.deep_json())])
-def test_a_report_to_compare_with_that_is_none(make, tmp_path, validated):
+def test_an_invalid_report_to_compare_with_is_rejected(make, tmp_path, validated):
     make(tmp_path / "results.json")
     command = ["report", "-o", str(tmp_path / "out"), "--against", str(tmp_path)]
     assert "holds no report to compare with" in validated(command)
@@ -91,7 +91,7 @@ STUDIES = [
 
 
 @pytest.mark.parametrize(("make", "words"), STUDIES, ids=[str(k) for k in range(len(STUDIES))])
-def test_a_study_that_is_none(make, words, tmp_path, validated):
+def test_an_invalid_study_is_rejected(make, words, tmp_path, validated):
     make(tmp_path / "study.toml")
     command = ["ablate", str(tmp_path / "study.toml"), "-o", str(tmp_path / "out"), "--plan"]
     assert words in validated(command)

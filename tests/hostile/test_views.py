@@ -41,7 +41,7 @@ NO_CAMERAS = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in NO_CAMERAS], ids=[name for name, _ in NO_CAMERAS])
-def test_views_refuses_what_are_no_cameras(make, tmp_path, told):
+def test_render_rejects_invalid_cameras(make, tmp_path, told):
     (tmp_path / "model.glb").write_bytes(files.glb(*files.triangle()))
     make(tmp_path / "cameras.json")
     said = told(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
@@ -111,7 +111,7 @@ NO_MODELS = [
 
 
 @pytest.mark.parametrize(("make", "words"), [m[1:] for m in NO_MODELS], ids=[m[0] for m in NO_MODELS])
-def test_views_refuses_what_is_no_model(make, words, tmp_path, told):
+def test_render_rejects_invalid_models(make, words, tmp_path, told):
     make(tmp_path / "model.glb")
     camera()(tmp_path / "cameras.json")
     said = told(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
@@ -134,7 +134,7 @@ BETWEEN = [
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [b[1:] for b in BETWEEN], ids=[b[0] for b in BETWEEN])
-def test_views_between_what_is_no_photograph(words, code, said, tmp_path, told, monkeypatch):
+def test_interpolation_rejects_files_that_are_not_images(words, code, said, tmp_path, told, monkeypatch):
     folder = files.folder_of(tmp_path, "in")
     (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
     (folder / "bomb.png").write_bytes(files.png(30_000, 30_000))

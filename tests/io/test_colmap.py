@@ -181,7 +181,7 @@ def test_folder_without_rigs_and_frames_is_read(tmp_path):
     assert [image.name for image in old.images] == [NAMES[i] for i in (0, 1, 2, 4)]
 
 
-def test_import_gives_back_what_was_exported(tmp_path):
+def test_import_restores_the_export(tmp_path):
     ours = _scene(k1=-0.08)
     write_colmap_model(tmp_path, _export(ours))
     back = reconstruction_from_colmap(read_colmap_model(tmp_path), names=NAMES)
@@ -249,7 +249,7 @@ def test_a_point_seen_twice_in_an_image_keeps_its_first_observation():
     np.testing.assert_array_equal(once.tracks.xy, again.tracks.xy)
 
 
-def test_export_refuses_what_colmap_cannot_hold():
+def test_export_rejects_values_that_colmap_cannot_store():
     ours = _scene()
     assert ours.K is not None
     K = ours.K.copy()
@@ -390,7 +390,7 @@ def test_damaged_bytes_never_end_in_a_trace(tmp_path_factory, name, seed):
         return
 
 
-def test_a_folder_without_a_model_says_what_is_missing(tmp_path):
+def test_a_folder_without_a_model_names_the_missing_file(tmp_path):
     with pytest.raises(StageFailure, match="holds no COLMAP model"):
         read_colmap_model(tmp_path)
 

@@ -69,7 +69,7 @@ def read_only(folder):
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
-def test_what_cannot_be_written_leaves_the_file_before_it(tmp_path, number):
+def test_a_failed_write_leaves_the_old_file(tmp_path, number):
     path = tmp_path / "a.json"
     write_json(path, {"a": 1})
     before = entries(tmp_path)
@@ -160,7 +160,7 @@ def test_json_has_no_nan(tmp_path):
     assert read_json(tmp_path / "b.json") is None
 
 
-def test_names_of_what_a_kill_leaves():
+def test_names_of_partial_files_after_a_kill():
     assert is_partial(".points.ply.partial")
     assert not is_partial("points.ply.partial")
     assert not is_partial(".lock")
@@ -234,14 +234,14 @@ def test_the_mark_and_the_line_ends_of_other_systems_belong_to_no_name(tmp_path)
 
 
 @pytest.mark.parametrize("line", ["a.jpg", "a.jpg b.jpg c.jpg", 'a.jpg "b.jpg', "a\tb\tc"])
-def test_a_line_that_is_no_pair_is_named(tmp_path, line):
+def test_a_line_that_is_not_a_pair_is_named(tmp_path, line):
     path = tmp_path / "pairs.txt"
     path.write_text(f"a.jpg b.jpg\n{line}\n", encoding="utf-8")
     with pytest.raises(UsageError, match=r"line 2 of .* takes two file names"):
         read_pairs(path)
 
 
-def test_a_file_that_is_no_text_is_refused(tmp_path):
+def test_a_binary_file_is_rejected_as_text(tmp_path):
     path = tmp_path / "pairs.txt"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UsageError, match="not a UTF-8 text"):
@@ -286,12 +286,12 @@ def test_cameras_are_those_of_the_file_in_its_order(tmp_path):
         ("text", "does not hold cameras"),
     ],
 )
-def test_other_files_are_told_in_a_sentence(content, words, tmp_path):
+def test_other_files_are_rejected(content, words, tmp_path):
     with pytest.raises(UsageError, match=words):
         read_cameras(written(tmp_path, content))
 
 
-def test_an_absent_or_damaged_file_is_told(tmp_path):
+def test_an_absent_or_damaged_file_is_reported(tmp_path):
     with pytest.raises(UsageError, match=r"there is no cameras\.json"):
         read_cameras(tmp_path / "cameras.json")
     (tmp_path / "cameras.json").write_text("{", encoding="utf-8")

@@ -185,7 +185,7 @@ each_reader = pytest.mark.parametrize("place", READERS, indirect=True, ids=[r.na
 @each_reader
 @few
 @given(data=st.data())
-def test_a_damaged_file_raises_only_what_its_reader_says(place, data):
+def test_a_damaged_file_raises_only_documented_errors(place, data):
     reader, path, whole = place
     read(reader, path, data.draw(damaged(whole)))
 
@@ -193,7 +193,7 @@ def test_a_damaged_file_raises_only_what_its_reader_says(place, data):
 @each_reader
 @settings(few, max_examples=25)
 @given(content=st.binary(max_size=300), head=st.sampled_from([0, 4, 8, 40]))
-def test_random_bytes_raise_only_what_their_reader_says(place, content, head):
+def test_random_bytes_raise_only_documented_errors(place, content, head):
     """As they are, and after the beginning of a good file."""
     reader, path, whole = place
     read(reader, path, whole[:head] + content)
@@ -228,7 +228,7 @@ TABLES = [(reader, content) for reader in READERS for name, content in (
 @pytest.mark.parametrize(("reader", "content"), TABLES, ids=[reader.name for reader, _ in TABLES])
 @few
 @given(data=st.data())
-def test_tables_of_other_types_raise_only_what_their_reader_says(reader, content, tmp_path, data):
+def test_tables_of_other_types_raise_only_documented_errors(reader, content, tmp_path, data):
     told = json.dumps(data.draw(mistyped(content)))
     read(reader, tmp_path / reader.name, told.encode("utf-8", "surrogatepass"))
 

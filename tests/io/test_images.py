@@ -84,7 +84,7 @@ def test_real_numbers_are_stretched_over_their_range(tmp_path):
     assert image.rgb.max() == 255
 
 
-def test_what_is_transparent_becomes_grey(tmp_path):
+def test_transparent_pixels_become_grey(tmp_path):
     rgba = np.dstack([picture(), np.full((80, 96), 255, np.uint8)])
     rgba[:40, :, 3] = 0
     image = read_one(save(tmp_path / "a.png", rgba))
@@ -145,14 +145,14 @@ def test_a_large_photograph_is_reduced_at_one_exact_scale(tmp_path):
     )
 
 
-def test_the_first_frame_of_an_animation_is_used_and_said(tmp_path):
+def test_the_first_frame_of_an_animation_is_used_and_reported(tmp_path):
     frames = [PIL.Image.fromarray(picture(n)) for n in range(2)]
     frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:])
     photographs = read_images(tmp_path, max_size_px=1600)
     assert photographs.decoded[0].note == "only the first frame is used"
 
 
-def test_what_cannot_be_read_gets_its_reason_and_the_others_go_on(tmp_path):
+def test_unreadable_images_are_rejected_and_the_others_are_used(tmp_path):
     save(tmp_path / "good one ü.jpg", picture())
     (tmp_path / "text.jpg").write_text("dear reader")
     whole = save(tmp_path / "cut.jpg", picture(1), quality=95).read_bytes()
@@ -179,7 +179,7 @@ def test_what_cannot_be_read_gets_its_reason_and_the_others_go_on(tmp_path):
         assert words in photographs.refused[name]
 
 
-def test_what_is_no_regular_file_is_not_waited_for(tmp_path):
+def test_reading_never_waits_for_special_files(tmp_path):
     os.mkfifo(tmp_path / "pipe.jpg")
     (tmp_path / "endless.png").symlink_to("/dev/zero")
     (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
@@ -224,7 +224,7 @@ def test_the_same_pixels_twice_are_one_photograph(tmp_path):
     assert photographs.refused == {"b.bmp": "has the same pixels as a.png"}
 
 
-def test_arrays_and_files_of_one_name_are_told_apart(tmp_path):
+def test_arrays_and_files_with_the_same_name_are_distinguished(tmp_path):
     (tmp_path / "x").mkdir()
     first, second = save(tmp_path / "a.png", picture(0)), save(tmp_path / "x" / "a.png", picture(1))
     names = [image.name for image in read_images([second, first], max_size_px=1600).images]
@@ -238,7 +238,7 @@ def test_arrays_and_files_of_one_name_are_told_apart(tmp_path):
         read_images([np.zeros(3)], max_size_px=90)
 
 
-def test_a_folder_that_is_none_gets_a_sentence(tmp_path):
+def test_a_missing_folder_is_reported(tmp_path):
     with pytest.raises(UsageError, match="no folder"):
         list_images(tmp_path / "absent")
     (tmp_path / "file").write_text("")
@@ -271,7 +271,7 @@ def at_once(picture, size, max_size_px):
     "transform", [STORED, *EXIF_TRANSFORMS.values()], ids=lambda transform: str(transform.method)
 )
 @pytest.mark.parametrize(("width", "height"), [(1000, 667), (600, 1100)])
-def test_stripes_give_the_pixels_of_the_whole_picture(transform, width, height):
+def test_stripes_give_the_pixels_of_the_whole_image(transform, width, height):
     upright = coloured(width, height)
     back = {PIL.Image.Transpose.ROTATE_90: 270, PIL.Image.Transpose.ROTATE_270: 90}.get(transform.method)
     if back is not None:
@@ -338,7 +338,7 @@ def opened(kind, image, **options):
     return PIL.Image.open(stream)
 
 
-def test_what_decoding_takes_depends_on_the_format():
+def test_memory_for_decoding_depends_on_the_format():
     image = coloured(90, 90)
     assert decoding_bytes(opened("PNG", image)) == 4 * 8100
     assert decoding_bytes(opened("JPEG", image)) == 4 * 8100
@@ -346,7 +346,7 @@ def test_what_decoding_takes_depends_on_the_format():
     assert decoding_bytes(opened("WEBP", image)) == 16 * 8100
 
 
-def test_a_photograph_whose_decoder_takes_too_much_is_refused_before_it_begins(tmp_path, monkeypatch):
+def test_an_image_whose_decoder_needs_too_much_memory_is_rejected_first(tmp_path, monkeypatch):
     for name in ("a.webp", "b.png", "c.jpg"):
         options = {"progressive": True} if name == "c.jpg" else {}
         coloured(90, 80).save(tmp_path / name, **options)
@@ -406,7 +406,7 @@ def test_one_frame_is_an_animation_too(suffix, tmp_path):
         assert image.size == (64, 48)
 
 
-def test_what_cannot_be_written_is_told(tmp_path):
+def test_an_unwritable_animation_is_reported(tmp_path):
     (one,) = frames(tmp_path, 1)
     with pytest.raises(ValueError, match=r"written as \.webp or \.png; got all\.gif"):
         write_animation(tmp_path / "all.gif", [one])

@@ -120,7 +120,7 @@ def test_colours_of_vertices_and_bare_meshes_are_read(tmp_path):
         np.testing.assert_array_equal(read.colors, given)
 
 
-def test_a_glb_that_cannot_be_read_is_told_in_a_sentence(tmp_path):
+def test_an_unreadable_glb_is_reported(tmp_path):
     path = tmp_path / "model.glb"
     with pytest.raises(UsageError, match="there is no mesh"):
         read_mesh(path)

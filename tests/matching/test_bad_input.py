@@ -44,7 +44,7 @@ def test_a_photograph_without_texture_is_named(name, level):
 
 
 @PRESETS
-def test_a_photograph_of_32_pixels_is_named_with_what_is_needed(name):
+def test_an_image_of_32_pixels_is_rejected_with_the_required_size(name):
     left, right = stereo()
     with pytest.raises(StageFailure, match="32 x 32 pixels; 64 x 64"):
         match_pair(left[:32, :32].copy(), right[:32, :32].copy(), config=preset(name))
@@ -64,7 +64,7 @@ def test_the_stages_themselves_take_32_pixels(detector, matcher):
 
 
 @PRESETS
-def test_saturated_photographs_match_rightly_or_not_at_all(name):
+def test_saturated_images_match_correctly_or_not_at_all(name):
     """Six times too long exposed: only the darkest spots are left."""
     left, right = (gray(image[:, :, 0] * 6.0) for image in stereo())
     pair = related(left, right, name)
@@ -113,6 +113,6 @@ def test_photographs_of_different_sizes_match():
     assert np.median(np.abs(upright.xy1[:, 0] - whole[:, 0] - disparity(whole))) < 0.1
 
 
-def test_numbers_that_are_no_pixels_are_refused():
+def test_float_arrays_are_rejected_as_images():
     with pytest.raises(ValueError, match="uint8"):
         match_pair(np.full(SHAPE, np.nan), stereo()[1])

@@ -145,7 +145,7 @@ def test_alignment_finds_the_true_place_under_gain_and_bias(affine_std):
     assert np.abs(np.linalg.det(maps[score > 0.9]) / slope[score > 0.9] - 1).mean() < 0.1
 
 
-def test_alignment_recovers_an_affine_map_it_was_not_told():
+def test_alignment_recovers_an_unknown_affine_map():
     gray = texture(240, 240, 5)
     truth = np.array([[1.08, 0.06], [-0.05, 0.95]])
     y, x = np.mgrid[0:240, 0:240].astype(np.float64)
@@ -178,7 +178,7 @@ def test_alignment_gives_up_on_blank_windows_and_outside():
     ]
 
 
-def test_alignment_drops_what_its_gradients_cannot_place():
+def test_alignment_drops_patches_with_weak_gradients():
     rich, straight = texture(100, 100, 3), np.repeat(texture(1, 100, 3), 100, axis=0)
     noise = RNG.normal(scale=2.0, size=(2, 100, 100))
     xy = np.array([[50.0, 50.0]])

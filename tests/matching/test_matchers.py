@@ -80,7 +80,7 @@ def test_photographs_of_different_things_share_nothing_or_little(detector, varia
 
 @BOTH
 @pytest.mark.parametrize("size", [(1, 1), (12, 12), (40, 60)])
-def test_blank_tiny_and_noisy_photographs_give_an_empty_answer(detector, variant, size):
+def test_blank_tiny_and_noisy_images_give_an_empty_result(detector, variant, size):
     noise = np.random.default_rng(1).uniform(0, 255, size)
     images = [photograph(np.full(size, 9.0)), photograph(noise), photograph(noise[::-1])]
     prepared = views(detector, variant, *images)

@@ -109,7 +109,7 @@ def test_a_list_that_does_not_fit_the_photographs_is_refused(listed, words):
         (lambda: OverlapEstimate(words=0), "words must be at least 1"),
     ],
 )
-def test_wishes_that_cannot_be_meant_are_refused(make, words):
+def test_meaningless_options_are_rejected(make, words):
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -176,7 +176,7 @@ def test_the_number_of_threads_changes_nothing(windows):
     assert alone.pairs.tolist() == together.pairs.tolist()
 
 
-def test_photographs_without_structure_are_no_obstacle(windows):
+def test_images_without_structure_do_no_harm(windows):
     blank = MultiScaleCorners().detect(photograph(np.full((SIDE, SIDE), 90.0)))
     choice = choose(ESTIMATE, CROPS, [*windows.features[:-1], blank])
     assert CROPS - 1 in choice.pairs
@@ -234,7 +234,7 @@ def test_the_most_alike_of_each(n, count, seed):
 
 
 @given(st.integers(2, 9), st.integers(0, 2**31))
-def test_bridges_join_what_is_apart_by_the_best_pairs_and_nothing_else(n, seed):
+def test_connecting_pairs_join_separate_groups_by_their_best_pairs_only(n, seed):
     rng = np.random.default_rng(seed)
     order = rng.random((n, n))
     order += order.T

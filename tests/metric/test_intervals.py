@@ -10,7 +10,7 @@ from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric.adjustment import tail_width
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.metric.uncertainty import Borrowing, model_error_share
+from thesisrecon.metric.uncertainty import FocalShrinkage, lack_of_fit
 from thesisrecon.numerics.block_scatter import BlockScatter
 
 
@@ -60,11 +60,11 @@ def test_the_share_of_model_error_follows_its_signs():
     def scatter(contradiction, blocks=32):
         return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, blocks)
 
-    assert model_error_share(scatter(1.0), 1.0) == 0.0
-    assert model_error_share(scatter(2.5), 1.0) == 1.0
-    assert model_error_share(scatter(1.0), 2.5) == 1.0
-    assert 0.0 < model_error_share(scatter(1.5), 1.0) < 1.0
-    assert model_error_share(scatter(1.0, blocks=1), 1.0) == 1.0
+    assert lack_of_fit(scatter(1.0), 1.0) == 0.0
+    assert lack_of_fit(scatter(2.5), 1.0) == 1.0
+    assert lack_of_fit(scatter(1.0), 2.5) == 1.0
+    assert 0.0 < lack_of_fit(scatter(1.5), 1.0) < 1.0
+    assert lack_of_fit(scatter(1.0, blocks=1), 1.0) == 1.0
 
 
 def test_the_tail_of_normal_noise_is_one():
@@ -73,7 +73,7 @@ def test_the_tail_of_normal_noise_is_one():
     assert tail_width(10.0 * lengths, 1.0) == 3.0
 
 
-def test_what_else_is_estimated_has_an_interval_that_holds_it():
+def test_other_estimates_have_intervals_that_hold_the_truth():
     """Aspect, skew and the whole lens; what is assumed is told as assumed."""
     scene = make_scene(sigma_px=0.5, points=300, seed=2)
     start = projective_reconstruction(scene)
@@ -92,6 +92,6 @@ def test_what_else_is_estimated_has_an_interval_that_holds_it():
 
 
 def test_a_focal_is_borrowed_only_where_its_own_matches_say_less_than_is_stated():
-    lent = Borrowing(np.array([0.02, 0.001, 0.02]), np.array([0.1, 0.1, 0.9]))
-    assert [lent.lends(view, 0.005) for view in range(3)] == [True, False, False]
-    assert "8%, one standard deviation" in Borrowing(np.array([0.08]), np.ones(1)).warnings([0], 0.05)[0]
+    lent = FocalShrinkage(np.array([0.02, 0.001, 0.02]), np.array([0.1, 0.1, 0.9]))
+    assert [lent.is_shrunk(view, 0.005) for view in range(3)] == [True, False, False]
+    assert "8%, one standard deviation" in FocalShrinkage(np.array([0.08]), np.ones(1)).warnings([0], 0.05)[0]

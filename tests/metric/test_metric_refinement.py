@@ -103,7 +103,7 @@ def test_a_view_without_points_keeps_its_reason():
     assert result.intrinsics[7] == {}
 
 
-def test_fixed_principal_point_is_said_to_be_assumed():
+def test_a_fixed_principal_point_is_reported_as_assumed():
     scene = make_scene(sigma_px=0.3, seed=7)
     result = run(scene, wish=IntrinsicsOptions(principal_point="known", k1="known"))
     interval = result.intrinsics[0]["principal_x_px"]

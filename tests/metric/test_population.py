@@ -8,7 +8,12 @@ import pytest
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.metric.uncertainty import OwnValues, estimate_population, measured_spread, outlying
+from thesisrecon.metric.uncertainty import (
+    PerCameraEstimates,
+    estimate_hierarchical_prior,
+    estimate_spread,
+    find_outliers,
+)
 from thesisrecon.records import SelfCalibration, Upgrade
 
 
@@ -43,9 +48,9 @@ def with_few_points(scene, view, count):
 def test_the_spread_of_values_that_agree_is_small_and_of_zoomed_ones_large():
     rng = np.random.default_rng(1)
     std = rng.uniform(0.002, 0.01, 30)
-    same = measured_spread(std * rng.normal(size=30), std, std)
+    same = estimate_spread(std * rng.normal(size=30), std, std)
     assert same < 0.004
-    zoomed = measured_spread(rng.normal(0.0, 0.3, 30) + std * rng.normal(size=30), std, std)
+    zoomed = estimate_spread(rng.normal(0.0, 0.3, 30) + std * rng.normal(size=30), std, std)
     assert zoomed == pytest.approx(0.3, rel=0.5)
 
 
@@ -53,9 +58,9 @@ def test_the_spread_is_that_of_the_values_beyond_their_noise_and_the_error_of_th
     rng = np.random.default_rng(2)
     std = np.full(12, 0.01)
     values = [0.02 * rng.normal(size=12) + std * rng.normal(size=12) for _ in range(200)]
-    assert np.median([measured_spread(v, std, std) for v in values]) == pytest.approx(0.02, rel=0.15)
-    assert np.median([measured_spread(v, std, 5.0 * std) for v in values]) < 0.005
-    assert measured_spread(np.zeros(1), np.ones(1), np.ones(1)) == np.inf
+    assert np.median([estimate_spread(v, std, std) for v in values]) == pytest.approx(0.02, rel=0.15)
+    assert np.median([estimate_spread(v, std, 5.0 * std) for v in values]) < 0.005
+    assert estimate_spread(np.zeros(1), np.ones(1), np.ones(1)) == np.inf
 
 
 def test_one_zoomed_camera_does_not_pull_the_rest():
@@ -64,11 +69,13 @@ def test_one_zoomed_camera_does_not_pull_the_rest():
     value = 0.001 * rng.normal(size=(9, 8))
     value[4, 0] += 0.4
     shared = np.tile(np.arange(9)[:, None], (1, 8))
-    found = estimate_population(OwnValues(value, std, 0.0 * std, np.zeros(9, dtype=np.int64)), shared)
+    found = estimate_hierarchical_prior(
+        PerCameraEstimates(value, std, 0.0 * std, np.zeros(9, dtype=np.int64)), shared
+    )
     assert found is not None
     np.testing.assert_array_equal(found.rows, np.where(np.arange(9) == 4, -1, 0))
     assert found.spread[0, 0] < 0.005
-    assert outlying(value[:, 0], std[:, 0]).sum() == 1
+    assert find_outliers(value[:, 0], std[:, 0]).sum() == 1
 
 
 def test_nothing_is_borrowed_where_all_is_shared_or_too_few_are_common_prior():
@@ -76,10 +83,16 @@ def test_nothing_is_borrowed_where_all_is_shared_or_too_few_are_common_prior():
     kind = np.zeros(4, dtype=np.int64)
     own = np.tile(np.arange(4)[:, None], (1, 8))
     assert (
-        estimate_population(OwnValues(value, std, 0.0 * std, kind), np.zeros((4, 8), dtype=np.int64)) is None
+        estimate_hierarchical_prior(
+            PerCameraEstimates(value, std, 0.0 * std, kind), np.zeros((4, 8), dtype=np.int64)
+        )
+        is None
     )
-    assert estimate_population(OwnValues(value, std, 0.0 * std, np.array([0, 0, 1, 2])), own) is None
-    assert estimate_population(OwnValues(value, std, 0.0 * std, kind), own) is not None
+    assert (
+        estimate_hierarchical_prior(PerCameraEstimates(value, std, 0.0 * std, np.array([0, 0, 1, 2])), own)
+        is None
+    )
+    assert estimate_hierarchical_prior(PerCameraEstimates(value, std, 0.0 * std, kind), own) is not None
 
 
 def test_a_badly_determined_focal_is_borrowed_and_named():
@@ -119,7 +132,7 @@ def test_kinds_of_different_sizes_have_spreads_of_their_own():
     value[:6, 0], value[6:, 0] = 0.001 * rng.normal(size=6), 0.2 * rng.normal(size=6)
     value[:6, 3], value[6:, 3] = 20.0 * rng.normal(size=6), 0.001 * rng.normal(size=6)
     own = np.tile(np.arange(12)[:, None], (1, 8))
-    found = estimate_population(OwnValues(value, std, 0.0 * std, np.repeat([0, 1], 6)), own)
+    found = estimate_hierarchical_prior(PerCameraEstimates(value, std, 0.0 * std, np.repeat([0, 1], 6)), own)
     assert found is not None
     assert found.spread[0, 0] < 0.005 < 0.05 < found.spread[6, 0]
     assert found.spread[6, 3] < 0.005 < 5.0 < found.spread[0, 3]

@@ -7,11 +7,15 @@ import pytest
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.checks import check_views, self_check, within_reach
-from thesisrecon.metric.model import MetricModel, camera_rows, project_observations, retriangulate
-from thesisrecon.metric.shared_camera import centre_of_a_bent_model, check_shared_cameras, contradicted_focals
-from thesisrecon.metric.uncertainty import with_open_sharing
+from thesisrecon.metric.adjustment import BundleAdjustment
+from thesisrecon.metric.checks import check_views, self_check, triangulable_observations
+from thesisrecon.metric.model import MetricEstimate, camera_rows, reproject_observations, retriangulate_tracks
+from thesisrecon.metric.shared_camera import (
+    inconsistent_principal_point,
+    check_shared_cameras,
+    contradicted_focal_priors,
+)
+from thesisrecon.metric.uncertainty import widen_unverified_focals
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
@@ -27,8 +31,8 @@ def true_model(scene, prior):
     n = len(scene.R)
     cameras = MetricCameras(scene.R, scene.t, rows, group, shared)
     every = [np.ones(count, dtype=bool) for count in (n, len(scene.X), len(scene.tracks.xy))]
-    model = MetricModel(scene.tracks, scene.sizes, cameras, every[0], scene.X, every[1], every[2], 0.5)
-    return retriangulate(model, sigmas=SIGMAS, min_angle=ANGLE)
+    model = MetricEstimate(scene.tracks, scene.sizes, cameras, every[0], scene.X, every[1], every[2], 0.5)
+    return retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
 
 
 def calibration_of(scene):
@@ -62,7 +66,9 @@ def test_a_camera_that_stands_elsewhere_is_named(view):
     scene, _, model = setting()
     t = model.cameras.t.copy()
     t[view] += [0.4, -0.3, 0.2]
-    spoiled = retriangulate(model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE)
+    spoiled = retriangulate_tracks(
+        model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE
+    )
     check, failed_checks = doubts_of(spoiled, scene)
     assert check["confirmed_share_worst_view"] < 0.5
     assert any(doubt.startswith(f"view {view}:") for doubt in failed_checks)
@@ -72,7 +78,9 @@ def test_several_wrong_cameras_share_a_sentence():
     scene, _, model = setting()
     t = model.cameras.t.copy()
     t[[1, 6]] += [0.4, -0.3, 0.2]
-    spoiled = retriangulate(model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE)
+    spoiled = retriangulate_tracks(
+        model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE
+    )
     failed_checks = doubts_of(spoiled, scene)[1]
     assert any("1" in doubt and "6" in doubt and doubt.startswith("views ") for doubt in failed_checks)
 
@@ -92,7 +100,7 @@ def test_a_view_of_another_focal_asks_for_it():
     assert any("view 2 alone asks for a focal length" in doubt for doubt in doubts_of(zoomed, scene)[1])
 
 
-def test_points_behind_a_camera_are_told():
+def test_points_behind_a_camera_are_detected():
     scene, _, model = setting()
     R, t = model.cameras.R.copy(), model.cameras.t.copy()
     about = np.diag([-1.0, 1.0, -1.0])
@@ -103,28 +111,28 @@ def test_points_behind_a_camera_are_told():
 
 
 @pytest.mark.parametrize(("off", "deviation", "told"), [(1.0, 0.01, 0), (1.05, 0.003, 1), (1.05, 0.1, 0)])
-def test_a_focal_that_the_photographs_contradict_is_told(off, deviation, told):
+def test_a_focal_that_the_images_contradict_is_reported(off, deviation, told):
     _, prior, model = setting(focal_px=1500.0 * off, focal_std_rel=deviation)
-    adjustment = Adjustment(prior, 0.0, 0.02)
+    adjustment = BundleAdjustment(prior, 0.0, 0.02)
     model = adjustment.run(model, iterations=10)[0]
-    model = retriangulate(model, sigmas=SIGMAS, min_angle=ANGLE)
-    failed_checks = contradicted_focals(model, adjustment)
+    model = retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
+    failed_checks = contradicted_focal_priors(model, adjustment)
     assert len(failed_checks) == told
     assert all("contradict the focal length" in doubt for doubt in failed_checks)
 
 
-def test_a_known_focal_that_is_contradicted_is_told_once_and_no_weight_is_advised():
+def test_a_contradicted_known_focal_is_reported_once_without_advice_on_weights():
     _, prior, model = setting(focal="known", focal_px=1600.0)
-    failed_checks = contradicted_focals(model, Adjustment(prior, 0.0, 0.02))
+    failed_checks = contradicted_focal_priors(model, BundleAdjustment(prior, 0.0, 0.02))
     assert len(failed_checks) == 1
     assert "shorter" in failed_checks[0]
     assert "px" not in failed_checks[0]
     assert "focal_std_rel" not in failed_checks[0]
 
 
-def test_nothing_said_is_nothing_contradicted():
+def test_no_prior_means_no_contradiction():
     _, prior, model = setting()
-    assert contradicted_focals(model, Adjustment(prior, 0.0, 0.02)) == []
+    assert contradicted_focal_priors(model, BundleAdjustment(prior, 0.0, 0.02)) == []
 
 
 def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_doubted():
@@ -137,16 +145,16 @@ def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_d
     model = true_model(scene, prior_for(projective_reconstruction(scene)))
     noise = check_views(model, sigmas=SIGMAS).noise_px
     assert noise == pytest.approx(0.5, rel=0.2)
-    xy, _ = project_observations(
-        model.cameras, model.X, model.tracks.view_index[model.ok], model.tracks.point_index[model.ok]
+    xy, _ = reproject_observations(
+        model.cameras, model.X, model.tracks.view_index[model.inlier], model.tracks.point_index[model.inlier]
     )
-    left = np.linalg.norm(xy - model.tracks.xy[model.ok], axis=1)
-    kept = [np.median(left[model.tracks.view_index[model.ok] == v]) for v in range(3)]
+    left = np.linalg.norm(xy - model.tracks.xy[model.inlier], axis=1)
+    kept = [np.median(left[model.tracks.view_index[model.inlier] == v]) for v in range(3)]
     assert kept[1] > 1.3 * min(kept[0], kept[2])
     assert not any("noise" in doubt for doubt in doubts_of(model, scene)[1])
 
 
-def test_two_photographs_from_one_place_are_not_doubted_for_what_only_they_share():
+def test_two_images_from_one_place_are_not_rejected_for_points_only_they_share():
     scene = make_scene(points=400, sigma_px=0.0, seed=3)
     R, centres = scene.R.copy(), scene.centres.copy()
     R[1], centres[1] = R[0], centres[0] + 1e-4
@@ -162,31 +170,31 @@ def test_two_photographs_from_one_place_are_not_doubted_for_what_only_they_share
     check, failed_checks = doubts_of(model, scene)
     assert failed_checks == []
     assert check["explained_share_worst_view"] > 0.9
-    assert 0.2 < within_reach(model).mean() < 0.9
+    assert 0.2 < triangulable_observations(model).mean() < 0.9
 
 
 def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself_too():
     scene = make_scene(sigma_px=0.3, principal_shift=(140.0, 0.0), seed=3)
     prior = prior_for(projective_reconstruction(scene))
-    model, adjustment = true_model(scene, prior), Adjustment(prior, 0.0, 0.02)
+    model, adjustment = true_model(scene, prior), BundleAdjustment(prior, 0.0, 0.02)
 
     def scatter(contradiction):
         return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, 32)
 
-    assert centre_of_a_bent_model(model, adjustment, scatter(3.0)) == []
-    assert len(centre_of_a_bent_model(model, adjustment, scatter(12.0))) == 1
+    assert inconsistent_principal_point(model, adjustment, scatter(3.0)) == []
+    assert len(inconsistent_principal_point(model, adjustment, scatter(12.0))) == 1
     middle = true_model(make_scene(seed=3), prior)
-    assert centre_of_a_bent_model(middle, adjustment, scatter(12.0)) == []
+    assert inconsistent_principal_point(middle, adjustment, scatter(12.0)) == []
 
 
 def settled(scene, **wish):
     """The model as the metric stage ends with it: adjusted and triangulated by turns."""
     prior = prior_for(projective_reconstruction(scene), IntrinsicsOptions(**wish))
-    adjustment = Adjustment(prior, 0.0, 0.02)
+    adjustment = BundleAdjustment(prior, 0.0, 0.02)
     model = true_model(scene, adjustment.prior)
     model = replace(model, sigma_px=30.0)
     for _ in range(3):
-        model = retriangulate(model, sigmas=SIGMAS, min_angle=ANGLE)
+        model = retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
         model = adjustment.run(model, iterations=10)[0]
     return model, adjustment
 
@@ -207,7 +215,7 @@ def test_one_camera_is_not_doubted():
 
 
 @pytest.mark.parametrize("zoom", [1.04, 1.08])
-def test_two_near_zooms_by_turns_are_told(zoom):
+def test_two_similar_zooms_in_turn_are_detected(zoom):
     scene = make_scene(sigma_px=0.3, seed=6)
     factors = np.where(np.arange(8) % 2 == 0, 1.0, zoom)
     failed_checks = check_shared_cameras(*settled(changed(scene, factors, np.zeros((8, 2))))).failed_checks
@@ -215,7 +223,7 @@ def test_two_near_zooms_by_turns_are_told(zoom):
     assert "one focal length" in failed_checks[0]
 
 
-def test_photographs_cropped_one_by_one_are_told():
+def test_individually_cropped_images_are_detected():
     scene = make_scene(sigma_px=0.3, seed=7)
     shift = np.random.default_rng(1).uniform(-80.0, 80.0, (8, 2))
     failed_checks = check_shared_cameras(*settled(changed(scene, np.ones(8), shift))).failed_checks
@@ -229,21 +237,21 @@ def test_where_nothing_is_shared_nothing_is_contradicted():
 
 
 @pytest.mark.parametrize("zoom", [1.03, 1.06])
-def test_one_zoomed_photograph_of_three_is_told(zoom):
+def test_one_zoomed_image_of_three_is_detected(zoom):
     scene = make_scene(views=3, sigma_px=0.1, seed=9)
     factors = np.array([1.0, zoom, 1.0])
     found = check_shared_cameras(*settled(changed(scene, factors, np.zeros((3, 2)))))
     assert len(found.failed_checks) + len(found.warnings) == 1
 
 
-def test_photographs_that_cannot_tell_widen_the_interval_and_say_so():
+def test_uninformative_images_widen_the_interval_with_a_warning():
     found = check_shared_cameras(*settled(make_scene(views=3, points=60, sigma_px=0.5, seed=2)))
     assert found.failed_checks == ()
     assert len(found.warnings) == 1
     assert "cannot be checked" in found.warnings[0]
     assert (found.focal_std > 0.01).all()
     narrow = {"focal_px": IntrinsicInterval(1000.0, 1.0, "")}
-    wide = with_open_sharing([narrow, narrow, {}], found.focal_std)
+    wide = widen_unverified_focals([narrow, narrow, {}], found.focal_std)
     assert wide[0]["focal_px"].std == pytest.approx(1000.0 * found.focal_std[0])
     assert wide[2] == {}
 
@@ -251,7 +259,7 @@ def test_photographs_that_cannot_tell_widen_the_interval_and_say_so():
 @pytest.mark.parametrize(
     "wish", [{"focal": "free"}, {"focal": "free", "principal_point": "known"}, {"principal_point": "known"}]
 )
-def test_crops_are_told_whatever_is_assumed_of_focal_and_principal_point(wish):
+def test_crops_are_detected_under_any_prior(wish):
     scene = make_scene(sigma_px=0.3, seed=7)
     shift = np.random.default_rng(1).uniform(-80.0, 80.0, (8, 2))
     failed_checks = check_shared_cameras(*settled(changed(scene, np.ones(8), shift), **wish)).failed_checks

@@ -276,7 +276,7 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
 )
 @pytest.mark.parametrize("spoiled", ["views", "corner", "rhs"])
 @pytest.mark.parametrize("value", [-1.0, 0.0, np.nan])
-def test_every_solver_tells_a_system_that_is_not_positive(solver, spoiled, value):
+def test_every_solver_detects_an_indefinite_system(solver, spoiled, value):
     row, column = np.array([0, 0, 1, 1, 2]), np.array([0, 1, 1, 2, 2])
     blocks, border, corner = np.zeros((5, 2, 2)), np.full((3, 2, 1), 0.1), np.eye(1)
     blocks[row == column] = np.eye(2)
@@ -384,7 +384,7 @@ def test_one_camera_behind_all_photographs_is_known_better_than_one_each():
     assert (own.variance[:, 0] > 1.5 * own.shared_variance[0]).all()
 
 
-def test_independent_noise_has_the_ratio_one_whatever_its_distribution():
+def test_independent_noise_of_any_distribution_has_ratio_one():
     block = make_block(points=400)
     rng = np.random.default_rng(1)
     normal, heavy = [], []

@@ -77,7 +77,7 @@ def test_outliers_move_huber_less_than_least_squares():
     assert typical(0.5) < 0.2 * typical(1e4)
 
 
-def test_what_is_fixed_or_not_seen_comes_back_untouched():
+def test_fixed_and_unseen_parameters_stay_unchanged():
     block = make_block()
     P, X = _start(block)
     P = np.concatenate([P, np.zeros((1, 3, 4))])

@@ -129,7 +129,7 @@ def test_consensus_stops_at_the_share_that_is_enough_and_breaks_ties_by_the_spre
     assert spread < np.std(y - x) * 1.05
 
 
-def test_consensus_without_a_model_is_none_and_too_few_data_are_refused():
+def test_consensus_without_a_model_is_none_and_too_few_data_are_rejected():
     problem = Line(np.zeros(5), np.arange(5.0))
     assert SampleConsensus(1.0, max_samples=10).search(problem, 5, np.random.default_rng(0)) is None
     with pytest.raises(ValueError, match="at least 2"):
@@ -274,7 +274,7 @@ def test_every_pair_is_visited_once_and_a_pair_and_its_turned_one_together():
 
 
 @pytest.mark.parametrize("room", [16, 60, 120])
-def test_views_are_made_few_times_whatever_room_there_is(room):
+def test_views_are_loaded_few_times_with_any_memory(room):
     i, j = np.divmod(np.arange(300 * 300), 300)
     i, j = i[i != j], j[i != j]
     order = morton_pair_order(i, j)

@@ -123,7 +123,7 @@ def test_the_core_grows_by_the_view_that_shares_most_as_long_as_enough_is_shared
 
 
 @pytest.mark.parametrize("iterations", [0, 50])
-def test_a_scene_is_reconstructed_from_its_core_whatever_the_rest(iterations):
+def test_a_scene_is_reconstructed_from_its_core_despite_bad_views(iterations):
     scene = make_scene(seed=4, sigma_px=0.5, points=600)
     t = scene.tracks
     wrong = np.random.default_rng(5).random(len(t.xy)) < 0.03

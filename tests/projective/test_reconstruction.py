@@ -221,7 +221,7 @@ def test_points_of_one_standpoint_do_not_take_part():
     assert select_tracks_with_parallax(t, [replace(p, homography_inlier_ratio=0.3) for p in pairs]).all()
 
 
-def test_every_photograph_twice_is_no_harder_than_once():
+def test_duplicated_images_are_handled():
     scene = make_scene(points=300, sigma_px=0.3, seed=11)
     t = scene.tracks
     rng = np.random.default_rng(0)
@@ -391,7 +391,7 @@ def test_a_beginning_in_a_corner_gives_way_to_one_that_reaches_more():
     assert all("sees only 0 points" in reason or "shares no" in reason for reason in found.reasons[6:])
 
 
-def test_each_attempt_begins_elsewhere_and_the_last_says_that_there_is_no_other():
+def test_each_attempt_starts_differently_and_the_last_ends_the_search():
     scene = make_scene(views=6)
     ranked = rank_initial_pairs(scene.tracks, true_pairs(scene))
     assert len({(pair.i, pair.j) for pair in ranked}) == 15
@@ -406,7 +406,7 @@ def test_a_pair_whose_f_is_open_is_not_the_first_choice():
     assert (best.i, best.j) == (1, 4)
 
 
-def test_right_observations_are_told_from_wrong_ones_of_the_same_point():
+def test_right_and_wrong_observations_of_a_point_are_separated():
     scene = make_scene(points=200, sigma_px=NOISE_PX, seed=9)
     t, rng = scene.tracks, np.random.default_rng(0)
     length = np.bincount(t.point_index, minlength=200)

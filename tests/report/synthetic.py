@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw
 
-from tests.surface.sphere import SHAPE, photograph, ring_of
+from tests.surface.sphere import SHAPE, image, ring_of
 from tests.surface.sphere import K as SPHERE_K
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
@@ -48,10 +48,10 @@ def made_up_points(rng, count):
     u, v = rng.uniform(-1, 1, (2, count))
     depth = 6.0 - 1.2 * np.exp(-3 * (u**2 + v**2)) + 0.3 * np.sin(6 * u)
     X = np.stack([3.2 * u, 1.9 * v, depth], axis=1)
-    colours = np.stack(
+    colors = np.stack(
         [140 + 90 * np.sin(3 * u), 130 + 80 * np.cos(4 * v), 110 + 60 * np.sin(5 * u * v)], axis=1
     )
-    return X, (colours + rng.normal(0, 10, colours.shape)).clip(0, 255).astype(np.uint8)
+    return X, (colors + rng.normal(0, 10, colors.shape)).clip(0, 255).astype(np.uint8)
 
 
 def made_up_cameras(count):
@@ -69,12 +69,12 @@ def made_up_cameras(count):
     return np.stack(rotations), np.stack(translations)
 
 
-def made_up_photograph(xy, colours, rng):
+def made_up_photograph(xy, colors, rng):
     """(H, W, 3) uint8: smooth shading with a disc of its own colour at every point."""
     coarse = rng.integers(70, 120, (5, 7, 3), dtype=np.uint8)
     picture = PillowImage.fromarray(coarse).resize(SIZE, PillowImage.Resampling.BICUBIC)
     draw = ImageDraw.Draw(picture)
-    for (x, y), rgb in zip(xy.tolist(), colours.tolist(), strict=True):
+    for (x, y), rgb in zip(xy.tolist(), colors.tolist(), strict=True):
         draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=tuple(rgb), outline="#202020")
     return np.asarray(picture)
 
@@ -110,14 +110,14 @@ def made_up_run(*, names=None, points=1500, seed=4):
     rng = np.random.default_rng(seed)
     names = names or [f"IMG_{2040 + n}.JPG" for n in range(9)]
     count = len(names)
-    X, colours = made_up_points(rng, points)
+    X, colors = made_up_points(rng, points)
     cameras = made_up_cameras(count)
     xy = [project_camera(K, R, t, X, distortion=K1) for R, t in zip(*cameras, strict=True)]
     seen = [((p > 5) & (p < np.array(SIZE) - 6)).all(axis=1) & (rng.random(points) < 0.7) for p in xy]
     reconstruction = _reconstruction(X, cameras, xy, seen, rng)
-    photographs = tuple(
+    images = tuple(
         ReportImage(
-            name, SIZE, (SIZE[0] * 4, SIZE[1] * 4), made_up_photograph(p[s][:200], colours[s][:200], rng)
+            name, SIZE, (SIZE[0] * 4, SIZE[1] * 4), made_up_photograph(p[s][:200], colors[s][:200], rng)
         )
         for name, p, s in zip(names, xy, seen, strict=True)
     )
@@ -138,7 +138,7 @@ def made_up_run(*, names=None, points=1500, seed=4):
     ]
     return ReportData(
         title="Courtyard wall",
-        photographs=photographs,
+        images=images,
         reports=_reports(),
         config_text=CONFIG,
         summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5},
@@ -147,7 +147,7 @@ def made_up_run(*, names=None, points=1500, seed=4):
         pairs=pairs,
         metric=metric,
         affine=dataclasses.replace(metric.reconstruction, stratum="affine"),
-        colours=colours,
+        colors=colors,
     )
 
 
@@ -157,9 +157,7 @@ def projective_run():
     assert data.metric is not None
     before = data.metric.reconstruction
     undistorted = dataclasses.replace(before, stratum="projective", K=None, distortion=None)
-    return dataclasses.replace(
-        data, metric=None, colours=None, reconstruction=undistorted, until="projective"
-    )
+    return dataclasses.replace(data, metric=None, colors=None, reconstruction=undistorted, until="projective")
 
 
 def _reconstruction(X, cameras, xy, seen, rng):
@@ -249,7 +247,7 @@ SPHERE_NAMES = tuple(f"sphere {k} <b>.jpg" for k in range(8))
 def sphere_model():
     """The sphere in at most 6000 triangles with the texture of its photographs."""
     mesh = simplify_mesh(VolumetricFusion().fuse(ring_of()), 6_000)
-    return TextureAtlas().texture(mesh, [photograph(m) for m in ring_of()])
+    return TextureAtlas().texture(mesh, [image(m) for m in ring_of()])
 
 
 @cache
@@ -278,12 +276,12 @@ def sphere_reconstruction():
 def sphere_run():
     """The whole page of it: model, depth of all photographs but the last, the third held out."""
     maps = ring_of()
-    rgb = [photograph(m).rgb for m in maps]
+    rgb = [image(m).rgb for m in maps]
     seen = np.isfinite(maps[2].depth)
     shifted = np.roll(rgb[2], 1, axis=1)
     return ReportData(
         title="Sphere",
-        photographs=tuple(
+        images=tuple(
             ReportImage(name, SPHERE_SIZE, SPHERE_SIZE, pixels)
             for name, pixels in zip(SPHERE_NAMES, rgb, strict=True)
         ),
@@ -293,6 +291,6 @@ def sphere_run():
         version="0.1.0",
         metric=MetricResult(sphere_reconstruction(), ({},) * len(maps), {}, trusted=True),
         model=sphere_model(),
-        depth_pictures={m.view: m.depth for m in maps[:-1]},
+        depth_maps={m.view: m.depth for m in maps[:-1]},
         held_out=HeldOut(2, rgb[2], shifted, seen, psnr_db=27.3456, ssim=0.9123),
     )

@@ -40,7 +40,7 @@ def test_the_scene_is_valid_json_with_escaped_names():
     assert data.metric is not None
     scene = build_scene(data.metric.reconstruction)
     assert scene is not None
-    figure = scene_figure(scene, [p.name for p in data.photographs], data.colours)
+    figure = scene_figure(scene, [p.name for p in data.images], data.colors)
     json.dumps(figure, allow_nan=False)
     points, lines, marks = figure["data"]
     assert len(points["x"]) == len(points["marker"]["color"]) == len(scene.points)
@@ -48,9 +48,9 @@ def test_the_scene_is_valid_json_with_escaped_names():
     assert marks["text"] == ["1 · &lt;b&gt;one&lt;/b&gt;.jpg", "2 · two&amp;.jpg"]
 
 
-def test_the_matrix_is_symmetric_and_tells_refused_pairs_apart():
+def test_the_matrix_is_symmetric_and_marks_rejected_pairs():
     data = made_up_run(points=300)
-    figure = pair_matrix_figure(data.pairs, [p.name for p in data.photographs])
+    figure = pair_matrix_figure(data.pairs, [p.name for p in data.images])
     json.dumps(figure, allow_nan=False)
     accepted, refused = figure["data"]
     pair, bad = data.pairs[0], next(p for p in data.pairs if not p.accepted)
@@ -64,7 +64,7 @@ def test_the_matrix_is_symmetric_and_tells_refused_pairs_apart():
 def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch):
     data = made_up_run(points=300)
     monkeypatch.setattr(figures_module, "MAX_MATRIX", 3)
-    figure = pair_matrix_figure(data.pairs, [p.name for p in data.photographs])
+    figure = pair_matrix_figure(data.pairs, [p.name for p in data.images])
     accepted = figure["data"][0]
     assert accepted["x"] == ["views 1–3", "views 4–6", "views 7–9"]
     inside = max(p.inliers for p in data.pairs if p.j < 3)
@@ -92,13 +92,13 @@ def opened(uri):
 
 
 def test_a_thumbnail_keeps_the_aspect_and_shrinks_when_there_are_many():
-    photograph = made_up_run(points=50).photographs[0]
-    few, many = thumbnail(photograph, 10), thumbnail(photograph, 2000)
+    image = made_up_run(points=50).images[0]
+    few, many = thumbnail(image, 10), thumbnail(image, 2000)
     assert few is not None
     assert many is not None
     assert opened(few.uri).size == (few.width, few.height) == (360, 240)
     assert many.width < few.width / 3
-    assert thumbnail(dataclasses.replace(photograph, rgb=None), 10) is None
+    assert thumbnail(dataclasses.replace(image, rgb=None), 10) is None
 
 
 def test_the_lines_pass_through_the_numbered_matches():
@@ -106,8 +106,7 @@ def test_the_lines_pass_through_the_numbered_matches():
     pair = data.pairs[2]
     flat = [np.full((SIZE[1], SIZE[0], 3), 90, dtype=np.uint8)] * 2
     first, second = (
-        dataclasses.replace(data.photographs[v], rgb=rgb)
-        for v, rgb in zip((pair.i, pair.j), flat, strict=True)
+        dataclasses.replace(data.images[v], rgb=rgb) for v, rgb in zip((pair.i, pair.j), flat, strict=True)
     )
     drawn = draw_pair(pair, first, second)
     assert drawn is not None
@@ -126,10 +125,10 @@ def test_the_lines_pass_through_the_numbered_matches():
 def test_a_pair_without_pixels_or_matches_is_no_error():
     data = made_up_run(points=100)
     pair = data.pairs[0]
-    bare = dataclasses.replace(data.photographs[0], rgb=None)
-    assert draw_pair(pair, bare, data.photographs[1]) is None
+    bare = dataclasses.replace(data.images[0], rgb=None)
+    assert draw_pair(pair, bare, data.images[1]) is None
     empty = dataclasses.replace(pair, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
-    assert draw_pair(empty, data.photographs[0], data.photographs[1]) is not None
+    assert draw_pair(empty, data.images[0], data.images[1]) is not None
 
 
 def test_lines_are_cut_at_the_edges_of_the_photograph():
@@ -153,10 +152,8 @@ def test_spread_matches_are_different_and_far_apart():
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3)])
 def test_odd_pictures_have_thumbnails(shape):
-    photograph = dataclasses.replace(
-        made_up_run(points=50).photographs[0], rgb=np.zeros(shape, dtype=np.uint8)
-    )
-    assert thumbnail(photograph, 3) is not None
+    image = dataclasses.replace(made_up_run(points=50).images[0], rgb=np.zeros(shape, dtype=np.uint8))
+    assert thumbnail(image, 3) is not None
 
 
 def lightness(rgb):
@@ -194,7 +191,7 @@ def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
 
 
 @pytest.mark.parametrize("value", [np.nan, 3.0])
-def test_depth_maps_without_depth_or_relief_are_no_error(value):
+def test_depth_maps_without_depth_or_relief_are_accepted(value):
     drawn = draw_depth(np.full((30, 40), value, dtype=np.float32))
     assert drawn.share == float(np.isfinite(value))
     np.testing.assert_equal((drawn.near, drawn.far), (value, value))
@@ -207,7 +204,7 @@ def test_depth_pictures_shrink_when_there_are_many():
     assert 300 * len(draw_depth(noise, side=depth_side(300)).picture.uri) < 4_000_000
 
 
-def test_the_comparison_shows_what_differs():
+def test_the_comparison_shows_the_differences():
     real = np.full((300, 400, 3), 120, dtype=np.uint8)
     rendered, compared = real.copy(), np.ones((300, 400), dtype=bool)
     rendered[:, 200:] += np.uint8(DIFFERENCE_LIMIT)
@@ -231,7 +228,7 @@ def rotation(axis, angle):
     return np.asarray(np.eye(3) + np.sin(angle) * A + (1 - np.cos(angle)) * A @ A)
 
 
-def test_up_is_found_whatever_the_frame_of_the_reconstruction():
+def test_up_is_found_in_any_frame():
     rotations, _ = made_up_cameras(7)
     turn = rotation(np.array([0.3, -1.0, 0.7]), 2.1)
     upright = upright_rotation(rotations @ turn.T)
@@ -268,7 +265,7 @@ def test_strays_are_left_out_and_many_points_are_thinned():
     assert (scene.high - scene.low).max() < 20
 
 
-def test_the_pyramids_point_at_what_the_cameras_saw():
+def test_the_pyramids_point_at_the_scene():
     data = made_up_run(points=300)
     assert data.metric is not None
     scene = build_scene(data.metric.reconstruction)

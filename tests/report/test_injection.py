@@ -30,7 +30,7 @@ TEXTS = (0x010E, 0x010F, 0x0110, 0x013B, 0x8298)
 """Description, make, model, artist and copyright."""
 
 
-def photographs(folder, names, *, snare):
+def images(folder, names, *, snare):
     """Two photographs of a scene, an animation, and three files that are none, by these names."""
     folder.mkdir()
     exif = PIL.Image.Exif()
@@ -51,7 +51,7 @@ def photographs(folder, names, *, snare):
 def page_of(place, names, title, snare):
     """The page of a run."""
     place.mkdir()
-    folder, out = photographs(place / title, names, snare=snare), place / f"out {title}"
+    folder, out = images(place / title, names, snare=snare), place / f"out {title}"
     command = ["reconstruct", str(folder), "-o", str(out), "--until", "matches", "--threads", "2"]
     assert run_command([*command, "--set", "pairs.kind=all-pairs"]) == 0
     return out / "report.html"

@@ -128,7 +128,7 @@ def test_a_projective_camera_is_not_called_registered(page):
     assert page.count('<span class="state good">registered</span>') == 8
 
 
-def test_the_caption_says_whether_points_are_left_out():
+def test_the_caption_states_omitted_points():
     data = made_up_run(points=200)
     assert data.metric is not None
     assert "All 200 points are drawn;" in render_report(data)
@@ -177,7 +177,7 @@ def test_warnings_of_the_run_stand_beside_those_of_its_stages():
     assert "2 initial pairs were tried" in section
 
 
-def test_a_name_that_is_no_unicode_can_be_written(tmp_path):
+def test_a_name_that_is_not_unicode_can_be_written(tmp_path):
     write_report(tmp_path / "report.html", made_up_run(names=["a\udcff.jpg", "b.jpg", "c.jpg"], points=60))
     assert "a?.jpg" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
@@ -185,10 +185,10 @@ def test_a_name_that_is_no_unicode_can_be_written(tmp_path):
 def test_three_hundred_photographs_stay_under_the_limit():
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
-    photographs = tuple(ReportImage(f"{n}.jpg", (240, 160), (240, 160), noise) for n in range(300))
+    images = tuple(ReportImage(f"{n}.jpg", (240, 160), (240, 160), noise) for n in range(300))
     template = made_up_run(points=100).pairs[0]
     pairs = [dataclasses.replace(template, i=i, j=j) for i in range(300) for j in range(i + 1, 300)]
-    data = ReportData("many", photographs, (), "", {}, "0.1.0", pairs=pairs)
+    data = ReportData("many", images, (), "", {}, "0.1.0", pairs=pairs)
     assert len(render_report(data).encode()) < 10_000_000
 
 
@@ -260,7 +260,7 @@ def test_without_a_model_nothing_of_it_is_on_the_page(page):
     for trace in ('id="model', 'id="depth"', 'id="held-out"', "model.glb", "WebGL 2"):
         assert trace not in page
     empty = dataclasses.replace(sphere_run().model, faces=np.zeros((0, 3), dtype=np.int64))
-    bare = render_report(dataclasses.replace(sphere_run(), model=empty, held_out=None, depth_pictures={}))
+    bare = render_report(dataclasses.replace(sphere_run(), model=empty, held_out=None, depth_maps={}))
     for trace in ("model-data", 'id="model"', 'id="depth"', 'id="held-out"'):
         assert trace not in bare
 
@@ -283,7 +283,7 @@ def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page():
     assert grown - len(render_report(dataclasses.replace(data, model=None))) < 8_000_000
 
 
-def test_the_table_of_cameras_has_a_column_for_whatever_was_estimated():
+def test_the_table_of_cameras_has_a_column_for_every_estimate():
     data = made_up_run()
     assert data.metric is not None
     square = {
@@ -353,15 +353,15 @@ def test_the_metric_reconstruction_goes_before_the_projective_one():
 def test_records_that_disagree_are_refused():
     data = made_up_run(points=100)
     with pytest.raises(ValueError, match="one camera per photograph"):
-        dataclasses.replace(data, photographs=data.photographs[:-1])
+        dataclasses.replace(data, images=data.images[:-1])
     with pytest.raises(ValueError, match=r"colours must be \(100, 3\)"):
-        dataclasses.replace(data, colours=np.zeros((99, 3), dtype=np.uint8))
+        dataclasses.replace(data, colors=np.zeros((99, 3), dtype=np.uint8))
     wrong = dataclasses.replace(data.pairs[0], j=99)
     with pytest.raises(ValueError, match="pairs must name views"):
         dataclasses.replace(data, pairs=[wrong])
 
 
-def test_intrinsics_are_told_in_pixels_of_the_file():
+def test_intrinsics_are_reported_in_pixels_of_the_file():
     data = made_up_run(points=100)  # worked at a quarter of the size
     assert data.metric is not None
     working, original = data.metric.intrinsics[0], data.original_intrinsics[0]
@@ -373,7 +373,7 @@ def test_intrinsics_are_told_in_pixels_of_the_file():
     )
     assert original["k1"] == working["k1"]
     assert data.original_intrinsics[-1] == {}
-    assert dataclasses.replace(data, metric=None, colours=None).original_intrinsics == ({},) * 9
+    assert dataclasses.replace(data, metric=None, colors=None).original_intrinsics == ({},) * 9
 
 
 def test_a_model_and_its_pictures_must_belong_to_the_run():
@@ -383,7 +383,7 @@ def test_a_model_and_its_pictures_must_belong_to_the_run():
     with pytest.raises(ValueError, match="model needs the metric reconstruction"):
         dataclasses.replace(projective_run(), model=mesh)
     with pytest.raises(ValueError, match="depth_pictures must name views below 9"):
-        dataclasses.replace(data, depth_pictures={9: np.ones((3, 4), dtype=np.float32)})
+        dataclasses.replace(data, depth_maps={9: np.ones((3, 4), dtype=np.float32)})
     pixels = np.zeros((4, 6, 3), dtype=np.uint8)
     compared = np.zeros((4, 6), dtype=bool)
     compared[:2] = True

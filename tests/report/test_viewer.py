@@ -19,7 +19,7 @@ from tests.report.synthetic import (
     sphere_reconstruction,
     sphere_run,
 )
-from tests.surface.sphere import SHAPE, K, photograph, ring_of
+from tests.surface.sphere import SHAPE, K, image, ring_of
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report import viewer
@@ -99,7 +99,7 @@ def test_the_viewer_stands_where_photographs_were_taken():
     assert 0 <= data["start"] < len(SPHERE_NAMES)
 
 
-def test_views_without_a_camera_are_no_stand():
+def test_views_without_a_camera_are_not_viewpoints():
     reconstruction = sphere_reconstruction()
     registered = reconstruction.registered.copy()
     registered[3] = False
@@ -195,7 +195,7 @@ def test_names_are_shown_as_they_are(witness):
 
 
 @pytest.mark.browser
-def test_the_page_is_no_wider_than_the_screen(witness):
+def test_the_page_fits_the_screen(witness):
     width = witness.page.evaluate("document.documentElement.scrollWidth")
     assert width <= witness.page.viewport_size["width"]
 
@@ -302,7 +302,7 @@ def inner(view):
 def test_where_a_photograph_was_taken_the_model_looks_like_it(model_page, view):
     model_page.page.select_option("#model-stand", str(view))
     picture = shown(model_page)
-    expected = photograph(ring_of()[view]).rgb.astype(int)
+    expected = image(ring_of()[view]).rgb.astype(int)
     difference = picture[where(picture)] - expected
     assert np.sqrt(np.mean(difference[inner(view)] ** 2)) < 14.0
     ground = np.array([0x13, 0x1A, 0x22])
@@ -466,7 +466,7 @@ def spread_fingers(model_page):
 
 
 @pytest.mark.browser
-def test_without_webgl_a_sentence_says_so(browser, model_report):
+def test_missing_webgl_is_reported(browser, model_report):
     model_page = Witness(browser, model_report, 1000, drawn=(), script=WITHOUT_WEBGL)
     text = model_page.page.locator("#model-figure").inner_text()
     assert "no WebGL 2" in text

@@ -6,13 +6,13 @@ from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DegeneracyReport, IntrinsicInterval
 from thesisrecon.report.data import ResidualSummary
-from thesisrecon.report.wording import (
+from thesisrecon.report.assessment import (
     decimals,
     duration,
     first_glance,
     grouped,
     interval_of,
-    judge,
+    assess,
     named_number,
     plus_minus,
 )
@@ -58,26 +58,26 @@ def test_words_for_numbers():
 def test_the_verdict_is_honest():
     data = made_up_run(points=100)
     assert data.metric is not None
-    assert judge(data).word == "Trusted, but incomplete"
+    assert assess(data).word == "Trusted, but incomplete"
     doubt = dataclasses.replace(data.metric, trusted=False, failed_checks=("pure rotation",))
-    verdict = judge(dataclasses.replace(data, metric=doubt))
+    verdict = assess(dataclasses.replace(data, metric=doubt))
     assert (verdict.level, verdict.reasons) == ("doubt", ("Pure rotation.",))
-    early = judge(projective_run())
+    early = assess(projective_run())
     assert early.level == "open"
     assert "projective reconstruction" in early.sentence
 
 
-def test_a_failure_says_what_how_far_and_what_to_try():
+def test_a_failure_states_reason_evidence_and_advice():
     failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
     data = dataclasses.replace(projective_run(), reconstruction=None, until=None, failure=failure)
-    verdict = judge(dataclasses.replace(data, reports=data.reports[:2]))
+    verdict = assess(dataclasses.replace(data, reports=data.reports[:2]))
     assert verdict.level == "bad"
     assert verdict.sentence == "No pair overlaps."
     assert verdict.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
     assert verdict.advice == "Take more photographs."
 
 
-def test_the_first_glance_tells_what_there_is():
+def test_the_head_of_the_page_summarises_the_run():
     labels = [fact.label for fact in first_glance(made_up_run(points=100), None)]
     assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", TIME]
     facts = first_glance(made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))

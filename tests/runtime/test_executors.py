@@ -63,7 +63,7 @@ def small_job(images, out, **options):
 
 
 @pytest.mark.parametrize("kind", ["threads", "processes", "dask", "shuffled"])
-def test_the_sparse_job_has_the_same_bytes_whoever_does_it(kind, serial, tmp_path, request):
+def test_the_sparse_job_gives_the_same_bytes_anywhere(kind, serial, tmp_path, request):
     images, out = serial
     if kind == "shuffled":
         images = [images[k] for k in np.random.default_rng(3).permutation(len(images))]
@@ -126,7 +126,7 @@ def test_a_worker_of_a_cluster_that_is_killed_loses_nothing(dask_cluster, tmp_pa
     assert results(tmp_path / "out") == whole
 
 
-def test_a_worker_process_that_is_killed_is_told_and_the_run_goes_on(tmp_path):
+def test_a_killed_worker_process_is_reported_and_the_run_continues(tmp_path):
     whole, config = undisturbed(tmp_path), deadly(tmp_path)
     given = {"config": config, "until": "metric", "threads": 2, "executor": "processes"}
     with pytest.raises(
@@ -154,7 +154,7 @@ def lonely():
         yield address(running), running
 
 
-def test_a_scheduler_that_dies_in_the_middle_is_told_and_the_run_goes_on(lonely, tmp_path, monkeypatch):
+def test_a_scheduler_that_dies_is_reported_and_the_run_continues(lonely, tmp_path, monkeypatch):
     executor, running = lonely
     monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
     monkeypatch.setattr(workers, "PATIENCE_S", 0.5)
@@ -186,7 +186,7 @@ class SlowMatcher(fakes.FakeMatcher):
 
 
 @pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])
-def test_an_address_that_is_none_is_refused_before_anything_is_made(port, tmp_path):
+def test_an_invalid_address_is_rejected_before_any_output(port, tmp_path):
     with pytest.raises(UsageError, match=r"dask://HOST:PORT, for instance .* got 'dask://there"):
         reconstruct(photographs(2), tmp_path / "out", config=fake_config(), executor=f"dask://there:{port}")
     assert not (tmp_path / "out").exists()
@@ -206,7 +206,7 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_scheduler_that_does_not_answer_is_told_on_the_command_line(monkeypatch, tmp_path, capsys):
+def test_an_unreachable_scheduler_is_reported_on_the_command_line(monkeypatch, tmp_path, capsys):
     pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
     with socket.socket() as free:
@@ -231,7 +231,7 @@ def test_a_task_that_a_worker_cannot_load_is_named():
         workers._answer(workers.package_key(), missing)
 
 
-def test_what_is_no_executor_is_refused():
+def test_invalid_executors_are_rejected():
     with pytest.raises(UsageError, match="or a concurrent"):
         Workers(1, 3)
 
@@ -264,7 +264,7 @@ def test_workers_may_become_fewer_in_the_middle():
     assert sorted(done) == list(range(20))
 
 
-def test_what_is_prepared_stays_within_bounds(monkeypatch):
+def test_prepared_views_stay_within_their_memory_bound(monkeypatch):
     made = []
 
     class Counting(fakes.FakeMatcher):

@@ -77,7 +77,7 @@ def test_equal_records_give_equal_bytes():
     assert bytes_from_record(some_features(1.0), "k") != bytes_from_record(some_features(2.0), "k")
 
 
-def test_another_key_and_absence_mean_compute_and_damage_is_told(tmp_path):
+def test_another_key_or_absence_recomputes_and_damage_is_reported(tmp_path):
     folder = StageFolder(tmp_path)
     assert folder.load("a", "key") is None
     folder.save("a", "key", some_features())
@@ -95,7 +95,7 @@ def test_a_pickle_is_never_loaded(tmp_path):
         StageFolder(tmp_path).load("a", "key")
 
 
-def test_the_manifest_ends_a_stage_and_sweeps_what_is_no_longer_part_of_it(tmp_path):
+def test_the_manifest_ends_a_stage_and_removes_stale_files(tmp_path):
     folder = StageFolder(tmp_path)
     folder.save("old", "1", some_features())
     folder.save("new", "2", some_features())
@@ -108,7 +108,7 @@ def test_the_manifest_ends_a_stage_and_sweeps_what_is_no_longer_part_of_it(tmp_p
     assert folder.finished({"new": "2"}) is None
 
 
-def test_keys_tell_values_types_and_arrays_apart():
+def test_keys_distinguish_values_types_and_arrays():
     keys = [key_of(1), key_of("1"), key_of(1, 1), key_of(np.arange(3)), key_of(np.arange(3.0)), key_of(None)]
     assert len(set(keys)) == len(keys)
     assert key_of({"a": 1, "b": 2}) == key_of({"b": 2, "a": 1})
@@ -123,7 +123,7 @@ def test_stages_have_different_code():
 IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "photographs": {"a.jpg": "1", "b.jpg": "2"}}
 
 
-def test_the_same_run_is_resumed_and_another_is_refused_with_what_differs(tmp_path):
+def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp_path):
     directory = RunDirectory(tmp_path / "new" / "out")
     with directory.claimed(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
@@ -215,7 +215,7 @@ def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path):
         pass
 
 
-def test_what_one_run_kept_another_takes_by_its_key(tmp_path):
+def test_cached_results_are_shared_by_key(tmp_path):
     one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01-features") for name in "ab")
     one.save("00000", "key", some_features(2.0))
     assert two.load("00007", "other") is None
@@ -232,7 +232,7 @@ def test_what_one_run_kept_another_takes_by_its_key(tmp_path):
     assert two.load("00007", "new") is not None
 
 
-def test_what_is_damaged_in_one_place_is_taken_from_the_other(tmp_path):
+def test_damaged_records_are_taken_from_the_other_place(tmp_path):
     one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01") for name in "ab")
     one.save("0", "key", some_features())
     own, kept = tmp_path / "b" / "01" / "0.npz", tmp_path / "shared" / "01" / "key.npz"
@@ -327,7 +327,7 @@ def told_otherwise(parts):
 
 
 @pytest.mark.parametrize("change", [change for _, change in CHANGES], ids=[name for name, _ in CHANGES])
-def test_what_another_program_has_written_anew_is_told(change, tmp_path):
+def test_records_changed_by_another_program_are_reported(change, tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(bytes_from_record(TRACKS, "k"))
     assert read_record(path, "k").n_points == 3
@@ -357,7 +357,7 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.55, 0.7, 0.85, 1.0])
-def test_a_run_whose_disk_is_full_goes_on_with_room(share, whole, tmp_path):
+def test_a_run_stopped_by_a_full_disk_resumes(share, whole, tmp_path):
     wanted, count = whole
     out = tmp_path / "out"
     with disk_ends(1 + round(share * (count - 1)), errno.ENOSPC), pytest.raises(OutputError) as refused:
@@ -397,7 +397,7 @@ def test_the_results_of_a_whole_run_stay_until_they_are_replaced(whole, tmp_path
     assert different(outputs(out), whole[0]) == ()
 
 
-def test_the_command_says_it_in_a_sentence(tmp_path, monkeypatch, capsys):
+def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, capsys):
     """On a small disk where one can be mounted, else one that is full by decree."""
     runs = SmallRuns(tmp_path, 2, 128, "features")
     wanted = runs.whole(tmp_path / "whole")
@@ -419,7 +419,7 @@ def test_the_command_says_it_in_a_sentence(tmp_path, monkeypatch, capsys):
     )
 
 
-def test_the_check_names_what_is_wrong():
+def test_the_check_names_the_fault():
     said = "thesisrecon: a cannot be written: no; make room there, then the same command goes on\n"
     well = Refusal("file 1: No space left on device", 2, said, (), ())
     bad = Refusal("a disk of 3 KiB", 1, "Traceback\nOSError\n", ("points.ply",), ("model.glb",))

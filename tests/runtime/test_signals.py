@@ -86,7 +86,7 @@ def is_alive(number):
 
 @pytest.mark.parametrize("what", AT_WORK)
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
-def test_a_program_is_ended_whatever_it_is_at(what, asked, tmp_path):
+def test_a_program_stops_at_any_time(what, asked, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ready = tmp_path / "ready"
     stop = stopped(program(tmp_path, AT_WORK[what]), ready.exists, asked, environment=environment)
@@ -105,7 +105,7 @@ def test_a_command_is_ended_while_it_is_loaded(name, slow, asked, tmp_path):
     assert stop.said == f"{name}: {word}; give the same command again\n"
 
 
-def test_what_a_program_was_started_to_ignore_it_ignores(tmp_path):
+def test_signals_ignored_at_start_stay_ignored(tmp_path):
     ready = tmp_path / "ready"
     work = "Path(sys.argv[1]).touch(); time.sleep(0.5)"
     process = subprocess.Popen(
@@ -148,7 +148,7 @@ def test_a_pool_is_abandoned_at_once():
     assert not is_alive(number)
 
 
-def test_an_interrupt_carries_what_is_advised():
+def test_an_interrupt_carries_advice():
     with pytest.raises(KeyboardInterrupt, match="go on"), advised("begin again"), advised("go on"):
         raise KeyboardInterrupt
 
@@ -168,7 +168,7 @@ def test_a_callers_own_program_is_interrupted_as_any_other(tmp_path):
     assert different(outputs(tmp_path / "out"), outputs(tmp_path / "whole")) == ()
 
 
-def test_the_check_names_what_is_wrong():
+def test_the_check_names_the_fault():
     said = "thesisrecon: interrupted; the same command goes on\n"
     well = Stop("5 % (0.4 s)", 0.1, 130, said, 0, 3)
     bad = Stop("15 % (1.2 s)", 2.5, 1, "Traceback\nKeyboardInterrupt\n", 2, 4, ("points.ply",))

@@ -29,7 +29,7 @@ def setup(scene, wish=CENTRED, *, seed=0):
     prior = prior_for(scene, wish)
     found = projective_scene(projective_reconstruction(scene, seed=seed), prior)
     strata = CalibrationProblem(
-        found.frame, found.knowledge, solver_unknowns(found.frame, prior), np.zeros((0, 2, 3))
+        found.frame, found.constraints, solver_unknowns(found.frame, prior), np.zeros((0, 2, 3))
     )
     return found, true_plane(scene, found), strata
 

@@ -81,7 +81,7 @@ def test_general_motions_are_far_from_all():
 
 
 @pytest.mark.parametrize("motion", [Motion.TRANSLATION, Motion.OPTICAL_AXIS])
-def test_cameras_that_did_not_tilt_show_it_whatever_focal_is_taken(motion):
+def test_cameras_without_tilt_are_detected_at_any_focal(motion):
     scene = make_sequence(motion, np.random.default_rng(3), zoom=0.3)
     cameras = true_cameras(scene)
     for factor in (0.3, 1.0, 4.0):
@@ -90,7 +90,7 @@ def test_cameras_that_did_not_tilt_show_it_whatever_focal_is_taken(motion):
     assert (infinite_homography_shift(H, roll=False) < 1e-9) == (motion is Motion.TRANSLATION)
 
 
-def test_the_projective_cameras_alone_tell_that_nothing_tilted():
+def test_missing_tilt_is_detected_from_projective_cameras():
     scene = make_scene(seed=2)
     still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
     for some, small in ((still, True), (scene, False)):
@@ -128,7 +128,7 @@ def test_the_counting_argument(known, views, spare):
     assert excess_equations(prior_for(estimate, known), registered) == spare
 
 
-def test_a_turntable_is_settled_by_square_pixels_and_said_so():
+def test_square_pixels_resolve_a_turntable_and_this_is_reported():
     identifiability = report_at_the_truth(make_sequence(Motion.TURNTABLE, np.random.default_rng(4)))
     assert identifiability.identifiable
     assert identifiability.critical
@@ -141,7 +141,7 @@ def test_a_turntable_is_settled_by_square_pixels_and_said_so():
     assert any("square pixels" in sentence for sentence in identifiability.sentences)
 
 
-def test_a_camera_that_rolled_only_is_refused_and_told_what_to_do():
+def test_pure_roll_is_rejected_with_advice():
     for cameras in ("shared", "per-image"):
         scene = make_sequence(Motion.OPTICAL_AXIS, np.random.default_rng(5))
         identifiability = report_at_the_truth(scene, cameras)
@@ -152,7 +152,7 @@ def test_a_camera_that_rolled_only_is_refused_and_told_what_to_do():
         )
 
 
-def test_a_turn_no_larger_than_what_lens_models_leave_out_tells_no_focal():
+def test_a_rotation_within_lens_model_error_determines_no_focal():
     """Turned by less than a tenth of a degree, thousands of points: as rectified photographs seem to be."""
     scene, rng = make_sequence(Motion.TRANSLATION, np.random.default_rng(0)), np.random.default_rng(1)
     turns = Rotation.from_rotvec(np.radians(rng.normal(0.0, 0.07, (len(scene.R), 3)))).as_matrix()
@@ -178,7 +178,7 @@ def test_a_general_motion_needs_no_words():
     assert identifiability.undetermined == ()
 
 
-def test_an_answer_that_explains_nothing_is_not_identifiable():
+def test_a_solution_with_large_residuals_is_not_identifiable():
     scene = make_sequence(Motion.GENERAL, np.random.default_rng(7))
     estimate = projective_estimate(scene, np.random.default_rng(0))
     prior = prior_for(estimate)
@@ -219,7 +219,7 @@ def metric_frame(estimate, scene):
     return np.asarray(np.linalg.inv(T))
 
 
-def test_noise_is_compared_with_what_the_projective_cameras_leave_not_with_a_floor():
+def test_noise_is_compared_with_the_projective_residual_not_a_floor():
     shared, own = bent_by_zooms()
     assert shared.evidence["noise_ratio_to_projective"] > MAX_NOISE_RATIO
     assert not shared.identifiable
@@ -229,7 +229,7 @@ def test_noise_is_compared_with_what_the_projective_cameras_leave_not_with_a_flo
     assert own.identifiable
 
 
-def test_no_sentence_promises_a_focal_that_the_self_check_may_doubt():
+def test_no_message_states_a_focal_that_the_self_check_may_reject():
     for motion in (Motion.TURNTABLE, Motion.PLANAR, Motion.TRANSLATION):
         scene = make_sequence(motion, np.random.default_rng(4), by_hand=True)
         for sentence in report_at_the_truth(scene).sentences:
@@ -245,7 +245,7 @@ def test_no_sentence_promises_a_focal_that_the_self_check_may_doubt():
         (IntrinsicsOptions(focal_px=900.0, focal="known"), " about the vertical and sideways"),
     ],
 )
-def test_nobody_is_told_to_give_a_focal_length_that_was_given(given, advice):
+def test_advice_never_asks_for_a_given_focal_length(given, advice):
     scene = make_sequence(Motion.TRANSLATION, np.random.default_rng(5))
     estimate = projective_estimate(scene, np.random.default_rng(0))
     sentences = identifiability_without_calibration(estimate, prior_for(estimate, given)).sentences

@@ -83,7 +83,7 @@ def test_exact_cameras_give_the_exact_focals(method, zoom):
 
 @pytest.mark.parametrize("method", EXACT, ids=name)
 @pytest.mark.parametrize("focal", [400.0, 15000.0])
-def test_wide_and_long_lenses_are_found_without_being_told(method, focal):
+def test_wide_and_long_lenses_are_found_without_a_prior(method, focal):
     scene = at_distance(make_scene(seed=3), focal)
     reconstruction = projective_reconstruction(scene, seed=3)
     answer = method.calibrate(reconstruction, prior=prior_for(scene), rng=np.random.default_rng(0))
@@ -123,7 +123,7 @@ def test_all_intrinsics_of_a_constant_camera_are_found(method):
 
 
 @pytest.mark.parametrize("method", [NonlinearQuadric(), KruppaEquations()], ids=name)
-def test_what_is_solved_for_has_a_deviation_of_the_size_of_its_error(method):
+def test_estimates_have_stds_of_the_size_of_their_errors(method):
     scaled = []
     for seed in range(4):
         scene = make_scene(sigma_px=0.3, seed=seed, principal_shift=(20.0, -12.0))
@@ -137,7 +137,7 @@ def test_what_is_solved_for_has_a_deviation_of_the_size_of_its_error(method):
     assert 0.3 < np.sqrt(np.mean(np.square(scaled))) < 4.0
 
 
-def test_what_is_left_as_assumed_is_as_sure_as_the_assumption():
+def test_unestimated_intrinsics_keep_the_std_of_the_prior():
     scene = make_scene(sigma_px=0.3, seed=1)
     told = calibrate(ScannedQuadric(), scene, prior_for(scene, stds=(0.05, 0.0, 10.0)), seed=1)
     np.testing.assert_allclose(told.K_std[:, 0, 2], 10.0)
@@ -150,7 +150,7 @@ def test_what_is_left_as_assumed_is_as_sure_as_the_assumption():
     assert (untold.K_std[:, 0, 0] > 0.0).all()
 
 
-def test_a_bias_is_no_deviation():
+def test_a_bias_does_not_count_as_spread():
     scene = make_scene(sigma_px=0.3, seed=1)
     answer = calibrate(LinearQuadric(), scene, prior_for(scene), seed=1)
     assert np.isnan(answer.K_std[:, (0, 1), (0, 1)]).all()

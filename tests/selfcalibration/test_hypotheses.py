@@ -112,7 +112,7 @@ def test_the_same_seed_gives_the_same_bytes():
     assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()
 
 
-def test_a_focal_that_leaves_no_answer_is_named_and_not_asked_for():
+def test_a_focal_without_a_solution_is_named_and_not_requested():
     scene = make_scene(seed=3)
     reconstruction = projective_reconstruction(scene)
     prior = prior_for(reconstruction, IntrinsicsOptions(focal_px=1.0, focal_std_rel=0.05))
@@ -127,7 +127,7 @@ def test_a_focal_that_leaves_no_answer_is_named_and_not_asked_for():
 @pytest.mark.parametrize(
     ("focals", "told"), [((900.0,), "900 px"), ((800.0, 900.0, 1000.0), "800 to 1000 px")]
 )
-def test_given_focals_that_leave_no_answer_are_named(focals, told):
+def test_given_focals_without_a_solution_are_named(focals, told):
     estimate = projective_reconstruction(make_scene(seed=6), seed=6)
     prior = prior_for(estimate, IntrinsicsOptions(focal_px=900.0, focal="known", cameras="per-image"))
     mean = prior.mean.copy()

@@ -95,9 +95,9 @@ def test_right_angles_determine_the_calibration_of_cameras_that_do_not_turn():
     H = np.tile(np.eye(3), (len(scene.K), 1, 1))
     v = (np.linalg.inv(found.frame.pixel_from_unit[reference]) @ scene.K[reference] @ scene.R[reference]).T
     orthogonal = np.array([[v[0], v[1]], [v[0], v[2]], [v[1], v[2]]])
-    knowledge = square_pixel_constraints(found.frame)
-    knowledge.std[:, 1:3] = np.inf
-    conic = solve_conic(H, knowledge, orthogonal=orthogonal)
+    constraints = square_pixel_constraints(found.frame)
+    constraints.std[:, 1:3] = np.inf
+    conic = solve_conic(H, constraints, orthogonal=orthogonal)
     dual = np.linalg.inv(conic.w)
     K = found.frame.pixel_from_unit[reference] @ calibration_from_dual_image(dual)
     np.testing.assert_allclose(K, scene.K[reference], rtol=1e-8, atol=1e-5)

@@ -9,14 +9,14 @@ from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CO
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
-from thesisrecon.selfcalibration.cheirality import CheiralityRegion, CheiralitySearch, local_minima
+from thesisrecon.selfcalibration.cheirality import CheiralityRegion, CheiralitySearch, _local_minima
 from thesisrecon.selfcalibration.hartley import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.modulus import (
     ModulusConstraint,
     modulus_coefficients,
     modulus_quartic,
     modulus_residuals,
-    pairs_of_constant_cameras,
+    _pairs_of_constant_cameras,
 )
 from thesisrecon.selfcalibration.refinement import minimize_batch
 from thesisrecon.selfcalibration.stratified import Stratified
@@ -41,10 +41,10 @@ def test_the_coefficients_are_those_of_the_characteristic_polynomial():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_true_plane_satisfies_the_quartics_whatever_the_constant_calibration(seed):
+def test_the_true_plane_satisfies_the_quartics_for_any_constant_calibration(seed):
     scene = make_scene(seed=seed, principal_shift=(80.0, -60.0))
     found, plane, _ = setup(scene, NOTHING_BUT_CONSTANT, seed=seed)
-    pairs = pairs_of_constant_cameras(found.knowledge.first)
+    pairs = _pairs_of_constant_cameras(found.constraints.first)
     assert len(pairs) == 28
     c = modulus_coefficients(found.frame.A, found.frame.a, pairs)
     assert np.abs(modulus_quartic(c, plane[None])).max() < 1e-9
@@ -85,7 +85,7 @@ def test_samples_of_the_bounds_are_inside_them():
 
 @pytest.mark.parametrize(("plane", "way"), PAIRS, ids=lambda v: type(v).__name__)
 @pytest.mark.parametrize("seed", range(3))
-def test_exact_cameras_give_the_exact_answer_in_closed_form(plane, way, seed):
+def test_exact_cameras_give_the_exact_solution_in_closed_form(plane, way, seed):
     scene = make_scene(seed=seed)
     answer = Stratified(plane, way, refine=False).calibrate(
         projective_reconstruction(scene, seed=seed), prior=prior_for(scene), rng=np.random.default_rng(seed)
@@ -142,7 +142,7 @@ def test_noise_moves_the_focal_by_little(plane, way):
 
 def test_the_modulus_descent_lowers_every_start():
     found, plane, _ = setup(make_scene(seed=8))
-    c = modulus_coefficients(found.frame.A, found.frame.a, pairs_of_constant_cameras(found.knowledge.first))
+    c = modulus_coefficients(found.frame.A, found.frame.a, _pairs_of_constant_cameras(found.constraints.first))
     starts = plane + 0.02 * np.random.default_rng(0).normal(size=(10, 3))
     ends, cost = minimize_batch(lambda p: modulus_residuals(c, p)[0], starts, iterations=60, loss_scale=0.05)
     assert cost.max() < 1e-20
@@ -169,5 +169,5 @@ def test_local_minima_are_no_worse_than_any_of_their_neighbours():
         if np.isfinite(score[cell]) and all(score[cell] <= score[n] for n in inside):
             expected.append(cell)
     expected.sort(key=lambda cell: score[cell])
-    found = local_minima(score)
+    found = _local_minima(score)
     assert [tuple(np.array(np.unravel_index(k, score.shape)).tolist()) for k in found] == expected

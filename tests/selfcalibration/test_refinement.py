@@ -54,7 +54,7 @@ def test_planes_alone_leave_the_focals():
     np.testing.assert_array_equal(refined[:, 3:], theta[:, 3:])
 
 
-def test_unknowns_are_what_the_assumptions_leave_open():
+def test_unknowns_are_the_free_intrinsics():
     scene = make_scene(views=4, seed=2)
     rec = projective_reconstruction(scene, seed=2)
     constant = solver_unknowns(normalized_frame(rec, prior_for(scene)), prior_for(scene))
@@ -105,7 +105,7 @@ def test_the_range_of_lenses_is_wider_than_any_maker_s(focal):
     np.testing.assert_allclose(answer.K[:, 0, 0], focal, rtol=2e-2)
 
 
-def test_answers_are_told_apart_by_focals_or_plane():
+def test_candidates_are_distinguished_by_focals_or_plane():
     scene = make_scene(views=4, points=40, seed=6)
     frame = normalized_frame(projective_reconstruction(scene, seed=6), prior_for(scene))
     K, plane = square_pixel_calibrations(np.zeros(4)), np.array([0.1, 0.2, 0.3])

@@ -41,7 +41,7 @@ def errors(walled, maps):
 
 
 @pytest.mark.parametrize("linker", [STEREO.linker, SequenceLinking()], ids=lambda v: type(v).__name__)
-def test_depth_is_that_of_the_scene_and_its_deviation_tells_the_error(walled, linker):
+def test_depth_matches_the_scene_and_its_std_predicts_the_error(walled, linker):
     stereo = MultiViewStereo(linker=linker)
     maps = stereo.map_all(walled.images, walled.reconstruction)
     error, known = errors(walled, maps)
@@ -56,7 +56,7 @@ def test_depth_is_that_of_the_scene_and_its_deviation_tells_the_error(walled, li
         assert np.array_equal(np.isnan(found.depth), np.isnan(found.std))
 
 
-def test_the_same_bytes_whatever_the_number_of_threads_and_one_by_one(walled):
+def test_the_same_bytes_with_any_number_of_threads(walled):
     reconstruction = replace(walled.reconstruction, registered=np.array([True, True, True, False]))
     stereo = replace(STEREO, max_side=120, match_side=90)
     together = stereo.map_all(walled.images, reconstruction, threads=2)
@@ -137,7 +137,7 @@ def test_forward_motion_is_right_where_it_is_known():
     assert np.median(error) < 0.01
 
 
-def test_views_without_a_camera_are_left_out_and_asking_for_them_is_wrong(walled):
+def test_views_without_a_camera_are_omitted_and_cannot_be_requested(walled):
     reconstruction = replace(walled.reconstruction, registered=np.array([True, True, False, False]))
     scene = STEREO.prepare(walled.images, reconstruction)
     assert sorted(scene.views) == [0, 1]

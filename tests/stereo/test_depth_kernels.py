@@ -96,7 +96,7 @@ def test_the_filter_ends_at_the_first_outlier():
     np.testing.assert_allclose(std[taken & ~first], np.sqrt(1.0 - gain) * 0.05, rtol=1e-5)
 
 
-def test_agreement_counts_what_comes_back_and_what_is_seen_through():
+def test_agreement_counts_consistent_and_contradicted_depths():
     rng = np.random.default_rng(3)
     to = np.column_stack([np.eye(3), [3.0, 1.0, 0.0]])
     back = np.column_stack([np.eye(3), [-3.0, -1.0, 0.0]])
@@ -138,7 +138,7 @@ def test_depths_land_on_the_nearest_pixels_of_another_view_the_nearer_before_the
     assert np.isnan(out).any()
 
 
-def test_planes_are_fitted_to_what_is_alike():
+def test_planes_are_fitted_to_similar_pixels():
     rng = np.random.default_rng(4)
     xy = pixels()
     rho = (1.0 + 1e-3 * xy[..., 0] - 2e-3 * xy[..., 1]).astype(np.float32)
@@ -152,7 +152,7 @@ def test_planes_are_fitted_to_what_is_alike():
     np.testing.assert_allclose(gy[known], -2e-3, atol=2e-6)
 
 
-def test_what_continues_a_surface_lies_on_the_plane_of_what_is_sure_about_it():
+def test_continued_surfaces_lie_on_the_plane_of_certain_pixels():
     rng = np.random.default_rng(6)
     y, x = np.indices(SHAPE)
     rho = (1.0 + 2e-3 * x - 1e-3 * y + 1e-4 * rng.normal(size=SHAPE)).astype(np.float32)

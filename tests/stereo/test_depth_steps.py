@@ -35,7 +35,7 @@ def views_of(walled, **options):
     }
 
 
-def test_an_undistorted_view_is_what_a_lens_without_distortion_shows(walled):
+def test_an_undistorted_view_equals_the_view_without_distortion(walled):
     straight = make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)))
     for i, view in views_of(walled).items():
         assert (view.rgb[~view.seen] == 0).all()
@@ -78,7 +78,7 @@ def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):
     )
 
 
-def test_a_view_at_the_same_place_or_with_few_points_is_no_neighbour(walled):
+def test_a_view_without_baseline_or_points_is_not_a_neighbour(walled):
     views, points = views_of(walled), sparse_points(walled.reconstruction)
     same = {0: views[0], 1: replace(views[1], P=views[0].P)}
     assert NeighbourSelection().select(points, same, 0) == []
@@ -131,7 +131,7 @@ def test_exact_disparities_give_exact_depth(method):
     assert np.nanmedian(6.0 * std) == pytest.approx(0.2 / 54.0 / np.sqrt(2.0), rel=0.5)
 
 
-def test_pixels_of_larger_photographs_are_told_where_their_places_are():
+def test_working_pixels_map_back_to_pixels_of_the_file():
     walled = make_walled(on_arc((-6.0, 6.0)))
     true = TrueDisparity(walled, (0, 1), "metric")
     larger = (2 * SIZE[0], 2 * SIZE[1])
@@ -193,7 +193,7 @@ def true_maps(walled):
     ]  # fmt: skip
 
 
-def test_what_a_view_lacks_is_taken_from_others_where_the_photographs_agree():
+def test_holes_are_filled_from_views_that_agree():
     walled = make_walled(on_arc((-6.0, 6.0)))
     maps, views = true_maps(walled), views_of(walled)
     depth, other = maps[0].depth.copy(), maps[1].depth.copy()
@@ -218,7 +218,7 @@ def test_what_a_view_lacks_is_taken_from_others_where_the_photographs_agree():
     assert DepthCompletion().complete(own, [nothing], views, refinement=PlaneRefinement()) is own
 
 
-def test_what_other_views_see_through_and_small_pieces_go():
+def test_seen_through_and_small_pieces_are_removed():
     walled = make_walled(on_arc((-6.0, 6.0)))
     maps = true_maps(walled)
     depth = maps[0].depth.copy()
@@ -239,7 +239,7 @@ def test_what_other_views_see_through_and_small_pieces_go():
     assert sizes[25, 5] == 0
 
 
-def test_what_nobody_confirms_stays_if_it_continues_what_is_confirmed():
+def test_unconfirmed_depths_stay_if_they_continue_confirmed_ones():
     walled = make_walled(on_arc((-6.0, 6.0)))
     maps = true_maps(walled)
     other = maps[1].depth.copy()

@@ -106,7 +106,7 @@ def test_a_range_that_the_points_do_not_cover(stereo):
 
 
 @BOTH
-def test_a_view_of_elsewhere_is_alone_and_harms_nobody(stereo):
+def test_an_unrelated_view_stays_unregistered_and_does_no_harm(stereo):
     P = abreast(0.4, 4)
     P[3] = looking_ahead([[40.0, 0.0, 0.0]])[0]
     scene = photograph_scene(P, fence())

@@ -82,7 +82,7 @@ def test_a_range_may_span_zero(variant):
 
 
 @names
-def test_pixels_that_are_none_have_no_disparity(variant):
+def test_invalid_pixels_have_no_disparity(variant):
     left, right, truth, both = pair_with_truth()
     left[:20], left[100:, 90:] = np.nan, np.nan
     found = variant.match(left, right, disparity_range=(0, 24))
@@ -198,7 +198,7 @@ def test_parameters_are_checked(make, rule):
 
 def test_the_cost_of_a_hidden_pixel_is_that_of_the_paper():
     # ln(0.99 / 0.01 * 256 / sqrt(2 pi 4)), equation (9) with one grey level as measurement.
-    assert MaximumLikelihoodScanline().hidden_cost(1, 4.0) == pytest.approx(8.528, abs=1e-3)
+    assert MaximumLikelihoodScanline().occlusion_cost(1, 4.0) == pytest.approx(8.528, abs=1e-3)
 
 
 def test_cohesion_takes_the_solution_with_fewer_discontinuities():

@@ -26,12 +26,12 @@ from thesisrecon.stereo.postprocessing import (
     best_disparities,
     check_left_right,
     fill_pinholes,
-    rate,
-    remove_peaks,
-    smooth_alike,
+    final_confidence,
+    remove_speckles,
+    edge_preserving_mean,
     squared_gradient,
 )
-from thesisrecon.stereo.scanline import FORBIDDEN, NOTHING, solve_row
+from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED, solve_row
 
 
 def random_side(rng, height=13, width=21, channels=3):
@@ -44,7 +44,7 @@ def random_side(rng, height=13, width=21, channels=3):
     return bits, values, low, high, valid
 
 
-def test_channels_are_quarter_levels_and_pixels_that_are_none_are_told():
+def test_channels_are_quarter_levels_and_invalid_pixels_are_rejected():
     image = np.array([[[0.0, 255.0], [10.1, np.nan]], [[300.0, -4.0], [np.inf, 1.0]]], np.float32)
     channels, grey = np.empty((2, 2, 2), np.int16), np.empty((2, 2), np.int16)
     valid = np.empty((2, 2), np.uint8)
@@ -192,12 +192,12 @@ def test_peaks_go_and_surfaces_stay_where_there_is_texture():
     disparity[2:4, 2:4] = 5.0
     disparity[:, 8:] += np.arange(1, 5, dtype=np.float32)
     before = disparity.copy()
-    remove_peaks(disparity, np.ones((9, 12), bool), np.float32(1.0), 5)
+    remove_speckles(disparity, np.ones((9, 12), bool), np.float32(1.0), 5)
     gone = np.isnan(disparity)
     assert gone.sum() == 4
     assert gone[2:4, 2:4].all()
     assert (disparity[~gone] == before[~gone]).all()
-    remove_peaks(disparity, np.zeros((9, 12), bool), np.float32(1.0), 5)
+    remove_speckles(disparity, np.zeros((9, 12), bool), np.float32(1.0), 5)
     assert np.isnan(disparity).all()
 
 
@@ -205,7 +205,7 @@ def test_confidence_falls_with_texture_and_where_it_was_filled_in():
     confidence = np.full((1, 4), 0.8, np.float32)
     confirmed = np.array([[1.0, np.nan, np.nan, 2.0]], np.float32)
     disparity = np.array([[1.0, 1.0, np.nan, 2.0]], np.float32)
-    rate(confidence, confirmed, disparity, np.array([[4.0, 4.0, 4.0, 0.5]], np.float32))
+    final_confidence(confidence, confirmed, disparity, np.array([[4.0, 4.0, 4.0, 0.5]], np.float32))
     assert confidence[0].tolist() == pytest.approx([0.6, 0.3, 0.0, 0.04])
 
 
@@ -221,12 +221,12 @@ def test_pinholes_take_the_median_and_large_holes_stay():
     assert (out[known] == disparity[known]).all()
 
 
-def test_smoothing_averages_what_is_alike():
+def test_smoothing_averages_similar_pixels():
     rng = np.random.default_rng(7)
     disparity = np.where(np.arange(11) < 5, 3.0, 9.0) + rng.uniform(-0.4, 0.4, (8, 11))
     disparity[3, 3] = np.nan
     values, out = disparity.astype(np.float32), np.empty((8, 11), np.float32)
-    smooth_alike(values, np.float32(1.0), 2, out)
+    edge_preserving_mean(values, np.float32(1.0), 2, out)
     for y, x in np.ndindex(8, 11):
         window = values[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
         if np.isnan(values[y, x]):
@@ -253,12 +253,12 @@ def test_rows_of_greatest_likelihood(first, n, seed):
     rng = np.random.default_rng(seed)
     width = 12
     costs = rng.integers(0, 30, (n, width)).astype(np.int32)
-    costs[rng.random(costs.shape) < 0.1] = FORBIDDEN
+    costs[rng.random(costs.shape) < 0.1] = NO_MATCH
     for q in range(n):
         x = np.arange(width)
-        costs[q, (x - first - q < 0) | (x - first - q >= width)] = FORBIDDEN
+        costs[q, (x - first - q < 0) | (x - first - q >= width)] = NO_MATCH
     above = tuple(
-        np.where(rng.random(width) < 0.3, NOTHING, rng.integers(first, first + n, width)).astype(np.int32)
+        np.where(rng.random(width) < 0.3, OCCLUDED, rng.integers(first, first + n, width)).astype(np.int32)
         for _ in range(2)
     )
     left, right = np.empty(width, np.int32), np.empty(width, np.int32)
@@ -271,12 +271,12 @@ def test_rows_of_greatest_likelihood(first, n, seed):
 def price_of(costs, first, prices, above, left, right):
     """Cost and discontinuities of a correspondence; it must be ordered and unique."""
     width = costs.shape[1]
-    pairs = [(x, x - int(left[x])) for x in range(width) if left[x] != NOTHING]
+    pairs = [(x, x - int(left[x])) for x in range(width) if left[x] != OCCLUDED]
     assert all(right[j] == x - j for x, j in pairs)
-    assert (right != NOTHING).sum() == len(pairs)
+    assert (right != OCCLUDED).sum() == len(pairs)
     assert all(b[0] > a[0] and b[1] > a[1] for a, b in itertools.pairwise(pairs))
     # No other match is left: what the program says of these alone is their price.
-    fixed = np.full_like(costs, FORBIDDEN)
+    fixed = np.full_like(costs, NO_MATCH)
     for x, j in pairs:
         fixed[x - j - first, x] = costs[x - j - first, x]
     return twins.most_likely_row(fixed, first, prices, above)

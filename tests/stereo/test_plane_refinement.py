@@ -113,7 +113,7 @@ def test_a_pass_equals_that_of_plain_numpy(scene, backward):
     assert same.mean() > 0.95
 
 
-def test_passes_find_the_plane_and_fill_what_has_none(scene):
+def test_passes_find_the_plane_and_fill_holes(scene):
     _, given, (x, y) = scene
     planes = planes_about((x, y), 0.5, seed=2)
     cost = np.empty(SHAPE, np.float32)

@@ -377,7 +377,7 @@ def test_whole_pixels_are_kept_and_quadratics_are_reproduced():
     np.testing.assert_allclose(found[inner], expected[inner], atol=1e-3)
 
 
-def test_what_is_too_fine_for_the_frame_becomes_grey_not_another_pattern():
+def test_fine_patterns_become_grey_without_aliasing():
     stripes = np.zeros((200, 200), np.float32)
     stripes[:, ::2] = 200.0
     third = PlanarRectification(np.diag([1 / 3, 1 / 3, 1.0]), np.eye(3), (66, 66))

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 
 from thesisrecon.stereo.plane_kernels import HELD, HIDDEN, SAME_PLANE, TEXTURE, UNKNOWN
-from thesisrecon.stereo.scanline import FORBIDDEN, NOTHING
+from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED
 
 
 def squares(gray):
@@ -76,7 +76,7 @@ class Setting:
             cost[v, u] = self.cost(u, v, planes[v, u].astype(float))
         return cost
 
-    def rate(self, planes, accepted):
+    def final_confidence(self, planes, accepted):
         """Least cost, support and slope (H, W)."""
         least, support, slope = np.full(self.gray.shape, UNKNOWN), np.zeros(self.gray.shape, int), None
         slope = np.zeros(self.gray.shape)
@@ -247,13 +247,13 @@ def most_likely_row(costs, first, prices, above):
                 breaks += along * (before != state)
                 up, aside = above[0][i - 1], above[1][j - 1]
                 if state == 0:
-                    if costs[q, i - 1] == FORBIDDEN:
+                    if costs[q, i - 1] == NO_MATCH:
                         continue
                     cost += int(costs[q, i - 1])
-                    breaks += across * sum(1 for d in (up, aside) if d not in (NOTHING, i - j))
+                    breaks += across * sum(1 for d in (up, aside) if d not in (OCCLUDED, i - j))
                 else:
                     cost += hidden
-                    breaks += across * ((up if state == 1 else aside) != NOTHING)
+                    breaks += across * ((up if state == 1 else aside) != OCCLUDED)
                 enter((i, j, state), (cost, breaks))
         if width in (i, j):
             for state in (0, 1, 2):

@@ -102,7 +102,7 @@ def test_the_gradient_is_the_derivative_of_the_surface(surface):
 
 
 @BOTH
-def test_nothing_is_said_beyond_the_depths(surface):
+def test_nothing_is_reported_beyond_the_depths(surface):
     plane = polynomial(0.2, 0.05)
     hole = np.ones(SHAPE, dtype=bool)
     hole[20:40, 30:50] = False
@@ -132,7 +132,7 @@ def test_noise_is_averaged_where_the_surface_is_smooth():
     assert abs(fitted.mean()) < 0.05 * rms[0]
 
 
-def test_deviations_that_are_told_too_large_or_small_change_little():
+def test_wrong_standard_deviations_change_little():
     camera = looking_at_origin(0.3, 0.2, 3.5)
     clean, noisy = sphere_map(0, camera), sphere_map(0, camera, noise=0.01)
     rms = []

@@ -64,7 +64,7 @@ def test_a_coarser_sphere_is_still_the_sphere(sphere, most):
     assert face_areas(small.vertices, small.faces).sum() == pytest.approx(4 * np.pi, rel=0.08)
 
 
-def test_no_face_is_degenerate_or_told_twice(sphere):
+def test_no_face_is_degenerate_or_repeated(sphere):
     small = simplify_mesh(sphere, 2_000)
     assert (np.diff(np.sort(small.faces, axis=1), axis=1) > 0).all()
     assert len(np.unique(cycles(small.faces), axis=0)) == len(small.faces)
@@ -98,7 +98,7 @@ def test_a_ridge_stays_sharp():
     assert off.max() < 1e-6
 
 
-def test_what_is_small_enough_is_left_alone_and_colours_are_averaged(sphere):
+def test_small_meshes_are_unchanged_and_colours_are_averaged(sphere):
     assert simplify_mesh(sphere, len(sphere.faces)) is sphere
     high = sphere.vertices[:, 1] > 0
     colors = np.where(high[:, None], (200, 40, 90), (20, 60, 10)).astype(np.uint8)
@@ -153,7 +153,7 @@ def edges(domain):
     return start, stop
 
 
-def test_pieces_are_what_hangs_together_in_a_cell(domain, pieces):
+def test_pieces_are_connected_within_a_cell(domain, pieces):
     y, x = np.indices(domain.covered.shape)
     cell = ((y // CELL) * pieces.shape[1] + x // CELL).ravel()
     start, stop = edges(domain)
@@ -170,7 +170,7 @@ def test_pieces_are_what_hangs_together_in_a_cell(domain, pieces):
     np.testing.assert_array_equal(pieces.cell[found[covered]], cell[covered])
 
 
-def test_coefficients_are_shared_by_what_hangs_together_within_reach(domain, pieces):
+def test_coefficients_are_shared_within_connected_parts(domain, pieces):
     start, stop = (pieces.piece.ravel()[k] for k in edges(domain))
     row, column = np.divmod(pieces.cell, pieces.shape[1])
     owners = set()

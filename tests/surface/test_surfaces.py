@@ -86,7 +86,7 @@ def test_voxels_stop_growing_with_as_few_blocks_as_there_may_be(ring):
         VolumetricFusion(max_blocks=8).fuse(ring[:1])
 
 
-def test_what_views_look_through_is_removed(ring):
+def test_seen_through_points_are_removed(ring):
     """A wrong blob in one view, in empty space that the others see the sphere through."""
     depth = ring[0].depth.copy()
     depth[50:60, 70:80] -= 0.3
@@ -175,7 +175,7 @@ def test_hopeless_sheets_are_refused(ring):
             DepthSheets(**wrong)
 
 
-def test_the_model_is_made_of_fitted_surfaces_where_asked():
+def test_the_model_uses_fitted_surfaces_on_request():
     noise = 0.01
     noisy = [sphere_map(m.view, m.P, noise=noise) for m in ring_of()[:3]]
     views = [photograph(m) for m in ring_of()[:3]]

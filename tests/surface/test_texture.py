@@ -86,7 +86,7 @@ def seam_jumps(mesh):
     return np.abs(a - b).mean(axis=1)
 
 
-def test_what_is_hidden_or_cut_off_is_not_seen(sphere):
+def test_hidden_and_cut_off_points_are_not_visible(sphere):
     view = photograph(ring_of()[0])
     quality = face_quality(sphere, [view])[:, 0]
     middle = sphere.vertices[sphere.faces].mean(axis=1)
@@ -100,7 +100,7 @@ def test_what_is_hidden_or_cut_off_is_not_seen(sphere):
     assert face_quality(sphere, [half])[right, 0].max() == 0.0
 
 
-def test_charts_are_large_and_take_what_sees_them(sphere):
+def test_charts_are_large_and_use_views_that_see_them(sphere):
     views = [photograph(m) for m in ring_of()]
     quality = face_quality(sphere, views)
     neighbours = face_neighbours(sphere.faces)
@@ -137,7 +137,7 @@ def test_the_atlas_is_no_larger_than_allowed_and_the_same_for_any_threads(sphere
     assert np.sqrt(np.mean(difference(one) ** 2)) < 20.0
 
 
-def test_an_atlas_that_cannot_be_as_small_as_asked_is_refused(sphere):
+def test_an_atlas_that_cannot_be_small_enough_is_rejected(sphere):
     views = [photograph(m) for m in ring_of()]
     with pytest.raises(StageFailure, match=r"too large; \d+ pieces take \d+ texels, allowed are 40"):
         TextureAtlas(max_texels=40).texture(sphere, views)
@@ -162,7 +162,7 @@ def test_unseen_faces_take_the_colour_of_their_surroundings(sphere):
     )
 
 
-def test_a_surface_that_nobody_sees_is_refused(sphere):
+def test_a_surface_outside_all_views_is_rejected(sphere):
     away = photograph(ring_of()[0])
     away = replace(away, seen=np.zeros_like(away.seen))
     with pytest.raises(StageFailure, match="no texture"):
@@ -184,7 +184,7 @@ def test_gains_of_views_that_share_nothing_stay():
     np.testing.assert_allclose(equalizing_gains(weight, color)[:, 0], [1.2, 1 / 1.2, 1.0], rtol=1e-4)
 
 
-def test_what_one_photograph_contradicts_is_left_out(sphere):
+def test_depths_that_one_image_contradicts_are_removed(sphere):
     views = [photograph(m) for m in ring_of(24)]
     spoiled = views[0].rgb.copy()
     spoiled[40:80, 60:100] = [255, 0, 255]
@@ -248,8 +248,8 @@ def observed(points, normals, P, depth, trust, tolerance):
         rows, columns = [top, min(top + 1, height - 1)], [left, min(left + 1, width - 1)]
         s, t = np.array([1 - u + left, u - left]), np.array([1 - v + top, v - top])
         if x[2] * (1 - tolerance) <= depth[np.ix_(rows, columns)].max():
-            trust = t @ trust[np.ix_(rows, columns)] @ s
-            weight[n] = trust * abs(np.linalg.det(M)) * (N @ (centre - X)) / x[2] ** 3
+            confidence = t @ trust[np.ix_(rows, columns)] @ s
+            weight[n] = confidence * abs(np.linalg.det(M)) * (N @ (centre - X)) / x[2] ** 3
     return weight
 
 

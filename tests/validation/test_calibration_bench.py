@@ -53,7 +53,7 @@ def test_a_method_that_failed_has_no_camera_and_no_error():
     assert np.isinf(rows.all_focals(None)).all()
 
 
-def test_cameras_that_are_missing_count_in_what_is_pooled_over_seeds():
+def test_missing_cameras_count_in_pooled_results():
     errors = {OURS: [np.array([0.1, 0.3]), np.array([0.2, np.inf])]}
     registered, median, worst = _pooled("all", errors)
     assert registered.values[OURS] == 3.0

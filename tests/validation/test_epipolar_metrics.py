@@ -81,7 +81,7 @@ def test_the_target_is_the_best_rival():
     assert least({OURS: 0.1}, ("PoseLib",)) is None
 
 
-def test_a_wrong_matrix_is_called_sure_only_where_its_matches_are_said_to_determine_it():
+def test_a_wrong_matrix_is_certain_only_if_its_matches_determine_it():
     rng = np.random.default_rng(0)
     X = rng.uniform(-1.0, 1.0, (200, 3)) + np.array([0.0, 0.0, 5.0])
     xy1 = 1000.0 * X[:, :2] / X[:, 2:]

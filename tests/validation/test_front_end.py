@@ -64,7 +64,7 @@ def smooth_picture():
     return Image("waves", rgb, (140, 90))
 
 
-def test_the_maps_of_copies_tell_where_each_pixel_went(smooth_picture):
+def test_the_maps_of_copies_give_the_position_of_each_pixel(smooth_picture):
     names = []
     for copy in make_copies(smooth_picture.rgb):
         names.append(copy.name)

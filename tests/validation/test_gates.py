@@ -55,7 +55,7 @@ def results(tmp_path_factory):
         for key, gate in GATES.items()
     ],
 )
-def test_a_promise_is_kept(gate, results):
+def test_every_gate_holds(gate, results):
     scene = scene_of(gate)
     if scene not in HERE:
         pytest.skip(f"{scene} is not on this machine (THESISRECON_DATA)")

@@ -22,7 +22,7 @@ from validation.studies.reconstruction import COLMAP, OURS
 from .test_cameras import N, V, _reconstruction, _truth
 
 
-def test_a_process_is_measured_whole(tmp_path):
+def test_a_process_is_measured_with_its_children(tmp_path):
     program = "import os, sys; b = bytearray(200_000_000); print(len(os.sched_getaffinity(0))); sys.exit(3)"
     log = tmp_path / "log" / "out.txt"
     done = run_process([sys.executable, "-c", program], log=log, cores=own_cores()[:1], environment={})
@@ -55,7 +55,7 @@ def _save_run(out, scene):
     (out / "seconds.json").write_text(json.dumps({"extract": 3.0, "match": 1.0, "map": 2.0}))
 
 
-def test_the_table_is_made_from_what_the_methods_saved(tmp_path, monkeypatch, capsys):
+def test_the_table_is_made_from_saved_results(tmp_path, monkeypatch, capsys):
     scene, saved = _fake_scene(tmp_path), tmp_path / "saved"
     _save_run(saved, scene)
     copy = "import shutil, sys; shutil.copytree(sys.argv[1], sys.argv[2])"

@@ -57,7 +57,7 @@ def test_one_thing_changes_in_functions_and_nothing_in_settings_or_words(tmp_pat
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_what_is_drawn_is_python_and_the_same_every_time(package):
+def test_drawn_faults_are_python_and_repeatable(package):
     drawn = draw(ROOT, package, 30, seed=1)
     assert len(drawn) == 30
     assert drawn == draw(ROOT, package, 30, seed=1) != draw(ROOT, package, 30, seed=2)
@@ -85,7 +85,7 @@ def test_the_table_has_the_score_of_each_package_and_every_fault():
     assert "| thesisrecon/geometry/a.py | 3 | `a \\| b` | `a & b` | **nobody** |" in text
 
 
-def test_what_nobody_caught_is_judged_again_and_the_rest_is_kept(monkeypatch, tmp_path, capsys):
+def test_surviving_faults_are_tested_again_and_the_rest_is_kept(monkeypatch, tmp_path, capsys):
     judged = []
 
     def judge_all(bench, chosen, *, warm):
@@ -104,7 +104,7 @@ def test_what_nobody_caught_is_judged_again_and_the_rest_is_kept(monkeypatch, tm
     assert len(mutants.read_verdicts(tmp_path / "mutants.json")) == 4
 
 
-def test_a_bad_wish_ends_in_a_sentence(capsys):
+def test_bad_options_give_a_usage_error(capsys):
     with pytest.raises(SystemExit):
         mutants.main(["--packages", "nothing"])
     assert "invalid choice" in capsys.readouterr().err

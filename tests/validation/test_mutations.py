@@ -137,7 +137,7 @@ def test_gates_are_broken_by_numbers_beyond_them_and_by_none():
     assert found.broken(gates) == ("a/s/far", "a/s/untold")
 
 
-def test_the_table_says_what_caught_a_fault_and_what_survived(tmp_path):
+def test_the_table_lists_caught_and_surviving_faults(tmp_path):
     fates = [
         Fate("one", "a.py", ("a/s/far", "a/s/untold"), 1.2),
         Fate("two", "b.py", (), 3.0),

@@ -64,7 +64,7 @@ def test_a_suite_is_well_where_something_passed_and_nothing_broke():
     assert suite_faults([well, crashed]) == ["c ended with code -11"]
 
 
-def test_what_is_missing_or_does_not_belong_in_a_wheel_is_told():
+def test_missing_and_foreign_files_of_a_wheel_are_reported():
     photographs = [f"thesisrecon/courtyard/images/{i:04d}.jpg" for i in range(DEMO_IMAGES)]
     good = [*NEEDED, *photographs, "thesisrecon/cli/main.py", "thesisrecon-0.1.0.dist-info/METADATA"]
     assert wheel_faults(good, 1_000_000) == []
@@ -76,7 +76,7 @@ def test_what_is_missing_or_does_not_belong_in_a_wheel_is_told():
     assert wheel_faults(good[: len(NEEDED)], 1) == [f"0 photographs instead of {DEMO_IMAGES}"]
 
 
-def test_a_run_writes_into_its_folder_alone_and_speaks_to_nobody(tmp_path):
+def test_a_run_writes_only_into_its_folder_and_opens_no_connection(tmp_path):
     photographs, result = tmp_path / "photographs", tmp_path / "result"
     photographs.mkdir()
     for path in demo_images()[:3]:
@@ -91,7 +91,7 @@ def test_a_run_writes_into_its_folder_alone_and_speaks_to_nobody(tmp_path):
     assert len(run.outside(tmp_path / "elsewhere")) > 10
 
 
-def test_what_a_run_should_not_have_done_is_told(tmp_path):
+def test_forbidden_actions_of_a_run_are_reported(tmp_path):
     wrong = Watched(
         3, frozenset([tmp_path / "a", tmp_path / "out" / "b"]), ("socket.connect",), ("ls",), (), "no"
     )

@@ -317,7 +317,7 @@ def test_empty_rows_take_the_nearest():
     assert np.isnan(nothing).all()
 
 
-def test_disparities_are_taken_back_as_interpolation_says():
+def test_disparities_are_taken_back_by_interpolation():
     whole, sure = field(1, holes=0.0), np.random.default_rng(1).random((14, 23)).astype(np.float32)
     H = np.array([[1.1, 0.05, -2.0], [-0.03, 0.9, 1.2], [1e-3, -2e-3, 1.0]])
     shape = (16, 20)
@@ -345,7 +345,7 @@ def test_disparities_are_taken_back_as_interpolation_says():
     assert np.isfinite(d[:, :10]).all()
 
 
-def test_pixels_lie_between_as_the_homography_says():
+def test_pixels_are_sampled_as_the_homography_maps_them():
     rng = np.random.default_rng(2)
     places, d = rng.uniform(0, 30, (5, 7, 2)), field(3, (5, 7))
     G = np.array([[0.9, 0.1, 3.0], [-0.1, 1.1, -2.0], [4e-3, -0.05, 1.0]])

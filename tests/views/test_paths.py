@@ -92,7 +92,7 @@ def test_an_orbit_of_one_side_stays_on_that_side_and_closes():
     assert steps[-1] < 1.1 * steps.max()
 
 
-def test_an_orbit_goes_round_what_is_in_its_way_and_shows_the_model():
+def test_an_orbit_avoids_obstacles_and_shows_the_model():
     """A long wall: at its ends the cameras' median distance would lead through it."""
     wall = np.random.default_rng(0).uniform([-6, -1, -0.2], [6, 1, 0.2], (3000, 3))
     cameras = ring(np.radians(np.arange(0, 360, 30.0)), -0.5, 5.0)
@@ -173,7 +173,7 @@ def test_interpolation_ends_at_the_real_cameras_and_passes_all():
         np.testing.assert_allclose(path[nearest].K, camera.K, rtol=0.02, atol=1e-9)
 
 
-def test_interpolation_has_a_constant_speed_whatever_the_spacing():
+def test_interpolation_has_constant_speed_for_any_spacing():
     path = interpolate_cameras(ring(np.array([0.0, 0.05, 0.5, 0.6, 2.0])), 200)
     steps = np.linalg.norm(np.diff(centres_of(path), axis=0), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=0.02)

@@ -195,7 +195,7 @@ def test_ssim_is_that_of_its_windows():
     assert 0.3 < ssim(real, noisy, everything) < 0.95
 
 
-def test_what_is_not_compared_takes_no_part():
+def test_uncompared_pixels_take_no_part():
     real, noisy = pictures()
     mask = np.hypot(*(np.indices((40, 50)) - np.array([17, 21])[:, None, None])) < 9
     spoiled = np.where(mask[..., None], noisy, 0).astype(np.uint8)

@@ -141,7 +141,7 @@ def test_three_photographs_give_the_seed_that_their_cameras_have():
     np.testing.assert_allclose(seed.moved(R, t).transfer(xy1, xy2)[0], moved, atol=1e-4)
 
 
-def test_without_motion_the_second_view_is_seen_and_any_line_through_a_match_says_the_same():
+def test_without_motion_the_second_view_is_kept_for_any_line_through_a_match():
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(2))
     seed = seed_of_two(pair)
@@ -191,7 +191,7 @@ def test_points_behind_the_virtual_camera_have_no_place():
 
 
 @pytest.mark.parametrize(("ahead", "sign"), [(1.5, 1.0), (-1.5, -1.0)])
-def test_nearness_orders_what_falls_on_one_pixel_as_mcmillan_paints_it(ahead, sign):
+def test_inverse_depth_orders_pixels_as_mcmillan_paints_them(ahead, sign):
     """Towards the epipole of the new camera where it is in front of view 1, else away from it: what is
     painted last is nearest."""
     pair = _pair((0.0, -0.1, 0.0), (0.7, 0.1, 0.2, False))
@@ -257,7 +257,7 @@ def test_pairs_that_cannot_work_are_refused_with_a_sentence(problem, sentence):
     assert "\n" not in str(failure.value)
 
 
-def test_a_half_turn_is_no_small_rotation():
+def test_a_half_turn_is_not_a_small_rotation():
     pair = _pair((0.0, 0.0, np.pi), (0.0, 0.1, 0.9, False))
     xy1, xy2 = _images(pair, _scene(1))
     F = _fundamental(pair)
@@ -281,7 +281,7 @@ def test_a_half_turn_is_no_small_rotation():
         (np.eye(3), np.zeros(3), np.eye(4), "got shape"),
     ],
 )
-def test_motions_that_are_none_are_wrong_calls(rotation, translation, K, sentence):
+def test_invalid_motions_are_value_errors(rotation, translation, K, sentence):
     seed = seed_of_two(_pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False)))
     with pytest.raises(ValueError, match=sentence):
         seed.moved(rotation, translation, K=K)

@@ -69,7 +69,7 @@ def _psnr(picture, truth):
 @pytest.mark.parametrize(
     ("s", "least_db"), [(0.0, 40.0), (0.3, 38.0), (0.5, 38.0), (1.0, 40.0), (1.5, 29.0), (-0.5, 29.0)]
 )
-def test_on_the_baseline_and_beyond_it_is_what_a_camera_there_sees(synthesis, s, least_db):
+def test_synthesis_on_the_baseline_and_beyond_matches_a_camera_there(synthesis, s, least_db):
     camera = camera_at(PAIR, s, sizes=(SIZE, SIZE))
     assert _psnr(synthesis.render(camera), _truth(camera)) > least_db
 
@@ -88,7 +88,7 @@ def test_the_picture_does_not_depend_on_the_threads(synthesis):
     np.testing.assert_array_equal(synthesis.render(camera, threads=3), synthesis.render(camera))
 
 
-def test_what_one_photograph_does_not_see_is_taken_from_the_other():
+def test_pixels_hidden_in_one_image_are_taken_from_the_other():
     (one, X1), (two, X2) = _scene(*STILL), _scene(PAIR.R, PAIR.t)
     places = [_places(X1, PAIR.R, PAIR.t), _places(X2, *STILL)]
     hidden = _hidden(X1, PAIR.R, PAIR.t), _hidden(X2, *STILL)
@@ -127,7 +127,7 @@ def test_other_sizes_keep_the_second_ones_camera():
 
 
 @pytest.mark.parametrize(("frames", "beyond"), [(0, 0.0), (3, -0.1), (3, np.nan), (3, np.inf)])
-def test_paths_that_are_none_are_wrong_calls(frames, beyond):
+def test_invalid_paths_are_value_errors(frames, beyond):
     with pytest.raises(ValueError, match="a path"):
         cameras_along(PAIR, frames, sizes=(SIZE, SIZE), beyond=beyond)
 
@@ -204,7 +204,7 @@ def test_hidden_pixels_are_found_out_and_take_the_background(told):
         np.testing.assert_array_equal(complete[side][known[side]], given[side][known[side]])
 
 
-def test_everything_is_believed_where_asked_to():
+def test_the_prior_is_trusted_on_request():
     places, _ = _true_places()
     complete, known = complete_correspondence(PAIR, places, agree_px=np.inf)
     assert known[0].all()

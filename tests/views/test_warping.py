@@ -117,7 +117,7 @@ def test_the_compiled_map_is_the_plain_one(seed):
         np.testing.assert_array_equal(again[1], front)
 
 
-def test_strips_hold_what_reaches_into_them_from_pixels_far_above():
+def test_strips_include_contributions_from_far_above():
     y, x = np.mgrid[0:14, 0:14].astype(float)
     target = np.stack([1.4 * x, 2.8 * y], axis=-1)
     # Every third pixel is elsewhere, so that the triangle opposite to it stands alone.
@@ -153,7 +153,7 @@ def test_a_linear_photograph_is_moved_exactly():
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_nearer_wins_whatever_the_order(order):
+def test_the_nearer_pixel_wins_in_any_order(order):
     """A square in front of a wall; the photograph is also walked through from its other end."""
     y, x = np.mgrid[0:24, 0:40].astype(float)
     front = (np.abs(x - 20) <= 5) & (np.abs(y - 12) <= 6)
@@ -176,7 +176,7 @@ def test_nearer_wins_whatever_the_order(order):
     assert np.isfinite(filled).all()
 
 
-def test_holes_take_the_mean_of_what_is_behind():
+def test_holes_take_the_mean_of_the_background():
     rng = np.random.default_rng(3)
     near = rng.choice([1.0, 1.2, 2.4, 3.0, 5.0, np.nan, np.nan], (14, 17)).astype(np.float32)
     rgb = rng.uniform(0, 255, (14, 17, 3)).astype(np.float32)
@@ -348,7 +348,7 @@ def test_bytes_and_floats_of_a_texture_are_sampled_alike():
     np.testing.assert_allclose(seen[0], np.where(drawn[..., None] < 0, 0.0, plain), atol=1e-2)
 
 
-def test_a_colour_without_lamps_is_dimmed_alone():
+def test_a_colour_without_lights_is_dimmed_alone():
     color = np.full((2, 3), 100, dtype=np.float32)
     points, normals = np.zeros((2, 3), dtype=np.float32), np.ones((2, 3), dtype=np.float32)
     shade_points(color, points, normals, np.array([0.0, 0, -1]), np.zeros((0, 7)), (0.5, 0.0, 1.0))

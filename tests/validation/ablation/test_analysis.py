@@ -57,7 +57,7 @@ def test_a_planted_effect_of_one_deviation_is_found_and_nothing_else():
     assert false <= 0.05 * trials + 2
 
 
-def test_among_many_variants_none_of_which_does_anything_none_is_reported():
+def test_among_many_ineffective_variants_none_is_reported():
     reported, trials = 0, 60
     axes = {"task.aim": [float(n) for n in range(1, 11)]}
     plan = plan_study(replace(darts(metrics=["miss"], seeds=10), axes=axes))
@@ -68,7 +68,7 @@ def test_among_many_variants_none_of_which_does_anything_none_is_reported():
     assert reported <= 0.05 * trials + 2
 
 
-def test_better_is_on_the_side_that_the_measure_says():
+def test_better_follows_the_direction_of_the_measure():
     rows = rows_of(
         darts(), lambda p: p.seed % 5 + 3.0 * (p.variant == "aim = 1") - 0.01 * p.seed * len(p.variant)
     )
@@ -88,7 +88,7 @@ def test_quotients_where_all_values_allow_them():
     assert compared(with_zero, "aim = 1").interval.mean == 1.0
 
 
-def test_only_pairs_count_and_failures_are_told():
+def test_only_pairs_count_and_failures_are_reported():
     rows = rows_of(darts(), lambda p: "no luck" if p.variant == "aim = 1" and p.seed < 15 else float(p.seed))
     analysis = analyse(rows)
     cell = next(c for c in analysis.cells if (c.variant, c.measure.name) == ("aim = 1", "miss"))
@@ -112,7 +112,7 @@ def test_each_step_of_a_ladder_is_also_compared_with_the_one_before():
     assert against["aim = 2"].interval.mean == pytest.approx(-2.5, abs=0.1)
 
 
-def test_a_study_that_was_stopped_is_told_to_be_so():
+def test_a_stopped_study_is_reported_as_stopped():
     rows = rows_of(darts(), lambda p: float(p.seed))
     some = Rows(rows.plan, rows.rows[:-5])
     assert analyse(some).warnings == ("5 of 60 rows have not been computed",)

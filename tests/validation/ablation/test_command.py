@@ -52,7 +52,7 @@ def test_a_study_of_a_file_leaves_a_page_and_tables(tmp_path, capsys):
     assert main([*wish, "--read"]) == 0
 
 
-def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path):
+def test_an_interrupted_study_states_how_to_resume(tmp_path):
     file = write_study(tmp_path)
     file.write_text(file.read_text().replace(":Darts", f':Darts", pause_s = 600, log = "{tmp_path / "log"}'))
     wish = ["ablate", str(file), "-o", str(tmp_path / "out"), "--threads", "2"]
@@ -66,7 +66,7 @@ def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path):
     assert (stop.code, stop.said, stop.left) == (130, f"validation: interrupted; {kept}\n", 0)
 
 
-def test_an_interrupt_in_a_program_is_told_too(tmp_path, monkeypatch, capsys):
+def test_an_interrupt_in_a_program_is_reported(tmp_path, monkeypatch, capsys):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
@@ -75,7 +75,7 @@ def test_an_interrupt_in_a_program_is_told_too(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err.startswith("ablate: interrupted; the same command goes on from the rows")
 
 
-def test_rows_that_all_fail_and_wrong_wishes_end_otherwise(tmp_path, capsys):
+def test_failed_rows_and_wrong_options_have_their_exit_codes(tmp_path, capsys):
     out = ["-o", str(tmp_path / "out"), "--executor", "local", "--threads", "1"]
     some = write_study(tmp_path, "refuses")
     assert main(["ablate", str(some), *out]) == 0
@@ -88,7 +88,7 @@ def test_rows_that_all_fail_and_wrong_wishes_end_otherwise(tmp_path, capsys):
     assert "there is no scene 'nowhere'" in capsys.readouterr().err
 
 
-def test_the_view_says_what_the_bar_does_not():
+def test_the_view_has_a_text_alternative():
     state = State(10, kept=2, width=1, steps=3)
     assert words_of(state) == "0 of 3 shared steps"
     state.steps_done, state.done, state.failed = 3, 4, 1
@@ -135,7 +135,7 @@ def test_the_page_draws_complains_of_nothing_and_reaches_out_nowhere(opened):
 
 
 @pytest.mark.browser
-def test_the_page_tells_differences_and_failures(opened):
+def test_the_page_shows_differences_and_failures(opened):
     assert opened.page.locator("td.bad").count() >= 2
     text = opened.page.locator("main").inner_text()
     assert "aim = 4" in text

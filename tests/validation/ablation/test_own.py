@@ -27,7 +27,7 @@ def write_examples(folder):
     return folder / "study.toml"
 
 
-def test_the_example_of_the_documentation_runs_and_says_what_it_should(tmp_path):
+def test_the_example_of_the_documentation_runs(tmp_path):
     rows = ablate(read_study(write_examples(tmp_path)), tmp_path / "out", executor="local", threads=1)
     assert not [r.failure for r in rows if r.failure]
     verdicts = {(c.variant, c.condition): c.verdict for c in analyse(rows).comparisons}
@@ -85,7 +85,7 @@ def test_an_object_of_a_script_enters_a_study_in_python(tmp_path):
         ),
     ],
 )
-def test_what_is_wrong_with_a_variant_is_told_before_the_run(tmp_path, text, word, words):
+def test_invalid_variants_are_reported_before_the_run(tmp_path, text, word, words):
     (tmp_path / "mine.py").write_text(text, encoding="utf-8")
     table = {"scenes": ["cube"], "task": "fundamental", "axes": {"epipolar": [word]}}
     with pytest.raises(UsageError, match=words):

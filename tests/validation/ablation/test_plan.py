@@ -36,7 +36,7 @@ def test_one_thing_changes_at_a_time():
     assert plan.baseline == "as it is"
 
 
-def test_a_value_that_changes_nothing_is_no_second_variant():
+def test_an_ineffective_value_is_not_a_second_variant():
     assert names(darts({"task.aim": [0.0, 1.0]})) == ["unchanged", "aim = 1"]
 
 
@@ -71,7 +71,7 @@ def test_conditions_multiply_rows_but_not_variants():
     assert [r.seed for r in plan.rows] == sorted(r.seed for r in plan.rows), "a stopped study has whole seeds"
 
 
-def test_values_may_be_objects_tables_words_or_what_a_preset_has():
+def test_values_may_be_objects_tables_words_or_preset_values():
     values = [
         HarrisCorners(max_corners=77),
         {"kind": "harris-corners", "max_corners": 88},
@@ -110,7 +110,7 @@ def test_rows_are_named_by_setting_scene_seed_and_versions(monkeypatch):
     assert not {r.key for r in plan_study(study).rows} & set(keys.values())
 
 
-def test_a_function_is_a_task_when_it_says_what_it_tells():
+def test_a_function_that_declares_its_metrics_is_a_task():
     study = Study(
         {"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", Measure("scene_length")]
     )
@@ -170,13 +170,13 @@ TABLE = {"scenes": ["a"], "axes": {"epipolar.threshold_px": [2.0]}, "task": "rec
         ({"axes": {"features": ["mine.py:Corners"]}}, r"there is no file .*mine\.py to read Corners from"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_told_before_the_run(change, words):
+def test_inconsistent_plans_are_rejected_before_the_run(change, words):
     scenes = {"scenes": ["courtyard"]} if change.get("task", "") != {"kind": "stereo", "unti": 1} else {}
     with pytest.raises(UsageError, match=words):
         plan_study(study_from_table({**TABLE, **scenes, **change}))
 
 
-def test_a_file_that_is_no_study_is_told(tmp_path):
+def test_a_file_that_is_not_a_study_is_rejected(tmp_path):
     with pytest.raises(UsageError, match=r"gone\.toml cannot be read"):
         read_study(tmp_path / "gone.toml")
     (tmp_path / "broken.toml").write_text("scenes = [", encoding="utf-8")

@@ -28,7 +28,7 @@ def study(log, **more):
     return Study({"task.aim": [1.0, 2.0]}, **{**told, **more})
 
 
-def test_every_row_is_computed_once_and_told_in_the_order_of_the_plan(tmp_path):
+def test_every_row_is_computed_once_and_reported_in_order(tmp_path):
     log, out = tmp_path / "log", tmp_path / "out"
     rows = ablate(study(log), out, executor="local", threads=1)
     assert len(rows) == 3 * 2 * 2 == len(marks(log))
@@ -68,7 +68,7 @@ def test_a_damaged_row_is_computed_again(tmp_path):
     assert len(marks(log)) == 7
 
 
-def test_what_fails_is_kept_with_its_reason_and_not_tried_again(tmp_path):
+def test_failures_are_stored_with_their_reason_and_not_retried(tmp_path):
     log = tmp_path / "log"
     failing = study(log, scenes=["a", "refuses", "breaks", "empty"], seeds=1)
     rows = ablate(failing, tmp_path / "out", executor="local")
@@ -85,7 +85,7 @@ def test_what_fails_is_kept_with_its_reason_and_not_tried_again(tmp_path):
     assert any("every row of refuses failed, so that it says nothing: no board" in w for w in warnings)
 
 
-def test_a_metric_that_nobody_tells_is_named(tmp_path):
+def test_an_unreported_metric_is_named(tmp_path):
     wish = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
     rows = ablate(wish, tmp_path, executor="local")
     assert {r.failure for r in rows} == {"the task tells no wieght"}
@@ -93,7 +93,7 @@ def test_a_metric_that_nobody_tells_is_named(tmp_path):
     assert "no row tells wieght" in analyse(rows).warnings
 
 
-def test_what_rows_begin_with_is_computed_once(tmp_path):
+def test_common_first_stages_of_rows_are_computed_once(tmp_path):
     log = tmp_path / "log"
     axes = {"epipolar.threshold_px": [2.0], "dense.max_side": [512], "images.max_size_px": [800]}
     shared = Study(axes, ["a", "b"], seeds=2, task=Steps(log=str(log)))
@@ -110,7 +110,7 @@ def test_what_rows_begin_with_is_computed_once(tmp_path):
     assert sum(bool(told["steps"]) for told in own.values()) == len(rows)
 
 
-def test_the_same_rows_whoever_carries_them_out(tmp_path):
+def test_the_same_rows_from_any_executor(tmp_path):
     wish = study(tmp_path / "log", scenes=["a"], seeds=1)
     kinds = {"one": ("local", 1), "threads": ("local", 2), "processes": ("processes", 1)}
     found = {
@@ -120,7 +120,7 @@ def test_the_same_rows_whoever_carries_them_out(tmp_path):
     assert found["one"] == found["threads"] == found["processes"]
 
 
-def test_a_wrong_executor_or_folder_is_told(tmp_path):
+def test_a_wrong_executor_or_folder_is_reported(tmp_path):
     wish = study(tmp_path / "log", seeds=1)
     with pytest.raises(UsageError, match="unknown executor 'prozesses'; did you mean processes"):
         ablate(wish, tmp_path / "out", executor="prozesses")
@@ -212,7 +212,7 @@ def test_an_executor_of_the_caller_stays_open():
         assert pool.submit(len, "abc").result() == 3
 
 
-def test_progress_hears_of_every_row(tmp_path):
+def test_progress_reports_every_row(tmp_path):
     heard = []
     ablate(study(tmp_path / "log"), tmp_path / "out", executor="local", heard=lambda s: heard.append(s.done))
     assert heard[0] == 0

@@ -73,7 +73,7 @@ def test_many_scenes_are_the_sample_and_few_are_not():
     assert many.pairs == 30
 
 
-def test_what_no_seed_changes_is_judged_by_scenes_or_told_exactly():
+def test_deterministic_methods_are_compared_by_scenes_or_exactly():
     same = [np.full(3, v) for v in (1.0, 2.0, 4.0)]
     assert paired_interval(same).unit == "scenes"
     assert paired_interval(same).p == pytest.approx(stats.ttest_1samp([1.0, 2.0, 4.0], 0.0).pvalue)
@@ -83,7 +83,7 @@ def test_what_no_seed_changes_is_judged_by_scenes_or_told_exactly():
     assert (nothing.mean, nothing.low, nothing.high, nothing.p, nothing.effect) == (0.0, 0.0, 0.0, 1.0, 0.0)
 
 
-def test_one_difference_says_nothing_of_its_uncertainty():
+def test_one_difference_has_no_uncertainty():
     alone = paired_interval([np.array([2.0])])
     assert alone.mean == 2.0
     assert np.isnan([alone.low, alone.high, alone.p]).all()
@@ -101,7 +101,7 @@ DRAWS = {
 
 @pytest.mark.parametrize("count", [5, 10, 20])
 @pytest.mark.parametrize("kind", DRAWS)
-def test_no_effect_is_told_as_one_in_at_most_five_of_a_hundred(kind, count):
+def test_at_most_five_per_cent_of_null_effects_are_reported(kind, count):
     draw, mean = DRAWS[kind]
     rng = np.random.default_rng(7)
     trials = 400
@@ -143,6 +143,6 @@ def test_ranks_share_places_and_put_failures_last():
     assert mean_ranks(blocks) == pytest.approx([1.5, 2.75, 1.75])
 
 
-def test_the_front_is_what_nothing_beats_in_both():
+def test_the_front_is_not_dominated():
     cost, loss = np.array([1.0, 2.0, 3.0, 2.0, np.nan]), np.array([5.0, 3.0, 4.0, 3.0, 0.0])
     assert on_front(cost, loss).tolist() == [True, True, False, True, False]

@@ -35,7 +35,7 @@ def test_exact_points_have_an_exact_fundamental_matrix():
         assert "over_bound" not in found, "without noise there is no bound"
 
 
-def test_wrong_matches_hurt_who_believes_them():
+def test_wrong_matches_hurt_estimators_without_outlier_tests():
     believing, doubting = (
         FundamentalOfCube(method=method, noise_px=0.5, outliers=0.3, pairs=3).run(CONFIG, "cube", 1, NOWHERE)
         for method in ("eight-point, normalised", "default")
@@ -74,7 +74,7 @@ def test_exact_views_are_calibrated_exactly():
         (Reconstruction(), str(ROOT / "docs"), "there are no photographs in"),
     ],
 )
-def test_a_scene_that_is_not_there_is_told(task, scene, words):
+def test_a_missing_scene_is_reported(task, scene, words):
     with pytest.raises(UsageError, match=words):
         task.check(scene)
 
@@ -117,7 +117,7 @@ def yard(tmp_path_factory):
     return folder
 
 
-def test_what_a_scene_cannot_tell_is_not_missed_but_refused_where_asked_for(yard, tmp_path):
+def test_metrics_a_scene_cannot_give_are_rejected_only_on_request(yard, tmp_path):
     bare = tmp_path / "bare"
     shutil.copytree(yard / "images", bare / "images")
     study = Study({"epipolar": ["thesis-ransac"]}, [str(bare)], seeds=1)

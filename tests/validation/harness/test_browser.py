@@ -62,13 +62,13 @@ def test_the_verdict_comes_first_and_is_broken(scene):
     assert scene.page.locator("tr.missed").count() == 1
 
 
-def test_what_it_is_told_is_shown_as_it_is(scene):
+def test_input_text_is_shown_unchanged(scene):
     assert scene.page.locator("img[src='x']").count() == 0
     assert EVIL in scene.page.locator("tbody").first.inner_text()
     assert EVIL in scene.page.locator("#failures").inner_text()
 
 
-def test_the_page_is_no_wider_than_the_screen(scene):
+def test_the_page_fits_the_screen(scene):
     assert scene.page.evaluate("document.documentElement.scrollWidth") <= scene.page.viewport_size["width"]
 
 

@@ -11,7 +11,7 @@ from validation.harness.stages.clouds import _common_frame, _icp_metrics, _same_
 from validation.scenes.real import Scene
 
 
-def test_points_seen_at_one_place_are_one_whatever_their_order():
+def test_points_seen_at_one_position_are_merged_in_any_order():
     ours = _reconstruction(_truth())
     order = np.random.default_rng(0).permutation(N)
     tracks = ours.tracks
@@ -22,7 +22,7 @@ def test_points_seen_at_one_place_are_one_whatever_their_order():
     np.testing.assert_array_equal(order[pairs[:, 1]], pairs[:, 0])
 
 
-def test_a_shift_of_the_points_is_told_in_per_cent_of_their_distance():
+def test_a_shift_of_the_points_is_reported_in_per_cent_of_their_distance():
     truth = _truth()
     ours = _reconstruction(truth)
     scene = Scene("made up", (), truth.K, truth.R, truth.C)
@@ -35,7 +35,7 @@ def test_a_shift_of_the_points_is_told_in_per_cent_of_their_distance():
     assert rows[0].values["ours"] == N
 
 
-def test_what_icp_moves_is_told_of_its_matrix_alone(tmp_path):
+def test_the_motion_of_icp_depends_on_its_matrix_alone(tmp_path):
     rng = np.random.default_rng(1)
     mine = rng.normal(size=(200, 3))
     c, s = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))

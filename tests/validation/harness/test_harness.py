@@ -61,7 +61,7 @@ def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
     assert len(told) == 8
 
 
-def test_gates_judge_numbers_and_a_number_nobody_told_breaks_its_gate(ran):
+def test_gates_check_numbers_and_a_missing_number_breaks_its_gate(ran):
     wishes, judged, _ = ran
     results = collect(wishes, judged, GATES)
     row = results.rows[0]
@@ -86,7 +86,7 @@ def test_tasks_that_many_wait_for_come_first():
 
 
 @pytest.mark.parametrize("name", REPORTED)
-def test_a_quick_report_leaves_out_nothing_that_a_gate_asks_for(name, tmp_path):
+def test_a_quick_report_includes_all_gated_numbers(name, tmp_path):
     quick = Wishes(tmp_path, ("courtyard",), (name,), quick=True)
     asked = dataclasses.replace(quick, gates_only=True)
     stage = REPORTED[name]
@@ -127,7 +127,7 @@ def test_results_are_written_read_and_compared(ran, tmp_path):
     ]
 
 
-def test_two_runs_tell_the_same_numbers_but_for_times(ran, tmp_path):
+def test_two_runs_report_the_same_numbers_but_for_times(ran, tmp_path):
     wishes, judged, _ = ran
     quick = toy_wishes(tmp_path, quick=True)
     first, second = (collect(quick, run_tasks(quick, STAGES, lambda _: None), GATES) for _ in range(2))
@@ -135,7 +135,7 @@ def test_two_runs_tell_the_same_numbers_but_for_times(ran, tmp_path):
     assert first.rows[0].value == collect(wishes, judged, GATES).rows[0].value
 
 
-def test_the_pages_escape_what_they_are_told(ran):
+def test_the_pages_escape_their_input(ran):
     wishes, judged, _ = ran
     results = collect(wishes, judged, GATES)
     index = write_pages(wishes, STAGES, judged, results, compare(results, results))
@@ -174,7 +174,7 @@ def test_no_gate_without_its_reason(tmp_path):
         (["report", "-o", "OUT", "--max-side", "10"], "--max-side is at least 64 px"),
     ],
 )
-def test_wrong_wishes_are_named(arguments, words, tmp_path, capsys):
+def test_wrong_options_are_named(arguments, words, tmp_path, capsys):
     assert main([str(tmp_path / "out") if a == "OUT" else a for a in arguments]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

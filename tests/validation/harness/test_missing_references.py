@@ -124,7 +124,7 @@ def test_only_the_libraries_module_imports_them():
             assert not {name.split(".")[0] for name in names} & set(NAMES), path
 
 
-def test_one_that_does_not_load_says_why(stub, monkeypatch):
+def test_a_library_that_does_not_load_states_why(stub, monkeypatch):
     (stub / "open3d.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')")
     monkeypatch.syspath_prepend(str(stub))
     monkeypatch.delitem(sys.modules, "open3d", raising=False)
@@ -132,7 +132,7 @@ def test_one_that_does_not_load_says_why(stub, monkeypatch):
         load("open3d")
 
 
-def test_refused_ones_are_not_asked():
+def test_rejected_references_are_not_called():
     try:
         refuse({"poselib": "PoseLib is odd today"})
         with pytest.raises(NoReference, match="odd today"):
@@ -141,6 +141,6 @@ def test_refused_ones_are_not_asked():
         refuse({})
 
 
-def test_wrong_wishes_ask_nobody(tmp_path):
+def test_wrong_options_call_no_library(tmp_path):
     assert main(["check", "-o", str(tmp_path / "out"), "--scenes", "nowhere"]) == 2
     assert not (tmp_path / "out").exists()

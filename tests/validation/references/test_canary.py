@@ -23,7 +23,7 @@ def test_the_library_keeps_its_ways(library):
     ask_canary(library)
 
 
-def test_every_other_answer_is_told(library, monkeypatch):
+def test_every_deviating_answer_is_reported(library, monkeypatch):
     for question in QUESTIONS[library]:
         other = replace(question, answer=np.asarray(question.answer) + max(2.0 * question.tolerance, 1e-3))
         monkeypatch.setitem(canary.QUESTIONS, library, (other,))
@@ -34,14 +34,14 @@ def test_every_other_answer_is_told(library, monkeypatch):
         assert "; this harness expects " in str(told.value)
 
 
-def test_a_function_that_is_gone_is_told(library, monkeypatch, capsys):
+def test_a_missing_function_is_reported(library, monkeypatch, capsys):
     gone = replace(QUESTIONS[library][0], ask=lambda: getattr(load(library), "no_such_function"))  # noqa: B009
     monkeypatch.setitem(canary.QUESTIONS, library, (gone,))
     assert main([library]) == 3
     assert f"does not tell {gone.words}, which this harness needs" in capsys.readouterr().err
 
 
-def test_quaternions_in_another_order_would_be_told(monkeypatch):
+def test_quaternions_in_another_order_would_be_reported(monkeypatch):
     pycolmap = pytest.importorskip("pycolmap")
     turned = pycolmap.Rotation3d
     monkeypatch.setattr(pycolmap, "Rotation3d", lambda wxyz: turned(np.roll(wxyz, -1)))
@@ -49,7 +49,7 @@ def test_quaternions_in_another_order_would_be_told(monkeypatch):
         ask_canary("pycolmap")
 
 
-def test_a_disparity_in_pixels_would_be_told(monkeypatch):
+def test_a_disparity_in_pixels_would_be_reported(monkeypatch):
     pytest.importorskip("cv2")
     monkeypatch.setattr(canary, "_opencv_disparity", lambda: 4.0)
     asked = [q for q in QUESTIONS["cv2"] if "disparity" in q.words]

@@ -54,7 +54,7 @@ def test_colmap_sees_our_points_half_a_pixel_farther(looked):
         np.testing.assert_array_equal(model.points3D[j + 1].xyz, looked.X[j])
 
 
-def test_what_goes_in_comes_out(looked):
+def test_a_written_cloud_is_read_back(looked):
     cameras, seen = problem(looked)
     back, X = cameras_from_colmap(colmap_model(cameras, looked.X, seen, SIZE), cameras)
     np.testing.assert_allclose(back.R, cameras.R, atol=1e-12)
@@ -97,7 +97,7 @@ def test_quaternions_are_xyzw_in_memory_and_wxyz_in_text(looked, tmp_path):
     np.testing.assert_allclose(wxyz[1:] / np.sin(angle / 2.0), np.array([0.1, -0.3, 0.5]) / angle, atol=1e-9)
 
 
-def test_what_it_finds_in_a_photograph_is_half_a_pixel_farther(tmp_path):
+def test_sift_keypoints_are_shifted_by_half_a_pixel(tmp_path):
     images = tmp_path / "images"
     images.mkdir()
     y, x = np.indices((96, 128))

@@ -75,7 +75,7 @@ def seen_in(scene, X, view):
     return xy, x[:, 2], inside
 
 
-def test_the_set_is_what_was_promised(scene):
+def test_the_set_has_the_documented_size(scene):
     assert len(scene.image_paths) >= 12
     assert sum(p.stat().st_size for p in FOLDER.rglob("*") if p.is_file()) < 8e6
     assert max(SIZE) == 1024
@@ -199,7 +199,7 @@ def test_exact_matches_agree_with_f_and_the_others_do_not():
     assert np.median(wrong) > 2.0
 
 
-def test_a_flat_facade_is_a_plane_and_says_so():
+def test_a_flat_facade_is_reported_as_a_plane():
     flat = FacadeMaker(relief=0.0, off_plane=0.0).make(np.random.default_rng(1))
     assert flat.off_plane == 0
     H = estimate_homography(flat.exact1, flat.exact2)
@@ -362,7 +362,7 @@ def test_zoomed_frames_stay_inside_their_photograph_and_move_the_principal_point
     assert np.abs(shares).max() > 0.08
 
 
-def test_a_frame_of_the_whole_photograph_changes_nothing():
+def test_a_frame_of_the_whole_image_changes_nothing():
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 256, (12, 18, 3), dtype=np.uint8)
     frame = Frame(1.0, 0.0, 0.0, (18, 12))
@@ -381,7 +381,7 @@ def test_a_windowed_photograph_keeps_its_window_and_its_camera(spots_scene, tmp_
     assert new.K is spots_scene.K
 
 
-def test_photographs_without_calibration_are_not_taken_anew(spots_scene, tmp_path):
+def test_images_without_calibration_are_not_resampled(spots_scene, tmp_path):
     with pytest.raises(ValueError, match="need the calibration"):
         rezoom_scene(Scene("bare", spots_scene.image_paths), tmp_path, seed=0)
 
