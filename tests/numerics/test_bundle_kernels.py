@@ -404,10 +404,12 @@ def test_priors_do_not_pass_for_contradictions():
     block = make_block(points=200, groups=6)
     rng = np.random.default_rng(5)
     free = _scatter(block, block.xy + SIGMA * rng.normal(size=block.xy.shape))[1]
-    std = 0.3 * np.sqrt(np.median(free.model, axis=0))
-    told = [_scatter(block, block.xy + SIGMA * rng.normal(size=block.xy.shape), std=std)[1] for _ in range(6)]
-    assert np.median([s.model[:, 3] / free.model[:, 3] for s in told]) < 0.15
-    assert np.mean([s.overdispersion for s in told]) == pytest.approx(1.0, abs=0.25)
+    std = 0.3 * np.sqrt(np.median(free.variance, axis=0))
+    reported = [
+        _scatter(block, block.xy + SIGMA * rng.normal(size=block.xy.shape), std=std)[1] for _ in range(6)
+    ]
+    assert np.median([s.variance[:, 3] / free.variance[:, 3] for s in reported]) < 0.15
+    assert np.mean([s.overdispersion for s in reported]) == pytest.approx(1.0, abs=0.25)
 
 
 def test_noise_that_neighbours_share_is_seen():

@@ -14,6 +14,7 @@ from numba import njit
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
+from thesisrecon.numerics.small_solvers import solve_damped
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
@@ -265,41 +266,6 @@ def _rotate_columns(U: F64, a: F64, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
-    """Solve (H + damping diag H) step = -g by Cholesky; False if the matrix is not positive definite."""
-    n = len(g)
-    L = np.zeros((n, n))
-    floor = 0.0
-    for i in range(n):
-        floor = max(floor, H[i, i])
-    floor = 1e-14 * floor + 1e-300
-    for i in range(n):
-        for j in range(i + 1):
-            total = H[i, j]
-            if i == j:
-                total += damping * max(H[i, i], floor)
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 1e-3 * damping * floor:
-                    return False
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    for i in range(n):
-        total = -g[i]
-        for k in range(i):
-            total -= L[i, k] * step[k]
-        step[i] = total / L[i, i]
-    for i in range(n - 1, -1, -1):
-        total = step[i]
-        for k in range(i + 1, n):
-            total -= L[k, i] * step[k]
-        step[i] = total / L[i, i]
-    return True
-
-
-@njit(cache=True, nogil=True)
 def orthonormal_from_fundamental(f: F64, U: F64, V: F64) -> float:
     """Decompose the nearest matrix of rank 2 into U, V and phi.
 
@@ -362,7 +328,7 @@ def refine(
         accepted = False
         while steps < iterations and not accepted:
             steps += 1
-            if _solve_damped(H, g, damping, step):
+            if solve_damped(H, g, damping, step):
                 _rotate_columns(U, step[0:3], Un)
                 _rotate_columns(V, step[3:6], Vn)
                 fundamental_from_orthonormal(Un, Vn, phi + step[6], trial)

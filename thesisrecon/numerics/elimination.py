@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics.observations import Jacobians
+from thesisrecon.numerics.small_solvers import invert_cholesky_3x3, multiply_transposed_3x3
 
 
 class BlockIndex(NamedTuple):
@@ -84,17 +85,17 @@ def eliminate_points(
     k = index.start[first]
     n = index.start[last] - k
     left = _Elimination(k, np.empty((n, 2, 3)), np.empty((n, 2)), np.empty((last - first, 3)))
-    sum_points(first, last, damping, J, index, points, left)
-    add_views(first, last, J, index, sums, left)
+    _sum_points(first, last, damping, J, index, points, left)
+    _add_views(first, last, J, index, sums, left)
     if len(sums.corner) > 0:
-        add_common(first, last, J, index, sums, left)
+        _add_common(first, last, J, index, sums, left)
 
 
 # A call costs more than a point, for all the arrays that go with it: the loops over the points are inside.
 
 
 @njit(cache=True, nogil=True)
-def sum_points(
+def _sum_points(
     first: int,
     last: int,
     damping: float,
@@ -117,10 +118,8 @@ def sum_points(
         h, d, g = points.gradient[j], points.diagonal[j], left.g[j - first]
         h[0], h[1], h[2] = h0, h1, h2
         d[0], d[1], d[2] = v00, v11, v22
-        inverse_root(v00 * more, v01, v02, v11 * more, v12, v22 * more, M)
-        for a in range(3):
-            for b in range(3):
-                points.inverse[j, a, b] = M[0, a] * M[0, b] + M[1, a] * M[1, b] + M[2, a] * M[2, b]
+        invert_cholesky_3x3(v00 * more, v01, v02, v11 * more, v12, v22 * more, M)
+        multiply_transposed_3x3(M, points.inverse[j])
         m00, m10, m11, m20, m21, m22 = M[0, 0], M[1, 0], M[1, 1], M[2, 0], M[2, 1], M[2, 2]
         g0, g1, g2 = m00 * h0, m10 * h0 + m11 * h1, m20 * h0 + m21 * h1 + m22 * h2
         g[0], g[1], g[2] = g0, g1, g2
@@ -133,31 +132,8 @@ def sum_points(
                 left.residual[k - left.first, i] = J.residual[k, i] - t0 * g0 - t1 * g1 - t2 * g2
 
 
-@njit(cache=True, nogil=True)
-def inverse_root(v00: float, v01: float, v02: float, v11: float, v12: float, v22: float, M: F64) -> bool:
-    """M = L^-1 of a symmetric 3 x 3 matrix L L'; zeros (and False) where a pivot is not positive."""
-    M[:] = 0.0
-    if not v00 > 0.0:
-        return False
-    l00 = np.sqrt(v00)
-    l10, l20 = v01 / l00, v02 / l00
-    p1 = v11 - l10 * l10
-    if not p1 > 0.0:
-        return False
-    l11 = np.sqrt(p1)
-    l21 = (v12 - l20 * l10) / l11
-    p2 = v22 - l20 * l20 - l21 * l21
-    if not p2 > 0.0:
-        return False
-    M[0, 0], M[1, 1], M[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / np.sqrt(p2)
-    M[1, 0] = -l10 * M[0, 0] * M[1, 1]
-    M[2, 1] = -l21 * M[1, 1] * M[2, 2]
-    M[2, 0] = -(l20 * M[0, 0] + l21 * M[1, 0]) * M[2, 2]
-    return True
-
-
 @njit(cache=True, nogil=True, forceinline=True)
-def add_views(
+def _add_views(
     first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
 ) -> None:
     """The blocks of all pairs of views that see a point, and the views' part of the right-hand side."""
@@ -186,13 +162,13 @@ def add_views(
                 q10 = -b[1, 0] * c[0, 0] - b[1, 1] * c[0, 1] - b[1, 2] * c[0, 2]
                 q11 = same - b[1, 0] * c[1, 0] - b[1, 1] * c[1, 1] - b[1, 2] * c[1, 2]
                 S = sums.blocks[index.pair[v, w]]
-                add_block(S, J.A[k], J.A[m], q00, q01, q10, q11)
+                _add_block(S, J.A[k], J.A[m], q00, q01, q10, q11)
                 if v == w and m > k:
-                    add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
+                    _add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
 
 
 @njit(cache=True, nogil=True, inline="always", fastmath={"contract"}, forceinline=True)
-def add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float, q11: float) -> None:
+def _add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float, q11: float) -> None:
     """S (C, C) += left' Q right for left, right (2, C)."""
     C = S.shape[0]
     for a in range(C):
@@ -203,7 +179,7 @@ def add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float,
 
 
 @njit(cache=True, nogil=True)
-def add_common(
+def _add_common(
     first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
 ) -> None:
     """Border, corner and right-hand side of the columns that views have in common.
@@ -221,7 +197,7 @@ def add_common(
     ends = (sums.corner, sums.rhs[edge:], sums.diagonal[edge:], sums.gradient[edge:])
     for j in range(first, last):
         s, e = index.start[j], index.start[j + 1]
-        n = gather_common(s, e, J.E, index.view_index, index.common, E, column, slot)
+        n = _gather_common(s, e, J.E, index.view_index, index.common, E, column, slot)
         p[:, :n] = 0.0
         for i in range(e - s):
             for x in range(2):
@@ -242,11 +218,11 @@ def add_common(
                 a0, a1 = J.A[s + i, 0, a], J.A[s + i, 1, a]
                 for c in range(n):
                     sums.border[v, a, column[c]] += a0 * T[0, c] + a1 * T[1, c]
-        add_corner(column[:n], E[: e - s], p, left.g[j - first], J.residual[s:e], ends)
+        _add_corner(column[:n], E[: e - s], p, left.g[j - first], J.residual[s:e], ends)
 
 
 @njit(cache=True, nogil=True)
-def gather_common(
+def _gather_common(
     s: int, e: int, J_E: F64, view_index: I64, common: I64, E: F64, column: I64, slot: I64
 ) -> int:
     """The common columns of observations s..e side by side in E (m, 2, n), their ``column`` in the border;
@@ -273,7 +249,7 @@ def gather_common(
 
 
 @njit(cache=True, nogil=True)
-def add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[F64, F64, F64, F64]) -> None:
+def _add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[F64, F64, F64, F64]) -> None:
     """What the common columns of one point add to (corner, rhs, diagonal, gradient) of the border."""
     corner, rhs, diagonal, gradient = ends
     n = len(column)
@@ -336,7 +312,7 @@ def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
                 b0, b1, b2 = B[k, i, 0], B[k, i, 1], B[k, i, 2]
                 v00, v01, v02 = v00 + b0 * b0, v01 + b0 * b1, v02 + b0 * b2
                 v11, v12, v22 = v11 + b1 * b1, v12 + b1 * b2, v22 + b2 * b2
-        held = inverse_root(v00, v01, v02, v11, v12, v22, M)
+        held = invert_cholesky_3x3(v00, v01, v02, v11, v12, v22, M)
         for k in range(start[j], start[j + 1]):
             for i in range(2):
                 b0, b1, b2 = B[k, i, 0], B[k, i, 1], B[k, i, 2]

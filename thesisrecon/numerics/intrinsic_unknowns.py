@@ -22,7 +22,7 @@ MAX_LOG_STEP = 3.0
 
 
 @dataclass(frozen=True)
-class PriorTerms:
+class _PriorTerms:
     """Terms w (x_first - x_second - offset)^2 / 2; ``second`` -1 where a term binds one value to a number."""
 
     first: I64
@@ -65,7 +65,7 @@ class IntrinsicUnknowns:
     number: I64
     column: I64
     n_table: int
-    terms: PriorTerms
+    terms: _PriorTerms
 
     @property
     def size(self) -> int:
@@ -141,11 +141,11 @@ class _Parts:
         self.column.append(c)
         self.start.append(float(at.mean()))
 
-    def collect(self) -> PriorTerms:
+    def collect(self) -> _PriorTerms:
         """All terms in one table."""
         none = (np.zeros(0, dtype=np.int64),) * 2 + (np.zeros(0),) * 2
         first, second, offset, weight = (np.concatenate(a) for a in zip(none, *self.terms, strict=True))
-        return PriorTerms(first, second, offset, weight)
+        return _PriorTerms(first, second, offset, weight)
 
 
 def _number_column(

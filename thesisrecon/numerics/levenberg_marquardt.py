@@ -184,7 +184,7 @@ class _VectorProblem:
 
     def linearize(self, state: F64) -> DenseSystem:
         r = self.residual_fn(state)
-        J = self.jacobian(state) if self.jacobian else difference_jacobian(self.residual_fn, state, r)
+        J = self.jacobian(state) if self.jacobian else _difference_jacobian(self.residual_fn, state, r)
         rho, weight = LOSSES[self.loss](r**2, self.loss_scale)
         return DenseSystem(0.5 * float(rho.sum()), (J.T * weight) @ J, J.T @ (weight * r))
 
@@ -198,7 +198,7 @@ class _VectorProblem:
         return 0.5 * float(LOSSES[self.loss](r**2, self.loss_scale)[0].sum())
 
 
-def difference_jacobian(residual_fn: Callable[[F64], F64], x: F64, residual: F64) -> F64:
+def _difference_jacobian(residual_fn: Callable[[F64], F64], x: F64, residual: F64) -> F64:
     """Forward differences (M, D) with steps of sqrt(eps) (1 + |x|); columns that leave the domain are 0."""
     J = np.zeros((len(residual), len(x)))
     for d in range(len(x)):

@@ -31,7 +31,7 @@ class MetricModel(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
+def _in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
     """R x + t."""
     return (
         r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0],
@@ -41,7 +41,7 @@ def in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
+def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
     """Pixel of a point in the camera's frame, w away from 0; q a row of intrinsics."""
     a, b = x0 / w, x1 / w
     r2 = a * a + b * b
@@ -56,8 +56,8 @@ def project_metric(model: MetricModel, obs: Observations, residual: F64, depth: 
     """Fill residual (K, 2) px, projection minus observation, and depth (K,)."""
     for k in range(len(obs.xy)):
         v, x = obs.view_index[k], model.X[obs.point_index[k]]
-        x0, x1, x2 = in_camera(model.R[v], model.t[v], x)
-        px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
+        x0, x1, x2 = _in_camera(model.R[v], model.t[v], x)
+        px, py = _image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
         depth[k] = x2
         residual[k, 0] = px - obs.xy[k, 0]
         residual[k, 1] = py - obs.xy[k, 1]
@@ -69,8 +69,8 @@ def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> 
     cost = 0.0
     for k in range(len(obs.xy)):
         v, x = obs.view_index[k], model.X[obs.point_index[k]]
-        x0, x1, x2 = in_camera(model.R[v], model.t[v], x)
-        px, py = image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
+        x0, x1, x2 = _in_camera(model.R[v], model.t[v], x)
+        px, py = _image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
         e0, e1 = (px - obs.xy[k, 0]) / weighting.sigma, (py - obs.xy[k, 1]) / weighting.sigma
         cost += loss_value(weighting.code, e0 * e0 + e1 * e1, weighting.delta)
     return 0.5 * cost
@@ -111,15 +111,15 @@ def linearize_metric(
     for k in range(len(obs.xy)):
         v, x = obs.view_index[k], model.X[obs.point_index[k]]
         r, q = model.R[v], model.intrinsics[model.group[v]]
-        x0, x1, x2 = in_camera(r, model.t[v], x)
+        x0, x1, x2 = _in_camera(r, model.t[v], x)
         w = away_from_zero(x2)
-        px, py = image_of(q, x0, x1, w)
+        px, py = _image_of(q, x0, x1, w)
         e0, e1 = (px - obs.xy[k, 0]) / weighting.sigma, (py - obs.xy[k, 1]) / weighting.sigma
         s = e0 * e0 + e1 * e1
         cost += loss_value(weighting.code, s, weighting.delta)
         root = np.sqrt(loss_weight(weighting.code, s, weighting.delta))
         a, b = x0 / w, x1 / w
-        fill_columns(q, a, b, root / weighting.sigma, D)
+        _fill_columns(q, a, b, root / weighting.sigma, D)
         kept = max(loss_curvature(weighting.code, s, weighting.delta), weighting.min_curvature)
         if kept < 1.0:
             # (I - (1 - sqrt(kept)) e e' / s) J with the residual over sqrt(kept): the gradient is the same.
@@ -147,7 +147,7 @@ def linearize_metric(
 
 
 @njit(cache=True, nogil=True)
-def fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
+def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
     """Fill D (2, 10): derivatives of the pixel by the eight intrinsics and by the normalised point (a, b),
     times root."""
     f, g, skew = root * q[0], root * q[0] * q[1], root * q[2]

@@ -121,7 +121,7 @@ def _linearize_point(
 @njit(cache=True, nogil=True)
 def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, options: PointOptions) -> None:
     """Refine every unit point of X (N, 4) in place by Levenberg-Marquardt in its tangent space."""
-    H, M, Mi = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    H, M, Mi, root = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     g, step = np.empty(3), np.empty((1, 3))
     v, beta, moved = np.empty((1, 4)), np.empty(1), np.empty((1, 4))
     for j in range(len(start) - 1):
@@ -142,7 +142,7 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
                 for n in range(3):
                     M[m, n] = H[m, n]
                 M[m, m] *= 1.0 + damping
-            accepted = invert_positive_3x3(M, Mi)
+            accepted = invert_positive_3x3(M, root, Mi)
             if accepted:
                 for m in range(3):
                     step[0, m] = -(Mi[m, 0] * g[0] + Mi[m, 1] * g[1] + Mi[m, 2] * g[2])

@@ -22,7 +22,7 @@ from thesisrecon.numerics.levenberg_marquardt import solve_positive
 
 
 @njit(cache=True, nogil=True)
-def fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
+def _fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
     """Blocks (n, C, C) of views row[i] <= column[i] into the upper triangle of S (D, D)."""
     C = blocks.shape[1]
     for i in range(len(blocks)):
@@ -59,7 +59,7 @@ def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None
 
 
 @njit(cache=True, nogil=True)
-def multiply_blocks(blocks: F64, row: I64, column: I64, x: F64, y: F64) -> None:
+def _multiply_blocks(blocks: F64, row: I64, column: I64, x: F64, y: F64) -> None:
     """y (b, C) = S x for the symmetric S of which ``blocks`` are the upper triangle; x (b, C)."""
     C = blocks.shape[1]
     y[:] = 0.0
@@ -120,7 +120,7 @@ class ReducedSystem:
         """The matrix (D, D), upper triangle."""
         edge, D = self.sums.border.shape[0] * self.sums.border.shape[1], len(self.sums.rhs)
         S = np.zeros((D, D))
-        fill_dense(self.sums.blocks, self.row, self.column, S)
+        _fill_dense(self.sums.blocks, self.row, self.column, S)
         S[:edge, edge:] = self.sums.border.reshape(edge, D - edge)
         S[edge:, edge:] = self.sums.corner
         return S
@@ -144,7 +144,7 @@ class DenseCholesky:
 
 
 @dataclass(frozen=True)
-class BandedFactor:
+class _BandedFactor:
     """A reduced system taken apart.
 
     LAPACK's lower banded ``factor`` (width, b C) of the views' part, views in the order ``place`` (b,);
@@ -205,7 +205,7 @@ class BandedCholesky:
         found = None if factored is None else factored.solve(system.sums.rhs[:, None])
         return None if found is None else found[:, 0]
 
-    def factor(self, system: ReducedSystem) -> BandedFactor | None:
+    def factor(self, system: ReducedSystem) -> _BandedFactor | None:
         """The system taken apart; None where it is not positive."""
         s, (b, C, e) = system.sums, system.sums.border.shape
         band = np.zeros((b * C, (self.reach + 1) * C))
@@ -216,9 +216,9 @@ class BandedCholesky:
         if info != 0:
             return None
         flat = s.border.reshape(b * C, e)
-        views = BandedFactor(self.place, factor, s.border, flat, s.corner)
+        views = _BandedFactor(self.place, factor, s.border, flat, s.corner)
         moved = views.solve_views(flat) if e else flat
-        return BandedFactor(self.place, factor, s.border, moved, s.corner - flat.T @ moved)
+        return _BandedFactor(self.place, factor, s.border, moved, s.corner - flat.T @ moved)
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,7 @@ def multiply(system: ReducedSystem, x: F64) -> F64:
     """S x (D,)."""
     s, (b, C, e) = system.sums, system.sums.border.shape
     border, y = s.border.reshape(b * C, e), np.empty((b, C))
-    multiply_blocks(s.blocks, system.row, system.column, x[: b * C].reshape(b, C), y)
+    _multiply_blocks(s.blocks, system.row, system.column, x[: b * C].reshape(b, C), y)
     return np.concatenate([y.ravel() + border @ x[b * C :], border.T @ x[: b * C] + s.corner @ x[b * C :]])
 
 

@@ -19,30 +19,76 @@ def away_from_zero(w: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def invert_positive_3x3(M: F64, out: F64) -> bool:
-    """Inverse of a symmetric (3, 3) by Cholesky; zeros (and False) where a pivot is not positive."""
+def invert_cholesky_3x3(
+    m00: float, m10: float, m20: float, m11: float, m21: float, m22: float, out: F64
+) -> bool:
+    """Fill ``out`` with L^-1."""
     out[:] = 0.0
-    if not M[0, 0] > 0.0:
+    if not m00 > 0.0:
         return False
-    l00 = np.sqrt(M[0, 0])
-    l10, l20 = M[1, 0] / l00, M[2, 0] / l00
-    p1 = M[1, 1] - l10 * l10
+    l00 = np.sqrt(m00)
+    l10, l20 = m10 / l00, m20 / l00
+    p1 = m11 - l10 * l10
     if not p1 > 0.0:
         return False
     l11 = np.sqrt(p1)
-    l21 = (M[2, 1] - l20 * l10) / l11
-    p2 = M[2, 2] - l20 * l20 - l21 * l21
+    l21 = (m21 - l20 * l10) / l11
+    p2 = m22 - l20 * l20 - l21 * l21
     if not p2 > 0.0:
         return False
-    l22 = np.sqrt(p2)
-    i00, i11, i22 = 1.0 / l00, 1.0 / l11, 1.0 / l22
-    i10 = -l10 * i00 * i11
-    i21 = -l21 * i11 * i22
-    i20 = -(l20 * i00 + l21 * i10) * i22
-    out[0, 0] = i00 * i00 + i10 * i10 + i20 * i20
-    out[1, 1] = i11 * i11 + i21 * i21
-    out[2, 2] = i22 * i22
-    out[0, 1] = out[1, 0] = i10 * i11 + i20 * i21
-    out[0, 2] = out[2, 0] = i20 * i22
-    out[1, 2] = out[2, 1] = i21 * i22
+    out[0, 0], out[1, 1], out[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / np.sqrt(p2)
+    out[1, 0] = -l10 * out[0, 0] * out[1, 1]
+    out[2, 1] = -l21 * out[1, 1] * out[2, 2]
+    out[2, 0] = -(l20 * out[0, 0] + l21 * out[1, 0]) * out[2, 2]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def invert_positive_3x3(M: F64, root: F64, out: F64) -> bool:
+    """Fill ``out`` with M^-1."""
+    positive = invert_cholesky_3x3(M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2], root)
+    multiply_transposed_3x3(root, out)
+    return positive
+
+
+@njit(cache=True, nogil=True, inline="always")
+def multiply_transposed_3x3(L: F64, out: F64) -> None:
+    """Fill ``out`` with L' L."""
+    for a in range(3):
+        for b in range(3):
+            out[a, b] = L[0, a] * L[0, b] + L[1, a] * L[1, b] + L[2, a] * L[2, b]
+
+
+@njit(cache=True, nogil=True)
+def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
+    """Solve (H + damping diag H) step = -g by Cholesky; False if the matrix is not positive definite."""
+    n = len(g)
+    L = np.zeros((n, n))
+    floor = 0.0
+    for i in range(n):
+        floor = max(floor, H[i, i])
+    floor = 1e-14 * floor + 1e-300
+    for i in range(n):
+        for j in range(i + 1):
+            total = H[i, j]
+            if i == j:
+                total += damping * max(H[i, i], floor)
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 1e-3 * damping * floor:
+                    return False
+                L[i, i] = np.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    for i in range(n):
+        total = -g[i]
+        for k in range(i):
+            total -= L[i, k] * step[k]
+        step[i] = total / L[i, i]
+    for i in range(n - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, n):
+            total -= L[k, i] * step[k]
+        step[i] = total / L[i, i]
     return True
