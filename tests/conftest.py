@@ -1,4 +1,4 @@
-"""What all tests share: files with long tests begin first, so that no worker is left alone with one."""
+"""Shared fixtures; files with slow tests start first, so that workers finish together."""
 
 from tests.clusters import dask_cluster
 
@@ -6,6 +6,6 @@ __all__ = ["dask_cluster"]
 
 
 def pytest_collection_modifyitems(items):
-    """Files with a test that is marked slow come first, otherwise the order stays."""
+    """Move files with a slow test to the front."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)

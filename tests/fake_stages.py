@@ -1,4 +1,4 @@
-"""Small stages that know the truth of a small scene: for testing what stands around the real ones.
+"""Fake stages that return the truth of a small scene, for tests of the code around the real ones.
 
 Every call that computes something is written to ``CALLS``.
 """

@@ -69,8 +69,8 @@ def test_self_calibration_groups_views_by_size_and_takes_a_prior():
 
     config = fakes.fake_config(selfcalibration=Listening())
     thesisrecon.self_calibrate(small_reconstruction(), config=config)
-    wish = IntrinsicsOptions(focal_px=50.0, focal_std_rel=0.1, cameras="per-image")
-    thesisrecon.self_calibrate(small_reconstruction(), config=replace(config, intrinsics=wish))
+    options = IntrinsicsOptions(focal_px=50.0, focal_std_rel=0.1, cameras="per-image")
+    thesisrecon.self_calibrate(small_reconstruction(), config=replace(config, intrinsics=options))
     assert heard[0].group.tolist() == [0, 1]
     assert not heard[0].focal_known.any()
     assert heard[1].focal_known.all()

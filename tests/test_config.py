@@ -24,7 +24,7 @@ from thesisrecon.intrinsics import (
     prior_from_options,
     prior_warnings,
 )
-from thesisrecon.selfcalibration.hartley import FixedPlaneQuadric
+from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.stratified import Stratified
 from thesisrecon.settings import parse_word, toml_from_tables
@@ -207,8 +207,8 @@ SIZES = [(4000, 3000), (4000, 3000), (3000, 4000)]
 SCALES = np.array([0.4, 0.4, 0.25])
 
 
-def stages_view(wish, exif=(np.nan,) * 3):
-    return prior_from_options(wish, SIZES, np.array(exif), SCALES)
+def stages_view(options, exif=(np.nan,) * 3):
+    return prior_from_options(options, SIZES, np.array(exif), SCALES)
 
 
 def test_by_default_a_camera_is_a_size_with_square_pixels_and_an_unknown_focal():
@@ -228,11 +228,11 @@ def test_by_default_a_camera_is_a_size_with_square_pixels_and_an_unknown_focal()
 
 
 def test_values_in_original_pixels_come_to_working_size():
-    wish = IntrinsicsOptions(
+    options = IntrinsicsOptions(
         focal_px=5000.0, focal_std_rel=0.1, skew="constant", skew_px=10.0, skew_std_px=2.0,
         principal_point_px=(1999.5, 0.0),
     )  # fmt: skip
-    got = stages_view(wish)
+    got = stages_view(options)
     np.testing.assert_allclose(got.mean[:, 0], [2000.0, 2000.0, 1250.0])
     np.testing.assert_allclose(got.std[:, 0], 0.1)
     np.testing.assert_allclose(got.mean[:, 2], [4.0, 4.0, 2.5])
@@ -254,8 +254,8 @@ def test_a_zooming_camera_keeps_the_rest():
 
 
 def test_exif_is_used_on_request():
-    wish = IntrinsicsOptions(exif=True, focal_std_rel=0.2)
-    got = stages_view(wish, exif=(3000.0, np.nan, 4000.0))
+    options = IntrinsicsOptions(exif=True, focal_std_rel=0.2)
+    got = stages_view(options, exif=(3000.0, np.nan, 4000.0))
     assert got.focal_known.tolist() == [True, False, True]
     np.testing.assert_allclose(got.mean[[0, 2], 0], [1200.0, 1000.0])
     known = stages_view(IntrinsicsOptions(focal="known", focal_px=3000.0))
@@ -264,13 +264,13 @@ def test_exif_is_used_on_request():
 
 
 def test_a_known_focal_without_exif_is_constant_and_reported():
-    wish = IntrinsicsOptions(focal="known", exif=True)
+    options = IntrinsicsOptions(focal="known", exif=True)
     silent = np.full(3, np.nan)
-    got = stages_view(wish)
+    got = stages_view(options)
     assert got.group.tolist() == [0, 0, 1]
     assert np.isinf(got.std[:, 0]).all()
-    assert camera_numbers(SIZES, wish, silent).tolist() == [0, 0, 1]
-    (sentence,) = prior_warnings(wish, silent)
+    assert camera_numbers(SIZES, options, silent).tolist() == [0, 0, 1]
+    (sentence,) = prior_warnings(options, silent)
     assert "found in 3 images" in sentence
     assert "constant" in sentence
     each = IntrinsicsOptions(focal="known", exif=True, cameras="per-image")
@@ -278,17 +278,17 @@ def test_a_known_focal_without_exif_is_constant_and_reported():
 
 
 def test_images_without_exif_share_one_focal():
-    wish = IntrinsicsOptions(focal="known", exif=True)
+    options = IntrinsicsOptions(focal="known", exif=True)
     sizes = [(4000, 3000)] * 5
     exif = np.array([3000.0, np.nan, 3000.0, np.nan, 3500.0])
-    got = prior_from_options(wish, sizes, exif, np.ones(5))
+    got = prior_from_options(options, sizes, exif, np.ones(5))
     assert (got.std[:, 0] == 0.0).tolist() == [True, False, True, False, True]
     assert got.shared[1, 0] == got.shared[3, 0]
     assert got.shared[1, 0] not in got.shared[[0, 2, 4], 0]
     # Cameras are counted by what they have in common: known to be alike, tied, or neither.
-    assert camera_numbers(sizes, wish, exif).tolist() == [0, 1, 0, 1, 2]
-    assert "2 of the 5 images" in prior_warnings(wish, exif)[0]
-    assert "constant" in prior_warnings(wish, exif)[0]
+    assert camera_numbers(sizes, options, exif).tolist() == [0, 1, 0, 1, 2]
+    assert "2 of the 5 images" in prior_warnings(options, exif)[0]
+    assert "constant" in prior_warnings(options, exif)[0]
 
 
 def test_a_principal_point_far_outside_of_the_picture_is_refused():
@@ -306,7 +306,7 @@ def test_presets_survive_their_own_text(name):
 
 
 @pytest.mark.parametrize(
-    ("wish", "words"),
+    ("options", "words"),
     [
         ({"focal_px": 100.0}, "needs focal_std_rel"),
         ({"focal": "known"}, "needs its value"),
@@ -327,6 +327,6 @@ def test_presets_survive_their_own_text(name):
         ({"k1": "known", "k1_std": 0.1}, "has no effect with k1 = known"),
     ],
 )
-def test_contradictory_options_are_rejected(wish, words):
+def test_contradictory_options_are_rejected(options, words):
     with pytest.raises(ValueError, match=words):
-        IntrinsicsOptions(**wish)
+        IntrinsicsOptions(**options)

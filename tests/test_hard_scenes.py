@@ -101,8 +101,8 @@ class Given:
         return replace(self.truth, stratum="projective", K=None, distortion=None)
 
     def refine(self, reconstruction, calibration, *, prior, rng):
-        told = FakeMetric().refine(reconstruction, calibration, prior=prior, rng=rng)
-        return replace(told, reconstruction=self.truth)
+        reported = FakeMetric().refine(reconstruction, calibration, prior=prior, rng=rng)
+        return replace(reported, reconstruction=self.truth)
 
 
 def photographs(name):
@@ -132,9 +132,9 @@ def summary(out):
 def test_no_depths_are_one_sentence_and_the_cameras_stay(name, base, tmp_path):
     result = run(name, tmp_path, base)
     assert result.mesh is None
-    told = [w for w in result.warnings if "No surface model was built" in w]
-    assert len(told) == 1
-    assert "no depths were found" in told[0]
+    reported = [w for w in result.warnings if "No surface model was built" in w]
+    assert len(reported) == 1
+    assert "no depths were found" in reported[0]
     assert summary(tmp_path)["registered"] == len(MADE[name].images)
     assert not (tmp_path / "model.glb").exists()
     assert (tmp_path / "report.html").exists()

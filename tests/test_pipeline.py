@@ -105,8 +105,8 @@ def test_summary_and_cameras_are_in_original_pixels(tmp_path):
 def test_cameras_with_skew_are_written_where_they_can_be(tmp_path):
     """COLMAP has no camera with skew; everything else is there, and nothing of an older model stays."""
     assert (run(tmp_path).out / "sparse" / "0" / "cameras.bin").is_file()
-    wish = IntrinsicsOptions(skew="constant", skew_std_px=5.0)
-    config = fake_config(intrinsics=wish, selfcalibration=fakes.FakeCalibrator(skew_px=2.0))
+    knowledge = IntrinsicsOptions(skew="constant", skew_std_px=5.0)
+    config = fake_config(intrinsics=knowledge, selfcalibration=fakes.FakeCalibrator(skew_px=2.0))
     result = run(tmp_path, config=config, overwrite=True)
     (sentence,) = (w for w in result.summary["warnings"] if "sparse/0" in w)
     assert "COLMAP has no camera with skew" in sentence
@@ -223,8 +223,8 @@ def test_a_damaged_result_is_computed_again(tmp_path):
     called = sorted(c for c in CALLS if not c.startswith("prepare"))
     assert called == ["detect 03.png", "match (0, 1)", "match (1, 2)"]
     assert kept_bytes(tmp_path) == before
-    told = "02-matches/00000-00001.npz and 1 more were damaged or changed by another program"
-    assert f"{told}, and are computed again" in result.warnings
+    reported = "02-matches/00000-00001.npz and 1 more were damaged or changed by another program"
+    assert f"{reported}, and are computed again" in result.warnings
 
 
 @pytest.mark.parametrize("options", [{"threads": 1}, {"threads": 3}, {"threads": 2, "executor": "processes"}])
@@ -403,14 +403,14 @@ def test_cameras_are_shared_by_size_or_not_at_all():
 
 
 def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path):
-    wish = IntrinsicsOptions(focal_px=100.0, focal_std_rel=0.1)
-    run(tmp_path, config=fake_config(intrinsics=wish))
+    knowledge = IntrinsicsOptions(focal_px=100.0, focal_std_rel=0.1)
+    run(tmp_path, config=fake_config(intrinsics=knowledge))
     assert "calibrate prior=True" in CALLS
 
 
 def test_a_request_for_exif_without_exif_data_is_reported(tmp_path):
-    wish = IntrinsicsOptions(exif=True, focal_std_rel=0.1)
-    result = run(tmp_path, config=fake_config(intrinsics=wish))
+    knowledge = IntrinsicsOptions(exif=True, focal_std_rel=0.1)
+    result = run(tmp_path, config=fake_config(intrinsics=knowledge))
     assert "calibrate prior=False" in CALLS
     sentence = "No EXIF focal length was found in 4 images: no focal prior is used"
     assert sentence in result.summary["warnings"]
@@ -418,7 +418,7 @@ def test_a_request_for_exif_without_exif_data_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("wish", "focal_px", "words"),
+    ("knowledge", "focal_px", "words"),
     [
         (IntrinsicsOptions(exif=True, focal_std_rel=0.1), [800.0, np.nan], "1 of the 2 images"),
         (IntrinsicsOptions(exif=True, focal_std_rel=0.1), [800.0, 900.0], None),
@@ -426,8 +426,8 @@ def test_a_request_for_exif_without_exif_data_is_reported(tmp_path):
         (IntrinsicsOptions(), [np.nan, np.nan], None),
     ],
 )
-def test_only_an_ignored_option_gives_a_warning(wish, focal_px, words):
-    warnings = prior_warnings(wish, np.array(focal_px))
+def test_only_an_ignored_option_gives_a_warning(knowledge, focal_px, words):
+    warnings = prior_warnings(knowledge, np.array(focal_px))
     assert [words in warning for warning in warnings] == ([True] if words else [])
 
 

@@ -93,7 +93,7 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monke
         StageFailure, match=r"moved towards the scene or away from it; .*\(21, 14\) px, inside 0\.jpg"
     ):
         between.prepare_pair(a, b)
-    # A photograph and a copy of it, saved anew: this F is as good as any.
+    # An image and its copy: any F fits.
     pair.xy2 = xy + rng.normal(0.0, 0.01, xy.shape)
     with pytest.raises(StageFailure, match="no parallax"):
         between.prepare_pair(a, b)
@@ -196,11 +196,11 @@ def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
     assert said.out.splitlines()[0] == f"3 frames of 512 x 384 px and interpolation.webp written to {out}"
     names = ["frame-0001.png", "frame-0002.png", "frame-0003.png", "frames.json", "interpolation.webp"]
     assert sorted(path.name for path in out.iterdir()) == [*names, "strip.html"]
-    told = json.loads((out / "frames.json").read_text(encoding="utf-8"))
-    assert told["images"] == ["0006.jpg", "0007.jpg"]
-    assert told["frames"][1] == {"name": "frame-0002.png", "weights": [0.5, 0.5]}
-    assert 0.0 < told["violating_monotonicity"][0] < 0.3
-    assert told["known"][0] > 0.3
+    reported = json.loads((out / "frames.json").read_text(encoding="utf-8"))
+    assert reported["images"] == ["0006.jpg", "0007.jpg"]
+    assert reported["frames"][1] == {"name": "frame-0002.png", "weights": [0.5, 0.5]}
+    assert 0.0 < reported["violating_monotonicity"][0] < 0.3
+    assert reported["known"][0] > 0.3
     with PIL.Image.open(out / "interpolation.webp") as film:
         assert film.n_frames == 3
     page = (out / "strip.html").read_text(encoding="utf-8")

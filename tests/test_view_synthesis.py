@@ -57,8 +57,8 @@ def test_at_their_own_places_the_photographs_are_seen_again(found):
 
 
 def test_a_given_focal_length_is_used(found):
-    told = replace(SMALL, intrinsics=IntrinsicsOptions(focal="known", focal_px=900.0))
-    assert prepare_trilinear_views(found, config=told).pair.K1[0, 0] == 450.0
+    reported = replace(SMALL, intrinsics=IntrinsicsOptions(focal="known", focal_px=900.0))
+    assert prepare_trilinear_views(found, config=reported).pair.K1[0, 0] == 450.0
 
 
 def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
@@ -95,9 +95,9 @@ def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
     made = interpolate_images(
         tmp_path / "film", InterpolateOptions(paths, "tensor", frames=5, max_size_px=320)
     )
-    told = json.loads((tmp_path / "film" / "frames.json").read_text(encoding="utf-8"))
-    assert [frame["baselines"] for frame in told["frames"]] == [-0.5, 0.0, 0.5, 1.0, 1.5]
-    assert told["images"] == ["0006.jpg", "0007.jpg"]
+    reported = json.loads((tmp_path / "film" / "frames.json").read_text(encoding="utf-8"))
+    assert [frame["baselines"] for frame in reported["frames"]] == [-0.5, 0.0, 0.5, 1.0, 1.5]
+    assert reported["images"] == ["0006.jpg", "0007.jpg"]
     assert made.size == (320, 240)
     pictures = []
     for path in made.frames:

@@ -282,25 +282,26 @@ def test_kernels_without_a_cache_folder_are_reported_with_advice(monkeypatch, tm
 
 
 @pytest.mark.parametrize(
-    ("wish", "kind"), [("all", AllPairs()), ("overlap", OverlapEstimate()), ("window:3", SequenceWindow(3))]
+    ("knowledge", "kind"),
+    [("all", AllPairs()), ("overlap", OverlapEstimate()), ("window:3", SequenceWindow(3))],
 )
-def test_the_pairs_of_the_command_are_those_of_the_settings(wish, kind):
-    assert cli._config(None, None, cli._option_tables(None, None, wish), []).pairs == kind
+def test_the_pairs_of_the_command_are_those_of_the_settings(knowledge, kind):
+    assert cli._config(None, None, cli._option_tables(None, None, knowledge), []).pairs == kind
 
 
 def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, capsys):
     names = sorted(path.name for path in photographs.iterdir())
-    wish, out = tmp_path / "pairs.txt", tmp_path / "out"
-    wish.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
+    knowledge, out = tmp_path / "pairs.txt", tmp_path / "out"
+    knowledge.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
     given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
-    assert run_command([*given, "--pairs", str(wish)]) == 0
+    assert run_command([*given, "--pairs", str(knowledge)]) == 0
     assert "of 2 image pairs accepted (15 are possible)" in capsys.readouterr().out
     pairs = json.loads((out / "summary.json").read_text(encoding="utf-8"))["pairs"]
     assert (pairs["matched"], pairs["possible"], pairs["selection"]) == (2, 15, "the listed pairs")
     assert "2 of 15 pairs were tried: the listed pairs." in (out / "report.html").read_text(encoding="utf-8")
     for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is none"), ("", "leaves no pair")):
-        wish.write_text(line, encoding="utf-8")
-        assert run_command([*given, "--pairs", str(wish), "--overwrite"]) == 2
+        knowledge.write_text(line, encoding="utf-8")
+        assert run_command([*given, "--pairs", str(knowledge), "--overwrite"]) == 2
         assert words in capsys.readouterr().err
     # The run that was there is whole.
     assert json.loads((out / "run.json").read_text(encoding="utf-8"))["settings"]["pairs"]["listed"][0] == [
@@ -312,8 +313,8 @@ def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, cap
 
 def test_a_corrected_list_of_pairs_needs_no_overwrite(photographs, tmp_path):
     names = sorted(path.name for path in photographs.iterdir())
-    wish, out = tmp_path / "pairs.txt", tmp_path / "out"
+    knowledge, out = tmp_path / "pairs.txt", tmp_path / "out"
     given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
     for line, code in ((f"{names[0]} nope.jpg", 2), (f"{names[0]} {names[1]}", 0)):
-        wish.write_text(line, encoding="utf-8")
-        assert run_command([*given, "--pairs", str(wish)]) == code
+        knowledge.write_text(line, encoding="utf-8")
+        assert run_command([*given, "--pairs", str(knowledge)]) == code

@@ -90,11 +90,11 @@ def test_interpolation_begins_and_ends_as_the_photographs(run, capsys):
     assert difference_from_photograph(folder / "frame-0005.png", COUNT - 1) < 6
     with PIL.Image.open(folder / "interpolate.webp") as film:
         assert film.n_frames == 5
-    told = json.loads((folder / "frames.json").read_text(encoding="utf-8"))
+    reported = json.loads((folder / "frames.json").read_text(encoding="utf-8"))
     cameras = json.loads((run / "cameras.json").read_text(encoding="utf-8"))["cameras"]
     assert len(cameras) == COUNT - 1
-    np.testing.assert_allclose(told["frames"][0]["centre"], cameras[0]["centre"], atol=1e-9)
-    np.testing.assert_allclose(told["frames"][-1]["R"], cameras[-1]["R"], atol=1e-9)
+    np.testing.assert_allclose(reported["frames"][0]["centre"], cameras[0]["centre"], atol=1e-9)
+    np.testing.assert_allclose(reported["frames"][-1]["R"], cameras[-1]["R"], atol=1e-9)
 
 
 def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(run, tmp_path):
@@ -166,25 +166,25 @@ def test_wrong_options_get_one_sentence(options, words, run, capsys):
 
 
 def test_missing_arguments_are_named(run, tmp_path, capsys):
-    def told(out):
+    def reported(out):
         assert run_command(["render", str(out)]) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1
         return said
 
-    assert "holds no run; create one with thesisrecon reconstruct" in told(tmp_path / "nowhere")
+    assert "holds no run; create one with thesisrecon reconstruct" in reported(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    assert "holds no run" in told(tmp_path / "empty")
+    assert "holds no run" in reported(tmp_path / "empty")
     (run / "cameras.json").rename(run / "other.json")
-    assert "there is no cameras.json" in told(run)
+    assert "there is no cameras.json" in reported(run)
     (run / "model.glb").write_bytes(b"glTF")
-    assert "model.glb cannot be read" in told(run)
+    assert "model.glb cannot be read" in reported(run)
     (run / "model.glb").unlink()
-    assert "has no model yet (model.glb)" in (said := told(run))
+    assert "has no model yet (model.glb)" in (said := reported(run))
     assert "without --until" in said
     reason = "No surface model was built: no depths were found; none of 4 views agrees with another."
     (run / "summary.json").write_text(json.dumps({"warnings": ["something else", reason]}))
-    assert f"has cameras but no model: {reason}" in told(run)
+    assert f"has cameras but no model: {reason}" in reported(run)
 
 
 def test_a_folder_of_photographs_is_not_written_over(run, capsys):

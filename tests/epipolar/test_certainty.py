@@ -1,4 +1,4 @@
-"""Whether an F is determined is told from the matches off the plane, not from the number of inliers."""
+"""Degeneracy of F is assessed from the matches off the plane, not from the number of inliers."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from thesisrecon.epipolar.degeneracy import (
     NEIGHBOURS,
     _contradicted_ratios,
     assess_degeneracy,
-    fundamentals_of_plane,
     log10_false_alarms,
     multiplicity_weights,
 )
@@ -19,6 +18,7 @@ from thesisrecon.epipolar.planes import (
     _plane_distances,
     _plane_normal_equations,
     find_dominant_plane,
+    fundamentals_of_plane,
     plane_covariance,
     refine_plane,
 )
@@ -93,7 +93,7 @@ def test_matches_between_windows_do_not_make_a_facade_sure():
 
 
 def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_rival():
-    """All matches of a plane and few others, of which a wrong F has some."""
+    """All matches of a plane and few others; a wrong F fits some of these."""
     rng = np.random.default_rng(3)
     flat = make_pair(300, np.random.default_rng(8), planar=True)
     X = np.c_[rng.uniform(-1.0, 1.0, (30, 2)), rng.uniform(4.0, 4.6, 30)]
@@ -131,11 +131,11 @@ def test_a_wide_covariance_is_a_reason():
 def test_the_public_function_assesses_degeneracy_on_request():
     pair = make_pair(200, np.random.default_rng(1))
     xy1, xy2, _ = spoil(pair, np.random.default_rng(1), sigma=0.3, outliers=0.2)
-    plain, told = estimate_fundamental(xy1, xy2), estimate_fundamental(xy1, xy2, check_degeneracy=True)
+    plain, reported = estimate_fundamental(xy1, xy2), estimate_fundamental(xy1, xy2, check_degeneracy=True)
     assert plain.degeneracy is None
-    assert told.degeneracy is not None
-    assert told.degeneracy.determined
-    np.testing.assert_array_equal(plain.F, told.F)
+    assert reported.degeneracy is not None
+    assert reported.degeneracy.determined
+    np.testing.assert_array_equal(plain.F, reported.F)
 
 
 def test_the_same_generator_gives_the_same_verdict():

@@ -11,14 +11,7 @@ from thesisrecon.epipolar.configuration import Configuration, _refine_translatio
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
-from thesisrecon.epipolar.ransac import (
-    EpipolarDistanceTest,
-    LeastMedianOfSquares,
-    SampsonTest,
-    SymmetricDistanceTest,
-    ThesisRansac,
-    discard_outliers,
-)
+from thesisrecon.epipolar.ransac import INLIER_TESTS, LeastMedianOfSquares, ThesisRansac, discard_outliers
 from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
 from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.epipolar.verification import PairVerification
@@ -412,7 +405,7 @@ def test_algorithm_2_minimises_the_chosen_criterion():
     assert angle_between(fit.F, again) < 0.1 * angle_between(other, again)
 
 
-TESTS = [SampsonTest(), EpipolarDistanceTest(), SymmetricDistanceTest()]
+TESTS = list(INLIER_TESTS.values())
 
 
 @holds_for_every()

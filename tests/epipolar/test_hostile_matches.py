@@ -1,4 +1,4 @@
-"""Matches no pair of photographs has: every function answers with finite numbers or refuses by name."""
+"""Impossible matches: every function returns finite numbers or raises a named error."""
 
 from dataclasses import fields, is_dataclass
 

@@ -1,22 +1,22 @@
-"""The bound, the intervals of epipolar distances and of epipoles, and who reaches them."""
+"""The bound, the intervals of epipolar distances and of epipoles, and the estimators that reach them."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from validation.studies.epipolar import DEFAULT, GOLD, check_precision
+from validation.studies.epipolar_synthetic import DEFAULT, GOLD, check_precision
 
 from tests.epipolar.pairs import make_pair
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.precision import (
     Epipole,
-    degrees_of_freedom,
-    ellipse_95,
+    _degrees_of_freedom,
+    _ellipse_95,
+    _epipoles_with_covariance,
+    _student_95,
     epipolar_distance_std,
-    epipoles_with_covariance,
     fundamental_bound,
-    student_95,
 )
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
@@ -41,26 +41,26 @@ def test_gold_standard_reaches_the_bound_and_its_intervals_hold_the_truth(sigma,
 @pytest.mark.parametrize("nu", [1.0, 3.0, 23.0, 1e4, np.inf])
 def test_quantiles_are_those_of_student_and_fisher(nu):
     finite = min(nu, 1e9)
-    assert student_95(nu) == pytest.approx(stats.t.ppf(0.975, finite), rel=1e-6)
-    assert ellipse_95(nu) == pytest.approx(2.0 * stats.f.ppf(0.95, 2, finite), rel=1e-6)
+    assert _student_95(nu) == pytest.approx(stats.t.ppf(0.975, finite), rel=1e-6)
+    assert _ellipse_95(nu) == pytest.approx(2.0 * stats.f.ppf(0.95, 2, finite), rel=1e-6)
 
 
 def test_degrees_of_freedom_are_the_inliers_without_seven():
     inliers = np.arange(20) < 12
     fit = FundamentalFit(np.eye(3), inliers, 1.0, np.eye(9))
-    assert degrees_of_freedom(fit) == 5.0
-    assert degrees_of_freedom(FundamentalFit(np.eye(3), inliers[9:], 1.0, np.eye(9))) == 1.0
+    assert _degrees_of_freedom(fit) == 5.0
+    assert _degrees_of_freedom(FundamentalFit(np.eye(3), inliers[9:], 1.0, np.eye(9))) == 1.0
     with pytest.raises(ValueError, match="positive"):
-        student_95(0.0)
+        _student_95(0.0)
     with pytest.raises(ValueError, match="positive"):
-        ellipse_95(-1.0)
+        _ellipse_95(-1.0)
 
 
 def test_little_noise_gives_the_first_order_interval():
     _, bound = bound_of(2)
     for nu in (5.0, np.inf):
-        for found in epipoles_with_covariance(bound.F, 1e-8 * bound.covariance, degrees_of_freedom=nu):
-            half = student_95(nu) * np.sqrt(np.diag(found.xy_covariance))
+        for found in _epipoles_with_covariance(bound.F, 1e-8 * bound.covariance, _degrees_of_freedom=nu):
+            half = _student_95(nu) * np.sqrt(np.diag(found.xy_covariance))
             np.testing.assert_allclose(found.interval_95, [found.xy - half, found.xy + half], rtol=1e-4)
             assert found.contains_xy(found.xy).all()
             assert not found.contains_xy(found.xy + 1.01 * half).any()
@@ -82,14 +82,14 @@ def test_interval_ends_have_the_stated_number_of_stds(seed, scale):
         inside = [found.contains_xy(xy)[k] for xy in places]
         off = (e[k] - places[:, k] * e[2]) ** 2
         variance = C[k, k] - 2.0 * places[:, k] * C[k, 2] + places[:, k] ** 2 * C[2, 2]
-        assert inside == list(off <= student_95(12.0) ** 2 * variance)
-        assert (low <= high) == (e[2] ** 2 > student_95(12.0) ** 2 * C[2, 2] or np.isinf(low))
+        assert inside == list(off <= _student_95(12.0) ** 2 * variance)
+        assert (low <= high) == (e[2] ** 2 > _student_95(12.0) ** 2 * C[2, 2] or np.isinf(low))
         assert found.contains_xy(found.xy)[k]
 
 
 def test_exact_matches_give_an_interval_of_no_width():
     F = bound_of(0)[1].F
-    for found in epipoles_with_covariance(F, np.zeros((9, 9))):
+    for found in _epipoles_with_covariance(F, np.zeros((9, 9))):
         np.testing.assert_allclose(found.interval_95, [found.xy, found.xy], rtol=1e-6)
 
 
@@ -124,7 +124,7 @@ def test_distances_and_epipoles_move_as_their_derivatives_say():
     std = epipolar_distance_std(bound.F, covariance, scene.xy1, scene.xy2)
     np.testing.assert_allclose(change, std, rtol=1e-2, atol=2e-3 * std.max())
     for found, e, after in zip(
-        epipoles_with_covariance(bound.F, covariance), epipoles(bound.F), epipoles(moved), strict=True
+        _epipoles_with_covariance(bound.F, covariance), epipoles(bound.F), epipoles(moved), strict=True
     ):
         difference = (after * np.sign(after @ e) - e) / step
         np.testing.assert_allclose(
@@ -137,7 +137,7 @@ def test_distances_and_epipoles_move_as_their_derivatives_say():
 
 def test_an_epipole_at_infinity_has_no_pixels():
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) / np.sqrt(2.0)
-    for epipole in epipoles_with_covariance(F, np.eye(9)):
+    for epipole in _epipoles_with_covariance(F, np.eye(9)):
         assert np.isnan(epipole.xy).all()
         assert np.isfinite(epipole.covariance).all()
         assert not np.isnan(epipole.interval_95).any()
@@ -151,6 +151,6 @@ def test_wrong_calls():
     with pytest.raises(ValueError, match="different centres"):
         fundamental_bound(pair.P1, pair.P1, X, sigma_px=1.0)
     with pytest.raises(ValueError, match=r"\(9, 9\)"):
-        epipoles_with_covariance(pair.F, np.eye(3))
+        _epipoles_with_covariance(pair.F, np.eye(3))
     with pytest.raises(ValueError, match="unit norm"):
-        epipoles_with_covariance(2.0 * pair.F, np.eye(9))
+        _epipoles_with_covariance(2.0 * pair.F, np.eye(9))

@@ -1,4 +1,4 @@
-"""Which pairs are believed, and how planar they are."""
+"""Verification of pairs, and how planar they are."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from tests.epipolar.pairs import SIZE, Pair, make_pair, spoil
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
-from thesisrecon.epipolar.planes import homography_inlier_ratio, plane_homographies
+from thesisrecon.epipolar.planes import _plane_homographies, homography_inlier_ratio
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.geometry.camera_matrix import project
@@ -106,7 +106,7 @@ def test_share_of_a_dominant_plane_is_measured():
 def test_homographies_of_a_plane_from_three_matches():
     pair = make_pair(12, np.random.default_rng(7), planar=True)
     triples = np.array([[0, 1, 2], [3, 4, 5], [6, 6, 7]])
-    H = plane_homographies(pair.F, pair.xy1, pair.xy2, triples)
+    H = _plane_homographies(pair.F, pair.xy1, pair.xy2, triples)
     assert 1 <= len(H) <= 2
     for one in H:
         assert homography_residuals(one, pair.xy1, pair.xy2).max() < 1e-3

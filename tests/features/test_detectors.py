@@ -144,11 +144,11 @@ def test_the_derivation_kernel_is_scaled_to_slope_one():
 def test_without_surface_fit_corners_stay_on_pixels_and_with_it_they_are_nearer():
     error = {False: [], True: []}
     for dx, dy in np.random.default_rng(1).uniform(-0.5, 0.5, (12, 2)):
-        for subpixel, told in error.items():
+        for subpixel, reported in error.items():
             measure = CornerMeasure(subpixel=subpixel)
             xy, _ = find_corners(chessboard(dx, dy).gray[None], measure)
             assert subpixel or not (xy % 1.0).any()
-            told.append(np.linalg.norm(xy[0] - (60 + dx, 50 + dy)))
+            reported.append(np.linalg.norm(xy[0] - (60 + dx, 50 + dy)))
     assert np.mean(error[True]) < 0.5 * np.mean(error[False])
 
 

@@ -1,4 +1,4 @@
-"""Command lines whose answers are one sentence, within bounds of time and memory."""
+"""Fixtures that run a command line within bounds of time and memory."""
 
 import resource
 import signal
@@ -10,15 +10,15 @@ from thesisrecon.cli.main import run_command
 from validation.command import main as run_validation
 
 GROWTH_MB = 600
-"""What one case may add to the peak of the memory: a photograph of 89 megapixels takes 360."""
+"""Largest growth of peak memory; an image of 89 megapixels takes 360."""
 
 
 @pytest.fixture(autouse=True)
 def bounded():
-    """Ends what waits for ever, and finds what took more memory than it may."""
+    """Limit the time and the memory growth of each test."""
 
     def stop(*_):
-        raise TimeoutError("it waits for something")
+        raise TimeoutError("it hangs")
 
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     old = signal.signal(signal.SIGALRM, stop)
@@ -30,8 +30,8 @@ def bounded():
 
 
 @pytest.fixture
-def told(capsys):
-    """Runs a command line, holds its code and the form of its sentence, and returns that."""
+def run_cli(capsys):
+    """Run a command line, check its exit code and message, and return the message."""
 
     def run(arguments, code):
         capsys.readouterr()
@@ -50,7 +50,7 @@ def told(capsys):
 
 @pytest.fixture
 def validated(capsys):
-    """Runs a command of the validation that has to end with exit code 2 before it begins."""
+    """Run a validation command that must end with exit code 2, and return its message."""
 
     def run(arguments):
         assert run_validation(arguments) == 2

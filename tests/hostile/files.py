@@ -1,4 +1,4 @@
-"""Files that a careless or ill-meaning hand may leave in a folder, made from nothing and small."""
+"""Small hostile and damaged files."""
 
 import io
 import json
@@ -33,7 +33,7 @@ def encoded(kind, image=None, **options):
 
 
 def png(width, height, *, pixels=b"", before=b""):
-    """A PNG that claims this size, whatever of its ``pixels`` there is; ``before`` stands ahead of them."""
+    """A PNG that claims this size, with any ``pixels``; ``before`` precedes them."""
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     parts = chunk(b"IHDR", header) + before + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + parts
@@ -44,7 +44,7 @@ def chunk(kind, data):
 
 
 def bomb():
-    """30,000 x 30,000 pixels, of which the first 400 rows are there, in 100 kB."""
+    """30,000 x 30,000 pixels in 100 kB; only the first 400 rows exist."""
     packer, rows = zlib.compressobj(9), bytes(3 * 30_000 + 1) * 100
     data = b"".join(packer.compress(rows) for _ in range(4)) + packer.flush()
     header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
@@ -65,7 +65,7 @@ def _rows_of_nothing(width, count):
 
 
 def text_bomb():
-    """A good PNG with a note of 256 MiB, packed."""
+    """A valid PNG with a compressed comment of 256 MiB."""
     note = b"Comment\0\0" + zlib.compress(bytes(2**28), 9)
     whole = encoded("PNG")
     return whole[:33] + chunk(b"zTXt", note) + whole[33:]
@@ -87,7 +87,7 @@ def pipe(path):
 
 
 def listens(path):
-    """A socket that nobody listens to any more."""
+    """A closed socket."""
     with socket.socket(socket.AF_UNIX) as ear:
         # Names of sockets are short.
         here = Path.cwd()
@@ -123,10 +123,10 @@ def deep_json(depth=200_000):
 
 def glb(header, data=b""):
     """A GLB of this header and these numbers."""
-    told = json.dumps(header).encode()
-    told += b" " * (-len(told) % 4)
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
-    parts = struct.pack("<II", len(told), 0x4E4F534A) + told
+    parts = struct.pack("<II", len(text), 0x4E4F534A) + text
     parts += struct.pack("<II", len(data), 0x004E4942) + data
     return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
@@ -153,13 +153,13 @@ def triangle(**changes):
     return header | changes, data
 
 
-def glb_of(told):
+def glb_of(text):
     """A GLB of this text alone."""
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(told), len(told), 0x4E4F534A) + told
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
 
 
 def folder_of(place, name):
-    """A folder of photographs with a snare."""
+    """A folder with one image."""
     folder = place / name
     folder.mkdir()
     (folder / "a.png").write_bytes(encoded("PNG"))
@@ -167,7 +167,7 @@ def folder_of(place, name):
 
 
 def require_sentence(said):
-    """One line for a person: no trace, no control characters, not endless."""
+    """Require one printable line without traceback."""
     assert said.endswith("\n")
     assert not any(unicodedata.category(c) == "Cc" for c in said[:-1])
     assert "Traceback" not in said

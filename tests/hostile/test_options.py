@@ -1,12 +1,12 @@
-"""Wishes of the command line that cannot be granted: paths, settings, lists of pairs."""
+"""Options that must be rejected: paths, settings, lists of pairs."""
 
 import pytest
 
 from tests.hostile import files
 from tests.hostile.files import links, picture, pipe, sparse, writes
 
-# The words of a command in a folder that has photographs in ``in``; what is said.
-WISHES = [
+# Name, arguments (in a folder with images in ``in``), preparation, part of the message.
+OPTIONS = [
     ("images too long", [files.TOO_LONG, "-o", "out"], lambda _: None, "File name too long"),
     ("images round", ["round", "-o", "out"], lambda p: links("{here}/round")(p / "round"), "round"),
     ("images a pipe", ["pipe", "-o", "out"], lambda p: pipe(p / "pipe"), "is not a folder"),
@@ -46,12 +46,14 @@ WISHES = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "make", "words"), [w[1:] for w in WISHES], ids=[w[0] for w in WISHES])
-def test_impossible_options_are_rejected(arguments, make, words, tmp_path, told, monkeypatch):
+@pytest.mark.parametrize(
+    ("arguments", "make", "words"), [w[1:] for w in OPTIONS], ids=[w[0] for w in OPTIONS]
+)
+def test_impossible_options_are_rejected(arguments, make, words, tmp_path, run_cli, monkeypatch):
     files.folder_of(tmp_path, "in")
     make(tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert words in told(["reconstruct", *arguments], 2)
+    assert words in run_cli(["reconstruct", *arguments], 2)
     assert not (tmp_path / "out" / "run.json").exists()
     assert not (tmp_path / "elsewhere").exists()
 
@@ -86,11 +88,11 @@ CONFIGS = [
 
 
 @pytest.mark.parametrize(("text", "words"), CONFIGS, ids=[str(k) for k in range(len(CONFIGS))])
-def test_settings_of_wrong_types(text, words, tmp_path, told):
+def test_settings_of_wrong_types(text, words, tmp_path, run_cli):
     folder = files.folder_of(tmp_path, "in")
     writes(text)(tmp_path / "c.toml")
     out = tmp_path / "out"
-    said = told(["reconstruct", str(folder), "-o", str(out), "--config", str(tmp_path / "c.toml")], 2)
+    said = run_cli(["reconstruct", str(folder), "-o", str(out), "--config", str(tmp_path / "c.toml")], 2)
     assert words in said
     assert not out.exists()
 
@@ -108,12 +110,12 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("words", "text"), PAIRS, ids=[str(k) for k in range(len(PAIRS))])
-def test_invalid_lists_of_pairs_are_rejected(words, text, tmp_path, told):
+def test_invalid_lists_of_pairs_are_rejected(words, text, tmp_path, run_cli):
     folder = files.folder_of(tmp_path, "in")
     (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
     writes(text)(tmp_path / "pairs.txt")
     arguments = ["reconstruct", str(folder), "-o", str(tmp_path / "out"), "--until", "matches"]
-    assert words in told([*arguments, "--pairs", str(tmp_path / "pairs.txt")], 2)
+    assert words in run_cli([*arguments, "--pairs", str(tmp_path / "pairs.txt")], 2)
 
 
 @pytest.mark.parametrize(
@@ -121,5 +123,5 @@ def test_invalid_lists_of_pairs_are_rejected(words, text, tmp_path, told):
     [("/dev/null", "cannot be written"), (files.TOO_LONG, "File name too long"), (" ", "has no name")],
     ids=["device", "too long", "nothing"],
 )
-def test_the_demo_is_as_careful(out, words, told):
-    assert words in told(["demo", "-o", out], 2)
+def test_the_demo_is_as_careful(out, words, run_cli):
+    assert words in run_cli(["demo", "-o", out], 2)

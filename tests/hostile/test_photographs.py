@@ -1,4 +1,4 @@
-"""Hostile and odd photographs through the command line: refused in one sentence, or read in spite of all."""
+"""Hostile and unusual images through the command line: rejected in one sentence, or read."""
 
 import json
 import os
@@ -13,7 +13,7 @@ import pytest
 from tests.hostile import files
 from tests.hostile.files import FEATURES, links, picture, pipe, sparse, writes
 
-# Photographs that are none: name, how it is made, what is said of it.
+# Files that are not images: name, maker, part of the reason.
 NO_PHOTOGRAPHS = [
     ("gone.png", links("{here}/nowhere.png"), "cannot be read: No such file"),
     ("round.png", links("{here}/round.png"), "cannot be read: Too many levels of symbolic links"),
@@ -50,22 +50,22 @@ NO_PHOTOGRAPHS = [
 
 
 @pytest.mark.parametrize(("name", "make", "words"), NO_PHOTOGRAPHS, ids=[name for name, *_ in NO_PHOTOGRAPHS])
-def test_files_that_are_not_images_are_rejected(name, make, words, tmp_path, told):
+def test_files_that_are_not_images_are_rejected(name, make, words, tmp_path, run_cli):
     (tmp_path / "in").mkdir()
     make(tmp_path / "in" / name)
-    said = told(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
+    said = run_cli(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
     assert "no usable photographs; at least one is needed; " in said
     assert f"{name} {words}" in said
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert [entry["name"] for entry in summary["refused"]] == [name]
 
 
-def test_a_picture_below_the_limit_is_held_once(tmp_path, told):
+def test_a_picture_below_the_limit_is_held_once(tmp_path, run_cli):
     """80 megapixels of one byte each; as colours with alpha they would take 320 MB, several times over."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "large.png").write_bytes(files.large_palette())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    said = told(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
+    said = run_cli(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
     assert "large.png is blank" in said
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 250 * 2**10
 
@@ -99,7 +99,7 @@ def wrong_focal(value):
 PROFILE = PIL.ImageCms.ImageCmsProfile(PIL.ImageCms.createProfile("LAB")).tobytes()
 
 
-# What looks odd and is a photograph.
+# Unusual images that are valid.
 PHOTOGRAPHS = [
     ("sixteen bits.png", sixteen_bits()),
     ("cmyk.jpg", files.encoded("JPEG", picture().convert("CMYK"))),
@@ -124,15 +124,17 @@ PHOTOGRAPHS = [
 
 
 @pytest.mark.parametrize(("name", "content"), PHOTOGRAPHS, ids=[name for name, _ in PHOTOGRAPHS])
-def test_odd_photographs_are_read(name, content, tmp_path, told):
+def test_odd_photographs_are_read(name, content, tmp_path, run_cli):
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / name).write_bytes(content)
-    wish = ["--set", "intrinsics.exif=true", "--set", "intrinsics.focal_std_rel=0.1"]
-    said = told(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES, *wish], 0)
+    knowledge = ["--set", "intrinsics.exif=true", "--set", "intrinsics.focal_std_rel=0.1"]
+    said = run_cli(
+        ["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES, *knowledge], 0
+    )
     assert "corners in 1 photograph" in said or "1 of 1 photograph read" in said
 
 
-def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, told):
+def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, run_cli):
     folder = files.folder_of(tmp_path, "in")
     (tmp_path / "outside.png").write_bytes(files.encoded("PNG", picture(1)))
     (folder / "b.png").symlink_to(tmp_path / "outside.png")
@@ -140,27 +142,27 @@ def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, told
     (folder / "sub").mkdir()
     (folder / "sub" / "a.png").write_bytes(files.encoded("PNG", picture(2)))
     (folder / "sub" / "up").symlink_to(folder)
-    said = told(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *FEATURES], 0)
+    said = run_cli(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *FEATURES], 0)
     assert "2 photographs" in said
     only = tmp_path / "folders only"
     only.mkdir()
     (only / "sub").symlink_to(folder)
-    said = told(["reconstruct", str(only), "-o", str(tmp_path / "other"), *FEATURES], 2)
+    said = run_cli(["reconstruct", str(only), "-o", str(tmp_path / "other"), *FEATURES], 2)
     assert "no photographs in" in said
     assert "folders in it are not searched" in said
 
 
-def test_thousands_of_tiny_files_are_one_sentence(tmp_path, told):
+def test_thousands_of_tiny_files_are_one_sentence(tmp_path, run_cli):
     (tmp_path / "in").mkdir()
     tiny = files.encoded("PNG", picture(size=(8, 8)))
     for k in range(2000):
         (tmp_path / "in" / f"{k:04d}.png").write_bytes(tiny)
-    said = told(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
+    said = run_cli(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
     assert "is only 8 x 8 pixels" in said
     assert "and 1997 more" in said
 
 
-def test_a_file_that_vanishes_while_others_are_read(tmp_path, told, monkeypatch):
+def test_a_file_that_vanishes_while_others_are_read(tmp_path, run_cli, monkeypatch):
     folder = files.folder_of(tmp_path, "in")
     for k in range(3):
         (folder / f"b{k}.png").write_bytes(files.encoded("PNG", picture(k + 1)))
@@ -171,7 +173,7 @@ def test_a_file_that_vanishes_while_others_are_read(tmp_path, told, monkeypatch)
         return opened(file, **options)
 
     monkeypatch.setattr(PIL.Image, "open", open_and_take_away)
-    said = told(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *FEATURES], 0)
+    said = run_cli(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *FEATURES], 0)
     assert "refused: b1.png: cannot be read: No such file or directory" in said
     assert "in 3 photographs" in said
 
@@ -196,17 +198,17 @@ NAMES = [
 ]
 
 
-def test_names_are_distinguished_and_shown_in_one_line(tmp_path, told):
+def test_names_are_distinguished_and_shown_in_one_line(tmp_path, run_cli):
     (tmp_path / "in").mkdir()
     for k, name in enumerate(NAMES):
         (tmp_path / "in" / name).write_bytes(files.encoded("PNG", picture(k)))
     out = tmp_path / os.fsdecode(b"o\xff\n<b>ut")
-    told(["reconstruct", str(tmp_path / "in"), "-o", str(out), *FEATURES], 0)
+    run_cli(["reconstruct", str(tmp_path / "in"), "-o", str(out), *FEATURES], 0)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     names = [camera["name"] for camera in summary["cameras"]]
     assert len(set(names)) == len(NAMES)
     assert {"latin \\xff.png", "latin \\xff.png (2)", "latin \\xfe.png", "a\\x0ab.png (2)"} <= set(names)
     assert not any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for name in names for c in name)
     assert not any("\u202e" in name for name in names)
-    said = told(["inspect", str(out)], 0)
+    said = run_cli(["inspect", str(out)], 0)
     assert "\\xff\\x0a<b>ut/report.html" in said

@@ -1,4 +1,4 @@
-"""Run folders that are damaged, of another version, or laid as a snare."""
+"""Run folders that are damaged, hostile or of another version."""
 
 import json
 import os
@@ -16,11 +16,11 @@ from tests.hostile.files import FEATURES, links, pipe, sparse, writes
 CHANGED = "01-features/00000.npz was damaged or changed by another program, and is computed again"
 
 
-def finished_run(tmp_path, told):
+def finished_run(tmp_path, run_cli):
     """A command that was carried out, and its folder."""
     out = tmp_path / "out"
     command = ["reconstruct", str(files.folder_of(tmp_path, "in")), "-o", str(out), *FEATURES]
-    told(command, 0)
+    run_cli(command, 0)
     return command, out
 
 
@@ -53,7 +53,7 @@ RECORDS = [
 
 
 def rewritten(change):
-    """A record as another program writes it that has changed its arrays: a good npz."""
+    """A valid npz whose arrays another program has changed."""
 
     def make(path):
         with np.load(path) as file:
@@ -75,29 +75,29 @@ REWRITTEN = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in RECORDS], ids=[name for name, _ in RECORDS])
-def test_an_invalid_record_is_recomputed_or_rejected(make, tmp_path, told):
-    command, out = finished_run(tmp_path, told)
+def test_an_invalid_record_is_recomputed_or_rejected(make, tmp_path, run_cli):
+    command, out = finished_run(tmp_path, run_cli)
     (record,) = (out / "01-features").glob("*.npz")
     whole = record.read_bytes()
     record.unlink()
     make(record)
     if record.is_dir():
-        assert "cannot be written: Is a directory" in told(command, 2)
+        assert "cannot be written: Is a directory" in run_cli(command, 2)
         return
-    assert CHANGED in told(command, 0)
+    assert CHANGED in run_cli(command, 0)
     assert record.read_bytes() == whole
     assert not (out / "01-features" / "sprung").exists()
-    assert CHANGED not in told(command, 0)
+    assert CHANGED not in run_cli(command, 0)
 
 
 @pytest.mark.parametrize("make", [make for _, make in REWRITTEN], ids=[name for name, _ in REWRITTEN])
-def test_a_record_that_another_program_wrote_is_computed_again(make, tmp_path, told):
-    command, out = finished_run(tmp_path, told)
+def test_a_record_that_another_program_wrote_is_computed_again(make, tmp_path, run_cli):
+    command, out = finished_run(tmp_path, run_cli)
     (record,) = (out / "01-features").glob("*.npz")
     whole = record.read_bytes()
     make(record)
     assert record.read_bytes() != whole
-    assert CHANGED in told(command, 0)
+    assert CHANGED in run_cli(command, 0)
     assert record.read_bytes() == whole
     assert CHANGED in json.loads((out / "summary.json").read_text(encoding="utf-8"))["warnings"]
 
@@ -124,10 +124,10 @@ MANIFESTS = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in MANIFESTS], ids=[name for name, _ in MANIFESTS])
-def test_an_invalid_manifest_is_rewritten(make, tmp_path, told):
-    command, out = finished_run(tmp_path, told)
+def test_an_invalid_manifest_is_rewritten(make, tmp_path, run_cli):
+    command, out = finished_run(tmp_path, run_cli)
     make(out / "01-features" / "manifest.json")
-    told(command, 0)
+    run_cli(command, 0)
     report = json.loads((out / "01-features" / "manifest.json").read_text(encoding="utf-8"))["report"]
     assert report["counts"]
     assert isinstance(report["seconds"], float)
@@ -142,30 +142,30 @@ RUN_FILES = [
 
 
 @pytest.mark.parametrize(("make", "words"), [r[1:] for r in RUN_FILES], ids=[r[0] for r in RUN_FILES])
-def test_the_folder_of_another_version(make, words, tmp_path, told):
+def test_the_folder_of_another_version(make, words, tmp_path, run_cli):
     folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
     out.mkdir()
     make(out / "run.json")
     command = ["reconstruct", str(folder), "-o", str(out), *FEATURES]
-    said = told(command, 2)
+    said = run_cli(command, 2)
     assert words in said
     assert "choose another folder, or --overwrite" in said
-    told([*command, "--overwrite"], 0)
+    run_cli([*command, "--overwrite"], 0)
 
 
 @pytest.mark.parametrize("make", [pipe, links("/dev/zero"), writes(files.deep_json()), sparse(10**13)])
-def test_an_invalid_run_file_counts_as_another_run(make, tmp_path, told):
-    """What names no run may be replaced: nothing of a run stands beside it."""
+def test_an_invalid_run_file_counts_as_another_run(make, tmp_path, run_cli):
+    """An invalid run file may be replaced: the folder holds no results."""
     folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
     out.mkdir()
     make(out / "run.json")
-    told(["reconstruct", str(folder), "-o", str(out), *FEATURES], 0)
+    run_cli(["reconstruct", str(folder), "-o", str(out), *FEATURES], 0)
     assert json.loads((out / "run.json").read_text(encoding="utf-8"))["seed"] == 0
 
 
-def test_nothing_is_written_through_the_links_of_a_folder(tmp_path, told):
-    """A folder from elsewhere may hold links where files are begun or stand when they are whole."""
-    command, out = finished_run(tmp_path, told)
+def test_nothing_is_written_through_the_links_of_a_folder(tmp_path, run_cli):
+    """A foreign folder may hold links at the names of temporary and final files."""
+    command, out = finished_run(tmp_path, run_cli)
     victim = tmp_path / "letter.txt"
     victim.write_text("dear", encoding="utf-8")
     for name in ("run.json", "summary.json", "report.html", "config.toml"):
@@ -174,7 +174,7 @@ def test_nothing_is_written_through_the_links_of_a_folder(tmp_path, told):
         (out / name).symlink_to(victim)
     (out / "01-features" / ".manifest.json.partial").symlink_to(tmp_path / "new.txt")
     (out / "01-features" / "manifest.json").unlink()
-    told(command, 0)
+    run_cli(command, 0)
     assert victim.read_text(encoding="utf-8") == "dear"
     assert not (tmp_path / "new.txt").exists()
     assert not any(path.is_symlink() for path in out.rglob("*.*"))
@@ -210,15 +210,15 @@ SUMMARIES = [
 
 
 @pytest.mark.parametrize(("make", "words"), [s[1:] for s in SUMMARIES], ids=[s[0] for s in SUMMARIES])
-def test_inspect_rejects_invalid_summaries(make, words, tmp_path, told):
+def test_inspect_rejects_invalid_summaries(make, words, tmp_path, run_cli):
     make(tmp_path / "summary.json")
-    assert words in told(["inspect", str(tmp_path)], 2)
+    assert words in run_cli(["inspect", str(tmp_path)], 2)
 
 
-def test_inspect_lets_nothing_through_to_the_terminal(tmp_path, told):
+def test_inspect_lets_nothing_through_to_the_terminal(tmp_path, run_cli):
     warnings = ["\x1b]0;title\x07", "two\nlines", "\ud800", "\u202eturned"]
     (tmp_path / "summary.json").write_text(summary_of_run(warnings=warnings), encoding="utf-8")
-    said = told(["inspect", str(tmp_path)], 0).splitlines()
+    said = run_cli(["inspect", str(tmp_path)], 0).splitlines()
     assert said[2:6] == [
         "warning: \\x1b]0;title\\x07",
         "warning: two\\x0alines",

@@ -1,4 +1,4 @@
-"""The validation beside COLMAP models, cameras, reports and studies that are damaged."""
+"""Validation with damaged COLMAP models, cameras, reports and studies."""
 
 import json
 

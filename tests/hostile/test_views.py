@@ -1,4 +1,4 @@
-"""``thesisrecon render`` and ``interpolate`` of models, cameras and photographs that are none."""
+"""``thesisrecon render`` and ``interpolate`` with invalid models, cameras and images."""
 
 import json
 
@@ -41,10 +41,10 @@ NO_CAMERAS = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in NO_CAMERAS], ids=[name for name, _ in NO_CAMERAS])
-def test_render_rejects_invalid_cameras(make, tmp_path, told):
+def test_render_rejects_invalid_cameras(make, tmp_path, run_cli):
     (tmp_path / "model.glb").write_bytes(files.glb(*files.triangle()))
     make(tmp_path / "cameras.json")
-    said = told(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
+    said = run_cli(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
     assert "cameras.json" in said
     assert not (tmp_path / "views").exists()
 
@@ -111,10 +111,10 @@ NO_MODELS = [
 
 
 @pytest.mark.parametrize(("make", "words"), [m[1:] for m in NO_MODELS], ids=[m[0] for m in NO_MODELS])
-def test_render_rejects_invalid_models(make, words, tmp_path, told):
+def test_render_rejects_invalid_models(make, words, tmp_path, run_cli):
     make(tmp_path / "model.glb")
     camera()(tmp_path / "cameras.json")
-    said = told(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
+    said = run_cli(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
     assert "model" in said
     assert words in said
     assert not (tmp_path / "views").exists()
@@ -134,7 +134,7 @@ BETWEEN = [
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [b[1:] for b in BETWEEN], ids=[b[0] for b in BETWEEN])
-def test_interpolation_rejects_files_that_are_not_images(words, code, said, tmp_path, told, monkeypatch):
+def test_interpolation_rejects_files_that_are_not_images(words, code, said, tmp_path, run_cli, monkeypatch):
     folder = files.folder_of(tmp_path, "in")
     (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
     (folder / "bomb.png").write_bytes(files.png(30_000, 30_000))
@@ -142,5 +142,5 @@ def test_interpolation_rejects_files_that_are_not_images(words, code, said, tmp_
     (folder / "round.png").symlink_to("round.png")
     (folder / "linked.png").symlink_to("a.png")
     monkeypatch.chdir(folder)
-    assert said in told(["interpolate", *words, "--threads", "1"], code)
+    assert said in run_cli(["interpolate", *words, "--threads", "1"], code)
     assert not (folder / "views").exists()

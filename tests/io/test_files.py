@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from validation.studies.full_disk import disk_ends, remount, small_disk
+from validation.studies.robustness import disk_ends, remount, small_disk
 
 from thesisrecon.errors import DISK, MEND, OutputError, UsageError
 from thesisrecon.io.colmap_files import write_colmap_model
@@ -41,7 +41,7 @@ def entries(folder):
 
 @contextmanager
 def no_larger_than(size):
-    """No file may grow beyond that size: what a full disk does to one, for whoever may not mount any."""
+    """Limit the size of files, which acts like a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -52,7 +52,7 @@ def no_larger_than(size):
 
 @contextmanager
 def read_only(folder):
-    """Nothing can be made in this folder. Permissions are nothing to root, who may mark it instead."""
+    """Make a folder read-only; for root by an attribute, since permissions do not apply."""
     if os.geteuid():
         folder.chmod(0o500)
         yield

@@ -1,4 +1,4 @@
-"""Readers given random bytes, and good files with something changed: they read, or raise what they say."""
+"""Readers with random bytes and damaged files: they read, or raise their documented errors."""
 
 import json
 from collections.abc import Callable
@@ -141,10 +141,10 @@ READERS = [
 
 @st.composite
 def damaged(draw, whole):
-    """The bytes with a few of them changed, cut off, put in or said twice."""
+    """The bytes with a few of them changed, cut off, inserted or repeated."""
     data = bytearray(whole)
     for _ in range(draw(st.integers(1, 4))):
-        # The beginning of a file has what the rest hangs on.
+        # Most faults are in the header.
         at = draw(st.one_of(st.integers(0, min(len(data), 64)), st.integers(0, len(data))))
         what = draw(st.sampled_from(["one", "number", "word", "cut", "put", "twice"]))
         if what == "one" and at < len(data):
@@ -229,8 +229,8 @@ TABLES = [(reader, content) for reader in READERS for name, content in (
 @few
 @given(data=st.data())
 def test_tables_of_other_types_raise_only_documented_errors(reader, content, tmp_path, data):
-    told = json.dumps(data.draw(mistyped(content)))
-    read(reader, tmp_path / reader.name, told.encode("utf-8", "surrogatepass"))
+    reported = json.dumps(data.draw(mistyped(content)))
+    read(reader, tmp_path / reader.name, reported.encode("utf-8", "surrogatepass"))
 
 
 @few
@@ -239,7 +239,7 @@ def test_settings_of_other_types_are_refused_in_a_sentence(data):
     whole = {"features": {"kind": "harris-corners"}, "intrinsics": {"focal_px": 9.0, "focal_std_rel": 0.1}}
     whole |= {"dense": {"linker": {"kind": "sequence-linking"}}, "images": {"max_size_px": 640}}
     try:
-        told = data.draw(mistyped(whole).filter(lambda tables: isinstance(tables, dict)))
-        toml_from_config(config_from_tables(told))
+        reported = data.draw(mistyped(whole).filter(lambda tables: isinstance(tables, dict)))
+        toml_from_config(config_from_tables(reported))
     except UsageError as refusal:
         require_sentence(f"{refusal}\n")

@@ -1,4 +1,4 @@
-"""Which pairs are matched: the wishes of the user, and the estimate of the overlap."""
+"""Pair selection: lists and windows of the user, and the estimate of the overlap."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -74,12 +74,12 @@ def test_the_tail_of_normal_noise_is_one():
 
 
 def test_other_estimates_have_intervals_that_hold_the_truth():
-    """Aspect, skew and the whole lens; what is assumed is told as assumed."""
+    """Aspect, skew and the whole lens; priors are reported as assumed."""
     scene = make_scene(sigma_px=0.5, points=300, seed=2)
     start = projective_reconstruction(scene)
-    wish = IntrinsicsOptions(aspect="constant", skew="constant", skew_std_px=50.0)
+    options = IntrinsicsOptions(aspect="constant", skew="constant", skew_std_px=50.0)
     found = MetricRefinement().refine(
-        start, true_calibration(scene), prior=prior_for(start, wish), rng=np.random.default_rng(0)
+        start, true_calibration(scene), prior=prior_for(start, options), rng=np.random.default_rng(0)
     )
     for name, truth in (("aspect", 1.0), ("skew_px", 0.0), ("k2", 0.0), ("k3", 0.0)):
         interval = found.intrinsics[0][name]

@@ -15,9 +15,9 @@ from thesisrecon.metric.resection import resect_calibrated
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 
 
-def run(scene, *, shared=True, reconstruction=None, variant=None, wish=None):
+def run(scene, *, shared=True, reconstruction=None, variant=None, options=None):
     start = projective_reconstruction(scene) if reconstruction is None else reconstruction
-    prior = prior_for(start, wish or IntrinsicsOptions(cameras="shared" if shared else "per-image"))
+    prior = prior_for(start, options or IntrinsicsOptions(cameras="shared" if shared else "per-image"))
     rng = np.random.default_rng(0)
     calibration = HypothesesAndRefinement().calibrate(start, prior=prior, rng=rng)
     return (variant or MetricRefinement()).refine(start, calibration, prior=prior, rng=rng)
@@ -105,7 +105,7 @@ def test_a_view_without_points_keeps_its_reason():
 
 def test_a_fixed_principal_point_is_reported_as_assumed():
     scene = make_scene(sigma_px=0.3, seed=7)
-    result = run(scene, wish=IntrinsicsOptions(principal_point="known", k1="known"))
+    result = run(scene, options=IntrinsicsOptions(principal_point="known", k1="known"))
     interval = result.intrinsics[0]["principal_x_px"]
     assert interval.value == pytest.approx((1536 - 1) / 2)
     assert interval.source == "assumed"
@@ -135,9 +135,9 @@ def test_the_same_seed_gives_the_same_bytes():
 
 def refine(scene, *, start=None, cameras="shared"):
     start = projective_reconstruction(scene) if start is None else start
-    wish = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
+    options = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
     rng = np.random.default_rng(0)
-    prior = prior_for(start, wish)
+    prior = prior_for(start, options)
     return MetricRefinement().refine(start, true_calibration(scene), prior=prior, rng=rng)
 
 

@@ -11,9 +11,9 @@ from thesisrecon.metric.adjustment import BundleAdjustment
 from thesisrecon.metric.checks import check_views, self_check, triangulable_observations
 from thesisrecon.metric.model import MetricEstimate, camera_rows, reproject_observations, retriangulate_tracks
 from thesisrecon.metric.shared_camera import (
-    inconsistent_principal_point,
     check_shared_cameras,
     contradicted_focal_priors,
+    inconsistent_principal_point,
 )
 from thesisrecon.metric.uncertainty import widen_unverified_focals
 from thesisrecon.numerics.block_scatter import BlockScatter
@@ -110,14 +110,14 @@ def test_points_behind_a_camera_are_detected():
     assert any("view 4" in doubt for doubt in doubts_of(behind, scene)[1])
 
 
-@pytest.mark.parametrize(("off", "deviation", "told"), [(1.0, 0.01, 0), (1.05, 0.003, 1), (1.05, 0.1, 0)])
-def test_a_focal_that_the_images_contradict_is_reported(off, deviation, told):
+@pytest.mark.parametrize(("off", "deviation", "reported"), [(1.0, 0.01, 0), (1.05, 0.003, 1), (1.05, 0.1, 0)])
+def test_a_focal_that_the_images_contradict_is_reported(off, deviation, reported):
     _, prior, model = setting(focal_px=1500.0 * off, focal_std_rel=deviation)
     adjustment = BundleAdjustment(prior, 0.0, 0.02)
     model = adjustment.run(model, iterations=10)[0]
     model = retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
     failed_checks = contradicted_focal_priors(model, adjustment)
-    assert len(failed_checks) == told
+    assert len(failed_checks) == reported
     assert all("contradict the focal length" in doubt for doubt in failed_checks)
 
 
@@ -187,9 +187,9 @@ def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself
     assert inconsistent_principal_point(middle, adjustment, scatter(12.0)) == []
 
 
-def settled(scene, **wish):
+def settled(scene, **options):
     """The model as the metric stage ends with it: adjusted and triangulated by turns."""
-    prior = prior_for(projective_reconstruction(scene), IntrinsicsOptions(**wish))
+    prior = prior_for(projective_reconstruction(scene), IntrinsicsOptions(**options))
     adjustment = BundleAdjustment(prior, 0.0, 0.02)
     model = true_model(scene, adjustment.prior)
     model = replace(model, sigma_px=30.0)
@@ -257,14 +257,15 @@ def test_uninformative_images_widen_the_interval_with_a_warning():
 
 
 @pytest.mark.parametrize(
-    "wish", [{"focal": "free"}, {"focal": "free", "principal_point": "known"}, {"principal_point": "known"}]
+    "options",
+    [{"focal": "free"}, {"focal": "free", "principal_point": "known"}, {"principal_point": "known"}],
 )
-def test_crops_are_detected_under_any_prior(wish):
+def test_crops_are_detected_under_any_prior(options):
     scene = make_scene(sigma_px=0.3, seed=7)
     shift = np.random.default_rng(1).uniform(-80.0, 80.0, (8, 2))
-    failed_checks = check_shared_cameras(*settled(changed(scene, np.ones(8), shift), **wish)).failed_checks
+    failed_checks = check_shared_cameras(*settled(changed(scene, np.ones(8), shift), **options)).failed_checks
     assert len(failed_checks) == 1
-    right = settled(scene, **wish)
+    right = settled(scene, **options)
     assert check_shared_cameras(*right).failed_checks == ()
 
 

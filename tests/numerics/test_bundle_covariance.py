@@ -105,7 +105,7 @@ def test_errors_are_as_large_as_the_covariances_say(populations):
         true = cameras.intrinsics.copy()
         xy = exact
         if prior is not None:
-            # The truth of a population is drawn from it anew, as its prior has it.
+            # The truth of each member is drawn from the hierarchical prior.
             true[1:, 0] = 1200.0 * np.exp(0.03 * rng.normal(size=5))
             moved = MetricCameras(c.R, c.t, true, np.arange(6))
             xy = project_block(moved, block.X, block.view, block.point)

@@ -179,8 +179,7 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
         view[1] = view[0]
     o = sort_observations(view, block.point, block.xy + rng.normal(size=block.xy.shape), 6, 30)
     c = block.cameras
-    # View 0 is held fixed; the focals are the views' own, the rest belongs to two groups, of which one has no
-    # third coefficient.
+    # View 0 is fixed; focals are per view, the rest belongs to two groups, one without third coefficient.
     own, common = np.array([0]), np.arange(1, 6)
     columns = np.arange(5) + 5 * c.group[:, None]
     columns[c.group == 1, 4] = -1

@@ -65,7 +65,7 @@ def test_iterations_bring_the_factors_to_the_noise_and_any_depths_will_do_to_beg
         once, often, affine = (
             factorize(xy, d, iterations=n).rms_px for d, n in ((depths, 0), (depths, 50), (None, 100))
         )
-        # 6 x 80 x 2 coordinates, of which the model takes 6 x 11 + 80 x 3 - 15.
+        # 6 x 80 x 2 coordinates; the model has 6 x 11 + 80 x 3 - 15 parameters.
         expected = np.sqrt(2.0 * (1.0 - (66 + 240 - 15) / 960))
         assert often < 1.1 * expected
         assert often <= once

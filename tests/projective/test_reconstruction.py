@@ -344,7 +344,7 @@ def test_views_of_one_plane_wait_and_the_others_are_as_without_them(seed):
 def test_a_camera_that_wrong_matches_placed_is_discarded_with_its_reason():
     scene = make_scene(points=500, sigma_px=NOISE_PX, seed=5)
     t = scene.tracks
-    # What view 7 sees is where a camera elsewhere would see it: a crowd of wrong matches that agree.
+    # View 7 has many wrong matches that agree with a camera elsewhere.
     elsewhere = Rotation.from_rotvec([0.0, 0.3, 0.0]).as_matrix() @ scene.R[7]
     mine = t.view_index == 7
     xy = t.xy.copy()

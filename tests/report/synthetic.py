@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw
 
-from tests.surface.sphere import SHAPE, image, ring_of
+from tests.surface.sphere import SHAPE, photograph, ring_of
 from tests.surface.sphere import K as SPHERE_K
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
@@ -203,7 +203,7 @@ ARGUMENTS = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    # The 3D views need WebGL; without a graphics card Chromium draws it in software only when told so.
+    # The 3D views need WebGL; without a graphics card Chromium needs these options to draw it.
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 ]
@@ -247,7 +247,7 @@ SPHERE_NAMES = tuple(f"sphere {k} <b>.jpg" for k in range(8))
 def sphere_model():
     """The sphere in at most 6000 triangles with the texture of its photographs."""
     mesh = simplify_mesh(VolumetricFusion().fuse(ring_of()), 6_000)
-    return TextureAtlas().texture(mesh, [image(m) for m in ring_of()])
+    return TextureAtlas().texture(mesh, [photograph(m) for m in ring_of()])
 
 
 @cache
@@ -276,7 +276,7 @@ def sphere_reconstruction():
 def sphere_run():
     """The whole page of it: model, depth of all photographs but the last, the third held out."""
     maps = ring_of()
-    rgb = [image(m).rgb for m in maps]
+    rgb = [photograph(m).rgb for m in maps]
     seen = np.isfinite(maps[2].depth)
     shifted = np.roll(rgb[2], 1, axis=1)
     return ReportData(

@@ -1,6 +1,4 @@
-"""What photographs, folders and headers are called cannot become part of a page: the page of a run with evil
-names has the elements and attributes of the page of the same run with plain ones, and runs nothing of theirs.
-"""
+"""Hostile names of images, folders and headers cannot inject elements, attributes or scripts into a page."""
 
 import json
 import re
@@ -107,11 +105,11 @@ def test_names_add_no_element_and_no_attribute(pages):
     assert not any(name.startswith("on") for _, names in other.elements for name in names)
     assert scripts(plain) == scripts(evil)
     assert len(scripts(evil)) == len(re.findall(r"sha256-", evil))
-    told = "".join(other.words)
+    reported = "".join(other.words)
     for name in SNARES[:5]:
-        assert name in told
-    assert "\\u2028<\\u202ebody" in told
-    assert "<script>alert(7)" in told
+        assert name in reported
+    assert "\\u2028<\\u202ebody" in reported
+    assert "<script>alert(7)" in reported
     for block in re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', evil, re.S):
         json.loads(block)
 

@@ -292,13 +292,13 @@ def test_the_table_of_cameras_has_a_column_for_every_estimate():
     }
     own = {"aspect": IntrinsicInterval(1.0023, 0.0004, "b"), "skew_px": IntrinsicInterval(0.5, 0.1, "b")}
 
-    def told(more):
+    def reported(more):
         views = tuple({**view, **more} if view else {} for view in data.metric.intrinsics)
         metric = dataclasses.replace(data.metric, intrinsics=views)
         return render_report(dataclasses.replace(data, metric=metric))
 
-    assert "Aspect (fy/fx)" not in told(square)
-    page = told(own)
+    assert "Aspect (fy/fx)" not in reported(square)
+    page = reported(own)
     assert page.index("Aspect (fy/fx)") < page.index("Skew (px)") < page.index("Principal x (px)")
     assert "1.0023 ± 0.0004" in page
     # At a quarter of the size: four times as much in the photograph.

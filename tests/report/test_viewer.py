@@ -19,7 +19,7 @@ from tests.report.synthetic import (
     sphere_reconstruction,
     sphere_run,
 )
-from tests.surface.sphere import SHAPE, K, image, ring_of
+from tests.surface.sphere import SHAPE, K, photograph, ring_of
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report import viewer
@@ -86,9 +86,9 @@ def test_a_model_with_colours_or_none_needs_no_texture():
 def test_the_viewer_stands_where_photographs_were_taken():
     data = data_of(sphere_model())
     names = [f"{k + 1} · {name}" for k, name in enumerate(SPHERE_NAMES)]
-    assert [stand["name"] for stand in data["stands"]] == names
+    assert [stand["name"] for stand in data["viewpoints"]] == names
     turn = upright()
-    for stand, P in zip(data["stands"], sphere_reconstruction().P, strict=True):
+    for stand, P in zip(data["viewpoints"], sphere_reconstruction().P, strict=True):
         R, t = decompose_camera(P)[1:]
         np.testing.assert_allclose(stand["eye"], turn @ (-R.T @ t), atol=1e-9)
         ahead = np.array(stand["target"]) - stand["eye"]
@@ -105,7 +105,7 @@ def test_views_without_a_camera_are_not_viewpoints():
     registered[3] = False
     P = reconstruction.P * registered[:, None, None]
     data = viewer_data(sphere_model(), replace(reconstruction, registered=registered, P=P), SPHERE_NAMES)
-    assert [stand["name"][0] for stand in data["stands"]] == list("1235678")
+    assert [stand["name"][0] for stand in data["viewpoints"]] == list("1235678")
 
 
 def test_a_texture_beyond_the_limit_is_reduced(monkeypatch):
@@ -300,9 +300,9 @@ def inner(view):
 @pytest.mark.browser
 @pytest.mark.parametrize("view", [0, 3, 6])
 def test_where_a_photograph_was_taken_the_model_looks_like_it(model_page, view):
-    model_page.page.select_option("#model-stand", str(view))
+    model_page.page.select_option("#model-viewpoint", str(view))
     picture = shown(model_page)
-    expected = image(ring_of()[view]).rgb.astype(int)
+    expected = photograph(ring_of()[view]).rgb.astype(int)
     difference = picture[where(picture)] - expected
     assert np.sqrt(np.mean(difference[inner(view)] ** 2)) < 14.0
     ground = np.array([0x13, 0x1A, 0x22])
@@ -315,11 +315,11 @@ def test_it_starts_at_a_photograph_and_comes_back_to_it(model_page):
     start = shown(model_page)
     model_page.page.get_by_role("button", name="Shape").click()
     model_page.page.locator("#model").get_by_role("button", name="From above").click()
-    assert model_page.page.input_value("#model-stand") == ""
+    assert model_page.page.input_value("#model-viewpoint") == ""
     assert apart(shown(model_page), start) > 0.1
     model_page.page.locator("#model-reset").click()
     assert apart(shown(model_page), start) == 0.0
-    assert model_page.page.input_value("#model-stand") != ""
+    assert model_page.page.input_value("#model-viewpoint") != ""
 
 
 @pytest.mark.browser

@@ -1,4 +1,4 @@
-"""Whoever does the work, the answers are the same bytes; whoever is lost, the run goes on."""
+"""Every executor gives the same bytes, and a run survives the loss of workers."""
 
 import builtins
 import concurrent.futures as futures
@@ -93,13 +93,13 @@ def test_surfaces_have_the_same_bytes_on_a_cluster_and_in_an_executor_of_ones_ow
 class DeadlyMatcher(fakes.FakeMatcher):
     """Kills the process it works in, once: when it comes to a pair and the file is not there."""
 
-    told: str = ""
+    reported: str = ""
     fatal: tuple[int, int] = (1, 2)
 
     def match(self, view1, view2, *, pair, estimate_fundamental, rng):
         if tuple(pair) == self.fatal:
             try:
-                os.close(os.open(self.told, os.O_CREAT | os.O_EXCL))
+                os.close(os.open(self.reported, os.O_CREAT | os.O_EXCL))
             except FileExistsError:
                 pass
             else:
@@ -108,7 +108,7 @@ class DeadlyMatcher(fakes.FakeMatcher):
 
 
 def deadly(tmp_path):
-    return fake_config(matching=DeadlyMatcher(told=str(tmp_path / "killed")))
+    return fake_config(matching=DeadlyMatcher(reported=str(tmp_path / "killed")))
 
 
 def undisturbed(tmp_path):

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from validation.studies.full_disk import Refusal, SmallRuns, disk_ends, filled, refused_at, table
-from validation.studies.kill_anywhere import different, outputs
+from validation.studies.robustness import Refusal, SmallRuns, disk_ends, filled, refused_at, table
+from validation.studies.robustness import different, outputs
 
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
@@ -262,9 +262,9 @@ def test_code_of_the_caller_counts_by_its_file(tmp_path, monkeypatch):
 
 def saved(path, record, *, packed=False, **arrays):
     """A file that is sealed, whatever it holds."""
-    told = json.dumps({"key": "k", "record": record}).encode()
+    reported = json.dumps({"key": "k", "record": record}).encode()
     save = np.savez_compressed if packed else np.savez
-    save(path, description=np.frombuffer(told, dtype=np.uint8), **arrays)
+    save(path, description=np.frombuffer(reported, dtype=np.uint8), **arrays)
     with zipfile.ZipFile(path, "a") as archive:
         archive.comment = _seal(archive)
     return path
@@ -321,9 +321,9 @@ CHANGES = [
 
 
 def told_otherwise(parts):
-    told = parts["description"].tobytes().replace(b'"n_views": 1', b'"n_views": 2')
-    assert told != parts["description"].tobytes()
-    return np.frombuffer(told, dtype=np.uint8)
+    reported = parts["description"].tobytes().replace(b'"n_views": 1', b'"n_views": 2')
+    assert reported != parts["description"].tobytes()
+    return np.frombuffer(reported, dtype=np.uint8)
 
 
 @pytest.mark.parametrize("change", [change for _, change in CHANGES], ids=[name for name, _ in CHANGES])

@@ -1,4 +1,4 @@
-"""Programs that are told to stop: at once, with a sentence and its exit code, whatever they are at."""
+"""Programs that receive a stop signal end at once with one message and their exit code."""
 
 import os
 import signal
@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from validation.studies.kill_anywhere import different, outputs
-from validation.studies.stop_anywhere import Stop, stopped, table
+from validation.studies.robustness import different, outputs
+from validation.studies.robustness import Stop, stopped, table
 
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import projective_reconstruction
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
-from thesisrecon.selfcalibration.hartley import CalibrationProblem
+from thesisrecon.selfcalibration.absolute_conic import CalibrationProblem
 from thesisrecon.selfcalibration.stratified import projective_scene
 from thesisrecon.selfcalibration.unknowns import solver_unknowns
 
@@ -18,20 +18,20 @@ CENTRED = IntrinsicsOptions(principal_point="known")
 CENTRED_ZOOM = IntrinsicsOptions(cameras="per-image", principal_point="known")
 
 
-def prior_for(scene, wish=CENTRED):
-    """The wish for the views of a scene."""
+def prior_for(scene, options=CENTRED):
+    """The prior for the views of a scene."""
     sizes = [(int(w), int(h)) for w, h in scene.sizes]
-    return prior_from_options(wish, sizes, np.full(len(sizes), np.nan), np.ones(len(sizes)))
+    return prior_from_options(options, sizes, np.full(len(sizes), np.nan), np.ones(len(sizes)))
 
 
-def setup(scene, wish=CENTRED, *, seed=0):
+def setup(scene, options=CENTRED, *, seed=0):
     """The scene behind a random projective transform, the true p, and what calibration is given."""
-    prior = prior_for(scene, wish)
+    prior = prior_for(scene, options)
     found = projective_scene(projective_reconstruction(scene, seed=seed), prior)
-    strata = CalibrationProblem(
+    problem = CalibrationProblem(
         found.frame, found.constraints, solver_unknowns(found.frame, prior), np.zeros((0, 2, 3))
     )
-    return found, true_plane(scene, found), strata
+    return found, true_plane(scene, found), problem
 
 
 def true_plane(scene, found):

@@ -12,11 +12,10 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.pipeline.outputs import write_affine
-from thesisrecon.selfcalibration.affine import affine_camera_centres, upgrade_to_affine
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
-from thesisrecon.selfcalibration.stratified import Stratified
+from thesisrecon.selfcalibration.stratified import Stratified, affine_camera_centres, upgrade_to_affine
 
 
 def affine_map(source, target):

@@ -139,18 +139,18 @@ def test_estimates_have_stds_of_the_size_of_their_errors(method):
 
 def test_unestimated_intrinsics_keep_the_std_of_the_prior():
     scene = make_scene(sigma_px=0.3, seed=1)
-    told = calibrate(ScannedQuadric(), scene, prior_for(scene, stds=(0.05, 0.0, 10.0)), seed=1)
-    np.testing.assert_allclose(told.K_std[:, 0, 2], 10.0)
-    np.testing.assert_allclose(told.K_std[:, 1, 2], 10.0)
-    assert not told.K_std[:, 0, 1].any()
-    relative = told.K_std / np.where(told.K == 0.0, 1.0, told.K)
+    reported = calibrate(ScannedQuadric(), scene, prior_for(scene, stds=(0.05, 0.0, 10.0)), seed=1)
+    np.testing.assert_allclose(reported.K_std[:, 0, 2], 10.0)
+    np.testing.assert_allclose(reported.K_std[:, 1, 2], 10.0)
+    assert not reported.K_std[:, 0, 1].any()
+    relative = reported.K_std / np.where(reported.K == 0.0, 1.0, reported.K)
     np.testing.assert_allclose(relative[:, 1, 1], np.hypot(relative[:, 0, 0], 0.05))
     untold = calibrate(ScannedQuadric(), scene, prior_for(scene, stds=(0.0, 0.0, np.inf)), seed=1)
     assert np.isnan(untold.K_std[:, :2, 2]).all()
     assert (untold.K_std[:, 0, 0] > 0.0).all()
 
 
-def test_a_bias_does_not_count_as_spread():
+def test_standard_deviations_exclude_bias():
     scene = make_scene(sigma_px=0.3, seed=1)
     answer = calibrate(LinearQuadric(), scene, prior_for(scene), seed=1)
     assert np.isnan(answer.K_std[:, (0, 1), (0, 1)]).all()
@@ -172,11 +172,11 @@ def test_a_known_aspect_and_principal_point_are_normalised_away():
     K[:, 1, 1] *= 1.2
     scene = replace(scene, K=K)
     scene = replace(scene, tracks=reprojected(scene))
-    told = prior_for(scene)
-    told.mean[:, 1], told.mean[:, 3:5] = 1.2, scene.K[0, :2, 2]
+    reported = prior_for(scene)
+    reported.mean[:, 1], reported.mean[:, 3:5] = 1.2, scene.K[0, :2, 2]
     for method in EXACT:
         answer = method.calibrate(
-            projective_reconstruction(scene, seed=4), prior=told, rng=np.random.default_rng(0)
+            projective_reconstruction(scene, seed=4), prior=reported, rng=np.random.default_rng(0)
         )
         np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-4)
 

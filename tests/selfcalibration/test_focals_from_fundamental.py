@@ -15,11 +15,11 @@ from thesisrecon.selfcalibration.candidates import square_pixel_calibrations
 from thesisrecon.selfcalibration.focals_from_fundamental import (
     FocalsFromFundamental,
     _dual_with_changes,
-    bougnoux_focals,
-    focal_posterior,
     _independence_factor,
     _kruppa_chi_square,
     _kruppa_whitening,
+    bougnoux_focals,
+    focal_posterior,
     pair_focals,
 )
 from thesisrecon.selfcalibration.frame import normalized_frame

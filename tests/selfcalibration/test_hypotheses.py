@@ -125,9 +125,9 @@ def test_a_focal_without_a_solution_is_named_and_not_requested():
 
 
 @pytest.mark.parametrize(
-    ("focals", "told"), [((900.0,), "900 px"), ((800.0, 900.0, 1000.0), "800 to 1000 px")]
+    ("focals", "reported"), [((900.0,), "900 px"), ((800.0, 900.0, 1000.0), "800 to 1000 px")]
 )
-def test_given_focals_without_a_solution_are_named(focals, told):
+def test_given_focals_without_a_solution_are_named(focals, reported):
     estimate = projective_reconstruction(make_scene(seed=6), seed=6)
     prior = prior_for(estimate, IntrinsicsOptions(focal_px=900.0, focal="known", cameras="per-image"))
     mean = prior.mean.copy()
@@ -135,7 +135,7 @@ def test_given_focals_without_a_solution_are_named(focals, told):
     frame = normalized_frame(estimate, replace(prior, mean=mean))
     with pytest.raises(StageFailure, match="near the focal length that was given") as failure:
         select_candidate(frame, estimate, RotationCriterion(), [], max_candidates=3, min_in_front_ratio=0.9)
-    assert f"{told} (+-" in failure.value.evidence
+    assert f"{reported} (+-" in failure.value.evidence
 
 
 def test_the_cost_of_the_scan_is_its_formula():

@@ -14,7 +14,7 @@ from tests.synthetic import make_scene
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conics import calibration_from_dual_image
 from thesisrecon.intrinsics import IntrinsicsOptions
-from thesisrecon.selfcalibration.hartley import (
+from thesisrecon.selfcalibration.absolute_conic import (
     FixedPlaneQuadric,
     LinearAbsoluteConic,
     dual_conic_of_constant_camera,
@@ -46,21 +46,23 @@ def test_the_dual_image_is_carried_exactly_by_homographies_of_determinant_one(se
 
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda w: type(w).__name__)
-@pytest.mark.parametrize(("wish", "zoom"), [(CENTRED, 0.0), (CENTRED_ZOOM, 0.3), (NOTHING_BUT_CONSTANT, 0.0)])
+@pytest.mark.parametrize(
+    ("options", "zoom"), [(CENTRED, 0.0), (CENTRED_ZOOM, 0.3), (NOTHING_BUT_CONSTANT, 0.0)]
+)
 @pytest.mark.parametrize("seed", range(3))
-def test_the_true_plane_gives_the_true_calibrations(way, wish, zoom, seed):
-    shift = (60.0, -45.0) if wish is NOTHING_BUT_CONSTANT else (0.0, 0.0)
+def test_the_true_plane_gives_the_true_calibrations(way, options, zoom, seed):
+    shift = (60.0, -45.0) if options is NOTHING_BUT_CONSTANT else (0.0, 0.0)
     scene = make_scene(zoom=zoom, seed=seed, principal_shift=shift)
-    found, plane, strata = setup(scene, wish, seed=seed)
-    K = pixels(found, way.calibrations(strata, plane))
+    found, plane, problem = setup(scene, options, seed=seed)
+    K = pixels(found, way.calibrations(problem, plane))
     np.testing.assert_allclose(K[:, 0, 0], scene.K[:, 0, 0], rtol=1e-8)
     np.testing.assert_allclose(K, scene.K, atol=2e-5)
 
 
 def test_roughly_known_principal_points_move_towards_the_truth():
     scene = make_scene(seed=3, principal_shift=(12.0, -9.0))
-    found, plane, strata = setup(scene, IntrinsicsOptions(), seed=3)
-    K = pixels(found, LinearAbsoluteConic().calibrations(strata, plane))
+    found, plane, problem = setup(scene, IntrinsicsOptions(), seed=3)
+    K = pixels(found, LinearAbsoluteConic().calibrations(problem, plane))
     np.testing.assert_allclose(K[:, 0, 0], scene.K[:, 0, 0], rtol=2e-3)
     assert np.linalg.norm(K[0, :2, 2] - scene.K[0, :2, 2]) < 5.0
 
@@ -68,9 +70,9 @@ def test_roughly_known_principal_points_move_towards_the_truth():
 @pytest.mark.parametrize("focal", [500.0, 6000.0])
 def test_short_and_long_lenses_need_no_guess(focal):
     scene = make_scene(seed=2, focal=focal)
-    found, plane, strata = setup(scene, CENTRED, seed=2)
+    found, plane, problem = setup(scene, CENTRED, seed=2)
     for way in WAYS:
-        K = pixels(found, way.calibrations(strata, plane))
+        K = pixels(found, way.calibrations(problem, plane))
         np.testing.assert_allclose(K[:, 0, 0], focal, rtol=1e-7)
 
 
@@ -117,27 +119,27 @@ def test_turns_measures_the_rotation_and_its_axis():
 def test_one_axis_of_rotation_is_named():
     scene = make_scene(seed=0)
     turned = turned_about_one_axis(scene, np.linspace(-20.0, 20.0, 8))
-    _, plane, strata = setup(turned, NOTHING_BUT_CONSTANT)
+    _, plane, problem = setup(turned, NOTHING_BUT_CONSTANT)
     with pytest.raises(StageFailure, match=r"one axis.*one-parameter|one-parameter.*one axis"):
-        LinearAbsoluteConic().calibrations(strata, plane)
+        LinearAbsoluteConic().calibrations(problem, plane)
     with pytest.raises(StageFailure, match="one-parameter"):
-        FixedPlaneQuadric().calibrations(strata, plane)
+        FixedPlaneQuadric().calibrations(problem, plane)
 
 
 def test_cameras_that_do_not_turn_are_named():
     turned = turned_about_one_axis(make_scene(seed=0), np.zeros(8))
-    _, plane, strata = setup(turned, NOTHING_BUT_CONSTANT)
-    with pytest.raises(StageFailure, match="do not turn"):
-        LinearAbsoluteConic().calibrations(strata, plane)
+    _, plane, problem = setup(turned, NOTHING_BUT_CONSTANT)
+    with pytest.raises(StageFailure, match="do not rotate"):
+        LinearAbsoluteConic().calibrations(problem, plane)
 
 
 def test_a_wrong_plane_without_a_real_camera_is_refused_with_its_eigenvalues():
     scene = make_scene(seed=1)
-    _, plane, strata = setup(scene, NOTHING_BUT_CONSTANT, seed=1)
+    _, plane, problem = setup(scene, NOTHING_BUT_CONSTANT, seed=1)
     refused = 0
     for shift in np.random.default_rng(0).normal(0.0, 2.0, (20, 3)):
         try:
-            LinearAbsoluteConic().calibrations(strata, plane + shift)
+            LinearAbsoluteConic().calibrations(problem, plane + shift)
         except StageFailure as failure:
             refused += "eigenvalues" in str(failure)
     assert refused > 0
@@ -145,9 +147,9 @@ def test_a_wrong_plane_without_a_real_camera_is_refused_with_its_eigenvalues():
 
 def test_a_plane_through_a_camera_is_refused():
     scene = make_scene(seed=1)
-    found, plane, strata = setup(scene, seed=1)
+    found, plane, problem = setup(scene, seed=1)
     other = 0 if found.frame.reference else 1
     centre = -np.linalg.solve(found.frame.A[other], found.frame.a[other])
     through = plane - (plane @ centre + 1.0) / (centre @ centre) * centre
-    with pytest.raises(StageFailure, match="runs through a camera"):
-        LinearAbsoluteConic().calibrations(strata, through)
+    with pytest.raises(StageFailure, match="passes through a camera"):
+        LinearAbsoluteConic().calibrations(problem, through)

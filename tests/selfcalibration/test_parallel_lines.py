@@ -178,19 +178,19 @@ def test_fitted_segments_run_through_their_points():
 
 def courtyard(views):
     """The true cameras of the courtyard with points strewn over the yard."""
-    told = load_fixture_scene()
-    assert told.K is not None
-    assert told.R is not None
-    assert told.C is not None
+    reported = load_fixture_scene()
+    assert reported.K is not None
+    assert reported.R is not None
+    assert reported.C is not None
     X = np.random.default_rng(0).uniform([-3.0, -2.5, 0.2], [3.0, -0.2, 3.0], (200, 3))
-    t = -np.einsum("vij,vj->vi", told.R, told.C)[views]
-    K, R = told.K[views], told.R[views]
+    t = -np.einsum("vij,vj->vi", reported.R, reported.C)[views]
+    K, R = reported.K[views], reported.R[views]
     seen = np.einsum("vij,nj->vni", K @ R, X) + (K @ t[..., None])[:, None, :, 0]
     point, view = np.indices((len(X), len(views))).reshape(2, -1)
     xy = (seen[..., :2] / seen[..., 2:])[view, point]
     tracks = Tracks(view, point, xy, len(views), len(X))
     sizes = np.tile([1024, 768], (len(views), 1))
-    return TrueScene(K, R, t, X, 0.0, tracks, sizes), [told.image_paths[v] for v in views]
+    return TrueScene(K, R, t, X, 0.0, tracks, sizes), [reported.image_paths[v] for v in views]
 
 
 def test_parallel_lines_are_found_in_photographs():

@@ -9,14 +9,14 @@ from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CO
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralityRegion, CheiralitySearch, _local_minima
-from thesisrecon.selfcalibration.hartley import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.modulus import (
     ModulusConstraint,
+    _pairs_of_constant_cameras,
     modulus_coefficients,
     modulus_quartic,
     modulus_residuals,
-    _pairs_of_constant_cameras,
 )
 from thesisrecon.selfcalibration.refinement import minimize_batch
 from thesisrecon.selfcalibration.stratified import Stratified
@@ -123,7 +123,7 @@ def test_zooming_cameras_are_found_by_the_search_and_refused_by_the_modulus_cons
     given, prior = projective_reconstruction(scene, seed=6), prior_for(scene, CENTRED_ZOOM)
     answer = Stratified(refine=False).calibrate(given, prior=prior, rng=np.random.default_rng(0))
     np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[:, 0, 0], rtol=1e-8)
-    with pytest.raises(StageFailure, match="three photographs of one camera"):
+    with pytest.raises(StageFailure, match="three images of one camera"):
         Stratified(ModulusConstraint()).calibrate(given, prior=prior, rng=np.random.default_rng(0))
 
 
@@ -142,7 +142,9 @@ def test_noise_moves_the_focal_by_little(plane, way):
 
 def test_the_modulus_descent_lowers_every_start():
     found, plane, _ = setup(make_scene(seed=8))
-    c = modulus_coefficients(found.frame.A, found.frame.a, _pairs_of_constant_cameras(found.constraints.first))
+    c = modulus_coefficients(
+        found.frame.A, found.frame.a, _pairs_of_constant_cameras(found.constraints.first)
+    )
     starts = plane + 0.02 * np.random.default_rng(0).normal(size=(10, 3))
     ends, cost = minimize_batch(lambda p: modulus_residuals(c, p)[0], starts, iterations=60, loss_scale=0.05)
     assert cost.max() < 1e-20

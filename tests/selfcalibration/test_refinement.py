@@ -75,9 +75,11 @@ def test_unknowns_are_the_free_intrinsics():
 
 def test_a_known_focal_counts_for_its_own_camera_only():
     scene = make_scene(views=6, zoom=0.3, sigma_px=0.5, seed=3)
-    told = prior_for(scene, shared=False)
-    told.mean[:2, 0], told.std[:2, 0] = scene.K[:2, 0, 0], 0.001
-    answer = HypothesesAndRefinement().calibrate(adjusted(scene, 3), prior=told, rng=np.random.default_rng(0))
+    reported = prior_for(scene, shared=False)
+    reported.mean[:2, 0], reported.std[:2, 0] = scene.K[:2, 0, 0], 0.001
+    answer = HypothesesAndRefinement().calibrate(
+        adjusted(scene, 3), prior=reported, rng=np.random.default_rng(0)
+    )
     np.testing.assert_allclose(answer.K[:2, 0, 0], scene.K[:2, 0, 0], rtol=5e-3)
     np.testing.assert_allclose(answer.K[2:, 0, 0], scene.K[2:, 0, 0], rtol=3e-2)
 

@@ -136,14 +136,14 @@ def test_working_pixels_map_back_to_pixels_of_the_file():
     true = TrueDisparity(walled, (0, 1), "metric")
     larger = (2 * SIZE[0], 2 * SIZE[1])
     own = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE))
-    told = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (larger, larger))
-    assert told.sigma.shape == (2 * SIZE[1], 2 * SIZE[0])
+    reported = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (larger, larger))
+    assert reported.sigma.shape == (2 * SIZE[1], 2 * SIZE[0])
     # The middle of four pixels is the pixel of the smaller photograph.
-    four = np.mean([told.xy[a::2, b::2] for a in (0, 1) for b in (0, 1)], axis=0)
+    four = np.mean([reported.xy[a::2, b::2] for a in (0, 1) for b in (0, 1)], axis=0)
     apart = np.abs((four + 0.5) / 2.0 - 0.5 - own.xy)
     assert np.nanmedian(apart) < 1e-3
     assert np.nanquantile(apart, 0.99) < 0.02
-    assert np.nanmedian(told.sigma[::2, ::2] / own.sigma) == pytest.approx(2.0, rel=0.01)
+    assert np.nanmedian(reported.sigma[::2, ::2] / own.sigma) == pytest.approx(2.0, rel=0.01)
 
 
 def test_disparities_are_interpolated_on_a_surface_and_not_across_its_edge():

@@ -99,7 +99,7 @@ def test_views_without_common_points_have_no_depth(stereo, common):
 
 @BOTH
 def test_a_range_that_the_points_do_not_cover(stereo):
-    """The fence has no points: what of it is wrongly seen at the wall is little."""
+    """The fence has no points; few of its pixels get the depth of the wall."""
     scene = observed(photograph_scene(abreast(0.4), fence()), lambda r: r.X[r.tracks.point_index, 2] > 5.0)
     _, wrong, _ = solve(stereo, scene)
     assert wrong < (0.01 if stereo is DEFAULT else 0.1)

@@ -25,10 +25,10 @@ from thesisrecon.stereo.path_kernels import (
 from thesisrecon.stereo.postprocessing import (
     best_disparities,
     check_left_right,
+    edge_preserving_mean,
     fill_pinholes,
     final_confidence,
     remove_speckles,
-    edge_preserving_mean,
     squared_gradient,
 )
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED, solve_row
@@ -275,7 +275,7 @@ def price_of(costs, first, prices, above, left, right):
     assert all(right[j] == x - j for x, j in pairs)
     assert (right != OCCLUDED).sum() == len(pairs)
     assert all(b[0] > a[0] and b[1] > a[1] for a, b in itertools.pairwise(pairs))
-    # No other match is left: what the program says of these alone is their price.
+    # No other match is left: the dynamic program returns the cost of these alone.
     fixed = np.full_like(costs, NO_MATCH)
     for x, j in pairs:
         fixed[x - j - first, x] = costs[x - j - first, x]

@@ -85,9 +85,9 @@ def test_no_pixel_shrinks_by_more_than_is_stated_and_none_is_mirrored(method, mo
     for side in (0, 1):
         inside = np.isfinite(rectified.rectified_from_original(side, pair.regions[side])).all(axis=1)
         J = jacobians(rectified, side, pair.regions[side][inside])
-        told = np.isfinite(J).all(axis=(1, 2))
-        assert (np.linalg.det(J[told]) > 0.0).all()
-        assert told.mean() > 0.95
+        reported = np.isfinite(J).all(axis=(1, 2))
+        assert (np.linalg.det(J[reported]) > 0.0).all()
+        assert reported.mean() > 0.95
 
 
 @holds_for_every(st.sampled_from(CASES), examples=60)

@@ -137,8 +137,8 @@ def test_wrong_standard_deviations_change_little():
     clean, noisy = sphere_map(0, camera), sphere_map(0, camera, noise=0.01)
     rms = []
     for factor in (0.3, 1.0, 3.0):
-        told = replace(noisy, std=np.float32(factor) * noisy.std)
-        rms.append(float(np.sqrt(np.mean(errors(BSplineSurface(), told, clean) ** 2))))
+        reported = replace(noisy, std=np.float32(factor) * noisy.std)
+        rms.append(float(np.sqrt(np.mean(errors(BSplineSurface(), reported, clean) ** 2))))
     assert max(rms) < 1.3 * min(rms)
 
 

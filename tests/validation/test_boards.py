@@ -31,8 +31,8 @@ def test_a_calibration_finds_the_camera_that_photographed(way):
     board = make_board(way, VIEWS)
     corners = np.array([board_corners(picture, CORNERS) for picture in photographs(way, board)])
     found = calibrate_from_corners(board.X, list(corners), SIZE)
-    told = {"corners": corners, "K": found.K, "k1": np.array(found.k1), "std": found.std}
-    numbers = {row.name.split(": ")[1]: row.values[OURS] for row in _metrics("boards", way, board, told)}
+    reported = {"corners": corners, "K": found.K, "k1": np.array(found.k1), "std": found.std}
+    numbers = {row.name.split(": ")[1]: row.values[OURS] for row in _metrics("boards", way, board, reported)}
     limits = {"corners": 0.02, "focal length": 0.1, "principal point": 0.7, "distortion": 3e-3}
     for name, limit in limits.items():
         value = numbers[name]
@@ -40,7 +40,7 @@ def test_a_calibration_finds_the_camera_that_photographed(way):
         assert value < limit, name
     if way == LENS:
         assert found.k1 == pytest.approx(K1, abs=3e-3)
-    shifted = told | {"corners": corners + 0.5, "K": K + np.diag([3.0, 3.0, 0.0])}
+    shifted = reported | {"corners": corners + 0.5, "K": K + np.diag([3.0, 3.0, 0.0])}
     wrong = {row.name.split(": ")[1]: row.values[OURS] for row in _metrics("boards", way, board, shifted)}
     assert wrong["corners"] == pytest.approx(0.5 * np.sqrt(2.0), abs=0.05)
     assert wrong["focal length"] == pytest.approx(100.0 * 3.0 / K[0, 0])

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from validation.studies.dinosaur import compare, to_metrics
+from validation.studies.calibration_real import Rows
+from validation.studies.projective import compare, to_metrics
+from validation.studies.main_job import COLMAP, OURS
 
 import thesisrecon
 from tests.validation.test_metrics import _reconstruction, _truth
@@ -14,10 +16,8 @@ from validation.metrics.intervals import IntervalScores, focal_errors_pct, holdi
 from validation.scenes.dinosaur import load_dinosaur
 from validation.scenes.real import Scene, load_real_scene
 from validation.scenes.zoomed import rezoom_scene
-from validation.studies.calibration_bench import Rows
 from validation.studies.calibration_parts import keep_observations, one_camera
 from validation.studies.calibration_real import _change_pct, _pooled, _told
-from validation.studies.reconstruction import COLMAP, OURS
 
 
 def rows_of(models):
@@ -65,9 +65,9 @@ def test_missing_cameras_count_in_pooled_results():
 def test_a_change_is_relative_and_unknown_without_a_focal():
     assert _change_pct(1010.0, 1000.0) == pytest.approx(1.0)
     assert _change_pct(None, 1000.0) is None
-    told = _told(5000.0)(PipelineConfig()).intrinsics
-    assert told.focal_px == 5000.0
-    assert told.focal_std_rel == pytest.approx(np.log(5.0))
+    reported = _told(5000.0)(PipelineConfig()).intrinsics
+    assert reported.focal_px == 5000.0
+    assert reported.focal_std_rel == pytest.approx(np.log(5.0))
 
 
 def test_a_value_that_all_views_share_counts_once():

@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from validation.studies.epipolar_certainty import (
+from validation.studies.epipolar_synthetic import (
     certainty_metrics,
     certainty_table,
     check_degeneracy,

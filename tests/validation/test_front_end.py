@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from validation.studies.front_end import Copy, make_copies, repeatability, score_copy
+from validation.studies.front_end import CONTRADICTS_PX, disagreement, judge
 
 from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project_camera
 from thesisrecon.io.images import read_images
 from thesisrecon.records import Features, Image, Reconstruction, Tracks, TwoView
 from validation.scenes.real import load_real_scene
-from validation.studies.front_end_invariance import Copy, make_copies, repeatability, score_copy
-from validation.studies.front_end_kermit import CONTRADICTS_PX, disagreement, judge
 from validation.studies.front_end_pairs import OURS, SIFT, check_pairs, front_ends, measure_pairs
 
 # (scene, gap): pairs measured, least ratio of verified matches and largest of sigma, and error of F in px.

@@ -59,9 +59,9 @@ def test_every_gate_holds(gate, results):
     scene = scene_of(gate)
     if scene not in HERE:
         pytest.skip(f"{scene} is not on this machine (THESISRECON_DATA)")
-    told = results(scene in ALWAYS)
-    found = [row for row in told.rows if row.key == gate.key]
-    assert found, f"nobody told this number; what did not run: {dict(told.failures)}"
+    reported = results(scene in ALWAYS)
+    found = [row for row in reported.rows if row.key == gate.key]
+    assert found, f"nobody told this number; what did not run: {dict(reported.failures)}"
     assert gate.holds(found[0].value), f"{found[0].value} {found[0].unit}, {gate.reason}"
 
 

@@ -7,6 +7,8 @@ from PIL import Image
 
 pytest.importorskip("pycolmap")
 
+from validation.studies.main_job import COLMAP, OURS
+
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import colmap_from_reconstruction
 from thesisrecon.io.colmap_files import write_colmap_model
@@ -17,12 +19,11 @@ from validation.metrics.record import Metric
 from validation.references.colmap_mapping import read_run
 from validation.references.colmap_run import reconstruct_with_pycolmap
 from validation.scenes.real import Scene, load_fixture_scene
-from validation.studies.reconstruction import COLMAP, OURS
 
 from .test_cameras import N, V, _reconstruction, _truth
 
 
-def test_a_process_is_measured_with_its_children(tmp_path):
+def test_a_process_reports_memory_time_and_output(tmp_path):
     program = "import os, sys; b = bytearray(200_000_000); print(len(os.sched_getaffinity(0))); sys.exit(3)"
     log = tmp_path / "log" / "out.txt"
     done = run_process([sys.executable, "-c", program], log=log, cores=own_cores()[:1], environment={})
@@ -68,12 +69,12 @@ def test_the_table_is_made_from_saved_results(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(main_job, "find_scenes", lambda _names: [scene])
     assert main_job.main(["-o", str(tmp_path / "out"), "--scenes", "fountain-P11"]) == 1
 
-    told = json.loads((tmp_path / "out" / "main_job.json").read_text())["scenes"]["fountain-P11"]
-    rows = {row["name"]: row for row in told["rows"]}
+    reported = json.loads((tmp_path / "out" / "main_job.json").read_text())["scenes"]["fountain-P11"]
+    rows = {row["name"]: row for row in reported["rows"]}
     assert rows["focal error"]["verdict"] == "reached"
     assert rows["wall time"]["values"][COLMAP] == 6.0
-    assert told["seconds"][OURS] == {"features": 1.5}
-    assert len(told["failures"]) == 2
+    assert reported["seconds"][OURS] == {"features": 1.5}
+    assert len(reported["failures"]) == 2
     text = (tmp_path / "out" / "main_job.md").read_text()
     assert "## fountain-P11" in text
     assert text in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Small faults of the library, found and told; that tests catch them takes its time and is run by hand."""
+"""Small faults of the library are found and listed; the long mutation run is started by hand."""
 
 import ast
 from pathlib import Path
@@ -95,10 +95,10 @@ def test_surviving_faults_are_tested_again_and_the_rest_is_kept(monkeypatch, tmp
             yield Verdict(mutant, "a test" if number or len(judged) > 1 else "", 1.0)
 
     monkeypatch.setattr(mutants, "judge_all", judge_all)
-    wish = ["-o", str(tmp_path), "--packages", "geometry", "--sample", "4", "--warm"]
-    assert mutants.main(wish) == 1
+    options = ["-o", str(tmp_path), "--packages", "geometry", "--sample", "4", "--warm"]
+    assert mutants.main(options) == 1
     assert "4 faults, 75 % caught" in capsys.readouterr().out
-    assert mutants.main([*wish, "--again"]) == 0
+    assert mutants.main([*options, "--again"]) == 0
     assert judged == [4, 1]
     assert "4 faults, 100 % caught" in capsys.readouterr().out
     assert len(mutants.read_verdicts(tmp_path / "mutants.json")) == 4

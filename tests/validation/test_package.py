@@ -1,4 +1,4 @@
-"""The package as it is built and installed: what can be told without building it, and where a run writes."""
+"""The package as it is built and installed: checks without building it, and where a run writes."""
 
 import shutil
 import sys
@@ -6,13 +6,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from validation.studies.package.installed import Watched, trespasses, watch
+from validation.studies.package.environments import Part, counted, quick_parts, run_part, suite_faults
 
 from thesisrecon.io.pair_list import DEMO_IMAGES, demo_images
 from validation.scenes.real import ROOT
 from validation.studies.package.built import NEEDED, wheel_faults
 from validation.studies.package.environments import dependencies, lowest_versions
-from validation.studies.package.quiet import Watched, trespasses, watch
-from validation.studies.package.suite import Part, counted, quick_parts, run_part, suite_faults
 
 
 def test_the_wheel_carries_the_photographs_of_the_demo():
@@ -69,10 +69,10 @@ def test_missing_and_foreign_files_of_a_wheel_are_reported():
     good = [*NEEDED, *photographs, "thesisrecon/cli/main.py", "thesisrecon-0.1.0.dist-info/METADATA"]
     assert wheel_faults(good, 1_000_000) == []
     strangers = ["tests/cli/test_cli.py", "thesisrecon/__pycache__/cli.cpython-311.pyc"]
-    told = wheel_faults([*good[1:], *strangers], 9_000_000)
-    assert told[0] == "thesisrecon/py.typed is missing"
-    assert told[1:3] == [f"{name} does not belong there" for name in strangers]
-    assert "9.00 MB" in told[3]
+    reported = wheel_faults([*good[1:], *strangers], 9_000_000)
+    assert reported[0] == "thesisrecon/py.typed is missing"
+    assert reported[1:3] == [f"{name} does not belong there" for name in strangers]
+    assert "9.00 MB" in reported[3]
     assert wheel_faults(good[: len(NEEDED)], 1) == [f"0 photographs instead of {DEMO_IMAGES}"]
 
 

@@ -1,4 +1,4 @@
-"""Ways of a camera: even, upright, clear of the model, and right at their ends."""
+"""Camera paths: even, upright, clear of the model, and exact at their ends."""
 
 from itertools import pairwise
 

@@ -183,14 +183,14 @@ def _true_places():
     return places, (_hidden(X1, PAIR.R, PAIR.t), _hidden(X2, *STILL))
 
 
-@pytest.mark.parametrize("told", ["nothing", "the foreground"])
-def test_hidden_pixels_are_found_out_and_take_the_background(told):
+@pytest.mark.parametrize("reported", ["nothing", "the foreground"])
+def test_hidden_pixels_are_found_out_and_take_the_background(reported):
     places, hidden = _true_places()
     given = [there.copy() for there in places]
     for side in (0, 1):
         inside = np.all((places[side] > 0.0) & (places[side] < np.array(SIZE) - 1.0), axis=2)
         given[side][hidden[side]] = np.nan
-        if told == "the foreground":
+        if reported == "the foreground":
             # As a matcher does that fattens what is in front.
             given[side][hidden[side] & inside] = places[side][60, 80]
     complete, known = complete_correspondence(PAIR, (given[0], given[1]), agree_px=1.5)
@@ -204,7 +204,7 @@ def test_hidden_pixels_are_found_out_and_take_the_background(told):
         np.testing.assert_array_equal(complete[side][known[side]], given[side][known[side]])
 
 
-def test_the_prior_is_trusted_on_request():
+def test_all_places_are_trusted_without_a_limit():
     places, _ = _true_places()
     complete, known = complete_correspondence(PAIR, places, agree_px=np.inf)
     assert known[0].all()

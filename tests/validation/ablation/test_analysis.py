@@ -28,8 +28,8 @@ def rows_of(study, value):
 
 
 def darts(**more):
-    told = {"scenes": ["a"], "seeds": 20, "task": Darts()}
-    return Study({"task.aim": [1.0, 2.0]}, **{**told, **more})
+    stated = {"scenes": ["a"], "seeds": 20, "task": Darts()}
+    return Study({"task.aim": [1.0, 2.0]}, **{**stated, **more})
 
 
 def compared(rows, variant, measure="miss"):
@@ -125,15 +125,15 @@ def test_tables_hold_every_row_and_comparison(tmp_path):
     )
     written = {path.name: path for path in write_tables(analyse(rows), tmp_path)}
     with written["rows.csv"].open(encoding="utf-8") as file:
-        told = list(csv.DictReader(file))
-    assert len(told) == 3 * 2 * 20
-    assert told[0]["axis:task.spread"] == "spread = 1"
-    assert {r["failure"] for r in told} == {"", "gone"}
-    assert {r["miss"] for r in told if r["failure"]} == {""}
+        stated = list(csv.DictReader(file))
+    assert len(stated) == 3 * 2 * 20
+    assert stated[0]["axis:task.spread"] == "spread = 1"
+    assert {r["failure"] for r in stated} == {"", "gone"}
+    assert {r["miss"] for r in stated if r["failure"]} == {""}
     assert "| miss, cm | spread = 1 | spread = 2 | cost, s |" in written["tables.md"].read_text()
     with written["comparisons.csv"].open(encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == 2 * 2 * 2
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra tables is not installed")
     table = parquet.read_table(written["rows.parquet"])
-    assert table.num_rows == len(told)
+    assert table.num_rows == len(stated)
     assert table.column("miss").null_count == 3 * 2

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from validation.studies.stop_anywhere import stopped
+from validation.studies.robustness import stopped
 
 from tests.report.synthetic import Witness
 from tests.validation.ablation.toy import Darts, marks
@@ -37,27 +37,27 @@ def write_study(folder, scene="bb"):
 
 
 def test_a_study_of_a_file_leaves_a_page_and_tables(tmp_path, capsys):
-    wish = ["ablate", str(write_study(tmp_path)), "-o", str(tmp_path / "out"), "--executor", "local"]
-    assert main([*wish, "--plan"]) == 0
+    options = ["ablate", str(write_study(tmp_path)), "-o", str(tmp_path / "out"), "--executor", "local"]
+    assert main([*options, "--plan"]) == 0
     assert "3 variants: unchanged; aim = 1; aim = 4" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
-    assert main([*wish, "--threads", "1"]) == 0
-    told = capsys.readouterr()
-    assert told.out.startswith("18 rows; the page is ")
-    assert told.err == "", "nobody looks at a terminal"
+    assert main([*options, "--threads", "1"]) == 0
+    reported = capsys.readouterr()
+    assert reported.out.startswith("18 rows; the page is ")
+    assert reported.err == "", "nobody looks at a terminal"
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "Throws" in page
     assert "aim = 4" in page
     assert (tmp_path / "out" / "rows.csv").is_file()
-    assert main([*wish, "--read"]) == 0
+    assert main([*options, "--read"]) == 0
 
 
 def test_an_interrupted_study_states_how_to_resume(tmp_path):
     file = write_study(tmp_path)
     file.write_text(file.read_text().replace(":Darts", f':Darts", pause_s = 600, log = "{tmp_path / "log"}'))
-    wish = ["ablate", str(file), "-o", str(tmp_path / "out"), "--threads", "2"]
+    options = ["ablate", str(file), "-o", str(tmp_path / "out"), "--threads", "2"]
     stop = stopped(
-        [sys.executable, "-m", "validation", *wish],
+        [sys.executable, "-m", "validation", *options],
         lambda: len(marks(tmp_path / "log")) == 2,
         signal.SIGINT,
         environment={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -88,7 +88,7 @@ def test_failed_rows_and_wrong_options_have_their_exit_codes(tmp_path, capsys):
     assert "there is no scene 'nowhere'" in capsys.readouterr().err
 
 
-def test_the_view_has_a_text_alternative():
+def test_the_progress_text_reports_failures_and_time_left():
     state = State(10, kept=2, width=1, steps=3)
     assert words_of(state) == "0 of 3 shared steps"
     state.steps_done, state.done, state.failed = 3, 4, 1

@@ -24,8 +24,8 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def study(log, **more):
-    told = {"scenes": ["a", "bb"], "seeds": 2, "task": Darts(log=str(log))}
-    return Study({"task.aim": [1.0, 2.0]}, **{**told, **more})
+    reported = {"scenes": ["a", "bb"], "seeds": 2, "task": Darts(log=str(log))}
+    return Study({"task.aim": [1.0, 2.0]}, **{**reported, **more})
 
 
 def test_every_row_is_computed_once_and_reported_in_order(tmp_path):
@@ -50,13 +50,13 @@ def test_every_row_is_computed_once_and_reported_in_order(tmp_path):
 
 def test_a_row_on_disk_stands_on_its_own(tmp_path):
     rows = ablate(study(tmp_path / "log", seeds=1), tmp_path / "out", executor="local")
-    told = json.loads((tmp_path / "out" / "rows" / f"{rows[1].key}.json").read_text())
-    assert told["variant"] == "aim = 1"
-    assert told["task"]["aim"] == 1.0
-    assert told["config"]["epipolar"]["kind"] == "locally-optimised-ransac"
-    assert told["versions"]["numpy"] == np.__version__
-    assert told["metrics"] == dict(rows[1].metrics)
-    assert told["seconds"] > 0.0
+    reported = json.loads((tmp_path / "out" / "rows" / f"{rows[1].key}.json").read_text())
+    assert reported["variant"] == "aim = 1"
+    assert reported["task"]["aim"] == 1.0
+    assert reported["config"]["epipolar"]["kind"] == "locally-optimised-ransac"
+    assert reported["versions"]["numpy"] == np.__version__
+    assert reported["metrics"] == dict(rows[1].metrics)
+    assert reported["seconds"] > 0.0
 
 
 def test_a_damaged_row_is_computed_again(tmp_path):
@@ -72,11 +72,11 @@ def test_failures_are_stored_with_their_reason_and_not_retried(tmp_path):
     log = tmp_path / "log"
     failing = study(log, scenes=["a", "refuses", "breaks", "empty"], seeds=1)
     rows = ablate(failing, tmp_path / "out", executor="local")
-    told = {r.scene: r.failure for r in rows}
-    assert told["a"] == ""
-    assert told["refuses"] == "no board; nothing hangs there; hang one up."
-    assert told["breaks"].startswith("KeyError: 'board' (toy.py, line")
-    assert told["empty"] == "miss is nan"
+    reported = {r.scene: r.failure for r in rows}
+    assert reported["a"] == ""
+    assert reported["refuses"] == "no board; nothing hangs there; hang one up."
+    assert reported["breaks"].startswith("KeyError: 'board' (toy.py, line")
+    assert reported["empty"] == "miss is nan"
     assert list(next(r for r in rows if r.scene == "empty").metrics) == ["score"]
     count = len(marks(log))
     ablate(failing, tmp_path / "out", executor="local")
@@ -86,8 +86,8 @@ def test_failures_are_stored_with_their_reason_and_not_retried(tmp_path):
 
 
 def test_an_unreported_metric_is_named(tmp_path):
-    wish = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
-    rows = ablate(wish, tmp_path, executor="local")
+    knowledge = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
+    rows = ablate(knowledge, tmp_path, executor="local")
     assert {r.failure for r in rows} == {"the task tells no wieght"}
     assert rows[1].metrics["size"] == 800.0
     assert "no row tells wieght" in analyse(rows).warnings
@@ -107,46 +107,46 @@ def test_common_first_stages_of_rows_are_computed_once(tmp_path):
     own = {r.key: json.loads((tmp_path / "out" / "rows" / f"{r.key}.json").read_text()) for r in rows}
     for row in rows:
         assert row.cost_s >= own[row.key]["cpu_s"]
-    assert sum(bool(told["steps"]) for told in own.values()) == len(rows)
+    assert sum(bool(reported["steps"]) for reported in own.values()) == len(rows)
 
 
 def test_the_same_rows_from_any_executor(tmp_path):
-    wish = study(tmp_path / "log", scenes=["a"], seeds=1)
+    knowledge = study(tmp_path / "log", scenes=["a"], seeds=1)
     kinds = {"one": ("local", 1), "threads": ("local", 2), "processes": ("processes", 1)}
     found = {
-        name: [(r.key, r.metrics) for r in ablate(wish, tmp_path / name, executor=kind, threads=threads)]
+        name: [(r.key, r.metrics) for r in ablate(knowledge, tmp_path / name, executor=kind, threads=threads)]
         for name, (kind, threads) in kinds.items()
     }
     assert found["one"] == found["threads"] == found["processes"]
 
 
 def test_a_wrong_executor_or_folder_is_reported(tmp_path):
-    wish = study(tmp_path / "log", seeds=1)
+    knowledge = study(tmp_path / "log", seeds=1)
     with pytest.raises(UsageError, match="unknown executor 'prozesses'; did you mean processes"):
-        ablate(wish, tmp_path / "out", executor="prozesses")
+        ablate(knowledge, tmp_path / "out", executor="prozesses")
     with pytest.raises(UsageError, match="threads must be at least 1"):
-        ablate(wish, tmp_path / "out", threads=0)
+        ablate(knowledge, tmp_path / "out", threads=0)
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(UsageError, match="cannot be written"):
-        ablate(wish, tmp_path / "file" / "out", executor="local")
+        ablate(knowledge, tmp_path / "file" / "out", executor="local")
 
 
 @dataclass(frozen=True)
 class Deadly(Darts):
     """Kills its process where the aim is 2."""
 
-    def run(self, *wish):
+    def run(self, *knowledge):
         if self.aim == 2.0:
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().run(*wish)
+        return super().run(*knowledge)
 
 
 def test_a_row_that_kills_its_process_is_lost_alone_and_tried_again_next_time(tmp_path):
-    wish = study(tmp_path / "log", scenes=["a"], seeds=1, task=Deadly(log=str(tmp_path / "log")))
-    rows = ablate(wish, tmp_path / "out", executor="processes", threads=2)
+    knowledge = study(tmp_path / "log", scenes=["a"], seeds=1, task=Deadly(log=str(tmp_path / "log")))
+    rows = ablate(knowledge, tmp_path / "out", executor="processes", threads=2)
     assert [bool(r.failure) for r in rows] == [False, False, True]
     assert "ended before it did" in rows[2].failure
-    assert len(read_rows(wish, tmp_path / "out")) == 2
+    assert len(read_rows(knowledge, tmp_path / "out")) == 2
 
 
 KILLED = """
@@ -221,25 +221,25 @@ def test_progress_reports_every_row(tmp_path):
 
 def test_a_dask_cluster_finds_the_same_and_is_missed_when_gone(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
-    wish = study(tmp_path / "log", scenes=["a"], seeds=2)
-    here = ablate(wish, tmp_path / "here", executor="local", threads=1)
+    knowledge = study(tmp_path / "log", scenes=["a"], seeds=2)
+    here = ablate(knowledge, tmp_path / "here", executor="local", threads=1)
     options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
     with distributed.LocalCluster(protocol="tcp://", **options) as cluster:
         address = f"dask://{cluster.scheduler_address.removeprefix('tcp://')}"
         with distributed.Client(cluster, set_as_default=False) as client:
-            given = ablate(wish, tmp_path / "given", executor=client.get_executor(pure=False))
-        named = ablate(wish, tmp_path / "named", executor=address)
-    told = [[(r.key, r.metrics) for r in rows] for rows in (here, given, named)]
-    assert told[0] == told[1] == told[2]
+            given = ablate(knowledge, tmp_path / "given", executor=client.get_executor(pure=False))
+        named = ablate(knowledge, tmp_path / "named", executor=address)
+    reported = [[(r.key, r.metrics) for r in rows] for rows in (here, given, named)]
+    assert reported[0] == reported[1] == reported[2]
     with pytest.raises(UsageError, match="a Dask scheduler is given as dask://HOST:PORT"):
-        ablate(wish, tmp_path / "gone", executor="dask://nowhere")
+        ablate(knowledge, tmp_path / "gone", executor="dask://nowhere")
 
 
 @dataclass(frozen=True)
 class DeadlyOnce(Darts):
     """Kills its process where the aim is 2, unless somebody has done so before."""
 
-    def run(self, *wish):
+    def run(self, *knowledge):
         if self.aim == 2.0:
             try:
                 os.close(os.open(f"{self.log}.killed", os.O_CREAT | os.O_EXCL))
@@ -247,17 +247,17 @@ class DeadlyOnce(Darts):
                 pass
             else:
                 os.kill(os.getpid(), signal.SIGKILL)
-        return super().run(*wish)
+        return super().run(*knowledge)
 
 
 def test_a_worker_of_a_cluster_that_is_killed_loses_no_row(dask_cluster, tmp_path):
     log = tmp_path / "log"
-    wish = study(log, scenes=["a"], seeds=4, task=DeadlyOnce(log=str(log)))
-    rows = ablate(wish, tmp_path / "out", executor=address(dask_cluster))
+    knowledge = study(log, scenes=["a"], seeds=4, task=DeadlyOnce(log=str(log)))
+    rows = ablate(knowledge, tmp_path / "out", executor=address(dask_cluster))
     assert log.with_name("log.killed").exists()
     assert not any(row.failure for row in rows)
     # The file is there, so that nobody is killed this time.
-    undisturbed = ablate(wish, tmp_path / "here", executor="local", threads=1)
+    undisturbed = ablate(knowledge, tmp_path / "here", executor="local", threads=1)
     assert [(r.key, r.metrics) for r in rows] == [(r.key, r.metrics) for r in undisturbed]
 
 
@@ -279,7 +279,7 @@ class Vanishing(Executor):
 
 
 def test_workers_that_vanish_are_a_sentence_and_lose_nothing_that_ended(tmp_path):
-    wish = study(tmp_path / "log", seeds=1)
+    knowledge = study(tmp_path / "log", seeds=1)
     with pytest.raises(UsageError, match="the workers are gone; the rows that ended are kept"):
-        ablate(wish, tmp_path / "out", executor=Vanishing(), threads=1)
-    assert len(read_rows(wish, tmp_path / "out")) == 1
+        ablate(knowledge, tmp_path / "out", executor=Vanishing(), threads=1)
+    assert len(read_rows(knowledge, tmp_path / "out")) == 1

@@ -57,7 +57,7 @@ def test_the_polynomial_method_does_not_care_in_which_frame_it_works():
 def test_exact_views_are_calibrated_exactly():
     config = replace(CONFIG, selfcalibration=Stratified())
     found = CalibrationOverNoise(noise_px=0.0, views=5).run(config, "cloud", 0, NOWHERE)
-    # What is told of the principal point is not exactly so.
+    # The prior of the principal point is not exact.
     assert found["focal_error_pct"] < 1.0
     assert found["success_pct"] == 100.0
 
@@ -108,11 +108,11 @@ def yard(tmp_path_factory):
     """Three photographs of the courtyard, with their cameras."""
     folder, source = tmp_path_factory.mktemp("yard"), ROOT / "fixtures" / "courtyard"
     (folder / "images").mkdir()
-    told = json.loads((source / "cameras.json").read_text(encoding="utf-8"))
-    names = sorted(told["cameras"])[4:7]
+    reported = json.loads((source / "cameras.json").read_text(encoding="utf-8"))
+    names = sorted(reported["cameras"])[4:7]
     for name in names:
         shutil.copy(source / "images" / name, folder / "images" / name)
-    cameras = {"cameras": {name: told["cameras"][name] for name in names}}
+    cameras = {"cameras": {name: reported["cameras"][name] for name in names}}
     (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
     return folder
 

@@ -98,7 +98,7 @@ def hash_of(key):
 
 
 def mark(log, word):
-    """Add a line to the log; short lines are written whole, whoever writes beside."""
+    """Add a line to the log; short lines are written atomically."""
     if log:
         with Path(log).open("a", encoding="utf-8") as file:
             file.write(f"{word}\n")

@@ -40,12 +40,12 @@ def toy_wishes(out, *, quick):
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory):
-    wishes, told = toy_wishes(tmp_path_factory.mktemp("harness"), quick=False), list[str]()
-    return wishes, run_tasks(wishes, STAGES, told.append), told
+    wishes, reported = toy_wishes(tmp_path_factory.mktemp("harness"), quick=False), list[str]()
+    return wishes, run_tasks(wishes, STAGES, reported.append), reported
 
 
 def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
-    _, judged, told = ran
+    _, judged, reported = ran
     assert list(judged) == [("toy", "yard")]
     judgement, outcomes = judged["toy", "yard"]
     assert tuple(outcomes) == ("after", *WAYS)
@@ -58,7 +58,7 @@ def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
     values = judgement.metrics[0].values
     assert (values["ours"], values["good"], values["after"]) == (0.5, 2.0, 8.0)
     assert values["crashing"] is None
-    assert len(told) == 8
+    assert len(reported) == 8
 
 
 def test_gates_check_numbers_and_a_missing_number_breaks_its_gate(ran):
@@ -192,11 +192,11 @@ def test_a_run_starts_from_the_references_of_a_like_one(tmp_path):
     run_tasks(first, STAGES, lambda _: None)
     # Of ours nothing is taken but the folders of a run; a reference stands as it is.
     (first.place("toy", "yard", "good") / "value.json").write_text("7.0", encoding="utf-8")
-    told = []
+    reported = []
     second = dataclasses.replace(toy_wishes(tmp_path / "second", quick=True), resume=str(first.out))
-    judgement, outcomes = run_tasks(second, STAGES, told.append)["toy", "yard"]
+    judgement, outcomes = run_tasks(second, STAGES, reported.append)["toy", "yard"]
     assert judgement.metrics[0].values == {"ours": 0.5, "good": 7.0}
-    assert [line for line in told if "good" in line] == []
+    assert [line for line in reported if "good" in line] == []
     assert outcomes["good"].place == second.place("toy", "yard", "good")
 
 

@@ -102,8 +102,8 @@ def test_report_and_check_run_without_any(stub, tmp_path):
         check=False,
     )
     assert done.stderr.splitlines() == [f"validation: {not_installed(library)}" for library in NAMES]
-    told = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))
-    assert told["failures"] == {"bundle/street/Ceres": not_installed("pycolmap")}
+    reported = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))
+    assert reported["failures"] == {"bundle/street/Ceres": not_installed("pycolmap")}
     promised = [key for key in read_gates() if key.startswith("bundle/street/")]
     assert done.returncode == int(bool(promised))
     for key in promised:

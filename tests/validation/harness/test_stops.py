@@ -1,4 +1,4 @@
-"""A report that is told to stop leaves no task behind."""
+"""A stopped report leaves no task behind."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ import time
 from dataclasses import replace
 
 import pytest
-from validation.studies.stop_anywhere import stopped
+from validation.studies.robustness import stopped
 
 from tests.runtime.test_signals import is_alive
 from tests.validation.harness.test_harness import toy_wishes
@@ -42,12 +42,12 @@ def hanging_stages():
 
 def process_of(out):
     """The process of the task that hangs, 0 where it is not there yet."""
-    told = list(out.rglob("hanging/process"))
-    return int(told[0].read_text() or 0) if told else 0
+    reported = list(out.rglob("hanging/process"))
+    return int(reported[0].read_text() or 0) if reported else 0
 
 
 def is_gone(number):
-    """Whether the process ends soon: it is told by the end of its parent."""
+    """Say whether the process ends soon, as its parent has ended."""
     end = time.monotonic() + 10.0
     while is_alive(number) and time.monotonic() < end:
         time.sleep(0.02)

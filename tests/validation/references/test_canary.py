@@ -27,11 +27,11 @@ def test_every_deviating_answer_is_reported(library, monkeypatch):
     for question in QUESTIONS[library]:
         other = replace(question, answer=np.asarray(question.answer) + max(2.0 * question.tolerance, 1e-3))
         monkeypatch.setitem(canary.QUESTIONS, library, (other,))
-        with pytest.raises(NoReference) as told:
+        with pytest.raises(NoReference) as reported:
             ask_canary(library)
-        assert str(told.value).startswith(f"{NAMES[library]} ")
-        assert f" gives {question.words} as " in str(told.value)
-        assert "; this harness expects " in str(told.value)
+        assert str(reported.value).startswith(f"{NAMES[library]} ")
+        assert f" gives {question.words} as " in str(reported.value)
+        assert "; this harness expects " in str(reported.value)
 
 
 def test_a_missing_function_is_reported(library, monkeypatch, capsys):

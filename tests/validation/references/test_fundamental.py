@@ -1,4 +1,4 @@
-"""The direction of F: x2' F x1 = 0 in every library, whoever estimates it."""
+"""The direction of F: x2' F x1 = 0 in every library."""
 
 import numpy as np
 import pytest

@@ -1,0 +1,99 @@
+import dataclasses
+
+import pytest
+
+from tests.report.synthetic import made_up_run, projective_run
+from thesisrecon.errors import StageFailure
+from thesisrecon.records import DegeneracyReport, IntrinsicInterval
+from thesisrecon.report.assessment import (
+    assess,
+    decimals,
+    duration,
+    key_facts,
+    grouped,
+    interval_of,
+    named_number,
+    plus_minus,
+)
+from thesisrecon.report.data import ResidualSummary
+
+TIME = "Computing time of this result"
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (1520.34, 1.84, "1520.3 ± 1.8"),
+        (1520.34, 4.2, "1520 ± 4"),
+        (1520.34, 0.42, "1520.3 ± 0.4"),
+        (-0.03012, 0.00042, "-0.0301 ± 0.0004"),
+        (512.0, 0.0, "512 (fixed)"),
+        (1520.34, float("inf"), "1520 (not determined)"),
+    ],
+)
+def test_numbers_carry_as_many_digits_as_they_deserve(value, std, text):
+    assert plus_minus(value, std) == text
+
+
+def test_shared_values_are_one_and_varying_ones_a_range():
+    same = [IntrinsicInterval(800.0, 1.5, "a")] * 3
+    assert interval_of(same, "px") == "800.0 ± 1.5\u202fpx"
+    varying = [*same, IntrinsicInterval(900.0, 1.5, "a")]
+    assert interval_of(varying, "px") == "800.0 to 900.0\u202fpx (± 1.5)"
+
+
+def test_words_for_numbers():
+    assert decimals(0.256, 2) == "0.26"
+    assert decimals(float("nan"), 2) == "–"
+    assert grouped(1234567) == "1\u202f234\u202f567"
+    assert duration(3.04) == "3.0\u202fs"
+    assert duration(125) == "2\u202fmin 05\u202fs"
+    assert duration(7325) == "2\u202fh 02\u202fmin"
+    assert named_number("sigma_px", 0.19) == ("sigma", "0.19\u202fpx")
+    assert named_number("focal_spread_rel", 0.0008) == ("focal spread", "0.08\u202f%")
+    assert named_number("accepted", 26) == ("accepted", "26")
+    assert named_number("score", float("nan")) == ("score", "nan")
+
+
+def test_the_verdict_is_honest():
+    data = made_up_run(points=100)
+    assert data.metric is not None
+    assert assess(data).word == "Trusted, but incomplete"
+    doubt = dataclasses.replace(data.metric, trusted=False, failed_checks=("pure rotation",))
+    verdict = assess(dataclasses.replace(data, metric=doubt))
+    assert (verdict.level, verdict.reasons) == ("doubt", ("Pure rotation.",))
+    early = assess(projective_run())
+    assert early.level == "open"
+    assert "projective reconstruction" in early.sentence
+
+
+def test_a_failure_states_reason_evidence_and_advice():
+    failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
+    data = dataclasses.replace(projective_run(), reconstruction=None, until=None, failure=failure)
+    verdict = assess(dataclasses.replace(data, reports=data.reports[:2]))
+    assert verdict.level == "bad"
+    assert verdict.sentence == "No pair overlaps."
+    assert verdict.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
+    assert verdict.advice == "Take more photographs."
+
+
+def test_the_head_of_the_page_summarises_the_run():
+    labels = [fact.label for fact in key_facts(made_up_run(points=100), None)]
+    assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", TIME]
+    facts = key_facts(made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
+    assert facts[3].value == "0.80 px median"
+    assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
+    early = dataclasses.replace(projective_run(), reconstruction=None)
+    assert [fact.label for fact in key_facts(early, None)] == ["Photographs", "Pairs accepted", TIME]
+
+
+def test_pairs_that_leave_their_geometry_open_are_counted():
+    run = dataclasses.replace(projective_run(), reconstruction=None)
+    unsure = DegeneracyReport(False, ("one homography explains the matches (plane)",))
+    pairs = tuple(
+        dataclasses.replace(pair, degeneracy=unsure) if pair.accepted else pair for pair in run.pairs
+    )
+    early = dataclasses.replace(run, pairs=pairs)
+    note = key_facts(early, None)[1].note
+    assert f"; {sum(pair.accepted for pair in pairs)} leave their epipolar geometry undetermined" in note
+    assert "undetermined" not in key_facts(run, None)[1].note
