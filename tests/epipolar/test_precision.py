@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from validation.studies.epipolar_synthetic import DEFAULT, GOLD, check_precision
 
 from tests.epipolar.pairs import make_pair
 from thesisrecon.epipolar.configuration import Configuration
@@ -22,6 +21,7 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
 from thesisrecon.records import FundamentalFit
 from validation.scenes.two_views import make_two_views
+from validation.studies.epipolar_synthetic import DEFAULT, GOLD, check_precision
 
 
 def bound_of(seed, n=40, sigma=0.5):
@@ -59,7 +59,7 @@ def test_degrees_of_freedom_are_the_inliers_without_seven():
 def test_little_noise_gives_the_first_order_interval():
     _, bound = bound_of(2)
     for nu in (5.0, np.inf):
-        for found in _epipoles_with_covariance(bound.F, 1e-8 * bound.covariance, _degrees_of_freedom=nu):
+        for found in _epipoles_with_covariance(bound.F, 1e-8 * bound.covariance, degrees_of_freedom=nu):
             half = _student_95(nu) * np.sqrt(np.diag(found.xy_covariance))
             np.testing.assert_allclose(found.interval_95, [found.xy - half, found.xy + half], rtol=1e-4)
             assert found.contains_xy(found.xy).all()

@@ -14,7 +14,6 @@ VARIANTS = [
     HarrisCorners(selection="spread", measure=HARRIS),
     MultiScaleCorners(measure=HARRIS),
 ]
-Variant = HarrisCorners | MultiScaleCorners
 
 
 def chessboard(dx, dy):

@@ -7,13 +7,11 @@ import socket
 import struct
 import unicodedata
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import PIL.Image
 
-Make = Callable[[Path], object]
 FEATURES = ["--until", "features", "--threads", "1", "--max-size", "1600"]
 TOO_LONG = "x" * 5000
 
@@ -151,11 +149,6 @@ def triangle(**changes):
         "buffers": [{"byteLength": 48}],
     }
     return header | changes, data
-
-
-def glb_of(text):
-    """A GLB of this text alone."""
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
 
 
 def folder_of(place, name):

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from validation.studies.robustness import disk_ends, remount, small_disk
 
 from thesisrecon.errors import DISK, MEND, OutputError, UsageError
 from thesisrecon.io.colmap_files import write_colmap_model
@@ -31,6 +30,7 @@ from thesisrecon.io.files import (
     write_text,
 )
 from thesisrecon.io.pair_list import read_pairs
+from validation.studies.robustness import disk_ends, remount, small_disk
 
 MANY = np.zeros((20_000, 3))
 

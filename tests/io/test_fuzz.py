@@ -95,10 +95,6 @@ SUMMARY = {
 }  # fmt: skip
 
 
-def as_json(content):
-    return lambda folder, name: (folder / name).write_text(json.dumps(content), encoding="utf-8") and None
-
-
 def text_file(name, text, read):
     return Reader(
         name, lambda folder: (folder / name).write_text(text, encoding="utf-8"), read, (UsageError,)

@@ -10,8 +10,6 @@ from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seed
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.records import Image
 
-Detector = HarrisCorners | MultiScaleCorners
-Variant = SeedsAndGrowth | StrengthOfMatch
 VARIANTS = [(MultiScaleCorners(), SeedsAndGrowth()), (HarrisCorners(), StrengthOfMatch())]
 SWITCHED = [
     SeedsAndGrowth(orientation="upright"),

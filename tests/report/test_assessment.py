@@ -9,15 +9,15 @@ from thesisrecon.report.assessment import (
     assess,
     decimals,
     duration,
-    key_facts,
     grouped,
     interval_of,
+    key_facts,
     named_number,
     plus_minus,
 )
 from thesisrecon.report.data import ResidualSummary
 
-TIME = "Computing time of this result"
+TIME = "Computing time"
 
 
 @pytest.mark.parametrize(
@@ -55,13 +55,13 @@ def test_words_for_numbers():
     assert named_number("score", float("nan")) == ("score", "nan")
 
 
-def test_the_verdict_is_honest():
+def test_the_assessment_is_honest():
     data = made_up_run(points=100)
     assert data.metric is not None
     assert assess(data).word == "Trusted, but incomplete"
     doubt = dataclasses.replace(data.metric, trusted=False, failed_checks=("pure rotation",))
-    verdict = assess(dataclasses.replace(data, metric=doubt))
-    assert (verdict.level, verdict.reasons) == ("doubt", ("Pure rotation.",))
+    assessment = assess(dataclasses.replace(data, metric=doubt))
+    assert (assessment.level, assessment.reasons) == ("doubt", ("Pure rotation.",))
     early = assess(projective_run())
     assert early.level == "open"
     assert "projective reconstruction" in early.sentence
@@ -70,11 +70,11 @@ def test_the_verdict_is_honest():
 def test_a_failure_states_reason_evidence_and_advice():
     failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
     data = dataclasses.replace(projective_run(), reconstruction=None, until=None, failure=failure)
-    verdict = assess(dataclasses.replace(data, reports=data.reports[:2]))
-    assert verdict.level == "bad"
-    assert verdict.sentence == "No pair overlaps."
-    assert verdict.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
-    assert verdict.advice == "Take more photographs."
+    assessment = assess(dataclasses.replace(data, reports=data.reports[:2]))
+    assert assessment.level == "bad"
+    assert assessment.sentence == "No pair overlaps."
+    assert assessment.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
+    assert assessment.advice == "Take more photographs."
 
 
 def test_the_head_of_the_page_summarises_the_run():
@@ -84,7 +84,7 @@ def test_the_head_of_the_page_summarises_the_run():
     assert facts[3].value == "0.80 px median"
     assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
     early = dataclasses.replace(projective_run(), reconstruction=None)
-    assert [fact.label for fact in key_facts(early, None)] == ["Photographs", "Pairs accepted", TIME]
+    assert [fact.label for fact in key_facts(early, None)] == ["Images", "Pairs accepted", TIME]
 
 
 def test_pairs_that_leave_their_geometry_open_are_counted():
@@ -95,5 +95,5 @@ def test_pairs_that_leave_their_geometry_open_are_counted():
     )
     early = dataclasses.replace(run, pairs=pairs)
     note = key_facts(early, None)[1].note
-    assert f"; {sum(pair.accepted for pair in pairs)} leave their epipolar geometry undetermined" in note
-    assert "undetermined" not in key_facts(run, None)[1].note
+    assert f"; {sum(pair.accepted for pair in pairs)} pairs with degenerate epipolar geometry" in note
+    assert "degenerate" not in key_facts(run, None)[1].note

@@ -78,12 +78,12 @@ def test_the_page_fetches_nothing_and_is_small(page):
 def test_the_page_holds_every_section_and_its_links_lead_somewhere(page):
     structure = structure_of(page)
     wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
-    assert wanted == {"main", "view", "photographs", "pairs", "stages", "warnings", "config"}
+    assert wanted == {"main", "view", "images", "pairs", "stages", "warnings", "config"}
     assert wanted <= set(structure.ids)
     assert structure.tags.count("svg") == 8  # a histogram of each registered view
     assert structure.tags.count("img") == 9 + 2  # thumbnails, best and weakest pair
     for text in (
-        "Computing time of this result",
+        "Computing time",
         "2081.4 ± 1.7",
         "Trusted, but incomplete",
         "2 pairs lie on one plane",
@@ -109,15 +109,15 @@ def test_names_are_text_everywhere():
     assert figures["matrix-figure"]["data"][0]["x"][0] == "1 · " + html.escape(EVIL[0])
 
 
-def test_runs_that_ended_early_say_how_far_they_got():
+def test_runs_that_stopped_early_say_how_far_they_got():
     early = projective_run()
     page = render_report(early)
-    assert "Ended early" in page
+    assert "Stopped early" in page
     assert 'id="scene-figure"' not in page
     assert structure_of(page).tags.count("svg") == 8
     only_features = dataclasses.replace(early, reconstruction=None, pairs=(), until="features")
     page = render_report(only_features)
-    assert "corners were found" in page
+    assert "corners were detected" in page
     assert "plotly.js v" not in page  # nothing to draw, nothing to carry
 
 
@@ -131,7 +131,7 @@ def test_a_projective_camera_is_not_called_registered(page):
 def test_the_caption_states_omitted_points():
     data = made_up_run(points=200)
     assert data.metric is not None
-    assert "All 200 points are drawn;" in render_report(data)
+    assert "All 200 points are shown." in render_report(data)
     X = data.metric.reconstruction.X.copy()
     X[0, :3] = 1e6
     metric = dataclasses.replace(
@@ -330,11 +330,11 @@ def test_one_turns_through_the_pictures(browser, tmp_path):
     seen = Witness(browser, path, 900, drawn=())
     assert abs(int(seen.pixels("#shown")[30, 40, 0]) - LEVELS[0]) < 4
     seen.page.locator("#place").press("ArrowRight")
-    assert seen.page.inner_text("#told") == "picture <1>"
+    assert seen.page.inner_text("#caption") == "picture <1>"
     assert abs(int(seen.pixels("#shown")[30, 40, 0]) - LEVELS[1]) < 4
     seen.page.click("#play")
     for caption in ("picture <2>", "picture <0>"):
-        seen.page.locator("#told", has_text=caption).wait_for()
+        seen.page.locator("#caption", has_text=caption).wait_for()
     seen.page.click("#play")
     assert seen.page.inner_text("#play") == "Play"
     assert seen.errors == []
@@ -352,7 +352,7 @@ def test_the_metric_reconstruction_goes_before_the_projective_one():
 
 def test_records_that_disagree_are_refused():
     data = made_up_run(points=100)
-    with pytest.raises(ValueError, match="one camera per photograph"):
+    with pytest.raises(ValueError, match="one camera per image"):
         dataclasses.replace(data, images=data.images[:-1])
     with pytest.raises(ValueError, match=r"colours must be \(100, 3\)"):
         dataclasses.replace(data, colors=np.zeros((99, 3), dtype=np.uint8))
@@ -380,7 +380,7 @@ def test_a_model_and_its_pictures_must_belong_to_the_run():
     data = made_up_run(points=100)
     mesh = TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))
     assert dataclasses.replace(data, model=mesh).model is mesh
-    with pytest.raises(ValueError, match="model needs the metric reconstruction"):
+    with pytest.raises(ValueError, match="model needs its metric reconstruction"):
         dataclasses.replace(projective_run(), model=mesh)
     with pytest.raises(ValueError, match="depth_pictures must name views below 9"):
         dataclasses.replace(data, depth_maps={9: np.ones((3, 4), dtype=np.float32)})

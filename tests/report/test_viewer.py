@@ -79,7 +79,7 @@ def test_a_model_with_colours_or_none_needs_no_texture():
     assert "texture" not in coloured
     np.testing.assert_array_equal(unpacked(coloured["colors"], "u1", 3), colors)
     plain = unpacked(data_of(bare)["colors"], "u1", 3)
-    assert (plain == viewer.PLAIN).all()
+    assert (plain == viewer._PLAIN).all()
     assert len(plain) == len(unpacked(data_of(bare)["positions"], "<u2", 3))
 
 

@@ -7,13 +7,9 @@ import os
 import shutil
 import sys
 import zipfile
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
-from validation.studies.robustness import Refusal, SmallRuns, disk_ends, filled, refused_at, table
-from validation.studies.robustness import different, outputs
 
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
@@ -31,6 +27,16 @@ from thesisrecon.records import (
 )
 from thesisrecon.runtime.record_files import ChangedRecord, _seal, bytes_from_record, read_record
 from thesisrecon.runtime.run_folder import RunDirectory, StageFolder, code_key, key_of
+from validation.studies.robustness import (
+    Refusal,
+    SmallRuns,
+    different,
+    disk_ends,
+    filled,
+    outputs,
+    refusal_table,
+    refused_at,
+)
 
 
 def some_features(value=1.0):
@@ -302,9 +308,6 @@ def test_nothing_is_unpacked(tmp_path):
 TRACKS = Tracks(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)), 1, 3)
 
 
-Change = Callable[[dict[str, Any]], object]
-
-
 CHANGES = [
     ("beyond the views", lambda parts: parts["array0"].__setitem__(1, 10**9)),
     ("below zero", lambda parts: parts["array1"].__setitem__(1, -1)),
@@ -428,5 +431,5 @@ def test_the_check_names_the_fault():
         "exit code 1; not one sentence; names no place; does not say what to do; strange files: points.ply; "
         "differs: model.glb"
     )
-    assert table([well]).splitlines()[2:] == [f"| {well.when} | 2 | {said.strip()} | nothing |"]
+    assert refusal_table([well]).splitlines()[2:] == [f"| {well.when} | 2 | {said.strip()} | nothing |"]
     assert os.strerror(errno.ENOSPC) in well.when

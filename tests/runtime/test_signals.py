@@ -8,14 +8,13 @@ import time
 from pathlib import Path
 
 import pytest
-from validation.studies.robustness import different, outputs
-from validation.studies.robustness import Stop, stopped, table
 
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime.executors import ProcessPool
 from thesisrecon.runtime.signals import CODES, advised
+from validation.studies.robustness import Stop, different, outputs, stop_table, stopped
 
 ROOT = Path(__file__).parents[2]
 COURTYARD = ROOT / "fixtures" / "courtyard" / "images"
@@ -174,7 +173,7 @@ def test_the_check_names_the_fault():
     bad = Stop("15 % (1.2 s)", 2.5, 1, "Traceback\nKeyboardInterrupt\n", 2, 4, ("points.ply",))
     assert well.wrong(signal.SIGINT) == ""
     assert well.wrong(signal.SIGTERM) == "exit code 130"
-    assert table([well, bad], signal.SIGINT).splitlines()[2:] == [
+    assert stop_table([well, bad], signal.SIGINT).splitlines()[2:] == [
         "| 5 % (0.4 s) | 0.10 | 130 | 3 | nothing |",
         "| 15 % (1.2 s) | 2.50 | 1 | 4 | took 2.5 s; exit code 1; not one sentence; 2 processes left; "
         "differs: points.ply |",

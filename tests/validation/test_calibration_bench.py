@@ -4,9 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from validation.studies.calibration_real import Rows
-from validation.studies.projective import compare, to_metrics
-from validation.studies.main_job import COLMAP, OURS
 
 import thesisrecon
 from tests.validation.test_metrics import _reconstruction, _truth
@@ -17,12 +14,14 @@ from validation.scenes.dinosaur import load_dinosaur
 from validation.scenes.real import Scene, load_real_scene
 from validation.scenes.zoomed import rezoom_scene
 from validation.studies.calibration_parts import keep_observations, one_camera
-from validation.studies.calibration_real import _change_pct, _pooled, _told
+from validation.studies.calibration_real import CameraRows, _change_pct, _focal_prior, _pooled
+from validation.studies.main_job import COLMAP, OURS
+from validation.studies.projective import compare, to_metrics
 
 
 def rows_of(models):
     truth = _truth()
-    return Rows("a set", Scene("a set", (), truth.K, truth.R, truth.C), models)
+    return CameraRows("a set", Scene("a set", (), truth.K, truth.R, truth.C), models)
 
 
 def value(rows, name, method=OURS):
@@ -43,13 +42,13 @@ def test_a_method_that_failed_has_no_camera_and_no_error():
     rows.registered()
     rows.focals(0.2, 0.5)
     rows.poses(3.3, 0.05)
-    assert [metric.verdict for metric in rows.metrics] == [
+    assert [metric.verdict for metric in rows] == [
         "reached", "reached", "missed", "reached", "reached",
     ]  # fmt: skip
-    assert value(rows.metrics, "focal error, median") == pytest.approx(0.0, abs=1e-9)
-    assert value(rows.metrics, "focal error, worst") == pytest.approx(1.0)
-    assert value(rows.metrics, "cameras registered of 6", COLMAP) == 0.0
-    assert value(rows.metrics, "focal error, worst", COLMAP) is None
+    assert value(rows, "focal error, median") == pytest.approx(0.0, abs=1e-9)
+    assert value(rows, "focal error, worst") == pytest.approx(1.0)
+    assert value(rows, "cameras registered of 6", COLMAP) == 0.0
+    assert value(rows, "focal error, worst", COLMAP) is None
     assert np.isinf(rows.all_focals(None)).all()
 
 
@@ -65,7 +64,7 @@ def test_missing_cameras_count_in_pooled_results():
 def test_a_change_is_relative_and_unknown_without_a_focal():
     assert _change_pct(1010.0, 1000.0) == pytest.approx(1.0)
     assert _change_pct(None, 1000.0) is None
-    reported = _told(5000.0)(PipelineConfig()).intrinsics
+    reported = _focal_prior(5000.0)(PipelineConfig()).intrinsics
     assert reported.focal_px == 5000.0
     assert reported.focal_std_rel == pytest.approx(np.log(5.0))
 

@@ -2,6 +2,7 @@
 
 from collections import Counter
 
+from thesisrecon.epipolar.configuration import Configuration
 from validation.studies.epipolar_synthetic import (
     certainty_metrics,
     certainty_table,
@@ -10,8 +11,6 @@ from validation.studies.epipolar_synthetic import (
     judge_pairs,
     named_rightly,
 )
-
-from thesisrecon.epipolar.configuration import Configuration
 
 
 def test_no_wrong_f_of_a_facade_is_called_sure():

@@ -9,13 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from validation.studies.front_end import Copy, make_copies, repeatability, score_copy
-from validation.studies.front_end import CONTRADICTS_PX, disagreement, judge
 
 from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project_camera
 from thesisrecon.io.images import read_images
 from thesisrecon.records import Features, Image, Reconstruction, Tracks, TwoView
 from validation.scenes.real import load_real_scene
+from validation.studies.front_end import (
+    CONTRADICTS_PX,
+    Copy,
+    disagreement,
+    judge,
+    make_copies,
+    repeatability,
+    score_copy,
+)
 from validation.studies.front_end_pairs import OURS, SIFT, check_pairs, front_ends, measure_pairs
 
 # (scene, gap): pairs measured, least ratio of verified matches and largest of sigma, and error of F in px.
@@ -71,7 +78,7 @@ def test_the_maps_of_copies_give_the_position_of_each_pixel(smooth_picture):
         if copy.name.startswith(("turned", "scaled")):
             grey, brightness = smooth_picture.rgb[..., 0], copy.rgb[..., 0]
             for xy in np.array([[70.0, 45.0], [61.0, 38.0], [80.0, 52.0]]):
-                there = copy.copy_from_photograph[:, :2] @ xy + copy.copy_from_photograph[:, 2]
+                there = copy.copy_from_image[:, :2] @ xy + copy.copy_from_image[:, 2]
                 column, row = np.rint(there).astype(int)
                 # Half a pixel of rounding is worth a few grey levels here, a wrong map tens.
                 assert abs(float(brightness[row, column]) - float(grey[int(xy[1]), int(xy[0])])) < 8.0

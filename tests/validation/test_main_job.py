@@ -7,18 +7,18 @@ from PIL import Image
 
 pytest.importorskip("pycolmap")
 
-from validation.studies.main_job import COLMAP, OURS
-
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import colmap_from_reconstruction
 from thesisrecon.io.colmap_files import write_colmap_model
-from validation import main_job
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric
 from validation.references.colmap_mapping import read_run
 from validation.references.colmap_run import reconstruct_with_pycolmap
 from validation.scenes.real import Scene, load_fixture_scene
+from validation.studies import main_job
+from validation.studies.main_job import COLMAP, OURS
+from validation.studies.runner import run_study
 
 from .test_cameras import N, V, _reconstruction, _truth
 
@@ -66,16 +66,15 @@ def test_the_table_is_made_from_saved_results(tmp_path, monkeypatch, capsys):
         return [sys.executable, "-c", copy, str(source), str(out)]
 
     monkeypatch.setattr(main_job, "_command", pretend)
-    monkeypatch.setattr(main_job, "find_scenes", lambda _names: [scene])
-    assert main_job.main(["-o", str(tmp_path / "out"), "--scenes", "fountain-P11"]) == 1
+    monkeypatch.setattr(main_job, "scenes_here", lambda _names: [scene])
+    assert run_study("main-job", ["-o", str(tmp_path / "out"), "--scenes", "fountain-P11"]) == 1
 
-    reported = json.loads((tmp_path / "out" / "main_job.json").read_text())["scenes"]["fountain-P11"]
-    rows = {row["name"]: row for row in reported["rows"]}
+    rows = {row["name"]: row for row in json.loads((tmp_path / "out" / "main-job.json").read_text())}
     assert rows["focal error"]["verdict"] == "reached"
     assert rows["wall time"]["values"][COLMAP] == 6.0
-    assert reported["seconds"][OURS] == {"features": 1.5}
-    assert len(reported["failures"]) == 2
-    text = (tmp_path / "out" / "main_job.md").read_text()
+    text = (tmp_path / "out" / "main-job.md").read_text()
+    assert f"- {OURS}: features 1.50 s" in text
+    assert text.count(" failed: ") == 2
     assert "## fountain-P11" in text
     assert text in capsys.readouterr().out
 

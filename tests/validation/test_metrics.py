@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from validation.studies.calibration_parts import run_trial
 
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Reconstruction, Tracks
@@ -13,7 +12,7 @@ from thesisrecon.views.image_similarity import GREY
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection, rotation_errors_deg
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
 from validation.metrics.pictures import psnr_db, ssim
-from validation.studies.calibration_parts import named, without
+from validation.studies.calibration_parts import named, run_trial, without
 from validation.studies.subsets import Matched
 
 

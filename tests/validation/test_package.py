@@ -6,13 +6,20 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from validation.studies.package.installed import Watched, trespasses, watch
-from validation.studies.package.environments import Part, counted, quick_parts, run_part, suite_faults
 
 from thesisrecon.io.pair_list import DEMO_IMAGES, demo_images
 from validation.scenes.real import ROOT
 from validation.studies.package.built import NEEDED, wheel_faults
-from validation.studies.package.environments import dependencies, lowest_versions
+from validation.studies.package.environments import (
+    Part,
+    counted,
+    dependencies,
+    lowest_versions,
+    quick_parts,
+    run_part,
+    suite_faults,
+)
+from validation.studies.package.installed import Watched, trespasses, watch
 
 
 def test_the_wheel_carries_the_photographs_of_the_demo():
@@ -98,6 +105,6 @@ def test_forbidden_actions_of_a_run_are_reported(tmp_path):
     assert trespasses(wrong, tmp_path / "out") == [
         "the run ended with code 3: no",
         f"{tmp_path / 'a'} was written",
-        "it spoke: socket.connect",
+        "network call: socket.connect",
         "it started a program: ls",
     ]

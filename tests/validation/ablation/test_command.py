@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from validation.studies.robustness import stopped
 
 from tests.report.synthetic import Witness
 from tests.validation.ablation.toy import Darts, marks
@@ -16,6 +15,7 @@ from validation.ablation.progress import duration, words_of
 from validation.ablation.run import State
 from validation.command import main
 from validation.scenes.real import ROOT
+from validation.studies.robustness import stopped
 
 EVIL = "<img src=x onerror=alert(1)>"
 STUDY = """

@@ -12,7 +12,7 @@ from tests.validation.harness.toy_stages import STAGES, WAYS
 from validation.command import main
 from validation.harness.gates import Gate, read_gates
 from validation.harness.page import write_pages
-from validation.harness.records import Judgement, Outcome, Task, Wishes, slug
+from validation.harness.records import Task, Wishes, slug
 from validation.harness.results import Results, collect, compare, read_results, write_results
 from validation.harness.scenes import QUICK
 from validation.harness.schedule import run_tasks, tasks_behind, tasks_of
@@ -24,7 +24,6 @@ GATES = {
     "toy/yard/never-told": Gate("toy/yard/never-told", 1.0, True, "nobody tells this"),
     "other/yard/wheels": Gate("other/yard/wheels", 1.0, True, "of a stage that did not run"),
 }
-Judged = dict[tuple[str, str], tuple[Judgement, dict[str, Outcome]]]
 
 
 def toy_wishes(out, *, quick):

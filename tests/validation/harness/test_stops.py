@@ -8,13 +8,13 @@ import time
 from dataclasses import replace
 
 import pytest
-from validation.studies.robustness import stopped
 
 from tests.runtime.test_signals import is_alive
 from tests.validation.harness.test_harness import toy_wishes
 from tests.validation.harness.toy_stages import ToyStage
 from validation.harness.schedule import run_tasks
 from validation.scenes.real import ROOT
+from validation.studies.robustness import stopped
 
 PROGRAM = """
 import sys
