@@ -137,7 +137,7 @@ def test_the_caption_states_omitted_points():
     metric = dataclasses.replace(
         data.metric, reconstruction=dataclasses.replace(data.metric.reconstruction, X=X)
     )
-    assert "199 of 200 points are drawn, strays left out;" in render_report(
+    assert "199 of 200 points are shown, without outliers." in render_report(
         dataclasses.replace(data, metric=metric)
     )
 
@@ -354,7 +354,7 @@ def test_records_that_disagree_are_refused():
     data = made_up_run(points=100)
     with pytest.raises(ValueError, match="one camera per image"):
         dataclasses.replace(data, images=data.images[:-1])
-    with pytest.raises(ValueError, match=r"colours must be \(100, 3\)"):
+    with pytest.raises(ValueError, match=r"colors must be \(100, 3\)"):
         dataclasses.replace(data, colors=np.zeros((99, 3), dtype=np.uint8))
     wrong = dataclasses.replace(data.pairs[0], j=99)
     with pytest.raises(ValueError, match="pairs must name views"):
@@ -382,7 +382,7 @@ def test_a_model_and_its_pictures_must_belong_to_the_run():
     assert dataclasses.replace(data, model=mesh).model is mesh
     with pytest.raises(ValueError, match="model needs its metric reconstruction"):
         dataclasses.replace(projective_run(), model=mesh)
-    with pytest.raises(ValueError, match="depth_pictures must name views below 9"):
+    with pytest.raises(ValueError, match="depth_maps must refer to views below 9"):
         dataclasses.replace(data, depth_maps={9: np.ones((3, 4), dtype=np.float32)})
     pixels = np.zeros((4, 6, 3), dtype=np.uint8)
     compared = np.zeros((4, 6), dtype=bool)

@@ -25,10 +25,10 @@ from thesisrecon.io.meshes import write_mesh
 from thesisrecon.records import Image, Reconstruction, RunResult, TexturedMesh
 from thesisrecon.report.data import ReportData, ReportImage
 from thesisrecon.report.page import write_report
-from thesisrecon.report.summary import cameras_table, point_colours, summarize
+from thesisrecon.report.summary import cameras_table, point_colors, summarize
 from thesisrecon.runtime.run import Run, Until
 from thesisrecon.runtime.run_folder import RunDirectory
-from thesisrecon.selfcalibration.affine import affine_camera_centres, upgrade_to_affine
+from thesisrecon.selfcalibration.stratified import affine_camera_centres, upgrade_to_affine
 from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
@@ -110,7 +110,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
     out, colours = run.directory.path, None
     with run.clock("outputs"):
         if result.metric is not None:
-            colours = point_colours(result.metric.reconstruction, result.images)
+            colours = point_colors(result.metric.reconstruction, result.images)
             run.warnings.extend(write_model(run.directory, result, result.metric.reconstruction, colours))
             write_affine(out / "affine.ply", affine_of(result), colours)
             if result.mesh is not None:
@@ -199,12 +199,12 @@ def _peak_memory_mb() -> float:
 
 
 def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: StageFailure | None) -> ReportData:
-    photographs = tuple(
+    images = tuple(
         ReportImage(image.name, image.size, image.original_size, _thumbnail(image)) for image in result.images
     )
     return ReportData(
         title=run.title,
-        photographs=photographs,
+        images=images,
         reports=result.reports,
         config_text=toml_from_config(run.config),
         summary=result.summary,
@@ -214,12 +214,12 @@ def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: Stage
         pair_choice=result.pair_choice,
         reconstruction=result.projective,
         metric=result.metric,
-        colours=colours,
+        colors=colours,
         affine=affine_of(result) if result.metric is not None else None,
         failure=failure,
         model=_model_for_page(run, result),
         held_out=result.held_out,
-        depth_pictures={m.view: _thinned(m.depth) for m in result.depth_maps},
+        depth_maps={m.view: _thinned(m.depth) for m in result.depth_maps},
     )
 
 

@@ -1,9 +1,7 @@
-"""The reconstruction turned and trimmed for the eye: upright, without strays, cameras as small pyramids.
+"""Interactive figures of the report as plotly.js mappings, and histograms as SVG paths.
 
-The two interactive figures as plotly.js mappings, and the histograms as SVG paths.
-
-Plain mappings rather than plotly's classes: the page needs only what plotly.js reads, and lists of rounded
-numbers are understood by every version of it.
+The scene is drawn upright and without outliers. Plain mappings instead of plotly's classes work with every
+version of plotly.
 """
 
 from __future__ import annotations
@@ -26,11 +24,18 @@ MAX_POINTS = 25_000
 
 @dataclass(frozen=True)
 class Scene:
-    """What the 3D view draws, z up.
+    """Content of the 3D view, z up.
 
-    ``points`` (M, 3) and their number ``index`` (M,) in X; ``views`` (C,) the
-    registered ones, ``centres`` (C, 3) and ``corners`` (C, 4, 3) of their pyramids, first two along the upper
-    edge of the photograph; ``low, high`` (3,) the box to show.
+    Parameters
+    ----------
+    points, index : ndarray (M, 3) and (M,)
+        Drawn points and their numbers in X.
+    views : ndarray (C,)
+        Registered views.
+    centres, corners : ndarray (C, 3) and (C, 4, 3)
+        Camera pyramids; the first two corners are on the upper image edge.
+    low, high : ndarray (3,)
+        Bounding box.
     """
 
     points: F64
@@ -43,10 +48,20 @@ class Scene:
 
 
 def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS) -> Scene | None:
-    """The drawable scene of a metric or affine reconstruction; None without a registered camera.
+    """Build the 3D view of a metric or affine reconstruction, in its own unit of length.
 
-    At most ``max_points`` points, evenly thinned in the order of X, those beyond four times the 80 % distance
-    from the median left out. Lengths stay in the reconstruction's own (arbitrary) unit.
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Metric or affine.
+    max_points : int
+        Points are thinned evenly to this number, without those beyond four times the 80 % distance from the
+        median.
+
+    Returns
+    -------
+    Scene or None
+        None without a registered camera.
     """
     views = np.flatnonzero(reconstruction.registered).astype(np.int64)
     if len(views) == 0:
@@ -70,20 +85,29 @@ def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS)
 
 
 def upright_rotation(rotations: F64) -> F64:
-    """Turn of the world (3, 3) that puts z up and the cameras' mean gaze along +y.
+    """Estimate the rotation of the world that puts z up and the mean viewing direction along +y.
 
-    ``rotations`` (C, 3, 3) world-to-camera. Photographers hold the camera level, so up is orthogonal to the x
-    axes of the cameras; a little weight on the optical axes decides where all x axes are parallel. The sign
-    is that of the mean upper side of the photographs.
+    Cameras are assumed to be held level: up is orthogonal to their x axes. A small weight on the optical axes
+    decides if all x axes are parallel; the sign is that of the mean upward image direction.
+
+    Parameters
+    ----------
+    rotations : ndarray (C, 3, 3)
+        World-to-camera.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        Rotation.
     """
     x_axes, y_axes, z_axes = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     _, vectors = np.linalg.eigh(x_axes.T @ x_axes + 0.1 * z_axes.T @ z_axes)
     up = vectors[:, 0] if vectors[:, 0] @ y_axes.sum(axis=0) <= 0 else -vectors[:, 0]
     gaze = z_axes.sum(axis=0)
     gaze = gaze - (gaze @ up) * up
-    if np.linalg.norm(gaze) < 0.1 * len(z_axes):  # cameras all round the object: look as the first one does
+    if np.linalg.norm(gaze) < 0.1 * len(z_axes):  # cameras all around the object: use the first one
         gaze = z_axes[0] - (z_axes[0] @ up) * up
-    if np.linalg.norm(gaze) < 1e-6:  # it looks straight down: its upper side is as good as any direction
+    if np.linalg.norm(gaze) < 1e-6:  # it looks straight down: use its upward image direction
         gaze = -y_axes[0] + (y_axes[0] @ up) * up
     ahead = gaze / np.linalg.norm(gaze)
     return np.stack([np.cross(ahead, up), ahead, up])
@@ -101,14 +125,14 @@ def _kept_points(reconstruction: Reconstruction, max_points: int) -> I64:
 
 
 def _corner_rays(K: F64, size: NDArray[np.int64]) -> F64:
-    """Rays (4, 3) of unit depth through the photograph's corners, clockwise from the top left."""
+    """Return the rays (4, 3) of unit depth through the image corners, clockwise from the top left."""
     width, height = float(size[0]), float(size[1])
     xy = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
     return homogenize(xy) @ np.linalg.inv(K).T
 
 
 def _pyramid_depth(centres: F64, points: F64) -> float:
-    """A depth that keeps neighbouring pyramids apart, within 4 and 15 % of the reach of the scene."""
+    """Choose a depth that separates neighbouring pyramids, 4 to 15 % of the scene radius."""
     everything = np.concatenate([centres, points])
     reach = float(np.linalg.norm(np.ptp(everything, axis=0))) / 2 or 1.0
     if len(centres) < 2:
@@ -124,20 +148,35 @@ def _box(corners: F64) -> tuple[F64, F64]:
     return low - margin, high + margin
 
 
-INK, ACCENT, PANEL = "#1b2733", "#ff9f43", "#131a22"
-# White to deep blue-green; lightness falls evenly, so the order survives grey printing and colour blindness.
-PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1f8089"], [1.0, "#0b4a5c"]]
-REFUSED_SCALE = [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]]
+_INK, _ACCENT, _PANEL = "#1b2733", "#ff9f43", "#131a22"
+# Lightness falls evenly, so that the order is visible in grey and for colour-blind readers.
+_PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1f8089"], [1.0, "#0b4a5c"]]
+_REFUSED_SCALE = [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]]
 MAX_MATRIX = 200
-MAX_ANNOTATED = 14
+_MAX_ANNOTATED = 14
 
 Figure = dict[str, Any]
 
 
-def scene_figure(scene: Scene, names: Sequence[str], colours: NDArray[np.uint8] | None) -> Figure:
-    """Cameras and coloured points; ``names`` per view, ``colours`` (N, 3) per point of X or None."""
+def scene_figure(scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | None) -> Figure:
+    """Draw cameras and coloured points.
+
+    Parameters
+    ----------
+    scene : Scene
+        Of :func:`build_scene`.
+    names : sequence of str
+        File names of the V views.
+    colors : ndarray (N, 3) uint8, optional
+        Colours of the points X.
+
+    Returns
+    -------
+    dict
+        plotly.js figure.
+    """
     digits = _useful_digits(scene)
-    paint = "#9fb4c7" if colours is None else [_hex(rgb) for rgb in colours[scene.index]]
+    paint = "#9fb4c7" if colors is None else [_hex(rgb) for rgb in colors[scene.index]]
     points = {
         "type": "scatter3d",
         "mode": "markers",
@@ -153,7 +192,7 @@ def scene_figure(scene: Scene, names: Sequence[str], colours: NDArray[np.uint8] 
         for d, name in enumerate("xyz")
     }
     layout = {
-        "paper_bgcolor": PANEL,
+        "paper_bgcolor": _PANEL,
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "showlegend": False,
         "scene": {
@@ -168,7 +207,7 @@ def scene_figure(scene: Scene, names: Sequence[str], colours: NDArray[np.uint8] 
 
 
 def _pyramids(scene: Scene, digits: int) -> Figure:
-    """One line trace through all pyramids: rim, roof over the upper edge, four edges; None lifts the pen."""
+    """Draw all pyramids as one line trace: rim, roof over the upper edge, four edges; None interrupts it."""
     rows: list[list[float] | None] = []
     for centre, corners in zip(scene.centres, scene.corners, strict=True):
         top = corners[:2].mean(axis=0) + 0.25 * (corners[:2].mean(axis=0) - corners.mean(axis=0))
@@ -183,7 +222,7 @@ def _pyramids(scene: Scene, digits: int) -> Figure:
         "mode": "lines",
         "name": "cameras",
         "hoverinfo": "skip",
-        "line": {"color": ACCENT, "width": 2.5},
+        "line": {"color": _ACCENT, "width": 2.5},
         **columns,
     }
 
@@ -195,34 +234,46 @@ def _camera_marks(scene: Scene, names: Sequence[str], digits: int) -> Figure:
         "name": "centres",
         "text": [f"{i + 1} · {escape(names[i])}" for i in scene.views],
         "hovertemplate": "%{text}<extra></extra>",
-        "marker": {"size": 4, "color": ACCENT, "line": {"width": 0}},
+        "marker": {"size": 4, "color": _ACCENT, "line": {"width": 0}},
         **_xyz(scene.centres, digits),
     }
 
 
 def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure:
-    """Heat map of the verified matches of every tried pair (logarithmic), the pairs not accepted in red.
+    """Draw the matrix of verified matches on a logarithmic scale, rejected pairs in red.
 
-    More than ``MAX_MATRIX`` views are shown in blocks of neighbours, each with its strongest pair.
+    More than 200 views are grouped into blocks of neighbours, each with its strongest pair.
+
+    Parameters
+    ----------
+    pairs : sequence of TwoView
+        Matched pairs.
+    names : sequence of str
+        File names of the V views.
+
+    Returns
+    -------
+    dict
+        plotly.js figure.
     """
     block = max(1, -(-len(names) // MAX_MATRIX))
     labels = [_block_label(first, block, names) for first in range(0, len(names), block)]
     accepted, refused = (_count_matrix(pairs, len(labels), block, wanted) for wanted in (True, False))
     refused[accepted >= 0] = -1
     counts = accepted[accepted >= 0] if (accepted >= 0).any() else refused[refused >= 0]
-    # At least a factor of ten from the palest to the darkest, so that small differences do not look large.
+    # The scale spans at least a factor of ten, so that small differences look small.
     high = max(1.0, float(np.log10(counts.max(initial=10))))
     low = max(0.0, min(float(np.log10(max(counts.min(initial=10**9), 1))), high - 1.0))
     scale = {"zmin": low, "zmax": high}
     traces = [
         {
             **_heat(accepted, labels, "", "verified matches"),
-            "colorscale": PAIR_SCALE,
+            "colorscale": _PAIR_SCALE,
             "colorbar": _count_bar(),
         },
         {
             **_heat(refused, labels, "× ", "verified matches, not accepted"),
-            "colorscale": REFUSED_SCALE,
+            "colorscale": _REFUSED_SCALE,
             "showscale": False,
         },
     ]
@@ -230,7 +281,7 @@ def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure
 
 
 def _count_matrix(pairs: Sequence[TwoView], cells: int, block: int, accepted: bool) -> I64:
-    """(cells, cells) most verified matches of the pairs in each cell, -1 without any."""
+    """Return the (cells, cells) largest number of verified matches per cell, -1 without pairs."""
     best = np.full((cells, cells), -1, dtype=np.int64)
     for pair in pairs:
         if pair.accepted == accepted:
@@ -253,7 +304,7 @@ def _heat(counts: I64, labels: list[str], mark: str, words: str) -> Figure:
         "hoverongaps": False,
         "hovertemplate": "%{y}<br>%{x}<br><b>%{customdata}</b> " + words + "<extra></extra>",
     }
-    if len(labels) <= MAX_ANNOTATED:
+    if len(labels) <= _MAX_ANNOTATED:
         heat["text"] = [["" if n < 0 else f"{mark}{n}" for n in row] for row in rows]
         heat["texttemplate"] = "%{text}"
     return heat
@@ -276,7 +327,7 @@ def _matrix_layout(labels: list[str], block: int) -> Figure:
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "#e9edf0",
         "margin": {"l": 34, "r": 8, "t": 30, "b": 8},
-        "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": _INK},
         "showlegend": False,
         "xaxis": {**ticks, "side": "top", "constrain": "domain"},
         "yaxis": {**ticks, "autorange": "reversed", "scaleanchor": "x", "constrain": "domain"},
@@ -297,7 +348,22 @@ def _count_bar() -> Figure:
 
 
 def histogram_path(shares: F64, tallest: float, *, width: float, height: float) -> str:
-    """SVG path of the bars of a histogram (B,) in a box, the share ``tallest`` as high as the box."""
+    """Draw the bars of a histogram as an SVG path.
+
+    Parameters
+    ----------
+    shares : ndarray (B,)
+        Heights of the bars.
+    tallest : float
+        Height that fills the box.
+    width, height : float
+        Size of the box.
+
+    Returns
+    -------
+    str
+        Path data.
+    """
     step = width / max(len(shares), 1)
     strokes = []
     for n, share in enumerate(shares.tolist()):
@@ -309,12 +375,12 @@ def histogram_path(shares: F64, tallest: float, *, width: float, height: float) 
 
 def _block_label(first: int, block: int, names: Sequence[str]) -> str:
     last = min(first + block, len(names))
-    # plotly.js reads a little HTML in labels; escaped text is shown as it is.
+    # plotly.js interprets some HTML in labels.
     return f"{first + 1} · {escape(names[first])}" if block == 1 else f"views {first + 1}–{last}"
 
 
 def _useful_digits(scene: Scene) -> int:
-    """Decimals that keep a ten-thousandth of the scene."""
+    """Return the decimals that keep 1e-4 of the scene size."""
     extent = float((scene.high - scene.low).max())
     return int(np.clip(4 - np.floor(np.log10(max(extent, 1e-12))), 0, 15))
 

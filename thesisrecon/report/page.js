@@ -1,17 +1,17 @@
 "use strict";
-// Draws the figures of the page from the JSON beside this script.
+// Draws the figures from the JSON of the page.
 (function () {
   const figures = JSON.parse(document.getElementById("figures").textContent);
   const bar = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["resetCameraLastSave3d", "hoverClosest3d", "pan2d", "select2d", "lasso2d", "zoom2d", "zoomIn2d", "zoomOut2d", "autoScale2d", "resetScale2d"] };
 
   const START = [0.35, -1.45, 0.6];
-  const FIELD = 0.9 * Math.tan(Math.PI / 8);  // plotly.js sees 45 degrees from top to bottom; a tenth stays free
+  const FIELD = 0.9 * Math.tan(Math.PI / 8);  // plotly.js has a vertical field of view of 45 degrees; 10 % margin
 
   function dot(a, b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
   function cross(a, b) { return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]; }
   function unit(a) { const n = Math.sqrt(dot(a, a)); return a.map(function (v) { return v / n; }); }
 
-  // Some vertices of a trace along three axes, in the coordinates plotly.js measures the eye in.
+  // Some vertices of a trace along three axes, in plotly.js camera coordinates.
   function vertices(figure, trace, axes) {
     const box = figure.layout.scene, found = [];
     const step = Math.max(1, Math.floor(trace.x.length / 1500));
@@ -26,13 +26,13 @@
     return found;
   }
 
-  // The nearest eye in a direction that still has every camera in the picture and 99 of 100 points.
+  // The nearest eye in a direction that shows every camera and 99 % of the points.
   function camera(element, figure, direction) {
     const back = unit(direction), right = unit(cross([0, 0, 1], back)), up = cross(back, right);
     const points = vertices(figure, figure.data[0], [right, up, back]);
     const pyramids = vertices(figure, figure.data[1], [right, up, back]);
     const fields = [FIELD * element.clientWidth / Math.max(element.clientHeight, 1), FIELD];
-    // Where the eye may stand across the direction d: seen from the distance, all must lie within the field.
+    // Positions of the eye along axis d from which everything lies within the field of view.
     function bounds(distance, d) {
       function ends(seen, strays) {
         const low = seen.map(function (p) { return p[d] - fields[d] * (distance - p[2]); });
@@ -82,7 +82,7 @@
     }
   });
 
-  // A wheel over a picture scrolls the page until the picture was clicked.
+  // The wheel scrolls the page until the figure is clicked.
   document.querySelectorAll(".plot.scene").forEach(function (scene) {
     let active = false;
     scene.addEventListener("pointerdown", function () { active = true; });

@@ -1,15 +1,15 @@
 "use strict";
-const pictures = Array.from(document.querySelectorAll(".strip img"));
+const frames = Array.from(document.querySelectorAll(".strip img"));
 const shown = document.getElementById("shown");
 const place = document.getElementById("place");
-const told = document.getElementById("told");
+const caption = document.getElementById("caption");
 const play = document.getElementById("play");
 let timer = 0;
 let step = 1;
 function show(k) {
   place.value = String(k);
-  shown.src = pictures[k].src;
-  shown.alt = told.textContent = pictures[k].alt;
+  shown.src = frames[k].src;
+  shown.alt = caption.textContent = frames[k].alt;
 }
 function stop() {
   clearInterval(timer);
@@ -22,7 +22,7 @@ play.addEventListener("click", () => {
   play.textContent = "Stop";
   timer = setInterval(() => {
     const k = Number(place.value);
-    if (k + step < 0 || k + step >= pictures.length) { step = -step; }
-    if (k + step >= 0 && k + step < pictures.length) { show(k + step); }
+    if (k + step < 0 || k + step >= frames.length) { step = -step; }
+    if (k + step >= 0 && k + step < frames.length) { show(k + step); }
   }, 120);
 });

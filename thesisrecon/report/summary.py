@@ -1,23 +1,31 @@
-"""``summary.json`` and ``cameras.json``: what a run found, in pixels of the original photographs."""
+"""``summary.json`` and ``cameras.json``: the results of a run, in pixels of the original images."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
-from thesisrecon.records import Image, IntrinsicInterval, Reconstruction, RunResult
-from thesisrecon.report.data import reprojection_distances, used_observations
+from thesisrecon.records import Image, Reconstruction, RunResult
+from thesisrecon.report.data import in_original_pixels, reprojection_distances, used_observations
 
 
 def summarize(result: RunResult) -> dict[str, Any]:
-    """What ``summary.json`` says of what was found; the caller adds what it knows of time and settings.
+    """Summarize the results of a run.
 
-    Lengths are pixels of the original photographs (``(x + 0.5) / scale - 0.5``); ``..._working_px`` are
-    pixels the stages worked at. Keys whose stage did not run are None.
+    Lengths are in original pixels, (x + 0.5) / scale - 0.5; ``..._working_px`` are in pixels at working size.
+
+    Parameters
+    ----------
+    result : RunResult
+        Any run, finished or not.
+
+    Returns
+    -------
+    dict
+        Content of ``summary.json`` without times and settings; None for stages that did not run.
     """
     best = result.metric.reconstruction if result.metric is not None else result.projective
     working = reprojection_distances(best) if best is not None else [np.zeros(0) for _ in result.images]
@@ -40,7 +48,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "motion": _motion(result),
         "self_check": dict(result.metric.self_check) if result.metric is not None else {},
         "pairs": {
-            "chosen_by": result.pair_choice.how if result.pair_choice is not None else None,
+            "selection": result.pair_choice.how if result.pair_choice is not None else None,
             "possible": len(result.images) * (len(result.images) - 1) // 2,
             "compared": result.pair_choice.compared if result.pair_choice is not None else None,
             "matched": len(result.pairs),
@@ -57,7 +65,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
 
 
 def _motion(result: RunResult) -> dict[str, Any] | None:
-    """The critical motion that the cameras come nearest to, and the measures behind it."""
+    """Return the nearest critical motion and its evidence."""
     identifiability = None if result.calibration is None else result.calibration.identifiability
     if identifiability is None:
         return None
@@ -70,13 +78,13 @@ def _motion(result: RunResult) -> dict[str, Any] | None:
 
 
 def _depth_maps(result: RunResult) -> list[dict[str, Any]] | None:
-    """How much of each view has a depth, and how sure it is; None where no depths were sought."""
+    """Return coverage and precision of the depth maps; None if there are none."""
     if not result.depth_maps:
         return None
     return [
         {
             "name": result.images[m.view].name,
-            "share_known": float(np.isfinite(m.depth).mean()),
+            "known_fraction": float(np.isfinite(m.depth).mean()),
             "median_std_rel": _median((m.std / m.depth)[np.isfinite(m.depth)].astype(np.float64)),
         }
         for m in result.depth_maps
@@ -93,12 +101,12 @@ def _model(result: RunResult) -> dict[str, Any] | None:
         "faces": len(mesh.faces),
         "texture_px": texture,
         "held_out": _held_out(result),
-        "share_untextured": None if mesh.untextured is None else float(mesh.untextured.mean()),
+        "untextured_fraction": None if mesh.untextured is None else float(mesh.untextured.mean()),
     }
 
 
 def _held_out(result: RunResult) -> dict[str, Any] | None:
-    """How like an unseen photograph the model is."""
+    """Return the comparison of the model with a held-out image."""
     held = result.held_out
     if held is None:
         return None
@@ -106,7 +114,7 @@ def _held_out(result: RunResult) -> dict[str, Any] | None:
         "name": result.images[held.view].name,
         "psnr_db": held.psnr_db if np.isfinite(held.psnr_db) else None,
         "ssim": held.ssim,
-        "share_compared": held.share,
+        "compared_fraction": held.share,
     }
 
 
@@ -126,7 +134,9 @@ def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distan
         "reprojection_rms_px": _rms(distances),
     }
     if registered and result.metric is not None:
-        view.update(_original_intervals(result.metric.intrinsics[i], image.scale))
+        for name, working in result.metric.intrinsics[i].items():
+            interval = in_original_pixels(name, working, image.scale)
+            view[name] = {"value": interval.value, "std": interval.std, "source": interval.source}
     return view
 
 
@@ -134,21 +144,6 @@ def _reason(best: Reconstruction | None, i: int) -> str:
     if best is None or best.registered[i]:
         return ""
     return best.reasons[i] or "no reason was recorded"
-
-
-def _original_intervals(
-    intrinsics: Mapping[str, IntrinsicInterval], scale: float
-) -> dict[str, dict[str, Any]]:
-    """Value, standard deviation and source of each intrinsic, in original pixels."""
-    answer = {}
-    for name, interval in intrinsics.items():
-        value, std = interval.value, interval.std
-        if name.endswith("_px"):
-            value, std = value / scale, std / scale
-        if name.startswith("principal"):
-            value += 0.5 / scale - 0.5
-        answer[name] = {"value": value, "std": std, "source": interval.source}
-    return answer
 
 
 def _refused(result: RunResult, views: list[dict[str, Any]]) -> list[dict[str, str]]:
@@ -165,8 +160,24 @@ def _median(distances: F64) -> float | None:
 
 
 def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> dict[str, Any]:
-    """``cameras.json``: K, R (world-to-camera), t, centre and lens of every registered view, in original
-    pixels.
+    """Build ``cameras.json``: K, R (world-to-camera), t, centre and distortion of every registered view.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Metric, with K and distortion.
+    images : tuple of Image
+        The V views.
+
+    Returns
+    -------
+    dict
+        Content of the file, in original pixels.
+
+    Raises
+    ------
+    ValueError
+        If the reconstruction is not metric.
     """
     if reconstruction.K is None or reconstruction.distortion is None:
         raise ValueError(f"cameras_table needs a metric reconstruction; got {reconstruction.stratum}")
@@ -179,7 +190,7 @@ def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
                 "name": image.name,
                 "width": image.original_size[0],
                 "height": image.original_size[1],
-                "K": original_from_working(image.scale) @ K,
+                "K": _original_from_working(image.scale) @ K,
                 "distortion": reconstruction.distortion[i],
                 "R": Rt[:, :3],
                 "t": Rt[:, 3],
@@ -187,20 +198,33 @@ def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
             }
         )
     convention = (
-        "x ~ K d(R X + t), d(u) = u (1 + k1 |u|^2 + k2 |u|^4 + k3 |u|^6), radial = (k1, k2, k3); "
+        "x ~ K d(R X + t), d(u) = u (1 + k1 |u|^2 + k2 |u|^4 + k3 |u|^6), distortion = (k1, k2, k3); "
         "(0, 0) is the centre of the top-left pixel"
     )
     return {"convention": convention, "cameras": cameras}
 
 
-def original_from_working(scale: float) -> F64:
-    """(3, 3) map of working pixels to original ones: (x + 0.5) / scale - 0.5."""
+def _original_from_working(scale: float) -> F64:
+    """Return the (3, 3) map from working to original pixels, (x + 0.5) / scale - 0.5."""
     offset = 0.5 / scale - 0.5
     return np.array([[1 / scale, 0.0, offset], [0.0, 1 / scale, offset], [0.0, 0.0, 1.0]])
 
 
-def point_colours(reconstruction: Reconstruction, images: tuple[Image, ...]) -> NDArray[np.uint8]:
-    """(N, 3) mean RGB of each point where it is seen; mid-grey where it is not."""
+def point_colors(reconstruction: Reconstruction, images: tuple[Image, ...]) -> NDArray[np.uint8]:
+    """Average the colours of the observations of each point.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        With N points.
+    images : tuple of Image
+        The V views.
+
+    Returns
+    -------
+    ndarray (N, 3) uint8
+        RGB; mid-grey without observations.
+    """
     used = used_observations(reconstruction)
     tracks = reconstruction.tracks
     view, point = tracks.view_index[used], tracks.point_index[used]

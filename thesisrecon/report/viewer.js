@@ -1,13 +1,13 @@
 "use strict";
-// Shows the model of the page from the JSON beside this script: WebGL 2 and nothing else.
+// Shows the model from the JSON of the page with WebGL 2.
 (function () {
   const data = JSON.parse(document.getElementById("model-data").textContent);
   const stage = document.getElementById("model-figure"), canvas = stage.querySelector("canvas");
-  const select = document.getElementById("model-stand");
+  const select = document.getElementById("model-viewpoint");
   const sides = Array.from(document.querySelectorAll("button[data-paint]"));
   const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
   if (gl === null) {
-    return fail("This browser has no WebGL 2, which the model needs to be shown. The file model.glb beside this page opens in any viewer of 3D files.");
+    return fail("This browser cannot show the model: it has no WebGL 2. Open the file model.glb beside this page in a 3D viewer.");
   }
 
   const VERTEX = `#version 300 es
@@ -29,10 +29,10 @@
       float lit = 0.18 + 0.82 * max(dot(normal, normalize(vec3(-0.35, 0.5, 0.8))), 0.0);
       vec3 own = textured ? texture(picture, at).rgb : paint;
       vec3 colour = shape ? vec3(0.86, 0.88, 0.90) * lit : own;
-      // Backs, which no photograph saw, are a veil, so that one looks into a yard from outside.
+      // Back faces are translucent, so that a courtyard can be seen from outside.
       shown = gl_FrontFacing ? vec4(colour, 1.0) : vec4(vec3(0.42, 0.52, 0.62) * lit, 0.25);
     }`;
-  const EYES = Math.tan(Math.PI / 8);  // of half the angle from top to bottom
+  const EYES = Math.tan(Math.PI / 8);  // tangent of half the vertical field of view
   const calm = window.matchMedia("(prefers-reduced-motion: reduce)");
   const samples = sampled(3000), radius = reach();
   let pose = null, shape = false, textured = false, ready = false, waiting = false, moving = 0;
@@ -131,20 +131,20 @@
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, source);
     gl.generateMipmap(gl.TEXTURE_2D);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    gl.texParameterf(gl.TEXTURE_2D, gl.TEXTURE_MAX_LOD, 2);  // beyond, neighbours in the atlas would mix
+    gl.texParameterf(gl.TEXTURE_2D, gl.TEXTURE_MAX_LOD, 2);  // higher levels mix neighbours in the atlas
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
   }
 
-  // ---- points of view: target, yaw and pitch of what looks at it, distance, field ----
+  // ---- poses: target, yaw, pitch, distance, field of view ----
   function aspect() { return Math.max(stage.clientWidth, 1) / Math.max(stage.clientHeight, 1); }
-  function standing(stand) {
-    const back = stand.eye.map(function (v, d) { return v - stand.target[d]; });
-    const field = Math.max(stand.field[1], stand.field[0] / aspect());
-    return Object.assign({ target: stand.target, distance: Math.hypot(...back), field: field }, towards(back));
+  function poseOf(viewpoint) {
+    const back = viewpoint.eye.map(function (v, d) { return v - viewpoint.target[d]; });
+    const field = Math.max(viewpoint.field[1], viewpoint.field[0] / aspect());
+    return Object.assign({ target: viewpoint.target, distance: Math.hypot(...back), field: field }, towards(back));
   }
-  // The nearest eye in a direction that has nearly all of the model in the picture, in its middle.
-  function turned(direction) {
+  // Fit nearly all of the model into the view from a direction.
+  function fitted(direction) {
     const p = towards(direction), a = axes(p), fields = [EYES * aspect(), EYES];
     const seen = samples.map(function (v) { return [dot(v, a.right), dot(v, a.up), dot(v, a.back)]; });
     const middle = [0, 1, 2].map(function (d) { return (share(seen, d, 0.01) + share(seen, d, 0.99)) / 2; });
@@ -227,9 +227,9 @@
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     canvas.width = Math.max(1, Math.round(ratio * stage.clientWidth));
     canvas.height = Math.max(1, Math.round(ratio * stage.clientHeight));
-    if (select.value !== "") { pose = standing(data.stands[Number(select.value)]); }
+    if (select.value !== "") { pose = poseOf(data.viewpoints[Number(select.value)]); }
     waiting = false;
-    draw();  // at once: a canvas of a new size is empty
+    draw();  // at once: resizing clears the canvas
   }
   function fail(words) {
     stage.classList.add("broken");
@@ -241,9 +241,9 @@
     sides.forEach(function (button) { button.setAttribute("aria-pressed", String((button.dataset.paint === "shape") === bare)); });
     redraw();
   }
-  function reset() { select.value = String(data.start); dress(false); go(standing(data.stands[data.start])); }
+  function reset() { select.value = String(data.start); dress(false); go(poseOf(data.viewpoints[data.start])); }
 
-  // ---- hands: a click wakes the picture, until then wheel and upright strokes of a finger move the page ----
+  // ---- input: until the canvas is clicked, the wheel and vertical swipes scroll the page ----
   const down = new Map();
   function awake(on) { stage.classList.toggle("awake", on); }
   canvas.addEventListener("pointerdown", function (event) {
@@ -282,16 +282,16 @@
     event.preventDefault();
     KEYS[event.key]();
   });
-  document.querySelectorAll("button[data-turn]").forEach(function (button) {
-    button.addEventListener("click", function () { select.value = ""; go(turned(data.turns[Number(button.dataset.turn)].direction)); });
+  document.querySelectorAll("button[data-direction]").forEach(function (button) {
+    button.addEventListener("click", function () { select.value = ""; go(fitted(data.directions[Number(button.dataset.direction)].from)); });
   });
   sides.forEach(function (button) { button.addEventListener("click", function () { dress(button.dataset.paint === "shape"); }); });
-  select.addEventListener("change", function () { if (select.value !== "") { go(standing(data.stands[Number(select.value)])); } });
+  select.addEventListener("change", function () { if (select.value !== "") { go(poseOf(data.viewpoints[Number(select.value)])); } });
   document.getElementById("model-reset").addEventListener("click", reset);
   canvas.addEventListener("webglcontextlost", function (event) { event.preventDefault(); ready = false; });
   canvas.addEventListener("webglcontextrestored", upload);
 
-  pose = standing(data.stands[data.start]);
+  pose = poseOf(data.viewpoints[data.start]);
   select.value = String(data.start);
   new ResizeObserver(resized).observe(stage);
   upload();

@@ -1,4 +1,4 @@
-"""The model as numbers for ``viewer.js``: turned upright, quantised, packed as text."""
+"""Data of the model for ``viewer.js``: upright, quantized, in base64."""
 
 from __future__ import annotations
 
@@ -18,34 +18,45 @@ from thesisrecon.report.drawing import embed_jpeg
 from thesisrecon.report.figures import upright_rotation
 
 LEVELS = 65535
-"""Steps a side of the box about the model, and a side of the texture."""
+"""Quantization levels along each axis of the bounding box and of the texture."""
 
 MAX_TEXELS = 2100 * 2100
-"""A texture beyond this is reduced: with 150,000 faces the page then grows by less than 8 MB."""
+"""Larger textures are reduced: with 150,000 faces they then add less than 8 MB to the page."""
 
-STRAY = 8.0
-"""How many times further out than nearly all of the model a face may be."""
+_STRAY = 8.0
+"""Largest distance of a face from the median, relative to the 95 % quantile."""
 
-PLAIN = (200, 200, 200)
-"""Colour of a model that has none."""
+_PLAIN = (200, 200, 200)
+"""Colour of a model without colours."""
 
-TURNS = (
+_DIRECTIONS = (
     ("Behind the cameras", (0.35, -1.45, 0.6)),
     ("From above", (0.0, -0.01, 1.9)),
     ("From the left", (-1.3, -0.9, 0.5)),
     ("From the right", (1.3, -0.9, 0.5)),
 )
-"""Directions to look from, z up and the cameras' mean gaze along y."""
+"""Viewing directions; z is up and the mean viewing direction of the cameras is along y."""
 
 
 def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Sequence[str]) -> dict[str, Any]:
-    """What ``viewer.js`` draws, ready for JSON.
+    """Build the JSON data of the 3D viewer; z is up.
 
-    ``positions`` (N, 3) uint16 in the box from ``low`` to ``high``, ``uv`` (N, 2) uint16 over the texture or
-    ``colors`` (N, 3) uint8, and ``indices`` (M, 3) uint32, each in base64 with the lowest byte first;
-    ``texture`` a JPEG in a ``data:`` address; ``stands`` of the photographs (see :func:`stands`), the
-    one in their middle as ``start``; ``turns`` the directions of :data:`TURNS`. z is up. Faces further from
-    the middle than ``STRAY`` times the distance that holds 95 % of the model are left out.
+    Parameters
+    ----------
+    mesh : TexturedMesh
+        Surface with texture, vertex colours or neither.
+    reconstruction : Reconstruction
+        Its metric cameras.
+    names : sequence of str
+        File names of the V views.
+
+    Returns
+    -------
+    dict
+        ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
+        uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` a JPEG; ``viewpoints``
+        (see :func:`viewpoints`), the most central one as ``start``; ``directions``.
+        Faces farther from the median than 8 times the 95 % quantile are left out.
     """
     mesh = _without_strays(mesh)
     views = np.flatnonzero(reconstruction.registered).tolist()
@@ -55,8 +66,8 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     low, high = (end(vertices[mesh.faces], axis=(0, 1)) for end in (np.min, np.max))
     steps = np.where(high > low, high - low, 1.0) / LEVELS
     positions = np.rint(np.clip((vertices - low) / steps, 0, LEVELS)).astype("<u2")
-    paint, faces, vertex = _painted(mesh)
-    places = stands(mesh, reconstruction, upright, names)
+    color, faces, vertex = _colored(mesh)
+    places = viewpoints(mesh, reconstruction, upright, names)
     eyes = np.array([place["eye"] for place in places])
     middle = int(np.argmin(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1)))
     return {
@@ -64,44 +75,44 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
         "high": (low + steps * LEVELS).tolist(),
         "positions": _packed(positions[vertex]),
         "indices": _packed(faces.astype("<u4")),
-        **paint,
-        "stands": places,
+        **color,
+        "viewpoints": places,
         "start": middle,
-        "turns": [{"name": name, "direction": list(direction)} for name, direction in TURNS],
+        "directions": [{"name": name, "from": list(direction)} for name, direction in _DIRECTIONS],
     }
 
 
 def _without_strays(mesh: TexturedMesh) -> TexturedMesh:
-    """Without faces so far away that the rest would have few steps of the box."""
+    """Remove far faces, which would leave few quantization levels for the rest."""
     distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
-    keep = (distance <= STRAY * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
+    keep = (distance <= _STRAY * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
     return replace(mesh, faces=mesh.faces[keep], uv=None if mesh.uv is None else mesh.uv[keep])
 
 
-def _painted(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
-    """The paint by its names, the faces (M, 3), and the vertex of each corner they name."""
+def _colored(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
+    """Return the colour data, the faces (M, 3) and the vertex of each corner."""
     every = np.arange(len(mesh.vertices))
     if mesh.texture is None or mesh.uv is None:
         colors = mesh.colors
         if colors is None:
-            colors = np.tile(np.array(PLAIN, dtype=np.uint8), (len(mesh.vertices), 1))
+            colors = np.tile(np.array(_PLAIN, dtype=np.uint8), (len(mesh.vertices), 1))
         return {"colors": _packed(colors)}, mesh.faces, every
     height, width = mesh.texture.shape[:2]
-    # (0, 0) is the centre of the first texel, while graphics cards count from its corner.
+    # (0, 0) is the centre of the first texel; WebGL counts from its corner.
     uv = np.clip((mesh.uv + 0.5) / (width, height), 0.0, 1.0)
     corners = np.column_stack([mesh.faces.ravel(), np.rint(LEVELS * uv.reshape(-1, 2)).astype(np.int64)])
-    # One number per corner instead of three: whole rows sort ten times slower.
+    # Sorting one integer key per corner is ten times faster than sorting rows.
     key = (corners[:, 0] * (LEVELS + 1) + corners[:, 1]) * (LEVELS + 1) + corners[:, 2]
     _, first, index = np.unique(key, return_index=True, return_inverse=True)
-    paint = {
+    color = {
         "uv": _packed(corners[first, 1:].astype("<u2")),
         "texture": embed_jpeg(_within(mesh.texture), quality=82).uri,
     }
-    return paint, index.reshape(-1, 3).astype(np.int64), corners[first, 0]
+    return color, index.reshape(-1, 3).astype(np.int64), corners[first, 0]
 
 
 def _within(texture: NDArray[np.uint8]) -> PillowImage.Image:
-    """The texture with at most ``MAX_TEXELS``."""
+    """Reduce the texture to at most ``MAX_TEXELS``."""
     picture = PillowImage.fromarray(texture)
     scale = np.sqrt(MAX_TEXELS / (picture.width * picture.height))
     if scale >= 1.0:
@@ -110,13 +121,27 @@ def _within(texture: NDArray[np.uint8]) -> PillowImage.Image:
     return picture.resize(size, PillowImage.Resampling.BOX)
 
 
-def stands(
+def viewpoints(
     mesh: TexturedMesh, reconstruction: Reconstruction, upright: F64, names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Where each registered photograph was taken, after the turn ``upright`` (3, 3).
+    """Compute the viewpoints of the registered images in the viewer.
 
-    ``eye`` (3,), ``target`` (3,) the point of its optical axis as deep as the middle of what it sees of the
-    model, ``field`` the tangents of half its angles to the side and upwards.
+    Parameters
+    ----------
+    mesh : TexturedMesh
+        Surface.
+    reconstruction : Reconstruction
+        Metric.
+    upright : ndarray (3, 3)
+        Rotation to the axes of the viewer.
+    names : sequence of str
+        File names of the V views.
+
+    Returns
+    -------
+    list of dict
+        ``eye`` (3,), ``target`` (3,) on the optical axis at the median depth of the visible vertices,
+        ``field`` the tangents of half the horizontal and vertical field of view.
     """
     found = []
     for i in np.flatnonzero(reconstruction.registered).tolist():

@@ -1,4 +1,4 @@
-"""What the page says: the verdict, the facts, and numbers written as people read them."""
+"""Sentences and numbers of the report: the assessment of a run, its key facts, and number formatting."""
 
 from __future__ import annotations
 
@@ -13,20 +13,32 @@ from thesisrecon.records import IntrinsicInterval, TexturedMesh, TwoView
 from thesisrecon.report.data import ReportData, ResidualSummary
 
 Level = Literal["good", "doubt", "open", "bad"]
-THIN = "\u202f"  # a narrow space that does not break groups thousands in any language
+_THIN = "\u202f"  # narrow no-break space
 
-STAGE_WORDS = {
-    "features": "corners were found",
-    "matches": "pairs of photographs were matched",
-    "projective": "a projective reconstruction was made (shapes up to perspective, no focal yet)",
-    "metric": "metric cameras and points were made",
+_STAGE_RESULTS = {
+    "features": "corners were detected",
+    "matches": "image pairs were matched",
+    "projective": "a projective reconstruction was computed (without focal lengths and angles)",
+    "metric": "metric cameras and points were computed",
 }
-UNITS = {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB"}
+_UNITS = {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB"}
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """How far the run got and how sure it is: a word, a sentence, and the reasons behind it."""
+class Assessment:
+    """How far the run got and whether its result is trusted.
+
+    Parameters
+    ----------
+    level : {"good", "doubt", "open", "bad"}
+        Colour of the page.
+    word, sentence : str
+        The result.
+    reasons : tuple of str
+        Evidence.
+    advice : str
+        What to try.
+    """
 
     level: Level
     word: str
@@ -37,16 +49,33 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Fact:
-    """One number of the first glance, with what it needs to be understood."""
+    """One key number.
+
+    Parameters
+    ----------
+    label, value, note : str
+        Name, number with unit, and explanation.
+    """
 
     label: str
     value: str
     note: str = ""
 
 
-def judge(data: ReportData) -> Verdict:
-    """The honest word on a run: trusted, doubtful, ended early as asked, or failed."""
-    total = len(data.photographs)
+def assess(data: ReportData) -> Assessment:
+    """Assess a run: trusted, not trusted, stopped early or failed.
+
+    Parameters
+    ----------
+    data : ReportData
+        The run.
+
+    Returns
+    -------
+    Assessment
+        The first section of the page.
+    """
+    total = len(data.images)
     if data.failure is not None:
         last = (
             f"the last stage that finished was {data.reports[-1].stage}"
@@ -54,34 +83,45 @@ def judge(data: ReportData) -> Verdict:
             else "no stage finished"
         )
         evidence = tuple(_sentence(text) for text in (data.failure.evidence, last) if text)
-        return Verdict(
+        return Assessment(
             "bad", "Failed", _sentence(data.failure.reason), evidence, _sentence(data.failure.advice)
         )
     if data.metric is None:
-        done = STAGE_WORDS.get(data.until or "", "the stages below were run")
-        return Verdict("open", "Ended early", f"As asked, the run ended there: {done}.")
+        done = _STAGE_RESULTS.get(data.until or "", "the stages below were run")
+        return Assessment("open", "Stopped early", f"The run ended as requested: {done}.")
     registered = int(data.metric.reconstruction.registered.sum())
     have = "has a metric camera" if registered == 1 else "have a metric camera"
-    found = f"{registered} of {count_of(total, 'photograph')} {have}."
+    found = f"{registered} of {count_of(total, 'image')} {have}."
     if not data.metric.trusted:
-        failed_checks = tuple(_sentence(doubt) for doubt in data.metric.failed_checks) or (
+        failed_checks = tuple(_sentence(check) for check in data.metric.failed_checks) or (
             "The self-check failed.",
         )
-        return Verdict(
+        return Assessment(
             "doubt",
-            "Doubtful",
-            f"{found} Do not rely on the result before you have looked at it.",
+            "Not trusted",
+            f"{found} Inspect the result before you use it.",
             failed_checks,
         )
     if registered < total:
-        return Verdict(
-            "good", "Trusted, but incomplete", f"{found} The self-check found nothing to doubt in these."
-        )
-    return Verdict("good", "Trusted", f"{found} The self-check found nothing to doubt.")
+        return Assessment("good", "Trusted, but incomplete", f"{found} They passed the self-check.")
+    return Assessment("good", "Trusted", f"{found} The result passed the self-check.")
 
 
-def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
-    """The facts above everything else, as far as the run got: cameras, intrinsics, residuals, time."""
+def key_facts(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
+    """List the key facts of a run: cameras, intrinsics, residuals, points and time.
+
+    Parameters
+    ----------
+    data : ReportData
+        The run.
+    overall : ResidualSummary or None
+        Residuals in original pixels.
+
+    Returns
+    -------
+    list of Fact
+        Facts that are available.
+    """
     facts = [_registered(data)]
     if data.metric is not None:
         facts += _intrinsic_facts(data)
@@ -89,7 +129,7 @@ def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact
         facts.append(_pair_fact(data.pairs))
     if overall is not None:
         note = f"{overall.rms_px:.2f} px RMS over {count_of(overall.count, 'observation')}"
-        scales = {photograph.scale for photograph in data.photographs}
+        scales = {image.scale for image in data.images}
         if len(scales) == 1 and scales != {1.0}:
             note += f"; at working size {overall.median_px * scales.pop():.2f} px median"
         facts.append(Fact("Reprojection error", f"{overall.median_px:.2f} px median", note))
@@ -102,7 +142,7 @@ def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact
         share = round(100 * slowest.seconds / seconds) if seconds > 0 else 0
         facts.append(
             Fact(
-                "Computing time of this result",
+                "Computing time",
                 duration(seconds),
                 f"longest stage: {slowest.stage}, {share} %",
             )
@@ -111,12 +151,12 @@ def first_glance(data: ReportData, overall: ResidualSummary | None) -> list[Fact
 
 
 def _registered(data: ReportData) -> Fact:
-    total, best = len(data.photographs), data.best_reconstruction
+    total, best = len(data.images), data.best_reconstruction
     unread = f"{count_of(len(data.unread), 'file')} could not be read" if data.unread else ""
     if best is None:
-        return Fact("Photographs", str(total), unread)
+        return Fact("Images", str(total), unread)
     registered = int(best.registered.sum())
-    refused = f"{total - registered} refused" if registered < total else "all of them"
+    refused = f"{total - registered} not registered" if registered < total else "all"
     label = "Cameras registered" if data.metric is not None else "Projective cameras"
     note = ", ".join(part for part in (refused, unread) if part)
     return Fact(label, f"{registered} of {total}", note)
@@ -124,45 +164,64 @@ def _registered(data: ReportData) -> Fact:
 
 def _pair_fact(pairs: Sequence[TwoView]) -> Fact:
     accepted = [pair for pair in pairs if pair.accepted]
-    note = f"{count_of(sum(pair.inliers for pair in accepted), 'verified match')} in them"
+    note = count_of(sum(pair.inliers for pair in accepted), "verified match")
     if undetermined := sum(pair.undetermined for pair in accepted):
-        leave = "leaves its" if undetermined == 1 else "leave their"
-        note += f"; {undetermined} {leave} epipolar geometry undetermined"
+        note += f"; {count_of(undetermined, 'pair')} with degenerate epipolar geometry"
     return Fact("Pairs accepted", f"{len(accepted)} of {len(pairs)}", note)
 
 
-def chosen_pairs(data: ReportData) -> str:
-    """How many of the possible pairs were tried and how they were chosen, as a sentence; '' if unsaid."""
+def pair_selection_text(data: ReportData) -> str:
+    """Describe how many of the possible pairs were matched and how they were selected.
+
+    Parameters
+    ----------
+    data : ReportData
+        The run.
+
+    Returns
+    -------
+    str
+        A sentence, or empty if unknown.
+    """
     if data.pair_choice is None:
         return ""
-    views = len(data.photographs)
+    views = len(data.images)
     possible, tried = views * (views - 1) // 2, len(data.pairs)
     were = "was" if tried == 1 else "were"
-    return f"{grouped(tried)} of {count_of(possible, 'pair')} {were} tried: {data.pair_choice.how}."
+    return f"{grouped(tried)} of {count_of(possible, 'pair')} {were} matched: {data.pair_choice.how}."
 
 
-def model_words(mesh: TexturedMesh) -> str:
-    """How large the model on the page is, and what of it nobody saw."""
+def model_text(mesh: TexturedMesh) -> str:
+    """Describe the size of the displayed model and its untextured part.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+        The model on the page.
+
+    Returns
+    -------
+    str
+        A clause.
+    """
     words = count_of(len(mesh.faces), "triangle")
     if mesh.texture is not None and mesh.uv is not None:
         words += f" with a texture of {mesh.texture.shape[1]} × {mesh.texture.shape[0]} texels"
     elif mesh.colors is not None:
-        words += " with coloured corners"
+        words += " with vertex colours"
     unseen = float(mesh.untextured.mean()) if mesh.untextured is not None and len(mesh.untextured) else 0.0
     if unseen >= 0.001:
-        words += f"; {100 * unseen:.1f} % of them are in no photograph and coloured like their surroundings"
+        words += f"; {100 * unseen:.1f} % are visible in no image and have the colour of their surroundings"
     return words
 
 
 def _point_fact(points: int, overall: ResidualSummary | None) -> Fact:
-    seen = f"seen in {overall.count / points:.1f} photographs on average" if overall and points else ""
+    seen = f"{overall.count / points:.1f} observations per point" if overall and points else ""
     return Fact("Points", grouped(points), seen)
 
 
 def _intrinsic_facts(data: ReportData) -> list[Fact]:
-    known = [
-        (view, photo) for view, photo in zip(data.original_intrinsics, data.photographs, strict=True) if view
-    ]
+    known = [(view, photo) for view, photo in zip(data.original_intrinsics, data.images, strict=True) if view]
     focal = [view["focal_px"] for view, _ in known if "focal_px" in view]
     facts = []
     if focal:
@@ -171,8 +230,12 @@ def _intrinsic_facts(data: ReportData) -> list[Fact]:
         )
         angle = np.degrees(2 * np.arctan(widths / (2 * np.array([f.value for f in focal]))))
         sizes = {photo.original_size for _, photo in known}
-        where = "×".join(str(n) for n in sizes.pop()) + " px" if len(sizes) == 1 else "each its own size"
-        note = f"{np.median(angle):.1f}° wide, at {where}. {source_of(focal)}"
+        where = (
+            f"images of {'×'.join(map(str, sizes.pop()))} px"
+            if len(sizes) == 1
+            else "images of several sizes"
+        )
+        note = f"horizontal field of view {np.median(angle):.1f}°; {where}. {_source_of(focal)}"
         facts.append(Fact("Focal length", interval_of(focal, "px"), note))
     centre_x = [view["principal_x_px"] for view, _ in known if "principal_x_px" in view]
     centre_y = [view["principal_y_px"] for view, _ in known if "principal_y_px" in view]
@@ -182,30 +245,54 @@ def _intrinsic_facts(data: ReportData) -> list[Fact]:
         ) / 2
         offset = np.stack([[p.value for p in centre_x], [p.value for p in centre_y]], axis=1) - middles
         away = float(np.median(np.linalg.norm(offset, axis=1)))
-        note = f"x, y; {away:.1f} px off the middle of the photograph. {source_of([*centre_x, *centre_y])}"
+        note = f"x, y; {away:.1f} px from the image centre. {_source_of([*centre_x, *centre_y])}"
         value = f"{interval_of(centre_x, '')}, {interval_of(centre_y, 'px')}"
         facts.append(Fact("Principal point", value, note))
     return facts
 
 
 def interval_of(intervals: Sequence[IntrinsicInterval], unit: str) -> str:
-    """One value ± its standard deviation where all views share it, else the range over the views."""
+    """Format one value ± its standard deviation, or the range if the views differ.
+
+    Parameters
+    ----------
+    intervals : sequence of IntrinsicInterval
+        One per view.
+    unit : str
+        Unit, or empty.
+
+    Returns
+    -------
+    str
+        As "1520.3 ± 1.8 px".
+    """
     values = np.array([interval.value for interval in intervals])
     std = float(np.median([interval.std for interval in intervals]))
-    tail = f"{THIN}{unit}" if unit else ""
+    tail = f"{_THIN}{unit}" if unit else ""
     if np.ptp(values) <= 1e-9 * max(1.0, float(np.abs(values).max())):
         return plus_minus(float(values[0]), std) + tail
     digits = _decimals(std)
     return f"{values.min():.{digits}f} to {values.max():.{digits}f}{tail} (± {std:.{digits}f})"
 
 
-def source_of(intervals: Sequence[IntrinsicInterval]) -> str:
-    """Where the values come from, each source once."""
-    return "From: " + ", ".join(dict.fromkeys(interval.source for interval in intervals)) + "."
+def _source_of(intervals: Sequence[IntrinsicInterval]) -> str:
+    """List the sources of the values, each once."""
+    return "Source: " + ", ".join(dict.fromkeys(interval.source for interval in intervals)) + "."
 
 
 def plus_minus(value: float, std: float) -> str:
-    """``1520.3 ± 1.8``, with as many decimals as the standard deviation deserves; fixed values say so."""
+    """Format a value with as many decimals as its standard deviation justifies.
+
+    Parameters
+    ----------
+    value, std : float
+        Value and standard deviation; 0 = fixed, not finite = undetermined.
+
+    Returns
+    -------
+    str
+        As "1520.3 ± 1.8".
+    """
     if not np.isfinite(std):
         return f"{value:.4g} (not determined)"
     if std == 0:
@@ -217,62 +304,97 @@ def plus_minus(value: float, std: float) -> str:
 def _decimals(std: float) -> int:
     if not np.isfinite(std) or std <= 0:
         return 1
-    # Two digits of an uncertainty that starts with 1 or 2, one of any other: the customary rounding.
+    # The usual rounding: two digits of an uncertainty that starts with 1 or 2, else one.
     exponent = int(np.floor(np.log10(std)))
     return int(np.clip((1 if std < 3 * 10.0**exponent else 0) - exponent, 0, 6))
 
 
 def grouped(number: int) -> str:
-    """12345 as 12 345."""
-    return f"{number:,}".replace(",", THIN)
+    """Group the digits of an integer: 12345 as 12 345."""
+    return f"{number:,}".replace(",", _THIN)
 
 
 def decimals(value: float, digits: int) -> str:
-    """A number with so many decimals, a dash where it is not known."""
+    """Format a number with fixed decimals; a dash if it is not finite."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "–"
 
 
 def significant(value: float) -> str:
-    """A length in three digits, a dash where it is not known."""
+    """Format a length with three significant digits; a dash if it is not finite."""
     return f"{value:.3g}" if np.isfinite(value) else "–"
 
 
 def duration(seconds: float) -> str:
-    """Seconds as people say them."""
+    """Format a duration.
+
+    Parameters
+    ----------
+    seconds : float
+        Not negative.
+
+    Returns
+    -------
+    str
+        As "7.3 s", "4 min 05 s" or "1 h 02 min".
+    """
     if seconds < 60:
-        return f"{seconds:.1f}{THIN}s"
+        return f"{seconds:.1f}{_THIN}s"
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}{THIN}h {minutes:02d}{THIN}min" if hours else f"{minutes}{THIN}min {rest:02d}{THIN}s"
+    return f"{hours}{_THIN}h {minutes:02d}{_THIN}min" if hours else f"{minutes}{_THIN}min {rest:02d}{_THIN}s"
 
 
 def named_number(name: str, value: float) -> tuple[str, str]:
-    """A key as words and its value with the unit of its suffix: ``sigma_px`` -> ("sigma", "0.31 px")."""
+    """Format a key and its value with the unit of its suffix.
+
+    Parameters
+    ----------
+    name : str
+        As "sigma_px".
+    value : float
+        The number.
+
+    Returns
+    -------
+    tuple of str
+        As ("sigma", "0.31 px").
+    """
     stem, _, suffix = name.rpartition("_")
     text = grouped(int(value)) if float(value).is_integer() and abs(value) < 1e15 else _short(value)
-    if stem and suffix in UNITS:
-        return stem.replace("_", " "), f"{text}{THIN}{UNITS[suffix]}"
+    if stem and suffix in _UNITS:
+        return stem.replace("_", " "), f"{text}{_THIN}{_UNITS[suffix]}"
     if stem and suffix == "rel":
-        return stem.replace("_", " "), f"{100 * value:.3g}{THIN}%"
+        return stem.replace("_", " "), f"{100 * value:.3g}{_THIN}%"
     return name.replace("_", " "), text
 
 
 def _short(value: float) -> str:
-    """Three digits, more only where they stand before the point."""
+    """Three significant digits, more only before the decimal point."""
     return f"{value:.3g}" if not abs(value) >= 1000 else f"{value:.0f}"
 
 
 def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tuple[str, str]]:
-    """:func:`named_number` of a whole mapping, in its order."""
+    """Format a mapping of numbers by :func:`named_number`.
+
+    Parameters
+    ----------
+    numbers : mapping
+        Key -> number.
+
+    Returns
+    -------
+    list of tuple of str
+        In the order of the mapping.
+    """
     return [named_number(name, float(value)) for name, value in numbers.items()]
 
 
 def count_of(number: int, noun: str) -> str:
-    """``1 file``, ``2 files``."""
+    """Format a count with its noun: "1 file", "2 files"."""
     return counted(number, noun, grouped(number))
 
 
 def _sentence(text: str) -> str:
-    """A clause with a capital and a full stop, empty where there is nothing to say."""
+    """Capitalize a clause and end it with a full stop."""
     text = text.strip()
     return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""
