@@ -1,5 +1,8 @@
-"""``python -m validation report|check``: every stage of ours beside the references, on the same inputs;
-``ablate``: variants and parameters of ours beside each other."""
+"""Command line of the validation: ``python -m validation report|check|ablate|study``.
+
+``report`` and ``check`` run every stage beside the references on the same inputs, ``ablate`` runs variants
+and parameters beside each other, ``study`` runs one of the measurements of :mod:`validation.studies`.
+"""
 
 from __future__ import annotations
 
@@ -19,20 +22,24 @@ from validation.harness.results import Results, collect, compare, read_results, 
 from validation.harness.scenes import load_photographs
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
+from validation.studies.runner import run_studies
 
 LEAST_SIDE_PX = 64
-"""Of depth maps: in smaller ones there is no window to match."""
+"""Smallest long side of depth maps: smaller ones hold no matching window."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """0: done, all gates hold; 1: a gate is broken (``check``); 2: a wrong wish."""
-    parser = _parser()
-    told = parser.parse_args(arguments)
-    if told.command == "ablate":
-        return ablation.run_command(told)
+    """Run the command: 0 if all is well, 1 if a gate or a bound is missed, 2 for a wrong option."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["study"]:
+        with advised("run the same command again"):
+            return run_studies(given[1:])
+    options = _parser().parse_args(given)
+    if options.command == "ablate":
+        return ablation.run_command(options)
     try:
-        wishes = _wishes(told)
-        other = read_results(told.against) if getattr(told, "against", None) else None
+        wishes = _wishes(options)
+        other = read_results(options.against) if getattr(options, "against", None) else None
         gates = read_gates()
         for name in wishes.folders:
             load_photographs(name, wishes)
@@ -43,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
         for words in ask_canaries(wishes).values():
             print(f"validation: {words}", file=sys.stderr)
         try:
-            judged = run_tasks(wishes, STAGES, _tell)
+            judged = run_tasks(wishes, STAGES, _print_progress)
         except ValueError as error:
             print(f"validation: {error}", file=sys.stderr)
             return 2
@@ -51,11 +58,11 @@ def main(arguments: list[str] | None = None) -> int:
     write_results(wishes.out, results)
     changes = None if other is None else compare(other, results)
     page = write_pages(wishes, STAGES, judged, results, changes)
-    if told.command == "check":
+    if options.command == "check":
         _print_gates(results)
     broken = counted(len(results.broken) + len(results.missing), "gate")
     print(f"{broken} broken; the page is {page}")
-    return int(told.command == "check" and bool(results.broken or results.missing))
+    return int(options.command == "check" and bool(results.broken or results.missing))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -63,70 +70,71 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     for name, words in (
         ("report", "Run stages and references and write pages, tables and results.json."),
-        ("check", "Only what the gates need, a line for each; exit code 1 where one is broken."),
+        ("check", "Run what the gates need and print a line for each; exit code 1 if one is broken."),
     ):
         command = commands.add_parser(name, help=words, description=words)
         command.add_argument("-o", "--out", type=Path, required=name == "report", default=Path("out/check"))
-        command.add_argument("--scenes", nargs="+", metavar="SCENE", help="by default all that are here")
-        command.add_argument("--stages", nargs="+", choices=list(STAGES), help="by default all")
-        command.add_argument("--images", type=Path, help="a folder of photographs of your own")
+        command.add_argument("--scenes", nargs="+", metavar="SCENE", help="default: all on this machine")
+        command.add_argument("--stages", nargs="+", choices=list(STAGES), help="default: all")
+        command.add_argument("--images", type=Path, help="folder of your own images")
         command.add_argument("--quick", action="store_true", help="few scenes and few repetitions")
         command.add_argument("--seed", type=int, default=0)
-        command.add_argument("--threads", type=int, default=len(own_cores()), help="tasks at a time")
+        command.add_argument("--threads", type=int, default=len(own_cores()), help="tasks that run at a time")
         command.add_argument(
-            "--resume", type=Path, help="the folder of a like run, whose references are taken as they are"
+            "--resume", type=Path, help="folder of an earlier run whose references are reused"
         )
         command.add_argument(
-            "--methods", nargs="+", metavar="METHOD", help="of ours, those that run again with --resume"
+            "--methods", nargs="+", metavar="METHOD", help="own methods that run again with --resume"
         )
-        command.add_argument("--time-limit", type=float, default=300.0, help="seconds for one task")
+        command.add_argument("--time-limit", type=float, default=300.0, help="limit of one task in seconds")
         command.add_argument(
-            "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps, by default small"
+            "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps (default: small)"
         )
         if name == "report":
-            command.add_argument("--against", type=Path, help="the folder of another report, to compare with")
+            command.add_argument("--against", type=Path, help="folder of another report to compare with")
     ablation.add_parser(commands)
+    commands.add_parser("study", help="Run one study; --list shows them.", add_help=False)
     return parser
 
 
-def _wishes(told: argparse.Namespace) -> Wishes:
-    """The wishes of the command line; ``ValueError`` names what is not there."""
+def _wishes(options: argparse.Namespace) -> Wishes:
+    """Return the options as a record; ``ValueError`` names what does not exist."""
     folders = {}
-    if told.images is not None:
-        if not told.images.is_dir():
-            raise ValueError(f"there is no folder of photographs {told.images}")
-        folders[told.images.resolve().name] = str(told.images.resolve())
-    here = available_scenes(quick=told.quick)
-    scenes = told.scenes or ([*folders] if folders else here)
+    if options.images is not None:
+        if not options.images.is_dir():
+            raise ValueError(f"the folder of images {options.images} does not exist")
+        folders[options.images.resolve().name] = str(options.images.resolve())
+    here = available_scenes(quick=options.quick)
+    scenes = options.scenes or ([*folders] if folders else here)
     unknown = [s for s in scenes if s not in (*available_scenes(quick=False), *folders)]
     if unknown:
         raise ValueError(
-            f"no scene is called {unknown[0]}; here are {', '.join(available_scenes(quick=False))}"
+            f"no scene is called {unknown[0]}; choose from {', '.join(available_scenes(quick=False))}"
         )
-    if told.methods and told.resume is None:
-        raise ValueError("--methods says what runs again with --resume: name the folder of the run before")
-    if told.threads < 1 or told.time_limit <= 0:
-        raise ValueError("--threads and --time-limit are more than zero")
-    if told.max_side and told.max_side < LEAST_SIDE_PX:
-        raise ValueError(f"--max-side is at least {LEAST_SIDE_PX} px")
+    if options.methods and options.resume is None:
+        raise ValueError("--methods needs --resume: name the folder of the earlier run")
+    if options.threads < 1 or options.time_limit <= 0:
+        raise ValueError("--threads and --time-limit must be positive")
+    if options.max_side and options.max_side < LEAST_SIDE_PX:
+        raise ValueError(f"--max-side must be at least {LEAST_SIDE_PX} px")
     return Wishes(
-        out=told.out.resolve(),
+        out=options.out.resolve(),
         scenes=tuple(dict.fromkeys([*scenes, *folders])),
-        stages=tuple(told.stages or STAGES),
+        stages=tuple(options.stages or STAGES),
         folders=folders,
-        quick=told.quick,
-        gates_only=told.command == "check",
-        seed=told.seed,
-        threads=min(told.threads, len(own_cores())),
-        limit_s=told.time_limit,
-        methods=tuple(told.methods or ()),
-        resume="" if told.resume is None else str(told.resume.resolve()),
-        side_px=told.max_side,
+        quick=options.quick,
+        gates_only=options.command == "check",
+        seed=options.seed,
+        threads=min(options.threads, len(own_cores())),
+        limit_s=options.time_limit,
+        methods=tuple(options.methods or ()),
+        resume="" if options.resume is None else str(options.resume.resolve()),
+        side_px=options.max_side,
     )
 
 
-def _tell(line: str) -> None:
-    """Progress, where somebody looks."""
+def _print_progress(line: str) -> None:
+    """Print progress on a terminal."""
     if sys.stderr.isatty():
         print(line, file=sys.stderr, flush=True)
 
@@ -135,8 +143,8 @@ def _print_gates(results: Results) -> None:
     for row in results.rows:
         if row.limit is not None:
             sign = "<=" if row.direction == "at most" else ">="
-            value = "nothing" if row.value is None else f"{row.value:.4g}"
+            value = "none" if row.value is None else f"{row.value:.4g}"
             print(f"{row.verdict:8} {row.key}: {value} {sign} {row.limit:g} {row.unit}")
     for key in results.missing:
         why = [words for task, words in results.failures.items() if task.split("/")[:2] == key.split("/")[:2]]
-        print(f"missed   {key}: nobody told this number{''.join(f' ({words})' for words in why[:1])}")
+        print(f"missed   {key}: no method reported this number{''.join(f' ({words})' for words in why[:1])}")

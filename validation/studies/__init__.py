@@ -1,1 +1,1 @@
-"""Cross-checks of thesisrecon against reference tools and truth."""
+"""Studies: measurements beside theory and references, each run by ``python -m validation study NAME``."""

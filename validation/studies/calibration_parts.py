@@ -1,10 +1,15 @@
-"""Self-calibration of parts of a real set that was matched once: random subsets of its photographs, and the
-set with one photograph of which little is left, so that its matches do not determine its focal length."""
+"""Self-calibration on parts of real sets, and coverage of its intervals on synthetic scenes.
+
+The parts are random subsets of the images and points of a set, and sets with one image that hardly overlaps
+with the others. ``calibration-coverage``: general scenes of random cameras with noisy tracks, from the
+projective maximum-likelihood reconstruction through self-calibration to the metric stage. 95 % intervals of
+focal length and principal point should contain the truth in 95 of 100 cases.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,17 +17,24 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure
+from thesisrecon.intrinsics import prior_for
 from thesisrecon.records import MetricResult, Reconstruction, RunResult, Tracks
+from thesisrecon.runtime.run import stream
 from validation.metrics.cameras import TrueCameras
 from validation.metrics.intervals import (
     LEVEL,
     IntervalScores,
     focal_errors_pct,
+    holding_std,
     interval_scores,
     join_scores,
 )
 from validation.metrics.record import Metric
-from validation.studies.reconstruction import OURS
+from validation.scenes.critical import Motion, make_sequence, projective_estimate
+from validation.scenes.critical import Sequence as SyntheticSequence
+from validation.studies.main_job import OURS
+from validation.studies.runner import Part, Rows
 from validation.studies.subsets import Matched, solve, take_views
 
 Cameras = Literal["shared", "per-image"]
@@ -34,13 +46,13 @@ KEPT_TRACKS = 0.7
 LEAST_HOLDING = 0.92
 WINDOW_SHARE = 0.35
 PLANE_SHARE = 0.004
-"""A point this share of its depth off a plane is on it."""
+"""Largest distance of a point to its plane over its depth."""
 WIDE_REL = 0.02
-"""A stated sigma from which on a focal length says of itself that it is hardly known."""
+"""Relative standard deviation from which on a focal length counts as marked uncertain."""
 
 
 def check_parts(name: str, run: RunResult | None, truth: TrueCameras) -> list[list[Metric]]:
-    """The tables of both studies; none where the run of the whole set failed."""
+    """Return the tables of both studies; none if the run of the whole set failed."""
     if run is None or run.metric is None or run.tracks is None:
         return []
     sizes = np.array([image.size for image in run.images], dtype=np.int64)
@@ -48,17 +60,16 @@ def check_parts(name: str, run: RunResult | None, truth: TrueCameras) -> list[li
     tables = [check_subsets(f"{name}, subsets, {cameras}", matched, truth.K, cameras) for cameras in MODES]
     weak = list(weak_views(matched, run.metric.reconstruction))
     for alike in (True, False):
-        title = f"{name}, per-image, one weak photograph, {'alike' if alike else 'nothing prior alike'}"
+        title = f"{name}, per-image, one weak image, {'alike' if alike else 'nothing prior alike'}"
         tables.append(check_weak(title, weak, truth.K, alike=alike))
     return tables
 
 
-# ---------------------------------------------------------------- random subsets
-
-
 def check_subsets(title: str, matched: Matched, K: F64, cameras: Cameras) -> list[Metric]:
-    """What the intervals hold for random subsets of the photographs with random points; how often subsets
-    succeed is measured by :mod:`validation.studies.subsets`."""
+    """Measure the intervals on random subsets of the images with random points.
+
+    :mod:`validation.studies.subsets` measures how often subsets succeed.
+    """
     scores: list[IntervalScores] = []
     errors: list[float] = []
     for trial in range(SUBSETS):
@@ -69,34 +80,23 @@ def check_subsets(title: str, matched: Matched, K: F64, cameras: Cameras) -> lis
         assert result.reconstruction.K is not None
         errors.append(float(np.nanmax(focal_errors_pct(result.reconstruction.K, K[views]))))
         scores.append(one_camera(interval_scores(result, K[views]), cameras))
-    rows = OwnRows(title)
+    rows = Rows(title, OURS)
     rows.add(f"trusted of {SUBSETS}", float(len(scores)))
     if not scores:
-        return rows.metrics
+        return rows
     held = join_scores(scores)
     rows.add("focal error of the worst camera, median over subsets, %", float(np.median(errors)))
     rows.add("focal error of the worst camera of all, %", float(np.max(errors)))
     for what, columns in (("focal", (0,)), ("principal point", (1, 2))):
         share = held.holding(columns)
-        rows.add(f"95 % intervals of the {what} that hold the truth", share, LEAST_HOLDING, at_most=False)
+        rows.add(f"95 % intervals of the {what} that hold the truth", share, at_least=LEAST_HOLDING)
         rows.add(f"largest deviation, {what}, stated sigmas", held.worst(columns))
     rows.add("stated sigma of the focal, median, %", float(100.0 * np.nanmedian(held.std_rel)))
-    return rows.metrics
-
-
-class OwnRows:
-    """The rows of one table of ours alone."""
-
-    def __init__(self, title: str) -> None:
-        self.title, self.metrics = title, list[Metric]()
-
-    def add(self, name: str, value: float, target: float | None = None, *, at_most: bool = True) -> None:
-        """One row."""
-        self.metrics.append(Metric(self.title, name, "", {OURS: value}, OURS, target, at_most=at_most))
+    return rows
 
 
 def draw_subset(matched: Matched, rng: np.random.Generator) -> tuple[Matched, I64]:
-    """5 to 8 of the photographs with a part of the points, and which photographs these are."""
+    """Draw 5 to 8 images and a part of the points; also return the view numbers."""
     low, high = SUBSET_SIZES
     n = matched.tracks.n_views
     size = int(rng.integers(low, min(high, n - 1) + 1))
@@ -105,7 +105,7 @@ def draw_subset(matched: Matched, rng: np.random.Generator) -> tuple[Matched, I6
 
 
 def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
-    """A value that all views share is one value, not as many as there are views."""
+    """Keep one view if all views share a camera."""
     if cameras == "per-image":
         return scores
     first = int(np.flatnonzero(np.isfinite(scores.std_rel))[0])
@@ -113,19 +113,16 @@ def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
 
 
 def _try(matched: Matched, cameras: Cameras, seed: int, *, alike: bool = True) -> MetricResult | None:
-    wish = replace(PipelineConfig().intrinsics, cameras=cameras, common_prior=alike)
-    result, failures, _ = solve(matched, PipelineConfig(intrinsics=wish), seed=seed, first=0)
+    options = replace(PipelineConfig().intrinsics, cameras=cameras, common_prior=alike)
+    result, failures, _ = solve(matched, PipelineConfig(intrinsics=options), seed=seed, first=0)
     if result is None:
         print(f"{matched.name}, seed {seed}: {failures[0]}", flush=True)
     return result
 
 
-# ---------------------------------------------------------------- one photograph that hardly overlaps
-
-
 @dataclass(frozen=True)
 class Weak:
-    """A set of which one ``view`` keeps few observations, chosen as ``kind`` says."""
+    """A set in which one ``view`` keeps few observations, chosen by ``kind``."""
 
     matched: Matched
     view: int
@@ -133,7 +130,7 @@ class Weak:
 
 
 def weak_views(matched: Matched, model: Reconstruction) -> Iterator[Weak]:
-    """Every photograph in turn, with only a small window of it left, and with only what lies in one plane."""
+    """Reduce every image in turn to a small window, and to the points of one plane."""
     t = matched.tracks
     for view in np.flatnonzero(model.registered):
         rng = np.random.default_rng([7, int(view)])
@@ -147,14 +144,13 @@ def weak_views(matched: Matched, model: Reconstruction) -> Iterator[Weak]:
 
 
 def without(matched: Matched, observations: B8, view: int) -> Matched:
-    """The set without these ``observations`` (K,), all of one ``view``, and without its pairs, whose matches
-    are no longer what they were."""
+    """Drop these ``observations`` (K,) of one ``view``, and the pairs of this view."""
     tracks = keep_observations(matched.tracks, ~observations)
     return replace(matched, tracks=tracks, pairs=[p for p in matched.pairs if view not in (p.i, p.j)])
 
 
 def keep_observations(tracks: Tracks, kept: B8) -> Tracks:
-    """The ``kept`` (K,) observations of the points that still have two of them."""
+    """Return the ``kept`` (K,) observations of points that still have two of them."""
     t = tracks
     kept = kept & (np.bincount(t.point_index[kept], minlength=t.n_points)[t.point_index] >= 2)
     return Tracks(t.view_index[kept], t.point_index[kept], t.xy[kept], t.n_views, t.n_points)
@@ -167,7 +163,7 @@ def _in_window(matched: Matched, _: Reconstruction, mine: np.ndarray, rng: np.ra
 
 
 def _in_plane(matched: Matched, model: Reconstruction, mine: np.ndarray, rng: np.random.Generator) -> B8:
-    """The points of the plane that holds most of them."""
+    """Keep the points of the plane that holds most of them."""
     Xh = model.X[matched.tracks.point_index[mine]]
     depth = np.abs(Xh @ model.P[matched.tracks.view_index[mine[0]], 2])
     best = np.zeros(len(Xh), dtype=bool)
@@ -185,8 +181,8 @@ KINDS: dict[str, Callable[[Matched, Reconstruction, np.ndarray, np.random.Genera
 
 
 def check_weak(title: str, sets: Sequence[Weak], K: F64, *, alike: bool) -> list[Metric]:
-    """What becomes of the weak photograph: its error, its interval, and whether it is named."""
-    rows = OwnRows(title)
+    """Measure error and interval of the weak image, and whether the result marks it."""
+    rows = Rows(title, OURS)
     for kind in KINDS:
         found = [_judge(weak, K, alike) for weak in sets if weak.kind == kind]
         error, width, z, named, others = (np.array(part) for part in zip(*found, strict=True))
@@ -197,16 +193,18 @@ def check_weak(title: str, sets: Sequence[Weak], K: F64, *, alike: bool) -> list
         rows.add(f"{kind}: focal error, worst, %", float(np.nanmax(error)))
         rows.add(f"{kind}: stated sigma, median, %", float(np.nanmedian(width)))
         held = float((z[there] <= LEVEL).mean())
-        rows.add(f"{kind}: 95 % intervals that hold the truth", held, LEAST_HOLDING, at_most=False)
+        rows.add(f"{kind}: 95 % intervals that hold the truth", held, at_least=LEAST_HOLDING)
         rows.add(f"{kind}: largest deviation, stated sigmas", float(np.nanmax(z)))
-        rows.add(f"{kind}: off by more than {SUCCESS_PCT:.0f} % and not named", float(unnamed.sum()), 0.0)
-        rows.add(f"{kind}: named", float(named.mean()))
-        rows.add(f"{kind}: focal error of the other photographs, median, %", float(np.nanmedian(others)))
-    return rows.metrics
+        rows.add(
+            f"{kind}: off by more than {SUCCESS_PCT:.0f} % and not marked", float(unnamed.sum()), at_most=0.0
+        )
+        rows.add(f"{kind}: marked", float(named.mean()))
+        rows.add(f"{kind}: focal error of the other images, median, %", float(np.nanmedian(others)))
+    return rows
 
 
 def _judge(weak: Weak, K: F64, alike: bool) -> tuple[float, float, float, bool, float]:
-    """Of the weak view: focal error %, stated sigma %, |z|, whether it is named; the others' median error."""
+    """Return error %, std %, |z| and marking of the weak view, and the median error of the others."""
     result = _try(weak.matched, "per-image", weak.view, alike=alike)
     if result is None:
         return np.nan, np.nan, np.nan, True, np.nan
@@ -219,8 +217,11 @@ def _judge(weak: Weak, K: F64, alike: bool) -> tuple[float, float, float, bool, 
 
 
 def named(result: MetricResult, view: int) -> bool:
-    """Whether the result says of a view that its own matches hardly determine its focal length: it is not
-    registered, a sentence names it, its value is said to be borrowed, or its stated sigma is wide."""
+    """Return whether the result marks the focal length of a view as uncertain.
+
+    The view is not registered, a sentence names it, its value is borrowed, or its standard deviation is
+    large.
+    """
     if not result.reconstruction.registered[view]:
         return True
     sentence = re.compile(rf"\bviews?\b[^;:]*\b{view}\b")
@@ -228,3 +229,121 @@ def named(result: MetricResult, view: int) -> bool:
         return True
     interval = result.intrinsics[view]["focal_px"]
     return interval.source.startswith("borrowed") or interval.std / interval.value >= WIDE_REL
+
+
+COVERAGE = 0.92, 0.98
+ZOOM = 0.3
+COLUMNS = {"focal": (0,), "principal point": (1, 2)}
+
+
+def run_trial(cameras: Cameras, number: int) -> tuple[IntervalScores, MetricResult] | None:
+    """Solve one synthetic scene; None if calibration fails.
+
+    With one camera per image the focal lengths vary by factors of up to e^0.3.
+    """
+    rng = np.random.default_rng([number, 5])
+    scene = make_sequence(Motion.GENERAL, rng, zoom=0.0 if cameras == "shared" else ZOOM)
+    return _solve_sequence(scene, cameras, number, rng)
+
+
+def _solve_sequence(
+    scene: SyntheticSequence,
+    cameras: Cameras,
+    number: int,
+    rng: np.random.Generator,
+    deferred: tuple[int, ...] = (),
+) -> tuple[IntervalScores, MetricResult] | None:
+    projective = projective_estimate(scene, rng)
+    registered = ~np.isin(np.arange(len(scene.K)), deferred)
+    projective = replace(
+        projective,
+        registered=registered,
+        P=np.where(registered[:, None, None], projective.P, 0.0),
+        inlier=projective.inlier & registered[scene.tracks.view_index],
+    )
+    config = PipelineConfig()
+    config = replace(config, intrinsics=replace(config.intrinsics, cameras=cameras))
+    prior = prior_for(projective, config.intrinsics)
+    try:
+        calibration = config.selfcalibration.calibrate(
+            projective, prior=prior, rng=stream(number, "selfcalibration")
+        )
+        result = config.metric.refine(projective, calibration, prior=prior, rng=stream(number, "metric"))
+    except StageFailure:
+        return None
+    return one_camera(interval_scores(result, scene.K), cameras), result
+
+
+def run_weak_trial(number: int) -> tuple[IntervalScores, MetricResult] | None:
+    """Solve one scene with a camera per image whose first image is weak.
+
+    The first image keeps a window of 30 % of width and height, or in every other trial the points near a
+    plane; it is not registered in the projective reconstruction.
+    """
+    rng = np.random.default_rng([number, 6])
+    scene = make_sequence(Motion.GENERAL, rng, zoom=ZOOM)
+    keep = _window_of_image(scene, rng) if number % 2 else _near_plane(scene)
+    tracks = keep_observations(scene.tracks, keep | (scene.tracks.view_index != 0))
+    return _solve_sequence(replace(scene, tracks=tracks), "per-image", number, rng, deferred=(0,))
+
+
+def _window_of_image(scene: SyntheticSequence, rng: np.random.Generator) -> B8:
+    xy, mine = scene.tracks.xy, np.flatnonzero(scene.tracks.view_index == 0)
+    return np.asarray((np.abs(xy - xy[rng.choice(mine)]) <= 0.15 * scene.sizes[0]).all(axis=1))
+
+
+def _near_plane(scene: SyntheticSequence) -> B8:
+    return np.asarray(np.abs(scene.X[scene.tracks.point_index, 0]) < 0.1)
+
+
+def check_weak_coverage(numbers: Iterable[int]) -> list[Metric]:
+    """Measure error, interval and marking of the first image of these trials."""
+    title = "synthetic, per-image, one image with little overlap"
+    found = [part for part in map(run_weak_trial, numbers) if part is not None]
+    scores = [part[0] for part in found]
+    there = np.array([bool(np.isfinite(s.std_rel[0])) for s in scores])
+    error = np.array([100.0 * abs(s.z[0, 0]) * s.std_rel[0] for s in scores])
+    marked = np.array([named(result, 0) for _, result in found])
+    z = np.array([abs(s.z[0, 0]) for s in scores])
+    rows = Rows(title, OURS)
+    rows.add(f"registered of {len(found)}", float(there.sum()))
+    rows.add("focal error, median, %", float(np.median(error[there])))
+    rows.add("focal error, worst, %", float(np.max(error[there])))
+    held = float(np.mean(z[there] <= LEVEL))
+    rows.add("95 % intervals of the focal that hold the truth", held, at_least=COVERAGE[0])
+    rows.add("largest deviation, stated sigmas", float(np.max(z[there])))
+    rows.add(
+        "off by more than 3 % and not marked", float(np.sum(there & (error > 3.0) & ~marked)), at_most=0.0
+    )
+    rows.add("marked", float(np.mean(marked)))
+    return rows
+
+
+def check_coverage(cameras: Cameras, numbers: Iterable[int]) -> list[Metric]:
+    """Measure one mode over these trials; results that are not trusted do not count."""
+    found = [run_trial(cameras, number) for number in numbers]
+    trusted = [part for part in found if part is not None and part[1].trusted]
+    rows = Rows(f"synthetic, {cameras}", OURS)
+    rows.add(f"calibrated of {len(found)}", float(sum(part is not None for part in found)))
+    rows.add(f"trusted of {len(found)}", float(len(trusted)))
+    if not trusted:
+        return rows
+    scores = [part[0] for part in trusted]
+    joined = join_scores(scores)
+    for what, columns in COLUMNS.items():
+        z, share = joined.z[:, columns], joined.holding(columns)
+        name = f"95 % intervals of the {what} that hold the truth"
+        rows.add(name, share, at_least=COVERAGE[0])
+        rows.add(f"{name} (no wider than needed)", share, at_most=COVERAGE[1])
+        rows.add(f"{name}, 95 % uncertainty of this share", LEVEL * holding_std(scores, columns))
+        rows.add(f"deviation, {what}, rms in stated sigmas", float(np.sqrt(np.nanmean(z**2))))
+    rows.add("stated sigma of the focal, median, %", float(100 * np.nanmedian(joined.std_rel)))
+    return rows
+
+
+def calibration_coverage_study(trials: int = 200) -> Iterator[Part]:
+    """Count 95 % intervals that contain the truth, on synthetic scenes that match the model."""
+    numbers = range(trials)
+    for cameras in MODES:
+        yield check_coverage(cameras, numbers)
+    yield check_weak_coverage(numbers)

@@ -1,45 +1,267 @@
-"""Self-calibration on real photographs beside COLMAP and the truth, nothing told of the cameras:
-``python -m validation.studies.calibration_real -o OUT [--scenes NAME ...] [--parts PART ...]``.
+"""Self-calibration of real images beside COLMAP and the truth, without prior knowledge of the cameras.
 
-Each set is matched once by either program; what follows the matches is run with one camera for all
-photographs and with one for each, on the photographs as they are, on zoomed and cropped ones, on their
-central parts, with wrong guesses of the focal length, and on parts of the set. OUT gets
-``calibration_real.md`` and ``calibration_real.json``, and keeps all runs: what is there is not run again. The
-exit code is 1 where a target is missed.
+Either program matches each set once. The later stages run with one camera for all images and with one for
+each; on the images as they are, zoomed and cropped, and reduced to their centres; with wrong initial focal
+lengths; and on parts of the set. OUT keeps all runs, which are not repeated.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.io.files import write_text
-from thesisrecon.records import Reconstruction
+from thesisrecon.errors import StageFailure
+from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import Reconstruction, RunResult
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
-from validation.studies.calibration_bench import Bench, Config, Rows, model_of, truth_of
-from validation.studies.calibration_parts import LEAST_HOLDING, MODES, check_parts
-from validation.studies.calibration_wide import check_against_shared, check_wide
-from validation.studies.reconstruction import COLMAP, OURS
-from validation.metrics.intervals import interval_scores, join_scores
-from validation.metrics.record import Metric, markdown_table
-from validation.references.colmap_mapping import Start
-from validation.scenes.real import REAL_SCENES, load_real_scene
-from validation.scenes.zoomed import central_scene, rezoom_scene
+from validation.metrics.cameras import CameraErrors, TrueCameras, measure_cameras
+from validation.metrics.intervals import LEVEL, focal_errors_pct, interval_scores, join_scores
+from validation.metrics.record import Metric
+from validation.references.colmap_mapping import Start, map_with_pycolmap, read_run
+from validation.references.colmap_matching import match_with_pycolmap
+from validation.scenes.real import REAL_SCENES, Scene
+from validation.scenes.zoomed import central_scene, rezoom_scene, windowed_scene
+from validation.studies.calibration_parts import (
+    COLUMNS,
+    LEAST_HOLDING,
+    MODES,
+    SUCCESS_PCT,
+    Cameras,
+    check_parts,
+    named,
+)
+from validation.studies.main_job import COLMAP, COLMAP_PP, OURS
+from validation.studies.runner import Part, Rows, scenes_here
+
+Config = Callable[[PipelineConfig], PipelineConfig]
+
+
+def truth_of(scene: Scene) -> TrueCameras:
+    """Return the true cameras of a scene that has them."""
+    assert scene.K is not None
+    assert scene.R is not None
+    assert scene.C is not None
+    return TrueCameras(scene.K, scene.R, scene.C)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One scene and the folder that keeps its runs."""
+
+    scene: Scene
+    out: Path
+    threads: int = 2
+    seed: int = 0
+
+    def ours(self, cameras: Cameras, change: Config | None = None) -> RunResult | None:
+        """Run ours; the images are matched once for all runs. None if it fails."""
+        config = PipelineConfig()
+        config = replace(config, intrinsics=replace(config.intrinsics, cameras=cameras))
+        config = config if change is None else change(config)
+        images = list(self.scene.image_paths)
+        try:
+            return reconstruct(
+                images,
+                self.out / "ours",
+                config=config,
+                seed=self.seed,
+                threads=self.threads,
+                until="metric",
+                overwrite=True,
+            )
+        except StageFailure as failure:
+            print(f"{self.scene.name}: {cameras}: {failure}", flush=True)
+            return None
+
+    def colmap(self, cameras: Cameras, name: str, start: Start) -> Reconstruction | None:
+        """Run COLMAP, or read an earlier run. None if it fails."""
+        images, place = self.scene.image_paths[0].parent, self.out / f"colmap-{cameras}"
+        try:
+            if (place / name / "sparse" / "0").is_dir():
+                return read_run(images, place / name).reconstruction
+            if not (place / "matched" / "seconds.json").is_file():
+                match_with_pycolmap(
+                    images, place / "matched", shared_camera=cameras == "shared", threads=self.threads
+                )
+            run = map_with_pycolmap(
+                images, place / "matched", place / name, start=start, threads=self.threads
+            )
+        except StageFailure as failure:
+            print(f"{self.scene.name}: COLMAP, {name}: {failure}", flush=True)
+            return None
+        return run.reconstruction
+
+    def methods(self, cameras: Cameras) -> tuple[RunResult | None, dict[str, Reconstruction | None]]:
+        """Return our run and the models of ours and of COLMAP, also with its principal point refined."""
+        run = self.ours(cameras)
+        models = {OURS: model_of(run), COLMAP: self.colmap(cameras, "default", Start())}
+        models[COLMAP_PP] = self.colmap(cameras, "principal-point", Start(refine_principal_point=True))
+        return run, models
+
+    def colmap_true(self) -> Reconstruction | None:
+        """Run COLMAP with the true calibration."""
+        assert self.scene.K is not None
+        K = {path.name: K for path, K in zip(self.scene.image_paths, self.scene.K, strict=True)}
+        return self.colmap("per-image", "true-K", Start(K=K))
+
+
+def model_of(run: RunResult | None) -> Reconstruction | None:
+    """Return the metric model of a run, or None."""
+    return None if run is None or run.metric is None else run.metric.reconstruction
+
+
+class CameraRows(Rows):
+    """Rows with the same quantities of several methods on one scene."""
+
+    def __init__(self, title: str, scene: Scene, models: Mapping[str, Reconstruction | None]) -> None:
+        super().__init__(title, OURS)
+        truth = truth_of(scene)
+        self.models, self.K, self.total = models, truth.K, len(truth.K)
+        self.errors = {m: None if r is None else measure_cameras(r, truth) for m, r in models.items()}
+
+    def registered(self) -> None:
+        """Add the number of registered cameras."""
+        values = {m: 0.0 if r is None else float(r.registered.sum()) for m, r in self.models.items()}
+        self.add(f"cameras registered of {self.total}", values, at_least=float(self.total))
+
+    def error(
+        self, name: str, unit: str, read: Callable[[CameraErrors], float | None], bound: float | None = None
+    ) -> None:
+        """Add one of the errors of the cameras."""
+        values = {m: None if e is None else read(e) for m, e in self.errors.items()}
+        self.add(name, values, unit, at_most=bound)
+
+    def focals(self, median: float | None = None, worst: float | None = None) -> None:
+        """Add the median and the worst focal error of the views."""
+        errors = {m: self._focals(r) for m, r in self.models.items()}
+        for name, reduce, bound in (("median", np.median, median), ("worst", np.max, worst)):
+            values = {m: reduced(reduce, e) for m, e in errors.items()}
+            self.add(f"focal error, {name}", values, "%", at_most=bound)
+
+    def _focals(self, model: Reconstruction | None) -> np.ndarray | None:
+        if model is None or model.K is None or not model.registered.any():
+            return None
+        return focal_errors_pct(model.K, self.K)[model.registered]
+
+    def all_focals(self, model: Reconstruction | None) -> np.ndarray:
+        """Return focal errors (V,) in percent of all views, infinite if a view is not registered."""
+        errors = None if model is None or model.K is None else focal_errors_pct(model.K, self.K)
+        return np.full(self.total, np.inf) if errors is None else np.nan_to_num(errors, nan=np.inf)
+
+    def poses(self, centre_mm: float | None = None, rotation_deg: float | None = None) -> None:
+        """Add errors of centres and rotations."""
+        self.error("camera centres, mean", "mm", _centre_mm, centre_mm)
+        self.error("camera rotations, median", "deg", lambda e: e.rotation_error_deg, rotation_deg)
+
+    def principal_point(self, bound: float | None = None) -> None:
+        """Add the error of the principal point."""
+        self.error("principal point error", "px", lambda e: e.principal_point_error_px, bound)
+
+    def intervals(self, run: RunResult | None, least: float | None = LEAST_HOLDING) -> None:
+        """Add the coverage and the width of the 95 % intervals."""
+        if run is None or run.metric is None:
+            return
+        scores = interval_scores(run.metric, self.K)
+        for name, columns in COLUMNS.items():
+            row = f"95 % intervals of the {name} that hold the truth"
+            self.add(row, scores.holding(columns), at_least=least)
+            self.add(f"largest error, {name}", scores.worst(columns), "stated standard deviations")
+        width = float(np.nanmedian(100.0 * scores.std_rel))
+        self.add("stated standard deviation of the focal, median", width, "%")
+        self.add("trusted by the self-check", run.metric.trusted, at_least=1.0)
+
+
+def reduced(reduce: Callable[[np.ndarray], float], values: np.ndarray | None) -> float | None:
+    """Reduce values to one number; None without values."""
+    return None if values is None or not len(values) else float(reduce(values))
+
+
+def _centre_mm(errors: CameraErrors) -> float | None:
+    return None if errors.centre_error is None else 1000.0 * errors.centre_error
+
+
+WINDOW = 0.3, 0.45
+"""Width and height of the windows over those of an image."""
+
+
+def check_wide(bench: Bench) -> Iterator[list[Metric]]:
+    """Calibrate with one camera per image when every third image keeps only a window."""
+    rng, weak = np.random.default_rng(11), np.arange(1, len(bench.scene.image_paths), 3)
+    corners = rng.uniform(0.1, 0.9 - np.array(WINDOW), (len(weak), 2))
+    boxes = {int(v): np.hstack([corner, corner + WINDOW]) for v, corner in zip(weak, corners, strict=True)}
+    here = _variant(bench, "wide", partial(windowed_scene, boxes=boxes))
+    run, models = here.methods("per-image")
+    rows = CameraRows(f"{bench.scene.name}, windows of {len(weak)} images, per-image", here.scene, models)
+    rows.registered()
+    errors = {m: rows.all_focals(model) for m, model in models.items()}
+    for label, views in (("whole", np.setdiff1d(np.arange(rows.total), weak)), ("windowed", weak)):
+        there = {m: e[views][np.isfinite(e[views])] for m, e in errors.items()}
+        for name, reduce in (("median", np.median), ("worst", np.max)):
+            values = {m: reduced(reduce, e) for m, e in there.items()}
+            rows.add(f"focal error of the {label}, {name}", values, "%")
+    if run is not None and run.metric is not None:
+        marked = [named(run.metric, int(v)) for v in weak]
+        silent = sum(errors[OURS][v] > SUCCESS_PCT and not m for v, m in zip(weak, marked, strict=True))
+        rows.add(f"windowed, off by more than {SUCCESS_PCT:.0f} % and not marked", silent, at_most=0.0)
+        rows.add("windowed that are marked", sum(marked))
+    rows.intervals(run)
+    yield rows
+
+
+def check_against_shared(bench: Bench) -> Iterator[list[Metric]]:
+    """Compare one camera per image with one for all, on images without truth.
+
+    The result for a shared camera is far more certain and stands in for the truth.
+    """
+    runs = {cameras: bench.ours(cameras) for cameras in MODES}
+    focals = {c: {OURS: _focals_of(model_of(run))} for c, run in runs.items()}
+    for cameras in MODES:
+        focals[cameras][COLMAP] = _focals_of(bench.colmap(cameras, "default", Start()))
+    alone, shared = focals["per-image"], {m: np.nanmedian(f) for m, f in focals["shared"].items()}
+    off = {m: 100.0 * np.abs(f / shared[m] - 1.0) for m, f in alone.items()}
+    rows = Rows(f"{bench.scene.name}, per-image against shared", OURS)
+    rows.add("cameras registered", {m: float(np.isfinite(f).sum()) for m, f in alone.items()})
+    rows.add("focal off the shared one, median", {m: float(np.nanmedian(o)) for m, o in off.items()}, "%")
+    rows.add("focal off the shared one, worst", {m: float(np.nanmax(o)) for m, o in off.items()}, "%")
+    run = runs["per-image"]
+    if run is not None and run.metric is not None:
+        there = np.flatnonzero(run.metric.reconstruction.registered)
+        stated = [run.metric.intrinsics[v]["focal_px"] for v in there]
+        std = _stated(runs["shared"])
+        z = np.array([(f.value - shared[OURS]) / max(np.hypot(f.std, std), 1e-12) for f in stated])
+        silent = sum(off[OURS][v] > SUCCESS_PCT and not named(run.metric, int(v)) for v in there)
+        held = float(np.mean(np.abs(z) <= LEVEL))
+        rows.add("95 % intervals of the focal that hold the shared one", held, at_least=LEAST_HOLDING)
+        rows.add(f"off by more than {SUCCESS_PCT:.0f} % and not marked", silent, at_most=0.0)
+    yield rows
+
+
+def _stated(run: RunResult | None) -> float:
+    """Return the standard deviation (px) of the focal length that a run states."""
+    if run is None or run.metric is None:
+        return 0.0
+    return float(np.median([view["focal_px"].std for view in run.metric.intrinsics if view]))
+
+
+def _focals_of(model: Reconstruction | None) -> np.ndarray:
+    """Return focal lengths (V,) px, NaN if a view is not registered."""
+    if model is None or model.K is None:
+        return np.array([np.nan])
+    return np.where(model.registered, np.sqrt(model.K[:, 0, 0] * model.K[:, 1, 1]), np.nan)
+
 
 TRUE_K = "COLMAP, true K"
-PARTS = ("cameras", "guesses", "centre", "zoom", "wide", "parts")
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Of one set: focal %, principal point px, centres mm, rotations deg, with one camera for all."""
+    """Bounds of one set with a shared camera: focal %, principal point px, centres mm, rotations deg."""
 
     focal_pct: float | None = None
     principal_point_px: float | None = None
@@ -54,60 +276,52 @@ TARGETS = {
 PER_IMAGE_MEDIAN_PCT, PER_IMAGE_WORST_PCT = 0.2, 0.5
 ZOOM_MEDIAN_PCT, ZOOM_WORST_PCT = 0.5, 3.0
 GUESS_CHANGE_PCT = 0.02
-# ---------------------------------------------------------------- the set as it is
 
 
-def check_cameras(bench: Bench) -> list[list[Metric]]:
-    """One camera for all photographs, and one for each."""
-    tables = []
+def check_cameras(bench: Bench) -> Iterator[list[Metric]]:
+    """Calibrate with one camera for all images and with one for each."""
     for cameras in MODES:
         run, models = bench.methods(cameras)
-        rows = Rows(f"{bench.scene.name}, {cameras}", bench.scene, {**models, TRUE_K: bench.colmap_true()})
+        title = f"{bench.scene.name}, {cameras}"
+        rows = CameraRows(title, bench.scene, {**models, TRUE_K: bench.colmap_true()})
         rows.registered()
         target = TARGETS[bench.scene.name] if cameras == "shared" else Targets()
         if cameras == "shared":
             rows.error("focal error", "%", lambda e: e.focal_error_pct, target.focal_pct)
         else:
             rows.focals(PER_IMAGE_MEDIAN_PCT, PER_IMAGE_WORST_PCT)
-        rows.error(
-            "principal point error", "px", lambda e: e.principal_point_error_px, target.principal_point_px
-        )
+        rows.principal_point(target.principal_point_px)
         rows.poses(target.centre_mm, target.rotation_deg)
-        # A value that all views share is one value: it is in its interval or not.
+        # A shared camera is one value, inside its interval or not.
         rows.intervals(run, 1.0 if cameras == "shared" else LEAST_HOLDING)
-        tables.append(rows.metrics)
-    return tables
+        yield rows
 
 
-# ---------------------------------------------------------------- guesses that are wrong
+def check_guesses(bench: Bench) -> Iterator[list[Metric]]:
+    """Measure the change of the focal length after initial values that are wrong by a factor of five.
 
-
-def check_guesses(bench: Bench) -> list[list[Metric]]:
-    """How far the focal length moves when what it starts from is five times too long or too short.
-
-    Ours starts from no guess. What comes nearest to one is the weak pull of self-calibration and a prior of
-    the user that is wrong by its own sigma.
+    Ours needs no initial value. The nearest equivalents are the weak prior of self-calibration and a user
+    prior that is wrong by its own standard deviation.
     """
     assert bench.scene.K is not None
-    true, title = float(np.median(bench.scene.K[:, 0, 0])), f"{bench.scene.name}, wrong guesses"
+    true, rows = float(np.median(bench.scene.K[:, 0, 0])), Rows(f"{bench.scene.name}, wrong guesses", OURS)
     ours = _focal(model_of(bench.ours("shared")))
     colmap = _focal(bench.colmap("shared", "default", Start()))
-    metrics = []
     for word, factor in (("long", 5.0), ("short", 0.2)):
         start = Start(focal_rel=1.2 * factor)
         pulled = _focal(model_of(bench.ours("shared", _pulled(factor))))
-        told = _focal(model_of(bench.ours("shared", _told(factor * true))))
+        given = _focal(model_of(bench.ours("shared", _focal_prior(factor * true))))
         theirs = _focal(bench.colmap("shared", f"five-times-too-{word}", start))
         values = {OURS: _change_pct(pulled, ours), COLMAP: _change_pct(theirs, colmap)}
         name = f"focal change, default guess five times too {word}"
-        metrics.append(Metric(title, name, "%", values, OURS, GUESS_CHANGE_PCT))
+        rows.add(name, values, "%", at_most=GUESS_CHANGE_PCT)
         name = f"focal change, prior five times too {word}, within a factor of five"
-        metrics.append(Metric(title, name, "%", {OURS: _change_pct(told, ours)}, OURS, GUESS_CHANGE_PCT))
-    return [metrics]
+        rows.add(name, {OURS: _change_pct(given, ours)}, "%", at_most=GUESS_CHANGE_PCT)
+    yield rows
 
 
 def _pulled(factor: float) -> Config:
-    """The weak pull of the focal toward a value that is wrong by ``factor``."""
+    """Move the weak prior of the focal length by ``factor``."""
 
     def change(config: PipelineConfig) -> PipelineConfig:
         method = config.selfcalibration
@@ -119,12 +333,12 @@ def _pulled(factor: float) -> Config:
     return change
 
 
-def _told(focal_px: float) -> Config:
-    """A prior at ``focal_px`` with a sigma of a factor of five."""
+def _focal_prior(focal_px: float) -> Config:
+    """Set a prior at ``focal_px`` with a standard deviation of a factor of five."""
 
     def change(config: PipelineConfig) -> PipelineConfig:
-        wish = replace(config.intrinsics, focal_px=focal_px, focal_std_rel=float(np.log(5.0)))
-        return replace(config, intrinsics=wish)
+        options = replace(config.intrinsics, focal_px=focal_px, focal_std_rel=float(np.log(5.0)))
+        return replace(config, intrinsics=options)
 
     return change
 
@@ -139,131 +353,95 @@ def _change_pct(value: float | None, reference: float | None) -> float | None:
     return None if value is None or reference is None else 100.0 * abs(value / reference - 1.0)
 
 
-# ---------------------------------------------------------------- other lenses
-
-
-def check_centre(bench: Bench) -> list[list[Metric]]:
-    """The central quarter of every photograph: a lens twice as long, at its own size and enlarged."""
-    tables = []
+def check_centre(bench: Bench) -> Iterator[list[Metric]]:
+    """Calibrate the central quarter of every image, at its own size and enlarged."""
     for zoom in (1.0, 2.0):
-        name = f"centre-{zoom:g}"
-        scene = central_scene(bench.scene, bench.out / name / "images", zoom=zoom)
-        here = replace(bench, scene=scene, out=bench.out / name)
+        here = _variant(bench, f"centre-{zoom:g}", partial(central_scene, zoom=zoom))
         run, models = here.methods("shared")
-        rows = Rows(
-            f"{bench.scene.name}, central quarter, {'enlarged' if zoom > 1 else 'as it is'}", scene, models
-        )
+        title = f"{bench.scene.name}, central quarter, {'enlarged' if zoom > 1 else 'as it is'}"
+        rows = CameraRows(title, here.scene, models)
         rows.registered()
         rows.error("focal error", "%", lambda e: e.focal_error_pct)
-        rows.error("principal point error", "px", lambda e: e.principal_point_error_px)
+        rows.principal_point()
         rows.poses()
         rows.intervals(run, 1.0)
-        tables.append(rows.metrics)
-    return tables
+        yield rows
 
 
-def check_zoom(bench: Bench, seeds: Sequence[int]) -> list[list[Metric]]:
-    """Every photograph zoomed and cropped for itself, one camera per image: a table for each seed and one of
-    them all."""
-    tables = []
+def _variant(bench: Bench, name: str, change: Callable[[Scene, Path], Scene]) -> Bench:
+    """Return the bench of a changed scene in a folder of its own."""
+    scene = change(bench.scene, bench.out / name / "images")
+    return replace(bench, scene=scene, out=bench.out / name)
+
+
+def check_zoom(bench: Bench, seeds: Sequence[int]) -> Iterator[list[Metric]]:
+    """Calibrate images that are zoomed and cropped each on its own: a table per seed and one of all."""
     pooled: dict[str, list[np.ndarray]] = {}
     scores = []
     title = f"{bench.scene.name}, zoomed and cropped"
     for seed in seeds:
-        scene = rezoom_scene(bench.scene, bench.out / f"zoom-{seed}" / "images", seed=seed)
-        here = replace(bench, scene=scene, out=bench.out / f"zoom-{seed}")
+        here = _variant(bench, f"zoom-{seed}", partial(rezoom_scene, seed=seed))
         run, models = here.methods("per-image")
-        rows = Rows(f"{title}, seed {seed}", scene, models)
+        rows = CameraRows(f"{title}, seed {seed}", here.scene, models)
         rows.registered()
         rows.focals(ZOOM_MEDIAN_PCT, ZOOM_WORST_PCT)
-        rows.error("principal point error", "px", lambda e: e.principal_point_error_px)
+        rows.principal_point()
         rows.poses()
         rows.intervals(run)
-        tables.append(rows.metrics)
+        yield rows
         for method, model in models.items():
             pooled.setdefault(method, []).append(rows.all_focals(model))
         if run is not None and run.metric is not None:
             scores.append(interval_scores(run.metric, rows.K))
-    tables.append(_pooled(f"{title}, all seeds", pooled))
-    if scores:
-        joined = join_scores(scores)
-        for name, columns in (("focal", (0,)), ("principal point", (1, 2))):
-            row = f"95 % intervals of the {name} that hold the truth"
-            held = {OURS: joined.holding(columns)}
-            tables[-1].append(Metric(title, row, "", held, OURS, LEAST_HOLDING, at_most=False))
-    return tables
+    every = _pooled(f"{title}, all seeds", pooled)
+    for name, columns in COLUMNS.items() if scores else ():
+        share = join_scores(scores).holding(columns)
+        every.add(f"95 % intervals of the {name} that hold the truth", share, at_least=LEAST_HOLDING)
+    yield every
 
 
-def _pooled(title: str, pooled: Mapping[str, list[np.ndarray]]) -> list[Metric]:
+def _pooled(title: str, pooled: Mapping[str, list[np.ndarray]]) -> Rows:
     together = {method: np.concatenate(errors) for method, errors in pooled.items()}
+    total, rows = len(next(iter(together.values()))), Rows(title, OURS)
     registered = {m: float(np.isfinite(e).sum()) for m, e in together.items()}
-    total = len(next(iter(together.values())))
+    rows.add(f"cameras registered of {total}", registered, at_least=float(total))
     median = {m: float(np.median(e)) for m, e in together.items()}
+    rows.add("focal error, median", median, "%", at_most=ZOOM_MEDIAN_PCT)
     worst = {m: float(np.max(e[np.isfinite(e)], initial=0.0)) for m, e in together.items()}
-    return [
-        Metric(title, f"cameras registered of {total}", "", registered, OURS, float(total), at_most=False),
-        Metric(title, "focal error, median", "%", median, OURS, ZOOM_MEDIAN_PCT),
-        Metric(title, "focal error, worst", "%", worst, OURS, ZOOM_WORST_PCT),
-    ]
+    rows.add("focal error, worst", worst, "%", at_most=ZOOM_WORST_PCT)
+    return rows
 
 
-# ---------------------------------------------------------------- the command
+Name = Literal["cameras", "guesses", "centre", "zoom", "wide", "parts"]
+PARTS: tuple[Name, ...] = ("cameras", "guesses", "centre", "zoom", "wide", "parts")
 
 
-def write_results(out: Path, tables: Sequence[Sequence[Metric]]) -> None:
-    """``calibration_real.md`` and ``calibration_real.json`` in ``out``."""
-    text = ["# Self-calibration on real photographs", ""]
-    for rows in tables:
-        text += [f"## {rows[0].scene}", "", markdown_table(list(rows)), ""]
-    told = [{**asdict(metric), "verdict": metric.verdict} for rows in tables for metric in rows]
-    write_text(out / "calibration_real.md", "\n".join(text))
-    write_text(out / "calibration_real.json", json.dumps(told, indent=1) + "\n")
+def calibration_real_study(
+    out: Path,
+    scenes: Sequence[str] = tuple(REAL_SCENES),
+    parts: Sequence[Name] = PARTS,
+    seeds: Sequence[int] = (0, 1, 2),
+    threads: int = 2,
+) -> Iterator[Part]:
+    """Compare self-calibration of real images with COLMAP and the truth.
 
-
-def measure(bench: Bench, parts: Sequence[str], seeds: Sequence[int]) -> list[list[Metric]]:
-    """The tables of one set."""
-    checks: dict[str, Callable[[], list[list[Metric]]]] = {
-        "cameras": lambda: check_cameras(bench),
-        "guesses": lambda: check_guesses(bench),
-        "centre": lambda: check_centre(bench),
-        "zoom": lambda: check_zoom(bench, seeds),
-        "wide": lambda: check_wide(bench),
-        "parts": lambda: check_parts(bench.scene.name, bench.ours("shared"), truth_of(bench.scene)),
-    }
-    tables = []
-    if not bench.scene.has_truth:
-        checks, parts = {"against shared": lambda: check_against_shared(bench)}, ["against shared"]
-    for part in parts:
-        found = checks[part]()
-        for rows in found:
-            print(f"\n{rows[0].scene}\n\n{markdown_table(list(rows))}", flush=True)
-        tables += found
-    return tables
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Measure, write, and say whether every target was reached."""
-    parser = argparse.ArgumentParser(prog="python -m validation.studies.calibration_real", description=__doc__)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--scenes", nargs="+", default=list(REAL_SCENES), choices=list(REAL_SCENES))
-    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the zoomed sets")
-    parser.add_argument("--threads", type=int, default=2)
-    wishes = parser.parse_args(arguments)
-    out = wishes.out.resolve()
-    tables: list[list[Metric]] = []
-    for name in wishes.scenes:
-        scene = load_real_scene(name)
-        if scene is None:
-            print(f"{name}: its photographs are not on this machine, left out", flush=True)
-            continue
-        tables += measure(Bench(scene, out / name, wishes.threads), wishes.parts, wishes.seeds)
-        # Written after each scene, so that a run cut short keeps what it has.
-        write_results(out, tables)
-    if not tables:
-        parser.error("none of these scenes is on this machine")
-    return int(any(metric.verdict == "missed" for rows in tables for metric in rows))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    Parameters
+    ----------
+    seeds : sequence of int
+        Seeds of the zoomed sets.
+    """
+    for scene in scenes_here(scenes):
+        bench = Bench(scene, out / scene.name, threads)
+        checks: dict[str, Callable[[Bench], Iterable[list[Metric]]]] = {
+            "cameras": check_cameras,
+            "guesses": check_guesses,
+            "centre": check_centre,
+            "zoom": partial(check_zoom, seeds=seeds),
+            "wide": check_wide,
+            "parts": lambda b: check_parts(b.scene.name, b.ours("shared"), truth_of(b.scene)),
+        }
+        if scene.has_truth:
+            for part in parts:
+                yield from checks[part](bench)
+        else:
+            yield from check_against_shared(bench)

@@ -1,19 +1,20 @@
-"""Critical motions: are they named, exact and as made by hand, and are general motions left alone.
+"""Critical motions: whether they are named, exact and by hand, and general motions are not.
 
-Every trial is a random scene (:mod:`validation.scenes.critical`), its noisy tracks, the projective
-reconstruction of maximum likelihood, self-calibration and its verdict. Where the cameras have no parallax,
-pairs of views are estimated and verified first, as the pipeline does, and its refusal counts as naming where
-it says the name. The dinosaur on its turntable ends the list.
+Every trial is a random scene (:mod:`validation.scenes.critical`) with noisy tracks, the projective
+maximum-likelihood reconstruction, self-calibration and its identifiability report. Without parallax, pairs of
+views are estimated and verified first, as in the pipeline; a refusal that names the motion counts. The
+dinosaur on its turntable ends the list.
 """
 
 from __future__ import annotations
 
-import argparse
+import sys
 from collections import Counter
-from collections.abc import Sequence as Many
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -26,13 +27,15 @@ from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from thesisrecon.projective.initial_pair import require_pair_with_parallax
 from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
-from validation.metrics.record import Metric, markdown_table
-from validation.scenes.critical import Motion, Sequence, make_sequence, projective_estimate
+from validation.metrics.record import Metric
+from validation.scenes.critical import Motion, make_sequence, projective_estimate
+from validation.scenes.critical import Sequence as SyntheticSequence
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur
+from validation.studies.runner import Part, Rows, pick, text_table
 
 OURS = "ours"
 CALIBRATOR = HypothesesAndRefinement(search=None, camera_subsets=0, focal_steps=17)
-"""The default with fewer hypotheses: the verdict is what is measured, and 6000 trials must end."""
+"""The default with fewer hypotheses, because thousands of trials measure its report only."""
 ZOOM = 0.3
 WRONG_FOCAL = 0.15
 PLANAR_OR_TURNTABLE = (Motion.TURNTABLE, Motion.PLANAR)
@@ -41,8 +44,17 @@ WITHOUT_PARALLAX = (Motion.ROTATION, Motion.PLANE)
 
 @dataclass(frozen=True)
 class Trial:
-    """``named``: the critical motion that was told, empty for none; ``identifiable`` the verdict;
-    ``focal_error`` of the adjusted focal (median over the views, relative), NaN without an answer."""
+    """One scene.
+
+    Attributes
+    ----------
+    named : str
+        Reported critical motion, empty for none.
+    identifiable : bool
+        Whether the focal length is reported as identifiable.
+    focal_error : float
+        |log f / f_true| of the median view, NaN without an answer.
+    """
 
     named: str
     identifiable: bool
@@ -50,28 +62,30 @@ class Trial:
 
 
 def run_trial(motion: Motion, seed: int, *, by_hand: bool, zoom: float) -> Trial:
-    """One scene through the stages that can name its motion."""
+    """Run one scene through the stages that can name its motion."""
     rng = np.random.default_rng([seed, list(Motion).index(motion), int(by_hand), int(zoom > 0.0)])
     scene = make_sequence(motion, rng, by_hand=by_hand, zoom=zoom)
     try:
         if motion in WITHOUT_PARALLAX:
             require_pair_with_parallax(_neighbours(scene, rng))
         reconstruction = projective_estimate(scene, rng)
-        wish = IntrinsicsOptions(cameras="per-image" if zoom else "shared")
-        verdict = CALIBRATOR.calibrate(reconstruction, prior=prior_for(reconstruction, wish), rng=rng).verdict
+        options = IntrinsicsOptions(cameras="per-image" if zoom else "shared")
+        report = CALIBRATOR.calibrate(
+            reconstruction, prior=prior_for(reconstruction, options), rng=rng
+        ).identifiability
     except StageFailure as failure:
         said = [name.value for name in Motion if name.value in str(failure) and name is not Motion.GENERAL]
         return Trial(" or ".join(said) or "refused without a name", False, np.nan)
-    assert verdict is not None
+    assert report is not None
     truth = float(np.median(scene.K[:, 0, 0] / scene.sizes.max(axis=1)))
-    found = verdict.evidence.get("focal_long_sides", np.nan)
+    found = report.evidence.get("focal_long_sides", np.nan)
     return Trial(
-        verdict.motion if verdict.critical else "", verdict.identifiable, abs(float(np.log(found / truth)))
+        report.motion if report.critical else "", report.identifiable, abs(float(np.log(found / truth)))
     )
 
 
-def _neighbours(scene: Sequence, rng: np.random.Generator, *, most: int = 4) -> list[TwoView]:
-    """The first pairs of neighbours, estimated and verified."""
+def _neighbours(scene: SyntheticSequence, rng: np.random.Generator, *, most: int = 4) -> list[TwoView]:
+    """Estimate and verify the first pairs of neighbours."""
     t = scene.tracks
     table = np.full((t.n_views, t.n_points), -1)
     table[t.view_index, t.point_index] = np.arange(len(t.xy))
@@ -91,52 +105,46 @@ def _neighbours(scene: Sequence, rng: np.random.Generator, *, most: int = 4) -> 
 
 
 def is_named(motion: Motion, named: str) -> bool:
-    """Whether a name is right: planar motion and the turntable, which is one, count as one."""
+    """Return whether the name is right; planar motion includes the turntable."""
     if motion in PLANAR_OR_TURNTABLE:
         return named in {kind.value for kind in PLANAR_OR_TURNTABLE}
     return motion.value in named.split(" or ")
 
 
 def check_motion(
-    motion: Motion, trials: Many[Trial], *, by_hand: bool, zoom: float
-) -> tuple[list[Metric], str]:
-    """Rows beside their targets, and a line of a table that tells all."""
-    kind = "by hand" if by_hand else "exact"
-    scene = f"{motion.value}, {kind}, {'zooming' if zoom else 'one focal'}"
-    n = len(trials)
-    wrong = sum(t.identifiable and not t.focal_error < WRONG_FOCAL for t in trials)
+    motion: Motion, trials: Sequence[Trial], *, by_hand: bool, zoom: float
+) -> tuple[list[Metric], list[object]]:
+    """Return the judged rows and a row of the table of all motions."""
+    kind, focal = "by hand" if by_hand else "exact", "zooming" if zoom else "one"
+    rows, n = Rows(f"{motion.value}, {kind}, {'zooming' if zoom else 'one focal'}", OURS), len(trials)
+    wrong = 100.0 * sum(t.identifiable and not t.focal_error < WRONG_FOCAL for t in trials) / n
     sure = [t.focal_error for t in trials if t.identifiable]
-    told = ", ".join(
-        f"{name or 'none'} {count}" for name, count in Counter(t.named for t in trials).most_common()
-    )
+    named = 0.0
     if motion is Motion.GENERAL:
-        alarms = sum(bool(t.named) or not t.identifiable for t in trials)
-        rows = [Metric(scene, "false alarms", "%", {OURS: 100.0 * alarms / n}, OURS, 2.0)]
-        named = 0
+        alarms = 100.0 * sum(bool(t.named) or not t.identifiable for t in trials) / n
+        rows.add("false alarms", alarms, "%", at_most=2.0)
     else:
-        named = sum(is_named(motion, t.named) for t in trials)
-        rows = [Metric(scene, "named", "%", {OURS: 100.0 * named / n}, OURS, 95.0, at_most=False)]
-    rows.append(Metric(scene, "called identifiable, focal off by 15 %", "%", {OURS: 100.0 * wrong / n}, OURS))
+        named = 100.0 * sum(is_named(motion, t.named) for t in trials) / n
+        rows.add("named", named, "%", at_least=95.0)
+    rows.add("called identifiable, focal off by 15 %", wrong, "%")
+    names = ", ".join(f"{name or 'none'} {k}" for name, k in Counter(t.named for t in trials).most_common())
     error = f"{100.0 * float(np.median(sure)):.2f}" if sure else "-"
-    line = (
-        f"| {motion.value} | {kind} | {'zooming' if zoom else 'one'} | {100.0 * named / n:.1f} | "
-        f"{100.0 * len(sure) / n:.1f} | {error} | {100.0 * wrong / n:.1f} | {told} |"
-    )
-    return rows, line
+    shares = [f"{named:.1f}", f"{100.0 * len(sure) / n:.1f}", error, f"{wrong:.1f}"]
+    return rows, [motion.value, kind, focal, *shares, names]
 
 
 def dinosaur_verdict(reconstruction: Reconstruction, *, cameras: str = "shared") -> IdentifiabilityReport:
-    """The verdict on projective cameras of the dinosaur; ``StageFailure`` where there is none."""
-    wish = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
+    """Return the report on projective cameras of the dinosaur."""
+    options = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
     answer = HypothesesAndRefinement().calibrate(
-        reconstruction, prior=prior_for(reconstruction, wish), rng=np.random.default_rng(0)
+        reconstruction, prior=prior_for(reconstruction, options), rng=np.random.default_rng(0)
     )
-    assert answer.verdict is not None
-    return answer.verdict
+    assert answer.identifiability is not None
+    return answer.identifiability
 
 
 def published_reconstruction(dinosaur: Dinosaur) -> Reconstruction:
-    """The published cameras with their tracks triangulated and adjusted."""
+    """Triangulate and adjust the tracks with the published cameras."""
     t = dinosaur.tracks
     seen = np.bincount(t.point_index, minlength=t.n_points) >= 3
     keep = seen[t.point_index]
@@ -152,38 +160,43 @@ def published_reconstruction(dinosaur: Dinosaur) -> Reconstruction:
     )
 
 
-def main() -> int:
-    """Print the tables; 1 where a target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=200)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--zoom", choices=["no", "yes", "both"], default="both")
-    names = [motion.name.lower() for motion in Motion]
-    parser.add_argument("--motions", nargs="+", choices=names, default=names)
-    wishes = parser.parse_args()
-    rows: list[Metric] = []
-    print("| motion | made | focal | named % | identifiable % | its focal error % | wrong % | names |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
-    zooms = {"no": [0.0], "yes": [ZOOM], "both": [0.0, ZOOM]}[wishes.zoom]
-    with ProcessPoolExecutor(wishes.workers) as pool:
-        for zoom in zooms:
-            for motion in (Motion[name.upper()] for name in wishes.motions):
+HEAD = ["motion", "made", "focal", "named %", "identifiable %", "its focal error %", "wrong %", "names"]
+
+
+def critical_motions_study(
+    trials: int = 200,
+    workers: int = 1,
+    zoom: Literal["no", "yes", "both"] = "both",
+    motions: Sequence[str] | None = None,
+) -> Iterator[Part]:
+    """Count critical motions that are named and general motions that are not.
+
+    Parameters
+    ----------
+    zoom : str
+        Whether focal lengths differ.
+    motions : sequence of str
+        Names of motions (default: all).
+    """
+    names = pick(motions, [motion.name.lower() for motion in Motion])
+    lines, judged = [], list[list[Metric]]()
+    with ProcessPoolExecutor(workers) as pool:
+        for factor in {"no": [0.0], "yes": [ZOOM], "both": [0.0, ZOOM]}[zoom]:
+            for motion in (Motion[name.upper()] for name in names):
                 for by_hand in (False, True) if motion is not Motion.GENERAL else (False,):
-                    run = partial(run_trial, motion, by_hand=by_hand, zoom=zoom)
-                    trials = list(pool.map(run, range(wishes.trials), chunksize=5))
-                    block, line = check_motion(motion, trials, by_hand=by_hand, zoom=zoom)
-                    rows += block
-                    print(line, flush=True)
-    print("", *(markdown_table([row]) for row in rows if row.verdict == "missed"), sep="\n\n")
+                    run = partial(run_trial, motion, by_hand=by_hand, zoom=factor)
+                    done = list(pool.map(run, range(trials), chunksize=5))
+                    block, line = check_motion(motion, done, by_hand=by_hand, zoom=factor)
+                    judged.append(block)
+                    lines.append(line)
+                    print(*line, sep=" | ", file=sys.stderr, flush=True)
+    yield text_table(HEAD, lines)
+    yield from judged
     dinosaur = load_dinosaur()
-    if dinosaur is not None:
-        for cameras in ("shared", "per-image"):
-            verdict = dinosaur_verdict(published_reconstruction(dinosaur), cameras=cameras)
-            numbers = ", ".join(f"{name} {value:.3g}" for name, value in verdict.evidence.items())
-            told = "; ".join(verdict.sentences)
-            print(f"\ndinosaur, {cameras}: {verdict.motion}, critical {verdict.critical}: {told} ({numbers})")
-    return int(any(row.verdict == "missed" for row in rows))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    for cameras in ("shared", "per-image"):
+        if dinosaur is None:
+            break
+        report = dinosaur_verdict(published_reconstruction(dinosaur), cameras=cameras)
+        numbers = ", ".join(f"{name} {value:.3g}" for name, value in report.evidence.items())
+        sentences = "; ".join(report.sentences)
+        yield f"dinosaur, {cameras}: {report.motion}, critical {report.critical}: {sentences} ({numbers})"

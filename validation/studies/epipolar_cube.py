@@ -1,16 +1,15 @@
-"""The thesis' cube study (5.5): ``python -m validation.studies.epipolar_cube``.
+"""The thesis' cube study (5.5): estimators of F on noisy projections of a cube.
 
 "The 3D points were perfectly projected onto the pixel planes of the cameras [...] Gaussian noise were added
-to the feature points and the epipolar configuration was estimated. The results are presented in table" - and
-there the text that survives breaks off: neither the table's numbers nor its columns are known, so that ours
-stand alone. Every pair of the 27 cameras whose common points are on more than one face takes part; the others
-share a plane, which leaves F free.
+to the feature points and the epipolar configuration was estimated. The results are presented in table" - here
+the surviving text breaks off. Neither numbers nor columns of the table are known, so ours stand alone. Every
+pair of the 27 cameras whose common points lie on more than one face takes part: points of one plane leave F
+undetermined.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -23,13 +22,13 @@ from thesisrecon.arrays import F64
 from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
-from thesisrecon.io.files import write_text
-from validation.studies.epipolar_catalogue import METHODS, THRESHOLD_PX, TOLD_SIGMAS, Method
 from validation.scenes.cube import CubeSequence, make_cube
+from validation.studies.epipolar_methods import MATCHED_SIGMAS, METHODS, THRESHOLD_PX, Method
+from validation.studies.runner import Part, pick, text_table
 
 NOISES_PX = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
 OFF_FACE = 20
-"""Common points that must lie off the face with the most of them."""
+"""Least number of common points off the face that holds most of them."""
 BOUND = "the bound"
 CUBE_METHODS = (
     "eight-point, raw pixels, rank 3",
@@ -49,12 +48,12 @@ CUBE_METHODS = (
     "least median of squares",
     "default",
 )
-"""The thesis' methods and the two that this library adds; the catalogue's others on demand."""
+"""The thesis' methods and the two that this library adds."""
 
 
 @dataclass(frozen=True)
 class CubePair:
-    """Two cameras (3, 4) with common calibration K, the points X (N, 3) both see, and their exact pixels."""
+    """Two cameras (3, 4) with calibration K, the common points X (N, 3) and their exact pixels."""
 
     K: F64
     P1: F64
@@ -66,13 +65,22 @@ class CubePair:
 
 @dataclass(frozen=True)
 class CubeRow:
-    """A method at one noise over all pairs.
+    """One method at one noise over all pairs.
 
-    ``distance_px`` and ``worst_px`` are the median and the 90 % quantile over the pairs of the RMS distance
-    of the exact points to their epipolar lines; ``residual_px`` the median of the same over the noisy points
-    that F was estimated from; ``ratio`` the RMS over the pairs of the distance over the bound;
-    ``epipole_deg`` the median angle between the rays of the true and of the estimated epipole; ``within`` the
-    share of the pairs whose distance is below 1 px; ``failures`` the pairs without F.
+    Attributes
+    ----------
+    distance_px, worst_px : float
+        Median and 90 % quantile over pairs of the RMS distance of the exact points to their epipolar lines.
+    residual_px : float
+        Median over pairs of the same for the noisy points that F is estimated from.
+    ratio : float
+        RMS over pairs of the distance over the KCR bound.
+    epipole_deg : float
+        Median angle between the rays of the true and the estimated epipole.
+    within : float
+        Share of pairs with a distance below 1 px.
+    failures : int
+        Pairs without F.
     """
 
     method: str
@@ -87,7 +95,7 @@ class CubeRow:
 
 
 def cube_pairs(cube: CubeSequence) -> list[CubePair]:
-    """The pairs whose common points do not lie on one face."""
+    """Return the pairs whose common points do not lie on one face."""
     P = [compose_camera(cube.K, R, -R @ C) for R, C in zip(cube.R, cube.C, strict=True)]
     pairs = []
     for i, j in combinations(range(len(P)), 2):
@@ -101,7 +109,7 @@ def cube_pairs(cube: CubeSequence) -> list[CubePair]:
 def run_cube(
     pairs: Sequence[CubePair], methods: Sequence[Method], noises: Sequence[float] = NOISES_PX
 ) -> list[CubeRow]:
-    """A row for each method and noise; all methods see the same noise. The bound is a method too."""
+    """Measure every method, and the bound, at every noise; all methods get the same noise."""
     rows = []
     for sigma in noises:
         bounds = [fundamental_bound(p.P1, p.P2, p.X, sigma_px=sigma) if sigma else None for p in pairs]
@@ -120,15 +128,20 @@ def run_cube(
 
 
 def _measure(method: Method, pair: CubePair, sigma: float, rng: np.random.Generator) -> tuple[float, ...]:
-    """Distance and residual, px, and the larger epipole error, degrees; NaN without F."""
     xy1, xy2 = (xy + rng.normal(0.0, 1.0, xy.shape) * sigma for xy in (pair.xy1, pair.xy2))
-    threshold = max(THRESHOLD_PX, TOLD_SIGMAS * sigma)
+    threshold = max(THRESHOLD_PX, MATCHED_SIGMAS * sigma)
     return measure_pair(method.fundamental(xy1, xy2, threshold_px=threshold, seed=0), pair, xy1, xy2)
 
 
 def measure_pair(F: F64 | None, pair: CubePair, xy1: F64, xy2: F64) -> tuple[float, ...]:
-    """RMS distances, px, of the exact points and of those F was estimated from to their lines, and the larger
-    epipole error, degrees; NaN without F."""
+    """Measure one F on one pair.
+
+    Returns
+    -------
+    tuple of float
+        RMS distances of the exact and of the noisy points to their epipolar lines (px) and the larger epipole
+        error (degrees); NaN without F.
+    """
     if F is None:
         return float("nan"), float("nan"), float("nan")
     distances = (
@@ -171,10 +184,10 @@ MEASURES: tuple[tuple[str, Callable[[CubeRow], str]], ...] = (
         "RMS distance of the exact points to their epipolar lines, px: median (90 % quantile) of the pairs",
         lambda r: f"{_short(r.distance_px)} ({_short(r.worst_px)})",
     ),
-    ("the same over the bound, RMS of the pairs", lambda r: _short(r.ratio)),
+    ("the same distance over the bound, RMS of the pairs", lambda r: _short(r.ratio)),
     ("direction of the worse epipole, degrees: median of the pairs", lambda r: _short(r.epipole_deg)),
     (
-        "RMS distance of the noisy points, which is all that can be seen without truth, px: median",
+        "RMS distance of the noisy points, which needs no truth, px: median",
         lambda r: _short(r.residual_px),
     ),
     (
@@ -190,26 +203,8 @@ def _short(value: float) -> str:
     return f"{value:.0e}" if 0.0 < value < 1e-3 else f"{value:.3g}"
 
 
-def report(rows: Sequence[CubeRow]) -> str:
-    """A Markdown table for each measure: methods by noise."""
-    sigmas = list(dict.fromkeys(r.sigma_px for r in rows))
-    names = list(dict.fromkeys(r.method for r in rows))
-    cells = {(r.method, r.sigma_px): r for r in rows}
-    blocks = []
-    for title, cell in MEASURES:
-        lines = [
-            f"| {' | '.join(['', *(f'{s:g} px' for s in sigmas)])} |",
-            f"| --- |{' --- |' * len(sigmas)}",
-        ]
-        for name in names:
-            shown = (cell(cells[name, s]) if (name, s) in cells else "-" for s in sigmas)
-            lines.append(f"| {name} | {' | '.join(shown)} |")
-        blocks.append(f"{title}\n\n" + "\n".join(lines))
-    return "\n\n".join(blocks)
-
-
 def draw(rows: Sequence[CubeRow]) -> go.Figure:
-    """RMS over the pairs of the distance over the bound against the noise, on logarithms."""
+    """Plot the RMS ratio to the bound over the noise, on logarithmic axes."""
     figure = go.Figure()
     for k, name in enumerate(dict.fromkeys(r.method for r in rows)):
         some = [r for r in rows if r.method == name and r.sigma_px > 0.0]
@@ -230,25 +225,33 @@ def draw(rows: Sequence[CubeRow]) -> go.Figure:
     return figure
 
 
-def main() -> int:
-    """Print the tables, and with -o write them and the plot."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--noise", type=float, nargs="+", default=NOISES_PX)
-    parser.add_argument("--every", type=int, default=1, help="take every so many pairs")
-    parser.add_argument("--methods", nargs="+", choices=[m.name for m in METHODS], metavar="NAME")
-    parser.add_argument("-o", "--out", type=Path, help="folder for cube.md and cube.html")
-    arguments = parser.parse_args()
-    names = CUBE_METHODS if arguments.methods is None else arguments.methods
-    pairs = cube_pairs(make_cube())
-    rows = run_cube(pairs[:: arguments.every], [m for m in METHODS if m.name in names], arguments.noise)
-    text = f"{len(pairs[:: arguments.every])} pairs of 27 cameras\n\n{report(rows)}\n"
-    print(text)
-    if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        write_text(arguments.out / "cube.md", text)
-        draw(rows).write_html(arguments.out / "cube.html", include_plotlyjs=True)
-    return 0
+
+def report(rows: Sequence[CubeRow]) -> Iterator[str]:
+    """Give a Markdown table of methods by noise for each measure."""
+    sigmas = list(dict.fromkeys(r.sigma_px for r in rows))
+    names = list(dict.fromkeys(r.method for r in rows))
+    cells = {(r.method, r.sigma_px): r for r in rows}
+    for title, cell in MEASURES:
+        lines = ([n, *(cell(cells[n, s]) if (n, s) in cells else "-" for s in sigmas)] for n in names)
+        yield f"{title}\n\n{text_table(['', *(f'{s:g} px' for s in sigmas)], lines)}"
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def epipolar_cube_study(
+    out: Path,
+    noise: Sequence[float] = NOISES_PX,
+    every: int = 1,
+    methods: Sequence[str] = CUBE_METHODS,
+) -> Iterator[Part]:
+    """Repeat the thesis' cube study (5.5); OUT gets a plot, cube.html.
+
+    Parameters
+    ----------
+    every : int
+        Take every n-th pair.
+    """
+    names = pick(methods, [m.name for m in METHODS])
+    pairs = cube_pairs(make_cube())[::every]
+    rows = run_cube(pairs, [m for m in METHODS if m.name in names], noise)
+    yield f"{len(pairs)} pairs of 27 cameras"
+    yield from report(rows)
+    draw(rows).write_html(out / "cube.html", include_plotlyjs=True)

@@ -1,29 +1,25 @@
-"""F of real photographs beside OpenCV, COLMAP and PoseLib, ``python -m validation.studies.epipolar_real``.
+"""F of real image pairs beside OpenCV, COLMAP and PoseLib.
 
-Three sets, each method run with several seeds. ``kusvod2``: errors on hand-made correspondences. ``strecha``:
-errors on noise-free correspondences of the true cameras. ``adelaide``: inliers against labels. An error is
-the RMS distance to the epipolar lines over both images. The targets are the best of OpenCV's two USAC
-variants, COLMAP and PoseLib, PoseLib, and the reference with the best F1: each with whichever of its
-settings is better.
+Each method runs with several seeds on three sets. ``kusvod2``: errors on hand-made correspondences;
+``strecha``: errors on noise-free correspondences of the true cameras; ``adelaide``: inliers against labels.
+An error is the RMS distance to the epipolar lines over both images. The bounds are the best of OpenCV's two USAC
+variants, COLMAP and PoseLib; PoseLib; and the reference with the best F1.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from validation.metrics.epipolar import precision_recall, rms_epipolar_distance, rms_sampson_distance
-from validation.metrics.record import Metric, markdown_table
+from validation.metrics.record import Metric
 from validation.references.fundamental import OURS, SOLVERS, Estimate, estimate_with
 from validation.references.libraries import one_thread
-from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import (
     SCENES_WITH_CAMERAS,
     RealPair,
@@ -31,18 +27,19 @@ from validation.scenes.real_pairs import (
     camera_pairs,
     kusvod2_pairs,
 )
+from validation.studies.runner import CACHE, Part, Rows, load_scene, pick
 
 Runs = dict[str, list[list[Estimate]]]
 THRESHOLD_PX = 1.0
 FAILED_PX = 5.0
 STRONG, STRONGEST = ("USAC_ACCURATE", "USAC_MAGSAC", "COLMAP", "PoseLib"), ("PoseLib",)
-"""References to beat on kusvod2, and on the scenes with cameras."""
+"""References that bound our errors on kusvod2, and on the scenes with cameras."""
 
 
 def run_pair(
     pair: RealPair, methods: Iterable[str], *, seeds: int, threshold_px: float
 ) -> dict[str, list[Estimate]]:
-    """Every method on one pair, once a seed."""
+    """Run every method on one pair, once for each seed."""
     return {
         method: [
             estimate_with(method, pair.xy1, pair.xy2, threshold_px=threshold_px, seed=seed)
@@ -52,15 +49,15 @@ def run_pair(
     }
 
 
-def least(values: dict[str, float], rivals: tuple[str, ...]) -> float | None:
-    """The smallest number of the methods whose names begin like a rival, None where none ran."""
-    return min((value for method, value in values.items() if method.startswith(rivals)), default=None)
+def least(values: dict[str, float], references: tuple[str, ...]) -> float | None:
+    """Return the smallest number of the methods whose names begin like a reference, or None."""
+    return min((value for method, value in values.items() if method.startswith(references)), default=None)
 
 
 def errors_of(
     runs: dict[str, list[Estimate]], pair: RealPair, error: Callable[[F64 | None, F64], float]
 ) -> dict[str, F64]:
-    """Errors (seeds,) of every method on the pair's truth."""
+    """Return errors (seeds,) of every method on the pair's true correspondences."""
     assert pair.truth is not None
     return {name: np.array([error(e.F, pair.truth) for e in found]) for name, found in runs.items()}
 
@@ -69,35 +66,35 @@ def error_rows(
     scene: str,
     pairs: list[str],
     errors: list[dict[str, F64]],
-    rivals: tuple[str, ...],
+    references: tuple[str, ...],
     limits: tuple[float, ...],
 ) -> list[Metric]:
-    """A row of medians for each pair; over all runs the median and the number beyond each limit, judged."""
+    """Return medians of each pair, and bounds on the medians and on the large errors of all runs."""
     medians = [{m: float(np.median(e)) for m, e in row.items()} for row in errors]
-    rows = [Metric(scene, pair, "px", row, OURS) for pair, row in zip(pairs, medians, strict=True)]
+    rows = Rows(scene, OURS)
+    for pair, row in zip(pairs, medians, strict=True):
+        rows.add(pair, row, "px")
     every = {method: np.concatenate([row[method] for row in errors]) for method in errors[0]}
-    n = len(next(iter(every.values())))
-    middle = {method: float(np.median(e)) for method, e in every.items()}
-    rows.append(Metric(scene, "**median of all runs**", "px", middle, OURS, least(middle, rivals)))
-    over_pairs = {m: float(np.median([row[m] for row in medians])) for m in middle}
-    rows.append(
-        Metric(scene, "**median of the pairs' medians**", "px", over_pairs, OURS, least(over_pairs, rivals))
-    )
+
+    def judge(name: str, values: dict[str, float], unit: str = "") -> None:
+        rows.add(name, values, unit, at_most=least(values, references))
+
+    judge("**median of all runs**", {method: float(np.median(e)) for method, e in every.items()}, "px")
+    over_pairs = {m: float(np.median([row[m] for row in medians])) for m in every}
+    judge("**median of the pairs' medians**", over_pairs, "px")
     for limit in limits:
         beyond = {method: float(np.sum(e > limit)) for method, e in every.items()}
-        name = f"**runs > {limit:g} px**, of {n}"
-        rows.append(Metric(scene, name, "", beyond, OURS, least(beyond, rivals)))
+        judge(f"**runs > {limit:g} px**, of {len(next(iter(every.values())))}", beyond)
     return rows
 
 
 def check_kusvod2(pairs: Iterable[RealPair], methods: list[str], seeds: int) -> list[Metric]:
-    """Errors on the hand-made correspondences of the pairs."""
+    """Measure errors on the hand-made correspondences."""
     labels: list[str] = []
     errors: list[dict[str, F64]] = []
     sampson: list[dict[str, F64]] = []
     sure = 0
     for pair in pairs:
-        assert pair.truth is not None
         runs = run_pair(pair, methods, seeds=seeds, threshold_px=THRESHOLD_PX)
         labels.append(f"{pair.name} ({len(pair.xy1)} matches)")
         errors.append(errors_of(runs, pair, rms_epipolar_distance))
@@ -113,14 +110,13 @@ def check_kusvod2(pairs: Iterable[RealPair], methods: list[str], seeds: int) -> 
     middle = {m: float(np.median(np.concatenate([row[m] for row in sampson]))) for m in methods}
     rows.append(Metric("kusvod2", "median Sampson distance of all runs", "px", middle, OURS))
     if OURS in methods:
-        rows.append(
-            Metric("kusvod2", f"runs > {FAILED_PX:g} px and called sure", "", {OURS: float(sure)}, OURS)
-        )
+        name = f"runs > {FAILED_PX:g} px and called sure"
+        rows.append(Metric("kusvod2", name, "", {OURS: float(sure)}, OURS))
     return rows
 
 
 def called_sure(estimate: Estimate, pair: RealPair, limit_px: float) -> bool:
-    """Whether F is off by more than the limit and yet the matches are said to determine it."""
+    """Return whether F errs by more than the limit and the degeneracy test accepts it."""
     assert pair.truth is not None
     if estimate.fit is None or rms_epipolar_distance(estimate.F, pair.truth) <= limit_px:
         return False
@@ -131,7 +127,7 @@ def called_sure(estimate: Estimate, pair: RealPair, limit_px: float) -> bool:
 def check_cameras(
     pairs: Iterable[RealPair], methods: list[str], seeds: int, *, verbose: bool
 ) -> list[Metric]:
-    """Errors on noise-free correspondences of the true cameras, of the pairs of one scene."""
+    """Measure errors on noise-free correspondences of the true cameras of one scene."""
     labels: list[str] = []
     errors: list[dict[str, F64]] = []
     sure = 0
@@ -156,9 +152,9 @@ def check_cameras(
 
 
 def check_adelaide(methods: list[str], seeds: int) -> list[Metric]:
-    """Precision and recall of the inliers, means over the seeds.
+    """Measure precision and recall of the inliers, means over the seeds.
 
-    The target is the reference with the largest F1: who calls every match an inlier has the best recall.
+    The bound is the reference with the largest F1: a method that accepts every match has the best recall.
     """
     rows = []
     for pair in adelaide_pairs():
@@ -183,43 +179,33 @@ def check_adelaide(methods: list[str], seeds: int) -> list[Metric]:
     return rows
 
 
-def blocks(a: argparse.Namespace) -> Iterator[list[Metric]]:
-    """The rows of each set asked for, empty where its photographs are not on this machine."""
-    if a.only in (None, "kusvod2"):
-        names = tuple(a.pairs) if a.pairs else None
-        yield check_kusvod2(kusvod2_pairs(a.cache, names, mutual=a.mutual), a.methods, a.seeds)
-    for scene in SCENES_WITH_CAMERAS if a.only in (None, "strecha") else ():
-        yield check_cameras(
-            camera_pairs(load_real_scene(scene), a.cache), a.methods, a.seeds, verbose=a.verbose
-        )
-    if a.only in (None, "adelaide"):
-        yield check_adelaide(a.methods, a.seeds)
 
+def epipolar_real_study(
+    parts: Sequence[Literal["kusvod2", "strecha", "adelaide"]] = ("kusvod2", "strecha", "adelaide"),
+    seeds: int = 20,
+    methods: Sequence[str] | None = None,
+    pairs: Sequence[str] | None = None,
+    mutual: bool = False,
+    verbose: bool = False,
+    cache: Path = CACHE,
+) -> Iterator[Part]:
+    """Compare F of real images with OpenCV, COLMAP and PoseLib.
 
-def main() -> int:
-    """Print the tables; 1 where a target is missed, 3 where there are no photographs."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=["kusvod2", "strecha", "adelaide"])
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--methods", nargs="+", choices=list(SOLVERS), default=list(SOLVERS))
-    parser.add_argument("--pairs", nargs="+", help="some pairs of kusvod2 by name")
-    parser.add_argument("--mutual", action="store_true", help="kusvod2: matches nearest to each other")
-    parser.add_argument("--verbose", action="store_true", help="every pair of the scenes with cameras")
-    default = Path(tempfile.gettempdir()) / "thesisrecon-matches"
-    parser.add_argument("--cache", type=Path, default=default, help="folder that keeps the SIFT matches")
-    arguments = parser.parse_args()
+    Parameters
+    ----------
+    pairs : sequence of str
+        Names of pairs of kusvod2 (default: all).
+    mutual : bool
+        Keep only mutual best matches in kusvod2.
+    verbose : bool
+        Report every pair of the scenes with cameras.
+    """
     one_thread()
-    rows: list[Metric] = []
-    for found in blocks(arguments):
-        rows += found
-        if found:
-            title = f"## {found[0].scene}, {arguments.seeds} seeds"
-            print(title, markdown_table(found), "", sep="\n\n", flush=True)
-    if not rows:
-        print("the photographs are not on this machine (THESISRECON_DATA)", file=sys.stderr)
-        return 3
-    return int(any(row.verdict == "missed" for row in rows))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    names = pick(methods, SOLVERS)
+    if "kusvod2" in parts:
+        chosen = tuple(pairs) if pairs else None
+        yield check_kusvod2(kusvod2_pairs(cache, chosen, mutual=mutual), names, seeds)
+    for scene in SCENES_WITH_CAMERAS if "strecha" in parts else ():
+        yield check_cameras(camera_pairs(load_scene(scene), cache), names, seeds, verbose=verbose)
+    if "adelaide" in parts:
+        yield check_adelaide(names, seeds)

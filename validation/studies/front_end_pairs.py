@@ -1,13 +1,13 @@
-"""Verified matches of pairs of photographs with known cameras: our front ends beside SIFT.
+"""Verified matches of pairs with known cameras: our front ends beside SIFT.
 
-All front ends see the same photographs, and their matches go through one estimator of F and one verification,
-those of the preset ``default``. A match counts as verified where it is an inlier, within max(2.5 sigma,
-0.3 px), of an F that is right: the RMS distance of true correspondences to its epipolar lines is below 1 px.
+All front ends get the same images; their matches go through one estimator of F and one verification, those of
+the preset ``default``. A match counts as verified if it is an inlier, within max(2.5 sigma, 0.3 px), of an F
+that is right: the RMS distance of true correspondences to its epipolar lines is below 1 px.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.geometry.two_view import sampson_residuals
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import read_images
 from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
 from thesisrecon.records import Image, TwoView
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
@@ -26,6 +26,7 @@ from validation.metrics.record import Metric
 from validation.references.sift_front_end import sift_front_end
 from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import camera_pairs
+from validation.studies.runner import Rows, text_table
 
 OURS, THESIS, SIFT = "ours", "thesis", "SIFT"
 MAX_SIZE_PX = 1536
@@ -37,7 +38,7 @@ Values = dict[str, float | None]
 
 
 def front_ends() -> dict[str, PipelineConfig]:
-    """The default, the thesis' corners and correlation, and SIFT, all with one estimator and verification."""
+    """Return default, thesis and SIFT front ends with one estimator and verification."""
     ours, thesis = preset("default"), preset("thesis")
     return {
         OURS: ours,
@@ -48,14 +49,14 @@ def front_ends() -> dict[str, PipelineConfig]:
 
 @dataclass(frozen=True)
 class Related:
-    """A pair of photographs by one front end: what it verified and how far its F is from the truth."""
+    """A pair of images by one front end, and the error of its F."""
 
     view: TwoView
     error_px: float
 
     @property
     def right(self) -> bool:
-        """Whether the F is right."""
+        """Whether F is right."""
         return self.error_px < RIGHT_PX
 
     @property
@@ -65,12 +66,12 @@ class Related:
 
     @property
     def falsely_accepted(self) -> bool:
-        """Whether the pair passed the verification with a wrong F."""
+        """Whether the pair is accepted with a wrong F."""
         return self.view.accepted and not self.right
 
     @property
     def residual_px(self) -> float:
-        """RMS Sampson distance of the verified matches to their own F, NaN without any."""
+        """RMS Sampson distance of the verified matches to their own F, NaN without matches."""
         if self.view.inliers == 0:
             return float("nan")
         d = sampson_residuals(self.view.F, self.view.xy1, self.view.xy2)
@@ -79,7 +80,7 @@ class Related:
 
 @dataclass(frozen=True)
 class MeasuredPair:
-    """One pair of views (i, i + gap) by every front end."""
+    """One pair (i, i + gap) by every front end."""
 
     name: str
     gap: int
@@ -87,7 +88,7 @@ class MeasuredPair:
 
 
 class PreparedViews:
-    """What one front end needs of each photograph, computed when it is first asked for."""
+    """Prepared images of one front end, computed on first use."""
 
     def __init__(self, config: PipelineConfig, images: tuple[Image, ...]) -> None:
         self.config, self.images = config, images
@@ -100,7 +101,7 @@ class PreparedViews:
         return self._views[i]
 
     def relate(self, i: int, j: int, seed: int = 0) -> TwoView:
-        """Matches, F and verification of one pair."""
+        """Match, estimate F and verify one pair."""
         return match_views(self.config, self[i], self[j], (i, j), seed)
 
 
@@ -112,12 +113,11 @@ def measure_pairs(
     names: tuple[str, ...] = (OURS, THESIS, SIFT),
     most: int | None = None,
 ) -> Iterator[MeasuredPair]:
-    """The pairs (i, i + gap) of a scene with known cameras, ``most`` of each gap, by the front ends
-    ``names``; nothing where the photographs are not on this machine."""
+    """Relate the pairs (i, i + gap) of a scene with known cameras, ``most`` of each gap."""
     scene = load_real_scene(scene_name)
     if scene is None:
         return
-    images = read_photographs(scene.image_paths, max_size_px=MAX_SIZE_PX).images
+    images = read_images(scene.image_paths, max_size_px=MAX_SIZE_PX).images
     configs = front_ends()
     by = {name: PreparedViews(configs[name], images) for name in names}
     for gap in gaps:
@@ -133,10 +133,7 @@ def _error(view: TwoView, truth: F64) -> float:
 
 
 def check_pairs(scene: str, gap: int, pairs: list[MeasuredPair]) -> list[Metric]:
-    """The rows of one scene and gap, ours judged against SIFT and the targets."""
-
-    def row(name: str, values: Values, unit: str = "", **judged: Any) -> Metric:
-        return Metric(f"{scene}, (i, i+{gap})", name, unit, values, OURS, **judged)
+    """Return the rows of one scene and gap; ours is held against SIFT."""
 
     def over(read: Callable[[list[Related]], float]) -> Values:
         return {name: read([pair.by[name] for pair in pairs]) for name in pairs[0].by}
@@ -149,27 +146,26 @@ def check_pairs(scene: str, gap: int, pairs: list[MeasuredPair]) -> list[Metric]
     needed = everyone if gap in ALL_MUST_BE_RIGHT else min(everyone, beyond_sift)
     verified = over(lambda found: float(sum(r.verified for r in found)))
     of_sums: Values = {name: (total or 0.0) / (verified[SIFT] or 1.0) for name, total in verified.items()}
-    more: dict[str, Any] = {"target": VERIFIED_TARGETS.get(gap), "at_most": False}
-    of_pairs, of_sigma = to_sift(lambda r: float(r.verified)), to_sift(lambda r: r.view.sigma_px)
-    false = over(lambda found: float(sum(r.falsely_accepted for r in found)))
+    more, of_pairs = VERIFIED_TARGETS.get(gap), to_sift(lambda r: float(r.verified))
     sure = over(lambda found: float(sum(r.falsely_accepted and not r.view.undetermined for r in found)))
-    return [
-        row("verified matches, all pairs", verified),
-        row("verified, mean of the pairs' ratios to SIFT", of_pairs, **more),
-        row("verified, ratio of the sums to SIFT", of_sums, **more),
-        row(f"pairs whose F is right, of {len(pairs)}", right, target=needed, at_most=False),
-        row("median error of F", over(lambda found: float(np.median([r.error_px for r in found]))), "px"),
-        row("largest error of F", over(lambda found: max(r.error_px for r in found)), "px"),
-        row("sigma, mean of the pairs' ratios to SIFT", of_sigma, target=SIGMA_TARGETS.get(gap)),
-        row("RMS of verified residuals, mean of the ratios to SIFT", to_sift(lambda r: r.residual_px)),
-        row("pairs accepted with a wrong F", false, target=0.0),
-        row("of these, not called undetermined", sure),
-    ]
+    rows = Rows(f"{scene}, (i, i+{gap})", OURS)
+    rows.add("verified matches, all pairs", verified)
+    rows.add("verified, mean of the pairs' ratios to SIFT", of_pairs, at_least=more)
+    rows.add("verified, ratio of the sums to SIFT", of_sums, at_least=more)
+    rows.add(f"pairs whose F is right, of {len(pairs)}", right, at_least=needed)
+    rows.add("median error of F", over(lambda found: float(np.median([r.error_px for r in found]))), "px")
+    rows.add("largest error of F", over(lambda found: max(r.error_px for r in found)), "px")
+    sigma, bound = to_sift(lambda r: r.view.sigma_px), SIGMA_TARGETS.get(gap)
+    rows.add("sigma, mean of the pairs' ratios to SIFT", sigma, at_most=bound)
+    rows.add("RMS of verified residuals, mean of the ratios to SIFT", to_sift(lambda r: r.residual_px))
+    false = over(lambda found: float(sum(r.falsely_accepted for r in found)))
+    rows.add("pairs accepted with a wrong F", false, at_most=0.0)
+    rows.add("of these, not called undetermined", sure)
+    return rows
 
 
 def _mean_ratio(pairs: list[MeasuredPair], name: str, read: Callable[[Related], float]) -> float | None:
-    """Mean over the pairs that SIFT relates rightly; a wrong F of the other counts 0, or not where it has no
-    such number."""
+    """Return the mean over pairs that SIFT relates rightly; a wrong F counts 0 or, without a number, not."""
     ratios = [
         read(pair.by[name]) / read(pair.by[SIFT])
         for pair in pairs
@@ -178,17 +174,10 @@ def _mean_ratio(pairs: list[MeasuredPair], name: str, read: Callable[[Related], 
     return float(np.mean(ratios)) if ratios else None
 
 
-def pair_table(scene: str, pairs: list[MeasuredPair]) -> str:
-    """Every pair as a row: verified matches / error of F px / sigma px of each front end."""
+def pair_table(scene: str, pairs: Sequence[MeasuredPair]) -> str:
+    """Return verified matches / error of F px / sigma px of every pair and front end."""
     methods = list(pairs[0].by)
-    lines = [
-        f"| {scene} | {' | '.join(methods)} |",
-        f"| --- |{' --- |' * len(methods)}",
-    ]
-    for pair in pairs:
-        cells = [_cell(pair.by[name]) for name in methods]
-        lines.append(f"| {pair.name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return text_table([scene, *methods], ([p.name, *(_cell(p.by[name]) for name in methods)] for p in pairs))
 
 
 def _cell(found: Related) -> str:

@@ -1,54 +1,64 @@
-"""How time and memory grow with the number of photographs: ``python -m validation.studies.growth``.
+"""Growth of time and memory with the number of images, and the choice of pairs.
 
-10, 30 and 100 parts of photographs at random places and zooms (:mod:`validation.scenes.crops`) are taken up
-to their matches, each set in a process of its own, once with all pairs and once with the estimate of the
-overlap; all pairs only up to ``--all-pairs-up-to``. The exponents are slopes of straight lines through the
-logarithms; those of time are of processor time, which does not hang on what else the machine does.
-
-By default every ten photographs show a scene of their own, so that each overlaps with as many whatever their
-number; with ``--same-scenes`` all sizes show the same ones, and the overlapping pairs grow with the square.
+``growth``: crops of images at random places and zooms are matched, each set in its own process, with all
+pairs and with the overlap estimate. Exponents are slopes of lines fitted to the logarithms; those of time use
+processor time, which other load disturbs less. By default every ten crops show a scene of their own, so that
+each overlaps with as many others in sets of all sizes.
+``growth-of-cost``: the first n images of a long walk around the courtyard become metric cameras. All sizes
+show the same yard, so each image overlaps with ever more others.
+``pair-choice``: all pairs of each set are matched and verified; the overlap estimate then chooses from the
+same features as if the set were large.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thesisrecon.config import PipelineConfig, preset
-from thesisrecon.io.files import write_text
+from thesisrecon.config import ImageOptions, PipelineConfig, preset
+from thesisrecon.errors import StageFailure
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import RunResult
-from validation.harness.process import own_cores, run_process
+from thesisrecon.records import Image, RunResult
+from thesisrecon.runtime.executors import Workers
+from validation.metrics.record import Metric
 from validation.scenes.crops import Crop, make_crops, make_separate_crops, shared_area
-from validation.scenes.real import REAL_SCENES, load_fixture_scene, load_real_scene
+from validation.scenes.many_views import walk, write_views
+from validation.scenes.real import REAL_SCENES
+from validation.studies.measuring import call_apart, exponent
+from validation.studies.runner import Part, Rows, load_scene, scenes_here, text_table
 
 METHODS = ("overlap-estimate", "all-pairs")
 SHARED = 0.3
-"""Crops of one photograph that share as much of the smaller one must be tried."""
+"""Crops of one image that share this part of the smaller one must be tried."""
 
 
 @dataclass(frozen=True)
 class Growth:
-    """One set and method: pairs, seconds by stage, processor seconds of all, peak memory.
+    """One set and one method.
 
-    ``pair_list`` (i, j, accepted) are the pairs tried. ``overlapping_tried`` is the share of the pairs known
-    to overlap (crops of one photograph) that was tried, None without any, ``recall`` that of the pairs
-    accepted when all are tried, None where nobody tried all.
+    Attributes
+    ----------
+    features_s, pairs_s, matches_s, cpu_s : float
+        Wall seconds by stage, and processor seconds of all.
+    overlapping_tried : float or None
+        Tried share of the pairs known to overlap (crops of one image), None without such pairs.
+    pair_list : tuple
+        Tried pairs (i, j, accepted).
+    recall : float or None
+        Tried share of the pairs that are accepted when all are tried, None if not all were tried.
     """
 
     method: str
-    photographs: int
+    images: int
     possible: int
     tried: int
     accepted: int
@@ -63,41 +73,36 @@ class Growth:
 
 
 def draw_crops(count: int, long_side: int, seed: int, *, separate: bool = False) -> list[Crop]:
-    """The set of this size: parts of the photographs of all scenes that are on this machine.
-
-    ``separate`` : each ten have a scene of their own, else all scenes give to all sizes.
-    """
-    scenes = [load_fixture_scene(), *(load_real_scene(name) for name in REAL_SCENES)]
+    """Cut crops of the images of all scenes on this machine; ``separate``: a scene for each ten crops."""
+    scenes = [load_scene(name) for name in ("courtyard", *REAL_SCENES)]
     paths = [scene.image_paths for scene in scenes if scene is not None]
     make = make_separate_crops if separate else make_crops
     return make(paths, count, long_side=long_side, rng=np.random.default_rng([seed, count]))
 
 
 def configure(method: str) -> PipelineConfig:
-    """The default pipeline with this choice of pairs, whatever the size of the set."""
+    """Return the default pipeline with this choice of pairs, for sets of any size."""
     pairs = AllPairs() if method == "all-pairs" else OverlapEstimate(all_up_to=0)
     return replace(preset("default"), pairs=pairs)
 
 
-def measure_here(wishes: argparse.Namespace, method: str, count: int) -> Growth:
-    """Take one set up to its matches in this process, warm."""
-    crops = draw_crops(count, wishes.long_side, wishes.seed, separate=not wishes.same_scenes)
-    threads = wishes.threads
-    config = configure(method)
+def measure_crops(
+    method: str, count: int, long_side: int, threads: int, seed: int, separate: bool
+) -> dict[str, Any]:
+    """Match one set in this process, its kernels loaded before; return the fields of :class:`Growth`."""
+    crops = draw_crops(count, long_side, seed, separate=separate)
+    config, images = configure(method), [crop.image for crop in crops]
     with tempfile.TemporaryDirectory() as place:
-        # Loading the compiled kernels is no part of what grows.
-        few = [crop.image for crop in crops[:4]]
-        reconstruct(few, Path(place) / "warm", config=config, until="matches", threads=threads)
-        images = [crop.image for crop in crops]
+        reconstruct(images[:4], Path(place) / "warm", config=config, until="matches", threads=threads)
         start = time.process_time()
         result = reconstruct(images, Path(place) / "run", config=config, until="matches", threads=threads)
         cpu_s = time.process_time() - start
-    return growth_of(method, crops, result, cpu_s)
+    return asdict(growth_of(method, crops, result, cpu_s))
 
 
 def growth_of(method: str, crops: Sequence[Crop], result: RunResult, cpu_s: float) -> Growth:
-    """What a run up to its matches says of its crops."""
-    # A crop that was left out has no number among the views.
+    """Return the record of a run up to its matches."""
+    # Views are numbered without the crops that were left out.
     views = [crops[int(Path(image.name).stem)] for image in result.images]
     n = len(views)
     tried = {(pair.i, pair.j) for pair in result.pairs}
@@ -105,7 +110,7 @@ def growth_of(method: str, crops: Sequence[Crop], result: RunResult, cpu_s: floa
     seconds = result.summary["seconds"]
     return Growth(
         method=method,
-        photographs=n,
+        images=n,
         possible=n * (n - 1) // 2,
         tried=len(tried),
         accepted=sum(pair.accepted for pair in result.pairs),
@@ -119,62 +124,33 @@ def growth_of(method: str, crops: Sequence[Crop], result: RunResult, cpu_s: floa
 
 
 def recall_of(tried: Growth, everything: Growth) -> float:
-    """The share of the pairs accepted among all that the choice tried."""
+    """Return the tried share of the pairs that are accepted among all."""
     pairs = {(i, j) for i, j, _ in tried.pair_list}
     accepted = [(i, j) for i, j, good in everything.pair_list if good]
     return sum(pair in pairs for pair in accepted) / max(len(accepted), 1)
 
 
-def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """The slope of log cost against log size, least squares; NaN where all sizes are the same."""
-    if min(sizes) == max(sizes):
-        return float("nan")
-    return float(np.polyfit(np.log(np.maximum(sizes, 1e-9)), np.log(np.maximum(costs, 1e-9)), 1)[0])
-
-
 def table(rows: Sequence[Growth]) -> str:
-    """The rows and, below each method's, its exponents against the photographs and the accepted pairs."""
-    head = (
-        "method",
-        "photographs",
-        "tried of possible",
-        "accepted",
-        "known overlaps tried",
-        "of all accepted, tried",
-        "features s",
-        "choice s",
-        "matching s",
-        "processor s",
-        "peak MB",
-    )
-    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    """Return the rows and, for each method, the powers of the numbers of images and of accepted pairs."""
+    head = ["method", "images", "tried of possible", "accepted", "known overlaps tried"]
+    head += ["of all accepted, tried", "features s", "choice s", "matching s", "processor s", "peak MB"]
+    lines = []
     for r in rows:
         share = f"{r.tried} of {r.possible} ({100 * r.tried / r.possible:.0f} %)"
-        shares = (_percent(r.overlapping_tried), _percent(r.recall))
-        cells = (r.method, r.photographs, share, r.accepted, *shares)
-        numbers = (r.features_s, r.pairs_s, r.matches_s, r.cpu_s)
-        lines.append(
-            f"| {' | '.join(str(c) for c in cells)} | {' | '.join(f'{v:.1f}' for v in numbers)} "
-            f"| {r.peak_mb:.0f} |"
-        )
-    lines.append("")
+        cells = (r.method, r.images, share, r.accepted, _percent(r.overlapping_tried), _percent(r.recall))
+        seconds = (f"{v:.1f}" for v in (r.features_s, r.pairs_s, r.matches_s, r.cpu_s))
+        lines.append([*cells, *seconds, f"{r.peak_mb:.0f}"])
+    text = [text_table(head, lines)]
     for method in METHODS:
         own = [r for r in rows if r.method == method]
         if len(own) > 1:
-            lines.append(exponents(method, own))
-    return "\n".join(lines)
+            text.append(_exponents(method, own))
+    return "\n\n".join(text)
 
 
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
-
-
-def exponents(method: str, rows: Sequence[Growth]) -> str:
-    """One sentence: how each cost grows."""
-    n = [float(r.photographs) for r in rows]
-    accepted = [float(r.accepted) for r in rows]
-    told = {
-        "accepted pairs": accepted,
+def _exponents(method: str, rows: Sequence[Growth]) -> str:
+    costs = {
+        "accepted pairs": [float(r.accepted) for r in rows],
         "tried pairs": [float(r.tried) for r in rows],
         "features": [r.features_s for r in rows],
         "choice": [r.pairs_s for r in rows],
@@ -182,65 +158,262 @@ def exponents(method: str, rows: Sequence[Growth]) -> str:
         "processor time": [r.cpu_s for r in rows],
         "peak memory": [r.peak_mb for r in rows],
     }
-    powers = ", ".join(f"{name} {exponent(n, costs):.2f}" for name, costs in told.items())
-    per_pair = exponent(accepted, told["processor time"])
+    powers = ", ".join(f"{name} {exponent([r.images for r in rows], v):.2f}" for name, v in costs.items())
+    per_pair = exponent(costs["accepted pairs"], costs["processor time"])
     return f"{method}, powers of N: {powers}. Processor time over accepted pairs: {per_pair:.2f}."
 
 
-def measure(wishes: argparse.Namespace, method: str, count: int) -> Growth:
-    """One set in a process of its own, so that its peak memory is its own."""
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
+
+
+STAGES = (
+    "images",
+    "features",
+    "pairs",
+    "matches",
+    "tracks",
+    "projective",
+    "selfcalibration",
+    "metric",
+    "outputs",
+)
+AFTER = {"matches": "tracks", "metric": "outputs"}
+"""Stage that reports its end -> the following stage, which does not report its beginning."""
+
+
+@dataclass
+class Meter:
+    """Processor seconds and highest memory by stage, from the progress reports of a run."""
+
+    cpu_s: dict[str, float] = field(default_factory=dict)
+    peak_mb: dict[str, float] = field(default_factory=dict)
+    stage: str = "images"
+    since: float = field(default_factory=time.process_time)
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Take the progress report of a stage."""
+        self.enter(stage)
+        if done == total and stage in AFTER:
+            self.enter(AFTER[stage])
+
+    def enter(self, stage: str) -> None:
+        """Count what was used until now to the stage before."""
+        now, peak = time.process_time(), _peak_mb()
+        self.cpu_s[self.stage] = self.cpu_s.get(self.stage, 0.0) + now - self.since
+        self.peak_mb[self.stage] = max(self.peak_mb.get(self.stage, 0.0), peak)
+        self.stage, self.since = stage, now
+        _reset_peak()
+
+
+def _peak_mb() -> float:
+    """Return the highest memory of this process since :func:`_reset_peak`."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
+    return float(line.split()[1]) / 1024.0
+
+
+def _reset_peak() -> None:
+    """Start a new measurement of the highest memory (Linux)."""
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """One number of images.
+
+    Attributes
+    ----------
+    cpu_s, peak_mb : mapping
+        Processor seconds and highest memory by stage.
+    counts : mapping
+        Numbers of pairs, matches, cameras and points.
+    failure : str
+        Message of a run without cameras.
+    """
+
+    images: int
+    cpu_s: Mapping[str, float]
+    peak_mb: Mapping[str, float]
+    counts: Mapping[str, int]
+    wall_s: float
+    focal_error_rel: float
+    failure: str = ""
+
+
+def measure_cost(images: str, count: int, threads: int, long_side: int) -> dict[str, Any]:
+    """Reconstruct cameras in this process, its kernels loaded before; return the fields of :class:`Cost`."""
+    paths = sorted(Path(images).glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
-        answer = Path(place) / "answer.json"
-        command = [sys.executable, "-m", "validation.studies.growth", "--child", method, str(count)]
-        command += ["--long-side", str(wishes.long_side), "--threads", str(wishes.threads)]
-        command += ["--seed", str(wishes.seed), "-o", str(answer)]
-        command += ["--same-scenes"] if wishes.same_scenes else []
-        log = Path(place) / "log"
-        environment = {"OPENBLAS_NUM_THREADS": "1"}
-        process = run_process(command, log=log, cores=own_cores()[: wishes.threads], environment=environment)
-        if process.code != 0:
-            raise RuntimeError(log.read_text(encoding="utf-8"))
-        told: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
-    told["pair_list"] = tuple((i, j, good) for i, j, good in told["pair_list"])
-    return replace(Growth(**told), peak_mb=process.peak_mb)
+        reconstruct(paths[:4], Path(place) / "warm", until="metric", threads=threads)
+        meter, failure = Meter(), ""
+        try:
+            reconstruct(paths, Path(place) / "run", until="metric", threads=threads, progress=meter.progress)
+        except StageFailure as error:
+            failure = str(error)
+        meter.enter("end")
+        summary = json.loads((Path(place) / "run" / "summary.json").read_text(encoding="utf-8"))
+    known = [view["focal_px"]["value"] for view in summary["cameras"] if "focal_px" in view]
+    truth = float(walk(1, (long_side, long_side * 3 // 4))[0].K[0, 0])
+    error_rel = abs(float(np.median(known)) / truth - 1.0) if known else float("nan")
+    seconds = summary["elapsed_seconds"]
+    found = Cost(len(paths), meter.cpu_s, meter.peak_mb, counts_of(summary), seconds, error_rel, failure)
+    return asdict(found)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure the sets and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m validation.studies.growth", description=__doc__)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[10, 30, 100])
-    parser.add_argument("--all-pairs-up-to", type=int, default=30)
-    parser.add_argument("--long-side", type=int, default=480)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--same-scenes", action="store_true", help="overlaps grow with the square")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("-o", "--out", type=Path, help="JSON of the rows")
-    parser.add_argument("--child", nargs=2, metavar=("METHOD", "COUNT"), help=argparse.SUPPRESS)
-    wishes = parser.parse_args(arguments)
-    if wishes.child:
-        method, count = wishes.child
-        row = measure_here(wishes, method, int(count))
-        write_text(wishes.out, json.dumps(asdict(row)))
-        return 0
-    # Compiling the kernels would take the most memory of all, in whichever process comes first.
-    measure(wishes, "overlap-estimate", 4)
+def counts_of(summary: Mapping[str, Any]) -> dict[str, int]:
+    """Return how much there was to do."""
+    pairs = summary["pairs"]
+    counts = {"pairs tried": pairs["matched"], "pairs accepted": pairs["accepted"]}
+    counts |= {"verified matches": pairs["verified_matches"]}
+    return counts | {"registered": summary["registered"], "points": summary["points"] or 0}
+
+
+def cost_table(costs: Sequence[Cost]) -> str:
+    """Return processor seconds, memory and counts by stage, with their powers of N."""
+    sizes, lines = [float(cost.images) for cost in costs], []
+
+    def row(name: str, values: Sequence[float], digits: int) -> None:
+        power = f"{exponent(sizes, values):.2f}" if len(sizes) > 1 and min(values) > 0.0 else "-"
+        lines.append([name, *(f"{v:.{digits}f}" for v in values), power])
+
+    for stage in STAGES:
+        row(f"{stage}, processor s", [cost.cpu_s.get(stage, 0.0) for cost in costs], 2)
+    row("all, processor s", [sum(cost.cpu_s.values()) for cost in costs], 1)
+    for stage in STAGES:
+        row(f"{stage}, peak MB", [cost.peak_mb.get(stage, 0.0) for cost in costs], 0)
+    row("whole run, peak MB", [max(cost.peak_mb.values()) for cost in costs], 0)
+    for name in costs[0].counts:
+        row(name, [float(cost.counts[name] or 0) for cost in costs], 0)
+    row("focal error, %", [100.0 * cost.focal_error_rel for cost in costs], 3)
+    row("wall s", [cost.wall_s for cost in costs], 0)
+    failures = [f"\n{cost.images} images: {cost.failure}" for cost in costs if cost.failure]
+    return "\n".join([text_table(["", *(f"{n:.0f}" for n in sizes), "power of N"], lines), *failures])
+
+
+LEAST_RECALL = 0.97
+ESTIMATE = "overlap estimate"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Pairs of one set: possible, tried by the estimate, and accepted if all are tried.
+
+    ``missed`` holds the verified matches of each accepted pair that the estimate did not try.
+    """
+
+    scene: str
+    possible: int
+    tried: int
+    accepted: int
+    missed: tuple[int, ...]
+
+    @property
+    def recall(self) -> float:
+        """Tried share of the accepted pairs."""
+        return 1.0 - len(self.missed) / max(self.accepted, 1)
+
+
+def choose(scene: str, everything: RunResult, threads: int, estimate: OverlapEstimate) -> Choice:
+    """Compare the estimate with a run that tried all pairs."""
+    choice = estimate.select(
+        [image.name for image in everything.images],
+        everything.features,
+        map_all=Workers(threads).map_all,
+        rng=np.random.default_rng(0),
+    )
+    tried = {(int(i), int(j)) for i, j in choice.pairs}
+    accepted = [pair for pair in everything.pairs if pair.accepted]
+    missed = tuple(sorted(pair.inliers for pair in accepted if (pair.i, pair.j) not in tried))
+    return Choice(scene, len(everything.pairs), len(tried), len(accepted), missed)
+
+
+def to_metrics(choice: Choice) -> list[Metric]:
+    """Return the rows of the table."""
+    lost, rows = ", ".join(map(str, choice.missed)), Rows(choice.scene, ESTIMATE)
+    rows.add("pairs tried", 100.0 * choice.tried / choice.possible, "%")
+    rows.add("pairs accepted of all", 100.0 * choice.accepted / choice.possible, "%")
+    note = f"missed pairs have {lost} verified matches" if lost else ""
+    name = "accepted pairs that were tried"
+    rows.add(name, 100.0 * choice.recall, "%", at_least=100.0 * LEAST_RECALL, note=note)
+    return rows
+
+
+def growth_study(
+    sizes: Sequence[int] = (10, 30, 100),
+    all_pairs_up_to: int = 30,
+    long_side: int = 480,
+    threads: int = 2,
+    same_scenes: bool = False,
+    seed: int = 0,
+) -> Iterator[Part]:
+    """Measure how time and memory of matching grow with the number of images.
+
+    Parameters
+    ----------
+    all_pairs_up_to : int
+        Largest set of which all pairs are tried.
+    same_scenes : bool
+        Cut all sets from the same scenes, so that overlapping pairs grow with the square of the size.
+    """
+
+    def measure(method: str, count: int) -> Growth:
+        given = (method, count, long_side, threads, seed, not same_scenes)
+        found, process = call_apart(measure_crops, *given, cores=threads)
+        found["pair_list"] = tuple((i, j, accepted) for i, j, accepted in found["pair_list"])
+        return replace(Growth(**found), peak_mb=process.peak_mb)
+
+    # The first process compiles the kernels, which takes the most memory.
+    measure(METHODS[0], 4)
     rows = []
-    for count in wishes.sizes:
-        row = measure(wishes, "overlap-estimate", count)
-        if count <= wishes.all_pairs_up_to:
-            everything = measure(wishes, "all-pairs", count)
-            row = replace(row, recall=recall_of(row, everything))
-            rows.append(everything)
+    for count in sizes:
+        row = measure(METHODS[0], count)
+        if count <= all_pairs_up_to:
+            rows.append(measure(METHODS[1], count))
+            row = replace(row, recall=recall_of(row, rows[-1]))
         rows.append(row)
-        print(f"{count} photographs: {row.cpu_s:.1f} processor s", flush=True)
+        yield f"{count} images: {row.cpu_s:.1f} processor s"
     rows.sort(key=lambda row: METHODS.index(row.method))
-    facts = f"long side {wishes.long_side} px, {wishes.threads} threads, seed {wishes.seed}"
-    print(f"\n{facts}, {os.cpu_count()} cores\n")
-    print(table(rows))
-    if wishes.out is not None:
-        write_text(wishes.out, json.dumps([asdict(row) for row in rows], indent=1) + "\n")
-    return 0
+    yield f"long side {long_side} px, {threads} threads, seed {seed}, {os.cpu_count()} cores"
+    yield table(rows)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def growth_of_cost_study(
+    out: Path, sizes: Sequence[int] = (10, 30, 100, 300), long_side: int = 480, threads: int = 2
+) -> Iterator[Part]:
+    """Measure what each stage costs by the number of images of one place."""
+    write_views(out, max(sizes), size=(long_side, long_side * 3 // 4), threads=threads)
+    costs = []
+    for count in sorted(sizes):
+        costs.append(Cost(**call_apart(measure_cost, out, count, threads, long_side, cores=threads)[0]))
+        yield f"{count} images: {sum(costs[-1].cpu_s.values()):.0f} processor s"
+    yield f"long side {long_side} px, {threads} threads, {os.cpu_count()} cores"
+    yield cost_table(costs)
+
+
+def pair_choice_study(
+    out: Path,
+    crops: Sequence[int] = (1, 2),
+    count: int = 30,
+    long_side: int = 480,
+    max_size: int = 1600,
+    threads: int = 2,
+) -> Iterator[Part]:
+    """Measure which accepted pairs the overlap estimate tries and misses.
+
+    Parameters
+    ----------
+    crops : sequence of int
+        Seeds of the sets of crops.
+    count : int
+        Crops of each set.
+    """
+    scenes = scenes_here(["courtyard", *REAL_SCENES])
+    sets: list[tuple[str, Sequence[Path] | Sequence[Image]]] = [(s.name, s.image_paths) for s in scenes]
+    for seed in crops:
+        images = [crop.image for crop in draw_crops(count, long_side, seed)]
+        sets.append((f"{count} crops, seed {seed}", images))
+    config = replace(preset("default"), pairs=AllPairs(), images=ImageOptions(max_size))
+    for name, chosen in sets:
+        run = reconstruct(list(chosen), out / name, config=config, until="matches", threads=threads)
+        yield to_metrics(choose(name, run, threads, OverlapEstimate(all_up_to=0)))

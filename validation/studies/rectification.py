@@ -1,16 +1,12 @@
-"""Rectification of real pairs beside OpenCV: ``python -m validation.studies.rectification [-o OUT]``.
+"""Rectification of real pairs beside OpenCV.
 
-Every accepted pair of fountain-P11 and Herz-Jesus-P8 (reconstructed once, kept in OUT) by every method, and
-the pairs of kusvod2, some with epipoles in view, by the choice among them. The exit code is 1 where a target
-is missed. With ``--pictures`` some pairs are drawn into OUT with lines over them.
+Every accepted pair of fountain-P11 and Herz-Jesus-P8 (reconstructed once in OUT) with every method, and pairs
+of kusvod2, some with the epipoles in the image, with the best method.
 """
 
 from __future__ import annotations
 
-import argparse
-import tempfile
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,9 +36,11 @@ from thesisrecon.stereo.rectification import (
     measure_quality,
     rectify,
 )
-from validation.metrics.record import Metric, markdown_table
+from validation.metrics.record import Metric
 from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
-from validation.scenes.real import data_root, load_real_scene
+from validation.scenes.real import data_root
+from validation.studies.measuring import timed
+from validation.studies.runner import Part, Rows, scenes_here
 
 SCENES = ("fountain-P11", "Herz-Jesus-P8")
 BEST_F, BEST = "best from F", "best from cameras"
@@ -54,7 +52,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class RealPair:
-    """A pair as F sees it, and as metric cameras do, lens distortion removed."""
+    """One pair: from F, and from metric cameras with the lens distortion removed."""
 
     name: str
     loose: EpipolarPair
@@ -63,7 +61,7 @@ class RealPair:
 
 @dataclass(frozen=True)
 class Measured:
-    """What one method does to one pair; ``kept`` is the share of what both see, the lesser of both sides."""
+    """One method on one pair; ``kept`` is the kept share of the common region, the lesser of both sides."""
 
     quality: RectificationQuality
     dy_px: float
@@ -73,7 +71,7 @@ class Measured:
 
 
 def undistorted(model: Reconstruction, view: int, xy: F64) -> F64:
-    """Pixels (N, 2) as a camera without lens distortion sees them."""
+    """Return pixels (N, 2) of a camera without lens distortion."""
     assert model.K is not None
     if model.distortion is None:
         return xy
@@ -83,7 +81,7 @@ def undistorted(model: Reconstruction, view: int, xy: F64) -> F64:
 
 
 def pairs_of(pairs: Sequence[TwoView], model: Reconstruction, sizes: F64) -> list[RealPair]:
-    """Every accepted pair of registered views."""
+    """Return every accepted pair of registered views."""
     found = []
     for p in pairs:
         if p.accepted and model.registered[p.i] and model.registered[p.j]:
@@ -101,7 +99,7 @@ def pairs_of(pairs: Sequence[TwoView], model: Reconstruction, sizes: F64) -> lis
 
 def _opencv_f(pair: RealPair) -> PlanarRectification | None:
     loose = pair.loose
-    # F as cameras and matches of this pair have it: of the same pixels.
+    # F in the pixels of the matches of this pair.
     L1, L2 = loose.pencil.lines
     T = [np.diag([1.0 / u, 1.0 / u, 1.0]) for u in loose.pencil.units]
     for t, u, c in zip(T, loose.pencil.units, loose.pencil.centres, strict=True):
@@ -126,13 +124,13 @@ METHODS: Mapping[str, tuple[bool, Callable[[RealPair], AnyRectification | None]]
     OPENCV_F: (False, _opencv_f),
     OPENCV: (True, _opencv_cameras),
 }
-"""Name -> whether it works on undistorted pixels, and the method; None or ``StageFailure``: refused."""
+"""Name -> whether the method needs undistorted pixels, and the method."""
 
 
 def seen_by_other(pair: EpipolarPair, side: int) -> F64:
-    """Pixels (M, 2) of a photograph's grid that the other one shows at some depth of the matches.
+    """Return pixels (M, 2) of a grid in one image that the other sees at some depth of the matches.
 
-    Depths are the 1 to 99 % quantiles of those of the matches, an eighth more at either end.
+    The depths are the 1 to 99 % quantiles of those of the matches, widened by an eighth.
     """
     assert pair.cameras is not None
     P = pair.cameras if side == 0 else pair.cameras[::-1]
@@ -152,30 +150,28 @@ def seen_by_other(pair: EpipolarPair, side: int) -> F64:
 
 
 def measure(pair: RealPair, name: str) -> Measured | None:
-    """One method on one pair; None where it refuses."""
+    """Rectify one pair with one method; None if it refuses."""
     with_cameras, method = METHODS[name]
     seen = pair.metric if with_cameras else pair.loose
-    begun = time.perf_counter()
     try:
-        found = method(pair)
+        found, seconds, _ = timed(lambda: method(pair))
     except StageFailure:
         return None
-    seconds = time.perf_counter() - begun
     if found is None:
         return None
     kept = []
     for side in (0, 1):
-        # Lens distortion moves these pixels by less than the distance of the grid.
+        # Lens distortion moves these pixels by less than the grid spacing.
         pixels = seen_by_other(pair.metric, side)
         inside = np.all(np.isfinite(found.rectified_from_original(side, pixels)), axis=1)
         kept.append(float(np.mean(inside)) if len(pixels) else 1.0)
     quality = measure_quality(found, seen)
     polar = not isinstance(found, PlanarRectification)
-    return Measured(quality, _dy_of_photograph(found, seen), min(kept), seconds, polar)
+    return Measured(quality, _dy_of_image(found, seen), min(kept), seconds, polar)
 
 
-def _dy_of_photograph(rectified: AnyRectification, pair: EpipolarPair) -> float:
-    """RMS of y1 - y2 of the matches, each over the pixels of the frame per pixel of its photographs."""
+def _dy_of_image(rectified: AnyRectification, pair: EpipolarPair) -> float:
+    """Return the RMS of y1 - y2 of the matches in pixels of the images."""
     rows = [rectified.rectified_from_original(s, xy)[:, 1] for s, xy in enumerate(pair.matches)]
     steps = [np.linalg.norm(jacobians(rectified, s, xy)[:, 1], axis=1) for s, xy in enumerate(pair.matches)]
     off = (rows[0] - rows[1]) / (0.5 * (steps[0] + steps[1]))
@@ -189,7 +185,7 @@ def _off(values: tuple[float, float], ideal: float) -> float:
 
 QUANTITIES: tuple[tuple[str, str, Callable[[Measured], float], float | None, bool], ...] = (
     ("RMS |dy| of inliers", "px of the frame", lambda m: m.quality.rms_dy_px, None, True),
-    ("RMS |dy| of inliers", "px of the photograph", lambda m: m.dy_px, DY_PX, True),
+    ("RMS |dy| of inliers", "px of the image", lambda m: m.dy_px, DY_PX, True),
     (
         "angle of midlines off 90",
         "deg",
@@ -203,53 +199,37 @@ QUANTITIES: tuple[tuple[str, str, Callable[[Measured], float], float | None, boo
     ("slant of disparities", "", lambda m: m.quality.disparity_slope, None, True),
     ("distortion", "", lambda m: m.quality.distortion, None, True),
     ("least scale", "", lambda m: m.quality.least_scale, None, False),
-    ("pixels over the photograph's", "", lambda m: m.quality.size_ratio, None, True),
+    ("pixels over the image's", "", lambda m: m.quality.size_ratio, None, True),
     ("range of disparities", "px", lambda m: float(np.ptp(m.quality.disparities)), None, True),
     ("time", "ms", lambda m: 1e3 * m.seconds, None, True),
 )
-"""Name, unit, number, target, and whether it is good to be small."""
+"""Name, unit, number, bound, and whether small values are good."""
 
 
 def check_scene(name: str, pairs: Sequence[RealPair]) -> list[Metric]:
-    """Medians and worst over the pairs by every method; targets are those of the best from F."""
+    """Return medians and worst values over the pairs; the best method from F is judged."""
     found = {method: [measure(pair, method) for pair in pairs] for method in METHODS}
     done = {method: [m for m in each if m is not None] for method, each in found.items()}
-    rows = [
-        Metric(
-            name,
-            f"done, of {counted(len(pairs), 'pair')}",
-            "",
-            {k: float(len(v)) for k, v in done.items()},
-            BEST_F,
-        ),
-        Metric(
-            name,
-            "polar chosen",
-            "",
-            {k: float(sum(m.polar for m in done[k])) for k in (BEST_F, BEST)},
-            BEST_F,
-        ),
-    ]
+    rows = Rows(name, BEST_F)
+    rows.add(f"done, of {counted(len(pairs), 'pair')}", {k: float(len(v)) for k, v in done.items()})
+    rows.add("polar chosen", {k: float(sum(m.polar for m in done[k])) for k in (BEST_F, BEST)})
     for label, unit, number, target, small in QUANTITIES:
         for how, merge in (("median", np.median), ("worst", np.max if small else np.min)):
             values = {k: _merged(merge, [number(m) for m in v]) for k, v in done.items()}
             held = target if how == "worst" else None
             rows.append(Metric(name, f"{label}, {how}", unit, values, BEST_F, held, at_most=small))
-    within = [number for _, _, number, target, _ in QUANTITIES if target is not None]
-    limits = [(target, small) for _, _, _, target, small in QUANTITIES if target is not None]
+    judged = [(number, target, small) for _, _, number, target, small in QUANTITIES if target is not None]
     shares = {
-        k: float(
-            np.mean([[_reached(f(m), *limit) for f, limit in zip(within, limits, strict=True)] for m in v])
-        )
+        k: float(np.mean([[_reached(f(m), target, small) for f, target, small in judged] for m in v]))
         for k, v in done.items()
         if v
     }
-    rows.append(Metric(name, "targets reached, share of all", "", shares, BEST_F))
+    rows.add("targets reached, share of all", shares)
     return rows
 
 
 def _reached(value: float, target: float | None, small: bool) -> bool:
-    # A midline through the epipole has no angle: a polar frame is not judged by it.
+    # A midline through the epipole has no angle, so polar frames have none.
     return target is None or not np.isfinite(value) or (value <= target if small else value >= target)
 
 
@@ -259,9 +239,8 @@ def _merged(merge: Callable[[F64], float], values: list[float]) -> float | None:
 
 
 def check_hand_made(names: Sequence[str]) -> list[Metric]:
-    """The pairs of kusvod2, matched here: what is chosen from F alone."""
-    root = data_root()
-    rows: list[Metric] = []
+    """Match and rectify pairs of kusvod2 with the best method from F."""
+    root, rows = data_root(), Rows("kusvod2", "RMS |dy|")
     for name in names:
         folder = root / "kusvod2" / name if root else None
         if folder is None or not folder.is_dir():
@@ -272,29 +251,22 @@ def check_hand_made(names: Sequence[str]) -> list[Metric]:
             pair = pair_of_fundamental(found.F, found.xy1, found.xy2, sizes[0], sizes[1])
             chosen = rectify(pair)
         except StageFailure as reason:
-            rows.append(Metric("kusvod2", name, "px", {"RMS |dy|": None}, "RMS |dy|", note=str(reason)))
+            rows.add(name, {"RMS |dy|": None}, "px", note=str(reason))
             continue
         q = measure_quality(chosen, pair)
-        values = {
-            "matches": float(len(found.xy1)),
-            "RMS |dy|": q.rms_dy_px,
-            "distortion": q.distortion,
-            "kept of A": q.coverage[0],
-            "kept of B": q.coverage[1],
-            "pixels over the photograph's": q.size_ratio,
-        }
-        kind = "planar" if isinstance(chosen, PlanarRectification) else "polar"
-        rows.append(Metric("kusvod2", name, "", values, "RMS |dy|", note=kind))
+        values = {"matches": float(len(found.xy1)), "RMS |dy|": q.rms_dy_px, "distortion": q.distortion}
+        values |= {"kept of A": q.coverage[0], "kept of B": q.coverage[1], "pixels over the image's": q.size_ratio}
+        rows.add(name, values, note="planar" if isinstance(chosen, PlanarRectification) else "polar")
     return rows
 
 
 def _size(path: Path) -> Size:
-    with Image.open(path) as photograph:
-        return photograph.size
+    with Image.open(path) as image:
+        return image.size
 
 
 def draw_pair(rectified: AnyRectification, images: Sequence[np.ndarray], to: Path) -> None:
-    """Both sides beside each other under red lines."""
+    """Draw both sides beside each other with red lines."""
     sides = [rectified.warp(image.astype(np.float32), side) for side, image in enumerate(images)]
     shown = np.hstack([np.where(np.isnan(s), 40.0, np.clip(s, 0.0, 255.0)).astype(np.uint8) for s in sides])
     picture = Image.fromarray(shown)
@@ -304,39 +276,30 @@ def draw_pair(rectified: AnyRectification, images: Sequence[np.ndarray], to: Pat
     picture.save(to)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the tables; 1 where a target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-o", "--out", type=Path, help="where reconstructions are kept")
-    parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--hand-made", nargs="*", default=["booksh", "corr", "kampa", "rotunda", "valbonne"])
-    parser.add_argument(
-        "--pictures", action="store_true", help="draw the best of neighbouring pairs into OUT"
-    )
-    options = parser.parse_args(arguments)
-    tables = [check_hand_made(options.hand_made)]
-    with tempfile.TemporaryDirectory() as folder:
-        out = options.out or Path(folder)
-        for name in options.scenes:
-            scene = load_real_scene(name)
-            if scene is None:
-                continue
-            run = thesisrecon.reconstruct(list(scene.image_paths), out / name, until="metric")
-            assert run.metric is not None
-            sizes = np.array([image.size for image in run.images], dtype=np.float64)
-            pairs = pairs_of(run.pairs, run.metric.reconstruction, sizes)
-            tables.append(check_scene(name, pairs))
-            if options.pictures:
-                for pair in pairs:
-                    i, j = map(int, pair.name.split("-"))
-                    if j - i in (1, 3):
-                        images = [run.images[k].rgb for k in (i, j)]
-                        draw_pair(rectify(pair.loose), images, out / f"{name}-{pair.name}.png")
-    for table in tables:
-        if table:
-            print(f"## {table[0].scene}", markdown_table(table), sep="\n\n", end="\n\n", flush=True)
-    return int(any(row.verdict == "missed" for table in tables for row in table))
+HAND_MADE = ("booksh", "corr", "kampa", "rotunda", "valbonne")
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def rectification_study(
+    out: Path, scenes: Sequence[str] = SCENES, hand_made: Sequence[str] = HAND_MADE, pictures: bool = False
+) -> Iterator[Part]:
+    """Compare rectification of real pairs with OpenCV.
+
+    Parameters
+    ----------
+    hand_made : sequence of str
+        Pairs of kusvod2, some with the epipoles in the image.
+    pictures : bool
+        Draw some pairs with horizontal lines into OUT.
+    """
+    yield check_hand_made(hand_made)
+    for scene in scenes_here(scenes):
+        run = thesisrecon.reconstruct(list(scene.image_paths), out / scene.name, until="metric")
+        assert run.metric is not None
+        sizes = np.array([image.size for image in run.images], dtype=np.float64)
+        pairs = pairs_of(run.pairs, run.metric.reconstruction, sizes)
+        yield check_scene(scene.name, pairs)
+        for pair in pairs if pictures else ():
+            i, j = map(int, pair.name.split("-"))
+            if j - i in (1, 3):
+                images = [run.images[k].rgb for k in (i, j)]
+                draw_pair(rectify(pair.loose), images, out / f"{scene.name}-{pair.name}.png")

@@ -1,41 +1,48 @@
-"""Chapter 7 on synthetic scenes: error and success per method.
+"""Chapter 7: error and success of every self-calibration method.
 
-``python -m validation.studies.selfcalibration``: every method of the table of kinds alone, and the whole with
-the metric stage behind it, on the thesis' cube and on a general cloud, over noise (at 27 cameras) and over
-the number of cameras (at 1 px), with one focal and with a zoomed one. The projective cameras are the minimum
-of the projective bundle adjustment, in a random frame: what is measured is chapter 7 alone. Success is a
-focal within 3 % (zoomed: the median camera's).
+``selfcalibration``: every method of the settings alone, and the whole with the metric stage, on the thesis'
+cube and on a general cloud, over noise (27 cameras) and over the number of cameras (1 px), with one focal
+length and with zoom. The projective cameras are the minimum of projective bundle adjustment in a random
+frame, so chapter 7 alone is measured. A success is a focal length within 3 % (with zoom: that of the median
+camera).
+``stratified``: every method for the plane at infinity and both methods from it to K, in closed form and
+refined.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
+import thesisrecon
 from thesisrecon.arrays import F64
 from thesisrecon.config import KINDS, SelfCalibrator
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_from_options
+from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for, prior_from_options
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.records import Reconstruction
-from thesisrecon.selfcalibration.hartley import FixedPlaneQuadric
+from thesisrecon.records import Image, Reconstruction
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch
+from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.stratified import Stratified
 from validation.metrics.focal_bound import focal_bound
-from validation.metrics.record import Metric, markdown_table
+from validation.metrics.record import Metric
 from validation.scenes.cloud import make_cloud
+from validation.scenes.real import REAL_SCENES
 from validation.scenes.rigs import Rig, cube_rig, noisy_tracks, projective_from_truth, zoomed
 from validation.studies.epipolar_cube import OFF_FACE
+from validation.studies.runner import Part, Rows, pick, scenes_here, text_table
 
 WITH_BUNDLE = "the whole, with the metric stage"
 BOUND = "the bound"
@@ -49,7 +56,7 @@ VARIANTS: dict[str, SelfCalibrator] = {
         ModulusConstraint(), FixedPlaneQuadric(), refine=False
     ),
 }
-"""Every kind of the table, and the stratified one (by default Hartley's search, then his K) in its parts."""
+"""Every method of the settings, and the stratified method (Hartley's search and K) in its parts."""
 
 SCENES = ("cube", "cloud")
 MODES = ("constant", "zooming")
@@ -57,14 +64,14 @@ NOISES_PX = (0.0, 0.5, 1.0, 2.0)
 VIEWS = (3, 5, 9, 18, 27)
 SUCCESS_PCT, WORST_PCT = 3.0, 5.0
 PRINCIPAL_STD = 0.01
-"""What is told of the principal point: its deviation over the long side."""
+"""Prior standard deviation of the principal point over the long side."""
 ZOOM = 0.3
-"""Focals are multiplied by e^u, u uniform within this of 0."""
+"""Focal lengths are multiplied by e^u with u uniform in +-ZOOM."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One place of the tables."""
+    """One setting: scene, mode, noise and number of cameras."""
 
     scene: str
     mode: str
@@ -74,11 +81,15 @@ class Cell:
 
 @dataclass(frozen=True)
 class Trial:
-    """One method on one draw: median and worst |f / f_true - 1| over the cameras in percent, NaN where it
-    refused, with the reason; whether it called itself identifiable (the whole: trusted); seconds.
+    """One method on one draw.
 
-    The cameras are those that see more than a plane; of the others no method can tell the focal to 5 %. The
-    bound's "errors" are those of a normal deviate of the Cramer-Rao standard deviation, its median |error|.
+    Attributes
+    ----------
+    median_pct, worst_pct : float
+        Median and largest |f / f_true - 1| over the cameras that see more than a plane, NaN after a refusal.
+        For the bound, 0.6745 times the Cramer-Rao standard deviation: the median of |error|.
+    sure : bool
+        Whether the method calls its result identifiable (the whole: trusted).
     """
 
     scene: str
@@ -95,9 +106,11 @@ class Trial:
 
 
 def make_rig(cell: Cell, rng: np.random.Generator) -> Rig:
-    """The cameras of one draw. Of the cube's, subsets leave out the six that see a single face, and are such
-    that pairs whose common points are on more than one face tie all together: others have no projective
-    reconstruction."""
+    """Draw the cameras.
+
+    Subsets of the cube leave out the six cameras that see one face only, and all their cameras are tied
+    together by pairs with common points on more than one face; others have no projective reconstruction.
+    """
     if cell.scene == "cloud":
         rig = make_cloud(cell.views, rng)
     else:
@@ -112,18 +125,18 @@ def make_rig(cell: Cell, rng: np.random.Generator) -> Rig:
 
 
 def assumptions(rig: Rig, mode: str) -> IntrinsicsPrior:
-    """Square pixels, a principal point near the middle, no distortion; the focal constant or free."""
-    wish = IntrinsicsOptions(
+    """Return the prior: square pixels, principal point near the middle, no distortion."""
+    options = IntrinsicsOptions(
         focal="constant" if mode == "constant" else "free",
         principal_point_std_rel=PRINCIPAL_STD,
         k1="known",
     )
     n = len(rig.K)
-    return prior_from_options(wish, [rig.size] * n, np.full(n, np.nan), np.ones(n))
+    return prior_from_options(options, [rig.size] * n, np.full(n, np.nan), np.ones(n))
 
 
 def run_cell(cell: Cell, methods: Sequence[str], seeds: Iterable[int]) -> list[Trial]:
-    """All methods on all draws of a cell; every method sees the same draws."""
+    """Run all methods on all draws of a cell; every method gets the same draws."""
     trials = []
     for seed in seeds:
         rig, projective = draw_cell(cell, seed)
@@ -137,7 +150,7 @@ def run_cell(cell: Cell, methods: Sequence[str], seeds: Iterable[int]) -> list[T
 
 
 def draw_cell(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
-    """One draw of a cell: the true cameras, and the projective reconstruction of noisy observations."""
+    """Return the true cameras and the projective reconstruction of noisy observations."""
     place = (
         seed,
         SCENES.index(cell.scene),
@@ -177,7 +190,7 @@ def _bound(cell: Cell, seed: int, rig: Rig) -> Trial:
 
 
 def focals_of(method: str, projective: Reconstruction, prior: IntrinsicsPrior) -> tuple[F64, bool]:
-    """K (V, 3, 3) by a kind of the table or by the whole, and whether the method stands by it."""
+    """Return K (V, 3, 3), and whether the method calls its result identifiable."""
     rng = np.random.default_rng(0)
     if method == WITH_BUNDLE:
         calibration = HypothesesAndRefinement().calibrate(projective, prior=prior, rng=rng)
@@ -196,7 +209,7 @@ def cells(
     *,
     grid: bool = False,
 ) -> list[Cell]:
-    """Noise at the most cameras, cameras at 1 px (or the noise nearest to it); or every noise at each."""
+    """Return noises at the most cameras and numbers of cameras at 1 px, or the whole ``grid``."""
     middle = min(noises, key=lambda s: abs(s - 1.0))
     cross = [(s, max(views)) for s in noises] + [(middle, v) for v in views]
     places = dict.fromkeys([(s, v) for s in noises for v in views] if grid else cross)
@@ -204,8 +217,11 @@ def cells(
 
 
 def report(trials: Sequence[Trial]) -> str:
-    """Markdown: for each scene and mode a table over cameras at 1 px and over noise at the most cameras, and
-    after these one for every other noise that has more than one number of cameras."""
+    """Return tables for each scene and mode.
+
+    One table has the cameras at 1 px and the noises at most cameras; every other noise with several numbers
+    of cameras gets its own table.
+    """
     crosses, others = [], []
     for scene in dict.fromkeys(t.scene for t in trials):
         for mode in dict.fromkeys(t.mode for t in trials if t.scene == scene):
@@ -222,33 +238,33 @@ def report(trials: Sequence[Trial]) -> str:
 
 
 def _table(title: str, trials: Sequence[Trial], places: Sequence[tuple[float, int]]) -> str:
-    """A row a method, a column a place (noise, number of cameras); ``title`` tells what they share."""
+    """Return methods by places (noise, number of cameras)."""
     cells = [[t for t in trials if (t.sigma_px, t.views) == place] for place in places]
-    lines = [
-        f"| {title} | {' | '.join(f'{v} cameras, {s:g} px' for s, v in places)} |",
-        f"| --- |{' --- |' * len(places)}",
-    ]
+    rows = []
     for method in dict.fromkeys(t.method for t in trials):
         shown = [[t for t in cell if t.method == method] for cell in cells]
         if any(shown):
-            lines.append(f"| {method} | {' | '.join(map(_entry, shown))} |")
+            rows.append([method, *map(_entry, shown)])
     whole = [[t for t in cell if t.method == WITH_BUNDLE] for cell in cells]
     alone = [[t for t in cell if t.method not in (WITH_BUNDLE, BOUND)] for cell in cells]
     for name, parts in (("draws of the whole", whole), ("draws of the others", alone)):
         if any(parts):
-            lines.append(f"| {name} | {' | '.join(map(_draws, parts))} |")
-    return "\n".join(lines)
+            rows.append([name, *map(_draws, parts)])
+    return text_table([title, *(f"{v} cameras, {s:g} px" for s, v in places)], rows)
 
 
 def _draws(trials: Sequence[Trial]) -> str:
-    """The number of draws that the entries of one column rest on."""
+    """Return the number of draws behind a column."""
     counts = Counter(t.method for t in trials).values() or [0]
     return f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
 
 
 def _entry(trials: Sequence[Trial]) -> str:
-    """Median error (those that refused count as infinite); where not all draws are near enough, the share
-    that is, and zoomed that of the worst cameras within 5 %."""
+    """Return the median error (refusals count as infinite) and the shares of good draws in percent.
+
+    Shares are shown unless all are 100: draws within 3 %, and with zoom draws whose worst camera is within 5
+    %.
+    """
     if not trials:
         return "-"
     error = np.array([t.median_pct if np.isfinite(t.median_pct) else np.inf for t in trials])
@@ -264,34 +280,32 @@ def _entry(trials: Sequence[Trial]) -> str:
     return f"{text} ({', '.join(f'{share:.0f}' for share in shares)})"
 
 
-def targets(trials: Sequence[Trial]) -> str:
-    """What the study must show, at 1 px and 27 cameras."""
-    rows = []
+def targets(trials: Sequence[Trial]) -> list[Metric]:
+    """Return the bounds of the whole at 1 px and 27 cameras."""
+    metrics: list[Metric] = []
     for scene in SCENES:
         for mode in MODES:
             place = (scene, mode, 1.0, 27, WITH_BUNDLE)
             some = [t for t in trials if (t.scene, t.mode, t.sigma_px, t.views, t.method) == place]
             if not some:
                 continue
-            error = np.nan_to_num([t.median_pct for t in some], nan=np.inf)
-            worst = np.nan_to_num([t.worst_pct for t in some], nan=np.inf)
-            name = f"{scene}, {mode}, {len(some)} trials"
+            error, worst = (
+                np.nan_to_num([getattr(t, name) for t in some], nan=np.inf)
+                for name in ("median_pct", "worst_pct")
+            )
+            rows = Rows(f"{scene}, {mode}, {len(some)} trials", WITH_BUNDLE)
             if mode == "constant":
-                rows.append(_metric(name, "median focal error", "%", float(np.median(error)), 0.06, True))
-                success = float(100.0 * np.mean(error <= SUCCESS_PCT))
-                rows.append(_metric(name, "success", "%", success, 100.0, False))
+                rows.add("median focal error", float(np.median(error)), "%", at_most=0.06)
+                rows.add("success", float(100.0 * np.mean(error <= SUCCESS_PCT)), "%", at_least=100.0)
             else:
                 share = float(100.0 * np.mean(worst <= WORST_PCT))
-                rows.append(_metric(name, "worst camera within 5 %", "% of trials", share, 90.0, False))
-    return "\n\n".join(f"{m.scene}\n\n{markdown_table([m])}" for m in rows)
-
-
-def _metric(scene: str, name: str, unit: str, value: float, target: float, at_most: bool) -> Metric:
-    return Metric(scene, name, unit, {WITH_BUNDLE: value}, WITH_BUNDLE, target, at_most)
+                rows.add("worst camera within 5 %", share, "% of trials", at_least=90.0)
+            metrics += rows
+    return metrics
 
 
 def read_trials(paths: Sequence[Path]) -> list[Trial]:
-    """Trials written before; of two of the same draw and method the later counts."""
+    """Read trials of earlier runs; the later of two equal draws and methods counts."""
     lines = [line for path in paths for line in path.read_text(encoding="utf-8").splitlines()]
     trials = [Trial(**json.loads(line)) for line in lines]
     unique = {(t.scene, t.mode, t.sigma_px, t.views, t.seed, t.method): t for t in trials}
@@ -306,43 +320,137 @@ def _quiet_cell(job: tuple[Cell, tuple[str, ...], int, int]) -> list[Trial]:
         return run_cell(cell, methods, range(first, first + count))
 
 
-def main() -> int:
-    """Run the cells, append every trial to a file, print the tables."""
-    known = [*VARIANTS, WITH_BUNDLE, BOUND]
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=SCENES, choices=SCENES)
-    parser.add_argument("--modes", nargs="+", default=MODES, choices=MODES)
-    parser.add_argument("--noise", type=float, nargs="+", default=NOISES_PX)
-    parser.add_argument("--views", type=int, nargs="+", default=VIEWS)
-    parser.add_argument("--methods", nargs="+", default=known, choices=known, metavar="NAME")
-    parser.add_argument("--grid", action="store_true", help="every noise at every number of cameras")
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--first", type=int, default=0, help="number of the first draw")
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument(
-        "--read", type=Path, nargs="*", default=[], help="trials of earlier runs; with --trials 0 only report"
-    )
-    parser.add_argument(
-        "-o", "--out", type=Path, help="file that every trial is appended to, a JSON line each"
-    )
-    arguments = parser.parse_args()
-    jobs = [
-        (cell, tuple(arguments.methods), arguments.first + k, 1)
-        for k in range(arguments.trials)
-        for cell in cells(
-            arguments.scenes, arguments.modes, arguments.noise, arguments.views, grid=arguments.grid
-        )
-    ]
-    trials = read_trials(arguments.read)
-    with ProcessPoolExecutor(arguments.workers) as pool:
+PLANES: Mapping[str, CheiralitySearch | ModulusConstraint | ParallelLines] = {
+    "cheirality, grid alone": CheiralitySearch(refine_iterations=0),
+    "cheirality search": CheiralitySearch(),
+    "modulus constraint": ModulusConstraint(),
+    "parallel lines": ParallelLines(),
+    "parallel lines, right angles": ParallelLines(orthogonal_directions=True),
+}
+K_METHODS: dict[str, LinearAbsoluteConic | FixedPlaneQuadric] = {
+    "Hartley": LinearAbsoluteConic(),
+    "Pollefeys": FixedPlaneQuadric(),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one image set.
+
+    Attributes
+    ----------
+    focal_pct : float
+        Focal error, median over the views.
+    principal_px : float
+        Error of the principal point.
+    refusal : str
+        Reason of a refusal.
+    """
+
+    plane: str
+    k_method: str
+    refined: bool
+    focal_pct: float
+    principal_px: float
+    seconds: float
+    refusal: str = ""
+
+
+def measure_stratified(
+    projective: Reconstruction, images: Sequence[Image], K: F64, *, cameras: str = "shared"
+) -> Iterator[Row]:
+    """Run every stratified method on one set, against K (V, 3, 3) at working size."""
+    options = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
+    prior = prior_for(projective, options)
+    views = np.flatnonzero(projective.registered)
+    for plane_name, plane in PLANES.items():
+        for k_name, k_method in K_METHODS.items():
+            for refined in (False, True):
+                variant = Stratified(plane, k_method, refine=refined).with_images(images)
+                start = time.perf_counter()
+                head = (plane_name, k_name, refined)
+                try:
+                    answer = variant.calibrate(projective, prior=prior, rng=np.random.default_rng(0))
+                except StageFailure as failure:
+                    yield Row(*head, np.nan, np.nan, time.perf_counter() - start, failure.reason)
+                    continue
+                focal = 100.0 * np.abs(answer.K[views, 0, 0] / K[views, 0, 0] - 1.0)
+                principal = np.linalg.norm(answer.K[views, :2, 2] - K[views, :2, 2], axis=1)
+                seconds = time.perf_counter() - start
+                yield Row(*head, float(np.median(focal)), float(np.median(principal)), seconds)
+
+
+def stratified_table(name: str, rows: Sequence[Row]) -> str:
+    """Return focal errors in closed form and refined, the refined principal point and the time."""
+    cells = []
+    for closed, refined in zip(rows[::2], rows[1::2], strict=True):
+        numbers = [f"{row.focal_pct:.3f} %" if not row.refusal else "refused" for row in (closed, refined)]
+        principal = f"{refined.principal_px:.1f} px" if not refined.refusal else refined.refusal
+        cells.append([closed.plane, closed.k_method, *numbers, principal, f"{closed.seconds:.1f}"])
+    head = [name, "method for K", "focal, closed form", "focal, refined", "principal point, refined", "s"]
+    return text_table(head, cells)
+
+
+def selfcalibration_study(
+    scenes: Sequence[Literal["cube", "cloud"]] = ("cube", "cloud"),
+    modes: Sequence[Literal["constant", "zooming"]] = ("constant", "zooming"),
+    noise: Sequence[float] = NOISES_PX,
+    views: Sequence[int] = VIEWS,
+    methods: Sequence[str] | None = None,
+    grid: bool = False,
+    trials: int = 10,
+    first: int = 0,
+    workers: int = 1,
+    read: Sequence[Path] = (),
+    append: Path | None = None,
+) -> Iterator[Part]:
+    """Compare all self-calibration methods on the thesis' cube and on a point cloud.
+
+    Parameters
+    ----------
+    modes : sequence of str
+        One focal length for all images, or one for each.
+    views : sequence of int
+        Numbers of cameras.
+    grid : bool
+        Run every noise at every number of cameras.
+    first : int
+        Number of the first draw.
+    read : sequence of Path
+        Files of earlier trials; with --trials 0 they are only reported.
+    append : Path
+        File to which every trial is appended as a line of JSON.
+    """
+    names = tuple(pick(methods, [*VARIANTS, WITH_BUNDLE, BOUND]))
+    places = cells(scenes, modes, noise, views, grid=grid)
+    jobs = [(cell, names, first + k, 1) for k in range(trials) for cell in places]
+    done = read_trials(read)
+    with ProcessPoolExecutor(workers) as pool:
         for found in pool.map(_quiet_cell, jobs):
-            trials += found
-            if arguments.out:
-                with arguments.out.open("a", encoding="utf-8") as file:
+            done += found
+            if append is not None:
+                with append.open("a", encoding="utf-8") as file:
                     file.writelines(json.dumps(asdict(t)) + "\n" for t in found)
-    print(report(trials), targets(trials), sep="\n\n")
-    return 0
+    yield report(done)
+    judged = targets(done)
+    for scene in dict.fromkeys(row.scene for row in judged):
+        yield [row for row in judged if row.scene == scene]
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def stratified_study(
+    out: Path,
+    scenes: Sequence[str] = ("courtyard", *REAL_SCENES),
+    cameras: Literal["shared", "per-image"] = "shared",
+) -> Iterator[Part]:
+    """Compare the stratified methods alone on real images.
+
+    Without truth, the metric result of the default pipeline stands in.
+    """
+    for scene in scenes_here(scenes):
+        run = thesisrecon.reconstruct(scene.image_paths[0].parent, out / scene.name, until="metric")
+        assert run.projective is not None
+        assert run.metric is not None
+        K = run.metric.reconstruction.K if scene.K is None else scene.K
+        assert K is not None
+        rows = list(measure_stratified(run.projective, run.images, K, cameras=cameras))
+        yield stratified_table(scene.name, rows)

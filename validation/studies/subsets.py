@@ -29,7 +29,8 @@ from thesisrecon.runtime.run import stream
 from validation.scenes.real import REAL_SCENES, Scene
 from validation.studies.runner import SHIFTED, Part, Rows, scenes_here, text_table
 
-MODES = ("shared", "per-image")
+Mode = Literal["shared", "per-image"]
+MODES: tuple[Mode, ...] = ("shared", "per-image")
 SUCCESS_PCT = 3.0
 LEAST_SUCCESS = 0.98
 MIN_VIEWS, MAX_VIEWS = 5, 8
@@ -246,7 +247,7 @@ HEAD = ["set", "cameras", "trials", *OUTCOMES, "median error, %", "worst camera 
 def subsets_study(
     out: Path,
     scenes: Sequence[str] = (*REAL_SCENES, "courtyard", SHIFTED),
-    modes: Sequence[Literal["shared", "per-image"]] = MODES,
+    modes: Sequence[Mode] = MODES,
     trials: int = 100,
     views: Sequence[int] = (MIN_VIEWS, MAX_VIEWS),
     threads: int = 2,

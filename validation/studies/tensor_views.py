@@ -1,20 +1,17 @@
-"""Views by the trilinear tensor beside the truth: ``python -m validation.studies.tensor_views``.
+"""Views by the trilinear tensor beside the truth.
 
-The courtyard is rendered anew at places along the baseline of two of its views and off it, with guessed and
-with true intrinsics; photograph 5 of fountain-P11 is made from 4 and 6; the views in between of Cones from
-its views 2 and 6, beside the same warp with OpenCV's semi-global matching. ``-o`` takes a folder for the
-pictures and the plot. The exit code is 1 where a target is missed.
+The courtyard is rendered at places along the baseline of two of its views and off it, with guessed and with
+true intrinsics; image 5 of fountain-P11 is made from 4 and 6.
 """
 
 from __future__ import annotations
 
-import argparse
 import io
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import PIL.Image
@@ -34,27 +31,28 @@ from thesisrecon.views.virtual_camera import (
     pair_from_fundamental,
 )
 from validation.metrics.pictures import picture_metrics, psnr_db, ssim
-from validation.metrics.record import Metric, markdown_table
+from validation.metrics.record import Metric
 from validation.metrics.timing import time_of_a_frame
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_photograph
 from validation.scenes.nine_views import dissolved
 from validation.scenes.raycast import Rays, World, trace
 from validation.scenes.real import load_real_scene
+from validation.studies.runner import Part, text_table
 
 VIEWS = (6, 7)
-"""Of the courtyard: 11 degrees and 1.3 m apart, the scene 3 to 9 m away."""
+"""Views of the courtyard: 11 degrees and 1.3 m apart, the scene 3 to 9 m away."""
 ALONG = (-1.0, -0.5, -0.25, 0.25, 0.5, 0.75, 1.25, 1.5, 2.0)
 OFF = (0.1, 0.25, 0.5, 1.0)
 DIRECTIONS = {"up": (0.0, -1.0, 0.0), "ahead": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0)}
 FRAME_SIZE, FRAME_S = (1000, 700), 1.0
 BORDER_PX = 50
-"""Columns of views beyond the baseline that no photograph shows, or whose picture ends before."""
+"""Columns of views beyond the baseline that no image shows."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A virtual camera of the courtyard: ``s`` baselines along it, ``off`` baselines from it."""
+    """A virtual camera: ``s`` baselines along the baseline, ``off`` baselines from it."""
 
     s: float
     off: float = 0.0
@@ -62,11 +60,11 @@ class Place:
 
     @property
     def distance(self) -> float:
-        """From the nearest place between the photographs, in baselines."""
+        """Distance from the nearest place between the images in baselines."""
         return float(np.hypot(max(-self.s, self.s - 1.0, 0.0), self.off))
 
     def of(self, pair: CalibratedPair) -> VirtualCamera:
-        """The camera as the pair takes it."""
+        """Return the camera for this pair."""
         camera = camera_at(pair, self.s, sizes=(SIZE, SIZE))
         if self.direction == "along":
             return camera
@@ -75,14 +73,14 @@ class Place:
 
 
 def places_of_courtyard() -> Iterator[Place]:
-    """Along the baseline, and off its middle in three directions."""
+    """Give places along the baseline and off its middle in three directions."""
     yield from (Place(s) for s in ALONG)
     yield from (Place(0.5, off, direction) for direction in DIRECTIONS for off in OFF)
 
 
 @dataclass(frozen=True)
 class CourtyardTruth:
-    """The ``world`` and two of its cameras, ``photographs`` of equal exposure and the true ``places``."""
+    """The world, two cameras, their images of equal exposure and the true places of the pixels."""
 
     world: World
     poses: tuple[Pose, Pose]
@@ -91,28 +89,28 @@ class CourtyardTruth:
 
     @property
     def pair(self) -> CalibratedPair:
-        """The true cameras, in baselines."""
+        """True cameras in baselines."""
         one, two = self.poses
         return CalibratedPair(
             one.K, two.K, two.R @ one.R.T, two.R @ (one.C - two.C) / np.linalg.norm(two.C - one.C)
         )
 
     def pose(self, camera: VirtualCamera) -> Pose:
-        """Where a virtual camera of the true pair stands in the world."""
+        """Return the pose of a virtual camera in the world."""
         two = self.poses[1]
         step = camera.rotation.T @ camera.translation * np.linalg.norm(two.C - self.poses[0].C)
         return Pose(camera.K, camera.rotation @ two.R, two.C - two.R.T @ step)
 
 
 def photograph(world: World, pose: Pose) -> U8:
-    """As the fixtures are made, with the exposure of the pose and no white balance."""
+    """Render an image with the exposure of the pose and without white balance."""
     with PIL.Image.open(io.BytesIO(render_photograph(world, pose, 0)[0])) as image:
         return np.asarray(image.convert("RGB"))
 
 
 @cache
 def courtyard() -> CourtyardTruth:
-    """Rendered, with the true correspondence from the traced depth."""
+    """Render the pair with the true correspondence from the traced depth."""
     world = build_courtyard()
     one, two = (replace(courtyard_poses()[k], exposure=1.0) for k in VIEWS)
     places = []
@@ -128,8 +126,7 @@ def courtyard() -> CourtyardTruth:
 
 @dataclass(frozen=True)
 class Measured:
-    """A picture at one ``place`` by one ``method``: ``psnr`` dB, ``ssim``, and how far its pixels are from
-    where they belong, median and 90 % (px)."""
+    """One rendered view: PSNR (dB), SSIM, median and 90 % quantile of the displacement (px)."""
 
     place: Place
     method: str
@@ -138,8 +135,8 @@ class Measured:
     off_px: tuple[float, float]
 
 
-def measure_courtyard(out: Path | None) -> list[Measured]:
-    """All places by true cameras and correspondence, and by F and matches with true and guessed K."""
+def measure_courtyard(out: Path) -> list[Measured]:
+    """Render all places with true cameras, and with F and matches (true and guessed K)."""
     truth = courtyard()
     found = match_images(*truth.photographs, config=PipelineConfig())
     dense = found.dense.correspondences(0, SIZE), found.dense.correspondences(1, SIZE)
@@ -169,14 +166,13 @@ def measure_courtyard(out: Path | None) -> list[Measured]:
             off = _displaced(truth, place, views.pair)
             rows.append(Measured(place, name, psnr_db(picture, wanted), ssim(picture, wanted), off))
             shown.append(picture)
-        if out is not None:
-            name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
-            save_beside(out / name, [wanted, *shown])
+        name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
+        save_beside(out / name, [wanted, *shown])
     return rows
 
 
 def _displaced(truth: CourtyardTruth, place: Place, pair: CalibratedPair) -> tuple[float, float]:
-    """How far the exact matches of view 1 come to lie from where the true camera has them (px)."""
+    """Return displacements (px) of the exact matches of view 1."""
     y, x = np.indices(truth.places[0].shape[:2])[:, ::8, ::8].reshape(2, -1).astype(np.float64)
     matches = truth.places[0][::8, ::8].reshape(-1, 2).astype(np.float64)
     both = []
@@ -191,8 +187,11 @@ def _displaced(truth: CourtyardTruth, place: Place, pair: CalibratedPair) -> tup
 
 
 def linear_range(rows: list[Measured], method: str) -> tuple[float, float]:
-    """Up to which distance beyond the baseline's ends the median displacement grows in proportion, within
-    10 %, and its slope, px a baseline: from the places along the baseline."""
+    """Return the range and the slope of the displacement beyond the ends of the baseline.
+
+    The range (baselines) ends where the median displacement departs by 10 % from proportion; the slope is in
+    px a baseline.
+    """
     ends = sorted((r.place.distance, r.off_px[0]) for r in rows if r.method == method and r.place.s > 1.0)
     slope = ends[0][1] / ends[0][0]
     reach = 0.0
@@ -204,7 +203,7 @@ def linear_range(rows: list[Measured], method: str) -> tuple[float, float]:
 
 
 def draw(rows: list[Measured]) -> go.Figure:
-    """PSNR and displacement as functions of the distance from the baseline."""
+    """Plot PSNR over the distance from the baseline."""
     figure = go.Figure()
     for method in dict.fromkeys(row.method for row in rows):
         for direction in ("along", *DIRECTIONS):
@@ -224,23 +223,22 @@ def draw(rows: list[Measured]) -> go.Figure:
 
 
 def save_beside(path: Path, pictures: list[U8]) -> None:
-    """Pictures in a row, at half their size."""
+    """Save images in a row at half their size."""
     PIL.Image.fromarray(np.concatenate(pictures, axis=1)[::2, ::2]).save(path)
 
 
 def courtyard_table(rows: list[Measured]) -> str:
-    """Every place, a column for each method: PSNR, SSIM, median displacement."""
-    methods = list(dict.fromkeys(row.method for row in rows))
-    lines = [f"| place | {' | '.join(methods)} |", f"| --- |{' --- |' * len(methods)}"]
+    """Return PSNR, SSIM and median displacement by place and method."""
+    lines = []
     for place in dict.fromkeys(row.place for row in rows):
-        cells = [f"{r.psnr:.1f} dB, {r.ssim:.3f}, {r.off_px[0]:.2f} px" for r in rows if r.place == place]
         where = f"s = {place.s:g}" if place.direction == "along" else f"{place.off:g} {place.direction}"
-        lines.append(f"| {where} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        found = (r for r in rows if r.place == place)
+        lines.append([where, *(f"{r.psnr:.1f} dB, {r.ssim:.3f}, {r.off_px[0]:.2f} px" for r in found)])
+    return text_table(["place", *dict.fromkeys(row.method for row in rows)], lines)
 
 
-def measure_fountain(out: Path | None) -> list[Metric]:
-    """Photograph 5 from 4 and 6, by its true place."""
+def measure_fountain(out: Path) -> list[Metric]:
+    """Render image 5 from 4 and 6 at its true place."""
     scene = load_real_scene("fountain-P11")
     if scene is None or scene.K is None or scene.R is None or scene.C is None:
         return []
@@ -266,13 +264,12 @@ def measure_fountain(out: Path | None) -> list[Metric]:
         camera = VirtualCamera(R @ R2.T, R @ (C2 - C) / baseline, own, size)
         pictures[name] = views.render(camera, threads=2)
     pictures["cross-dissolve"] = dissolved(images[0].rgb, images[1].rgb, 0.5)
-    if out is not None:
-        save_beside(out / "fountain-5.jpg", [wanted, *pictures.values()])
+    save_beside(out / "fountain-5.jpg", [wanted, *pictures.values()])
     return picture_metrics("fountain-P11, 5 from 4 and 6", pictures, wanted)
 
 
 def measure_time(repeats: int) -> Metric:
-    """A frame of 1000 x 700 px from photographs as large, once the correspondence is known."""
+    """Time a frame of 1000 x 700 px from images of that size."""
     truth = courtyard()
     width, height = FRAME_SIZE
     images = tuple(picture[:height, :width] for picture in truth.photographs)
@@ -283,32 +280,21 @@ def measure_time(repeats: int) -> Metric:
     return time_of_a_frame("courtyard, 1000 x 700", draw_frame, repeats=repeats, target_s=FRAME_S)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("parts", nargs="*", default=["fountain", "courtyard", "time"])
-    parser.add_argument("-o", "--out", type=Path)
-    parser.add_argument("--repeats", type=int, default=5)
-    wishes = parser.parse_args(arguments)
-    if wishes.out is not None:
-        wishes.out.mkdir(parents=True, exist_ok=True)
-    rows: list[Metric] = []
-    if "fountain" in wishes.parts:
-        rows += measure_fountain(wishes.out)
-    if "time" in wishes.parts:
-        rows.append(measure_time(wishes.repeats))
-    if "courtyard" in wishes.parts:
-        measured = measure_courtyard(wishes.out)
-        print(courtyard_table(measured), end="\n\n")
+Name = Literal["fountain", "courtyard", "time"]
+
+
+def tensor_views_study(
+    out: Path, parts: Sequence[Name] = ("fountain", "courtyard", "time"), repeats: int = 5
+) -> Iterator[Part]:
+    """Compare views by the trilinear tensor with the truth; OUT gets the images and a plot."""
+    if "fountain" in parts:
+        yield measure_fountain(out)
+    if "time" in parts:
+        yield [measure_time(repeats)]
+    if "courtyard" in parts:
+        measured = measure_courtyard(out)
+        yield courtyard_table(measured)
         for method in ("true K", "guessed K"):
             reach, slope = linear_range(measured, method)
-            print(f"{method}: {slope:.2f} px a baseline beyond, linear to {reach:g} baselines", end="\n\n")
-        if wishes.out is not None:
-            draw(measured).write_html(wishes.out / "tensor-views.html", include_plotlyjs=True)
-    for scene in dict.fromkeys(row.scene for row in rows):
-        print(f"### {scene}\n\n{markdown_table([r for r in rows if r.scene == scene])}", end="\n\n")
-    return int(any(row.verdict == "missed" for row in rows))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            yield f"{method}: {slope:.2f} px a baseline beyond, linear to {reach:g} baselines"
+        draw(measured).write_html(out / "tensor-views.html", include_plotlyjs=True)

@@ -1,10 +1,9 @@
-"""Three views, ``python -m validation.studies.trifocal``: real photographs (merton1) and synthetic scenes."""
+"""Three views: the trifocal tensor on real images (merton1) and on synthetic scenes."""
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,15 +23,16 @@ from thesisrecon.geometry.three_view import (
     transfer_lines,
     transfer_points,
 )
-from validation.metrics.record import Metric, markdown_table
+from validation.metrics.record import Metric
 from validation.scenes.real import data_root
+from validation.studies.runner import Part, Rows
 
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 WIDTH, HEIGHT = 1024, 768
 
 
 def read_merton1(root: Path) -> tuple[F64, F64, F64]:
-    """Published cameras (3, 3, 4), corners (3, N, 2) and segments (3, M, 2, 2) matched in all three views."""
+    """Read cameras (3, 3, 4), corners (3, N, 2) and segments (3, M, 2, 2) matched in all three views."""
     folder = root / "merton1" / "2D"
 
     def matched(kind: str) -> F64:
@@ -45,12 +45,12 @@ def read_merton1(root: Path) -> tuple[F64, F64, F64]:
 
 
 def point_transfer_px(T: F64, points: F64) -> F64:
-    """Distances (N,) of the transferred points to those of view 3."""
+    """Return distances (N,) of the transferred points to those of view 3."""
     return np.asarray(np.linalg.norm(transfer_points(T, points[0], points[1]) - points[2], axis=1))
 
 
 def line_transfer_px(T: F64, segments: F64) -> F64:
-    """RMS distances (M,) of the ends in view 3 to the transferred lines."""
+    """Return RMS distances (M,) of the segment ends in view 3 to the transferred lines."""
     ends = homogenize(segments)
     l1, l2 = line_through(ends[:2, :, 0], ends[:2, :, 1])
     found = unit_normals(transfer_lines(T, l1, l2))
@@ -58,7 +58,7 @@ def line_transfer_px(T: F64, segments: F64) -> F64:
 
 
 def with_wrong(points: F64, segments: F64, share: float, rng: Generator) -> tuple[F64, F64, B8, B8]:
-    """Copies in which a share of the points is anywhere and of the lines exchanged in view 3, and which."""
+    """Replace a share of the points and exchange a share of the lines of view 3; also return which."""
     points, segments = points.copy(), segments.copy()
     n, m = points.shape[1], segments.shape[1]
     wrong, wrong_lines = np.zeros(n, dtype=bool), np.zeros(m, dtype=bool)
@@ -82,7 +82,7 @@ def _robust(share: float) -> Method:
 
 
 def check_merton1(root: Path) -> list[Metric]:
-    """Median transfer into view 3 of a fit to all, and of fits to one half measured on the other half."""
+    """Measure the median transfer into view 3 of fits to all data and of fits to held-out halves."""
     cameras, points, segments = read_merton1(root)
     published = tensor_from_cameras(*cameras)
     methods: dict[str, tuple[Method, bool, bool]] = {
@@ -116,7 +116,7 @@ def check_merton1(root: Path) -> list[Metric]:
             tag = "held out" if held_out else "fit"
             values[f"points, {tag}"] = float(np.median(np.concatenate(of_points)))
             values[f"lines, {tag}"] = float(np.median(np.concatenate(of_lines)))
-        # What the linear start and the published cameras reach is only reported.
+        # Linear fits and published cameras are reported without a bound.
         reported = name.startswith(("linear", "published"))
         kinds = ["points"] if with_points else ["lines"]
         if with_points and with_lines:
@@ -133,7 +133,7 @@ def _of(values: dict[str, float], kind: str) -> dict[str, float]:
 
 
 def make_three_views(rng: Generator, n: int) -> tuple[F64, F64]:
-    """Cameras (3, 3, 4) 8 units from points (3, n, 2) px, some 20 degrees apart, 1280x960 px."""
+    """Draw cameras (3, 3, 4) 8 units from points, some 20 degrees apart, and pixels (3, n, 2)."""
     K = calibration_matrix(1200.0, 1180.0, 640.0, 480.0)
     cameras = []
     for turn in (-0.3, 0.1, 0.35):
@@ -145,7 +145,7 @@ def make_three_views(rng: Generator, n: int) -> tuple[F64, F64]:
 
 
 def check_synthetic(sigma_px: float, n: int, share: float, trials: int) -> list[Metric]:
-    """RMS transfer of exact points, relative to the refinement of the right tracks from the true cameras."""
+    """Measure the RMS transfer of exact points, relative to a refinement of the right tracks."""
     names = ["linear, right tracks", "least error, right tracks", "robust, all tracks"]
     squared: dict[str, list[float]] = {name: [] for name in names}
     seconds, precision, recall, failures = [], [], [], 0
@@ -165,47 +165,39 @@ def check_synthetic(sigma_px: float, n: int, share: float, trials: int) -> list[
         reference = refine_trifocal(tensor_from_cameras(*P), right, NO_SEGMENTS, loss_px=3.0 * sigma_px)
         tensors = (estimate_tensor_linear(right, NO_SEGMENTS), reference.T, found.fit.T)
         for name, T in zip(names, tensors, strict=True):
-            # An error of 100 px is as wrong as any.
+            # Errors are capped at 100 px.
             squared[name].append(float(np.mean(np.minimum(point_transfer_px(T, exact), 100.0) ** 2)))
         precision.append(float(np.mean(~wrong[found.inliers])))
         recall.append(float(np.mean(found.inliers[~wrong])))
-    scene = f"sigma {sigma_px:g} px, {n} tracks, {100 * share:g} % wrong, {trials} trials"
+    rows = Rows(f"sigma {sigma_px:g} px, {n} tracks, {100 * share:g} % wrong, {trials} trials", names[2])
     rms = {name: float(np.sqrt(np.mean(values))) for name, values in squared.items()}
     ratio = {name: rms[name] / rms[names[1]] for name in names}
-    own = names[2]
-    return [
-        Metric(scene, "RMS transfer of exact points", "px", rms, own),
-        Metric(scene, "relative to the least error of the right tracks", "", ratio, own, 1.1),
-        Metric(scene, "precision", "", {own: float(np.mean(precision))}, own, 0.99, at_most=False),
-        Metric(scene, "recall", "", {own: float(np.mean(recall))}, own, 0.95, at_most=False),
-        Metric(scene, "failures", "", {own: float(failures)}, own, 0.0),
-        Metric(scene, "median time", "s", {own: float(np.median(seconds))}, own),
-    ]
+    rows.add("RMS transfer of exact points", rms, "px")
+    rows.add("relative to the least error of the right tracks", ratio, at_most=1.1)
+    rows.add("precision", float(np.mean(precision)), at_least=0.99)
+    rows.add("recall", float(np.mean(recall)), at_least=0.95)
+    rows.add("failures", failures, at_most=0.0)
+    rows.add("median time", float(np.median(seconds)), "s")
+    return rows
 
 
-def main() -> int:
-    """Print the tables; 1 where a target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--tracks", type=int, nargs="+", default=[60, 200])
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.5, 1.0, 2.0])
-    parser.add_argument("--wrong", type=float, nargs="+", default=[0.3, 0.5])
-    arguments = parser.parse_args()
-    rows: list[Metric] = []
+def trifocal_study(
+    trials: int = 100,
+    tracks: Sequence[int] = (60, 200),
+    noise: Sequence[float] = (0.5, 1.0, 2.0),
+    wrong: Sequence[float] = (0.3, 0.5),
+) -> Iterator[Part]:
+    """Measure the trifocal tensor on the Merton College images and on synthetic scenes.
+
+    Parameters
+    ----------
+    tracks : sequence of int
+        Numbers of point tracks.
+    """
     root = data_root()
     if root is not None and (root / "merton1").is_dir():
-        rows += check_merton1(root)
-        print("merton1", markdown_table(rows), sep="\n\n", flush=True)
-    else:
-        print("merton1 is not here: skipped")
-    for sigma in arguments.noise:
-        for n in arguments.tracks:
-            for share in arguments.wrong:
-                block = check_synthetic(sigma, n, share, arguments.trials)
-                rows += block
-                print(block[0].scene, markdown_table(block), sep="\n\n", flush=True)
-    return int(any(row.verdict == "missed" for row in rows))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+        yield check_merton1(root)
+    for sigma in noise:
+        for n in tracks:
+            for share in wrong:
+                yield check_synthetic(sigma, n, share, trials)

@@ -15,9 +15,9 @@ from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
-from validation.studies.epipolar_catalogue import METHODS, THRESHOLD_PX, TOLD_SIGMAS
-from validation.studies.epipolar_cube import CubePair, cube_pairs, measure_pair
 from validation.scenes.cube import make_cube
+from validation.studies.epipolar_cube import CubePair, cube_pairs, measure_pair
+from validation.studies.epipolar_methods import MATCHED_SIGMAS, METHODS, THRESHOLD_PX
 
 BY_METHOD = {m.name: m for m in METHODS}
 OF_CONFIG = "epipolar of the configuration"
@@ -73,7 +73,7 @@ class FundamentalOfCube:
     ) -> Mapping[str, float]:
         rng = np.random.default_rng((seed, round(1e3 * self.noise_px), round(1e3 * self.outliers)))
         chosen = rng.choice(len(_pairs()), self.pairs, replace=False)
-        threshold = max(THRESHOLD_PX, TOLD_SIGMAS * self.noise_px)
+        threshold = max(THRESHOLD_PX, MATCHED_SIGMAS * self.noise_px)
         found = []
         for pair in (_pairs()[k] for k in chosen):
             xy1, xy2 = self._matches(pair, rng)

@@ -1,4 +1,1 @@
-"""The package as somebody gets it: built, installed into an empty environment, and used from an empty folder.
-
-``python -m validation.studies.package`` says each step.
-"""
+"""Checks of the package as it is built and installed."""

@@ -1,4 +1,4 @@
-"""The wheel and the sdist: made, and what is in them."""
+"""The wheel and the sdist: how they are built, and what they hold."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from thesisrecon.io.lists import COUNT
-from validation.studies.package.environments import bare, install, make_environment
+from thesisrecon.io.pair_list import DEMO_IMAGES
 from validation.scenes.real import ROOT
+from validation.studies.package.environments import clean_environment, install, make_environment
 
 MOST_BYTES = 3_000_000
-"""Of the wheel."""
+"""Bound of the size of the wheel."""
 NEEDED = (
     "thesisrecon/py.typed",
     "thesisrecon/report/template.html.j2",
@@ -27,16 +27,16 @@ NEEDED = (
     "thesisrecon/report/viewer.js",
     "thesisrecon/courtyard/cameras.json",
 )
-LAID_IN = re.compile(
+ALLOWED = re.compile(
     r"thesisrecon/(.*\.py|py\.typed|report/[a-z.]*\.(j2|js|css)|courtyard/(cameras\.json|images/\d{4}\.jpg))"
     r"|thesisrecon-[0-9.]*\.dist-info/.*"
 )
-"""All that may be in a wheel."""
+"""Files that a wheel may hold."""
 
 
 @dataclass(frozen=True)
 class Built:
-    """What a build made: the wheel out of the sdist, the sdist, and the wheel straight from the tree."""
+    """The wheel from the sdist, the sdist, and the wheel built from the tree."""
 
     wheel: Path
     sdist: Path
@@ -44,42 +44,42 @@ class Built:
 
 
 def build(out: Path) -> Built:
-    """Run ``python -m build`` in an environment that holds nothing else."""
+    """Run ``python -m build`` in an empty environment."""
     interpreter = make_environment(out / "build-environment")
     install(interpreter, "build")
-    for folder, wishes in (("dist", []), ("direct", ["--wheel"])):
-        command = [str(interpreter), "-m", "build", *wishes, "--outdir", str(out / folder), str(ROOT)]
-        subprocess.run(command, check=True, env=bare(), stdout=subprocess.DEVNULL)
+    for folder, flags in (("dist", []), ("direct", ["--wheel"])):
+        command = [str(interpreter), "-m", "build", *flags, "--outdir", str(out / folder), str(ROOT)]
+        subprocess.run(command, check=True, env=clean_environment(), stdout=subprocess.DEVNULL)
     return find_built(out)
 
 
 def find_built(out: Path) -> Built:
-    """What an earlier :func:`build` made there."""
+    """Return the files of an earlier :func:`build`."""
     wheel, sdist = next((out / "dist").glob("*.whl")), next((out / "dist").glob("*.tar.gz"))
     return Built(wheel, sdist, next((out / "direct").glob("*.whl")))
 
 
 def wheel_faults(names: Iterable[str], size: int) -> list[str]:
-    """What is wrong with a wheel of these files and so many bytes."""
+    """Return the faults of a wheel with these files and this size."""
     held = set(names)
     faults = [f"{name} is missing" for name in NEEDED if name not in held]
-    faults += [f"{name} does not belong there" for name in sorted(held) if not LAID_IN.fullmatch(name)]
-    photographs = sum(name.endswith(".jpg") for name in held)
-    if photographs != COUNT:
-        faults.append(f"{photographs} photographs instead of {COUNT}")
+    faults += [f"{name} does not belong there" for name in sorted(held) if not ALLOWED.fullmatch(name)]
+    images = sum(name.endswith(".jpg") for name in held)
+    if images != DEMO_IMAGES:
+        faults.append(f"{images} images instead of {DEMO_IMAGES}")
     if size > MOST_BYTES:
         faults.append(f"{size / 1e6:.2f} MB, at most {MOST_BYTES / 1e6:.2f}")
     return faults
 
 
 def content(wheel: Path) -> dict[str, str]:
-    """The digest of every file of a wheel by its name."""
+    """Return the digest of every file of a wheel."""
     with zipfile.ZipFile(wheel) as archive:
         return {name: hashlib.sha256(archive.read(name)).hexdigest() for name in archive.namelist()}
 
 
 def check_built(built: Built) -> list[str]:
-    """Faults of what was built; none where all is well."""
+    """Return the faults of the built files."""
     held = content(built.wheel)
     faults = wheel_faults(held, built.wheel.stat().st_size)
     direct = content(built.direct)

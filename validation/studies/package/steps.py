@@ -1,65 +1,65 @@
-"""The package as somebody gets it: ``python -m validation.studies.package STEP... -o OUT [-- PYTEST...]``.
+"""The package as a user gets it: built, installed into an empty environment, and used from an empty folder.
 
-``build`` makes wheel and sdist in OUT/dist and looks into them; the steps after it take what it made.
-``install`` puts the wheel into an empty environment; ``imports``, ``typed``, ``quiet`` and ``demo`` use it
-from empty folders. ``lowest`` and ``newest`` run the quick suite with the lowest and newest versions of the
-dependencies that pyproject.toml allows, part by part; what follows ``--`` goes to pytest in place of it.
-``--python`` is the interpreter of the new environments, each of which is made once and keeps what pytest said
-of each part in ``logs/``. The exit code is 1 where something is wrong.
+``build`` makes wheel and sdist in OUT/dist and checks them; the later steps use them. ``install`` puts the
+wheel into an empty environment; ``imports``, ``typed``, ``quiet`` and ``demo`` use it from empty folders.
+``lowest`` and ``newest`` run the quick suite with the lowest and newest versions of the dependencies, part by
+part. Each environment is made once and keeps the output of pytest in ``logs/``.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from thesisrecon.io.lists import COUNT, demo_photographs
+from thesisrecon.io.pair_list import DEMO_IMAGES, demo_images
 from validation.studies.package.built import build, check_built, find_built
 from validation.studies.package.environments import (
-    bare,
+    clean_environment,
     dependencies,
     install,
     lowest_versions,
     make_environment,
+    quick_parts,
+    run_part,
+    suite_environment,
+    suite_faults,
 )
-from validation.studies.package.imports import check_imports
-from validation.studies.package.quiet import trespasses, watch
-from validation.studies.package.suite import quick_parts, run_part, suite_environment, suite_faults
+from validation.studies.package.installed import check_imports, trespasses, watch
+from validation.studies.runner import Part, Rows, pick
 
 FOCAL_WITHIN = 0.01
-"""Of the truth: the demo calibrates itself."""
+"""Relative bound of the focal error of the demo."""
 
 
 class Checks:
-    """Every step by its name; each returns what is wrong."""
+    """All steps; each returns its faults."""
 
     def __init__(self, out: Path, python: str, pytest: list[str]) -> None:
         self.out, self.python, self.pytest = out, python, pytest
         self.interpreter = out / "environment" / "bin" / "python"
 
     def build(self) -> list[str]:
-        """Wheel and sdist, and what is in them."""
+        """Build wheel and sdist and check what they hold."""
         return check_built(build(self.out))
 
     def install(self) -> list[str]:
-        """The wheel into an empty environment."""
+        """Install the wheel into an empty environment."""
         shutil.rmtree(self.out / "environment", ignore_errors=True)
         make_environment(self.out / "environment", self.python)
         install(self.interpreter, str(find_built(self.out).wheel))
         return []
 
     def imports(self) -> list[str]:
-        """What importing the installed package costs."""
+        """Measure the import times of the installed package."""
         return check_imports(self.interpreter)
 
     def typed(self) -> list[str]:
-        """mypy --strict over a client of the installed package."""
+        """Run mypy --strict over a client of the installed package."""
         checker = make_environment(self.out / "mypy")
         install(checker, "mypy")
         with tempfile.TemporaryDirectory() as empty:
@@ -68,7 +68,7 @@ class Checks:
             run = subprocess.run(
                 [str(word) for word in command],
                 cwd=empty,
-                env=bare(),
+                env=clean_environment(),
                 capture_output=True,
                 text=True,
                 check=False,
@@ -77,13 +77,13 @@ class Checks:
         return [] if run.returncode == 0 else [f"mypy: {run.stdout.strip()}"]
 
     def quiet(self) -> list[str]:
-        """A run writes into its folder and the cache of the kernels alone, and speaks to nobody."""
+        """Check that a run writes only into its folder and the kernel cache, and makes no network call."""
         with tempfile.TemporaryDirectory() as place:
-            photographs, result = Path(place) / "photographs", Path(place) / "result"
-            photographs.mkdir()
-            for path in demo_photographs()[:4]:
-                shutil.copy(path, photographs)
-            command = ["reconstruct", str(photographs), "-o", str(result), "--max-size", "480"]
+            images, result = Path(place) / "images", Path(place) / "result"
+            images.mkdir()
+            for path in demo_images()[:4]:
+                shutil.copy(path, images)
+            command = ["reconstruct", str(images), "-o", str(result), "--max-size", "480"]
             cache = self.out / "kernels"
             run = watch(str(self.interpreter), command, Path(place) / "watched", NUMBA_CACHE_DIR=str(cache))
             written = len(run.written)
@@ -92,10 +92,10 @@ class Checks:
         return faults
 
     def demo(self) -> list[str]:
-        """The installed demo from an empty folder, against the truth that the wheel carries."""
+        """Run the installed demo from an empty folder and compare it with the truth in the wheel."""
         with tempfile.TemporaryDirectory() as empty:
             command = [str(self.interpreter.with_name("thesisrecon")), "demo"]
-            environment = bare(HOME=empty, NUMBA_CACHE_DIR=str(self.out / "kernels"))
+            environment = clean_environment(HOME=empty, NUMBA_CACHE_DIR=str(self.out / "kernels"))
             run = subprocess.run(
                 command, cwd=empty, env=environment, capture_output=True, text=True, check=False
             )
@@ -111,19 +111,19 @@ class Checks:
         faults = [
             f"{n} is missing" for n in ("model.glb", "report.html", "points.ply") if not (out / n).is_file()
         ]
-        if summary["registered"] != COUNT:
-            faults.append(f"{summary['registered']} of {COUNT} photographs have a camera")
+        if summary["registered"] != DEMO_IMAGES:
+            faults.append(f"{summary['registered']} of {DEMO_IMAGES} images have a camera")
         found = json.loads((out / "cameras.json").read_text(encoding="utf-8"))["cameras"]
         off = max(abs(c["K"][0][0] / truth["cameras"][c["name"]]["K"][0][0] - 1.0) for c in found)
         print(f"{len(found)} cameras, focal lengths within {100 * off:.2f} % of the truth")
         return faults + ([f"a focal length is off by {100 * off:.2f} %"] if off > FOCAL_WITHIN else [])
 
     def lowest(self) -> list[str]:
-        """The quick suite with the lowest versions that are allowed."""
+        """Run the quick suite with the lowest allowed versions of the dependencies."""
         return self._suite("lowest", lowest_versions(dependencies()))
 
     def newest(self) -> list[str]:
-        """The quick suite with the newest versions there are."""
+        """Run the quick suite with the newest versions of the dependencies."""
         return self._suite("newest", [])
 
     def _suite(self, name: str, constraints: list[str]) -> list[str]:
@@ -144,24 +144,23 @@ STEPS: dict[str, Callable[[Checks], list[str]]] = {
 }
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Take the steps, print what is wrong."""
-    given = sys.argv[1:] if arguments is None else arguments
-    at = given.index("--") if "--" in given else len(given)
-    parser = argparse.ArgumentParser(prog="python -m validation.studies.package", description=__doc__)
-    parser.add_argument("steps", nargs="+", choices=STEPS)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--python", default=sys.executable)
-    wishes = parser.parse_args(given[:at])
-    out = wishes.out.resolve()
-    out.mkdir(parents=True, exist_ok=True)
-    checks, faults = Checks(out, wishes.python, given[at + 1 :]), []
-    for step in wishes.steps:
+def package_study(
+    out: Path, steps: Sequence[str] = ("build",), python: str = sys.executable, pytest: Sequence[str] = ()
+) -> Iterator[Part]:
+    """Build the package, install it into empty environments and use it from empty folders.
+
+    Parameters
+    ----------
+    steps : sequence of str
+        build install imports typed quiet demo lowest newest.
+    python : str
+        Interpreter of the new environments.
+    pytest : sequence of str
+        Arguments of pytest in place of the quick suite.
+    """
+    checks, rows = Checks(out, python, list(pytest)), Rows("package", "ours")
+    for step in pick(steps, STEPS):
         found = STEPS[step](checks)
-        print(f"{step}: {'well' if not found else '; '.join(found)}", flush=True)
-        faults += found
-    return int(bool(faults))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        yield f"{step}: {'; '.join(found) or 'no fault'}"
+        rows.add(f"faults of {step}", len(found), at_most=0.0)
+    yield rows

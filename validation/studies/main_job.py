@@ -1,0 +1,322 @@
+"""The main job beside COLMAP on the same images: cameras registered, errors, reprojection, wall time.
+
+Each method runs as a process of its own on the same number of processor cores. Ours is the command line up to
+the metric stage, and its whole life counts; of COLMAP only extraction, matching and mapping count. Every
+number is computed here from saved cameras and points.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.colmap import reconstruction_from_colmap
+from thesisrecon.io.colmap_files import read_colmap_model
+from thesisrecon.io.files import write_text
+from thesisrecon.records import Reconstruction
+from validation.harness.process import Process, own_cores, run_process
+from validation.metrics.cameras import (
+    CameraErrors,
+    Reprojection,
+    TrueCameras,
+    measure_cameras,
+    measure_reprojection,
+)
+from validation.metrics.record import Metric, summary_table
+from validation.references.colmap_mapping import read_run
+from validation.scenes.real import REAL_SCENES, Scene
+from validation.studies.runner import Part, Rows, scenes_here
+
+OURS, THESIS = "ours (default)", "ours (thesis)"
+COLMAP, COLMAP_PP = "COLMAP", "COLMAP, principal point refined"
+
+# Per scene: focal %, centre mm, median reprojection px. All cameras must be registered.
+TARGETS: dict[str, tuple[float | None, float | None, float | None]] = {
+    "courtyard": (0.3, None, None),
+    "fountain-P11": (0.5, 8.0, 0.35),
+    "Herz-Jesus-P8": (0.5, 8.0, 0.35),
+}
+KERMIT_REGISTERED = 9
+CLAIM_TOLERANCE_PCT = 1.0
+TIMED_SCENES = ("fountain-P11", "Herz-Jesus-P8")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of one method on one scene.
+
+    Attributes
+    ----------
+    reconstruction : Reconstruction or None
+            None after a failure.
+    wall_s, seconds : float, mapping
+            The time that counts, and its parts.
+    cpu_s : float
+            Processor time of the whole process.
+    failure : str
+            Message of the failure.
+    reasons : mapping
+            Unregistered image -> reason that the method gives.
+    claimed_rms_px : float or None
+            Reprojection error that the method states.
+    """
+
+    reconstruction: Reconstruction | None
+    wall_s: float
+    peak_mb: float
+    cpu_s: float
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    failure: str = ""
+    reasons: Mapping[str, str] = field(default_factory=dict)
+    claimed_rms_px: float | None = None
+
+
+def check_reconstruction(
+    scene: str, n_views: int, truth: TrueCameras | None, outcomes: Mapping[str, Outcome]
+) -> list[Metric]:
+    """Return all rows of one scene; ``outcomes`` maps methods to their results, truth may be None."""
+    models = {name: outcome.reconstruction for name, outcome in outcomes.items()}
+    focal, centre, reprojection = TARGETS.get(scene, (None, None, None))
+    residuals = {name: None if m is None else measure_reprojection(m) for name, m in models.items()}
+    rows = Rows(scene, OURS)
+
+    def of_residuals(read: Callable[[Reprojection], float]) -> dict[str, float | None]:
+        return {name: None if residual is None else read(residual) for name, residual in residuals.items()}
+
+    def of_outcomes(read: Callable[[Outcome], float]) -> dict[str, float]:
+        return {name: read(outcome) for name, outcome in outcomes.items()}
+
+    rows.append(_registered(scene, n_views, outcomes))
+    if truth is not None:
+        errors = {name: None if m is None else measure_cameras(m, truth) for name, m in models.items()}
+        quantities: tuple[tuple[str, str, Callable[[CameraErrors], float | None], float | None], ...] = (
+            ("focal error", "%", lambda e: e.focal_error_pct, focal),
+            ("principal point error", "px", lambda e: e.principal_point_error_px, None),
+            ("mean camera-centre error", "mm", _centre_mm, centre),
+            ("median rotation error", "deg", lambda e: e.rotation_error_deg, None),
+        )
+        for label, unit, read, bound in quantities:
+            values = {name: None if e is None else read(e) for name, e in errors.items()}
+            rows.add(label, values, unit, at_most=bound)
+    rows.add("median reprojection", of_residuals(lambda r: r.median_px), "px", at_most=reprojection)
+    rows.add("mean reprojection", of_residuals(lambda r: r.mean_px), "px")
+    rows.add("points", {name: None if m is None else float(m.valid.sum()) for name, m in models.items()})
+    rows.add("observations", of_residuals(lambda r: float(r.observations)))
+    wall = of_outcomes(lambda o: o.wall_s)
+    rows.add("wall time", wall, "s", at_most=wall.get(COLMAP) if scene in TIMED_SCENES else None)
+    rows.add("rms it claims off by", _claims(outcomes, residuals), "%", at_most=CLAIM_TOLERANCE_PCT)
+    rows.add("processor time", of_outcomes(lambda o: o.cpu_s), "s")
+    rows.add("peak memory", of_outcomes(lambda o: o.peak_mb), "MB")
+    return rows
+
+
+def _centre_mm(errors: CameraErrors) -> float | None:
+    return None if errors.centre_error is None else 1000.0 * errors.centre_error
+
+
+def _registered(scene: str, n_views: int, outcomes: Mapping[str, Outcome]) -> Metric:
+    """Require all cameras of a scene with bounds; of kermit 9, or a reason for each missing one."""
+    values = {
+        name: 0.0 if o.reconstruction is None else float(o.reconstruction.registered.sum())
+        for name, o in outcomes.items()
+    }
+    if scene != "kermit":
+        target = float(n_views) if scene in TARGETS else None
+        return Metric(scene, f"cameras registered of {n_views}", "", values, OURS, target, at_most=False)
+    ours = outcomes[OURS]
+    missing = n_views - int(values[OURS])
+    explained = missing > n_views - KERMIT_REGISTERED and sum(map(bool, ours.reasons.values())) == missing
+    target = 0.0 if explained else float(KERMIT_REGISTERED)
+    note = f"{missing} missing, each with its reason" if explained else ""
+    return Metric(
+        scene, f"cameras registered of {n_views}", "", values, OURS, target, at_most=False, note=note
+    )
+
+
+def _claims(
+    outcomes: Mapping[str, Outcome], residuals: Mapping[str, Reprojection | None]
+) -> dict[str, float | None]:
+    """Return how far the stated RMS is from the one of the saved model in percent."""
+    differences: dict[str, float | None] = {}
+    for name, outcome in outcomes.items():
+        measured, claimed = residuals[name], outcome.claimed_rms_px
+        if measured is not None and claimed is not None:
+            differences[name] = 100.0 * abs(claimed / measured.rms_px - 1.0)
+    return differences
+
+
+METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colmap-principal-point"}
+
+
+README_BEGIN, README_END = "<!-- measured: begin -->", "<!-- measured: end -->"
+README_ROWS = (
+    "cameras registered",
+    "focal error",
+    "principal point error",
+    "mean camera-centre error",
+    "median rotation error",
+    "median reprojection",
+    "points",
+    "wall time",
+    "peak memory",
+)
+
+
+def run_method(method: str, scene: Scene, out: Path, *, threads: int, environment: dict[str, str]) -> Outcome:
+    """Run one method on one scene in the emptied folder ``out`` and read its result."""
+    images = scene.image_paths[0].parent
+    shutil.rmtree(out, ignore_errors=True)
+    process = run_process(
+        _command(method, images, out, threads),
+        log=out.with_suffix(".log"),
+        cores=own_cores()[:threads],
+        environment=environment,
+    )
+    read = _read_colmap if method in (COLMAP, COLMAP_PP) else _read_ours
+    try:
+        return read(scene, out, process)
+    except (StageFailure, OSError) as error:
+        failure = f"exit code {process.code}: {error}"
+        return Outcome(None, process.wall_s, process.peak_mb, process.cpu_s, failure=failure)
+
+
+def _command(method: str, images: Path, out: Path, threads: int) -> list[str]:
+    if method in (OURS, THESIS):
+        ours = [sys.executable, "-m", "thesisrecon", "reconstruct", str(images), "-o", str(out)]
+        ours += ["--until", "metric"]  # the last stage that the references have
+        return [*ours, "--preset", METHODS[method], "--cameras", "shared", "--threads", str(threads)]
+    theirs = [sys.executable, "-m", "validation.references.colmap_run", str(images), str(out)]
+    extra = ["--refine-principal-point"] if method == COLMAP_PP else []
+    return [*theirs, "--threads", str(threads), *extra]
+
+
+def _read_ours(scene: Scene, out: Path, process: Process) -> Outcome:
+    """Read cameras and points from the saved model, the rest from summary.json."""
+    path = out / "summary.json"
+    summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    reasons = {item["name"]: item["reason"] for item in summary.get("refused", [])}
+    names = [path.name for path in scene.image_paths]
+    model, failure = None, ""
+    try:
+        model = reconstruction_from_colmap(read_colmap_model(out / "sparse" / "0"), names=names)
+    except StageFailure as missing:
+        failure = str(summary.get("failure") or f"exit code {process.code}: {missing}")
+    return Outcome(
+        model,
+        process.wall_s,
+        process.peak_mb,
+        process.cpu_s,
+        seconds=_stage_seconds(summary),
+        failure=failure,
+        reasons=reasons,
+        claimed_rms_px=summary.get("reprojection_rms_px"),
+    )
+
+
+def _stage_seconds(summary: dict[str, Any]) -> dict[str, float]:
+    seconds = summary.get("seconds")
+    return {k: float(v) for k, v in seconds.items()} if isinstance(seconds, dict) else {}
+
+
+def _read_colmap(scene: Scene, out: Path, process: Process) -> Outcome:
+    run = read_run(scene.image_paths[0].parent, out)
+    wall_s = sum(run.seconds.values())
+    return Outcome(run.reconstruction, wall_s, process.peak_mb, process.cpu_s, seconds=run.seconds)
+
+
+def measure_scene(
+    scene: Scene, out: Path, *, threads: int, repeats: int, environment: dict[str, str]
+) -> tuple[list[Metric], dict[str, Outcome]]:
+    """Run all methods on one scene in turn; the fastest run of each counts."""
+    outcomes: dict[str, Outcome] = {}
+    for _ in range(repeats):
+        for method, folder in METHODS.items():
+            place = out / scene.name / folder
+            outcome = run_method(method, scene, place, threads=threads, environment=environment)
+            print(f"{scene.name}: {method}: {outcome.wall_s:.1f} s {outcome.failure}", flush=True)
+            if method not in outcomes or outcome.wall_s < outcomes[method].wall_s:
+                outcomes[method] = outcome
+    truth = None
+    if scene.K is not None and scene.R is not None and scene.C is not None:
+        truth = TrueCameras(scene.K, scene.R, scene.C)
+    return check_reconstruction(scene.name, len(scene.image_paths), truth, outcomes), outcomes
+
+
+def warm_up(scene: Scene, out: Path, *, threads: int, environment: dict[str, str]) -> float:
+    """Compile the kernels into an empty cache; return the seconds of ``default`` meanwhile."""
+    shutil.rmtree(environment["NUMBA_CACHE_DIR"], ignore_errors=True)
+    cold = run_method(OURS, scene, out / "cold" / "default", threads=threads, environment=environment)
+    run_method(THESIS, scene, out / "cold" / "thesis", threads=threads, environment=environment)
+    print(f"{scene.name}: {OURS}, compiling: {cold.wall_s:.1f} s {cold.failure}", flush=True)
+    return cold.wall_s
+
+
+def write_readme(readme: Path, rows: dict[str, list[Metric]], facts: dict[str, Any]) -> None:
+    """Replace the table between the markers of a Markdown file."""
+    text = readme.read_text(encoding="utf-8")
+    before, rest = text.split(README_BEGIN)
+    _, after = rest.split(README_END)
+    table = summary_table([metric for metrics in rows.values() for metric in metrics], README_ROWS)
+    given = "; ".join(f"{name}: {value}" for name, value in facts.items())
+    measured = f"{README_BEGIN}\n{table}\n\n{given}.\n{README_END}"
+    write_text(readme, before + measured + after)
+
+
+def _notes(outcomes: dict[str, Outcome]) -> str:
+    """Return stage times, failures and unregistered images."""
+    lines = []
+    for method, run in outcomes.items():
+        if run.seconds:
+            stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in run.seconds.items())
+            lines.append(f"- {method}: {stages}")
+        lines += [f"- {method} failed: {run.failure}"] * bool(run.failure)
+        lines += [f"- {method} refused {name}: {reason}" for name, reason in run.reasons.items()]
+    return "\n".join(lines)
+
+
+def main_job_study(
+    out: Path,
+    scenes: Sequence[str] = ("courtyard", *REAL_SCENES),
+    repeats: int = 1,
+    threads: int = 2,
+    readme: Path | None = None,
+) -> Iterator[Part]:
+    """Run both presets and COLMAP on the same images and compare them with the truth.
+
+    Parameters
+    ----------
+    readme : Path
+        Markdown file whose table of measurements is replaced.
+    """
+    found = scenes_here(scenes)
+    if not found:
+        return
+    environment = {"NUMBA_CACHE_DIR": str(out / "numba_cache")}
+    first = min(found, key=lambda scene: len(scene.image_paths))
+    seconds = warm_up(first, out, threads=threads, environment=environment)
+    facts: dict[str, Any] = {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
+        "threads": threads,
+        "python": platform.python_version(),
+        "pycolmap": version("pycolmap"),
+        "first run, kernels compiling": f"{seconds:.1f} s on {first.name}",
+    }
+    yield "; ".join(f"{name}: {value}" for name, value in facts.items())
+    rows: dict[str, list[Metric]] = {}
+    for scene in found:
+        rows[scene.name], outcomes = measure_scene(
+            scene, out, threads=threads, repeats=repeats, environment=environment
+        )
+        yield rows[scene.name]
+        yield _notes(outcomes)
+    if readme is not None:
+        write_readme(readme, rows, facts)

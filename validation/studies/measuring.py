@@ -1,0 +1,117 @@
+"""Measure calls: in this process, in turn, or in a process of their own."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.io.files import write_text
+from validation.harness.process import Process, own_cores, run_process
+
+ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+
+def timed(work: Callable[[], Any]) -> tuple[Any, float, float]:
+    """Return the answer of a call, its wall seconds and its processor seconds."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    answer = work()
+    return answer, time.perf_counter() - wall, time.process_time() - cpu
+
+
+def least_seconds(
+    calls: Mapping[str, Callable[[], object]], repeats: int, *, warm: bool = True
+) -> dict[str, tuple[float, float]]:
+    """Time calls that take turns.
+
+    Parameters
+    ----------
+    calls : mapping
+        Name -> call.
+    repeats : int
+        Timed rounds; the fastest call counts.
+    warm : bool
+        Make one more round first, which compiles and is not counted.
+
+    Returns
+    -------
+    dict
+        Name -> least processor seconds, least wall seconds.
+    """
+    least = dict.fromkeys(calls, (np.inf, np.inf))
+    for repeat in range(repeats + warm):
+        for name, call in calls.items():
+            _, wall, cpu = timed(call)
+            if repeat >= warm:
+                least[name] = min(least[name][0], cpu), min(least[name][1], wall)
+    return least
+
+
+def call_apart(
+    function: Callable[..., Any],
+    *arguments: Any,
+    cores: int = 2,
+    environment: Mapping[str, str] = ONE_BLAS_THREAD,
+) -> tuple[Any, Process]:
+    """Call a module-level function in a new process on its own cores.
+
+    Parameters
+    ----------
+    function : callable
+        Function whose arguments and answer can be written as JSON.
+    cores : int
+        Number of processor cores of the process.
+    environment : mapping
+        Further environment variables.
+
+    Returns
+    -------
+    answer, Process
+        The answer as read from JSON, and what the process used.
+
+    Raises
+    ------
+    RuntimeError
+        The process failed; the message is the end of its output.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        answer, log = Path(place) / "answer.json", Path(place) / "log"
+        name = f"{function.__module__}:{function.__name__}"
+        command = [
+            sys.executable,
+            "-m",
+            "validation.studies.measuring",
+            name,
+            json.dumps(arguments, default=str),
+        ]
+        process = run_process(
+            [*command, str(answer)], log=log, cores=own_cores()[:cores], environment=environment
+        )
+        if process.code != 0:
+            raise RuntimeError(log.read_text(encoding="utf-8")[-2000:])
+        return json.loads(answer.read_text(encoding="utf-8")), process
+
+
+def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """Fit the slope of log cost against log size by least squares; NaN if all sizes are equal."""
+    if min(sizes) == max(sizes):
+        return float("nan")
+    return float(np.polyfit(np.log(np.maximum(sizes, 1e-9)), np.log(np.maximum(costs, 1e-9)), 1)[0])
+
+
+def _main() -> None:
+    """Answer one :func:`call_apart`."""
+    module, _, function = sys.argv[1].partition(":")
+    found = getattr(import_module(module), function)(*json.loads(sys.argv[2]))
+    write_text(Path(sys.argv[3]), json.dumps(found))
+
+
+if __name__ == "__main__":
+    _main()

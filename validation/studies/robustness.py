@@ -1,0 +1,560 @@
+"""Runs of the courtyard that are killed, interrupted or out of disk space, and resumed.
+
+``kill-anywhere``: runs are killed (SIGKILL) at a share of their time or in the middle of a write and resumed;
+every output must have the bytes of an undisturbed run, times aside.
+``stop-anywhere``: runs and all their processes get SIGINT or SIGTERM, as from a terminal. Each must end
+within two seconds with the exit code of the signal, one sentence on how to continue and no process left
+behind; resumed, it must give the same bytes.
+``full-disk``: for every file that a small run writes, the disk is full or read-only from that file on; more
+runs use real file systems that are too small or become read-only, if file systems can be mounted. Each must
+end with exit code 2 and one sentence with place, cause and advice, leave no foreign file, and resume to the
+same bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from thesisrecon.cli.main import run_command
+from thesisrecon.errors import MEND
+from thesisrecon.runtime.signals import CODES
+from validation.scenes.real import ROOT
+from validation.studies.runner import Part, Rows, text_table
+
+COURTYARD = ROOT / "fixtures" / "courtyard"
+CLEAN = ("seconds", "elapsed_seconds", "resumed", "peak_memory_mb", "threads", "executor")
+"""Fields of the summary that may differ between equal runs."""
+TRIES = 3
+"""Attempts at one kill, if the run ends before it."""
+TORN = """
+import os, signal, sys
+left = int(sys.argv.pop(1))
+sync = os.fsync
+def torn(descriptor):
+    global left
+    left -= 1
+    if left == 0:
+        os.ftruncate(descriptor, os.fstat(descriptor).st_size // 2)
+        os.kill(os.getpid(), signal.SIGKILL)
+    sync(descriptor)
+os.fsync = torn
+from thesisrecon.cli import run_command
+sys.exit(run_command(sys.argv[1:]))
+"""
+"""Program that kills itself with its n-th file half written."""
+
+
+@dataclass(frozen=True)
+class Kill:
+    """A killed run: when, whether it died, finished stage files, outputs that differ after the resume."""
+
+    when: str
+    died: bool
+    kept: int
+    different: tuple[str, ...]
+
+
+def outputs(out: Path) -> dict[str, bytes]:
+    """Read every file of a finished run by name, without times and without the HTML report."""
+    found = {}
+    for path in sorted(p for p in out.rglob("*") if p.is_file() and p.name not in (".lock", "report.html")):
+        content = path.read_bytes()
+        if path.suffix == ".json" and path.name in ("summary.json", "manifest.json"):
+            content = json.dumps(_timeless(json.loads(content)), sort_keys=True).encode()
+        found[str(path.relative_to(out))] = content
+    return found
+
+
+def _timeless(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _timeless(v) for k, v in value.items() if k not in CLEAN}
+    return [_timeless(v) for v in value] if isinstance(value, list) else value
+
+
+def different(one: dict[str, bytes], other: dict[str, bytes]) -> tuple[str, ...]:
+    """Return the names of files that are missing on one side or differ."""
+    return tuple(sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name)))
+
+
+class Runs:
+    """Runs of one image set with one command line, in folders of ``place``."""
+
+    def __init__(self, place: Path, options: list[str], images: Path = COURTYARD / "images") -> None:
+        self.place, self.options, self.images = place, options, images
+        self.environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+
+    def arguments(self, out: Path) -> list[str]:
+        """Return the command line after the program."""
+        return ["reconstruct", str(self.images), "-o", str(out), *self.options]
+
+    def whole(self, out: Path) -> float:
+        """Run to the end and return the seconds."""
+        start = time.perf_counter()
+        program = [sys.executable, "-m", "thesisrecon", *self.arguments(out)]
+        subprocess.run(program, env=self.environment, check=True, stdout=subprocess.DEVNULL)
+        return time.perf_counter() - start
+
+    def killed(self, name: str, after_s: float) -> tuple[Path, bool]:
+        """Kill a run after some seconds; return its folder and whether it was still running."""
+        out = self.place / name
+        program = [sys.executable, "-m", "thesisrecon", *self.arguments(out)]
+        process = subprocess.Popen(program, env=self.environment, stdout=subprocess.DEVNULL)
+        try:
+            process.wait(after_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+        return out, process.wait() == -signal.SIGKILL
+
+    def torn(self, name: str, write: int) -> tuple[Path, bool]:
+        """Run a program that dies while it writes its ``write``-th file."""
+        out = self.place / name
+        program = [sys.executable, "-c", TORN, str(write), *self.arguments(out)]
+        ended = subprocess.run(program, env=self.environment, check=False, stdout=subprocess.DEVNULL)
+        return out, ended.returncode == -signal.SIGKILL
+
+    def resumed(self, when: str, out: Path, died: bool, wanted: dict[str, bytes]) -> Kill:
+        """Resume a killed run and compare its outputs."""
+        kept = sum(1 for _ in out.glob("0*/*.npz"))
+        self.whole(out)
+        return Kill(when, died, kept, different(outputs(out), wanted))
+
+
+def kill_runs(runs: Runs, kills: int, writes: int) -> Iterator[Kill]:
+    """Compare two undisturbed runs, then kill and resume others."""
+    runs.whole(runs.place / "first")
+    seconds = runs.whole(runs.place / "whole")
+    wanted = outputs(runs.place / "whole")
+    yield Kill("two undisturbed runs", False, 0, different(outputs(runs.place / "first"), wanted))
+    for k in range(kills):
+        share = (k + 0.5) / kills
+        for again in range(TRIES):
+            begun = time.perf_counter()
+            out, died = runs.killed(f"kill-{k}-{again}", share * seconds)
+            if died:
+                break
+            # The whole run was slower, because of other load.
+            seconds = time.perf_counter() - begun
+        yield runs.resumed(f"after {100 * share:.0f} % of the time", out, died, wanted)
+    for k in range(writes):
+        write = 1 + k * (len(wanted) - 1) // max(writes - 1, 1)
+        out, died = runs.torn(f"write-{k}", write)
+        yield runs.resumed(f"in the middle of file {write}", out, died, wanted)
+
+
+def kill_table(rows: Sequence[Kill]) -> str:
+    """Return every kill as a row."""
+    cells = []
+    for row in rows:
+        late = "" if row.died or not row.kept else " (had ended)"
+        cells.append([row.when + late, row.kept, ", ".join(row.different) or "none"])
+    return text_table(["killed", "stage files kept", "outputs that differ after the resume"], cells)
+
+
+LIMIT_S, POLL_S = 2.0, 0.005
+GRACE_S = 0.5
+"""Seconds for a process to end after its parent."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """An interrupted run.
+
+    Attributes
+    ----------
+    seconds : float
+        From the signal to the end.
+    code, said : int, str
+        Exit code and error stream.
+    left : int
+        Processes left behind.
+    kept : int
+        Finished stage files.
+    different : tuple of str
+        Outputs that differ after the resume.
+    """
+
+    when: str
+    seconds: float
+    code: int
+    said: str
+    left: int
+    kept: int
+    different: tuple[str, ...] = ()
+
+    def wrong(self, asked: signal.Signals) -> str:
+        """Return the faults in a few words; empty if there is none or if the run had ended before."""
+        if self.code == 0:
+            return f"differs: {', '.join(self.different)}" if self.different else ""
+        found = {
+            f"took {self.seconds:.1f} s": self.seconds > LIMIT_S,
+            f"exit code {self.code}": self.code != CODES[asked],
+            "not one sentence": self.said.count("\n") != 1 or "Traceback" in self.said,
+            f"{self.left} processes left": self.left > 0,
+            f"differs: {', '.join(self.different)}": bool(self.different),
+        }
+        return "; ".join(words for words, here in found.items() if here)
+
+
+def stopped(
+    program: list[str],
+    ready: Callable[[], bool],
+    asked: signal.Signals,
+    *,
+    environment: dict[str, str] | None = None,
+) -> Stop:
+    """Signal a program and its process group when ``ready``, and record how it ends."""
+    begun = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-c", _LISTEN, *program],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+    )
+    assert process.stderr is not None
+    while process.poll() is None and not ready():
+        time.sleep(POLL_S)
+    start = time.perf_counter()
+    if process.poll() is None:
+        os.killpg(process.pid, asked)
+    try:
+        process.wait(60.0)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+    seconds = time.perf_counter() - start
+    time.sleep(GRACE_S)
+    left = _of_session(process.pid)
+    for number in left:
+        os.kill(number, signal.SIGKILL)
+    with process.stderr as said:
+        return Stop(f"{start - begun:.1f} s", seconds, process.wait(), said.read(), len(left), 0)
+
+
+_LISTEN = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+"""Restores the default action of SIGINT, which a background shell ignores."""
+
+
+def _of_session(leader: int) -> list[int]:
+    """Return the living processes of a session."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == leader and fields[0] not in "ZX":
+            found.append(int(path.parent.name))
+    return found
+
+
+def _is_past(moment: float) -> bool:
+    return time.perf_counter() > moment
+
+
+def stop_runs(runs: Runs, moments: int, asked: signal.Signals, *, cold: bool) -> Iterator[Stop]:
+    """Interrupt runs at moments spread over their time, and resume them."""
+    runs.whole(runs.place / "first")
+    if cold:
+        runs.environment["NUMBA_CACHE_DIR"] = str(runs.place / "kernels")
+    seconds = runs.whole(runs.place / "whole")
+    wanted = outputs(runs.place / "whole")
+    for k in range(moments):
+        share, out = (k + 0.5) / moments, runs.place / f"stop-{k}"
+        environment = {**runs.environment}
+        if cold:
+            environment["NUMBA_CACHE_DIR"] = str(runs.place / f"kernels-{k}")
+        program = [sys.executable, "-m", "thesisrecon", *runs.arguments(out)]
+        end = time.perf_counter() + share * seconds
+        stop = stopped(program, partial(_is_past, end), asked, environment=environment)
+        kept = sum(1 for _ in out.glob("0*/*.npz"))
+        runs.whole(out)
+        changed = different(outputs(out), wanted)
+        yield replace(stop, when=f"{100 * share:.0f} % ({stop.when})", kept=kept, different=changed)
+
+
+def stop_table(rows: Sequence[Stop], asked: signal.Signals) -> str:
+    """Return every interrupted run as a row."""
+    cells = []
+    for row in rows:
+        wrong = row.wrong(asked) or ("nothing" if row.code else "nothing (had ended)")
+        cells.append([row.when, f"{row.seconds:.2f}", row.code, row.kept, wrong])
+    return text_table(["stopped at", "seconds to stop", "exit code", "stage files kept", "wrong"], cells)
+
+
+REFUSED = 2
+ROOM = "64m"
+SMALL_MODEL = ["--set", "dense.max_side=160", "--set", "dense.match_side=160"]
+"""Coarse depth maps: every stage writes its files quickly."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A run that could not write.
+
+    Attributes
+    ----------
+    when : str
+        Where the disk was full or read-only.
+    code, said : int, str
+        Exit code and error stream.
+    strange : tuple of str
+        Files that a whole run does not have.
+    different : tuple of str
+        Outputs that differ after the resume.
+    """
+
+    when: str
+    code: int
+    said: str
+    strange: tuple[str, ...]
+    different: tuple[str, ...]
+
+    @property
+    def wrong(self) -> str:
+        """Faults in a few words; empty if there is none."""
+        found = {
+            f"exit code {self.code}": self.code != REFUSED,
+            "not one sentence": self.said.count("\n") != 1 or "Traceback" in self.said,
+            "names no place": " cannot be written: " not in self.said,
+            "does not say what to do": not any(words in self.said for words in MEND.values()),
+            f"strange files: {', '.join(self.strange)}": bool(self.strange),
+            f"differs: {', '.join(self.different)}": bool(self.different),
+        }
+        return "; ".join(words for words, here in found.items() if here)
+
+
+@contextlib.contextmanager
+def disk_ends(first: int, number: int) -> Iterator[list[int]]:
+    """Let the ``first``-th file (from 1) and all later ones fail with the error ``number``.
+
+    No file fails if ``first`` is 0. The list holds the number of files that were written.
+    """
+    written, sync = [0], os.fsync
+
+    def synced(descriptor: int) -> None:
+        written[0] += 1
+        if first and written[0] >= first:
+            os.ftruncate(descriptor, os.fstat(descriptor).st_size // 2)
+            raise OSError(number, os.strerror(number))
+        sync(descriptor)
+
+    os.fsync = synced  # type: ignore[assignment]
+    try:
+        yield written
+    finally:
+        os.fsync = sync
+
+
+class SmallRuns:
+    """Runs of the same few images in this process."""
+
+    def __init__(self, place: Path, views: int, size_px: int, until: str) -> None:
+        self.place = place
+        self.images = place / "images"
+        self.images.mkdir()
+        for path in sorted((COURTYARD / "images").iterdir())[:views]:
+            (self.images / path.name).symlink_to(path)
+        self.options = ["--max-size", str(size_px), "--until", until, "--threads", "1", *SMALL_MODEL]
+
+    def run(self, out: Path) -> tuple[int, str]:
+        """Run; return the exit code and the error stream."""
+        said = io.StringIO()
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            code = run_command(["reconstruct", str(self.images), "-o", str(out), *self.options])
+        return code, said.getvalue()
+
+    def whole(self, out: Path) -> dict[str, bytes]:
+        """Return the outputs of an undisturbed run; ``RuntimeError`` if it fails."""
+        code, said = self.run(out)
+        if code:
+            raise RuntimeError(f"a run with room ended with {code}: {said}")
+        return outputs(out)
+
+
+def refused_at(runs: SmallRuns, write: int, number: int, wanted: dict[str, bytes]) -> Refusal:
+    """Run with the ``write``-th file and all later ones unwritable, then resume."""
+    out = runs.place / f"write-{write}"
+    with disk_ends(write, number):
+        ended = runs.run(out)
+    strange = _strange(outputs(out), wanted)
+    return Refusal(
+        f"file {write}: {os.strerror(number)}", *ended, strange, different(runs.whole(out), wanted)
+    )
+
+
+def _strange(there: dict[str, bytes], wanted: dict[str, bytes]) -> tuple[str, ...]:
+    return tuple(name for name, content in there.items() if wanted.get(name) != content)
+
+
+@contextlib.contextmanager
+def small_disk(place: Path, size: str) -> Iterator[Path]:
+    """Mount a file system of this size in memory; ``PermissionError`` if that is not allowed."""
+    place.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
+    try:
+        mounted = subprocess.run(command, check=False, capture_output=True).returncode == 0
+    except OSError:
+        mounted = False
+    if not mounted:
+        raise PermissionError("file systems cannot be mounted here")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
+def remount(place: Path, options: str) -> None:
+    """Change a file system of :func:`small_disk`: ``size=64m`` for more room, ``ro`` for read-only."""
+    subprocess.run(["mount", "-o", f"remount,{options}", str(place)], check=True)
+
+
+def filled(runs: SmallRuns, share: float, wanted: dict[str, bytes]) -> Refusal:
+    """Run on a disk with room for this share of the files, then resume with more."""
+    size = int(share * sum(map(len, wanted.values())))
+    with small_disk(runs.place / f"disk-{size}", f"{size}") as disk:
+        ended = runs.run(disk / "out")
+        strange = _strange(outputs(disk / "out"), wanted)
+        remount(disk, f"size={ROOM}")
+        again = runs.whole(disk / "out")
+    return Refusal(f"a disk of {size // 1024} KiB", *ended, strange, different(again, wanted))
+
+
+def locked(runs: SmallRuns, write: int, wanted: dict[str, bytes]) -> Refusal:
+    """Run on a disk that becomes read-only before the ``write``-th file, then resume."""
+    with small_disk(runs.place / f"locked-{write}", ROOM) as disk:
+        with disk_ends(write, errno.EIO):
+            runs.run(disk / "out")
+        remount(disk, "ro")
+        ended = runs.run(disk / "out")
+        strange = _strange(outputs(disk / "out"), wanted)
+        remount(disk, "rw")
+        again = runs.whole(disk / "out")
+    return Refusal(f"read-only at file {write}", *ended, strange, different(again, wanted))
+
+
+def refuse_runs(runs: SmallRuns, every: int, disks: int) -> Iterator[Refusal]:
+    """Run undisturbed, then with every n-th file unwritable and on small disks."""
+    runs.whole(runs.place / "first")
+    with disk_ends(0, 0) as written:
+        wanted = runs.whole(runs.place / "whole")
+    for k, write in enumerate(range(1, written[0] + 1, every)):
+        yield refused_at(runs, write, errno.ENOSPC if k % 2 == 0 else errno.EROFS, wanted)
+    try:
+        for k in range(disks):
+            yield filled(runs, (k + 0.5) / disks, wanted)
+            yield locked(runs, 2 + k * (written[0] - 2) // disks, wanted)
+    except PermissionError as error:
+        print(f"left out: {error}", file=sys.stderr, flush=True)
+
+
+def refusal_table(rows: Sequence[Refusal]) -> str:
+    """Return every run as a row."""
+    cells = ([r.when, r.code, r.said.strip(), r.wrong or "nothing"] for r in rows)
+    return text_table(["the run could not write", "exit code", "message", "wrong"], cells)
+
+
+def _count(scene: str, name: str, wrong: int, total: int) -> Rows:
+    rows = Rows(scene, "ours")
+    rows.add(f"{name}, of {total}", wrong, at_most=0.0)
+    return rows
+
+
+def kill_anywhere_study(
+    out: Path, kills: int = 20, writes: int = 5, max_size: int = 640, until: str = "model", threads: int = 2
+) -> Iterator[Part]:
+    """Kill runs anywhere, resume them and compare all bytes with an undisturbed run.
+
+    Parameters
+    ----------
+    kills : int
+        Runs killed (SIGKILL) at moments spread over their time.
+    writes : int
+        Runs killed in the middle of a write.
+    """
+    options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
+    rows = []
+    for row in kill_runs(Runs(out, options), kills, writes):
+        rows.append(row)
+        print(row, file=sys.stderr, flush=True)
+    yield kill_table(rows)
+    yield _count("killed runs", "runs that differ", sum(bool(r.different) for r in rows), len(rows))
+
+
+def stop_anywhere_study(
+    out: Path,
+    signal_: Literal["INT", "TERM"] = "INT",
+    moments: int = 20,
+    images: Path = COURTYARD / "images",
+    max_size: int = 640,
+    until: str = "model",
+    threads: int = 2,
+    executor: str = "local",
+    set_: Sequence[str] = (),
+    cold: bool = False,
+) -> Iterator[Part]:
+    """Interrupt runs anywhere; each must end in 2 s with one sentence and resume to the same bytes.
+
+    Parameters
+    ----------
+    signal_ : str
+        Signal that the process group gets.
+    moments : int
+        Moments spread over the time of a run.
+    images : Path
+        Folder of images.
+    executor : str
+        Executor of the runs.
+    set_ : sequence of str
+        Settings STAGE.FIELD=VALUE of the runs.
+    cold : bool
+        Begin each run without compiled kernels.
+    """
+    asked = signal.Signals[f"SIG{signal_}"]
+    options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
+    options += ["--executor", executor, *(word for value in set_ for word in ("--set", value))]
+    rows = []
+    for row in stop_runs(Runs(out, options, images), moments, asked, cold=cold):
+        rows.append(row)
+        print(row, file=sys.stderr, flush=True)
+    yield stop_table(rows, asked)
+    yield _count("interrupted runs", "runs with faults", sum(bool(r.wrong(asked)) for r in rows), len(rows))
+
+
+def full_disk_study(
+    out: Path, every: int = 1, disks: int = 10, views: int = 3, max_size: int = 320, until: str = "model"
+) -> Iterator[Part]:
+    """Fill the disk or make it read-only at every file; each run must say so and resume.
+
+    Parameters
+    ----------
+    every : int
+        Take every n-th file only.
+    disks : int
+        Number of small and of read-only file systems.
+    views : int
+        Number of images.
+    """
+    rows = []
+    for row in refuse_runs(SmallRuns(out, views, max_size, until), every, disks):
+        rows.append(row)
+        print(row, file=sys.stderr, flush=True)
+    yield refusal_table(rows)
+    yield _count("runs without room", "runs with faults", sum(bool(r.wrong) for r in rows), len(rows))

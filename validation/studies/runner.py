@@ -1,0 +1,316 @@
+"""Run the studies: ``python -m validation study NAME [--option ...]``, ``python -m validation study --list``.
+
+A study is a generator function ``NAME_study`` in a module of this folder. Its keyword parameters with their
+defaults and annotations are the options of the command; :data:`HELP` or the Parameters section of its
+docstring explain them. It yields parts: a list of :class:`Metric` rows (printed as one table under the scene
+of the first row) or a string (printed as it is). The exit code is 1 if a bound is missed, 2 if an option or
+the data are missing.
+
+A parameter ``out : Path`` is a folder that keeps what the study makes; without ``--out`` it is temporary.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import sys
+import tempfile
+import types
+import typing
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.files import write_text
+from validation.metrics.record import Metric, markdown_table
+from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_scene, load_real_scene
+
+MODULES = {
+    "ablation-cost": "timing",
+    "benchmark-table": "timing",
+    "bundle": "bundle",
+    "calibration-coverage": "calibration_parts",
+    "calibration-real": "calibration_real",
+    "critical-motions": "critical_motions",
+    "dinosaur": "projective",
+    "epipolar": "epipolar_synthetic",
+    "epipolar-certainty": "epipolar_synthetic",
+    "epipolar-cube": "epipolar_cube",
+    "epipolar-methods": "epipolar_methods",
+    "epipolar-real": "epipolar_real",
+    "epipolar-speed": "epipolar_methods",
+    "factorization": "projective",
+    "front-end": "front_end",
+    "full-disk": "robustness",
+    "fuzz-colmap": "fuzz_colmap",
+    "growth": "growth",
+    "growth-of-cost": "growth",
+    "harsh": "harsh",
+    "harsh-images": "harsh",
+    "initial-cameras": "projective",
+    "interpolation": "interpolation",
+    "kill-anywhere": "robustness",
+    "main-job": "main_job",
+    "mapping-time": "timing",
+    "package": "package.steps",
+    "pair-choice": "growth",
+    "parallel": "timing",
+    "perturbation": "perturbation",
+    "rectification": "rectification",
+    "rendering": "rendering",
+    "self-check": "self_check",
+    "selfcalibration": "selfcalibration",
+    "stereo": "stereo",
+    "stop-anywhere": "robustness",
+    "stratified": "selfcalibration",
+    "subsets": "subsets",
+    "surfaces": "surfaces",
+    "tensor-views": "tensor_views",
+    "triangulation": "triangulation",
+    "trifocal": "trifocal",
+}
+"""Name of a study -> the module of this folder that holds its function."""
+CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
+"""Folder that keeps SIFT matches of image pairs between studies."""
+HELP = {
+    "cache": "folder that keeps SIFT matches",
+    "cameras": "shared: one camera for all images; per-image: one for each",
+    "long_side": "long side of the images in px",
+    "max_size": "long side of the images in px",
+    "methods": "names of methods (default: all)",
+    "noise": "standard deviations of image coordinates in px",
+    "parts": "parts of the study (default: all)",
+    "points": "numbers of points or matches",
+    "repeats": "repetitions; the least or the median counts",
+    "scenes": "names of image sets (default: all on this machine)",
+    "seed": "random seed",
+    "seeds": "random seeds, or their number",
+    "sizes": "numbers of images",
+    "threads": "threads of a run",
+    "trials": "random trials of each setting",
+    "until": "last stage of the runs",
+    "views": "view numbers, or fewest and most views",
+    "workers": "processes that share the trials",
+    "wrong": "shares of wrong matches",
+}
+"""Help of the options that mean the same in all studies."""
+SHIFTED = "Cones9"
+"""Nine views of the Middlebury Cones, by a camera that moves without rotation."""
+Part = Sequence[Metric] | str
+StudyFunction = Callable[..., Iterable[Part]]
+
+
+class UsageError(ValueError):
+    """An option of a study has a value that does not exist."""
+
+
+def run_studies(arguments: Sequence[str]) -> int:
+    """Run the study that the command line names and return its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m validation study", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("name", nargs="?", choices=list(MODULES), metavar="NAME", help="name of the study")
+    parser.add_argument("--list", action="store_true", help="list the studies and exit")
+    options = parser.parse_args(list(arguments[:1]))
+    if options.list:
+        for name in MODULES:
+            print(f"{name:22} {_summary(load_study(name))}")
+        return 0
+    if options.name is None:
+        parser.error("name a study; --list shows them")
+    return run_study(options.name, arguments[1:])
+
+
+def run_study(name: str, arguments: Sequence[str] = ()) -> int:
+    """Run one study with its options: print its parts, write them if asked, judge its bounds.
+
+    Returns
+    -------
+    int
+        0, 1 if a bound is missed, 2 if an option is wrong or there is no data.
+    """
+    function = load_study(name)
+    options = vars(study_parser(name, function).parse_args(list(arguments)))
+    out, json_file, texts = options.pop("out"), options.pop("json"), list[str]()
+    metrics: list[Metric] = []
+    with output_folder(out) as folder:
+        if "out" in inspect.signature(function).parameters:
+            options["out"] = folder
+        try:
+            for part in function(**options):
+                if not part:
+                    continue
+                metrics += [] if isinstance(part, str) else part
+                texts.append(part_text(part))
+                print(texts[-1], end="\n\n", flush=True)
+                # Written after each part, so that an interrupted study keeps what it has.
+                if out is not None:
+                    write_text(folder / f"{name}.md", "\n\n".join(texts) + "\n")
+                    write_json(folder / f"{name}.json", metrics)
+                if json_file is not None:
+                    write_json(json_file, metrics)
+        except (UsageError, StageFailure) as error:
+            print(f"study {name}: {error}", file=sys.stderr)
+            return 2
+    if not texts:
+        print(f"study {name}: the images are not on this machine (THESISRECON_DATA)", file=sys.stderr)
+        return 2
+    return int(any(row.verdict == "missed" for row in metrics))
+
+
+def load_study(name: str) -> StudyFunction:
+    """Import the function of a study."""
+    module = import_module(f"validation.studies.{MODULES[name]}")
+    function: StudyFunction = getattr(module, f"{name.replace('-', '_')}_study")
+    return function
+
+
+def study_parser(name: str, function: StudyFunction) -> argparse.ArgumentParser:
+    """Make the command-line parser from the signature and the docstring of a study."""
+    module = sys.modules[function.__module__]
+    text = f"{_summary(function)}\n\n{inspect.getdoc(module) or ''}"
+    parser = argparse.ArgumentParser(
+        prog=f"python -m validation study {name}",
+        description=text,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("-o", "--out", type=Path, help="folder for the tables and for what the study makes")
+    parser.add_argument("--json", type=Path, help="file for the metric rows")
+    hints, help_of = typing.get_type_hints(function), HELP | _parameter_help(function)
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.name != "out":
+            flag = f"--{parameter.name.replace('_', '-').strip('-')}"
+            given = _argument(hints[parameter.name], parameter.default)
+            parser.add_argument(flag, dest=parameter.name, help=help_of.get(parameter.name), **given)
+    return parser
+
+
+def _argument(hint: Any, default: Any) -> dict[str, Any]:
+    """Return the keywords of ``add_argument`` for an annotation and its default."""
+    given: dict[str, Any] = {"default": default}
+    if default is inspect.Parameter.empty:
+        given = {"required": True}
+    if isinstance(hint, types.UnionType):
+        hint = next(one for one in typing.get_args(hint) if one is not type(None))
+    if hint is bool:
+        return {"action": "store_true"}
+    if typing.get_origin(hint) in (Sequence, tuple):
+        given["nargs"] = "*"
+        hint = typing.get_args(hint)[0]
+    if typing.get_origin(hint) is typing.Literal:
+        return given | {"choices": typing.get_args(hint)}
+    return given | {"type": hint, "metavar": hint.__name__.upper()}
+
+
+def _summary(function: StudyFunction) -> str:
+    return (inspect.getdoc(function) or "").partition("\n")[0]
+
+
+def _parameter_help(function: StudyFunction) -> dict[str, str]:
+    """Read the descriptions in the Parameters section of a numpydoc docstring."""
+    lines = (inspect.getdoc(function) or "").partition("Parameters\n----------\n")[2].splitlines()
+    found: dict[str, str] = {}
+    for line in lines:
+        if line and not line.startswith(" "):
+            name = line.partition(" :")[0]
+        elif line.strip():
+            found[name] = f"{found.get(name, '')} {line.strip()}".strip().replace("%", "%%")
+    return found
+
+
+@contextmanager
+def output_folder(folder: Path | None) -> Iterator[Path]:
+    """Give the folder, made if it is absent, or a temporary one."""
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder.resolve()
+        return
+    with tempfile.TemporaryDirectory() as place:
+        yield Path(place)
+
+
+def part_text(part: Part) -> str:
+    """Return the Markdown of one part."""
+    return part if isinstance(part, str) else f"## {part[0].scene}\n\n{markdown_table(list(part))}"
+
+
+def write_json(path: Path, metrics: Sequence[Metric]) -> None:
+    """Write rows with their verdicts."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [{**asdict(metric), "verdict": metric.verdict} for metric in metrics]
+    write_text(path, json.dumps(rows, indent=1) + "\n")
+
+
+# ---------------------------------------------------------------- helpers of the studies
+
+
+class Rows(list[Metric]):
+    """Rows of one scene with one judged method.
+
+    Parameters
+    ----------
+    scene : str
+        Title of the table.
+    judged : str
+        Method whose numbers are held against the bounds.
+    """
+
+    def __init__(self, scene: str, judged: str) -> None:
+        super().__init__()
+        self.scene, self.judged = scene, judged
+
+    def add(
+        self,
+        name: str,
+        values: typing.Mapping[str, float | None] | float,
+        unit: str = "",
+        at_most: float | None = None,
+        at_least: float | None = None,
+        note: str = "",
+    ) -> None:
+        """Append one row; a plain number belongs to the judged method."""
+        given = values if isinstance(values, typing.Mapping) else {self.judged: float(values)}
+        bound = at_most if at_least is None else at_least
+        self.append(Metric(self.scene, name, unit, given, self.judged, bound, at_least is None, note))
+
+
+def text_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
+    """Return a Markdown table of cells that are printed as they are."""
+    lines = [[*map(str, head)], ["---"] * len(head), *([*map(str, row)] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def pick(names: Sequence[str] | None, known: Iterable[str]) -> list[str]:
+    """Return the names asked for, all known ones by default; ``UsageError`` for an unknown name."""
+    known = list(known)
+    for name in names or ():
+        if name not in known:
+            raise UsageError(f"{name!r} does not exist; choose from {', '.join(known)}")
+    return known if names is None else list(names)
+
+
+def load_scene(name: str) -> Scene | None:
+    """Load a fixture, a real scene or the shifted views; None if its images are not on this machine."""
+    if name in REAL_SCENES:
+        return load_real_scene(name)
+    if name != SHIFTED:
+        return load_fixture_scene(name)
+    root = data_root()
+    paths = () if root is None else tuple(sorted((root / "stereo" / SHIFTED).glob("im*.png")))
+    return Scene(SHIFTED, paths) if paths else None
+
+
+def scenes_here(names: Iterable[str]) -> list[Scene]:
+    """Load the scenes that are on this machine; the others are named on the error stream."""
+    found = []
+    for name in names:
+        scene = load_scene(name)
+        if scene is None:
+            print(f"{name}: its images are not on this machine, left out", file=sys.stderr, flush=True)
+        else:
+            found.append(scene)
+    return found
