@@ -12,29 +12,28 @@ pytest.importorskip("poselib")
 pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
+from validation.scenes.cube import make_cube
 from validation.studies import epipolar_cube, epipolar_methods
-from validation.studies.epipolar_catalogue import (
+from validation.studies.epipolar_cube import BOUND, CubeRow, cube_pairs, run_cube
+from validation.studies.epipolar_methods import (
     DEFAULT,
     GOLD,
     GOLD_FROM_DEFAULT,
     METHODS,
     NORMALISED,
-    OURS,
+    OWN,
     RAW,
     Method,
-)
-from validation.studies.epipolar_cube import BOUND, CubeRow, cube_pairs, run_cube
-from validation.studies.epipolar_methods import (
     Result,
     Setting,
     make_trial,
     measure,
     merged,
     read_results,
-    run_study,
+    run_methods,
     write_results,
 )
-from validation.scenes.cube import make_cube
+from validation.studies.runner import run_study
 
 BY_NAME = {m.name: m for m in METHODS}
 CRITERIA = ("gradient (5.4)", "epipolar distance (5.6)", "gold standard")
@@ -43,7 +42,7 @@ CRITERIA = ("gradient (5.4)", "epipolar distance (5.6)", "gold standard")
 @pytest.fixture(scope="module")
 def clean() -> dict[str, Result]:
     """Every method at 1 px and 60 matches, 40 trials, by its label."""
-    return {r.label: r for r in run_study([Setting(1.0, 60)], METHODS, 40)}
+    return {r.label: r for r in run_methods([Setting(1.0, 60)], METHODS, 40)}
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +86,7 @@ def test_wrong_matches_are_for_robust_methods_alone() -> None:
     assert len(trial.xy1) == 100
     assert len(trial.exact1) == 80
     some = [BY_NAME[name] for name in (GOLD, "Algorithm 2, gradient", "least median of squares", DEFAULT)]
-    results = {r.label: r for r in run_study([setting], some, 8)}
+    results = {r.label: r for r in run_methods([setting], some, 8)}
     assert GOLD not in results
     assert results[f"{DEFAULT}, 3 sigma"].rms_ratio < 1.4
     assert results["least median of squares"].rms_ratio < 2.5
@@ -95,7 +94,7 @@ def test_wrong_matches_are_for_robust_methods_alone() -> None:
     assert measure(BY_NAME[GOLD], [trial], setting).rms_ratio > 5.0
 
 
-def test_a_method_without_an_answer_is_counted() -> None:
+def test_a_method_without_a_result_is_counted() -> None:
     def refuse(*_: object) -> None:
         raise StageFailure("no")
 
@@ -145,13 +144,10 @@ def test_the_cube_orders_the_methods(cube: dict[tuple[str, float], CubeRow]) -> 
     assert cube["Algorithm 2, seven-point search alone", 2.0].ratio > 2.0
 
 
-def test_tables_and_plot_of_the_cube(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tables_and_plot_of_the_cube(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     some = ["--methods", NORMALISED, GOLD, "--every", "40", "--noise", "0", "1"]
-    monkeypatch.setattr("sys.argv", ["epipolar_cube", *some, "-o", str(tmp_path)])
-    assert epipolar_cube.main() == 0
-    text = (tmp_path / "cube.md").read_text(encoding="utf-8")
+    assert run_study("epipolar-cube", [*some, "-o", str(tmp_path)]) == 0
+    text = (tmp_path / "epipolar-cube.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out
     assert text.count(f"| {GOLD} |") == len(epipolar_cube.MEASURES)
     page = (tmp_path / "cube.html").read_text(encoding="utf-8")
@@ -159,17 +155,15 @@ def test_tables_and_plot_of_the_cube(
     assert 'src="http' not in page
 
 
-def test_the_command_says_whether_the_bound_was_reached(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_the_command_states_if_the_bound_was_reached(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    base = ["epipolar_methods", "--trials", "30", "--points", "100", "--noise", "0.5", "--wrong", "0"]
     out = tmp_path / "r.json"
-    monkeypatch.setattr("sys.argv", [*base, "--methods", NORMALISED, "-o", str(out)])
-    assert epipolar_methods.main() == 0
-    monkeypatch.setattr("sys.argv", [*base, "--methods", GOLD, "-o", str(out)])
-    code = epipolar_methods.main()
+    base = ["--trials", "30", "--points", "100", "--noise", "0.5", "--wrong", "0", "--results", str(out)]
+    assert run_study("epipolar-methods", [*base, "--methods", NORMALISED]) == 0
+    code = run_study("epipolar-methods", [*base, "--methods", GOLD])
     normalised, gold = read_results(out)
     assert (normalised.method, gold.method) == (NORMALISED, GOLD)
     assert code == (gold.rms_ratio > epipolar_methods.ALLOWED)
     assert "RMS (median)" in capsys.readouterr().out
-    assert set(epipolar_cube.CUBE_METHODS) <= {m.name for m in OURS}
+    assert set(epipolar_cube.CUBE_METHODS) <= {m.name for m in OWN}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from validation.studies.factorization import (
+from validation.scenes.rigs import cube_rig, noisy_tracks, projective_from_truth
+from validation.studies.projective import (
     AFFINE,
     GROWN,
     ITERATED,
@@ -15,7 +16,6 @@ from validation.studies.factorization import (
     projective_error_pct,
     residual_rms_px,
 )
-from validation.scenes.rigs import cube_rig, noisy_tracks, projective_from_truth
 
 
 @pytest.mark.parametrize("sigma_px", [0.0, 1.0])

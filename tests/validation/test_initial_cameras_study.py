@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from validation.studies.initial_cameras import IDENTITY, KINDS, ROTATION, check_kind
+from validation.studies.projective import IDENTITY, KINDS, ROTATION, check_kind
 
 
 @pytest.mark.parametrize("kind", KINDS)

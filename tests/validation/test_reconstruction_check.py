@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from tests.validation.test_cameras import V, _reconstruction, _truth
-from validation.studies.reconstruction import COLMAP, OURS, Outcome, check_reconstruction
+from tests.validation.test_metrics import V, _reconstruction, _truth
 from validation.metrics.record import Metric, markdown_table
+from validation.studies.main_job import COLMAP, OURS, Outcome, check_reconstruction
 
 
 def _rows(scene: str, outcomes: dict[str, Outcome], *, n_views: int = V) -> dict[str, Metric]:

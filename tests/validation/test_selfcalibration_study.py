@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 
 from thesisrecon.geometry.camera_matrix import project
+from validation.metrics.focal_bound import focal_bound
+from validation.metrics.record import markdown_table
+from validation.scenes.cloud import make_cloud
+from validation.scenes.rigs import cube_rig, noisy_tracks, projective_from_truth
 from validation.studies.selfcalibration import (
     BOUND,
     WITH_BUNDLE,
@@ -22,9 +26,6 @@ from validation.studies.selfcalibration import (
     run_cell,
     targets,
 )
-from validation.metrics.focal_bound import focal_bound
-from validation.scenes.cloud import make_cloud
-from validation.scenes.rigs import cube_rig, noisy_tracks, projective_from_truth
 
 
 @pytest.mark.parametrize("scene", ["cube", "cloud"])
@@ -52,7 +53,7 @@ def test_cameras_of_one_face_are_left_out_of_the_projective_stage() -> None:
     assert rec.sigma_px == pytest.approx(0.9, abs=0.1)
 
 
-def test_the_bound_grows_with_the_noise_and_shrinks_with_cameras_and_what_is_known() -> None:
+def test_the_bound_grows_with_noise_and_shrinks_with_cameras_and_priors() -> None:
     rig = make_cloud(9, np.random.default_rng(1), points=80)
     std = focal_bound(rig, 1.0, zooming=False, principal_std_px=15.0)
     np.testing.assert_allclose(std, std[0])
@@ -91,7 +92,7 @@ def test_refusals_count_as_failures_and_targets_are_judged() -> None:
         trial(2, "constant", 0.04, 0.04),
     ]
     assert "0.05 (67)" in report(some)
-    text = targets([*some, trial(0, "zooming", 0.1, 4.0), trial(1, "zooming", 0.1, 6.0)])
+    text = markdown_table(targets([*some, trial(0, "zooming", 0.1, 4.0), trial(1, "zooming", 0.1, 6.0)]))
     assert "missed" in text
     assert "worst camera within 5 %, % of trials | 50 | >= 90 | missed" in text
 

@@ -4,17 +4,14 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Literal
 
 import numpy as np
 import pytest
-from validation.benchmark_table import main, ratio_table, ratios_to_ours
-from validation.studies.growth_of_cost import Cost, Meter
-from validation.studies.kill_anywhere import TORN, Kill, different, outputs
-from validation.studies.kill_anywhere import table as kill_table
-from validation.studies.pair_choice import Choice, choose, to_metrics
 
 from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
@@ -22,10 +19,15 @@ from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.io.colmap_model import MODEL_NUMBERS, inconsistency
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import PairChoice
+from validation.metrics.record import Metric
 from validation.scenes.many_views import walk
-from validation.studies import fuzz_colmap, growth_of_cost, parallel, perturbation
-from validation.studies.growth import Growth, exponent, recall_of, table
+from validation.studies import fuzz_colmap, growth, perturbation, timing
+from validation.studies.growth import Choice, Cost, Growth, Meter, choose, recall_of, table, to_metrics
+from validation.studies.measuring import call_apart, exponent
+from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
+from validation.studies.runner import MODULES, load_study, run_studies, run_study, study_parser, text_table
 from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
+from validation.studies.timing import efficiency_rows, ratio_table, ratios_to_ours
 
 ROW = Growth(
     "all-pairs", 10, 45, 45, 2, 1.0, 0.0, 9.0, 10.0, None, ((0, 1, True), (0, 2, False), (1, 2, True))
@@ -42,16 +44,14 @@ def test_recall_counts_the_accepted_pairs_alone():
 
 
 def test_the_table_names_shares_and_exponents():
-    more = replace(
-        ROW, photographs=20, possible=190, tried=95, cpu_s=40.0, recall=0.985, overlapping_tried=1.0
-    )
+    more = replace(ROW, images=20, possible=190, tried=95, cpu_s=40.0, recall=0.985, overlapping_tried=1.0)
     text = table([ROW, more])
     assert "95 of 190 (50 %)" in text
     assert "| 100.0 % | 98.5 % |" in text
     assert "processor time 2.00" in text
 
 
-def test_missed_pairs_are_told_and_judged():
+def test_missed_pairs_are_reported():
     good, bad = (Choice("a", 100, 30, 20, missed) for missed in ((), (41,)))
     assert [metric.verdict for metric in to_metrics(good)] == ["reported", "reported", "reached"]
     row = to_metrics(bad)[-1]
@@ -114,7 +114,7 @@ def test_a_trial_finds_the_focal_length_and_is_the_same_twice():
     assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
 
 
-def test_what_came_of_a_trial_is_told_apart():
+def test_outcomes_of_a_trial_are_distinguished():
     wrong = Trial(0, (0, 1), 2, 10.0, 12.0, (), 1, 1.0)
     shifted = replace(wrong, median_pct=np.nan, reasons=("pure translation",))
     trials = {
@@ -130,9 +130,8 @@ def test_what_came_of_a_trial_is_told_apart():
     assert [trial.outcome for trial in trials.values()] == list(OUTCOMES)
     assert replace(wrong, failed_checks=("no",)).outcome == "refused"
     assert shifted.outcome == "wrong"
-    assert "| s | shared | 7 | 1 | 1 | 1 | 1 | 1 | 1 | 1 | 5.50 |" in table_row(
-        "s", "shared", [*trials.values()]
-    )
+    row = text_table([], [table_row("s", "shared", [*trials.values()])])
+    assert "| s | shared | 7 | 1 | 1 | 1 | 1 | 1 | 1 | 1 | 5.50 |" in row
 
 
 def write(folder, seconds, focal):
@@ -173,7 +172,7 @@ def test_a_torn_write_leaves_no_half_file_under_its_name(tmp_path):
 
 
 def test_good_inputs_are_models(tmp_path):
-    inputs = fuzz_colmap.corpus()
+    inputs = fuzz_colmap.valid_inputs()
     assert len(inputs) == len(MODEL_NUMBERS) + 6
     assert max(map(len, inputs)) <= fuzz_colmap.LARGEST_INPUT
     for data in inputs:
@@ -190,14 +189,14 @@ def test_good_inputs_are_models(tmp_path):
 
 
 def test_nothing_is_found_and_a_fault_is(monkeypatch, capsys):
-    assert fuzz_colmap.main(["--plain", "--seconds", "1"]) == 0
+    assert run_study("fuzz-colmap", ["--plain", "--seconds", "1"]) == 0
     assert "nothing found" in capsys.readouterr().out
 
     def careless(contents):
         return contents[Path("cameras.bin")][100_000]
 
     monkeypatch.setattr(fuzz_colmap, "decode_model", careless)
-    assert fuzz_colmap.main(["--plain", "--seconds", "1"]) == 1
+    assert run_study("fuzz-colmap", ["--plain", "--seconds", "1"]) == 1
     assert "IndexError" in capsys.readouterr().out
 
 
@@ -208,7 +207,8 @@ def entry(group, method, seconds):
 def test_ratios_are_ours_over_each_reference(tmp_path, capsys):
     told = {"benchmarks": [entry("F", "ours", 0.002), entry("F", "OpenCV", 0.008), entry("G", "OpenCV", 1.0)]}
     (tmp_path / "b.json").write_text(json.dumps(told))
-    assert main([str(tmp_path / "b.json"), "-o", str(tmp_path / "r.json")]) == 0
+    options = ["--benchmark", str(tmp_path / "b.json"), "--ratios", str(tmp_path / "r.json")]
+    assert run_study("benchmark-table", options) == 0
     assert "| F | OpenCV | 8 | **0.25** |" in capsys.readouterr().out
     assert json.loads((tmp_path / "r.json").read_text())["ours_over"] == {"F": {"OpenCV": 0.25}}
 
@@ -218,10 +218,10 @@ def test_a_group_without_ours_has_no_ratio():
     assert "| G | OpenCV | 1e+03 |  |" in ratio_table({"G": {"OpenCV": 1.0}})
 
 
-def test_a_file_that_is_no_benchmark_is_named(tmp_path, capsys):
+def test_a_file_without_benchmarks_is_named(tmp_path, capsys):
     (tmp_path / "b.json").write_text("[]")
-    assert main([str(tmp_path / "b.json")]) == 2
-    assert "is no benchmark of ours" in capsys.readouterr().err
+    assert run_study("benchmark-table", ["--benchmark", str(tmp_path / "b.json")]) == 2
+    assert "is not a JSON file of our benchmarks" in capsys.readouterr().err
 
 
 def test_a_longer_walk_begins_with_the_shorter_and_looks_at_the_yard():
@@ -239,17 +239,15 @@ def test_a_longer_walk_begins_with_the_shorter_and_looks_at_the_yard():
 def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_path):
     CALLS.clear()
     meter = Meter()
-    reconstruct(photographs(4), tmp_path, config=fake_config(), until="metric", progress=meter.hear)
+    reconstruct(photographs(4), tmp_path, config=fake_config(), until="metric", progress=meter.progress)
     meter.enter("end")
-    assert set(growth_of_cost.STAGES) <= set(meter.cpu_s)
+    assert set(growth.STAGES) <= set(meter.cpu_s)
     assert all(peak > 20.0 for peak in meter.peak_mb.values())
     costs = [
-        Cost(
-            n, dict.fromkeys(growth_of_cost.STAGES, n**1.5), {"images": 3.0 * n}, {"points": n**2}, 1.0, 0.01
-        )
+        Cost(n, dict.fromkeys(growth.STAGES, n**1.5), {"images": 3.0 * n}, {"points": n**2}, 1.0, 0.01)
         for n in (10, 100)
     ]
-    rows = growth_of_cost.table(costs).splitlines()
+    rows = growth.cost_table(costs).splitlines()
     assert next(row for row in rows if row.startswith("| matches, processor s")).endswith("| 1.50 |")
     assert next(row for row in rows if row.startswith("| whole run, peak MB")).endswith("| 1.00 |")
     assert next(row for row in rows if row.startswith("| points")).endswith("| 2.00 |")
@@ -257,7 +255,7 @@ def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_
 
 def test_the_efficiency_is_that_of_two_workers():
     found = {"one thread": [(10.0, 10.0)], "two processes": [(6.25, 12.5)]}
-    rows = {row.name: row for row in parallel.rows("a set", found)}
+    rows = {row.name: row for row in efficiency_rows("a set", found)}
     assert rows["efficiency by the clock"].values == {"two processes": 0.8}
     assert rows["efficiency by work"].values == {"two processes": 0.8}
     assert rows["efficiency by work"].verdict == "missed"
@@ -267,9 +265,9 @@ def test_shaken_numbers_are_moved_by_their_rounding():
     rng = np.random.default_rng(0)
     for kind, rel in ((np.float64, 1e-12), (np.float32, 1.3e-7)):
         values = np.linspace(1.0, 500.0, 1000).astype(kind)
-        apart = np.abs(perturbation.shaken(values, rng).astype(np.float64) / values - 1.0)
+        apart = np.abs(perturbation.perturbed(values, rng).astype(np.float64) / values - 1.0)
         assert 0.0 < apart.max() <= rel
-    assert perturbation.shaken(values, rng).dtype == np.float32
+    assert perturbation.perturbed(values, rng).dtype == np.float32
 
 
 @pytest.mark.parametrize("stage", perturbation.STAGES)
@@ -289,7 +287,7 @@ def test_a_shaken_run_lies_beside_the_still_one(stage, tmp_path):
     assert moved.registered == 0
 
 
-def test_what_moved_is_told_in_standard_deviations():
+def test_changes_are_reported_in_standard_deviations():
     still = _result()
     further = replace(still.intrinsics[0]["focal_px"], value=100.5)
     other = replace(still, intrinsics=({**still.intrinsics[0], "focal_px": further}, *still.intrinsics[1:]))
@@ -315,3 +313,48 @@ def _result():
 
     calibration = FakeCalibrator().calibrate(projective, prior=Assumed(), rng=rng)
     return FakeMetric().refine(projective, calibration, prior=Assumed(), rng=rng)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_every_study_has_options_with_help(name):
+    function = load_study(name)
+    text = " ".join(study_parser(name, function).format_help().split())
+    assert function.__doc__.partition("\n")[0] in text
+    parser = study_parser(name, function)
+    assert all(action.help for action in parser._actions)
+
+
+def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypatch):
+    rows = [Metric("a set", "error", "px", {"ours": 2.0}, "ours", 1.0)]
+
+    def toy_study(out: Path, numbers: Sequence[int] = (1, 2), kind: Literal["a", "b"] = "a"):
+        """Measure a toy."""
+        (out / "made").touch()
+        yield f"{sum(numbers)} {kind}"
+        yield rows if kind == "b" else rows[:0]
+
+    monkeypatch.setitem(MODULES, "toy", "timing")
+    monkeypatch.setattr(timing, "toy_study", toy_study, raising=False)
+    toy_study.__annotations__ = {"out": Path, "numbers": Sequence[int], "kind": Literal["a", "b"]}
+    assert run_studies(["toy", "--numbers", "3", "4"]) == 0
+    assert capsys.readouterr().out == "7 a\n\n"
+    out = tmp_path / "out"
+    assert run_studies(["toy", "--kind", "b", "-o", str(out), "--json", str(tmp_path / "rows.json")]) == 1
+    assert "| error, px | 2 | <= 1 | missed |" in (out / "toy.md").read_text()
+    assert json.loads((tmp_path / "rows.json").read_text())[0]["verdict"] == "missed"
+    assert (out / "toy.json").read_bytes() == (tmp_path / "rows.json").read_bytes()
+    assert (out / "made").exists()
+
+
+def test_missing_data_and_unknown_names_end_with_code_2(capsys, monkeypatch):
+    monkeypatch.setenv("THESISRECON_DATA", "/nowhere")
+    assert run_study("dinosaur") == 2
+    assert "not on this machine" in capsys.readouterr().err
+    assert run_study("epipolar-methods", ["--methods", "nobody's"]) == 2
+    assert "choose from" in capsys.readouterr().err
+
+
+def test_a_call_in_a_process_of_its_own_returns_its_answer():
+    assert call_apart(exponent, [1.0, 10.0], [1.0, 100.0])[0] == pytest.approx(2.0)
+    with pytest.raises(RuntimeError, match="ZeroDivisionError|ValueError"):
+        call_apart(exponent, [], [])
