@@ -1,11 +1,13 @@
-"""Whether a homography is that of a camera that turned: K R K^-1 with square pixels (HZ 13.2, 19.6).
+"""Section 5.5: which model explains a pair: general F, plane, pure rotation or pure translation.
 
-Section 5.5: is F determined at all, and what else would explain the matches: evidence, then a name.
+Matches of a plane or of a rotating camera are explained by a homography and leave the epipoles undetermined;
+for a camera that moves without rotation F is [e]x with two degrees of freedom instead of seven. A simpler
+model is accepted unless its residuals exceed the noise, or more of the matches that it does not explain agree
+with F than expected by chance. A homography is a pure rotation if it is K R K^-1 with square pixels (HZ 13.2,
+19.6).
 
-Matches of one plane, and of a camera that only turned, are explained by a homography and leave the epipoles
-free; of a camera that moved without turning F is [e]x with two degrees of freedom in place of seven. Every
-test is against the noise: a simpler model is believed unless its residuals are larger than the noise allows,
-or more of the matches that it leaves agree with F than chance would have of the wrong ones.
+:mod:`thesisrecon.epipolar.degeneracy` answers a different question: whether another F explains the matches as
+well.
 """
 
 from __future__ import annotations
@@ -19,12 +21,16 @@ import scipy
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar.degeneracy import (
     chance_of_agreement,
-    fundamentals_of_plane,
     log10_false_alarms,
     multiplicity_weights,
 )
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar.planes import find_dominant_plane, plane_covariance, refine_plane
+from thesisrecon.epipolar.planes import (
+    find_dominant_plane,
+    fundamentals_of_plane,
+    plane_covariance,
+    refine_plane,
+)
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
 from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
@@ -32,16 +38,26 @@ from thesisrecon.geometry.two_view import homography_sampson_residuals
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 from thesisrecon.numerics.noise import noise_scale, trimmed_noise_scale
 
+# Initial focal lengths in units of the point spread: fields of view of 150 to 10 degrees.
 FOCALS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-"""Tried focal lengths, in spreads of the points: fields of view of 150 to 10 degrees."""
 REFINED = 3
 CONSTRAINTS = 2
-"""A homography has 8 degrees of freedom; a rotation, a focal length and a principal point 6."""
 ITERATIONS = 50
 
 
 def rotation_homography(parameters: F64) -> F64:
-    """K R K^-1 (3, 3) of log f, principal point and rotation vector (6,)."""
+    """Compute the homography K R K^-1 of a rotating camera with square pixels.
+
+    Parameters
+    ----------
+    parameters : ndarray (6,)
+        log f, principal point (2), rotation vector (3).
+
+    Returns
+    -------
+    ndarray (3, 3)
+        The homography.
+    """
     f, (x, y) = float(np.exp(np.clip(parameters[0], -20.0, 20.0))), parameters[1:3]
     K = np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
     back = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, f]]) / f
@@ -50,11 +66,25 @@ def rotation_homography(parameters: F64) -> F64:
 
 
 def rotation_homography_test(H: F64, xy1: F64, xy2: F64, *, risk: float) -> float:
-    """Increase of the squared residuals from H to the best K R K^-1, over the limit that noise keeps to.
+    """Test whether a homography is that of a rotating camera, K R K^-1, by an F-test.
 
-    ``H`` (3, 3) is the least-squares homography of matches (N > 4, 2) in coordinates about one centre for
-    both images and of unit spread. An F-test with 2 and 2 N - 8 degrees of freedom: at most 1 for a camera of
-    square pixels that only turned, except with the probability ``risk``.
+    2 and 2 N - 8 degrees of freedom: a homography has eight, a rotation with focal length and principal point
+    six.
+
+    Parameters
+    ----------
+    H : ndarray (3, 3)
+        Least-squares homography of the matches.
+    xy1, xy2 : ndarray (N, 2)
+        Matches, N > 4, relative to one centre for both images and with unit spread.
+    risk : float
+        Probability to reject a rotation.
+
+    Returns
+    -------
+    float
+        Increase of the squared residuals from H to the best K R K^-1, relative to its limit; at most 1 for a
+        rotation.
     """
 
     def residuals(parameters: F64) -> F64:
@@ -78,7 +108,7 @@ def rotation_homography_test(H: F64, xy1: F64, xy2: F64, *, risk: float) -> floa
 
 
 def _start(H: F64, f: float) -> F64:
-    """The rotation nearest to K^-1 H K for a focal length and the principal point at the centre."""
+    """Parameters of the rotation nearest to K^-1 H K for a focal length and a central principal point."""
     A = H * np.array([[1.0, 1.0, 1.0 / f], [1.0, 1.0, 1.0 / f], [f, f, 1.0]])
     A = A * np.sign(np.linalg.det(A))
     U, _, Vt = np.linalg.svd(A)
@@ -87,34 +117,34 @@ def _start(H: F64, f: float) -> F64:
 
 
 MINIMUM = 12
+# Squared distances from a homography in sigma^2 are chi-square(2) with this median; below 11 their halves
+# across and along the epipolar lines have this mean.
 NEAR = 11.0
 NEAR_MEAN, CHI2_MEDIAN = 0.97743, 1.386294
-"""Squared distances from a homography, in sigma^2, are chi-square(2) with this median; of those below 11
-either half, the one across epipolar lines and the parallax along them, has this mean."""
 TRIMMINGS = 3
+# The F of a plane chooses the epipole with the smallest noise along its lines: 1.5 +- 1 standard errors.
 STANDARD_ERRORS = 4.0
-"""The F of a plane may choose the epipole toward which the noise is least: 1.5 errors, give or take 1."""
+# Squared distance in sigma^2 beyond which a match is off the homography; noise exceeds it once in 3000.
 FAR = 16.0
-"""A match stands off a homography beyond this squared distance: noise does so once in 3000."""
+# Maximum log10 of the false alarms of the matches off the simpler model.
 LARGEST_CHANCE = -3.0
-"""log10 of the false alarms that matches off the simpler model may be."""
 BAND = 2.5
+# The F of a plane is also fitted to wrong matches, which therefore agree this much more often.
 FLEXIBLE = 2.0
-"""An F of a plane is fitted to wrong matches too, and moves toward them: they agree so much more often."""
+# Degrees of freedom of F beyond a homography and beyond [e]x.
 EPIPOLE, BEYOND_TRANSLATION = 2, 5
-"""Degrees of freedom that F has beyond a homography, and beyond [e]x."""
+# Probability to reject a pure translation for normal residuals, and the tolerance added if wrong matches are
+# expected in the band, which attract F.
 RISK, ALLOWANCE = 2e-3, 0.4
-"""Chance to take a pure translation for more than that, were all residuals normal; what is allowed beyond it
-where a wrong match or more is expected in the band, for F to bend to."""
-TURN_RISK = 1e-3
-"""Chance to take a rotation for a plane, by its eigenvalues (on either side) and as a camera's."""
+# Probability to reject a rotation by its eigenvalues (either side) and by the camera test.
+ROTATION_RISK = 1e-3
+# Matches within this many sigma of a translation are compared with F.
 TRANSLATED = 3.3
-"""Matches within so many sigma of a translation are compared with F; more would be cut by what noise does."""
 CORRECTIONS, EXACT = 10, 1e-12
 
 
 class Configuration(Enum):
-    """What the matches of a pair show."""
+    """Model that explains the matches of a pair."""
 
     GENERAL = "general"
     PLANE = "plane"
@@ -124,23 +154,30 @@ class Configuration(Enum):
 
 @dataclass(frozen=True)
 class ConfigurationReport:
-    """The name and the evidence that it rests on.
+    """The configuration of a pair and its evidence.
 
-    Attributes
+    Parameters
     ----------
-    kind : what was found.
-    sigma_px : standard deviation of one coordinate, from the residuals of the general F.
-    homography_errors : excess of the squared parallax of the matches within 3.3 sigma of the best homography
-        over their squared distances from F, as a logarithm in its standard errors; above 4 they show relief.
-    off_homography : share of the inliers more than 4 sigma off it.
-    off_homography_chance : log10 of how often chance has as many of the wrong matches agree with F; below -3
-        they show relief.
-    rotation_errors : |trace H - trace H^-1| (det H = 1), 0 for a rotation, in its standard errors.
-    rotation_camera_ratio : increase of the squared residuals from the homography to that of a camera of square
-        pixels that turned, over its limit; at most 1 for a rotation, NaN where the eigenvalues told already.
-    rotation_deg : the angle of that rotation, NaN where the eigenvalues are not those of one.
-    translation_ratio : increase of the squared residuals from F to [e]x, over its limit; at most 1 where F is
-        that of a translation, inf where more matches leave [e]x than chance would have.
+    kind : Configuration
+        The result.
+    sigma_px : float
+        Standard deviation of one coordinate from the residuals of the general F.
+    homography_errors : float
+        Log ratio of the squared parallax of matches within 3.3 sigma of the homography to their squared
+        distances from F, in standard errors; above 4 it shows relief.
+    off_homography : float
+        Fraction of the inliers more than 4 sigma off the homography.
+    off_homography_chance : float
+        log10 of the false alarms of the matches off the homography; below -3 they show relief.
+    rotation_errors : float
+        abs(trace H - trace H^-1) for det H = 1 in standard errors, 0 for a rotation.
+    rotation_camera_ratio : float
+        Result of :func:`rotation_homography_test`; NaN if the eigenvalues exclude a rotation.
+    rotation_deg : float
+        Rotation angle; NaN if the eigenvalues exclude a rotation.
+    translation_ratio : float
+        Increase of the squared residuals from F to [e]x relative to its limit: at most 1 for a translation,
+        inf if more matches leave [e]x than expected by chance.
     """
 
     kind: Configuration
@@ -165,22 +202,52 @@ class ConfigurationReport:
 def classify_configuration(
     F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None, seed: int = 0
 ) -> ConfigurationReport:
-    """Name what the matches (N, 2) px that agree with F (3, 3) show.
+    """Determine which model explains the inliers of F.
 
-    ``inliers`` (N,), at least 12, are those that agree, all of them where None. Given the wrong ones too it
-    is known how many could agree by chance: an F fitted to a plane gathers wrong matches at will. Both images
-    are taken to share their intrinsics (else a rotation is named a plane, a translation general) and to have
-    square pixels, which tell a plane from a rotation where its eigenvalues happen to be those of one. GENERAL
-    where relief and baseline stand out of the noise. ``seed`` draws the planes that are tried. Raises as
-    :func:`~thesisrecon.epipolar.frame.check_matches`, and ``ValueError`` for an F below rank 2 and for flags
-    of another shape.
+    The matches with their outliers show how many agree by chance. Both images are assumed to share their
+    intrinsics (otherwise a rotation is classified as a plane and a translation as general) and to have square
+    pixels.
+
+    Parameters
+    ----------
+    F : array_like (3, 3)
+        Fundamental matrix, px.
+    xy1, xy2 : array_like (N, 2)
+        Matched points, px.
+    inliers : ndarray (N,) of bool, optional
+        At least 12 inliers of F; all matches by default.
+    seed : int
+        Seed of the sampled planes.
+
+    Returns
+    -------
+    ConfigurationReport
+        The configuration, GENERAL if relief and baseline exceed the noise, and its evidence.
+
+    Raises
+    ------
+    ValueError
+        If F has rank below 2, flags have the wrong shape, or as
+        :func:`~thesisrecon.epipolar.frame.as_matches`.
+    StageFailure
+        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import estimate_fundamental
+    >>> rng = np.random.default_rng(0)
+    >>> xy1 = rng.uniform(0, 500, (60, 2))
+    >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1)) + rng.normal(0, 0.3, (60, 2))
+    >>> classify_configuration(estimate_fundamental(xy1, xy2).F, xy1, xy2).kind.value
+    'pure translation'
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
     inliers = np.ones(len(xy1), dtype=bool) if inliers is None else inliers
     if inliers.shape != (len(xy1),):
         raise ValueError(f"classify_configuration got {inliers.shape} inlier flags for {len(xy1)} matches")
     check_matches(xy1[inliers], xy2[inliers], needed=MINIMUM)
-    # One centre for both images: F of a translation is skew in it, H of a rotation keeps its eigenvalues.
+    # One centre for both images keeps F of a translation skew-symmetric and the eigenvalues of a rotation.
     own = PairFrame.of(xy1[inliers], xy2[inliers])
     centre = 0.5 * (own.centroid1 + own.centroid2)
     frame = PairFrame(centre, centre, own.scale)
@@ -195,7 +262,7 @@ def classify_configuration(
 
 @dataclass(frozen=True)
 class _Case:
-    """``points`` (N, 4), F and sigma in one frame, which ``agree``, ``weights``, the ``chance`` to agree."""
+    """Matches (N, 4), F and noise in one frame, inliers, weights, and the probability to agree by chance."""
 
     f: F64
     points: F64
@@ -205,9 +272,9 @@ class _Case:
     chance: float
 
     def false_alarms(self, off: B8, free: int) -> float:
-        """How often, log10, as many of the matches ``off`` a simpler model agree with a better one."""
+        """log10 of the false alarms of the matches ``off`` a simpler model."""
         agreeing, tried = self.weights[off & self.agree].sum(), self.weights[off].sum()
-        # What F can still choose beside the model, it chooses to agree with wrong matches.
+        # The free parameters of F adapt to wrong matches.
         chance = FLEXIBLE * self.chance if free == EPIPOLE else self.chance
         return log10_false_alarms(float(agreeing), float(tried), chance=chance, free=free)
 
@@ -219,7 +286,7 @@ def _scale(f: F64, points: F64) -> float:
 
 def _classify(case: _Case, scale: float, seed: int) -> ConfigurationReport:
     sigma = case.sigma
-    errors, off, chance, turning, angle, camera = np.inf, 1.0, -np.inf, np.inf, np.nan, np.nan
+    errors, off, chance, rotation_errors, angle, camera = np.inf, 1.0, -np.inf, np.inf, np.nan, np.nan
     plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
     if plane is not None:
         squared = plane.squared * case.sigma**2
@@ -229,25 +296,29 @@ def _classify(case: _Case, scale: float, seed: int) -> ConfigurationReport:
         off, chance = float(np.mean(far[case.agree])), case.false_alarms(far, EPIPOLE)
         # Least squares of all of them, for which the covariance holds.
         refine_plane(plane.h, case.points[near], 1e6 * noise, 4)
-        turning, angle = _turning(plane.h.reshape(3, 3), plane_covariance(plane.h, case.points[near], noise))
+        rotation_errors, angle = _rotation_evidence(
+            plane.h.reshape(3, 3), plane_covariance(plane.h, case.points[near], noise)
+        )
     ratio = _translation_ratio(case)
     kind = Configuration.GENERAL
     if plane is not None and errors < STANDARD_ERRORS and chance > LARGEST_CHANCE:
-        # F has fitted itself to the noise of a plane; the homography could not.
+        # F fits the noise of a plane, the homography does not: use the noise of the homography.
         sigma = noise
-        turned = turning < _turn_limit(int(near.sum())) and np.isfinite(angle)
-        if turned:
+        rotated = rotation_errors < _rotation_limit(int(near.sum())) and np.isfinite(angle)
+        if rotated:
             xy1, xy2 = case.points[near, :2], case.points[near, 2:]
-            camera = rotation_homography_test(plane.h.reshape(3, 3), xy1, xy2, risk=TURN_RISK)
-            turned = camera <= 1.0
-        kind = Configuration.ROTATION if turned else Configuration.PLANE
+            camera = rotation_homography_test(plane.h.reshape(3, 3), xy1, xy2, risk=ROTATION_RISK)
+            rotated = camera <= 1.0
+        kind = Configuration.ROTATION if rotated else Configuration.PLANE
     elif ratio <= 1.0:
         kind = Configuration.TRANSLATION
-    return ConfigurationReport(kind, sigma / scale, errors, off, chance, turning, camera, angle, ratio)
+    return ConfigurationReport(
+        kind, sigma / scale, errors, off, chance, rotation_errors, camera, angle, ratio
+    )
 
 
 def _plane_noise(squared: F64) -> float:
-    """Standard deviation of one coordinate from squared distances (N,) to a homography, some off it."""
+    """Standard deviation of one coordinate from squared distances (N,) to a homography with outliers."""
     variance = float(np.median(squared)) / CHI2_MEDIAN
     for _ in range(TRIMMINGS):
         near = squared[squared < NEAR * variance]
@@ -258,10 +329,11 @@ def _plane_noise(squared: F64) -> float:
 
 
 def _excess_errors(case: _Case, near: B8, rss_plane: float) -> float:
-    """By how many standard errors the squared parallax of the matches near the plane is more than noise.
+    """Standard errors by which the squared parallax of the matches near the plane exceeds the noise.
 
-    A homography has 8 parameters for 2 K residuals, F takes 7 of the K across the lines: K - 1 are left along
-    them, and of the same variance if they are noise. The F of just these matches is compared.
+    A homography has 8 parameters for 2 K residuals and F takes 7 of the K across the epipolar lines: K - 1
+    remain along the lines, with the same variance if they are noise. The F of these matches alone is
+    compared.
     """
     k = int(near.sum())
     if k < MINIMUM - 4:
@@ -271,13 +343,15 @@ def _excess_errors(case: _Case, near: B8, rss_plane: float) -> float:
     return float(np.log(ratio) / np.sqrt(2.0 / (k - 1) + 2.0 / (k - 7)))
 
 
-def _turning(H: F64, covariance: F64) -> tuple[float, float]:
-    """|trace H - trace H^-1| in standard errors and the angle, deg: H of a rotation has eigenvalues
-    1, exp(+-i angle) whatever the camera (HZ 13.2; Hartley 1994)."""
+def _rotation_evidence(H: F64, covariance: F64) -> tuple[float, float]:
+    """Return abs(trace H - trace H^-1) in standard errors, and the angle in degrees.
+
+    H of a rotation has eigenvalues 1, exp(+-i angle) for every camera (HZ 13.2; Hartley 1994).
+    """
     determinant = float(np.cbrt(np.linalg.det(H)))
     if not abs(determinant) > 1e-4 * float(np.linalg.norm(H)):
         return np.inf, np.nan
-    # Of unit determinant; what the covariance has along H itself is 0, and traces do not see it.
+    # Unit determinant; the covariance along H itself is 0.
     M, back = H / determinant, np.linalg.inv(H / determinant)
     covariance = covariance / determinant**2
     t, t_back = float(np.trace(M)), float(np.trace(back))
@@ -295,15 +369,15 @@ def _turning(H: F64, covariance: F64) -> tuple[float, float]:
     return abs(t - t_back) / gap, angle
 
 
-def _turn_limit(n: int) -> float:
-    """Standard errors that the turning of a rotation keeps to: Student's, since the noise is estimated."""
-    return float(scipy.special.stdtrit(n - 7, 1.0 - TURN_RISK))
+def _rotation_limit(n: int) -> float:
+    """Limit of the rotation errors in standard errors: Student's, since the noise is estimated."""
+    return float(scipy.special.stdtrit(n - 7, 1.0 - ROTATION_RISK))
 
 
 def _translation_ratio(case: _Case) -> float:
-    """(RSS of [e]x - RSS of F) over the limit that noise keeps to, an F-test with 5 and n - 7 degrees."""
-    mine = case.points[case.agree]
-    f = _fit_translation(mine, case.sigma)
+    """(RSS of [e]x - RSS of F) relative to its limit, an F-test with 5 and n - 7 degrees of freedom."""
+    inliers = case.points[case.agree]
+    f = _fit_translation(inliers, case.sigma)
     simple = np.asarray(sampson_distances(f, case.points))
     off = simple > np.sqrt(FAR) * case.sigma
     if case.false_alarms(off, BEYOND_TRANSLATION) < LARGEST_CHANCE:
@@ -312,7 +386,7 @@ def _translation_ratio(case: _Case) -> float:
     degrees = len(near) - 7
     if degrees < MINIMUM - 7:
         return float("inf")
-    # The same matches for both models, chosen by neither's favour: F would keep what it fits best.
+    # Both models use the same matches; those that F fits best would favour F.
     _refine_translation(f, near, np.inf)
     rss_simple = float(np.sum(np.asarray(sampson_distances(f, near)) ** 2))
     rss = min(rss_simple, *(_least_squares(start, near) for start in (case.f, f)))
@@ -346,7 +420,7 @@ def _fit_translation(points: F64, sigma: float) -> F64:
 
 
 def _refine_translation(f: F64, points: F64, gate: float) -> None:
-    """Least squares of the Sampson distances of [e]x (9,) within the gate (in place), by Gauss-Newton."""
+    """Minimise the Sampson distances of [e]x (9,) within the gate, in place, by Gauss-Newton."""
     e = np.array([f[7], f[2], f[3]])
     if not np.linalg.norm(e) > EXACT:
         return

@@ -1,14 +1,13 @@
-"""The plane that most matches of an F lie on, and which matches stand off it.
+"""Section 5.5: do the matches determine F, or does another F explain them as well?
 
-Other epipolar geometries of the same plane that explain about as many matches as the one found.
+If most matches lie on one plane with homography H, every [e]x H explains them, and the epipole depends on the
+few matches off the plane. A wrong F then has as many inliers as the right one. Four indicators are tested:
+matches off the plane agree with F no more often than by chance; another epipole explains about as many; the
+covariance of F is large; or the inliers off the plane lie among matches of the plane where no surface can be,
+as matches between repeated windows of a facade do.
 
-Whether the matches of a pair determine its F, beyond agreeing with it: evidence, verdict, reasons.
-
-Where most matches lie on one plane, every [e]x H of its homography H explains them, and the epipole rests on
-the rest. A wrong F then has as many inliers as the right one, or more. It betrays itself in four ways: hardly
-more matches off the plane agree with it than chance would have; another epipole explains about as many; its
-covariance is large; or its matches off the plane lie amid those of the plane, where no surface could be, as
-matches from one window of a facade to the next do.
+:mod:`thesisrecon.epipolar.configuration` answers a different question: which simpler model (plane, pure
+rotation, pure translation) explains the matches within their noise.
 """
 
 from __future__ import annotations
@@ -23,78 +22,51 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar.frame import PairFrame, check_matches
-from thesisrecon.epipolar.planes import DominantPlane, find_dominant_plane
+from thesisrecon.epipolar.planes import DominantPlane, find_dominant_plane, fundamentals_of_plane
 from thesisrecon.epipolar.precision import epipolar_distance_std
 from thesisrecon.epipolar.refinement import SAMPSON, refine
 from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
+# Matches within a cell of this size count as one place.
 SAME_PX = 2.0
 NEIGHBOURS = 5
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _parallax_lines(h: F64, points: F64) -> F64:
-    """(N, 3) lines x2 x H x1, in image 2 through a match and the place where the plane would have it."""
-    lines = np.empty((len(points), 3))
-    for k in range(len(points)):
-        x1, y1, x2, y2 = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
-        p0 = h[0] * x1 + h[1] * y1 + h[2]
-        p1 = h[3] * x1 + h[4] * y1 + h[5]
-        p2 = h[6] * x1 + h[7] * y1 + h[8]
-        lines[k, 0], lines[k, 1], lines[k, 2] = y2 * p2 - p1, p0 - x2 * p2, x2 * p1 - y2 * p0
-    return lines
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fundamental_of_plane(h: F64, e2: F64, f: F64) -> None:
-    """f = [e2]x H, unit norm."""
-    for j in range(3):
-        f[j] = e2[1] * h[6 + j] - e2[2] * h[3 + j]
-        f[3 + j] = e2[2] * h[j] - e2[0] * h[6 + j]
-        f[6 + j] = e2[0] * h[3 + j] - e2[1] * h[j]
-    f /= np.sqrt(np.sum(f * f)) + 1e-300
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
-def _inlier_mask(f: F64, columns: F64, gate: float, agree: F64) -> None:
-    """``agree`` (N,): 1 for the columns of (4, N) with a Sampson distance below the gate, else 0."""
-    wide = gate * gate
-    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
-    for k in range(columns.shape[1]):
-        x1, y1, x2, y2 = columns[0, k], columns[1, k], columns[2, k], columns[3, k]
-        a0 = f0 * x1 + f1 * y1 + f2
-        a1 = f3 * x1 + f4 * y1 + f5
-        b0 = f0 * x2 + f3 * y2 + f6
-        b1 = f1 * x2 + f4 * y2 + f7
-        e = a0 * x2 + a1 * y2 + f6 * x1 + f7 * y1 + f8
-        agree[k] = 1.0 if e * e < wide * (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1) else 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
-    """[e2]x H with the epipole of every pair of matches off the plane, and the weight within the gate of it.
-
-    ``points`` (N, 4) are matches off the plane, ``weights`` (M, N) several weights of each, ``pairs`` (S, 2)
-    indices into them; -> F (S, 9), which agree (S, N) as 0 and 1, and the sums of the weights (S, M).
-    """
-    columns = np.ascontiguousarray(points.T)
-    lines = _parallax_lines(h, points)
-    F, agree, e2 = np.empty((len(pairs), 9)), np.empty((len(pairs), len(points))), np.empty(3)
-    for s in range(len(pairs)):
-        a, b = lines[pairs[s, 0]], lines[pairs[s, 1]]
-        e2[0], e2[1], e2[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-        _fundamental_of_plane(h, e2, F[s])
-        _inlier_mask(F[s], columns, gate, agree[s])
-    return F, agree, agree @ weights.T
+# Epipoles tried and matches off the plane that each is scored on.
+PAIRS, COMPETING_SUBSET = 300, 400
+# Distinct models refined per ranking, chosen among the first of the ranking.
+COMPETING, EXAMINED = 3, 100
+# Quantile of the tried epipoles that gives the agreement by chance: most epipoles are wrong.
+TYPICAL = 0.3
+# Fraction of common matches above which two models count as one.
+SAME_MODEL = 0.8
+GATES, KNEE, STEPS = (2.4, 1.8, 1.2), 0.4, 5
+# Bands of the first scoring: an F of two noisy matches and a local plane is inaccurate.
+WIDE = 2.0
+# Distances are truncated at this many bands, so that a single wrong match cannot dominate a comparison.
+FAR = 20.0
+MINIMUM = 8
+BAND_SIGMAS, BAND_FLOOR_PX, SIGMA_FLOOR_PX = 2.5, 0.3, 0.1
+# Maximum log10 of the false alarms of the matches off the plane.
+LARGEST_CHANCE = -2.0
+# Standard errors by which a competing model must be worse: right models of facades reach 7, wrong ones 2.
+# Not a probability, since matches of repeated structure are dependent.
+LEAST_MARGIN = 3.0
+# Smallest change, relative to the matches off the plane, that makes another model a competing one.
+LEAST_GAIN = 0.05
+# Distance from epipolar lines that is relevant, px, or 2 sigma if that is larger.
+LARGEST_ERROR_PX = 1.0
+# Fraction of neighbours that contradict a match, maximum fraction of contradicted matches, and sample size.
+CONTRADICTED, MOST_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
 
 
 @njit(cache=True, nogil=True)
 def _select_distinct(
-    order: I64, agree: F64, weights: F64, alike: float, chosen: I64, count: int, most: int
+    order: I64, agree: F64, weights: F64, overlap: float, chosen: I64, count: int, most: int
 ) -> int:
-    """Add the first of ``order`` to ``chosen`` that share at most ``alike`` of their weight with one chosen
-    before, until ``most`` are; ``count`` are there already. Returns how many there are then."""
+    """Add models of ``order`` that share at most ``overlap`` of their weight with one chosen before.
+
+    Starts with ``count`` chosen models, stops at ``most`` and returns their number.
+    """
     for s in order:
         own = 0.0
         for k in range(len(weights)):
@@ -104,7 +76,7 @@ def _select_distinct(
             common = 0.0
             for k in range(len(weights)):
                 common += weights[k] * agree[s, k] * agree[chosen[c], k]
-            if common > alike * own:
+            if common > overlap * own:
                 fresh = False
                 break
         if fresh:
@@ -117,11 +89,10 @@ def _select_distinct(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: float) -> F64:
-    """Of the nearest neighbours of each chosen point, the share that lie on the plane and contradict it.
+    """Fraction of the nearest neighbours of each chosen point that lie on the plane and contradict it.
 
-    A neighbour contradicts where the parallax differs by more than the two are apart in image 1: no opaque
-    surface looks so, two points of it would change places. Points nearer than ``near`` are the same feature
-    and do not count.
+    A neighbour contradicts if the parallax differs by more than the distance in image 1: two points of an
+    opaque surface would change order. Points nearer than ``near`` are the same feature and do not count.
     """
     parallax = np.empty((len(points), 2))
     for k in range(len(points)):
@@ -129,7 +100,7 @@ def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: f
         w = h[6] * x1 + h[7] * y1 + h[8]
         parallax[k, 0] = points[k, 2] - (h[0] * x1 + h[1] * y1 + h[2]) / w
         parallax[k, 1] = points[k, 3] - (h[3] * x1 + h[4] * y1 + h[5]) / w
-    shares, nearest, which = np.zeros(len(chosen)), np.empty(NEIGHBOURS), np.empty(NEIGHBOURS, np.int64)
+    ratios, nearest, which = np.zeros(len(chosen)), np.empty(NEIGHBOURS), np.empty(NEIGHBOURS, np.int64)
     for c in range(len(chosen)):
         k, found = chosen[c], 0
         for m in range(len(points)):
@@ -145,16 +116,26 @@ def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: f
         for n in range(found):
             m = which[n]
             apart = (parallax[m, 0] - parallax[k, 0]) ** 2 + (parallax[m, 1] - parallax[k, 1]) ** 2
-            shares[c] += 1.0 if on_plane[m] and apart > nearest[n] else 0.0
-        shares[c] /= max(found, 1)
-    return shares
+            ratios[c] += 1.0 if on_plane[m] and apart > nearest[n] else 0.0
+        ratios[c] /= max(found, 1)
+    return ratios
 
 
 def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
-    """Weights (N,): one over the number of matches that share a place (of 2 px) in either image.
+    """Compute the weight of each match, one over the number of matches at its position.
 
-    At most one of the matches of one place is right, and all of them agree with every F whose epipole lies
-    there: they are one piece of evidence.
+    At most one of the matches at one position (within 2 px in either image) is right, and all of them agree
+    with every F whose epipole lies there: together they count once.
+
+    Parameters
+    ----------
+    xy1, xy2 : ndarray (N, 2)
+        Matched points, px.
+
+    Returns
+    -------
+    ndarray (N,)
+        Weights in (0, 1].
     """
     return 1.0 / np.maximum(_crowd(xy1), _crowd(xy2))
 
@@ -166,11 +147,30 @@ def _crowd(xy: F64) -> F64:
 
 
 def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: int) -> float:
-    """log10 of how often ``agreeing`` or more of ``tried`` wrong matches agree with the best model by chance.
+    """Compute log10 of the expected number of models with as many inliers among wrong matches.
 
-    The model is laid through ``free`` of them and each of the rest agrees with probability ``chance``: the
-    a-contrario bound (tried - free) C(tried, free) P(Binomial >= agreeing - free) of Moisan and Stival (IJCV
-    2004). 0 or more where that many are no surprise.
+    A-contrario bound (tried - free) C(tried, free) P(Binomial >= agreeing - free): the model passes through
+    ``free`` matches and each of the rest agrees with probability ``chance``.
+
+    Parameters
+    ----------
+    agreeing : float
+        Weight of the matches that agree with the model.
+    tried : float
+        Weight of all matches.
+    chance : float
+        Probability that a wrong match agrees.
+    free : int
+        Number of matches that define the model.
+
+    Returns
+    -------
+    float
+        0 or more if that many are expected by chance.
+
+    References
+    ----------
+    L. Moisan and B. Stival, "A probabilistic criterion to detect rigid point matches", IJCV 57, 2004.
     """
     rest, hits = tried - free, agreeing - free
     if hits <= 0.0 or rest <= 0.0:
@@ -186,35 +186,33 @@ def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: in
 
 
 def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:
-    """Probability that a wrong match lies within Sampson distance ``band_px`` of any F.
+    """Compute the probability that a wrong match lies within a Sampson distance of any F.
 
-    A band of width 2 sqrt(2) band_px across the picture, over the picture: the bounds of the matches.
+    Area of a band of width 2 sqrt(2) band_px across the bounding box of the matches, relative to the box.
+
+    Parameters
+    ----------
+    xy1, xy2 : ndarray (N, 2)
+        Matched points, px.
+    band_px : float
+        Sampson distance.
+
+    Returns
+    -------
+    float
+        Probability in (0, 1].
     """
     narrow = min(float(np.ptp(xy)) for xy in (*xy1.T, *xy2.T))
     return min(1.0, float(2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300)))
 
 
-PAIRS, COMPETING_SUBSET, COMPETING, LOOKED_AT = 300, 400, 3, 100
-"""Epipoles tried, matches off the plane that each is judged on, and how many of the best by all of these, and
-by those that the found F does not explain, are refined if they are unlike each other."""
-TYPICAL = 0.3
-"""Of the epipoles tried, so many are taken for wrong: what they explain, chance explains."""
-ALIKE = 0.8
-"""Share of its matches that two geometries have in common to count as one."""
-GATES, KNEE, STEPS = (2.4, 1.8, 1.2), 0.4, 5
-WIDE = 2.0
-"""In bands: two noisy matches and a plane that is known where its matches are do not make a good F."""
-FAR = 20.0
-"""Distances count to so many bands, or one wrong match would be the whole difference of two geometries."""
-
-
 @dataclass(frozen=True)
 class _CompetingModel:
-    """Another F: ``f`` (9,) in the frame, and how it differs from the one that was found.
+    """Another F ``f`` (9,) and how it differs from the estimate.
 
-    ``lost`` and ``gained`` are weights of matches that only the one or only the other explains; ``error`` is
-    the RMS distance of the rival's inliers to the found F, ``apart`` that or the other way round, whichever
-    is less, in the units of the frame.
+    ``lost`` and ``gained`` are the weights of matches that only the estimate or only this F explains.
+    ``error`` is the RMS distance of its inliers to the estimate, ``apart`` the smaller of that and the
+    reverse, in frame units.
     """
 
     f: F64
@@ -225,19 +223,19 @@ class _CompetingModel:
 
     @property
     def margin(self) -> float:
-        """By how many standard errors the found F explains more: McNemar's test."""
+        """Standard errors by which the estimate explains more (McNemar's test)."""
         return (self.lost - self.gained) / float(np.sqrt(max(self.lost + self.gained, 1.0)))
 
 
 def _find_competing_models(
     f: F64, points: F64, weights: F64, plane: DominantPlane, *, band: float, rng: Generator
 ) -> tuple[list[_CompetingModel], float]:
-    """The rivals of ``f`` and the share of the matches off the plane that a geometry explains by chance.
+    """Competing models of ``f`` and the fraction of matches off the plane that a model explains by chance.
 
-    [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005), right or wrong, are judged
-    on all matches off it; the best that are unlike each other are refined on all ``points`` (N, 4). Of half
-    of the pairs one match agrees with ``f`` and the other does not: a wrong F often has most of its matches
-    in common with the right one. Matches have ``weights`` (N,), and agree within ``band``.
+    [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005), right or wrong, is scored
+    on all matches off the plane; the best distinct ones are refined on all ``points`` (N, 4). In half of the
+    pairs one match agrees with ``f`` and the other does not, since a wrong F often ratios most of its inliers
+    with the right one. Matches have ``weights`` (N,) and agree within ``band``.
     """
     distances = np.asarray(sampson_distances(f, points))
     inside = distances < band
@@ -245,17 +243,17 @@ def _find_competing_models(
     if len(off) < 3:
         return [], 0.0
     off = off[rng.permutation(len(off))[:COMPETING_SUBSET]]
-    w, mine = weights[off], inside[off]
+    w, own = weights[off], inside[off]
     F, agree, sums = fundamentals_of_plane(
-        plane.h, points[off], np.stack([w, w * ~mine]), _pairs(mine, rng), WIDE * band
+        plane.h, points[off], np.stack([w, w * ~own]), _pairs(own, rng), WIDE * band
     )
-    # The two matches that made a geometry agree with it always.
+    # The two matches that define a model always agree with it.
     beyond = np.maximum(sums[:, 0] - 2.0, 0.0) / max(float(w.sum()) - 2.0, 1.0)
     chance = float(np.quantile(beyond, TYPICAL)) / WIDE
     chosen, count = np.empty(2 * COMPETING, dtype=np.int64), 0
     for k, value in enumerate((sums[:, 0], sums[:, 0] + sums[:, 1])):
         order = np.argsort(-value, kind="stable")
-        count = _select_distinct(order[:LOOKED_AT], agree, w, ALIKE, chosen, count, (k + 1) * COMPETING)
+        count = _select_distinct(order[:EXAMINED], agree, w, SAME_MODEL, chosen, count, (k + 1) * COMPETING)
     competing_models = [
         _competing_model(_refined(F[s], points, band), points, weights, (distances, inside), band)
         for s in chosen[:count]
@@ -265,10 +263,10 @@ def _find_competing_models(
 
 def _pairs(inside: B8, rng: Generator) -> NDArray[np.int64]:
     pairs = rng.integers(0, len(inside), (PAIRS, 2))
-    mine, others = np.flatnonzero(inside), np.flatnonzero(~inside)
-    if len(mine) and len(others):
+    own, others = np.flatnonzero(inside), np.flatnonzero(~inside)
+    if len(own) and len(others):
         half = PAIRS // 2
-        pairs[:half, 0] = mine[rng.integers(0, len(mine), half)]
+        pairs[:half, 0] = own[rng.integers(0, len(own), half)]
         pairs[:half, 1] = others[rng.integers(0, len(others), half)]
     return pairs
 
@@ -283,7 +281,7 @@ def _refined(f: F64, points: F64, band: float) -> F64:
 def _compare_competing_models(
     others: list[F64], f: F64, points: F64, weights: F64, *, band: float
 ) -> list[_CompetingModel]:
-    """Other matrices (9,) in the frame as rivals of ``f``, each refined on all ``points`` (N, 4)."""
+    """Other matrices (9,) as competing models of ``f``, each refined on all ``points`` (N, 4)."""
     distances = np.asarray(sampson_distances(f, points))
     found = (distances, distances < band)
     return [_competing_model(_refined(other, points, band), points, weights, found, band) for other in others]
@@ -304,24 +302,9 @@ def _competing_model(
     return _CompetingModel(f, float(lost), float(gained), float(error), float(min(error, back)))
 
 
-MINIMUM = 8
-BAND_SIGMAS, BAND_FLOOR_PX, SIGMA_FLOOR_PX = 2.5, 0.3, 0.1
-LARGEST_CHANCE = -2.0
-"""log10 of the false alarms that matches off the plane may be."""
-LEAST_MARGIN = 3.0
-"""Standard errors by which a rival must be worse. Right ones of real facades have 7 and more, wrong ones less
-than 2; it is no bound of a probability, since matches of repeated parts are not independent."""
-LEAST_GAIN = 0.05
-"""A rival that changes less than this share of the matches off the plane is F with other wrong matches."""
-LARGEST_ERROR_PX = 1.0
-"""Distance from epipolar lines that matters, in pixels, or 2 sigma where that is more."""
-CONTRADICTED, MOST_CONTRADICTED, JUDGED = 0.3, 0.2, 60
-"""A match is contradicted where more than this share of its neighbours does so; so many matches may be."""
-
-
 @dataclass(frozen=True)
 class _Support:
-    """Weights of matches off the plane: ``agreeing`` with F, all ``tried``, and what is ``contradicted``."""
+    """Weights of matches off the plane: inliers of F, all, and contradicted inliers."""
 
     agreeing: float
     tried: float
@@ -329,17 +312,47 @@ class _Support:
 
 
 def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) -> DegeneracyReport:
-    """Whether the matches (N, 2) px, wrong ones too, leave only ``fit`` as their epipolar geometry.
+    """Test whether the matches determine the fundamental matrix of a fit.
 
-    Undetermined where fewer matches off the dominant plane agree with F than would be a surprise by chance,
-    where another F, of that plane or from another search, explains about as many (McNemar's test, distances
-    that matter), where more than a fifth of those off the plane are contradicted by neighbours on it, or
-    where the covariance lets the inliers be more than a pixel off their lines. A pure translation is
-    determined. Wrong matches that are as coherent as a surface (a whole facade shifted by a window) cannot be
-    told from one.
+    F is undetermined if the inliers off the dominant plane are no more than expected by chance, if another F
+    of that plane or of another search explains about as many matches (McNemar's test) at a relevant distance,
+    if more than a fifth of the inliers off the plane are contradicted by neighbours on it, or if the
+    covariance allows errors of the epipolar lines above a pixel. The F of a pure translation is determined.
+    Wrong matches that are as coherent as a surface (a whole facade shifted by one window) cannot be detected.
 
-    Raises ``ValueError`` where ``fit`` and the matches do not belong together, and as
-    :func:`~thesisrecon.epipolar.frame.check_matches`.
+    Parameters
+    ----------
+    fit : FundamentalFit
+        The estimate.
+    xy1, xy2 : array_like (N, 2)
+        All matches with their outliers, N >= 8, px.
+    rng : numpy.random.Generator
+        Source of the samples.
+
+    Returns
+    -------
+    DegeneracyReport
+        Whether F is determined, with the evidence and the reasons if not.
+
+    Raises
+    ------
+    ValueError
+        If the inlier flags do not fit the matches, or as :func:`~thesisrecon.epipolar.frame.as_matches`.
+    StageFailure
+        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import estimate_fundamental
+    >>> rng = np.random.default_rng(0)
+    >>> xy1 = rng.uniform(0, 500, (60, 2))
+    >>> plane = xy1 + [40.0, 10.0] + rng.normal(0, 0.3, (60, 2))
+    >>> assess_degeneracy(estimate_fundamental(xy1, plane), xy1, plane, rng=rng).determined
+    False
+    >>> relief = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1)) + rng.normal(0, 0.3, (60, 2))
+    >>> assess_degeneracy(estimate_fundamental(xy1, relief), xy1, relief, rng=rng).determined
+    True
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
     if fit.inliers.shape != (len(xy1),):
@@ -351,21 +364,19 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     plane = find_dominant_plane(f, points, fit.inliers, sigma=sigma_px * frame.scale, rng=rng)
     error_px = _expected_error(fit, xy1, xy2)
     if plane is None:
-        return DegeneracyReport(
-            False, ("too few matches agree with the geometry",), expected_error_px=error_px
-        )
+        return DegeneracyReport(False, ("F has too few inliers",), expected_error_px=error_px)
     weights = multiplicity_weights(xy1, xy2)
-    competing_models, share = _find_competing_models(
+    competing_models, by_model_chance = _find_competing_models(
         f, points, weights, plane, band=band_px * frame.scale, rng=rng
     )
-    ends = [frame.matrix_in_frame(F) for F in fit.competing_models]
-    competing_models += _compare_competing_models(ends, f, points, weights, band=band_px * frame.scale)
+    starts = [frame.matrix_in_frame(F) for F in fit.competing_models]
+    competing_models += _compare_competing_models(starts, f, points, weights, band=band_px * frame.scale)
     support = _support(points, fit.inliers, weights, plane, 2.0 * sigma_px * frame.scale)
     by_chance = chance_of_agreement(xy1, xy2, band_px)
     chance = log10_false_alarms(
         support.agreeing - support.contradicted,
         support.tried,
-        chance=max(share, by_chance),
+        chance=max(by_model_chance, by_chance),
         free=2,
     )
     matters_px = max(LARGEST_ERROR_PX, 2.0 * fit.sigma_px)
@@ -385,35 +396,37 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
 
 
 def _least_gain(support: _Support, chance: float) -> float:
-    """Weight of matches that a rival must gain to be one: more than of the wrong ones agree by chance."""
+    """Weight of matches that a competing model must gain: more than wrong matches agree by chance."""
     expected = 2.0 * chance * (support.tried - support.agreeing)
     return float(max(LEAST_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
 
 
 def _differs(competing_model: _CompetingModel, matters: float) -> bool:
-    """Whether F is wrong if the rival is right; one that explains all that F does must explain much more, as
-    a wrong match or two that it gains are far from F too."""
+    """Return whether F is wrong if the competing model is right.
+
+    A model that explains all inliers of F must explain much more, since a wrong match or two that it gains
+    are far from F.
+    """
     return competing_model.apart > matters or (
         competing_model.error > matters and competing_model.margin < -LEAST_MARGIN
     )
 
 
 def _support(points: F64, inliers: B8, weights: F64, plane: DominantPlane, near: float) -> _Support:
-    mine = inliers & plane.off
-    chosen = np.flatnonzero(mine[inliers])
-    # Every k-th: enough to know a share.
-    chosen = chosen[:: max(1, len(chosen) // JUDGED)]
-    shares = _contradicted_ratios(plane.h, points[inliers], ~plane.off[inliers], chosen, near)
+    own = inliers & plane.off
+    chosen = np.flatnonzero(own[inliers])
+    chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
+    ratios = _contradicted_ratios(plane.h, points[inliers], ~plane.off[inliers], chosen, near)
     some = weights[inliers][chosen]
-    agreeing = float(weights[mine].sum())
-    part = float(some[shares > CONTRADICTED].sum() / max(some.sum(), 1e-300))
+    agreeing = float(weights[own].sum())
+    part = float(some[ratios > CONTRADICTED].sum() / max(some.sum(), 1e-300))
     return _Support(agreeing, float(weights[plane.off].sum()), part * agreeing)
 
 
 def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
-    """RMS over the inliers of the distance of exact matches to their lines, px, from the covariance of F."""
+    """RMS distance of exact matches to their lines over the inliers, px, from the covariance of F."""
     some = np.flatnonzero(fit.inliers)
-    some = some[:: max(1, len(some) // JUDGED)]
+    some = some[:: max(1, len(some) // SAMPLED)]
     std = epipolar_distance_std(fit.F, fit.covariance, xy1[some], xy2[some])
     return float(np.sqrt(np.mean(std**2))) if len(std) else float("inf")
 
@@ -425,20 +438,20 @@ def _reasons(
     error_px: float,
     matters_px: float,
 ) -> list[str]:
-    off = f"{support.agreeing:.0f} of {support.tried:.0f} matches off the dominant plane agree with it"
+    off = f"{support.agreeing:.0f} of {support.tried:.0f} matches off the dominant plane agree with F"
     reasons = []
     if chance > LARGEST_CHANCE:
-        reasons.append(f"{off}, no more than chance gives")
+        reasons.append(f"{off}, no more than expected by chance")
     if support.contradicted > MOST_CONTRADICTED * support.agreeing:
         reasons.append(
-            f"{off}, but {support.contradicted:.0f} of them lie amid matches of the plane, as those between "
-            f"repeated parts do"
+            f"{off}, but {support.contradicted:.0f} of them lie among matches of the plane, as matches "
+            "between repeated structures do"
         )
     if competing_model is not None and competing_model.margin < LEAST_MARGIN:
         reasons.append(
-            f"another geometry explains {competing_model.gained:.0f} matches that it does not, and "
-            f"leaves {competing_model.lost:.0f} of its own"
+            f"another F explains {competing_model.gained:.0f} matches that this F does not explain, and "
+            f"misses {competing_model.lost:.0f} of its inliers"
         )
     if error_px > matters_px:
-        reasons.append(f"its covariance allows epipolar lines to be {error_px:.2g} px off")
+        reasons.append(f"the covariance of F allows epipolar line errors of {error_px:.2g} px")
     return reasons

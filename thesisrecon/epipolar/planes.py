@@ -1,4 +1,8 @@
-"""module"""
+"""Homographies induced by F and a scene plane (HZ 13.6), and the dominant plane of the matches.
+
+Points are rows (x1, y1, x2, y2); the kernels take F and H as row-major vectors of 9. Distances are Sampson
+distances of H, so that noise has the standard deviation of one coordinate.
+"""
 
 from __future__ import annotations
 
@@ -9,36 +13,29 @@ from numba import njit
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_residuals, unit_norm
 
+# H is singular at a match if det J J' is below the first times its squared trace; it then has the second
+# squared distance.
 SINGULAR_REL, FARTHEST = 1e-28, 1e280
-"""det J J' over the square of its trace below which an H is singular at a match, and its distance squared."""
-
-
+# Planes tried and matches that each is scored on: a plane with a third of the matches is found with 98 %.
 TRIPLES, SUBSET = 100, 200
-"""Planes tried, and matches that each is judged on: a plane of a third of them is found with 98 %."""
-
-
+# Planes tried for the inlier ratio: a plane with a quarter of the matches is found with 96 %.
+RATIO_TRIPLES = 200
+# Squared distance in sigma^2 beyond which a match is off the plane; noise exceeds it once in 3000.
 OFF_PLANE = 16.0
-"""Squared distance in sigma^2 beyond which a match stands off the plane: noise does so once in 3000."""
-
-
+# Gate of the plane in sigma, reweighting steps on the subset and on all matches, maximum number of matches.
 GATE = 5.0
-
-
 SUBSET_STEPS, ALL_STEPS, MOST = 3, 4, 600
-
-
-SAMPLES = 200
-"""Homographies tried, and matches they are judged on: a plane of a quarter of them is found with 96 %."""
+# Twice the area of the smallest triangle of three matches, in squared frame units.
+SMALLEST_AREA = 1e-3
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared distance of a match to the nearest exact match of x2 ~ H x1, to first order.
 
-    c' (J J')^-1 c of the two equations c and their derivatives J by the four coordinates (Chum, Pajdla and
+    c' (J J')^-1 c with the two equations c and their derivatives J by the four coordinates (Chum, Pajdla and
     Sturm, 2005).
     """
     w = h[6] * x1 + h[7] * y1 + h[8]
@@ -46,11 +43,11 @@ def _squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) 
     c1 = h[3] * x1 + h[4] * y1 + h[5] - w * y2
     j00, j01 = h[0] - x2 * h[6], h[1] - x2 * h[7]
     j10, j11 = h[3] - y2 * h[6], h[4] - y2 * h[7]
-    # Sums of squares (Lagrange's identity): the difference of products would round to less than nothing.
+    # Sums of squares (Lagrange's identity): a difference of products could round below zero.
     above = (c0 * j10 - c1 * j00) ** 2 + (c0 * j11 - c1 * j01) ** 2 + w * w * (c0 * c0 + c1 * c1)
     entries = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11 + w * w
     below = (j00 * j11 - j01 * j10) ** 2 + w * w * entries
-    # An H that takes all of the image to one place has no exact match nearby.
+    # A singular H has no exact match nearby.
     squared: float = above / below if below > SINGULAR_REL * entries * entries else FARTHEST
     return squared
 
@@ -65,10 +62,11 @@ def _plane_distances(h: F64, points: F64) -> F64:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _induced_homography(f: F64, e2: F64, points: F64, triple: I64, h: F64) -> bool:
-    """H of the plane through three matches that agree with F: A - e2 v', A = [e2]x F (HZ, result 13.6).
+def _induced_homography(f: F64, e2: F64, points: F64, triple: I64, smallest_area: float, h: F64) -> bool:
+    """Homography of the plane of three matches, H = A - e2 v' with A = [e2]x F (HZ, result 13.6).
 
-    Each match has v . x1 = b with b = (x2 x A x1) . (x2 x e2) / |x2 x e2|^2. False for points near one line.
+    Each match gives v . x1 = b with b = (x2 x A x1) . (x2 x e2) / |x2 x e2|^2. False if the points are nearly
+    collinear.
     """
     A = np.empty(9)
     for j in range(3):
@@ -87,7 +85,7 @@ def _induced_homography(f: F64, e2: F64, points: F64, triple: I64, h: F64) -> bo
         b[k] = (q0 * a0 + q1 * a1 + q2 * a2) / (a0 * a0 + a1 * a1 + a2 * a2 + 1e-300)
     ux, uy, wx, wy = M[1, 0] - M[0, 0], M[1, 1] - M[0, 1], M[2, 0] - M[0, 0], M[2, 1] - M[0, 1]
     area = ux * wy - uy * wx
-    if abs(area) < 1e-3:
+    if not abs(area) > smallest_area:
         return False
     v0 = ((b[1] - b[0]) * wy - (b[2] - b[0]) * uy) / area
     v1 = ((b[2] - b[0]) * ux - (b[1] - b[0]) * wx) / area
@@ -101,8 +99,10 @@ def _induced_homography(f: F64, e2: F64, points: F64, triple: I64, h: F64) -> bo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
-    """``G`` (9, 9) of the equations of x2 ~ H x1, each match weighted by (J J')^-1 and, within the gate, by
-    (1 - d^2 / gate^2)^2 (Tukey); returns the sum of min(d^2 / gate^2, 1)."""
+    """Compute ``G`` (9, 9) of the equations of x2 ~ H x1 and return the sum of min(d^2 / gate^2, 1).
+
+    Each match has the weight (J J')^-1 and, within the gate, (1 - d^2 / gate^2)^2 (Tukey).
+    """
     G[:] = 0.0
     total, wide = 0.0, gate * gate
     row = np.zeros((2, 9))
@@ -139,7 +139,24 @@ def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
-    """Fit ``h`` (in place, unit norm) to the points within the gate, reweighted; the last ``G`` (9, 9)."""
+    """Fit a homography to the points within a gate by reweighted least squares.
+
+    Parameters
+    ----------
+    h : ndarray (9,)
+        Start; overwritten by the result, unit norm.
+    points : ndarray (N, 4)
+        Matches.
+    gate : float
+        Distance beyond which a match has no weight.
+    iterations : int
+        Maximum number of iterations.
+
+    Returns
+    -------
+    ndarray (9, 9)
+        Matrix of the last normal equations.
+    """
     G = np.empty((9, 9))
     for _ in range(iterations):
         h /= np.sqrt(np.sum(h * h)) + 1e-300
@@ -157,15 +174,15 @@ def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F64) -> float:
-    """The homography (``h``) of a plane of F with the least truncated distances; their mean (1 for none).
+    """Find the plane ``h`` of F with the smallest mean truncated squared distance; return it (1 without any).
 
-    The plane of each triple is judged on all ``points`` (the matches that F fits, or some of them).
+    Each triple of ``points`` gives a plane that is scored on all of them.
     """
     best, trial = float(len(points)), np.empty(9)
     h[:] = 0.0
     wide = 1.0 / (gate * gate)
     for t in range(len(triples)):
-        if not _induced_homography(f, e2, points, triples[t], trial):
+        if not _induced_homography(f, e2, points, triples[t], SMALLEST_AREA, trial):
             continue
         total = 0.0
         for k in range(len(points)):
@@ -183,7 +200,7 @@ def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: flo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
-    """How many of the points (N, 2) each of the homographies (S, 3, 3) takes to within ``tolerance``."""
+    """Count the points (N, 2) that each homography (S, 3, 3) maps to within ``tolerance``."""
     counts = np.zeros(len(H), np.int64)
     for s in range(len(H)):
         h = H[s]
@@ -198,23 +215,49 @@ def _count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
 
 @dataclass(frozen=True)
 class DominantPlane:
-    """``h`` (9,) unit norm in the frame of the points, ``squared`` (N,) distances of all, in sigma^2."""
+    """The plane that most inliers of an F lie on.
+
+    Parameters
+    ----------
+    h : ndarray (9,)
+        Homography in the frame of the points, unit norm.
+    squared : ndarray (N,)
+        Squared distances of all points, in sigma^2.
+    """
 
     h: F64
     squared: F64
 
     @property
     def off(self) -> B8:
-        """(N,) which points stand off the plane."""
+        """Points (N,) off the plane."""
         return np.asarray(self.squared > OFF_PLANE)
 
 
 def find_dominant_plane(
     f: F64, points: F64, inliers: B8, *, sigma: float, rng: Generator
 ) -> DominantPlane | None:
-    """The plane of F with most of its inliers, least squares over those within 5 sigma; None without one.
+    """Find the plane of F with most of its inliers.
 
-    ``f`` (9,), ``points`` (N, 4) and ``sigma`` in one frame.
+    Least squares over the inliers within 5 sigma of the best of 100 sampled planes.
+
+    Parameters
+    ----------
+    f : ndarray (9,)
+        F in the frame.
+    points : ndarray (N, 4)
+        Matches.
+    inliers : ndarray (N,) of bool
+        Inliers of F.
+    sigma : float
+        Noise of one coordinate in the frame.
+    rng : numpy.random.Generator
+        Source of the samples.
+
+    Returns
+    -------
+    DominantPlane or None
+        None if there is no plane.
     """
     mine = points[inliers]
     if len(mine) < 4:
@@ -227,7 +270,7 @@ def find_dominant_plane(
     _search_dominant_plane(f, e2, some, triples, GATE * sigma, h)
     if not h.any():
         return None
-    # A plane through three noisy matches is off elsewhere: the gate starts wide.
+    # The plane of three noisy matches is inaccurate elsewhere: the gate starts wide.
     refine_plane(h, some, 2.0 * GATE * sigma, SUBSET_STEPS)
     refine_plane(h, mine, GATE * sigma, ALL_STEPS)
     squared = np.asarray(_plane_distances(h, points)) / sigma**2
@@ -235,54 +278,80 @@ def find_dominant_plane(
 
 
 def plane_covariance(h: F64, points: F64, sigma: float) -> F64:
-    """Covariance (9, 9) of h, unit norm, from the points (N, 4) of the plane."""
+    """Compute the covariance of a homography fitted to points.
+
+    Parameters
+    ----------
+    h : ndarray (9,)
+        Homography, unit norm.
+    points : ndarray (N, 4)
+        Matches on the plane.
+    sigma : float
+        Noise of one coordinate in the frame.
+
+    Returns
+    -------
+    ndarray (9, 9)
+        Covariance of ``h``.
+    """
     G = np.empty((9, 9))
     _plane_normal_equations(h, points, 1e6 * sigma, G)
     values, vectors = np.linalg.eigh(G)
-    # The least eigenvalue is the scale of H, which no distance sees.
+    # The smallest eigenvalue belongs to the scale of H, on which no distance depends.
     half = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-14 * values[-1]))
     return np.asarray(sigma**2 * half @ half.T)
 
 
-def plane_homographies(F: F64, xy1: F64, xy2: F64, triples: I64) -> F64:
-    """Homographies of the planes through three matches each, given F; triples (S, 3) -> (S', 3, 3).
-
-    H = A - e2 (M^-1 b)', A = [e2]x F (HZ, result 13.6). Triples on a line are left out.
-    """
-    _, e2 = epipoles(F)
-    A = cross_matrix(e2) @ unit_norm(F)
-    x1, x2 = homogenize(xy1), homogenize(xy2)
-    away = np.cross(x2, e2)
-    b = np.sum(np.cross(x2, x1 @ A.T) * away, axis=1) / np.maximum(np.sum(away**2, axis=1), 1e-300)
-    M = x1[triples]
-    area, size = np.abs(np.linalg.det(M)), np.ptp(xy1, axis=0).max()
-    usable = area > 1e-4 * size**2
-    v = np.linalg.solve(M[usable], b[triples[usable]][..., None])[..., 0]
-    return A - e2[:, None] * v[:, None, :]
+def _plane_homographies(F: F64, xy1: F64, xy2: F64, triples: I64) -> F64:
+    """Homographies (S', 3, 3) of the planes through three matches each, without nearly collinear triples."""
+    points, h, found = np.hstack([xy1, xy2]), np.empty(9), []
+    e2, f = epipoles(F)[1].copy(), unit_norm(F).ravel()
+    smallest_area = 1e-4 * float(np.ptp(xy1, axis=0).max()) ** 2
+    for triple in triples:
+        if _induced_homography(f, e2, points, triple, smallest_area, h):
+            found.append(h.copy())
+    return np.array(found).reshape(-1, 3, 3)
 
 
 def homography_inlier_ratio(F: F64, xy1: F64, xy2: F64, *, tolerance_px: float, rng: Generator) -> float:
-    """Share of matches (N, 2) px that one homography takes to within ``tolerance_px`` in image 2.
+    """Compute the largest fraction of matches that one homography explains.
 
-    The matches agree with F, so three of them give a homography; the best of the sampled ones is fitted again
-    to all its matches until they stay the same. 1 for fewer than 5 matches, which always have one.
+    The best of 200 planes through three matches is fitted again to its inliers until they stay the same. A
+    ratio near 1 indicates a planar scene or a pure rotation.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3)
+        Fundamental matrix, px.
+    xy1, xy2 : ndarray (N, 2)
+        Inliers of F, px.
+    tolerance_px : float
+        Maximum transfer error in image 2.
+    rng : numpy.random.Generator
+        Source of the samples.
+
+    Returns
+    -------
+    float
+        Inlier ratio; 1 for fewer than 5 matches, which always have a homography.
     """
     n = len(xy1)
     if n < 5:
         return 1.0
     chosen = rng.permutation(n)[:SUBSET]
-    triples = np.argsort(rng.random((SAMPLES, min(len(chosen), 50))), axis=1)[:, :3]
-    offsets = rng.integers(0, len(chosen), (SAMPLES, 1))
+    triples = np.argsort(rng.random((RATIO_TRIPLES, min(len(chosen), 50))), axis=1)[:, :3]
+    offsets = rng.integers(0, len(chosen), (RATIO_TRIPLES, 1))
     triples = chosen[(triples + offsets) % len(chosen)]
-    planes = plane_homographies(F, xy1, xy2, triples)
+    planes = _plane_homographies(F, xy1, xy2, triples)
     if not len(planes):
-        return _refit_share(np.eye(3), xy1, xy2, tolerance_px)
+        return _refit_inlier_ratio(np.eye(3), xy1, xy2, tolerance_px)
     counts = _count_transferred(planes, xy1[chosen], xy2[chosen], tolerance_px)
     best = planes[int(np.argmax(counts))]
-    return _refit_share(best, xy1, xy2, tolerance_px)
+    return _refit_inlier_ratio(best, xy1, xy2, tolerance_px)
 
 
-def _refit_share(H: F64, xy1: F64, xy2: F64, tolerance_px: float) -> float:
+def _refit_inlier_ratio(H: F64, xy1: F64, xy2: F64, tolerance_px: float) -> float:
+    """Inlier ratio of a homography after refitting it to its inliers while they increase."""
     inside = homography_residuals(H, xy1, xy2) < tolerance_px
     for _ in range(5):
         points1, points2 = xy1[inside], xy2[inside]
@@ -293,3 +362,78 @@ def _refit_share(H: F64, xy1: F64, xy2: F64, tolerance_px: float) -> float:
             break
         inside = again
     return float(inside.mean())
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _parallax_lines(h: F64, points: F64) -> F64:
+    """Lines (N, 3) x2 x H x1 in image 2 through a match and its position on the plane."""
+    lines = np.empty((len(points), 3))
+    for k in range(len(points)):
+        x1, y1, x2, y2 = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
+        p0 = h[0] * x1 + h[1] * y1 + h[2]
+        p1 = h[3] * x1 + h[4] * y1 + h[5]
+        p2 = h[6] * x1 + h[7] * y1 + h[8]
+        lines[k, 0], lines[k, 1], lines[k, 2] = y2 * p2 - p1, p0 - x2 * p2, x2 * p1 - y2 * p0
+    return lines
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fundamental_of_plane(h: F64, e2: F64, f: F64) -> None:
+    """Compute f = [e2]x H, unit norm."""
+    for j in range(3):
+        f[j] = e2[1] * h[6 + j] - e2[2] * h[3 + j]
+        f[3 + j] = e2[2] * h[j] - e2[0] * h[6 + j]
+        f[6 + j] = e2[0] * h[3 + j] - e2[1] * h[j]
+    f /= np.sqrt(np.sum(f * f)) + 1e-300
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+def _inlier_mask(f: F64, columns: F64, gate: float, agree: F64) -> None:
+    """Set ``agree`` (N,) to 1 for columns of (4, N) with a Sampson distance below the gate, else 0."""
+    wide = gate * gate
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    for k in range(columns.shape[1]):
+        x1, y1, x2, y2 = columns[0, k], columns[1, k], columns[2, k], columns[3, k]
+        a0 = f0 * x1 + f1 * y1 + f2
+        a1 = f3 * x1 + f4 * y1 + f5
+        b0 = f0 * x2 + f3 * y2 + f6
+        b1 = f1 * x2 + f4 * y2 + f7
+        e = a0 * x2 + a1 * y2 + f6 * x1 + f7 * y1 + f8
+        agree[k] = 1.0 if e * e < wide * (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1) else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
+    """Compute [e2]x H with the epipole of each pair of matches off the plane (plane plus parallax).
+
+    Parameters
+    ----------
+    h : ndarray (9,)
+        Homography of the plane.
+    points : ndarray (N, 4)
+        Matches off the plane.
+    weights : ndarray (M, N)
+        M sets of weights of the matches.
+    pairs : ndarray (S, 2) of int
+        Pairs of matches.
+    gate : float
+        Sampson distance of an inlier.
+
+    Returns
+    -------
+    F : ndarray (S, 9)
+        Fundamental matrices, unit norm.
+    agree : ndarray (S, N)
+        1 for inliers, else 0.
+    sums : ndarray (S, M)
+        Sums of the weights of the inliers.
+    """
+    columns = np.ascontiguousarray(points.T)
+    lines = _parallax_lines(h, points)
+    F, agree, e2 = np.empty((len(pairs), 9)), np.empty((len(pairs), len(points))), np.empty(3)
+    for s in range(len(pairs)):
+        a, b = lines[pairs[s, 0]], lines[pairs[s, 1]]
+        e2[0], e2[1], e2[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        _fundamental_of_plane(h, e2, F[s])
+        _inlier_mask(F[s], columns, gate, agree[s])
+    return F, agree, agree @ weights.T

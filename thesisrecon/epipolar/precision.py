@@ -1,7 +1,4 @@
-"""The uncertainty of an estimated F: from the curvature of the gradient criterion at its minimum.
-
-Section 5.5: what the uncertainty of F means for epipolar lines and epipoles, and the least possible.
-"""
+"""Section 5.5: the covariance of F, what it means for epipolar lines and epipoles, and its lower bound."""
 
 from __future__ import annotations
 
@@ -24,15 +21,31 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import epipoles, fundamental_from_cameras, unit_norm
 from thesisrecon.records import FundamentalFit
 
+# Smallest curvature relative to the largest: the F of a plane stays uncertain but finite.
 FLATTEST_REL = 1e-14
-"""Curvatures below this share of the largest are raised to it: a plane's F is uncertain, not inf."""
 
 
 def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) -> F64:
-    """Covariance (9, 9) of vec(F), F in pixels with unit norm, to first order: sigma^2 B (J'J)^-1 B'.
+    """Compute the first-order covariance of F from the curvature of the Sampson criterion.
 
-    ``f`` (9,) and ``points`` (N, 4) (the inliers) in ``frame``, ``sigma`` of one image coordinate in its
-    units. J are the derivatives of the Sampson distances by the seven parameters, B those of vec(F). Rank 7.
+    sigma^2 B (J'J)^-1 B' with J the derivatives of the Sampson distances by the seven parameters and B those
+    of vec(F).
+
+    Parameters
+    ----------
+    frame : PairFrame
+        Frame of ``f`` and ``points``.
+    f : ndarray (9,)
+        F in the frame.
+    points : ndarray (N, 4)
+        Inliers in the frame.
+    sigma : float
+        Standard deviation of one image coordinate, in frame units.
+
+    Returns
+    -------
+    ndarray (9, 9)
+        Covariance of vec(F), row-major, for F in pixels with unit norm; rank 7.
     """
     U, V, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((9, 7))
     G, h = np.empty((9, 9)), np.empty(9)
@@ -53,24 +66,24 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
 PARAMETERS = 7
 
 
-def degrees_of_freedom(fit: FundamentalFit) -> float:
-    """What is left of the inliers after the seven parameters of F, for the noise to be estimated from: >= 1.
+def _degrees_of_freedom(fit: FundamentalFit) -> float:
+    """Number of inliers minus the seven parameters of F, at least 1.
 
-    With few of them sigma is uncertain itself, and intervals need the quantiles of Student and of Fisher: at
-    30 matches those of the normal distribution hold the truth in 93.6 % (epipoles 92.7 %) instead of 95 %.
+    With few degrees of freedom intervals need Student's and Fisher's quantiles: for 30 matches normal
+    quantiles contain the truth in 93.6 % (epipoles 92.7 %) instead of 95 %.
     """
     return max(float(np.sum(fit.inliers)) - PARAMETERS, 1.0)
 
 
-def student_95(degrees_of_freedom: float) -> float:
-    """95 % of a Student variable lie within it; 1.96 for infinite degrees of freedom."""
+def _student_95(degrees_of_freedom: float) -> float:
+    """95 % quantile of the absolute value of a Student variable; 1.96 for infinite degrees of freedom."""
     if not degrees_of_freedom > 0.0:
         raise ValueError(f"degrees of freedom must be positive; got {degrees_of_freedom}")
     return float(scipy.special.stdtrit(min(degrees_of_freedom, 1e9), 0.975))
 
 
-def ellipse_95(degrees_of_freedom: float) -> float:
-    """95 % of squared Mahalanobis distances in two dimensions lie below, 2 F(2, nu); 5.99 for infinite nu."""
+def _ellipse_95(degrees_of_freedom: float) -> float:
+    """95 % quantile of squared Mahalanobis distances in two dimensions, 2 F(2, nu); 5.99 for infinite nu."""
     if not degrees_of_freedom > 0.0:
         raise ValueError(f"degrees of freedom must be positive; got {degrees_of_freedom}")
     nu = min(degrees_of_freedom, 1e9)
@@ -78,20 +91,44 @@ def ellipse_95(degrees_of_freedom: float) -> float:
 
 
 def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
-    """Standard deviation (N,), px, of the distances of exact matches (N, 2) to their lines in image 2.
+    """Compute the standard deviation of the distances of exact matches to their epipolar lines in image 2.
 
-    To first order in the error of F alone: the interval of a distance d is d +- 1.96 std where sigma is known
-    (else :func:`epipolar_distance_interval`). The ``covariance`` (9, 9) of vec(F) is for F (3, 3) of unit
-    norm. A match with noise sigma of its own is off by sqrt(std^2 + sigma^2 (1 + g1 / g2)) instead, g1 and g2
-    the squared gradients of x2' F x1 by x1 and x2.
-    Raises ``ValueError`` for other shapes and as :func:`~thesisrecon.epipolar.frame.as_matches`.
+    First order in the error of F alone. A match with own noise sigma has sqrt(std^2 + sigma^2 (1 + g1 / g2))
+    with g1 and g2 the squared gradients of x2' F x1 by x1 and x2.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3)
+        Fundamental matrix, unit norm.
+    covariance : ndarray (9, 9)
+        Covariance of vec(F).
+    xy1, xy2 : array_like (N, 2)
+        Matched points, px.
+
+    Returns
+    -------
+    ndarray (N,)
+        Standard deviations, px.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are wrong or F has no unit norm.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> F = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
+    >>> covariance = np.diag([1e-6, 0, 0, 0, 0, 0, 0, 0, 0])
+    >>> epipolar_distance_std(F, covariance, np.array([[10.0, 5.0]]), np.array([[20.0, 5.0]])).round(3)
+    array([0.283])
     """
     _check(F, covariance)
     xy1, xy2 = as_matches(xy1, xy2)
     x1, x2 = homogenize(xy1), homogenize(xy2)
     lines = x1 @ F.T
     norm = np.sqrt(np.sum(lines[:, :2] ** 2, axis=1, keepdims=True)) + 1e-300
-    # The point's distance is x2 . l / |l12|; where it is about 0 only the derivative of the numerator counts.
+    # The distance is x2 . l / |l12|; near 0 only the derivative of the numerator matters.
     foot = x2.copy()
     foot[:, :2] -= np.sum(x2 * lines, axis=1, keepdims=True) * lines[:, :2] / norm**2
     gradient = (foot[:, :, None] * x1[:, None, :]).reshape(-1, 9) / norm
@@ -100,20 +137,57 @@ def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
 
 
 def epipolar_distance_interval(fit: FundamentalFit, xy1: F64, xy2: F64) -> F64:
-    """Half widths (N,), px, of the 95 % intervals of the distances of exact matches (N, 2) to their lines.
+    """Compute the 95 % intervals of the distances of exact matches to their epipolar lines in image 2.
 
-    As :func:`epipolar_distance_std`, with Student's quantile for the inliers that sigma was estimated from.
+    Parameters
+    ----------
+    fit : FundamentalFit
+        The estimate; its inliers give Student's quantile.
+    xy1, xy2 : array_like (N, 2)
+        Matched points, px.
+
+    Returns
+    -------
+    ndarray (N,)
+        Half widths, px.
+
+    Raises
+    ------
+    ValueError
+        As :func:`epipolar_distance_std`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.records import FundamentalFit
+    >>> F = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
+    >>> fit = FundamentalFit(F, np.ones(27, bool), 0.5, np.diag([1e-6, 0, 0, 0, 0, 0, 0, 0, 0]))
+    >>> epipolar_distance_interval(fit, np.array([[10.0, 5.0]]), np.array([[20.0, 5.0]])).round(2)
+    array([0.59])
     """
-    return student_95(degrees_of_freedom(fit)) * epipolar_distance_std(fit.F, fit.covariance, xy1, xy2)
+    return _student_95(_degrees_of_freedom(fit)) * epipolar_distance_std(fit.F, fit.covariance, xy1, xy2)
 
 
 @dataclass(frozen=True)
 class Epipole:
-    """``direction`` (3,) unit vector, ``covariance`` (3, 3) of it (rank 2), and in pixels where it is finite.
+    """An epipole with its covariance.
 
-    ``xy`` (2,) px and ``xy_covariance`` (2, 2) px^2 are to first order: meaningless where the interval is not
-    small against the distance of the epipole from the image, and NaN for an epipole at infinity. The region
-    and the intervals do without them and hold for every epipole.
+    ``xy`` and ``xy_covariance`` are first order: meaningless unless the uncertainty is small compared with
+    the distance of the epipole from the image, and NaN for an epipole at infinity. The region and the
+    intervals are valid for every epipole.
+
+    Parameters
+    ----------
+    direction : ndarray (3,)
+        Homogeneous epipole, unit norm.
+    covariance : ndarray (3, 3)
+        Covariance of ``direction``, rank 2.
+    xy : ndarray (2,)
+        Epipole, px.
+    xy_covariance : ndarray (2, 2)
+        Covariance of ``xy``, px^2.
+    degrees_of_freedom : float
+        Degrees of freedom of the noise estimate.
     """
 
     direction: F64
@@ -123,30 +197,51 @@ class Epipole:
     degrees_of_freedom: float = np.inf
 
     def contains(self, direction: F64) -> bool:
-        """Whether the 95 % region of the direction holds this one (3,), a unit vector of either sign."""
+        """Return whether the 95 % region of the direction contains another direction.
+
+        Parameters
+        ----------
+        direction : ndarray (3,)
+            Homogeneous point, unit norm, either sign.
+
+        Returns
+        -------
+        bool
+            True inside the region.
+        """
         values, vectors = np.linalg.eigh(self.covariance)
         z = (direction * np.copysign(1.0, direction @ self.direction) - self.direction) @ vectors[:, 1:]
-        return bool(np.sum(z**2 / values[1:]) <= ellipse_95(self.degrees_of_freedom))
+        return bool(np.sum(z**2 / values[1:]) <= _ellipse_95(self.degrees_of_freedom))
 
     @property
     def interval_95(self) -> F64:
-        """Lower and upper ends (2, 2), px, of the 95 % intervals of x and of y, after Fieller.
+        """Ends (2, 2) of the 95 % intervals of x and y, px: row 0 lower, row 1 upper.
 
-        All x whose e1 - x e3 is within 1.96 (or Student's) standard deviations of 0, which holds where the
-        first-order xy +- 1.96 std does not (Fieller, J. R. Stat. Soc. B 16, 1954). Where e3 may be 0 the
-        epipole may lie at infinity: a lower end above the upper one says that the interval runs from it
-        through infinity to the upper one, -inf and inf that every place is possible.
+        All x for which e1 - x e3 is within 1.96 (or Student's) standard deviations of 0 (Fieller, J. R. Stat.
+        Soc. B 16, 1954). If e3 may be 0 the epipole may lie at infinity: a lower end above the upper one
+        denotes an interval through infinity, (-inf, inf) that nothing is known.
         """
         return np.stack([self._fieller(0), self._fieller(1)], axis=1)
 
     def contains_xy(self, xy: F64) -> NDArray[np.bool_]:
-        """Whether x and y (2,) lie in their intervals, those through infinity included; (2,)."""
+        """Return whether x and y lie in their 95 % intervals.
+
+        Parameters
+        ----------
+        xy : ndarray (2,)
+            Point, px.
+
+        Returns
+        -------
+        ndarray (2,) of bool
+            One flag per coordinate; intervals through infinity are handled.
+        """
         low, high = self.interval_95
         through = low > high
         return np.asarray(np.where(through, (xy >= low) | (xy <= high), (xy >= low) & (xy <= high)))
 
     def _fieller(self, k: int) -> F64:
-        e, C, q2 = self.direction, self.covariance, student_95(self.degrees_of_freedom) ** 2
+        e, C, q2 = self.direction, self.covariance, _student_95(self.degrees_of_freedom) ** 2
         a, b, c = e[2] ** 2 - q2 * C[2, 2], e[k] * e[2] - q2 * C[k, 2], e[k] ** 2 - q2 * C[k, k]
         inside = b * b - a * c
         if a == 0.0 or (a < 0.0 and inside <= 0.0):
@@ -157,14 +252,10 @@ class Epipole:
         return np.asarray(roots if a > 0.0 else roots[::-1])
 
 
-def epipoles_with_covariance(
+def _epipoles_with_covariance(
     F: F64, covariance: F64, *, degrees_of_freedom: float = np.inf
 ) -> tuple[Epipole, Epipole]:
-    """The epipoles of image 1 and of image 2 of F (3, 3), unit norm, with ``covariance`` (9, 9) of vec(F).
-
-    From F e1 = 0 the differential de1 = -F^+ dF e1, and likewise with F' for e2. ``degrees_of_freedom`` are
-    those that the noise in the covariance was estimated with. Raises ``ValueError`` for other shapes.
-    """
+    """Both epipoles of F with their covariances: F e1 = 0 gives de1 = -F^+ dF e1, and likewise e2 with F'."""
     _check(F, covariance)
     e1, e2 = epipoles(F)
     inverse = np.linalg.pinv(F, rcond=1e-12)
@@ -177,8 +268,28 @@ def epipoles_with_covariance(
 
 
 def epipoles_of(fit: FundamentalFit) -> tuple[Epipole, Epipole]:
-    """The epipoles of image 1 and of image 2 of a fit, with its covariance and degrees of freedom."""
-    return epipoles_with_covariance(fit.F, fit.covariance, degrees_of_freedom=degrees_of_freedom(fit))
+    """Compute both epipoles of a fit with their covariances.
+
+    Parameters
+    ----------
+    fit : FundamentalFit
+        The estimate.
+
+    Returns
+    -------
+    tuple of Epipole
+        Epipoles of image 1 and image 2.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.records import FundamentalFit
+    >>> F = np.array([[0, 0, 1], [0, 0, -2], [-1, 2, 0]]) / np.sqrt(10)
+    >>> e1, e2 = epipoles_of(FundamentalFit(F, np.ones(27, bool), 0.5, 1e-8 * np.eye(9)))
+    >>> np.abs(e1.direction).round(3)
+    array([0.894, 0.447, 0.   ])
+    """
+    return _epipoles_with_covariance(fit.F, fit.covariance, degrees_of_freedom=_degrees_of_freedom(fit))
 
 
 def _epipole(e: F64, covariance: F64, nu: float) -> Epipole:
@@ -190,10 +301,16 @@ def _epipole(e: F64, covariance: F64, nu: float) -> Epipole:
 
 @dataclass(frozen=True)
 class PrecisionBound:
-    """The least covariance (9, 9) of vec(F), unit norm, that any unbiased estimator can have.
+    """Lower bound of the covariance of any unbiased estimator of F.
 
-    ``rms_distance_px`` is the root of the expected mean squared distance of the exact points to their
-    epipolar lines, over both images.
+    Parameters
+    ----------
+    F : ndarray (3, 3)
+        True fundamental matrix, unit norm.
+    covariance : ndarray (9, 9)
+        Bound of the covariance of vec(F).
+    rms_distance_px : float
+        Expected RMS distance of exact points to their epipolar lines over both images.
     """
 
     F: F64
@@ -202,12 +319,46 @@ class PrecisionBound:
 
 
 def fundamental_bound(P1: F64, P2: F64, X: F64, *, sigma_px: float) -> PrecisionBound:
-    """The KCR (Cramer-Rao) lower bound for F from points X (N >= 8, 3) seen by cameras P1, P2 (3, 4).
+    """Compute the KCR (Cramer-Rao) lower bound of the covariance of F for known cameras and points.
 
-    Gaussian noise of ``sigma_px`` on every coordinate: covariance sigma^2 B (J'J)^-1 B' with J the
-    derivatives of the distances from the manifold of exact matches, at the truth (Kanatani, 1996;
-    Chernov and Lesort, 2004). Raises ``ValueError`` for equal centres or a sigma that is not positive, and as
-    :func:`~thesisrecon.epipolar.frame.check_matches`.
+    sigma^2 B (J'J)^-1 B' with J the derivatives of the distances to the manifold of exact matches, at the
+    truth.
+
+    Parameters
+    ----------
+    P1, P2 : ndarray (3, 4)
+        Cameras.
+    X : ndarray (N, 3)
+        Space points, N >= 8.
+    sigma_px : float
+        Standard deviation of the Gaussian noise of every coordinate.
+
+    Returns
+    -------
+    PrecisionBound
+        The bound.
+
+    Raises
+    ------
+    ValueError
+        If the camera centres coincide or ``sigma_px`` is not positive.
+    StageFailure
+        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+
+    References
+    ----------
+    K. Kanatani, Statistical Optimization for Geometric Computation, 1996. N. Chernov and C. Lesort,
+    "Statistical efficiency of curve fitting algorithms", 2004.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> X = np.random.default_rng(0).uniform(-1, 1, (40, 3)) + [0, 0, 5]
+    >>> P1 = np.diag([800.0, 800.0, 1.0]) @ np.eye(3, 4)
+    >>> P2 = P1 + np.array([[0, 0, 0, 400.0], [0, 0, 0, 0], [0, 0, 0, 0]])
+    >>> bound = fundamental_bound(P1, P2, X, sigma_px=0.5)
+    >>> 0.0 < bound.rms_distance_px < 0.5
+    True
     """
     if not (np.isfinite(sigma_px) and sigma_px > 0.0):
         raise ValueError(f"sigma_px must be positive; got {sigma_px}")
@@ -233,4 +384,4 @@ def _check(F: F64, covariance: F64) -> None:
             f"precision needs F (3, 3) and its covariance (9, 9); got {F.shape}, {covariance.shape}"
         )
     if not np.allclose(F, unit_norm(F), atol=1e-9):
-        raise ValueError("precision needs F of unit norm, as its covariance is for")
+        raise ValueError("precision needs F of unit norm, the norm its covariance refers to")

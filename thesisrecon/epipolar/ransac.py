@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.random import Generator
@@ -27,129 +28,47 @@ MINIMUM = 8
 EXACT_PX = 1e-6
 
 
-class InlierTest(Protocol):
-    """Distance of a match to F and the limit of that distance for an inlier."""
-
-    @property
-    def ratio(self) -> float:
-        """Ratio to the Sampson distance if both images have equal weight."""
-
-    @property
-    def limit(self) -> float:
-        """Maximum squared distance of an inlier, in variances of one coordinate."""
-
-    def distances(self, F: F64, xy1: F64, xy2: F64) -> F64:
-        """Return the distances (N,) >= 0, px."""
-
-
 @dataclass(frozen=True)
-class SampsonTest:
-    """Inlier test by the Sampson distance, chi-square with one degree of freedom: 95 % of right matches pass.
+class InlierTest:
+    """Distance of a match to F and its limit for an inlier.
 
     Parameters
     ----------
     ratio : float
-        Ratio to the Sampson distance.
+        Ratio to the Sampson distance if both images have equal weight.
     limit : float
-        Maximum squared distance, in variances of one coordinate.
+        Maximum squared distance of an inlier, in variances of one coordinate.
+    distances : callable
+        ``distances(F, xy1, xy2)`` returns the distances (N,), px, of either sign.
     """
 
-    ratio: float = 1.0
-    limit: float = CHI2_1_95
-
-    def distances(self, F: F64, xy1: F64, xy2: F64) -> F64:
-        """Compute the Sampson distances.
-
-        Parameters
-        ----------
-        F : ndarray (3, 3)
-            Fundamental matrix, px.
-        xy1, xy2 : ndarray (N, 2)
-            Matched points, px.
-
-        Returns
-        -------
-        ndarray (N,)
-            Distances >= 0, px.
-        """
-        return np.abs(sampson_residuals(F, xy1, xy2))
+    ratio: float
+    limit: float
+    distances: Callable[[F64, F64, F64], F64]
 
 
-@dataclass(frozen=True)
-class EpipolarDistanceTest:
-    """First test of section 5.4: both points within 1.96 sigma_d of their epipolar lines.
-
-    The standard deviation sigma_d of a distance to a line is sqrt(2) times that of a coordinate if the images
-    have equal weight; the two distances are then equal and the test is that of Sampson.
-
-    Parameters
-    ----------
-    ratio : float
-        Ratio to the Sampson distance.
-    limit : float
-        Maximum squared distance, in variances of one coordinate.
-    """
-
-    ratio: float = 1.4142135623730951
-    limit: float = 2.0 * CHI2_1_95
-
-    def distances(self, F: F64, xy1: F64, xy2: F64) -> F64:
-        """Compute the larger of the two epipolar distances.
-
-        Parameters
-        ----------
-        F : ndarray (3, 3)
-            Fundamental matrix, px.
-        xy1, xy2 : ndarray (N, 2)
-            Matched points, px.
-
-        Returns
-        -------
-        ndarray (N,)
-            Distances >= 0, px.
-        """
-        return np.asarray(epipolar_distances(F, xy1, xy2).max(axis=1))
+def _larger_epipolar_distance(F: F64, xy1: F64, xy2: F64) -> F64:
+    return np.asarray(epipolar_distances(F, xy1, xy2).max(axis=1))
 
 
-@dataclass(frozen=True)
-class SymmetricDistanceTest:
-    """Second test of section 5.4: sum of both squared epipolar distances below 5.99 sigma_d^2.
-
-    The thesis takes the limit from the chi-square distribution with two degrees of freedom. Both distances
-    are multiples of one residual, so the sum is 2 sigma_d^2 times a chi-square variable with one: 92 % of
-    right matches pass, not 95 %.
-
-    Parameters
-    ----------
-    ratio : float
-        Ratio to the Sampson distance.
-    limit : float
-        Maximum squared distance, in variances of one coordinate.
-    """
-
-    ratio: float = 2.0
-    limit: float = 2.0 * CHI2_2_95
-
-    def distances(self, F: F64, xy1: F64, xy2: F64) -> F64:
-        """Compute the root of the sum of both squared epipolar distances.
-
-        Parameters
-        ----------
-        F : ndarray (3, 3)
-            Fundamental matrix, px.
-        xy1, xy2 : ndarray (N, 2)
-            Matched points, px.
-
-        Returns
-        -------
-        ndarray (N,)
-            Distances >= 0, px.
-        """
-        return symmetric_residuals(F, xy1, xy2)
+# Chi-square with one degree of freedom: 95 % of the right matches pass.
+SAMPSON_TEST = InlierTest(1.0, CHI2_1_95, sampson_residuals)
+# First test of section 5.4: both points within 1.96 sigma_d of their epipolar lines, sigma_d = sqrt(2) sigma.
+# If the images have equal weight the distances are equal and this is the test by the Sampson distance.
+EPIPOLAR_DISTANCE_TEST = InlierTest(1.4142135623730951, 2.0 * CHI2_1_95, _larger_epipolar_distance)
+# Second test of section 5.4: sum of both squared epipolar distances below 5.99 sigma_d^2. The distances are
+# multiples of one residual, so the sum is 2 sigma_d^2 times a chi-square of one degree of freedom, not the
+# two of the thesis: 92 % of the right matches pass, not 95 %.
+SYMMETRIC_DISTANCE_TEST = InlierTest(2.0, 2.0 * CHI2_2_95, symmetric_residuals)
+INLIER_TESTS = {
+    "sampson": SAMPSON_TEST,
+    "epipolar-distance": EPIPOLAR_DISTANCE_TEST,
+    "symmetric-distance": SYMMETRIC_DISTANCE_TEST,
+}
 
 
 def discard_outliers(
-    F: F64, xy1: F64, xy2: F64, *, limit_px: float = np.inf, test: InlierTest | None = None
+    F: F64, xy1: F64, xy2: F64, *, limit_px: float = np.inf, test: InlierTest = SAMPSON_TEST
 ) -> tuple[float, B8]:
     """Estimate the noise from the median distance and test every match against it.
 
@@ -162,8 +81,8 @@ def discard_outliers(
     limit_px : float
         The median is taken over matches with a Sampson distance up to this (at least 8). Without it sigma is
         too large if more than half of the matches are wrong.
-    test : InlierTest, optional
-        :class:`SampsonTest` by default.
+    test : InlierTest
+        Distance and limit of an inlier.
 
     Returns
     -------
@@ -187,22 +106,13 @@ def discard_outliers(
     [True, True, True, True, True, True, True, True, False]
     """
     xy1, xy2 = as_matches(xy1, xy2)
-    test = SampsonTest() if test is None else test
-    residuals = test.distances(F, xy1, xy2)
+    residuals = np.abs(test.distances(F, xy1, xy2))
     if len(residuals) < MINIMUM:
         raise ValueError(f"discard_outliers needs at least {MINIMUM} matches; got {len(residuals)}")
     limit = max(test.ratio * limit_px, float(np.partition(residuals, MINIMUM - 1)[MINIMUM - 1]))
     sigma = noise_scale(residuals[residuals <= limit]) / test.ratio
     inliers = residuals**2 <= max(test.limit * sigma**2, EXACT_PX**2)
     return sigma, inliers if inliers.sum() >= MINIMUM else residuals <= limit
-
-
-SAMPSON_TEST = SampsonTest()
-INLIER_TESTS: dict[str, InlierTest] = {
-    "sampson": SAMPSON_TEST,
-    "epipolar-distance": EpipolarDistanceTest(),
-    "symmetric-distance": SymmetricDistanceTest(),
-}
 
 
 @dataclass(frozen=True)
@@ -252,7 +162,7 @@ class SevenPointProblem:
         ndarray (N,)
             Distances >= 0 in units of the frame.
         """
-        if isinstance(self.test, SampsonTest):
+        if self.test is SAMPSON_TEST:
             return np.asarray(sampson_distances(model, self.points))
         return self.test.distances(model.reshape(3, 3), self.points[:, :2], self.points[:, 2:])
 
@@ -334,10 +244,10 @@ class ThesisRansac:
         >>> import numpy as np
         >>> rng = np.random.default_rng(0)
         >>> xy1 = rng.uniform(0, 500, (60, 2))
-        >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
+        >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1)) + rng.normal(0, 0.3, (60, 2))
         >>> xy2[:15] = rng.uniform(0, 500, (15, 2))
         >>> fit = ThesisRansac().estimate(xy1, xy2, rng)
-        >>> bool(fit.inliers[15:].mean() > 0.9)
+        >>> bool(fit.inliers[15:].mean() > 0.8)
         True
         """
         xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)

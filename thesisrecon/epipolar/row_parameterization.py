@@ -4,8 +4,7 @@ The left null vector (alpha, beta, -1) is the epipole of image 2 (the thesis cal
 epipole with a zero in the place of the dependent row has no such form. The dependent row and the entry fixed
 at 1 are therefore chosen for each F: 18 maps that together reach every matrix of rank 2. Luong and Faugeras
 (IJCV 1996) make a column dependent, too: 36 maps whose parameters are both epipoles and the homography of the
-pencils of epipolar lines. These comparators reach the minimum of :mod:`thesisrecon.epipolar.refinement` more
-slowly.
+pencils of epipolar lines. Both reach the minimum of :mod:`thesisrecon.epipolar.refinement` more slowly.
 """
 
 from __future__ import annotations
@@ -16,10 +15,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar.refinement import (
-    SAMPSON,
-    residuals_and_derivatives,
-)
+from thesisrecon.epipolar.refinement import SAMPSON, residuals_and_derivatives
 from thesisrecon.geometry.two_view import epipoles, unit_norm
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 
@@ -29,133 +25,45 @@ MAPS_TRIED = 4
 
 @dataclass(frozen=True)
 class RowParameterization:
-    """Row ``dependent`` of F is alpha times the first plus beta times the second of the other rows.
+    """F = L B R: row ``row`` of F, and optionally column ``column``, are combinations of the others.
+
+    L (3, 2) holds the identity and (alpha, beta) in the dependent row, R (2, 3) the identity and (gamma,
+    delta) in the dependent column: e2 is (alpha, beta, -1) and e1 (gamma, delta, -1) in that order of
+    coordinates. Without a dependent column B (2, 3) holds the other two rows and R is the identity.
 
     Parameters
     ----------
-    dependent : int
+    row : int
         The dependent row.
     fixed : int
-        Entry (0 to 5, row by row) of the other two rows that is 1.
-    """
-
-    dependent: int
-    fixed: int
-
-    @classmethod
-    def best_for(cls, F: F64) -> RowParameterization:
-        """Return the map in which |alpha|, |beta| and all entries are at most 1.
-
-        Parameters
-        ----------
-        F : ndarray (3, 3)
-            Matrix of rank 2.
-
-        Returns
-        -------
-        RowParameterization
-            The map.
-        """
-        _, e2 = epipoles(F)
-        dependent = int(np.argmax(np.abs(e2)))
-        free = np.delete(F, dependent, axis=0).ravel()
-        return cls(dependent, int(np.argmax(np.abs(free))))
-
-    def parameters(self, F: F64) -> F64:
-        """Compute the parameters of the nearest F of rank 2.
-
-        Parameters
-        ----------
-        F : ndarray (3, 3)
-            Fundamental matrix.
-
-        Returns
-        -------
-        ndarray (7,)
-            Five entries, alpha, beta.
-        """
-        _, e2 = epipoles(F)
-        free = np.delete(F, self.dependent, axis=0).ravel()
-        combination = -np.delete(e2, self.dependent) / e2[self.dependent]
-        return np.concatenate([np.delete(free, self.fixed) / free[self.fixed], combination])
-
-    def matrix(self, parameters: F64) -> F64:
-        """Compute F from its parameters.
-
-        Parameters
-        ----------
-        parameters : ndarray (7,)
-            Five entries, alpha, beta.
-
-        Returns
-        -------
-        ndarray (3, 3)
-            F, rank 2, unit norm.
-        """
-        free = np.insert(parameters[:5], self.fixed, 1.0).reshape(2, 3)
-        return unit_norm(np.insert(free, self.dependent, parameters[5:] @ free, axis=0))
-
-    def tangent(self, parameters: F64) -> F64:
-        """Compute the derivatives of the unit vec(F) by the parameters.
-
-        Parameters
-        ----------
-        parameters : ndarray (7,)
-            Five entries, alpha, beta.
-
-        Returns
-        -------
-        ndarray (9, 7)
-            Derivatives.
-        """
-        free = np.insert(parameters[:5], self.fixed, 1.0).reshape(2, 3)
-        F = np.insert(free, self.dependent, parameters[5:] @ free, axis=0)
-        moves = np.zeros((7, 2, 3))
-        moves.reshape(7, 6)[np.arange(5), np.delete(np.arange(6), self.fixed)] = 1.0
-        rows = parameters[5:] @ moves
-        rows[5:] = free
-        T = np.insert(moves, self.dependent, rows, axis=1).reshape(7, 9).T
-        return _unit_tangent(F.ravel(), T)
-
-
-@dataclass(frozen=True)
-class RowColumnParameterization:
-    """Row ``row`` and column ``column`` of F are combinations of the others: F = L B R, 9 times 4 maps.
-
-    B (2, 2) holds the four remaining entries; L (3, 2) and R (2, 3) hold the identity and (alpha, beta),
-    (gamma, delta) in the dependent place: e2 is (alpha, beta, -1) and e1 (gamma, delta, -1) in that order of
-    coordinates.
-
-    Parameters
-    ----------
-    row, column : int
-        The dependent row and column.
-    fixed : int
-        Entry (0 to 3) of B that is 1.
+        Entry of B, row by row, that is 1.
+    column : int, optional
+        The dependent column.
     """
 
     row: int
-    column: int
     fixed: int
+    column: int | None = None
 
     @classmethod
-    def best_for(cls, F: F64) -> RowColumnParameterization:
+    def best_for(cls, F: F64, *, and_columns: bool = False) -> RowParameterization:
         """Return the map in which all parameters are at most 1.
 
         Parameters
         ----------
         F : ndarray (3, 3)
             Matrix of rank 2.
+        and_columns : bool
+            Make a column dependent, too.
 
         Returns
         -------
-        RowColumnParameterization
+        RowParameterization
             The map.
         """
         e1, e2 = epipoles(F)
-        row, column = int(np.argmax(np.abs(e2))), int(np.argmax(np.abs(e1)))
-        B = np.delete(np.delete(F, row, axis=0), column, axis=1)
-        return cls(row, column, int(np.argmax(np.abs(B))))
+        row, column = int(np.argmax(np.abs(e2))), int(np.argmax(np.abs(e1))) if and_columns else None
+        return cls(row, int(np.argmax(np.abs(cls(row, 0, column)._independent(F)))), column)
 
     def parameters(self, F: F64) -> F64:
         """Compute the parameters of the nearest F of rank 2.
@@ -168,13 +76,14 @@ class RowColumnParameterization:
         Returns
         -------
         ndarray (7,)
-            Three entries, alpha, beta, gamma, delta.
+            Entries of B but one, alpha, beta and, with a dependent column, gamma, delta.
         """
         e1, e2 = epipoles(F)
-        B = np.delete(np.delete(F, self.row, axis=0), self.column, axis=1).ravel()
-        left = -np.delete(e2, self.row) / e2[self.row]
-        right = -np.delete(e1, self.column) / e1[self.column]
-        return np.concatenate([np.delete(B, self.fixed) / B[self.fixed], left, right])
+        B = self._independent(F)
+        parts = [np.delete(B, self.fixed) / B[self.fixed], -np.delete(e2, self.row) / e2[self.row]]
+        if self.column is not None:
+            parts.append(-np.delete(e1, self.column) / e1[self.column])
+        return np.concatenate(parts)
 
     def matrix(self, parameters: F64) -> F64:
         """Compute F from its parameters.
@@ -182,7 +91,7 @@ class RowColumnParameterization:
         Parameters
         ----------
         parameters : ndarray (7,)
-            Three entries, alpha, beta, gamma, delta.
+            As :meth:`parameters` returns them.
 
         Returns
         -------
@@ -198,7 +107,7 @@ class RowColumnParameterization:
         Parameters
         ----------
         parameters : ndarray (7,)
-            Three entries, alpha, beta, gamma, delta.
+            As :meth:`parameters` returns them.
 
         Returns
         -------
@@ -206,22 +115,28 @@ class RowColumnParameterization:
             Derivatives.
         """
         L, B, R = self._factors(parameters)
-        entries = np.delete(np.eye(4), self.fixed, axis=0).reshape(3, 2, 2)
-        rows, columns = np.zeros((2, 3, 2)), np.zeros((2, 2, 3))
-        rows[[0, 1], self.row, [0, 1]] = columns[[0, 1], [0, 1], self.column] = 1.0
-        T = np.concatenate([L @ entries @ R, rows @ B @ R, L @ B @ columns]).reshape(7, 9).T
-        return _unit_tangent((L @ B @ R).ravel(), T)
+        entries = np.delete(np.eye(B.size), self.fixed, axis=0).reshape(-1, *B.shape)
+        rows = np.zeros((2, 3, 2))
+        rows[[0, 1], self.row, [0, 1]] = 1.0
+        parts = [L @ entries @ R, rows @ B @ R]
+        if self.column is not None:
+            columns = np.zeros((2, 2, 3))
+            columns[[0, 1], [0, 1], self.column] = 1.0
+            parts.append(L @ B @ columns)
+        T, f = np.concatenate(parts).reshape(7, 9).T, (L @ B @ R).ravel()
+        norm = np.linalg.norm(f)
+        return np.asarray((T - np.outer(f, f @ T) / norm**2) / norm)
+
+    def _independent(self, F: F64) -> F64:
+        rows = np.delete(F, self.row, axis=0)
+        return (rows if self.column is None else np.delete(rows, self.column, axis=1)).ravel()
 
     def _factors(self, parameters: F64) -> tuple[F64, F64, F64]:
-        B = np.insert(parameters[:3], self.fixed, 1.0).reshape(2, 2)
-        L = np.insert(np.eye(2), self.row, parameters[3:5], axis=0)
-        return L, B, np.insert(np.eye(2), self.column, parameters[5:], axis=1)
-
-
-def _unit_tangent(f: F64, T: F64) -> F64:
-    """Derivatives (9, 7) of f / |f| from those ``T`` of f (9,)."""
-    norm = np.linalg.norm(f)
-    return np.asarray((T - np.outer(f, f @ T) / norm**2) / norm)
+        n = 5 if self.column is None else 3
+        B = np.insert(parameters[:n], self.fixed, 1.0).reshape(2, -1)
+        L = np.insert(np.eye(2), self.row, parameters[n : n + 2], axis=0)
+        R = np.eye(3) if self.column is None else np.insert(np.eye(2), self.column, parameters[5:], axis=1)
+        return L, B, R
 
 
 def refine_by_rows(F: F64, xy1: F64, xy2: F64, *, criterion: int = SAMPSON, and_columns: bool = False) -> F64:
@@ -262,18 +177,15 @@ def refine_by_rows(F: F64, xy1: F64, xy2: F64, *, criterion: int = SAMPSON, and_
     frame = PairFrame.of(xy1, xy2)
     points = frame.points(xy1, xy2)
     current = check_start(F, frame).reshape(3, 3)
-    best_for = RowColumnParameterization.best_for if and_columns else RowParameterization.best_for
     for _ in range(MAPS_TRIED):
-        chart = best_for(current)
+        chart = RowParameterization.best_for(current, and_columns=and_columns)
         current = _minimize_in(chart, current, points, criterion)
-        if best_for(current) == chart:
+        if RowParameterization.best_for(current, and_columns=and_columns) == chart:
             break
     return frame.matrix_in_pixels(current.ravel())
 
 
-def _minimize_in(
-    chart: RowParameterization | RowColumnParameterization, start: F64, points: F64, criterion: int
-) -> F64:
+def _minimize_in(chart: RowParameterization, start: F64, points: F64, criterion: int) -> F64:
     def residuals(p: F64) -> F64:
         r: F64 = residuals_and_derivatives(chart.matrix(p).ravel(), points, criterion)[0]
         return r

@@ -1,7 +1,7 @@
-"""Compiled loops of the robust trifocal tensor: six-point solver, reprojection distances and the search.
+"""Kernels of the robust trifocal tensor: six-point solver, reprojection distances and search.
 
-Tracks are rows (x1, y1, x2, y2, x3, y3) in one frame in which the three images are scaled alike, so that
-distances are pixels times that scale. Cameras are P (3, 3, 4).
+Tracks are rows (x1, y1, x2, y2, x3, y3) in a common frame of the three images, so that distances are pixels
+times its scale. Cameras are P (3, 3, 4).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ SAMPLE = 6
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 DEPENDENT = 1e-9
 STEPS = 2
+# Inverse squares of the widths of the score, in thresholds: 1, 2 and 4.
 WIDTHS = (1.0, 0.25, 0.0625)
-"""Inverse squares of the widths of the score, in thresholds: 1, 2 and 4."""
 
 
 @njit(cache=True, nogil=True)
 def _cross(a: F64, b: F64, out: F64) -> float:
-    """out = a x b; the squared length."""
+    """Compute out = a x b and return its squared length."""
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
@@ -33,7 +33,7 @@ def _cross(a: F64, b: F64, out: F64) -> float:
 
 @njit(cache=True, nogil=True)
 def _null_vector(M: F64, out: F64) -> bool:
-    """Null vector (3,), unit norm, of a matrix (3, 3) of rank 2: its longest product of two rows."""
+    """Unit null vector (3,) of a matrix (3, 3) of rank 2: the longest cross product of two rows."""
     best, trial = 0.0, np.empty(3)
     for k in range(3):
         squared = _cross(M[k], M[(k + 1) % 3], trial)
@@ -69,7 +69,7 @@ def _basis_matrix(track: F64, sample: I64, view: int, B: F64) -> bool:
 
 @njit(cache=True, nogil=True)
 def _in_basis(B: F64, x: float, y: float, out: F64) -> None:
-    """B^-1 (x, y, 1) as a unit vector."""
+    """Compute B^-1 (x, y, 1) as a unit vector."""
     columns = B.T
     area = np.empty(3)
     for k in range(3):
@@ -80,10 +80,10 @@ def _in_basis(B: F64, x: float, y: float, out: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def _reduced_pencil(five: F64, six: F64, pencil: F64) -> bool:
-    """Orthonormal span (2, 9) of the matrices G, zero on the diagonal and of sum 0, with x6'G x5 = 0.
+    """Orthonormal basis (2, 9) of the G with zero diagonal, sum 0 and x6' G x5 = 0.
 
     ``five`` and ``six`` (3, 3) are the unit vectors of the fifth and sixth point in the basis of the others,
-    a row for each view. False where the equations are dependent.
+    one row per view. False if the equations are dependent.
     """
     Q = np.zeros((6, 6))
     Q[0] = 1.0
@@ -92,7 +92,7 @@ def _reduced_pencil(five: F64, six: F64, pencil: F64) -> bool:
             Q[v + 1, c] = six[v, OFF_DIAGONAL[c][0]] * five[v, OFF_DIAGONAL[c][1]]
     for k in range(6):
         if k >= 4:
-            # The coordinate vector that is farthest from the span completes it.
+            # Complete the basis with the coordinate vector farthest from the span.
             inside = np.zeros(6)
             for m in range(k):
                 inside += Q[m] ** 2
@@ -115,7 +115,7 @@ def _reduced_pencil(five: F64, six: F64, pencil: F64) -> bool:
 
 @njit(cache=True, nogil=True)
 def _sixth_point(G: F64, X: F64) -> bool:
-    """The sixth point (4,), where the others are E_1, ..., E_4 and (1, 1, 1, 1), of a singular G (3, 3).
+    """The sixth point (4,) of a singular G (3, 3), the others being E_1, ..., E_4 and (1, 1, 1, 1).
 
     G = [u]x diag(X, Y, Z) with u = (X - W, Y - W, Z - W), its left null vector; the right one is u / X.
     """
@@ -138,10 +138,10 @@ def _sixth_point(G: F64, X: F64) -> bool:
 
 @njit(cache=True, nogil=True)
 def _reduced_camera(B: F64, five: F64, six: F64, X: F64, P: F64) -> bool:
-    """P (3, 4) = B [a 0 0 d; 0 b 0 d; 0 0 c d], unit norm, that shows (1, 1, 1, 1) and X where they are."""
+    """P (3, 4) = B [a 0 0 d; 0 b 0 d; 0 0 c d], unit norm, that projects (1, 1, 1, 1) and X."""
     M, mix = np.empty((3, 3)), np.empty(3)
     for k in range(3):
-        # a = s x5 - d and its like, put into a X + d W = t x6.
+        # a = s x5 - d and so on, put into a X + d W = t x6.
         M[k, 0], M[k, 1], M[k, 2] = five[k] * X[k], X[3] - X[k], -six[k]
     if not _null_vector(M, mix):
         return False
@@ -159,11 +159,25 @@ def _reduced_camera(B: F64, five: F64, six: F64, X: F64, P: F64) -> bool:
 
 @njit(cache=True, nogil=True)
 def six_point(track: F64, sample: I64, P: F64) -> int:
-    """Cameras (``P`` (3, 3, 3, 4), a solution each) that show six points of space as the sample; how many.
+    """Compute the cameras of three views from six points.
 
-    Quan (1995) by Carlsson's duality: in the frame of five of the points the two last images obey the
-    epipolar constraint of the sixth point, the same in all views, which with four constraints that hold for
-    every point is the seven-point problem of (5.2): 0 to 3 real solutions.
+    Quan (1995) by Carlsson's duality: in the frame of five points the last two images satisfy an epipolar
+    constraint that is the same in all views. With four constraints that hold for every point it is the
+    seven-point problem of (5.2).
+
+    Parameters
+    ----------
+    track : ndarray (N, 6)
+        Tracks.
+    sample : ndarray (6,) of int
+        Indices of the tracks.
+    P : ndarray (3, 3, 3, 4)
+        Output: the three cameras of each solution.
+
+    Returns
+    -------
+    int
+        Number of solutions, 0 to 3.
     """
     B, five, six = np.empty((3, 3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for v in range(3):
@@ -188,9 +202,9 @@ def six_point(track: F64, sample: I64, P: F64) -> int:
 
 @njit(cache=True, nogil=True)
 def _in_front(P: F64, X6: F64) -> bool:
-    """Whether the six points can be in front of all three cameras, in some frame and with some signs.
+    """Return whether the six points can be in front of all three cameras, in some frame with some signs.
 
-    The depths of every two views have the same sign for all points, or opposite ones for all.
+    The depths of every two views must have the same sign for all points, or opposite signs for all.
     """
     agreed1, agreed2 = 0.0, 0.0
     for k in range(SAMPLE):
@@ -234,9 +248,10 @@ def _first_ray(P1: F64, C: F64, D: F64) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _start_on_ray(C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> None:
-    """X (4,) on the ray of the first image, where the lines through the others see it best.
+    """X (4,) on the ray of the first image nearest to the lines through the other images.
 
-    The lines run across the epipolar lines, so a point of the plane of the three centres is no exception.
+    The lines are perpendicular to the epipolar lines, so points of the plane of the three centres are no
+    exception.
     """
     aa, ad, dd = 0.0, 0.0, 0.0
     for v in range(2):
@@ -262,8 +277,8 @@ def _start_on_ray(C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> None:
 def _squared_distance(P: F64, C: F64, D: F64, A: F64, e: F64, track: F64, X: F64) -> float:
     """Sum over three views of the squared distances of a track to the reprojection of its best point X (4,).
 
-    ``A`` (2, 3, 3) = P2 D, P3 D and ``e`` (2, 3) = P2 C, P3 C. From :func:`start_on_ray`, two steps of Gauss
-    and Newton.
+    ``A`` (2, 3, 3) = P2 D, P3 D and ``e`` (2, 3) = P2 C, P3 C. Two Gauss-Newton steps from
+    :func:`_start_on_ray`.
     """
     _start_on_ray(C, D, A, e, track, X)
     H, g = np.empty((4, 4)), np.empty(4)
@@ -327,7 +342,17 @@ def _gauss_newton_step(H: F64, g: F64, X: F64) -> bool:
 
 @njit(cache=True, nogil=True)
 def reprojection_distances(P: F64, track: F64, distances: F64) -> None:
-    """Root of the sum over three views of a track's squared distances to its reprojection; (N,)."""
+    """Compute the distance of each track to its reprojection in three views.
+
+    Parameters
+    ----------
+    P : ndarray (3, 3, 4)
+        Cameras.
+    track : ndarray (N, 6)
+        Tracks.
+    distances : ndarray (N,)
+        Output: root of the sum of squared distances over the views.
+    """
     C, D, X = np.empty(4), np.empty((4, 3)), np.empty(4)
     if not _first_ray(P[0], C, D):
         distances[:] = np.inf
@@ -341,10 +366,7 @@ def reprojection_distances(P: F64, track: F64, distances: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def _gain(squared: float, inverse: float) -> float:
-    """What a track adds to the score: the mean over three widths of 1 - d^2 / width^2 where that is positive.
-
-    ``inverse`` is that of the squared threshold.
-    """
+    """Mean over three widths of 1 - d^2 / width^2 if positive; ``inverse`` is 1 / threshold^2."""
     total = 0.0
     for shrink in WIDTHS:
         total += max(0.0, 1.0 - squared * inverse * shrink)
@@ -353,7 +375,7 @@ def _gain(squared: float, inverse: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _score(P: F64, track: F64, inverse: float, bar: float) -> float:
-    """Sum of the gains of all tracks, 0 as soon as it cannot come above ``bar`` any more."""
+    """Sum of the gains of all tracks, 0 as soon as it cannot exceed ``bar``."""
     C, D, X = np.empty(4), np.empty((4, 3)), np.empty(4)
     if not _first_ray(P[0], C, D):
         return 0.0
@@ -371,7 +393,20 @@ def _score(P: F64, track: F64, inverse: float, bar: float) -> float:
 
 @njit(cache=True, nogil=True)
 def draw_samples(uniforms: F64, n: int) -> I64:
-    """Samples of distinct indices below n from uniform numbers (S, k); (S, k)."""
+    """Draw samples of distinct indices.
+
+    Parameters
+    ----------
+    uniforms : ndarray (S, k)
+        Uniform random numbers in [0, 1).
+    n : int
+        Upper bound of the indices.
+
+    Returns
+    -------
+    ndarray (S, k) of int
+        Sorted samples.
+    """
     samples = np.empty(uniforms.shape, dtype=np.int64)
     for s in range(len(uniforms)):
         draw_sample(uniforms[s], n, samples[s])
@@ -380,9 +415,27 @@ def draw_samples(uniforms: F64, n: int) -> I64:
 
 @njit(cache=True, nogil=True)
 def search_trifocal(track: F64, samples: I64, scored: F64, threshold: float, bar: float, best: F64) -> float:
-    """The best score over ``judges`` above ``bar`` of ``samples`` (S, 6) of tracks, its cameras in ``best``.
+    """Find the cameras with the best score among the solutions of samples.
 
-    ``bar`` itself, with ``best`` untouched, where none is better.
+    Parameters
+    ----------
+    track : ndarray (N, 6)
+        Tracks.
+    samples : ndarray (S, 6) of int
+        Samples of tracks.
+    scored : ndarray (M, 6)
+        Tracks that define the score.
+    threshold : float
+        Width of the score.
+    bar : float
+        Score to exceed.
+    best : ndarray (3, 3, 4)
+        Output: best cameras, unchanged if none exceeds ``bar``.
+
+    Returns
+    -------
+    float
+        Best score, or ``bar``.
     """
     P = np.empty((3, 3, 3, 4))
     for s in range(len(samples)):

@@ -1,14 +1,11 @@
-"""The reprojection error of points and lines in three views, as a problem for Levenberg-Marquardt.
-
-P1 = [I 0] stays; P2 and P3 move with all their 24 entries, of which 18 matter (the scales and the frame of
-space are left to the damping). A point moves in the 3 directions across its vector, a line, kept by two
-orthonormal points, in the 4 across their plane: neither has a position in which this fails.
-
-Section 3.6.3: the trifocal tensor that fits points and lines of three views best in pixels.
+"""Section 3.6.3: the trifocal tensor with the least reprojection error of points and lines in three views.
 
 Three steps, each the start of the next: linear equations; the least algebraic error among tensors that have
-cameras, over the two epipoles (Hartley and Zisserman, algorithm 16.2); the least reprojection error over
-cameras, points and lines (their 16.4), by Levenberg-Marquardt with the points and lines eliminated.
+cameras, over the two epipoles (HZ, algorithm 16.2); the least reprojection error over cameras, points and
+lines (HZ 16.4) by Levenberg-Marquardt with points and lines eliminated. P1 = [I 0] stays fixed; P2 and P3
+move with all their 24 entries, 18 of which matter (damping handles the scales and the frame of space). A
+point moves in the 3 directions orthogonal to its vector, a line, represented by two orthonormal points, in 4:
+both without singularities.
 """
 
 from __future__ import annotations
@@ -43,7 +40,7 @@ from thesisrecon.numerics.losses import LOSSES
 
 @dataclass(frozen=True)
 class _State:
-    """Conditioned cameras (3, 3, 4), unit points (N, 4), lines (M, 2, 4) by two orthonormal points."""
+    """Conditioned cameras (3, 3, 4), unit points (N, 4) and lines (M, 2, 4) as two orthonormal points."""
 
     P: F64
     X: F64
@@ -52,7 +49,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Step:
-    """Moves of P2 and P3 (24,), of points (N, 3) and lines (M, 4) in their tangent spaces."""
+    """Steps of P2 and P3 (24,), of points (N, 3) and lines (M, 4) in their tangent spaces."""
 
     cameras: F64
     points: F64
@@ -61,7 +58,7 @@ class _Step:
 
 @dataclass(frozen=True)
 class _FeatureBlock:
-    """Normal equations of one kind of feature: with the cameras W (n, 24, f), alone V (n, f, f), h (n, f)."""
+    """Normal equations of features: camera coupling W (n, 24, f), own V (n, f, f), gradient h (n, f)."""
 
     W: F64
     V: F64
@@ -76,7 +73,7 @@ class _FeatureBlock:
         return solved[:, :, :-1], solved[:, :, -1]
 
     def diagonal(self, damping: float) -> F64:
-        """What the damping adds to the diagonals of V; (n, f)."""
+        """Damping terms (n, f) of the diagonals of V."""
         diagonal = np.diagonal(self.V, axis1=1, axis2=2)
         return damping * np.asarray(floored_diagonal(diagonal))
 
@@ -91,7 +88,7 @@ class _System:
     blocks: tuple[_FeatureBlock, _FeatureBlock]
 
     def reduced(self, damping: float) -> tuple[F64, F64, list[tuple[F64, F64]]]:
-        """The damped system S c = b of the cameras alone, with each block's part of the way back."""
+        """The damped system S c = b of the cameras, and V^-1 W', V^-1 h of each block."""
         S = self.H + np.diag(damping * floored_diagonal(np.diag(self.H)))
         b = -self.g
         solved = [block.damped(damping) for block in self.blocks]
@@ -101,7 +98,7 @@ class _System:
         return S, b, solved
 
     def solve(self, damping: float) -> tuple[_Step, float] | None:
-        """The damped step and the gain it promises."""
+        """The damped step and its predicted gain."""
         S, b, solved = self.reduced(damping)
         cameras = solve_positive(S, b)
         if cameras is None:
@@ -116,7 +113,7 @@ class _System:
 
 @dataclass(frozen=True)
 class _ReprojectionProblem:
-    """points (N, 3, 2) and ends (M, 3, 2, 3), conditioned; ``scale`` (3,) conditioned units per pixel."""
+    """Conditioned points (N, 3, 2) and segment ends (M, 3, 2, 3); ``scale`` (3,) per pixel."""
 
     points: F64
     ends: F64
@@ -125,12 +122,13 @@ class _ReprojectionProblem:
 
     @classmethod
     def of(cls, points: F64, segments: F64, transforms: F64, loss_px: float) -> _ReprojectionProblem:
+        """Condition points and segments by ``transforms`` (3, 3, 3)."""
         x = homogenize(points) @ transforms.swapaxes(1, 2)
         y = homogenize(segments) @ transforms.swapaxes(1, 2)[:, None]
         return cls(x[:, :, :2].swapaxes(0, 1), y.swapaxes(0, 1), transforms[:, 0, 0], loss_px)
 
     def start(self, T: F64) -> _State:
-        """Cameras of a conditioned tensor, points by triangulation, lines as the meet of their planes."""
+        """Cameras of a conditioned tensor, triangulated points, lines as intersections of planes."""
         P = np.stack(cameras_from_tensor(T))
         P[1:] /= np.linalg.norm(P[1:], axis=(1, 2), keepdims=True)
         X = _off_principal_planes(triangulate_linear(P, self.points.swapaxes(0, 1)), P)
@@ -157,7 +155,7 @@ class _ReprojectionProblem:
         return _System(0.5 * float(rho.sum()), H, g, (blocks[0], blocks[1]))
 
     def retract(self, state: _State, step: _Step) -> _State:
-        """Cameras and points of unit norm, lines orthonormal again."""
+        """Apply a step; cameras and points keep unit norm, lines stay orthonormal."""
         P = state.P.copy()
         P[1:] += step.cameras.reshape(2, 3, 4)
         P[1:] /= np.linalg.norm(P[1:], axis=(1, 2), keepdims=True)
@@ -167,14 +165,14 @@ class _ReprojectionProblem:
         return _State(P, X, np.linalg.qr(lines.swapaxes(1, 2))[0].swapaxes(1, 2))
 
     def cost(self, state: _State) -> float:
-        """1/2 sum rho, px^2; inf where a point falls on a principal plane."""
+        """1/2 sum rho, px^2; inf if a point lies on a principal plane."""
         residual = self.residual(state)
         if not np.isfinite(residual).all():
             return np.inf
         return 0.5 * float(LOSSES["huber"](np.sum(residual**2, axis=2), self.loss_px)[0].sum())
 
     def residual(self, state: _State) -> F64:
-        """Offsets of the points, then distances of the segments' ends; (N + M, 3 views, 2) px."""
+        """Offsets of the points, then distances of the segment ends; (N + M, 3 views, 2) px."""
         p = np.einsum("vab,nb->nva", state.P, state.X)
         with np.errstate(divide="ignore", invalid="ignore"):
             offset = p[:, :, :2] / p[:, :, 2:] - self.points
@@ -182,16 +180,16 @@ class _ReprojectionProblem:
         return np.concatenate([offset, distance]) / self.scale[:, None]
 
     def _line_images(self, state: _State) -> tuple[F64, F64]:
-        """Images (M, 3, 3) of the two points that stand for each line."""
+        """Images (M, 3, 3) of the two points that represent each line."""
         ends = np.einsum("vab,meb->mvea", state.P, state.lines)
         return ends[:, :, 0], ends[:, :, 1]
 
     def _line_distances(self, p: F64, q: F64) -> F64:
-        """Signed distances (M, 3, 2) of the segments' ends to the lines through p and q, conditioned."""
+        """Signed distances (M, 3, 2) of the segment ends to the lines through p and q, conditioned."""
         return np.asarray(np.einsum("mvea,mva->mve", self.ends, unit_normals(line_through(p, q))))
 
     def _point_jacobian(self, state: _State) -> tuple[F64, F64]:
-        """By the cameras (N, 3, 2, 24) and the points (N, 3, 2, 3), px."""
+        """Derivatives by the cameras (N, 3, 2, 24) and the points (N, 3, 2, 3), px."""
         p = np.einsum("vab,nb->nva", state.P, state.X)
         by_image = np.zeros((*p.shape[:2], 2, 3))
         by_image[:, :, 0, 0] = by_image[:, :, 1, 1] = 1.0 / p[:, :, 2]
@@ -201,7 +199,7 @@ class _ReprojectionProblem:
         return _camera_columns(np.einsum("nvra,nb->nvrab", by_image, state.X)), by_point
 
     def _line_jacobian(self, state: _State) -> tuple[F64, F64]:
-        """By the cameras (M, 3, 2, 24) and the lines (M, 3, 2, 4), px: d = l.y / |(l_1, l_2)|, l = p x q."""
+        """Derivatives by cameras (M, 3, 2, 24) and lines (M, 3, 2, 4): d = l.y / |(l_1, l_2)|, l = p x q."""
         p, q = self._line_images(state)
         l = line_through(p, q)
         size = np.linalg.norm(l[:, :, :2], axis=2)[:, :, None]
@@ -218,7 +216,7 @@ class _ReprojectionProblem:
 
 
 def _off_principal_planes(X: F64, P: F64) -> F64:
-    """Unit points X (N, 4), those exactly on a principal plane moved off it, where they have an image."""
+    """Unit points X (N, 4), moved off a principal plane so that they have an image."""
     on = (np.einsum("va,na->nv", P[:, 2], X) == 0.0).any(axis=1)
     X = X + 1e-9 * on[:, None] * np.array([0.6, -0.5, 0.4, 0.3])
     return np.asarray(X / np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300))
@@ -238,30 +236,45 @@ def _camera_columns(by_camera: F64) -> F64:
     return columns.reshape(n, 3, 2, 24)
 
 
+# Maximum weakness of a fit. Planes, rotations and random matches give 0.5 to 1.5 at any noise; scenes with
+# depth and noise of a hundredth of the parallax below 0.1.
 WEAK = 0.4
-"""Weakness beyond which a fit is refused. Planes, rotations and chance matches come out between 0.5 and 1.5
-at any noise; scenes with depth, noise being a hundredth of the parallax, below 0.1."""
 
+# A fit is refused if noise of 1.25 times its own explains six tensors of the linear equations. Points or
+# lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls at most 5, which the
+# constraints of the cameras resolve.
 SAME_NOISE, FAMILY = 1.25, 6
-"""A fit is refused where noise up to 1.25 that of the fit explains a family of six tensors by the linear
-equations. Points or lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls 5 at
-most: what the linear equations leave free there, the constraints of the cameras determine."""
 
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 
 
 @dataclass(frozen=True)
 class TrifocalFit:
-    """A tensor with the cameras it is made of.
+    """A trifocal tensor with its cameras.
 
-    ``T`` (3, 3, 3) unit norm and ``P`` (3, 3, 4), P[0] = [I 0], in pixels; ``X`` (N, 4) points; ``lines`` (M,
-    2, 4) two points of each line; ``point_residuals_px`` (3, N) distances of the images to the reprojected
-    points, ``line_residuals_px`` (3, M, 2) of the segments' ends to the reprojected lines; ``sigma_px`` the
-    noise of one coordinate, from all residuals and the freedoms left; ``covariance`` (27, 27) of T,
-    row-major, to first order for that noise, of rank 18. ``weakness`` is the
-    standard deviation of T in its least certain direction, in coordinates conditioned as for the linear
-    equations and relative to T, times the root of the number of matches: near 1, a change of T by its own
-    size moves the images no more than their noise.
+    Parameters
+    ----------
+    T : ndarray (3, 3, 3)
+        Tensor in pixels, unit norm.
+    P : ndarray (3, 3, 4)
+        Cameras in pixels, P[0] = [I 0].
+    X : ndarray (N, 4)
+        Points.
+    lines : ndarray (M, 2, 4)
+        Two points of each line.
+    point_residuals_px : ndarray (3, N)
+        Distances of the points to their reprojections.
+    line_residuals_px : ndarray (3, M, 2)
+        Distances of the segment ends to the reprojected lines.
+    sigma_px : float
+        Noise of one coordinate from all residuals and degrees of freedom.
+    covariance : ndarray (27, 27)
+        First-order covariance of T, row-major, rank 18.
+    weakness : float
+        Largest standard deviation of T in conditioned coordinates, relative to T, times the root of the
+        number of matches. Near 1 a change of T by its own size moves the images no more than their noise.
+    iterations : int
+        Iterations of Levenberg-Marquardt.
     """
 
     T: F64
@@ -277,16 +290,15 @@ class TrifocalFit:
 
 
 def _minimize_algebraic_error(equations: TensorEquations, start: F64) -> F64:
-    """T (3, 3, 3), unit norm, that has cameras and the least |A t|, near a tensor ``start`` (HZ 16.2).
+    """T (3, 3, 3), unit norm, with cameras and the least |A t| near a tensor ``start`` (HZ 16.2).
 
-    Both in the equations' conditioned coordinates. The epipoles are the six parameters; all other entries
-    follow from them.
+    Conditioned coordinates. The epipoles are the six parameters; all other entries follow from them.
     """
 
     def tensor(epipoles: F64) -> F64:
         e2, e3 = epipoles[:3], epipoles[3:]
         T = equations.solve_with_epipoles(e2 / np.linalg.norm(e2), e3 / np.linalg.norm(e3))
-        # The singular vector has either sign: that of the start keeps the residuals continuous.
+        # The sign of the start keeps the residuals continuous.
         return T * (1.0 if np.sum(T * start) >= 0.0 else -1.0)
 
     e2, e3 = tensor_epipoles(start)
@@ -297,15 +309,50 @@ def _minimize_algebraic_error(equations: TensorEquations, start: F64) -> F64:
 def estimate_trifocal(
     points: F64 = NO_POINTS, segments: F64 = NO_SEGMENTS, *, loss_px: float = 1.0, max_iterations: int = 50
 ) -> TrifocalFit:
-    """Tensor and cameras of three views with the least reprojection error of points and lines.
+    """Estimate the trifocal tensor and cameras from points and lines of three views.
 
-    points (3, N, 2) px; segments (3, M, 2, 2) px, the ends of each line's piece in each view, which need not
-    match each other; 4 N + 2 M >= 26. Minimises sum rho over images of the squared distance of a point to its
-    reprojection and of the two squared distances of a segment's ends to its reprojected line, rho = Huber's
-    loss at ``loss_px``: optimal for Gaussian noise of the points and ends, tolerant of a few wrong matches.
-    Raises ``ValueError`` for wrong shapes and values that are not finite, ``StageFailure`` for too few
-    matches and where they leave the tensor free, exactly or up to their noise: points of one plane or line, a
-    pure rotation, matches by chance. Points of the plane of the three centres are no exception.
+    Minimises Huber's loss of the squared distances of points to their reprojections and of segment ends to
+    their reprojected lines: optimal for Gaussian noise, tolerant of a few wrong matches. The ends of a
+    segment need not match between views.
+
+    Parameters
+    ----------
+    points : ndarray (3, N, 2)
+        Matched points, px.
+    segments : ndarray (3, M, 2, 2)
+        Ends of matched line segments, px; 4 N + 2 M >= 26.
+    loss_px : float
+        Width of Huber's loss.
+    max_iterations : int
+        Maximum number of iterations.
+
+    Returns
+    -------
+    TrifocalFit
+        Tensor, cameras, points, lines, noise and covariance.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are wrong or values are not finite.
+    StageFailure
+        If there are too few matches, or they do not determine the tensor, exactly or within their noise:
+        points of one plane or line, pure rotation, random matches.
+
+    References
+    ----------
+    Hartley and Zisserman, Multiple View Geometry, chapter 16.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.geometry.camera_matrix import project
+    >>> X = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + [0, 0, 5]
+    >>> K, views = np.diag([800.0, 800.0, 1.0]), ([0, 0, 0], [-1, 0.2, 0], [0.3, -1, 0.4])
+    >>> points = np.stack([project(K @ np.c_[np.eye(3), t], X) for t in views])
+    >>> fit = estimate_trifocal(points)
+    >>> bool(fit.point_residuals_px.max() < 1e-6)
+    True
     """
     if not loss_px > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
@@ -313,18 +360,18 @@ def estimate_trifocal(
     n, m = points.shape[1], segments.shape[1]
     if 4 * n + 2 * m < NEEDED_EQUATIONS:
         raise StageFailure(
-            "too few matches for the geometry of three views",
-            f"found {n} points and {m} lines, needed 7 points, 13 lines or a mixture",
-            "use photographs that overlap more",
+            "too few matches for the trifocal tensor",
+            f"found {n} points and {m} lines; 7 points, 13 lines or a mixture are needed",
+            "use images with more overlap",
         )
     equations = tensor_equations(points, segments)
     try:
         start = equations.solve()
     except ValueError as error:
         raise StageFailure(
-            "the matches do not determine the geometry of three views",
+            "the matches do not determine the trifocal tensor",
             f"{n} points and {m} lines in a special position",
-            "use matches that do not lie on one plane",
+            "add matches off the dominant plane",
         ) from error
     T = equations.in_pixels(_minimize_algebraic_error(equations, start))
     fit = refine_trifocal(T, points, segments, loss_px=loss_px, max_iterations=max_iterations)
@@ -333,36 +380,72 @@ def estimate_trifocal(
 
 
 def require_determined(fit: TrifocalFit, equations: TensorEquations, xy: F64, *, weak: float = WEAK) -> None:
-    """``StageFailure`` where the noise alone decides the fit; xy (3, K, 2) all points and ends, in px.
+    """Raise if the noise alone decides a trifocal fit.
 
-    Three kinds of evidence: noise like that of the fit explains many solutions of the linear equations; the
-    covariance of the fit; the matches are of one line of an image.
+    Three indicators: noise like that of the fit explains many solutions of the linear equations; the
+    covariance of the fit; collinear matches in an image.
+
+    Parameters
+    ----------
+    fit : TrifocalFit
+        The fit.
+    equations : TensorEquations
+        Linear equations of its matches.
+    xy : ndarray (3, K, 2)
+        All points and segment ends, px.
+    weak : float
+        Maximum weakness.
+
+    Raises
+    ------
+    StageFailure
+        If the tensor is undetermined.
     """
     family = int(np.sum(equations.noise_levels_px() <= SAME_NOISE * fit.sigma_px))
     across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
     if not (family < FAMILY and fit.weakness <= weak and narrowest > 3.0 * fit.sigma_px):
         raise StageFailure(
-            "the matches do not determine the geometry of three views",
-            f"noise {fit.sigma_px:.2g} px, which explains {family} independent tensors where {FAMILY - 1} "
-            f"is the most, narrowest spread of the matches {narrowest:.3g} px, weakness {fit.weakness:.2g} "
-            f"where {weak:.2g} is the most",
-            "use matches of more than one plane from three places; wrong matches look like this, too",
+            "the matches do not determine the trifocal tensor",
+            f"noise {fit.sigma_px:.2g} px explains {family} independent tensors (at most {FAMILY - 1}); "
+            f"narrowest spread of the matches {narrowest:.3g} px; weakness {fit.weakness:.2g} (at most "
+            f"{weak:.2g})",
+            "use matches off one plane from three different positions, and check for wrong matches",
         )
 
 
 def refine_trifocal(
     T: F64, points: F64, segments: F64, *, loss_px: float = 1.0, max_iterations: int = 50
 ) -> TrifocalFit:
-    """The fit of least reprojection error near a tensor T (3, 3, 3) in px, as :func:`estimate_trifocal`.
+    """Minimise the reprojection error of points and lines from a start.
 
-    Nothing is refused for what the fit turns out to be. Raises ``ValueError`` as
-    :func:`~thesisrecon.geometry.three_view.tensor_equations` and for a T that is not finite or zero.
+    Parameters
+    ----------
+    T : array_like (3, 3, 3)
+        Start, px.
+    points : ndarray (3, N, 2)
+        Matched points, px.
+    segments : ndarray (3, M, 2, 2)
+        Ends of matched line segments, px.
+    loss_px : float
+        Width of Huber's loss.
+    max_iterations : int
+        Maximum number of iterations.
+
+    Returns
+    -------
+    TrifocalFit
+        The fit; whether the matches determine it is not tested.
+
+    Raises
+    ------
+    ValueError
+        As :func:`~thesisrecon.geometry.three_view.tensor_equations`, or if T is zero or not finite.
     """
     points, segments = check_triplets(points, segments)
     T = np.asarray(T, dtype=np.float64)
     if T.shape != (3, 3, 3) or not np.isfinite(T).all() or not T.any():
-        raise ValueError(f"the refinement starts from a finite tensor (3, 3, 3) that is not 0; got {T.shape}")
+        raise ValueError(f"the refinement needs a finite tensor (3, 3, 3) other than 0; got {T.shape}")
     transforms = tensor_equations(points, segments).transforms
     problem = _ReprojectionProblem.of(points, segments, transforms, loss_px)
     solution = run_levenberg_marquardt(
@@ -397,7 +480,7 @@ def refine_trifocal(
 
 
 def _pixel_cameras(P: F64, transforms: F64) -> tuple[F64, F64]:
-    """Conditioned cameras in pixels with P1 = [I 0], and the (4, 4) transform of space that goes with it."""
+    """Conditioned cameras in pixels with P1 = [I 0], and the (4, 4) transform of space."""
     G = np.eye(4)
     G[:3, :3] = np.linalg.inv(transforms[0])
     return np.asarray(np.linalg.inv(transforms) @ P @ np.linalg.inv(G)), G
@@ -413,7 +496,7 @@ def _tensor_and_root(problem: _ReprojectionProblem, state: _State) -> tuple[F64,
     information = problem.linearize(state).reduced(1e-12)[0]
     scale = 1.0 / np.sqrt(floored_diagonal(np.diag(information)))
     values, vectors = np.linalg.eigh(information * scale * scale[:, None])
-    # 6 of the 24 freedoms are the cameras' scales and the frame of space, which T does not feel.
+    # 6 of the 24 parameters are the camera scales and the frame of space, on which T does not depend.
     root = scale[:, None] * vectors[:, 6:] / np.sqrt(np.maximum(values[6:], 1e-14 * values[-1]))
     return _normalized(T, J @ root)
 
@@ -426,13 +509,13 @@ def _normalized(T: F64, root: F64) -> tuple[F64, F64]:
 
 
 def _in_pixels(transforms: F64) -> F64:
-    """(27, 27) matrix that takes flat conditioned tensors to pixels."""
+    """Matrix (27, 27) that takes flat conditioned tensors to pixels."""
     inverse = np.linalg.inv(transforms)
     by_index = np.einsum("ri,js,kt->ijkrst", transforms[0], inverse[1], inverse[2])
     return np.asarray(by_index.reshape(27, 27))
 
 
 def _canonical_tensor(P2: F64, P3: F64) -> F64:
-    """T_i^jk = a_i^j b_4^k - a_4^j b_i^k of cameras beside [I 0], not normalised (HZ 15.1)."""
+    """T_i^jk = a_i^j b_4^k - a_4^j b_i^k of cameras with P1 = [I 0], not normalised (HZ 15.1)."""
     of_first = np.einsum("ji,k->ijk", P2[:, :3], P3[:, 3])
     return np.asarray(of_first - np.einsum("j,ki->ijk", P2[:, 3], P3[:, :3]))

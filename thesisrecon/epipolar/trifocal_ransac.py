@@ -1,9 +1,9 @@
-"""Section 3.6.3 by the method of 5.4: the trifocal tensor of tracks many of which are wrong.
+"""Section 3.6.3 by the method of 5.4: the trifocal tensor of tracks with outliers.
 
-Samples of six tracks (Quan 1995; Torr and Zisserman 1997; Hartley and Zisserman, algorithm 16.4), scored by
-their reprojection in all three views over several widths of the noise; every better sample is refined on the
-tracks it agrees with; at the end the noise is estimated, the tracks are judged by it, and the tensor of least
-reprojection error of the right ones, with the lines that agree, is found.
+Samples of six tracks (Quan 1995; Torr and Zisserman 1997; HZ, algorithm 16.4) are scored by their
+reprojection in all three views over several widths of the noise; every better sample is refined on its
+inliers. At the end the noise is estimated, tracks and lines are tested against it, and the tensor with the
+least reprojection error is computed.
 """
 
 from __future__ import annotations
@@ -37,25 +37,32 @@ from thesisrecon.numerics.ransac import required_samples
 CHUNK, COMPLETIONS = 200, 1000
 REFINEMENTS, SHORT = 3, 4
 ROUNDS, MIXTURE_STEPS = 6, 100
+# Maximum distance of an inlier in sigma: 99.3 % of a chi variable with 3 degrees of freedom.
 INSIDE = 3.5
-"""Widths of the noise within which a track is right: of 3 freedoms, 99.3 % are."""
 LINE_INSIDE = 3.2
 OFF_PLANE, PLANE_ROUNDS, PLANE_WIDTH = 4, 6, 6.0
+# Width of Huber's loss in sigma.
 HUBER = 3.0
-"""Widths of the noise from which a residual counts less in the refinement."""
+# Minimum number of tracks, and the spread below which powers underflow.
 NEEDED, SMALLEST_PX = 9, 1e-50
-"""Tracks, and their spread, below which powers of it underflow."""
+# Stricter than for matches without outliers: a plane with a few wrong tracks that fit has 0.25 to 0.4.
 WEAK = 0.2
-"""As in :func:`estimate_trifocal`, but less: of a plane and a wrong track or two that happen to fit it is
-0.25 to 0.4."""
 
 
 @dataclass(frozen=True)
 class RobustTrifocal:
-    """A :class:`TrifocalFit` of the right matches and which they are.
+    """A trifocal fit of the inliers.
 
-    ``fit`` of the inliers alone, in their order; ``inliers`` (N,) of the points, ``line_inliers`` (M,) of the
-    lines, ``samples`` drawn.
+    Parameters
+    ----------
+    fit : TrifocalFit
+        Fit of the inliers alone, in their order.
+    inliers : ndarray (N,) of bool
+        Inliers among the points.
+    line_inliers : ndarray (M,) of bool
+        Inliers among the lines.
+    samples : int
+        Number of samples.
     """
 
     fit: TrifocalFit
@@ -66,12 +73,17 @@ class RobustTrifocal:
 
 @dataclass(frozen=True)
 class TrifocalRansac:
-    """Robust estimation of three views.
+    """Robust estimation of the geometry of three views.
 
-    ``threshold_px`` is the width of the score: the root of the sum of a track's squared distances in three
-    views up to which it is surely good; tracks up to four times as far still count for something, so noise of
-    0.2 to 1 threshold is served. Sampling ends with ``confidence`` that one sample was right, or after
-    ``max_samples``.
+    Parameters
+    ----------
+    threshold_px : float
+        Width of the score: root of the sum of a track's squared distances in three views. Tracks up to four
+        times as far still contribute, which suits noise of 0.2 to 1 threshold.
+    confidence : float
+        Probability of a sample without outliers at which sampling stops.
+    max_samples : int
+        Maximum number of samples.
     """
 
     threshold_px: float = 2.0
@@ -85,21 +97,40 @@ class TrifocalRansac:
     def estimate(
         self, points: F64, segments: F64 = NO_SEGMENTS, *, rng: Generator | None = None
     ) -> RobustTrifocal:
-        """The tensor of tracks points (3, N >= 9, 2) px and lines segments (3, M, 2, 2) px, some wrong.
+        """Estimate the trifocal tensor of points and lines with outliers.
 
-        The lines do not take part in the search. The same generator gives the same answer (None: one with
-        seed 0). Raises ``ValueError`` for wrong shapes and values that are not finite, ``StageFailure`` for
-        too few tracks, for tracks of which no more agree than by chance, and where the right ones leave the
-        tensor free, exactly or up to their noise.
+        The lines do not take part in the search.
+
+        Parameters
+        ----------
+        points : ndarray (3, N, 2)
+            Points of N >= 9 tracks, px.
+        segments : ndarray (3, M, 2, 2)
+            Ends of matched line segments, px.
+        rng : numpy.random.Generator, optional
+            Source of the samples; seed 0 by default.
+
+        Returns
+        -------
+        RobustTrifocal
+            The fit and its inliers.
+
+        Raises
+        ------
+        ValueError
+            If the shapes are wrong or values are not finite.
+        StageFailure
+            If there are too few tracks, no more agree than expected by chance, or the inliers do not
+            determine the tensor, exactly or within their noise.
         """
         points, segments = check_triplets(points, segments)
         rng = np.random.default_rng(0) if rng is None else rng
         n = points.shape[1]
         if n < NEEDED:
             raise StageFailure(
-                "too few tracks for the robust geometry of three views",
+                "too few tracks for the robust trifocal tensor",
                 f"found {n}, needed at least {NEEDED}",
-                "use photographs that overlap more",
+                "use images with more overlap",
             )
         frame = _Frame.of(points)
         cameras, samples = self._search(frame, points, rng)
@@ -115,7 +146,7 @@ class TrifocalRansac:
 
     def _search(self, frame: _Frame, points: F64, rng: Generator) -> tuple[F64, int]:
         """Conditioned cameras of the best score and the number of samples."""
-        # In random order, so that a bad sample shows early that it is one.
+        # Random order, so that a bad sample is rejected early.
         track = frame.tracks(points)[rng.permutation(points.shape[1])]
         threshold, best, bar, drawn = self.threshold_px * frame.scale, np.zeros((3, 3, 4)), 0.0, 0
         needed = self.max_samples
@@ -136,10 +167,10 @@ class TrifocalRansac:
     def _off_the_plane(
         self, frame: _Frame, track: F64, best: F64, bar: float, rng: Generator
     ) -> tuple[F64, float]:
-        """The best with four tracks that agree and two that do not, where that is better.
+        """Try samples of four inliers and two outliers of the best cameras, and keep a better result.
 
-        Most samples of a scene with a dominant plane lie on it but for one, and explain nothing else (Chum,
-        Werner and Matas, CVPR 2005, for two views).
+        With a dominant plane most samples have all but one track on it and explain nothing else (Chum, Werner
+        and Matas, CVPR 2005, for two views).
         """
         threshold = self.threshold_px * frame.scale
         near = _distances(best, track) < threshold / np.sqrt(WIDTHS[1])
@@ -149,8 +180,8 @@ class TrifocalRansac:
         four = on[draw_samples(rng.random((COMPLETIONS, SAMPLE - 2)), len(on))]
         two = off[draw_samples(rng.random((COMPLETIONS, 2)), len(off))]
         better = best.copy()
-        # The solver's frame is of the first five, no four of which may be of one plane. Judged by the others
-        # alone: on the plane no sample is as good as what was refined there.
+        # No four of the first five tracks may be coplanar, as they define the solver's frame. The score uses
+        # the other tracks alone, since no sample on the plane is as good as the refined cameras.
         found = search_trifocal(
             track, np.concatenate([two, four], axis=1), track[off], threshold, 0.0, better
         )
@@ -160,7 +191,7 @@ class TrifocalRansac:
         return (better, found) if found > bar else (best, bar)
 
     def _improve(self, frame: _Frame, track: F64, P: F64, value: float) -> tuple[F64, float]:
-        """Cameras refined on the tracks they agree with, while their score grows."""
+        """Refine cameras on their inliers while their score increases."""
         threshold = self.threshold_px * frame.scale
         for _ in range(REFINEMENTS):
             near = _distances(P, track) < threshold / np.sqrt(WIDTHS[-1])
@@ -179,11 +210,11 @@ class TrifocalRansac:
         return float(sum(np.sum(np.maximum(0.0, 1.0 - squared * w)) for w in WIDTHS) / len(WIDTHS))
 
     def _settle(self, frame: _Frame, P: F64, points: F64) -> tuple[TrifocalFit, B8]:
-        """The fit of the tracks within the noise, which they tell, until they stay the same."""
+        """Fit the tracks within the estimated noise until they stay the same."""
         track = frame.tracks(points)
         T, inliers = frame.tensor_in_pixels(P), np.zeros(len(track), dtype=bool)
         for round_ in range(ROUNDS):
-            now, sigma = self._judge(frame, P, track)
+            now, sigma = self._test_tracks(frame, P, track)
             if round_ and np.array_equal(now, inliers):
                 break
             inliers = now
@@ -194,16 +225,16 @@ class TrifocalRansac:
     def _with_lines(
         self, frame: _Frame, fit: TrifocalFit, points: F64, segments: F64
     ) -> tuple[TrifocalFit, B8, B8]:
-        """The fit of the right tracks and of the lines that agree with them, judged anew with it once."""
+        """Fit the inlier tracks and the lines that agree with them, tested twice."""
         for _ in range(2):
-            now, sigma = self._judge(frame, frame.cameras_in_frame(fit.P), frame.tracks(points))
-            # The noise of lines need not be that of points.
+            now, sigma = self._test_tracks(frame, frame.cameras_in_frame(fit.P), frame.tracks(points))
+            # Lines may have a different noise.
             lines = _line_distances_px(fit.P, segments) <= LINE_INSIDE * max(sigma, self.threshold_px / 2.0)
             fit = refine_trifocal(fit.T, points[:, now], segments[:, lines], loss_px=HUBER * sigma)
         return fit, now, lines
 
-    def _judge(self, frame: _Frame, P: F64, track: F64) -> tuple[B8, float]:
-        """Which tracks are right, and their noise in px; ``StageFailure`` where they may be so by chance."""
+    def _test_tracks(self, frame: _Frame, P: F64, track: F64) -> tuple[B8, float]:
+        """Inlier tracks and their noise in px; ``StageFailure`` if they may agree by chance."""
         distances_px = _distances(P, track) / frame.scale
         sigma = _track_noise(distances_px, self.threshold_px, frame.width_px)
         right = distances_px <= INSIDE * sigma
@@ -213,7 +244,7 @@ class TrifocalRansac:
         return right, sigma
 
     def _refuse_a_plane(self, points: F64, sigma_px: float) -> None:
-        """``StageFailure`` where fewer than 4 tracks are off a plane: any two off it decide all the rest."""
+        """Raise ``StageFailure`` if fewer than 4 tracks are off a plane: any two would determine the rest."""
         off = np.zeros(points.shape[1], dtype=bool)
         for _ in range(PLANE_ROUNDS):
             distances = [
@@ -227,43 +258,43 @@ class TrifocalRansac:
         count = int(np.sum(worst > PLANE_WIDTH * sigma_px))
         if count < OFF_PLANE:
             raise StageFailure(
-                "the matches do not determine the geometry of three views",
-                f"{count} of {len(off)} tracks are off a plane or a rotation, {OFF_PLANE} are needed",
-                "use matches of more than one plane from three places",
+                "the matches do not determine the trifocal tensor",
+                f"{count} of {len(off)} tracks are off a plane or a rotation; {OFF_PLANE} are needed",
+                "use matches off one plane from three different positions",
             )
 
     def _no_consensus(self, n: int, found: int) -> StageFailure:
         return StageFailure(
-            "no geometry of three views explains the tracks",
-            f"{found} of {n} tracks agree on one, no more than would by chance",
-            "the photographs may not overlap, or the tracks are wrong",
+            "no trifocal tensor explains the tracks",
+            f"{found} of {n} tracks agree with one, no more than expected by chance",
+            "check that the images overlap and that the tracks are correct",
         )
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """Image coordinates scale (xy - centre) of each view; ``centre`` (3, 2) px; one scale for all views."""
+    """Coordinates scale (xy - centre) with ``centre`` (3, 2) px and one scale for all views."""
 
     centre: F64
     scale: float
 
     @classmethod
     def of(cls, points: F64) -> _Frame:
-        """Raises ``StageFailure`` for points on a line or in one place of a view."""
+        """Frame of points (3, N, 2); ``StageFailure`` for collinear points."""
         centre = np.median(points, axis=1)
         offsets = points - points.mean(axis=1, keepdims=True)
         spread = np.linalg.svd(offsets, compute_uv=False) / np.sqrt(points.shape[1])
         if not (spread[:, 1] > np.maximum(1e-9 * spread[:, 0], SMALLEST_PX)).all():
             raise StageFailure(
-                "the tracked points of a photograph lie on one line",
+                "the tracked points of an image are collinear",
                 f"spread along and across {spread[:, 0].min():.3g} and {spread[:, 1].min():.3g} px",
-                "such points leave the geometry of three views free",
+                "collinear points do not determine the trifocal tensor; use tracks from the whole image",
             )
         return cls(centre, float(1.0 / spread[:, 0].mean()))
 
     @property
     def width_px(self) -> float:
-        """Two standard deviations of the points' places."""
+        """Two standard deviations of the point positions."""
         return 2.0 / self.scale
 
     def tracks(self, points: F64) -> F64:
@@ -305,12 +336,12 @@ def _refined(P: F64, xy: F64, threshold: float) -> F64:
 
 
 def _track_noise(distances_px: F64, threshold_px: float, width_px: float) -> float:
-    """Standard deviation of a coordinate of the right tracks, by expectation and maximisation; px.
+    """Standard deviation of a coordinate of the right tracks by expectation maximisation; px.
 
-    distances_px (N,) are roots of sums over three views, those of right tracks sigma times a chi variable of
-    3 freedoms, less the 18 of a tensor fitted to them; wrong tracks are even in the space of the three
-    residuals up to ``width_px``. Starts at ``threshold_px`` / 2.5 with half of the tracks right (Torr and
-    Zisserman, MLESAC, 2000).
+    distances_px (N,) are roots of sums over three views: sigma times a chi variable of 3 degrees of freedom
+    for right tracks, minus the 18 of the tensor; wrong tracks are uniform in the space of the three residuals
+    up to ``width_px``. Starts at ``threshold_px`` / 2.5 with half of the tracks right (Torr and Zisserman,
+    MLESAC, 2000).
     """
     squared = np.minimum(distances_px, width_px) ** 2
     # The densities of the distances are d^2 times these: normal, and even in a ball.
@@ -321,7 +352,7 @@ def _track_noise(distances_px: F64, threshold_px: float, width_px: float) -> flo
         total = float(right.sum())
         if total < 1.0:
             return sigma
-        # Below a hundred-thousandth of the threshold the residuals are rounding.
+        # Residuals below 1e-5 of the threshold are rounding errors.
         freedom = max(3.0 * total - 18.0, total)
         now = max(np.sqrt(float(right @ squared) / freedom), 1e-5 * threshold_px)
         share = min(max(total / len(squared), 1e-3), 1.0 - 1e-3)
@@ -334,8 +365,8 @@ def _track_noise(distances_px: F64, threshold_px: float, width_px: float) -> flo
 def _line_distances_px(P: F64, segments: F64) -> F64:
     """Root of the sum of squared distances of six segment ends to a reprojected line; (M,) px.
 
-    P (3, 3, 4) and segments (3, M, 2, 2) in px; the line of space is that nearest to the three planes of its
-    segments, which is exact for exact segments. inf where it has no image.
+    P (3, 3, 4) and segments (3, M, 2, 2) in px. The space line is nearest to the three planes of its
+    segments, exact for exact segments; inf if it has no image.
     """
     ends = homogenize(segments)
     planes = np.einsum("vma,vab->mvb", unit_normals(line_through(ends[:, :, 0], ends[:, :, 1])), P)
@@ -351,10 +382,10 @@ def _line_distances_px(P: F64, segments: F64) -> F64:
 
 
 def _by_chance(found: int, n: int, radius: float) -> bool:
-    """Whether wrong tracks alone are expected to show so many within ``radius`` widths more often than 1e-3.
+    """Return whether wrong tracks alone reach so many within ``radius`` widths more often than 1e-3.
 
-    The number of samples times that of choices of the others times the chance of each (Moisan and Stival
-    2004); a track is near with the volume of the ball of its three residuals.
+    Number of samples times choices of the others times the chance of each (Moisan and Stival 2004); the
+    chance of a track is the volume of the ball of its three residuals.
     """
     chance = min(1.0, 4.19 * radius**3)
     k = np.arange(1, found + 1)
