@@ -1,6 +1,7 @@
-"""Where the pixels of one view are in another: rectified, matched, and taken back exactly.
+"""Dense correspondence of two views: rectify, match, and map the disparities back to the original pixels.
 
-Section 2.5 for two photographs alone: rectified from F, matched from either side, and taken back.
+:class:`PairMatching` serves multi-view stereo; :func:`match_two_views` rectifies two images by their
+fundamental matrix and matches both directions (thesis, section 2.5).
 """
 
 from __future__ import annotations
@@ -16,7 +17,11 @@ from thesisrecon.geometry.two_view import canonical_cameras
 from thesisrecon.records import DisparityMap, PinholeView
 from thesisrecon.stereo.cost import MAX_DISPARITIES
 from thesisrecon.stereo.epipolar_pair import pair_of_fundamental
-from thesisrecon.stereo.planar import HartleyRectifier, LoopZhangRectifier, MinimumDistortionRectifier
+from thesisrecon.stereo.planar_rectifiers import (
+    HartleyRectifier,
+    LoopZhangRectifier,
+    MinimumDistortionRectifier,
+)
 from thesisrecon.stereo.rectification import (
     AnyRectification,
     BestRectifier,
@@ -29,21 +34,27 @@ from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import SemiGlobalMatching, match_both_sides
 
 Size = tuple[int, int]
-"""Width and height, px."""
+"""Width and height in pixels."""
 STRIP_ROWS = 128
-"""Rows of the reference whose places are held in float64 at a time."""
+"""Rows of the reference view that are mapped at a time."""
 ONE_SURFACE_PX = 1.0
-"""Neighbouring disparities that differ by more are not interpolated between."""
+"""Disparity range of four neighbours up to which they are interpolated."""
 GAIN_PATCH = 2
-"""Half the side of the patches whose brightness is compared."""
+"""Radius of the patches whose brightness is compared."""
 
 
 @dataclass(frozen=True)
 class Correspondence:
-    """Where the pixels of a reference view are in another one.
+    """Positions of the pixels of a reference view in another view.
 
-    ``xy`` (H, W, 2) px of the other view, NaN where unknown; ``sigma`` (H, W) px, the deviation of that place
-    along its epipolar line; ``confidence`` (H, W) in [0, 1].
+    Attributes
+    ----------
+    xy : ndarray (H, W, 2) float32
+        Pixels of the other view, NaN = unknown.
+    sigma : ndarray (H, W) float32
+        Standard deviation along the epipolar line in pixels.
+    confidence : ndarray (H, W) float32
+        Confidence in [0, 1].
     """
 
     xy: F32
@@ -52,17 +63,24 @@ class Correspondence:
 
     @property
     def known(self) -> B8:
-        """(H, W) whether the pixel has a place."""
+        """(H, W) pixels with a known correspondence."""
         return np.isfinite(self.sigma)
 
 
 @dataclass(frozen=True)
 class PairMatching:
-    """Correspondence of two undistorted views by way of a rectified pair.
+    """Dense correspondence of two undistorted views by stereo matching of the rectified pair.
 
-    ``matcher`` finds the disparities, in the range of the sparse points widened by ``range_margin`` of itself
-    at either end. Their deviation is what the matcher tells but at least ``least_sigma_px``, in pixels of the
-    rectified frame, and larger where its confidence is low; below ``min_confidence`` there are none.
+    Parameters
+    ----------
+    matcher : SemiGlobalMatching or MaximumLikelihoodScanline
+        Matcher of rectified images.
+    range_margin : float
+        Widening of the disparity range of the sparse points at both ends, as a share of the range.
+    min_sigma_px : float
+        Lower limit of the standard deviation of disparities, which grows with decreasing confidence.
+    min_confidence : float
+        Disparities of less confidence are ignored.
     """
 
     matcher: SemiGlobalMatching | MaximumLikelihoodScanline = field(default_factory=SemiGlobalMatching)
@@ -79,12 +97,27 @@ class PairMatching:
         *,
         sizes: tuple[Size, Size] | None = None,
     ) -> Correspondence:
-        """Where the pixels of ``reference`` are in ``other``.
+        """Compute the positions of the pixels of ``reference`` in ``other``.
 
-        ``xy1, xy2`` (N, 2) px are the projections of points of the scene into both: they give the range of
-        disparities and how much brighter one photograph is. ``sizes`` (width, height) of both: pixels of
-        these sizes are asked for and told of, though the views are matched at their own. ``StageFailure``
-        where the pair cannot be rectified or no point is inside.
+        Parameters
+        ----------
+        reference, other : PinholeView
+            Undistorted views with their cameras.
+        xy1, xy2 : ndarray (N, 2)
+            Projections of sparse points into both views in pixels. They determine the disparity range and the
+            brightness gain.
+        sizes : tuple of (width, height), optional
+            Image sizes in which pixels are given and returned; default: the sizes of the views.
+
+        Returns
+        -------
+        Correspondence
+            Positions in ``other``.
+
+        Raises
+        ------
+        StageFailure
+            If the pair cannot be rectified or no point lies in the rectified frame.
         """
         own = (size_of(reference), size_of(other))
         frame = rectify_cameras(reference.P, other.P, *own, xy1=xy1, xy2=xy2)
@@ -95,10 +128,10 @@ class PairMatching:
         return self._back(frame, found, own, sizes or own)
 
     def _back(
-        self, frame: AnyRectification, found: DisparityMap, own: tuple[Size, Size], told: tuple[Size, Size]
+        self, frame: AnyRectification, found: DisparityMap, own: tuple[Size, Size], wanted: tuple[Size, Size]
     ) -> Correspondence:
-        shape = told[0][::-1]
-        enlarged = max(told[1]) / max(own[1])
+        shape = wanted[0][::-1]
+        enlarged = max(wanted[1]) / max(own[1])
         xy = np.full((*shape, 2), np.nan, dtype=np.float32)
         sigma = np.full(shape, np.nan, dtype=np.float32)
         confidence = np.zeros(shape, dtype=np.float32)
@@ -106,7 +139,7 @@ class PairMatching:
         deviation = max(sigma_px, self.min_sigma_px)
         for first in range(0, shape[0], STRIP_ROWS):
             rows = slice(first, min(first + STRIP_ROWS, shape[0]))
-            pixels = resized(_pixels(shape[1], rows), told[0], own[0])
+            pixels = resized(_pixels(shape[1], rows), wanted[0], own[0])
             places = frame.rectified_from_original(0, pixels)
             d, sure = sample_disparity(found, places)
             inside: B8 = np.asarray(np.isfinite(d) & (sure >= self.min_confidence))
@@ -117,40 +150,92 @@ class PairMatching:
             )
             scale = np.linalg.norm(b - a, axis=1)
             at = (np.flatnonzero(inside) // shape[1] + first, np.flatnonzero(inside) % shape[1])
-            xy[at] = resized(right, own[1], told[1])
+            xy[at] = resized(right, own[1], wanted[1])
             confidence[at] = sure[inside]
-            # Half the confidence is what a pixel has whose rival costs a step on every path more.
+            # Confidence 1/2: the second best disparity costs P1 more on every path.
             sigma[at] = enlarged * deviation * scale * np.sqrt(0.5 / np.clip(sure[inside], 0.05, 0.5))
         return Correspondence(xy, sigma, confidence)
 
 
 def size_of(view: PinholeView) -> Size:
-    """(width, height)."""
+    """Return the size of a view.
+
+    Parameters
+    ----------
+    view : PinholeView
+
+    Returns
+    -------
+    tuple of int
+        (width, height) in pixels.
+    """
     return view.seen.shape[1], view.seen.shape[0]
 
 
 def resized(xy: F64, size: Size, wanted: Size) -> F64:
-    """Pixels (N, 2) of a photograph of ``size`` where they are at the size that is wanted."""
+    """Convert pixels between two sizes of an image.
+
+    Parameters
+    ----------
+    xy : ndarray (N, 2)
+        Pixels of the image of ``size``.
+    size, wanted : tuple of int
+        (width, height) before and after.
+
+    Returns
+    -------
+    ndarray (N, 2)
+        Pixels of the image of ``wanted`` size, (x + 0.5) s - 0.5.
+    """
     return np.asarray((xy + 0.5) * (np.array(wanted) / np.array(size)) - 0.5)
 
 
 def searched(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int]:
-    """What of a range can be inside the frame; ``StageFailure`` where that is nothing or too much."""
+    """Restrict a disparity range to the width of the rectified frame.
+
+    Parameters
+    ----------
+    frame : PlanarRectification or PolarRectification
+    wanted : tuple of int
+        First and last disparity.
+
+    Returns
+    -------
+    tuple of int
+        First and last disparity.
+
+    Raises
+    ------
+    StageFailure
+        If the range is empty or too large.
+    """
     reach = frame.size[0] - 1
     first, last = max(wanted[0], -reach), min(wanted[1], reach)
     if not 0 <= last - first < MAX_DISPARITIES:
         raise StageFailure(
-            "the disparities of the pair cannot be searched",
-            f"they run from {first} to {last} px",
-            "choose neighbours nearer to each other, or a smaller size",
+            "the disparity range of the pair cannot be searched",
+            f"it is {first} to {last} px",
+            "choose neighbours with a shorter baseline, or a smaller image size",
         )
     return first, last
 
 
 def sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
-    """Disparity and confidence (N,) at places (N, 2) of the rectified frame, NaN where unknown.
+    """Interpolate disparity and confidence at positions of the rectified frame.
 
-    Bilinear where all four pixels around lie on one surface, else that of the nearest pixel.
+    Bilinear if the four pixels around lie on one surface, else the nearest pixel.
+
+    Parameters
+    ----------
+    found : DisparityMap
+        Disparities of the frame.
+    places : ndarray (N, 2)
+        Positions in the frame, NaN = none.
+
+    Returns
+    -------
+    tuple of ndarray (N,)
+        Disparity, NaN = unknown, and confidence.
     """
     height, width = found.disparity.shape
     inside: B8 = np.asarray(np.isfinite(places).all(axis=1))
@@ -165,16 +250,27 @@ def sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
     bottom = corners[2] + fx * (corners[3] - corners[2])
     spread = np.maximum.reduce(corners) - np.minimum.reduce(corners)
     nearest = np.rint(y).astype(np.int64), np.rint(x).astype(np.int64)
-    # A comparison with NaN is false: a hole among the four leaves the nearest.
+    # A comparison with NaN is false: with an unknown pixel among the four the nearest is used.
     d = np.where(spread <= ONE_SURFACE_PX, top + fy * (bottom - top), found.disparity[nearest])
     d = np.where(inside, d, np.nan)
     return d, np.where(np.isfinite(d), found.confidence[nearest], 0.0)
 
 
 def brightness_gain(reference: PinholeView, other: PinholeView, xy1: F64, xy2: F64) -> F32:
-    """(3,) factors that make ``other`` as bright as ``reference``, the median over the points; 1 without any.
+    """Estimate the gain per channel that makes ``other`` as bright as ``reference``.
 
-    Exposure and white balance change between photographs, and colours are compared as they are.
+    The median ratio of patch means compensates exposure and white balance; 1 with fewer than 8 usable points.
+
+    Parameters
+    ----------
+    reference, other : PinholeView
+    xy1, xy2 : ndarray (N, 2)
+        Corresponding pixels.
+
+    Returns
+    -------
+    ndarray (3,) float32
+        Gain per channel.
     """
     levels = [_patch_means(view, xy) for view, xy in ((reference, xy1), (other, xy2))]
     good = np.isfinite(levels[0]).all(axis=1) & np.isfinite(levels[1]).all(axis=1)
@@ -187,7 +283,7 @@ def brightness_gain(reference: PinholeView, other: PinholeView, xy1: F64, xy2: F
 
 
 def _patch_means(view: PinholeView, xy: F64) -> F64:
-    """Mean colours (N, 3) about pixels (N, 2), NaN where the patch leaves the image."""
+    """Mean colours (N, 3) around pixels (N, 2), NaN where the patch leaves the image."""
     height, width = view.seen.shape
     at = np.rint(xy).astype(np.int64)
     reach = GAIN_PATCH
@@ -216,11 +312,18 @@ PLANAR = BestRectifier((HartleyRectifier(), LoopZhangRectifier(), MinimumDistort
 
 @dataclass(frozen=True)
 class RectifiedPair:
-    """Two photographs in the frame whose rows are their epipolar lines, and what matches there.
+    """Two rectified images and their dense disparities.
 
-    ``frame`` maps either photograph to it and back; ``images`` (H, W, 3) float32 in it, NaN outside; ``gain``
-    (3,) what makes the second photograph as bright as the first, in ``images`` applied. ``left``, ``right``:
-    disparities of either side, x_right = x_left - d, larger ones nearer.
+    Attributes
+    ----------
+    frame : PlanarRectification or PolarRectification
+        Maps between the images and the rectified frame.
+    images : tuple of ndarray (H, W, 3) float32
+        Rectified images, NaN outside; the gain is applied to the second.
+    gain : ndarray (3,) float32
+        Gain that makes the second image as bright as the first.
+    left, right : DisparityMap
+        Disparities of both images, x_right = x_left - d, larger for nearer points.
     """
 
     frame: AnyRectification
@@ -230,10 +333,19 @@ class RectifiedPair:
     right: DisparityMap
 
     def correspondences(self, side: int, size: tuple[int, int]) -> F32:
-        """Where the pixels of the photograph of ``side``, of ``size`` (width, height), are in the other one.
+        """Compute the positions of the pixels of one image in the other.
 
-        (H, W, 2) px. What the other one does not see is taken for background
-        (:meth:`DisparityMap.filled`); NaN outside the frame.
+        Parameters
+        ----------
+        side : {0, 1}
+        size : tuple of int
+            (width, height) of that image.
+
+        Returns
+        -------
+        ndarray (H, W, 2) float32
+            Pixels of the other image, NaN outside the frame; occluded pixels get the background disparity
+            (:meth:`DisparityMap.filled`).
         """
         found = self.right if require_side(side) else self.left
         complete = replace(found, disparity=found.filled())
@@ -254,19 +366,31 @@ class RectifiedPair:
 def match_two_views(
     rgb1: U8, rgb2: U8, F: F64, xy1: F64, xy2: F64, *, pairs: PairMatching, planar: bool = False
 ) -> RectifiedPair:
-    """Dense correspondence of two photographs of which F and its inliers are known.
+    """Compute dense correspondence of two images with known fundamental matrix.
 
     Parameters
     ----------
-    rgb1, rgb2 : (H, W, 3) uint8.
-    F, xy1, xy2 : (3, 3), x2' F x1 = 0, and (N >= 8, 2) px matches that obey it.
-    pairs : whose matcher and range of disparities are taken.
-    planar : rectify by homographies alone, which need the epipoles outside of the photographs.
+    rgb1, rgb2 : ndarray (H, W, 3) uint8
+    F : ndarray (3, 3)
+        Fundamental matrix, x2' F x1 = 0.
+    xy1, xy2 : ndarray (N >= 8, 2)
+        Inlier matches in pixels.
+    pairs : PairMatching
+        Matcher and disparity range.
+    planar : bool
+        Rectify by homographies only, which requires the epipoles to lie outside the images.
+
+    Returns
+    -------
+    RectifiedPair
+        Rectified images and disparities of both.
 
     Raises
     ------
-    ValueError, StageFailure : as :func:`thesisrecon.stereo.rectification.rectify_pair`; ``StageFailure`` also
-        where the range of disparities is too long to be searched.
+    ValueError
+        If an array has the wrong shape.
+    StageFailure
+        If the pair cannot be rectified or the disparity range is too large.
     """
     cameras = canonical_cameras(F)
     views = [

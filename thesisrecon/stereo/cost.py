@@ -52,7 +52,7 @@ def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
     first, last = (int(d) for d in disparity_range)
     if not 0 <= last - first < MAX_DISPARITIES:
         raise ValueError(
-            f"a disparity range needs first <= last < first + {MAX_DISPARITIES}; got {disparity_range}"
+            f"a disparity range must obey first <= last < first + {MAX_DISPARITIES}; got {disparity_range}"
         )
     return first, last
 
@@ -103,9 +103,7 @@ def run_strips(work: Callable[[Strip], Result], strips: Sequence[Strip], threads
     work : callable
         Function of a strip.
     strips : sequence of Strip
-        The strips.
     threads : int
-        Number of threads.
 
     Returns
     -------
@@ -162,7 +160,7 @@ def prepare_pair(left: ArrayLike, right: ArrayLike) -> tuple[StereoImage, Stereo
     sides = tuple(_side(np.asarray(image)) for image in (left, right))
     if sides[0].channels.shape != sides[1].channels.shape:
         raise ValueError(
-            f"the images of a rectified pair must have one shape; got {np.shape(left)} and {np.shape(right)}"
+            f"rectified images must have the same shape; got {np.shape(left)} and {np.shape(right)}"
         )
     return sides[0], sides[1]
 
@@ -190,7 +188,6 @@ def estimate_noise(image: StereoImage) -> float:
     Parameters
     ----------
     image : StereoImage
-        The image.
 
     Returns
     -------
@@ -208,7 +205,7 @@ def estimate_noise(image: StereoImage) -> float:
     inimage = whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:]
     if not inimage.any():
         return 0.0
-    # A median of whole numbers by counting them. The mask has the squares 1, 4, 1, 4, 16, 4, 1, 4, 1: 36.
+    # Median of integers by counting. The squared filter coefficients sum to 36.
     below = np.cumsum(np.bincount(np.abs(response[:, inimage]).ravel()))
     median = int(np.searchsorted(below, 0.5 * below[-1]))
     return 1.4826 * median / 6.0 / LEVELS
@@ -308,7 +305,6 @@ class CensusAndColour:
         Parameters
         ----------
         image : StereoImage
-            The image.
 
         Returns
         -------

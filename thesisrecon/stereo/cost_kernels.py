@@ -1,8 +1,7 @@
-"""Compiled matching costs: an image row against the row of the other, all disparities, columns innermost.
+"""Compiled matching costs of image rows for all disparities.
 
-The column runs in the inner loop everywhere, so that each operation works on whole rows whatever the number
-of disparities. Functions that take rows get them as slices: with no index arithmetic in them the compiler
-uses vector instructions.
+The inner loops run over the columns and take row slices without index arithmetic, so that the compiler
+vectorises them for any number of disparities.
 """
 
 from __future__ import annotations
@@ -13,18 +12,18 @@ from numba import njit
 from thesisrecon.arrays import F32, I16, I32, U8, U16
 
 LEVELS = 4
-"""Steps of a grey level: channels are whole numbers of quarter levels, for rectified images are resampled."""
+"""Integer steps of one grey level: resampled images have fractional levels."""
 REACH = 2
-"""Of the census window: 5 x 5 pixels, 24 comparisons."""
+"""Radius of the census window: 5 x 5 pixels, 24 comparisons."""
 ARM = 2
-"""Pixels to each side in the support of a pixel."""
+"""Maximal length of a support arm in pixels."""
 WEIGHT_SHIFT = 8
-"""Weights are given in 1 / 256."""
+"""Weights are in units of 1 / 256."""
 
 
 @njit(cache=True, nogil=True)
-def count_ones(word: np.int32) -> np.uint32:
-    """Number of ones, added up in pairs, fours and bytes: the compiler knows this form as one instruction."""
+def _count_ones(word: np.int32) -> np.uint32:
+    """Population count in a form that the compiler replaces by one instruction."""
     x = np.uint32(word)
     x = np.uint32(x - np.uint32(np.uint32(x >> np.uint32(1)) & np.uint32(0x55555555)))
     twos = np.uint32(np.uint32(x >> np.uint32(2)) & np.uint32(0x33333333))
@@ -35,8 +34,19 @@ def count_ones(word: np.int32) -> np.uint32:
 
 @njit(cache=True, nogil=True)
 def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
-    """(H, W, K) grey levels, NaN = no pixel, as ``channels`` (K, H, W) of quarter levels, their sum ``grey``
-    (H, W), and ``valid`` (H, W) 0 or 255."""
+    """Convert floating-point grey levels to integer channels.
+
+    Parameters
+    ----------
+    image : ndarray (H, W, K) float32
+        Grey levels, NaN = no pixel.
+    channels : ndarray (K, H, W) int16
+        Receives quarters of a grey level.
+    grey : ndarray (H, W) int16
+        Receives the sum of the channels.
+    valid : ndarray (H, W) uint8
+        Receives 255 where there is a pixel, else 0.
+    """
     height, width, n = image.shape
     top = np.float32(255.0 * LEVELS)
     for y in range(height):
@@ -56,7 +66,16 @@ def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
 
 @njit(cache=True, nogil=True)
 def split_bytes(image: U8, channels: I16, grey: I16) -> None:
-    """The same of an image of bytes, of which every pixel is one."""
+    """Convert an 8-bit image to integer channels.
+
+    Parameters
+    ----------
+    image : ndarray (H, W, K) uint8
+    channels : ndarray (K, H, W) int16
+        Receives quarters of a grey level.
+    grey : ndarray (H, W) int16
+        Receives the sum of the channels.
+    """
     height, width, n = image.shape
     for y in range(height):
         total = grey[y]
@@ -77,8 +96,15 @@ def _compare(centre: I16, other: I16, bits: I32) -> None:
 
 @njit(cache=True, nogil=True)
 def census(grey: I16, bits: I32) -> None:
-    """Census transform (Zabih and Woodfill 1994) of (H, W): which pixels of the window are darker than its
-    centre, a bit each. Beyond the border the outermost pixel is repeated."""
+    """Compute the census transform (Zabih and Woodfill 1994) of a 5 x 5 window.
+
+    Parameters
+    ----------
+    grey : ndarray (H, W) int16
+        Intensities; border pixels are repeated outside the image.
+    bits : ndarray (H, W) int32
+        Receives one bit per window pixel, 1 if it is darker than the centre.
+    """
     height, width = grey.shape
     padded = np.empty((2 * REACH + 1, width + 2 * REACH), np.int16)
     bits[:] = 0
@@ -97,8 +123,14 @@ def census(grey: I16, bits: I32) -> None:
 
 @njit(cache=True, nogil=True)
 def sampled_bounds(channels: I16, low: I16, high: I16) -> None:
-    """Least and greatest value within half a pixel left and right, linearly interpolated, (K, H, W)
-    (Birchfield and Tomasi 1998)."""
+    """Compute the range of the linearly interpolated image within half a pixel (Birchfield and Tomasi 1998).
+
+    Parameters
+    ----------
+    channels : ndarray (K, H, W) int16
+    low, high : ndarray (K, H, W) int16
+        Receive the minimum and maximum to the left and right.
+    """
     n, height, width = channels.shape
     for k in range(n):
         for y in range(height):
@@ -113,7 +145,7 @@ def sampled_bounds(channels: I16, low: I16, high: I16) -> None:
 
 @njit(cache=True, nogil=True)
 def _add_difference(a: I16, a_low: I16, a_high: I16, b: I16, b_low: I16, b_high: I16, total: I16) -> None:
-    """Add the sampling-insensitive difference of one channel: 0 where one lies within the other's bounds."""
+    """Add the sampling-insensitive difference: 0 where one value lies within the other's bounds."""
     for x in range(len(total)):
         one, other = np.int16(a[x] - b_high[x]), np.int16(b_low[x] - a[x])
         one = other if other > one else one
@@ -135,12 +167,12 @@ def _add_plain_difference(a: I16, b: I16, total: I16) -> None:
 @njit(cache=True, nogil=True)
 def _hamming(a: I32, b: I32, out: I16) -> None:
     for x in range(len(out)):
-        out[x] = np.int16(count_ones(np.int32(a[x] ^ b[x])))
+        out[x] = np.int16(_count_ones(np.int32(a[x] ^ b[x])))
 
 
 @njit(cache=True, nogil=True)
 def _join(bits: I16, colour: I16, known: U8, weights: I16, outside: np.uint8, out: U8) -> None:
-    """Weighted sum of both costs."""
+    """Combine Hamming distance and truncated colour difference."""
     of_bit, of_level, cap = weights[0], weights[1], weights[2]
     for x in range(len(out)):
         level = colour[x]
@@ -157,7 +189,7 @@ def _both(a: U8, b: U8, out: U8) -> None:
 
 
 @njit(cache=True, nogil=True)
-def row_costs(
+def _row_costs(
     y: int,
     left: tuple[I32, I16, I16, I16, U8],
     right: tuple[I32, I16, I16, I16, U8],
@@ -166,11 +198,11 @@ def row_costs(
     outside: np.uint8,
     out: U8,
 ) -> None:
-    """Costs (D, W) of the pixels of row y of the left image at the disparities first, first + 1, ...
+    """Costs (D, W) of row y of the left image at the disparities first, first + 1, ...
 
-    Each side is (census (H, W), channels, low, high (K, H, W), valid (H, W)). ``weights``: of a bit, of a
-    quarter level, the cap of the levels (sum over channels), whether the difference is insensitive to
-    sampling. ``outside`` is the cost where one of the pixels is none.
+    Each side is (census (H, W), channels, low, high (K, H, W), valid (H, W)). ``weights``: of one bit, of a
+    quarter level, the truncation of the levels (sum over channels), whether the difference is
+    sampling-insensitive. ``outside`` is the cost of a pair with a missing pixel.
     """
     bits_l, a, a_low, a_high, valid_l = left
     bits_r, b, b_low, b_high, valid_r = right
@@ -215,9 +247,19 @@ def _alike(a: I16, b: I16, tolerance: np.int16, mask: U8) -> None:
 
 @njit(cache=True, nogil=True)
 def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> None:
-    """The arms of a pixel's support (Zhang, Lu and Lafruit 2009): ``masks`` (4, ARM, H, W) is 255 where the
-    pixel s + 1 to the left, right, above, below and all before it differ from this one by no more than
-    ``tolerance`` in every channel, else 0."""
+    """Compute the cross-shaped support arms of all pixels (Zhang, Lu and Lafruit 2009).
+
+    Parameters
+    ----------
+    channels : ndarray (K, H, W) int16
+        Channels of the left image.
+    valid : ndarray (H, W) uint8
+        255 where there is a pixel, else 0.
+    tolerance : int16
+        Largest difference to the centre in every channel.
+    masks : ndarray (4, ARM, H, W) uint8
+        Receives 255 where the pixel s + 1 to the left, right, top or bottom belongs to the arm, else 0.
+    """
     height, width = valid.shape
     masks[:] = 0
     for arm in range(4):
@@ -263,7 +305,7 @@ def _sum_five(
 
 @njit(cache=True, nogil=True)
 def _sum_along_row(padded: U8, masks: U8, y: int, out: U16) -> None:
-    """Sums (W,) of the costs over the horizontal arms of every pixel of row y; ``padded`` (W + 2 ARM,)."""
+    """Sums (W,) of the costs over the horizontal arms of row y; ``padded`` (W + 2 ARM,)."""
     n = len(out)
     _sum_five_bytes(
         (padded[:n], padded[1 : n + 1], padded[2 : n + 2], padded[3 : n + 3], padded[4 : n + 4]),
@@ -292,7 +334,7 @@ def _widen_mask(mask: U8, out: U16) -> None:
 
 @njit(cache=True, nogil=True)
 def _shares(counts: U16, y: int, masks: U16, share: F32) -> None:
-    """1 / number of pixels in the support of every pixel of row y."""
+    """1 / size of the support region of every pixel of row y."""
     n = len(counts)
     far_a, above, here = counts[(y - 2) % n], counts[(y - 1) % n], counts[y % n]
     below, far_b = counts[(y + 1) % n], counts[(y + 2) % n]
@@ -313,16 +355,30 @@ def cost_volume(
     outside: np.uint8,
     volume: U8,
 ) -> None:
-    """Mean costs over every pixel's support, ``volume`` (H, D, W); the rows of ``left, right, masks`` are
-    those of the volume. Without masks (of length 0) the support is the pixel.
+    """Compute the matching costs averaged over the support regions.
 
-    Horizontal sums of the 2 ARM + 1 rows about the present one wait in a ring, so nothing but the volume is
-    as large as the volume.
+    A ring buffer holds the horizontal sums of 2 ARM + 1 rows, so only the volume itself is large.
+
+    Parameters
+    ----------
+    left, right : tuple of ndarray
+        (census (H, W), channels, low, high (K, H, W), valid (H, W)) of the rows of the volume.
+    masks : ndarray (4, ARM, H, W) uint8
+        Support arms; without averaging if the second axis is empty.
+    first : int
+        First disparity.
+    weights : ndarray (4,) int16
+        Weight of a census bit and of a quarter level, truncation, and whether the difference is
+        sampling-insensitive.
+    outside : uint8
+        Cost of a pair with a missing pixel.
+    volume : ndarray (H, D, W) uint8
+        Receives the costs.
     """
     height, n, width = volume.shape
     if masks.shape[1] == 0:
         for y in range(height):
-            row_costs(y, left, right, first, weights, outside, volume[y])
+            _row_costs(y, left, right, first, weights, outside, volume[y])
         return
     span = 2 * ARM + 1
     ring, counts = np.zeros((n, span, width), np.uint16), np.zeros((span, width), np.uint16)
@@ -331,7 +387,7 @@ def cost_volume(
     summed = 0
     for y in range(height):
         while summed < min(y + ARM + 1, height):
-            row_costs(summed, left, right, first, weights, outside, costs[:, ARM : ARM + width])
+            _row_costs(summed, left, right, first, weights, outside, costs[:, ARM : ARM + width])
             _sum_along_row(ones, masks, summed, counts[summed % span])
             for q in range(n):
                 _sum_along_row(costs[q], masks, summed, ring[q, summed % span])

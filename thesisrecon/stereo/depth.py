@@ -1,4 +1,4 @@
-"""Depth maps of all views: each from its neighbours, then held against the others."""
+"""Multi-view stereo: depth maps from neighbouring views, and their consistency (thesis, section 2.6)."""
 
 from __future__ import annotations
 
@@ -36,21 +36,36 @@ from thesisrecon.stereo.semi_global import match_rectified
 
 Result = TypeVar("Result")
 SURE = 3.0
-"""Deviations by which an inverse depth is above that of infinity."""
+"""Standard deviations by which an inverse depth must exceed 0, that of infinity."""
 
 
 @dataclass(frozen=True)
 class GeometricConsistency:
-    """Reprojection both ways (as Merrell et al., ICCV 2007, and COLMAP's fusion have it) and speckles.
+    """Confirmation of depths by the depth maps of other views.
 
-    A pixel is taken to another view by its depth, and that view's depth brings it back. It is confirmed
-    where it returns within ``reprojection_px`` and both depths differ by at most ``relative`` plus
-    ``deviations`` of their deviations; it is contradicted where the other view sees through it. A pixel
-    stays if at least ``least_views`` confirm it and more than contradict it, or if none contradicts it and it
-    continues the surface of those about it: within ``gate`` deviations of the plane through the pixels within
-    ``radius``. Connected pieces of fewer than
-    ``smallest_piece`` of the pixels, across which depth changes by less than ``step`` from pixel to pixel,
-    go.
+    A pixel is projected into another view, and the depth there is projected back (Merrell et al., ICCV 2007;
+    fusion in COLMAP). It is confirmed if both agree and contradicted if the other view sees through it. It is
+    kept if at least ``min_views`` views and more than contradict it confirm it, or if none contradicts it and
+    it continues the surface of confirmed pixels.
+
+    Parameters
+    ----------
+    reprojection_px : float
+        Largest reprojection error.
+    max_relative : float
+        Largest relative depth difference ...
+    max_sigmas : float
+        ... in addition to so many standard deviations.
+    min_views : int
+        Views that must confirm a pixel.
+    min_region_ratio : float
+        Connected regions below this share of the pixels are removed.
+    step : float
+        Largest relative depth step between connected pixels.
+    radius : int
+        Radius of the window of the surface continuation.
+    gate : float
+        Distance from the plane of that window in standard deviations.
     """
 
     reprojection_px: float = 1.5
@@ -63,7 +78,18 @@ class GeometricConsistency:
     gate: float = 2.0
 
     def confirm(self, depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
-        """``depth_map`` where ``others`` confirm it, with their number in ``views``."""
+        """Keep the depths that other depth maps confirm.
+
+        Parameters
+        ----------
+        depth_map : DepthMap
+        others : sequence of DepthMap
+
+        Returns
+        -------
+        DepthMap
+            Confirmed depths; ``views`` is the number of confirming views.
+        """
         agree = np.zeros(depth_map.depth.shape, dtype=np.uint8)
         contradict = np.zeros_like(agree)
         limits = np.array([self.reprojection_px, self.max_relative, self.max_sigmas])
@@ -82,7 +108,19 @@ class GeometricConsistency:
         return self.remove_small_regions(_kept(replace(depth_map, views=np.maximum(agree, 1)), keep))
 
     def continues_surface(self, depth_map: DepthMap, sure: B8) -> B8:
-        """(H, W) pixels that continue the surface of those that are ``sure``."""
+        """Find pixels that continue the surface of reliable neighbours.
+
+        Parameters
+        ----------
+        depth_map : DepthMap
+        sure : ndarray (H, W) bool
+            Reliable pixels.
+
+        Returns
+        -------
+        ndarray (H, W) bool
+            Continuing pixels.
+        """
         with np.errstate(divide="ignore"):
             rho = (1.0 / depth_map.depth).astype(np.float32)
         joins = np.zeros(sure.shape, dtype=np.uint8)
@@ -91,22 +129,52 @@ class GeometricConsistency:
         return joins > 0
 
     def remove_small_regions(self, depth_map: DepthMap) -> DepthMap:
-        """Without small pieces."""
+        """Remove small connected regions.
+
+        Parameters
+        ----------
+        depth_map : DepthMap
+
+        Returns
+        -------
+        DepthMap
+            The other depths.
+        """
         least = self.min_region_ratio * depth_map.depth.size
         return _kept(depth_map, region_sizes(depth_map.depth, self.step) >= least)
 
 
 def transfer(P: F64, P_other: F64) -> F64:
-    """(3, 4) that takes (z x, z y, z, 1) of one camera to z' (x', y', 1) of the other."""
+    """Return the transform between the pixels and depths of two cameras.
+
+    Parameters
+    ----------
+    P, P_other : ndarray (3, 4)
+        Cameras whose third coordinate is the depth.
+
+    Returns
+    -------
+    ndarray (3, 4)
+        Maps (z x, z y, z, 1) to z' (x', y', 1).
+    """
     M = np.linalg.inv(P[:, :3])
     centre = camera_centre(P)
     return np.column_stack([P_other[:, :3] @ M, P_other @ (centre / centre[3])])
 
 
 def region_sizes(depth: F32, step: float) -> F64:
-    """(H, W) pixels of the connected piece that each belongs to, 0 where unknown.
+    """Count the pixels of the connected region of each pixel.
 
-    Neighbours are connected where their depths differ by at most ``step`` of either.
+    Parameters
+    ----------
+    depth : ndarray (H, W) float32
+    step : float
+        Largest relative depth step between connected neighbours.
+
+    Returns
+    -------
+    ndarray (H, W)
+        Number of pixels, 0 where unknown.
     """
     number = np.arange(depth.size).reshape(depth.shape)
     log = np.log(depth)
@@ -135,12 +203,20 @@ def _kept(depth_map: DepthMap, keep: B8) -> DepthMap:
 
 @dataclass(frozen=True)
 class DepthCompletion:
-    """Depths for what is hidden from all neighbours of a view but measured by others that it shares it with.
+    """Completion of a depth map with surfaces that only the depth maps of other views contain.
 
-    The maps of other views are taken to a view; where it has no depth their nearest one is offered to
-    the search for slanted windows, against the ``most`` photographs whose maps offer most. What the windows
-    accept (the rule of :class:`PlaneRefinement`) is depth as good as any: nothing is interpolated. Gaps of
-    ``gap_px`` between offered pixels are searched too, for maps differ in resolution.
+    The depths of other views are projected into the view. Where it has none, the nearest of these initialise
+    the plane search against the ``max_sources`` images that contribute most pixels. Accepted planes (by the
+    rule of :class:`PlaneRefinement`) are measured depths: nothing is interpolated.
+
+    Parameters
+    ----------
+    max_sources : int
+        Largest number of contributing views.
+    gap_px : int
+        Gaps of this size between projected pixels are searched too.
+    sweeps : int
+        Passes of the plane search.
     """
 
     max_sources: int = 4
@@ -155,7 +231,21 @@ class DepthCompletion:
         *,
         refinement: PlaneRefinement,
     ) -> DepthMap:
-        """``own`` with depths of more pixels, from the maps ``others`` and the photographs ``views``."""
+        """Complete a depth map from the depth maps of other views.
+
+        Parameters
+        ----------
+        own : DepthMap
+        others : sequence of DepthMap
+        views : mapping of int to PinholeView
+            Images of all views.
+        refinement : PlaneRefinement
+
+        Returns
+        -------
+        DepthMap
+            The depth map with additional depths.
+        """
         unknown = np.isnan(own.depth) & views[own.view].seen
         offers = []
         for other in others:
@@ -171,13 +261,13 @@ class DepthCompletion:
         nearest = np.fmin.reduce([offers[k] for k in best])
         wanted = unknown & scipy.ndimage.binary_dilation(np.isfinite(nearest), np.ones((3, 3)), self.gap_px)
         rho = (np.float32(1.0) / np.where(unknown, nearest, own.depth)).astype(np.float32)
-        photographs = [views[others[k].view] for k in best]
-        found = refinement.search(views[own.view], photographs, rho, wanted=wanted, sweeps=self.sweeps)
+        images = [views[others[k].view] for k in best]
+        found = refinement.search(views[own.view], images, rho, wanted=wanted, sweeps=self.sweeps)
         return _with(own, *found)
 
 
 def _with(own: DepthMap, rho: F32, std: F32, support: np.ndarray) -> DepthMap:
-    """The map with inverse depths where they are known."""
+    """The map with additional inverse depths."""
     new = np.isfinite(rho)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.float32(1.0) / rho
@@ -192,8 +282,18 @@ def _with(own: DepthMap, rho: F32, std: F32, support: np.ndarray) -> DepthMap:
 
 @dataclass(frozen=True)
 class MultiViewScene:
-    """What the views share: ``views`` without distortion by number, the sparse ``points``, the ``neighbours``
-    of each view, the best first, and views ``matched`` at another size than that of their depth maps."""
+    """Input of multi-view stereo.
+
+    Attributes
+    ----------
+    views : mapping of int to PinholeView
+        Undistorted views by number, in the size of their depth maps.
+    points : SparsePoints
+    neighbours : mapping of int to tuple of int
+        Neighbours of each view, the most useful first.
+    matched : mapping of int to PinholeView
+        Views in the size used for stereo matching.
+    """
 
     views: Mapping[int, PinholeView]
     points: SparsePoints
@@ -201,8 +301,18 @@ class MultiViewScene:
     matched: Mapping[int, PinholeView] = field(default_factory=dict)
 
     def subset(self, numbers: Collection[int]) -> MultiViewScene:
-        """The photographs of these views alone, and the points that they see: enough for the map of a view
-        with its :meth:`MultiViewStereo.surroundings`, and much less to send."""
+        """Restrict the scene to some views, which reduces the data sent to a worker.
+
+        Parameters
+        ----------
+        numbers : collection of int
+            Views, e.g. those of :meth:`MultiViewStereo.required_views`.
+
+        Returns
+        -------
+        MultiViewScene
+            Images of these views and the points that they observe.
+        """
         views, matched = (
             {i: view for i, view in given.items() if i in numbers} for given in (self.views, self.matched)
         )
@@ -213,16 +323,31 @@ class MultiViewScene:
 
 @dataclass(frozen=True)
 class MultiViewStereo:
-    """Depth maps from undistorted views (thesis, section 2.6: dense depth from all photographs).
+    """Depth maps of undistorted views (thesis, section 2.6: dense depth from all images).
 
-    ``pairs`` finds correspondences, ``choice`` the neighbours, ``linker`` makes one inverse depth of what
-    they say, ``refinement`` (None: none) makes it agree with the photographs, ``consistency`` holds the maps
-    of at least ``least_partners`` views, as far as there are, against each other once ``completion`` (None:
-    none) has taken from them what a view lacks. ``max_side`` px bounds the size of the depth maps,
-    ``match_side`` px that at which pairs are matched: windows that do not slant find less in larger
-    pictures, and the refinement works out what the smaller ones lack. One view's map depends on
-    nothing but the photographs and cameras, so views can be done in any order, by any number of threads and
-    in several runs: :meth:`prepare`, :meth:`depth_map` of each, :meth:`confirm` of each.
+    The depth map of a view depends on images and cameras only, so views can be processed in any order and in
+    parallel: :meth:`prepare`, then :meth:`depth_map` of each view, then :meth:`confirm` of each view.
+
+    Parameters
+    ----------
+    pairs : PairMatching
+        Dense correspondence of two views.
+    selection : NeighbourSelection
+        Selection of neighbouring views.
+    linker : RobustFusion or SequenceLinking
+        Fusion of correspondences to one inverse depth.
+    refinement : PlaneRefinement or None
+        Refinement with slanted windows.
+    consistency : GeometricConsistency
+        Confirmation by the depth maps of other views.
+    completion : DepthCompletion or None
+        Completion from the depth maps of other views.
+    min_comparison_views : int
+        Number of depth maps to compare with, if there are as many.
+    max_side : int
+        Longest side of the depth maps in pixels.
+    match_side : int
+        Longest side of the images for stereo matching; fronto-parallel windows find less in larger images.
     """
 
     pairs: PairMatching = field(default_factory=PairMatching)
@@ -236,22 +361,66 @@ class MultiViewStereo:
     match_side: int = 640
 
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
-        """Disparities of a rectified pair of arrays by the matcher of ``pairs``."""
+        """Compute the disparities of a rectified pair with the matcher of ``pairs``.
+
+        Parameters
+        ----------
+        left, right : array_like (H, W) or (H, W, 3)
+            Grey levels 0 .. 255; rows correspond.
+        max_disparity_px : float
+            Disparity of the nearest point.
+
+        Returns
+        -------
+        DisparityMap
+            x_right = x_left - d, NaN = unknown or occluded.
+        """
         return match_rectified(left, right, max_disparity_px=max_disparity_px, matcher=self.pairs.matcher)
 
     def match_two_views(
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
     ) -> RectifiedPair:
-        """Dense correspondence of two photographs with F and its inliers; see :func:`match_two_views`."""
+        """Compute dense correspondence of two images, see :func:`.correspondence.match_two_views`.
+
+        Parameters
+        ----------
+        image1, image2 : Image
+        F : ndarray (3, 3)
+            Fundamental matrix, x2' F x1 = 0.
+        xy1, xy2 : ndarray (N >= 8, 2)
+            Inlier matches in pixels.
+        planar : bool
+            Rectify by homographies only.
+
+        Returns
+        -------
+        RectifiedPair
+            Rectified images and disparities of both.
+        """
         return match_two_views(image1.rgb, image2.rgb, F, xy1, xy2, pairs=self.pairs, planar=planar)
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
-        """Undistorted views, sparse points and neighbours of V photographs with a metric reconstruction.
+        """Undistort the views and select their neighbours.
 
-        Raises ``ValueError`` for reconstructions that are not metric or of other photographs.
+        Parameters
+        ----------
+        images : sequence of Image
+            The V images.
+        reconstruction : Reconstruction
+            Metric reconstruction of these images.
+
+        Returns
+        -------
+        MultiViewScene
+            Input of :meth:`depth_map`.
+
+        Raises
+        ------
+        ValueError
+            If the reconstruction is not metric or belongs to other images.
         """
         if len(images) != len(reconstruction.P):
-            raise ValueError(f"{len(reconstruction.P)} cameras need as many photographs; got {len(images)}")
+            raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
         points = sparse_points(reconstruction)
         views, matched = (
             {
@@ -265,10 +434,23 @@ class MultiViewStereo:
         return MultiViewScene(views, points, chosen, matched)
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
-        """Depths of one view from its neighbours, before other depth maps are asked.
+        """Compute the depth map of one view from its neighbours, before the consistency check.
 
-        NaN where unknown; nothing but NaN for a view without neighbours or whose pairs all fail. ``views``
-        counts the neighbours that agree. ``ValueError`` for a view without a camera.
+        Parameters
+        ----------
+        scene : MultiViewScene
+        view : int
+
+        Returns
+        -------
+        DepthMap
+            NaN = unknown, everywhere if the view has no neighbours or all pairs fail; ``views`` counts the
+            neighbours that agree.
+
+        Raises
+        ------
+        ValueError
+            If the view has no camera.
         """
         if view not in scene.views:
             raise ValueError(f"view {view} has no camera; those with one are {sorted(scene.views)}")
@@ -290,7 +472,19 @@ class MultiViewStereo:
         return self.consistency.remove_small_regions(_depth_map(scene.views[view], found))
 
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
-        """The map of ``view`` with what the maps of other views confirm; see :class:`Consistency`."""
+        """Complete a depth map and keep what other depth maps confirm.
+
+        Parameters
+        ----------
+        scene : MultiViewScene
+        depth_maps : mapping of int to DepthMap
+        view : int
+
+        Returns
+        -------
+        DepthMap
+            Confirmed depths, see :class:`GeometricConsistency`.
+        """
         others = [depth_maps[j] for j in self.comparison_views(scene, view) if j in depth_maps]
         own = depth_maps[view]
         if self.completion is not None and self.refinement is not None:
@@ -298,15 +492,36 @@ class MultiViewStereo:
         return self.consistency.confirm(own, others)
 
     def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
-        """The views whose photographs :meth:`depth_map` and :meth:`confirm` of ``view`` look at, itself among
-        them."""
+        """Return the views whose images :meth:`depth_map` and :meth:`confirm` of a view use.
+
+        Parameters
+        ----------
+        scene : MultiViewScene
+        view : int
+
+        Returns
+        -------
+        frozenset of int
+            Numbers of the views, the view among them.
+        """
         near = scene.neighbours[view]
         reached = self.linker.views_used(view, scene.views, near)
         return frozenset({view, *near, *reached, *self.comparison_views(scene, view)})
 
     def comparison_views(self, scene: MultiViewScene, view: int) -> tuple[int, ...]:
-        """Views whose maps are held against that of ``view``: its neighbours, those it is one of, and as
-        many more as make ``least_partners``, those with most points in common."""
+        """Return the views whose depth maps are compared with that of a view.
+
+        Parameters
+        ----------
+        scene : MultiViewScene
+        view : int
+
+        Returns
+        -------
+        tuple of int
+            Its neighbours, the views it is a neighbour of, and up to ``min_comparison_views`` those with the
+            most common points.
+        """
         mutual = {j for j, chosen in scene.neighbours.items() if view in chosen}
         comparison_views = (mutual | set(scene.neighbours[view])) - {view}
         seen = scene.points.seen
@@ -321,7 +536,22 @@ class MultiViewStereo:
     def map_all(
         self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
     ) -> dict[int, DepthMap]:
-        """Confirmed depth maps of all registered views by number; the same whatever the number of threads."""
+        """Compute the confirmed depth maps of all registered views.
+
+        Parameters
+        ----------
+        images : sequence of Image
+            The V images.
+        reconstruction : Reconstruction
+            Metric reconstruction of these images.
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        dict of int to DepthMap
+            Depth maps by view number.
+        """
         scene = self.prepare(images, reconstruction)
         order = sorted(scene.views)
         found = dict(zip(order, _run(lambda i: self.depth_map(scene, i), order, threads), strict=True))
@@ -329,7 +559,7 @@ class MultiViewStereo:
 
 
 def _depth_map(view: PinholeView, found: InverseDepth) -> DepthMap:
-    """Depths of inverse depths; those that cannot be told from infinity are none."""
+    """Convert inverse depths to depths; those not significantly above 0 are unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         known = (found.value > SURE * found.std) & view.seen
         depth = np.where(known, 1.0 / found.value, np.nan).astype(np.float32)

@@ -1,4 +1,4 @@
-"""From correspondences of a reference view to inverse depths of its pixels: two ways."""
+"""Fusion of correspondences with several views into the inverse depth of each pixel (thesis, section 2.5)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,22 @@ from thesisrecon.stereo.correspondence import Correspondence
 from thesisrecon.stereo.depth_kernels import fuse_inverse_depths, inverse_depths, update_kalman
 
 Correspond = Callable[[int, int], Correspondence | None]
-"""The correspondence of view i in view j, None where the pair gives none."""
+"""Returns the correspondence of view i in view j, None if the pair fails."""
 
 
 @dataclass(frozen=True)
 class InverseDepth:
-    """Inverse depth of the pixels of a view: ``value``, ``std`` (H, W) float32, NaN where unknown; ``views``
-    (H, W) how many other views it is from, ``rivals`` how many say otherwise."""
+    """Inverse depth of the pixels of a view.
+
+    Attributes
+    ----------
+    value, std : ndarray (H, W) float32
+        Inverse depth and standard deviation, NaN = unknown.
+    views : ndarray (H, W) uint8
+        Number of other views that agree.
+    conflicts : ndarray (H, W) uint8
+        Number of other views that disagree.
+    """
 
     value: F32
     std: F32
@@ -31,18 +40,29 @@ class InverseDepth:
 
     @property
     def contradictory(self) -> B8:
-        """(H, W) where no two agree although two or more speak."""
+        """(H, W) pixels with several measurements none of which agree."""
         return np.asarray((self.views < 2) & (self.conflicts > 0))
 
     def where(self, keep: B8) -> InverseDepth:
-        """What is kept, unknown elsewhere."""
+        """Keep some of the pixels.
+
+        Parameters
+        ----------
+        keep : ndarray (H, W) bool
+            Pixels to keep; the others become unknown.
+
+        Returns
+        -------
+        InverseDepth
+            The kept inverse depths.
+        """
         value, std = (np.where(keep, part, np.float32(np.nan)) for part in (self.value, self.std))
         views, conflicts = (np.where(keep, part, np.uint8(0)) for part in (self.views, self.conflicts))
         return InverseDepth(value, std, views, conflicts)
 
 
 class Linker(Protocol):
-    """A way of making one inverse depth of several correspondences."""
+    """Method that fuses correspondences with other views into one inverse depth."""
 
     def link(
         self,
@@ -51,19 +71,23 @@ class Linker(Protocol):
         neighbours: Sequence[int],
         correspond: Correspond,
     ) -> InverseDepth:
-        """Inverse depths of the pixels of ``view``."""
+        """Compute the inverse depths of the pixels of ``view``."""
 
     def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
-        """The numbers of the other views that :meth:`link` asks for."""
+        """Return the numbers of the other views that :meth:`link` requests."""
 
 
 @dataclass(frozen=True)
 class RobustFusion:
-    """Every neighbour gives an inverse depth with a deviation; those that agree are averaged.
+    """Robust weighted mean of the inverse depths measured with all neighbours.
 
-    Estimates within ``gate`` deviations of each other agree, and the largest party wins, the
-    more certain one among equals. A pixel about which a single neighbour speaks is kept, for another view's
-    depth map to confirm.
+    The largest group of estimates that agree is averaged, the more certain one among equals. A measurement
+    with a single neighbour is kept; the depth map of another view must confirm it.
+
+    Parameters
+    ----------
+    gate : float
+        Standard deviations within which estimates agree.
     """
 
     gate: float = 3.0
@@ -75,7 +99,21 @@ class RobustFusion:
         neighbours: Sequence[int],
         correspond: Correspond,
     ) -> InverseDepth:
-        """Inverse depths of the pixels of ``view`` from each of its neighbours."""
+        """Compute the inverse depths of the pixels of ``view`` from its neighbours.
+
+        Parameters
+        ----------
+        view : int
+        views : mapping of int to PinholeView
+        neighbours : sequence of int
+        correspond : callable
+            Returns the correspondence of view i in view j, None if the pair fails.
+
+        Returns
+        -------
+        InverseDepth
+            Inverse depths with their standard deviations.
+        """
         found = []
         for other in neighbours:
             pair = correspond(view, other)
@@ -89,21 +127,39 @@ class RobustFusion:
         return result
 
     def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
-        """The neighbours."""
+        """Return the numbers of the neighbours.
+
+        Parameters
+        ----------
+        view : int
+        views : collection of int
+        neighbours : sequence of int
+
+        Returns
+        -------
+        set of int
+            The neighbours.
+        """
         del view, views
         return set(neighbours)
 
 
 @dataclass(frozen=True)
 class SequenceLinking:
-    """Koch, Pollefeys and Van Gool, "Multi viewpoint stereo from uncalibrated video sequences", ECCV 1998.
+    """Link correspondences through the image sequence with a Kalman filter per pixel.
 
-    From the reference view the disparities of neighbouring pairs are chained up and down the sequence: where
-    a pixel is in view k + 1 follows from where it was in view k. Every view of the chain measures the depth
-    anew with a longer baseline; a 1-D Kalman filter on the inverse depth takes the measurements in until the
-    first beyond ``gate`` deviations of the innovation, where the pixel is taken to be hidden. The deviations
-    of the links add up in squares. Chains end after ``length`` links and where a pair gives nothing; both
-    directions are filtered on their own and joined where they agree.
+    Koch, Pollefeys and Van Gool, "Multi viewpoint stereo from uncalibrated video sequences", ECCV 1998. The
+    disparities of consecutive pairs are chained up and down the sequence from the reference view. Each view
+    of the chain measures the depth with a longer baseline, and the variances of the links add up. A pixel's
+    chain ends at the first measurement outside the gate, where it is taken as occluded. Both directions are
+    filtered separately and fused where they agree.
+
+    Parameters
+    ----------
+    length : int
+        Maximal number of links in each direction.
+    gate : float
+        Limit of the innovation in standard deviations.
     """
 
     length: int = 4
@@ -116,7 +172,21 @@ class SequenceLinking:
         neighbours: Sequence[int],  # noqa: ARG002 - one signature for all linkers
         correspond: Correspond,
     ) -> InverseDepth:
-        """Inverse depths of the pixels of ``view``; the sequence is that of the views' numbers."""
+        """Compute the inverse depths of the pixels of ``view``; views are ordered by number.
+
+        Parameters
+        ----------
+        view : int
+        views : mapping of int to PinholeView
+        neighbours : sequence of int
+        correspond : callable
+            Returns the correspondence of view i in view j, None if the pair fails.
+
+        Returns
+        -------
+        InverseDepth
+            Inverse depths with their standard deviations.
+        """
         order = sorted(views)
         place = order.index(view)
         chains = [order[place : place + self.length + 1], order[: place + 1][::-1][: self.length + 1]]
@@ -130,7 +200,19 @@ class SequenceLinking:
         return result
 
     def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
-        """Those next in the sequence, on either side."""
+        """Return the numbers of the views within ``length`` of ``view``.
+
+        Parameters
+        ----------
+        view : int
+        views : collection of int
+        neighbours : sequence of int
+
+        Returns
+        -------
+        set of int
+            Numbers of the other views.
+        """
         del neighbours
         order = sorted(views)
         place = order.index(view)
@@ -154,10 +236,20 @@ class SequenceLinking:
 
 
 def follow(first: Correspondence, second: Correspondence) -> Correspondence:
-    """Where the pixels of a view i are in view k, from i in j and j in k.
+    """Concatenate the correspondences of views i to j and j to k.
 
-    The place in j is between pixels: the places of the four around are interpolated where they are within two
-    pixels of each other's step, else the nearest one's is moved along. Deviations add up in squares.
+    The positions of the four pixels around in j are interpolated if they are consistent, else that of the
+    nearest is shifted. Variances add up.
+
+    Parameters
+    ----------
+    first, second : Correspondence
+        Correspondence of i in j and of j in k.
+
+    Returns
+    -------
+    Correspondence
+        Correspondence of i in k.
     """
     height, width = second.sigma.shape
     at = first.xy
@@ -186,7 +278,20 @@ def follow(first: Correspondence, second: Correspondence) -> Correspondence:
 
 
 def inverse_depth_of(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32]:
-    """Inverse depth and deviation (H, W) of the pixels of a camera whose places in another one are known."""
+    """Compute inverse depths from the correspondence with another camera.
+
+    Parameters
+    ----------
+    P, P_other : ndarray (3, 4)
+        Cameras of both views.
+    pair : Correspondence
+        Positions of the pixels in the other view.
+
+    Returns
+    -------
+    tuple of ndarray (H, W) float32
+        Inverse depth and standard deviation, NaN = unknown.
+    """
     M = np.linalg.inv(P[:, :3])
     centre = camera_centre(P)
     rho, std = np.empty_like(pair.sigma), np.empty_like(pair.sigma)

@@ -19,10 +19,23 @@ class DepthStd(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> None:
-    """Inverse depth (H, W) of pixels x that are seen at ``xy`` (H, W, 2) in the other view, with deviation.
+    """Compute inverse depths from correspondences, with standard deviations.
 
-    There a pixel of inverse depth rho is at H (x, y, 1) + rho e; the answer is the rho whose place is
-    nearest. NaN where the place is not known or behind either camera.
+    A pixel of inverse depth rho is at H (x, y, 1) + rho e in the other view; rho minimises the distance to
+    the correspondence. NaN if that is unknown or behind a camera.
+
+    Parameters
+    ----------
+    xy : ndarray (H, W, 2) float32
+        Correspondences in pixels of the other view.
+    sigma : ndarray (H, W) float32
+        Their standard deviation in pixels.
+    H : ndarray (3, 3)
+        Homography of the plane at infinity.
+    e : ndarray (3,)
+        Epipole of the other view.
+    rho, std : ndarray (H, W) float32
+        Receive inverse depth and standard deviation.
     """
     height, width = rho.shape
     for v in range(height):
@@ -48,10 +61,21 @@ def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> N
 def fuse_inverse_depths(
     rho: F32, std: F32, gate: float, out: F32, out_std: F32, support: U8, conflicts: U8
 ) -> None:
-    """One inverse depth (H, W) of several (K, H, W): the mean, weighted by the inverse variances, of those
-    that agree within ``gate`` deviations with the one that most agree with (the more certain among equals).
+    """Fuse several inverse depths per pixel into one.
 
-    ``support`` is how many agree, ``rivals`` how many are known and do not.
+    The estimate that most others agree with within ``gate`` standard deviations is averaged with these,
+    weighted by the inverse variances; among equals the more certain one.
+
+    Parameters
+    ----------
+    rho, std : ndarray (K, H, W) float32
+        Inverse depths and standard deviations, NaN = unknown.
+    gate : float
+        Standard deviations within which estimates agree.
+    out, out_std : ndarray (H, W) float32
+        Receive the fused inverse depth and its standard deviation.
+    support, conflicts : ndarray (H, W) uint8
+        Receive the numbers of estimates that agree and disagree.
     """
     count, height, width = rho.shape
     for v in range(height):
@@ -82,7 +106,7 @@ def fuse_inverse_depths(
             for m in range(count):
                 if _agree(rho[best, v, u], std[best, v, u], rho[m, v, u], std[m, v, u], gate):
                     scatter += ((rho[m, v, u] - mean) / std[m, v, u]) ** 2
-            # What the estimates differ by beyond their deviations is deviation too.
+            # A scatter larger than the standard deviations enlarges the result.
             spread = scatter / (most - 1) if most > 1 else 1.0
             out[v, u], out_std[v, u] = mean, np.sqrt(max(spread, 1.0) / weights)
 
@@ -95,10 +119,23 @@ def _agree(a: float, sa: float, b: float, sb: float, gate: float) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive: U8, support: U8) -> None:
-    """One step of the 1-D Kalman filter of every pixel (H, W), in place.
+    """Update the one-dimensional Kalman filter of every pixel in place.
 
-    A measurement beyond ``gate`` deviations of the innovation, or none, ends the chain of its pixel
-    (``alive`` 0); the first one starts it.
+    The first measurement starts the chain of a pixel; a missing measurement, or one beyond ``gate`` standard
+    deviations of the innovation, ends it.
+
+    Parameters
+    ----------
+    rho, std : ndarray (H, W) float32
+        Filtered inverse depth and standard deviation.
+    new, new_std : ndarray (H, W) float32
+        Measurement and its standard deviation.
+    gate : float
+        Limit of the innovation in standard deviations.
+    alive : ndarray (H, W) uint8
+        1 while the chain continues.
+    support : ndarray (H, W) uint8
+        Number of measurements.
     """
     height, width = rho.shape
     for v in range(height):
@@ -130,13 +167,26 @@ def count_agreement(
     agree: U8,
     contradict: U8,
 ) -> None:
-    """Add 1 to ``agree`` (H, W) where the depth map ``other`` confirms ``depth``, to ``contradict`` where it
-    sees through it.
+    """Count pixels that another depth map confirms or contradicts.
 
-    ``to`` and ``back`` (3, 4) take z (x, y, 1), 1 of one view to z' (x', y', 1) of the other and back. With
-    ``limits`` (pixels, relative depth, deviations): confirmed is what comes back within the pixels from a
-    depth that differs by less than the relative bound plus the deviations of both; seen through what is
-    nearer than what the other view sees there by more.
+    A pixel is confirmed if the reprojection of the other map's depth returns within ``limits[0]`` pixels and
+    the depths differ by less than the bound; it is contradicted if the other view sees through it.
+
+    Parameters
+    ----------
+    own : DepthStd
+        Depth map of the view.
+    to : ndarray (3, 4)
+        Transform of z (x, y, 1), 1 to z' (x', y', 1) of the other view.
+    other : DepthStd
+        Depth map of the other view.
+    back : ndarray (3, 4)
+        Transform from the other view back.
+    limits : ndarray (3,)
+        Pixels, relative depth difference, and standard deviations; the depth bound is the sum of the latter
+        two.
+    agree, contradict : ndarray (H, W) uint8
+        Counters, incremented.
     """
     depth, std = own
     other_depth, other_std = other
@@ -162,7 +212,7 @@ def count_agreement(
             if found > w + bound:
                 contradict[v, u] += 1
             elif found >= w - bound:
-                # The nearest pixel's depth, taken along the very ray of the pixel.
+                # Depth of the nearest pixel on the ray of this pixel.
                 b = found * (back[2, 0] * x + back[2, 1] * y + back[2, 2]) + back[2, 3]
                 dx = (found * (back[0, 0] * x + back[0, 1] * y + back[0, 2]) + back[0, 3]) / b - u
                 dy = (found * (back[1, 0] * x + back[1, 1] * y + back[1, 2]) + back[1, 3]) / b - v
@@ -172,8 +222,16 @@ def count_agreement(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def splat_depths(depth: F32, to: F64, out: F32) -> None:
-    """Depths (H, W) of one view at the nearest pixels of another, the nearer of several there; ``out``
-    (H', W') is updated, NaN where nothing is known. ``to`` (3, 4) see :func:`count_agreement`."""
+    """Project the depths of one view to the nearest pixels of another, keeping the smaller depth.
+
+    Parameters
+    ----------
+    depth : ndarray (H, W) float32
+    to : ndarray (3, 4)
+        Transform to the other view, see :func:`count_agreement`.
+    out : ndarray (H', W') float32
+        Depths of the other view, updated; NaN = unknown.
+    """
     rows, columns = out.shape
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -194,11 +252,25 @@ def splat_depths(depth: F32, to: F64, out: F32) -> None:
 def surface_continuation(
     rho: F32, std: F32, sure: U8, radius: int, alike: float, gate: float, joins: U8
 ) -> None:
-    """``joins`` (H, W): whether the inverse depth of a pixel that is not sure continues the surface about it.
+    """Find pixels that continue the surface of reliable neighbours.
 
-    The surface is the plane that fits the sure pixels within ``radius``, those that differ by at most the
-    share ``alike``; they must be a quarter of the window and not all to one side, and the plane must pass
-    within ``gate`` deviations.
+    A plane is fitted to the reliable pixels of the window with similar inverse depth. They must be a quarter
+    of the window and surround the pixel, and the plane must pass within ``gate`` standard deviations.
+
+    Parameters
+    ----------
+    rho, std : ndarray (H, W) float32
+        Inverse depths and standard deviations.
+    sure : ndarray (H, W) uint8
+        Nonzero for reliable pixels.
+    radius : int
+        Radius of the window.
+    alike : float
+        Largest relative difference of inverse depths on one surface.
+    gate : float
+        Limit of the plane's distance in standard deviations.
+    joins : ndarray (H, W) uint8
+        Receives 1 for continuing pixels.
     """
     height, width = rho.shape
     least = (2 * radius + 1) ** 2 // 4
@@ -223,7 +295,7 @@ def surface_continuation(
             sxx, sxy, syy = sxx - sx * mx, sxy - sx * my, syy - sy * my
             sxd, syd = sxd - sx * sd / n, syd - sy * sd / n
             det = sxx * syy - sxy * sxy
-            # Farther from their middle than they spread, the plane would be extrapolated.
+            # Reject extrapolation: the pixel must lie within the spread of the window pixels.
             if det <= 1e-3 * sxx * syy or mx * mx + my * my > 0.5 * (sxx + syy) / n:
                 continue
             gx, gy = (syy * sxd - sxy * syd) / det, (sxx * syd - sxy * sxd) / det

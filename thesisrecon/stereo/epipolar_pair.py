@@ -1,12 +1,9 @@
-"""The pencil of epipolar lines of a pair: what every way of rectifying shares.
+"""Epipolar pencils of image pairs, the common input of all rectification methods.
 
-Epipolar planes are numbered by an angle phi, the plane p = (cos phi, sin phi) being seen as the line L p in
-either view (3, 2 matrices L, two lines through the epipole). Every pixel lies on one half-plane bounded by
-the baseline, so phi runs over the whole circle: half epipolar lines (Pollefeys, Koch and Van Gool, ICCV
-1999), without an exception for epipoles at infinity. Places are z = (x - centre) / unit, the unit about one
-focal length.
-
-What a pair of views gives to every way of rectifying it, and the refusal of pairs that cannot be.
+An epipolar plane has an angle phi; p = (cos phi, sin phi) is imaged as the line L p with a 3 x 2 matrix L per
+view whose columns are two lines through the epipole. A pixel lies in a half-plane bounded by the baseline, so
+phi covers the full circle: half epipolar lines (Pollefeys, Koch and Van Gool, ICCV 1999), also for epipoles
+at infinity. Normalised coordinates are z = (x - centre) / unit with a unit of about one focal length.
 """
 
 from __future__ import annotations
@@ -29,17 +26,26 @@ from thesisrecon.geometry.two_view import (
 )
 
 FOCAL_PER_SIDE = 1.2
-"""The unit of length in an image over its long side: the focal length of a usual lens."""
+"""Unit of normalised coordinates relative to the longer image side: the focal length of a usual lens."""
 _J = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class EpipolarPencil:
-    """``lines`` (2, 3, 2): L of each view in places z, oriented such that matches share their phi.
+    """Epipolar lines of two views, parametrised by the angle of the epipolar plane.
 
-    ``centres`` (2, 2) px and ``units`` (2,) px make z of pixels; ``sizes`` (2, 2) width, height of the
-    photographs. ``turned`` says that rows run against phi and columns against the half-lines: with it larger
-    disparities are nearer.
+    Attributes
+    ----------
+    lines : ndarray (2, 3, 2)
+        L of each view in normalised coordinates, oriented so that matches have equal phi.
+    centres : ndarray (2, 2)
+        Image centres in pixels.
+    units : ndarray (2,)
+        Units of the normalised coordinates in pixels.
+    sizes : tuple of (width, height)
+        Image sizes in pixels.
+    flipped : bool
+        Rows run against phi and columns against the half-lines, so that larger disparities are nearer.
     """
 
     lines: F64
@@ -49,32 +55,99 @@ class EpipolarPencil:
     flipped: bool = False
 
     def normalized(self, side: int, xy: F64) -> F64:
-        """z (..., 2) of pixels (..., 2)."""
+        """Convert pixels to normalised coordinates.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        xy : ndarray (..., 2)
+
+        Returns
+        -------
+        ndarray (..., 2)
+            Normalised coordinates z.
+        """
         return np.asarray((xy - self.centres[side]) / self.units[side])
 
     def pixels(self, side: int, z: F64) -> F64:
-        """Pixels (..., 2) of z (..., 2)."""
+        """Convert normalised coordinates to pixels.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        z : ndarray (..., 2)
+            Normalised coordinates.
+
+        Returns
+        -------
+        ndarray (..., 2)
+        """
         return np.asarray(z * self.units[side] + self.centres[side])
 
     def epipole(self, side: int) -> F64:
-        """(3,) homogeneous, in places; the third entry is 0 at infinity."""
+        """Return the epipole of a view.
+
+        Parameters
+        ----------
+        side : {0, 1}
+
+        Returns
+        -------
+        ndarray (3,)
+            Homogeneous normalised coordinates; the third is 0 at infinity.
+        """
         return np.asarray(np.cross(self.lines[side, :, 0], self.lines[side, :, 1]))
 
     def planes(self, side: int, xy: F64) -> F64:
-        """p (..., 2), any positive length, of the half-planes that hold pixels (..., 2)."""
+        """Return the half-planes of pixels.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        xy : ndarray (..., 2)
+
+        Returns
+        -------
+        ndarray (..., 2)
+            Vectors p of any positive length.
+        """
         z = self.normalized(side, xy)
         L = self.lines[side]
         q = z @ L[:2] + L[2]
         return np.stack([q[..., 1], -q[..., 0]], axis=-1)
 
     def angles(self, side: int, xy: F64, *, about: float = 0.0) -> F64:
-        """phi (...) of pixels (..., 2), within pi of ``about``."""
+        """Return the angles of the half-planes of pixels.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        xy : ndarray (..., 2)
+        about : float
+            Centre of the interval of length 2 pi in which angles are returned.
+
+        Returns
+        -------
+        ndarray (...)
+            Angles phi.
+        """
         p = self.planes(side, xy)
         c, s = np.cos(about), np.sin(about)
         return np.asarray(about + np.arctan2(c * p[..., 1] - s * p[..., 0], c * p[..., 0] + s * p[..., 1]))
 
     def half_lines(self, side: int, phi: F64) -> HalfLines:
-        """The half epipolar lines phi (N,) of a view."""
+        """Return the half epipolar lines of a view.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        phi : ndarray (N,)
+
+        Returns
+        -------
+        HalfLines
+            The half-lines in normalised coordinates.
+        """
         l = plane_from_angle(phi) @ self.lines[side].T
         norm = np.linalg.norm(l[:, :2], axis=1)
         n, offset = l[:, :2] / norm[:, None], l[:, 2] / norm
@@ -85,7 +158,20 @@ class EpipolarPencil:
         return HalfLines(-offset[:, None] * n, d, offset, e)
 
     def sweep_rate(self, side: int, phi: F64, z: F64) -> F64:
-        """How far lines phi (N,) move across their points z (N, 2) per radian, in places."""
+        """Return the motion of epipolar lines across their points per radian.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        phi : ndarray (N,)
+        z : ndarray (N, 2)
+            A point of each line.
+
+        Returns
+        -------
+        ndarray (N,)
+            Normalised distance per radian.
+        """
         p = plane_from_angle(phi)
         l, moving = p @ self.lines[side].T, p @ (self.lines[side] @ _J).T
         return np.asarray(
@@ -95,10 +181,20 @@ class EpipolarPencil:
 
 @dataclass(frozen=True)
 class HalfLines:
-    """Half-lines as ``foot`` (N, 2), the point nearest to the image centre, and unit ``direction`` (N, 2).
+    """Half epipolar lines of a view.
 
-    Along the direction d(z - e) grows, or falls where the epipole's third coordinate is negative;
-    ``epipole`` (3,) has a largest entry of about 1, ``distance`` (N,) is signed, of the centre.
+    Along the direction d(z - e) grows, or falls if the epipole's third coordinate is negative.
+
+    Attributes
+    ----------
+    foot : ndarray (N, 2)
+        Points nearest to the image centre.
+    direction : ndarray (N, 2)
+        Unit directions.
+    distance : ndarray (N,)
+        Signed distance of the image centre.
+    epipole : ndarray (3,)
+        Epipole with a largest entry of about 1.
     """
 
     foot: F64
@@ -108,11 +204,11 @@ class HalfLines:
 
     @property
     def sagitta(self) -> F64:
-        """(N,) by how much the circle about the epipole through the centre is off each foot.
+        """(N,) distance of each foot from the circle about the epipole through the centre.
 
-        D (1 - cos alpha) with the epipole's distance D and the angle alpha it sees foot and centre under:
-        columns of equal distance from the epipole, without cancellation where that is far away, and 0 at
-        infinity.
+        D (1 - cos alpha) with the epipole's distance D and the angle alpha between foot and centre, without
+        cancellation for distant epipoles and 0 at infinity. It aligns columns of equal distance from the
+        epipole.
         """
         e = self.epipole
         D_w = float(np.hypot(e[0], e[1]))
@@ -128,21 +224,41 @@ class HalfLines:
 
     @property
     def start(self) -> F64:
-        """(N,) position along the direction where the half-line begins or ends; infinite for an epipole at
-        infinity."""
+        """(N,) position of the epipole along the direction, infinite for an epipole at infinity."""
         e = self.epipole
         if e[2] == 0.0:
             return np.full(len(self.foot), -np.inf)
         return np.asarray(self.direction @ (e[:2] / e[2]))
 
     def on_half(self, t: F64) -> F64:
-        """Whether positions ``t`` (N, ...) along the directions lie on the half-lines, not beyond."""
+        """Test whether positions lie on the half-lines.
+
+        Parameters
+        ----------
+        t : ndarray (N, ...)
+            Positions along the directions.
+
+        Returns
+        -------
+        ndarray (N, ...) bool
+            False beyond the epipole.
+        """
         first = self.start.reshape(-1, *([1] * (t.ndim - 1)))
         return np.asarray(t < first if self.epipole[2] < 0.0 else t > first)
 
     def chord(self, low: F64, high: F64) -> tuple[F64, F64]:
-        """The positions (N,), (N,) between which the half-lines are within the box ``low`` to ``high`` (2,);
-        the first is not below the second where they miss it."""
+        """Intersect the half-lines with a box.
+
+        Parameters
+        ----------
+        low, high : ndarray (2,)
+            Corners of the box.
+
+        Returns
+        -------
+        tuple of ndarray (N,)
+            Positions of entry and exit; entry >= exit if the box is missed.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             one, two = (low - self.foot) / self.direction, (high - self.foot) / self.direction
         inside = (self.foot >= low) & (self.foot <= high)
@@ -155,14 +271,24 @@ class HalfLines:
 
 
 def plane_from_angle(phi: F64) -> F64:
-    """(cos phi, sin phi), (N, 2)."""
+    """Return the plane vectors of angles.
+
+    Parameters
+    ----------
+    phi : ndarray (N,)
+
+    Returns
+    -------
+    ndarray (N, 2)
+        (cos phi, sin phi).
+    """
     return np.stack([np.cos(phi), np.sin(phi)], axis=-1)
 
 
 def _pencil_of_fundamental(
     F: F64, sizes: tuple[tuple[int, int], tuple[int, int]]
 ) -> tuple[EpipolarPencil, float]:
-    """The pencil of F (3, 3), of either orientation, and the ratio of the singular values of F in places."""
+    """Unoriented pencil of F (3, 3), and the ratio of the singular values of the normalised F."""
     units = FOCAL_PER_SIDE * np.array([max(size) for size in sizes], dtype=np.float64)
     centres = (np.array(sizes, dtype=np.float64) - 1.0) / 2.0
     T = [
@@ -177,7 +303,7 @@ def _pencil_of_fundamental(
 
 
 def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> tuple[EpipolarPencil, float]:
-    """The pencil with the second view's sign such that matches share their half-planes, and how many do."""
+    """Pencil with the sign of the second view that most matches support, and their share."""
     p1, p2 = pencil.planes(0, xy1), pencil.planes(1, xy2)
     with np.errstate(invalid="ignore"):
         same = np.sum(p1 * p2, axis=1) > 0.0
@@ -193,19 +319,27 @@ Size = tuple[int, int]
 
 MIN_MATCHES = 8
 MIN_SAME_HALF = 0.8
-"""Share of matches that must lie on the same half of their epipolar lines: wrong ones do by chance."""
+"""Share of matches that must lie on corresponding half-lines; wrong matches do by chance."""
 SAMPLES = 16
-"""Places along either side of a photograph at which distortion is measured."""
+"""Samples along each image side at which distortion is measured."""
 
 
 @dataclass(frozen=True)
 class EpipolarPair:
-    """A pair ready for rectification.
+    """An image pair prepared for rectification.
 
-    ``pencil`` oriented, and turned such that larger disparities are nearer; ``xy1``, ``xy2`` (N, 2) px
-    matches, perhaps none; ``arc`` the half-planes, in increasing phi, that both photographs see; ``regions``
-    two (M, 2) px samples of what either photograph shows of them, first the corners of that polygon;
-    ``cameras`` (2, 3, 4) where they are known.
+    Attributes
+    ----------
+    pencil : EpipolarPencil
+        Oriented, and flipped so that larger disparities are nearer.
+    xy1, xy2 : ndarray (N, 2)
+        Matches in pixels, possibly none.
+    arc : tuple of float
+        Interval of phi that both images see.
+    regions : tuple of ndarray (M, 2)
+        Pixels of the part of each image inside the arc, beginning with the corners of that polygon.
+    cameras : ndarray (2, 3, 4), optional
+        Metric cameras.
     """
 
     pencil: EpipolarPencil
@@ -217,22 +351,41 @@ class EpipolarPair:
 
     @property
     def sizes(self) -> tuple[Size, Size]:
-        """(width, height) of the photographs."""
+        """(width, height) of the images."""
         return self.pencil.sizes
 
     @property
     def matches(self) -> tuple[F64, F64]:
-        """Matches of either side."""
+        """Matches of both sides."""
         return self.xy1, self.xy2
 
 
 def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
-    """The pair of F (3, 3) and its inliers (N, 2) px.
+    """Prepare a pair with known fundamental matrix.
 
-    Which disparities are nearer follows from cameras with a usual focal length (quasi-Euclidean frame), with
-    every point in front. Raises ``ValueError`` for wrong shapes, numbers that are not finite and sizes below
-    2 px; ``StageFailure`` for fewer than 8 matches, an F of rank 1, matches that a homography explains and
-    matches on opposite halves of their epipolar lines.
+    The direction of disparities follows from cameras with a usual focal length (quasi-Euclidean frame) with
+    the points in front.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3)
+        Fundamental matrix, x2' F x1 = 0.
+    xy1, xy2 : ndarray (N >= 8, 2)
+        Inlier matches in pixels.
+    size1, size2 : tuple of int
+        (width, height) of the images.
+
+    Returns
+    -------
+    EpipolarPair
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape or non-finite values, or an image is smaller than 2 x 2 px.
+    StageFailure
+        If there are fewer than 8 matches, F has rank 1, a homography explains the matches, or matches lie on
+        opposite half-lines.
     """
     sizes = _checked_sizes(size1, size2)
     xy1, xy2 = _checked_matches(xy1, xy2)
@@ -241,15 +394,15 @@ def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) ->
         raise ValueError(f"rectification needs a finite F (3, 3) that is not zero; got shape {F.shape}")
     if len(xy1) < MIN_MATCHES:
         raise StageFailure(
-            "the pair has too few matches to rectify it",
-            f"{counted(len(xy1), 'match')}, needed at least {MIN_MATCHES}",
-            "match the photographs anew, or rectify from cameras",
+            "the pair has too few matches for rectification",
+            f"{counted(len(xy1), 'match')}, at least {MIN_MATCHES} are needed",
+            "match the images again, or rectify from cameras",
         )
     pencil, ratio = _pencil_of_fundamental(F, sizes)
     if not ratio > 1e-9:
         raise StageFailure(
-            "the fundamental matrix has rank 1 and no epipolar lines",
-            f"its second singular value is {ratio:.1g} of the first",
+            "the fundamental matrix has rank 1",
+            f"the ratio of its singular values is {ratio:.1g}",
             "estimate it from more matches",
         )
     require_parallax_of_matches(F, xy1, xy2, advice=", or rectify from cameras if the scene is a plane")
@@ -259,11 +412,27 @@ def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) ->
 def pair_of_cameras(
     P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
 ) -> EpipolarPair:
-    """The pair of two metric cameras (3, 4), P = K [R t] with points in front where P[2] X > 0.
+    """Prepare a pair with known metric cameras.
 
-    Matches (N, 2) px are of use for the range of disparities but need not be given. Raises ``ValueError`` as
-    :func:`pair_of_fundamental`; ``StageFailure`` where the centres coincide or the matches do not move but
-    by the noise, and where nothing is in front of both cameras.
+    Parameters
+    ----------
+    P1, P2 : ndarray (3, 4)
+        Cameras P = K [R t] with P[2] X > 0 for points in front.
+    size1, size2 : tuple of int
+        (width, height) of the images.
+    xy1, xy2 : ndarray (N, 2), optional
+        Matches in pixels; they determine the disparity range.
+
+    Returns
+    -------
+    EpipolarPair
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape or non-finite values, or a camera is not finite.
+    StageFailure
+        If the camera centres coincide, the matches have no parallax, or no point is in front of both cameras.
     """
     sizes = _checked_sizes(size1, size2)
     none = np.empty((0, 2))
@@ -288,9 +457,9 @@ def _fundamental(P: F64) -> F64:
     apart = float(np.linalg.norm(normalized[1] - normalized[0]))
     if not apart > 1e-12 * (1.0 + float(np.abs(normalized).max())):
         raise StageFailure(
-            "the cameras have one centre and no epipolar lines",
-            f"their centres are {apart:.1g} apart",
-            "take photographs from different places, or other views",
+            "both cameras have one centre",
+            f"the distance of the centres is {apart:.1g}",
+            "take images from different positions, or choose other views",
         )
     return fundamental_from_cameras(P[0], P[1])
 
@@ -299,7 +468,7 @@ def _checked_sizes(size1: Size, size2: Size) -> tuple[Size, Size]:
     sizes = []
     for size in (size1, size2):
         if len(size) != 2 or not all(float(side).is_integer() and side >= 2 for side in size):
-            raise ValueError(f"a photograph to rectify is at least 2 x 2 px; got {tuple(size)}")
+            raise ValueError(f"an image must have at least 2 x 2 px; got {tuple(size)}")
         sizes.append((int(size[0]), int(size[1])))
     return sizes[0], sizes[1]
 
@@ -313,14 +482,14 @@ def _checked_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
 
 def _complete(pencil: EpipolarPencil, xy1: F64, xy2: F64, P: F64 | None) -> EpipolarPair:
-    """Orientation, direction of disparities, and what both photographs see."""
+    """Determine orientation, direction of disparities, and common field of view."""
     seen1, seen2, P_z = (xy1, xy2, None) if P is None else _virtual_matches(pencil, P)
     pencil, share = _orient(pencil, seen1, seen2)
     if share < MIN_SAME_HALF:
         raise StageFailure(
-            "matches lie on opposite halves of their epipolar lines, which no scene shows",
-            f"only {100.0 * share:.0f} % of {len(seen1)} agree on the halves",
-            "the fundamental matrix or the matches are wrong; estimate them anew",
+            "matches lie on opposite halves of their epipolar lines",
+            f"only {100.0 * share:.0f} % of {len(seen1)} lie on corresponding halves",
+            "the fundamental matrix or the matches are wrong; estimate them again",
         )
     P_z = _quasi_euclidean(pencil, xy1, xy2) if P_z is None else P_z
     pencil = replace(pencil, flipped=not _farther_is_along(pencil, P_z, seen1, seen2))
@@ -335,7 +504,7 @@ def _normalizing_transform(pencil: EpipolarPencil, side: int) -> F64:
 
 
 def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[F64, F64, F64]:
-    """Pixels of points at many depths in front of both cameras, and the cameras in places."""
+    """Pixels of points at many depths in front of both cameras, and the cameras in normalised coordinates."""
     (width, height), centres = pencil.sizes[0], np.stack([camera_centre(camera) for camera in P])
     C = centres[:, :3] / centres[:, 3:]
     grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 7), np.linspace(0, height - 1, 7)), -1).reshape(
@@ -348,14 +517,16 @@ def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[F64, F64, F64]:
     X = X[np.column_stack([X, np.ones(len(X))]) @ P[1, 2] > 0.0]
     if len(X) == 0:
         raise StageFailure(
-            "nothing is in front of both cameras", "they look away from each other", "choose another pair"
+            "no point is in front of both cameras",
+            "their fields of view do not intersect",
+            "choose another pair",
         )
     z = np.stack([_normalizing_transform(pencil, side) @ P[side] for side in (0, 1)])
     return project(P[0], X), project(P[1], X), z
 
 
 def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
-    """Two cameras (2, 3, 4) in places with the pencil's F: of four candidates the one with most in front."""
+    """Normalised cameras (2, 3, 4) of the pencil: the candidate with most points in front."""
     z = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)])
     L1, L2 = pencil.lines
     F = L2 @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ L1.T
@@ -385,7 +556,7 @@ def _farther_is_along(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> boo
 
 
 def _common_arc(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
-    """The interval of phi that both photographs see."""
+    """Interval of phi that both images see."""
     arcs = [_arc(pencil, side) for side in (0, 1)]
     if arcs[0] is None and arcs[1] is None:
         return _full_circle(pencil, xy1)
@@ -398,15 +569,15 @@ def _common_arc(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
     low, high = max(a, c + turn), min(b, d + turn)
     if not high > low:
         raise StageFailure(
-            "the photographs share no epipolar line",
-            "no half-plane through the baseline is seen in both",
+            "the images share no epipolar line",
+            "no half-plane through the baseline is visible in both",
             "the fundamental matrix is wrong, or the views do not overlap; choose another pair",
         )
     return low, high
 
 
 def _arc(pencil: EpipolarPencil, side: int) -> tuple[float, float] | None:
-    """The interval of phi that a photograph sees, None for all of the circle (the epipole is inside)."""
+    """Interval of phi that an image sees, None for the full circle (epipole inside)."""
     width, height = pencil.sizes[side]
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
     e = pencil.epipole(side)
@@ -414,14 +585,14 @@ def _arc(pencil: EpipolarPencil, side: int) -> tuple[float, float] | None:
         inside = pencil.pixels(side, e[:2] / e[2])
         if (inside >= 0.0).all() and (inside <= corners[2]).all():
             return None
-    # Half-lines away from an epipole outside sweep a convex photograph within half a turn.
+    # If the epipole is outside, the half-lines through the convex image span less than 180 degrees.
     about = float(pencil.angles(side, pencil.centres[side][None])[0])
     phi = pencil.angles(side, corners, about=about)
     return float(phi.min()), float(phi.max())
 
 
 def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
-    """All half-planes, beginning in the widest gap between matches."""
+    """Full circle, starting in the widest gap between matches."""
     phi = np.sort(pencil.angles(0, xy1))
     if len(phi) == 0:
         return -np.pi, np.pi
@@ -432,12 +603,12 @@ def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
 
 
 def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
-    """Samples of the part of a photograph within the arc: the corners of that polygon, then a grid."""
+    """Samples of the part of an image within the arc: the corners of that polygon, then a grid."""
     width, height = pencil.sizes[side]
     x, y = np.linspace(0.0, width - 1.0, SAMPLES), np.linspace(0.0, height - 1.0, SAMPLES)
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     middle, half = 0.5 * (arc[0] + arc[1]), 0.5 * (arc[1] - arc[0])
-    # The corners that bound the arc are of it, rounding or not.
+    # The tolerance keeps the corners that bound the arc despite rounding.
     inside = np.abs(pencil.angles(side, grid, about=middle) - middle) <= half + 1e-9
     low, high = (
         pencil.normalized(side, np.array(corner)) for corner in ((0.0, 0.0), (width - 1.0, height - 1.0))

@@ -1,7 +1,4 @@
-"""Which other views the depth of a view is worked out with.
-
-Photographs without their lens distortion, at the size that depth is worked out at.
-"""
+"""Views for multi-view stereo: undistorted images, sparse points, and the choice of neighbouring views."""
 
 from __future__ import annotations
 
@@ -19,16 +16,39 @@ from thesisrecon.stereo.resampling import warp_image
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """The points of a metric reconstruction: ``X`` (N, 3) and ``seen`` (V, N), which view observes which."""
+    """Points of a metric reconstruction.
+
+    Attributes
+    ----------
+    X : ndarray (N, 3)
+    seen : ndarray (V, N) bool
+        Whether a view observes a point.
+    """
 
     X: F64
     seen: B8
 
 
 def sparse_points(reconstruction: Reconstruction) -> SparsePoints:
-    """The valid points with their inlying observations; ``ValueError`` where not metric."""
+    """Return the valid points of a metric reconstruction with their inlier observations.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Metric reconstruction.
+
+    Returns
+    -------
+    SparsePoints
+        Points and their visibility.
+
+    Raises
+    ------
+    ValueError
+        If the reconstruction is not metric.
+    """
     if reconstruction.stratum != "metric":
-        raise ValueError(f"depth needs a metric reconstruction; got {reconstruction.stratum}")
+        raise ValueError(f"depth maps need a metric reconstruction; got {reconstruction.stratum}")
     tracks = reconstruction.tracks
     seen = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
     good = reconstruction.inlier
@@ -39,9 +59,20 @@ def sparse_points(reconstruction: Reconstruction) -> SparsePoints:
 
 
 def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> tuple[F64, F64]:
-    """Projections (N, 2), (N, 2) px into both views of the points that one of them observes and both hold.
+    """Project the points that one of two views observes into both.
 
-    More of the scene than what both observe: the range of depths is to be that of all that is seen.
+    All points inside both images are used, also those that only one view observes, because the depth range
+    must cover the whole visible scene.
+
+    Parameters
+    ----------
+    points : SparsePoints
+    a, b : PinholeView
+
+    Returns
+    -------
+    tuple of ndarray (N, 2)
+        Projections into both views in pixels.
     """
     X = points.X[points.seen[a.view] | points.seen[b.view]]
     keep = np.ones(len(X), dtype=bool)
@@ -57,13 +88,22 @@ def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> 
 
 @dataclass(frozen=True)
 class NeighbourSelection:
-    """At most ``most`` neighbours, the one that adds most first.
+    """Greedy selection of neighbouring views.
 
-    A point counts by the angle between its rays: most at ``best_deg``, less for smaller angles, whose depth
-    is less certain (falling off with ``below_deg``), and for larger ones, across which surfaces change their
-    looks (``above_deg``). What earlier neighbours serve counts less, and so does a view whose baseline runs
-    in a direction that has been chosen already: what is hidden from one side is seen from the other. A view
-    with fewer than ``least_points`` common points of at least ``least_deg`` is none.
+    The weight of a common point is a Gaussian of its triangulation angle. Points that earlier neighbours
+    observe count less, and so does a view whose baseline has the direction of an earlier one, because views
+    from other sides see what is occluded.
+
+    Parameters
+    ----------
+    max_neighbours : int
+        Largest number of neighbours.
+    best_deg : float
+        Triangulation angle of the greatest weight.
+    sigma_below_deg, sigma_above_deg : float
+        Decay of the weight for smaller and larger angles.
+    min_angle_deg, min_points : float, int
+        A neighbour has at least ``min_points`` common points of at least ``min_angle_deg``.
     """
 
     max_neighbours: int = 4
@@ -74,7 +114,19 @@ class NeighbourSelection:
     min_points: int = 12
 
     def select(self, points: SparsePoints, views: dict[int, PinholeView], view: int) -> list[int]:
-        """Numbers of the neighbours of ``view`` among ``views``, perhaps none."""
+        """Select the neighbours of a view.
+
+        Parameters
+        ----------
+        points : SparsePoints
+        views : dict of int to PinholeView
+        view : int
+
+        Returns
+        -------
+        list of int
+            Numbers of the neighbours, the most useful first.
+        """
         centre = _centre(views[view].P)
         worth: dict[int, F64] = {}
         direction: dict[int, F64] = {}
@@ -100,7 +152,7 @@ class NeighbourSelection:
     def _weights(
         self, points: SparsePoints, centre: F64, views: dict[int, PinholeView], view: int, other: int
     ) -> F64 | None:
-        """What the points are worth (N,) with ``other``, None where it is no neighbour."""
+        """Weights (N,) of the points seen with ``other``, None if it cannot be a neighbour."""
         common = points.seen[view] & points.seen[other]
         if other == view or int(common.sum()) < self.min_points:
             return None
@@ -115,7 +167,19 @@ class NeighbourSelection:
 
 
 def ray_angles_deg(X: F64, first: F64, second: F64) -> F64:
-    """Angles (N,) between the rays of points (N, 3) to two centres (3,), in degrees."""
+    """Compute the angles between the rays of points to two centres.
+
+    Parameters
+    ----------
+    X : ndarray (N, 3)
+    first, second : ndarray (3,)
+        Camera centres.
+
+    Returns
+    -------
+    ndarray (N,)
+        Angles in degrees.
+    """
     a, b = X - first, X - second
     return np.asarray(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))))
 
@@ -128,35 +192,42 @@ def _centre(P: F64) -> F64:
 def pinhole_view(
     image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
 ) -> PinholeView:
-    """Photograph ``view`` as a camera without distortion would have taken it.
+    """Undistort an image.
 
     Parameters
     ----------
-    image : the photograph at the size that the reconstruction's pixels are of.
-    reconstruction : metric, with ``K`` and the coefficients of the lens in ``radial`` (None: no distortion).
-    max_side : px; a photograph whose longer side is greater is made smaller (cubic, no aliasing).
+    image : Image
+        The image, in the size that the reconstruction refers to.
+    reconstruction : Reconstruction
+        Metric reconstruction with ``K`` and optional ``distortion``.
+    view : int
+    max_side : int
+        Longest side of the result in pixels; larger images are reduced without aliasing.
 
     Returns
     -------
-    The frame is the photograph's; pixels the lens does not reach are not ``seen`` and black. ``P`` is in this
-    frame's pixels and scaled such that the third coordinate is the depth.
+    PinholeView
+        Undistorted image with its camera, whose third coordinate is the depth. Pixels outside the original
+        image are black and not ``seen``.
 
     Raises
     ------
     ValueError
-        Where the reconstruction is not metric, or the photograph is of another size.
+        If the reconstruction is not metric or the image has another size.
     StageFailure
-        Where the view has no camera.
+        If the view has no camera.
     """
     K = reconstruction.K
     if reconstruction.stratum != "metric" or K is None:
         raise ValueError("undistorted views need a metric reconstruction with K")
     if tuple(reconstruction.sizes[view]) != image.size:
-        raise ValueError(f"view {view} is {tuple(reconstruction.sizes[view])} px; got {image.size}")
+        raise ValueError(
+            f"image {image.name} must be {tuple(reconstruction.sizes[view])} px; got {image.size}"
+        )
     if max_side < 2:
-        raise ValueError(f"max_side is at least 2 px; got {max_side}")
+        raise ValueError(f"max_side must be at least 2 px; got {max_side}")
     if not reconstruction.registered[view]:
-        raise StageFailure(f"view {view} has no camera", reconstruction.reasons[view], "")
+        raise StageFailure(f"image {image.name} has no camera", reconstruction.reasons[view], "")
     shrink = min(1.0, max_side / max(image.size))
     size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
     S = _resizing(image.size, size)
@@ -172,15 +243,15 @@ def pinhole_view(
 
 @dataclass(frozen=True)
 class _Lens:
-    """Where the pixels of a frame of ``size`` without distortion are in the photograph."""
+    """Positions of the pixels of an undistorted frame in the original image."""
 
     K: F64
     distortion: F64
     S: F64
     size: tuple[int, int]
 
-    def lookup(self, side: int, rows: range) -> F64:  # noqa: ARG002 - there is but one photograph
-        """(len(rows), width, 2) px in the photograph."""
+    def lookup(self, side: int, rows: range) -> F64:  # noqa: ARG002 - there is only one image
+        """Return the positions (len(rows), width, 2) in the original image."""
         x, y = np.meshgrid(np.arange(float(self.size[0])), np.arange(float(rows.start), float(rows.stop)))
         rays = homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ np.linalg.inv(self.S @ self.K).T
         xy = distort(dehomogenize(rays), self.distortion) @ self.K[:2, :2].T + self.K[:2, 2]

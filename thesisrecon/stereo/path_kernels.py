@@ -43,7 +43,6 @@ def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.flo
     Parameters
     ----------
     grey : ndarray (H, W) int16
-        Intensities.
     largest, least : float
         Limits of the penalty.
     scale : float
@@ -79,7 +78,7 @@ def _extend(
     """
     below, same, above = before
     for x in range(len(cost)):
-        # Read before the choices: a read inside of one would be a branch, and no vector instruction.
+        # Loads precede the selections: a load inside one would prevent vectorisation.
         near, other, value, floor = below[x], above[x], same[x], base[x]
         near = other if other < near else near
         near = np.uint8(near + P1)
@@ -159,28 +158,17 @@ def _shifted(p2: U8, shift: int, out: U8) -> None:
 
 
 @njit(cache=True, nogil=True)
-def sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> None:
-    """Sum the costs of two opposite paths through the rows.
+def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> None:
+    """Sum the path costs from above, ``shift`` columns aside, and the opposite ones, to ``total`` (N, D, W).
 
-    Parameters
-    ----------
-    costs : ndarray (N, D, W) uint8
-        Matching costs.
-    P2 : ndarray (N, W) uint8
-        Penalty between a pixel and the one above it.
-    P1 : uint8
-        Penalty of a disparity change of 1.
-    shift : int
-        Columns between a pixel and its predecessor from above.
-    total : ndarray (N, D, W) uint8
-        Receives the sums.
+    ``P2`` (N, W) is the penalty between a pixel and the one above it.
     """
     rows, n, width = costs.shape
     unreachable = np.full(width, np.uint8(255 - P1), np.uint8)
     least, p2 = np.empty((2, width), np.uint8), np.empty(width, np.uint8)
     _start_row(costs[0], total[0], least[0])
     for y in range(1, rows):
-        # The sum is still the path from above alone, so it is where the next one starts.
+        # The sum still holds the path from above only, from which the next row continues.
         _shifted(P2[y], shift, p2)
         settings = (P1, shift, unreachable)
         old, new = least[(y - 1) & 1], least[y & 1]
@@ -315,7 +303,6 @@ def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
     Parameters
     ----------
     costs : ndarray (H, D, W) uint8
-        Matching costs.
     P2 : ndarray (4, H, W) uint8
         Penalties of :func:`adaptive_P2`.
     P1 : uint8
@@ -326,7 +313,7 @@ def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
         Work space.
     """
     height, n, width = costs.shape
-    # Along a row every pixel waits for the one before: many rows together, transposed, fill the vectors.
+    # Horizontal paths are sequential in x: transposed rows are vectorised over y.
     for start in range(0, height, BLOCK):
         rows = min(BLOCK, height - start)
         wide, high = (width + 7) // 8 * 8, (rows + 7) // 8 * 8
@@ -335,9 +322,9 @@ def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
         transpose_rows(costs[start : start + rows], transposed)
         p2 = np.zeros((width, high), np.uint8)
         p2[:, :rows] = P2[0, start : start + rows].T
-        sum_opposite(transposed[:width], p2, P1, 0, summed[:width])
+        _sum_opposite(transposed[:width], p2, P1, 0, summed[:width])
         transpose_back(summed, total[0, start : start + rows])
-    sum_opposite(costs, P2[1], P1, 0, total[1])
+    _sum_opposite(costs, P2[1], P1, 0, total[1])
     if len(total) == 4:
-        sum_opposite(costs, P2[2], P1, -1, total[2])
-        sum_opposite(costs, P2[3], P1, 1, total[3])
+        _sum_opposite(costs, P2[2], P1, -1, total[2])
+        _sum_opposite(costs, P2[3], P1, 1, total[3])

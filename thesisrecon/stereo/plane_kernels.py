@@ -1,4 +1,4 @@
-"""Compiled search for the plane of every pixel that makes the photographs agree."""
+"""Compiled search for the plane of every pixel that maximises the correlation with neighbouring views."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from numba import njit
 from thesisrecon.arrays import F32, F64, I64, U8, U32
 
 UNKNOWN = 4.0
-"""Cost of a pixel without a plane; that of the worst plane is 2."""
+"""Cost of a pixel without a plane; the largest cost of a plane is 2."""
 HIDDEN = 0.5
-"""By how much a neighbour's cost may exceed the least one and still count."""
+"""Upper limit of the second neighbour's excess cost: the pixel may be occluded there."""
 TEXTURE = 4.0
-"""Variance in squared grey levels that counts as noise: below it a window says nothing."""
+"""Variance of the noise in squared grey levels: windows of less variance are uninformative."""
 HELD = 0.7
-"""Share of a window's weight that a neighbour has to hold."""
+"""Share of the window's weight that must lie in a neighbour's image."""
 SAME_PLANE = 0.1
-"""Planes that differ by less, in steps of the search over the whole window, are one."""
+"""Planes closer than this, in search steps over the window, are not tried again."""
 SUMS = {"reassoc", "contract", "arcp", "nsz"}
-"""What the compiler may do to sums over a window, so that samples are done several at once; NaN stays NaN."""
+"""Floating-point rules for sums over a window that allow vectorisation; NaN is preserved."""
 
 
 class PatchViews(NamedTuple):
@@ -66,8 +66,16 @@ class PatchWindow(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def pack_squares(gray: F32, squares: U32) -> None:
-    """``squares`` (H, W): the grey levels of a pixel, its right, lower and lower right neighbours as bytes,
-    the lowest first, so that an interpolation takes one load; 0 where one is unknown or outside."""
+    """Pack the grey levels of 2 x 2 pixels into one word, so that an interpolation needs one load.
+
+    Parameters
+    ----------
+    gray : ndarray (H, W) float32
+        Grey levels, NaN = no pixel.
+    squares : ndarray (H, W) uint32
+        Receives the pixel, its right, lower and lower right neighbour from the lowest byte on; 0 if one is
+        missing.
+    """
     height, width = gray.shape
     for v in range(height):
         for u in range(width):
@@ -85,8 +93,18 @@ def pack_squares(gray: F32, squares: U32) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_planes(rho: F32, radius: int, alike: float, gx: F32, gy: F32) -> None:
-    """Gradient (H, W) of the inverse depth about every known pixel, from the known ones within ``radius``
-    that differ from it by at most the share ``alike``; 0 where they are too few, NaN where unknown."""
+    """Fit the gradient of the inverse depth around every known pixel.
+
+    Parameters
+    ----------
+    rho : ndarray (H, W) float32
+    radius : int
+        Radius of the window.
+    alike : float
+        Largest relative difference to the centre of the pixels used.
+    gx, gy : ndarray (H, W) float32
+        Receive the gradient, 0 with too few pixels, NaN where unknown.
+    """
     height, width = rho.shape
     for v in range(height):
         for u in range(width):
@@ -115,11 +133,10 @@ def fit_planes(rho: F32, radius: int, alike: float, gx: F32, gy: F32) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _window_samples(gray: F32, u: int, v: int, window: PatchWindow, samples: F32) -> float:
-    """Fill ``samples`` (2, S) of the window about a pixel: weights that sum to 1, the more alike the centre
-    the more, and weighted grey levels less their mean; returns the weighted variance of the levels.
+    """Fill ``samples`` (2, S) with normalised weights and weighted, centred grey levels of the window.
 
-    What is outside or has no pixel weighs 0. ``offsets`` (2, S) whole px, among them (0, 0), ``likeness``
-    (256,) the weight by grey difference.
+    Samples similar to the centre weigh more, missing pixels 0. Returns the weighted variance of the grey
+    levels.
     """
     offsets, weights = window
     height, width = gray.shape
@@ -143,10 +160,10 @@ def _window_samples(gray: F32, u: int, v: int, window: PatchWindow, samples: F32
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _carry(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, way: F64) -> bool:
-    """Fill ``way`` (8,): the step (dx, dy) from pixel ``at`` is carried by the plane to view k's
-    (way[0] + dx way[1] + dy way[2], way[3] + dx way[4] + dy way[5]) / (1 + dx way[6] + dy way[7]).
+    """Fill ``way`` (8,) with the homography of the plane from offsets (dx, dy) of pixel ``at`` to view k.
 
-    False where that is behind the camera. (x, y, 1) of inverse depth rho is at H (x, y, 1) + rho e.
+    (way[0] + dx way[1] + dy way[2], way[3] + dx way[4] + dy way[5]) / (1 + dx way[6] + dy way[7]). Returns
+    False if the point is behind the camera.
     """
     u, v = at
     z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2] + plane[0] * e[k, 2]
@@ -165,8 +182,10 @@ def _carry(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, way: F64) ->
 def _cost_inside(
     squares: U32, start: int, width: int, way: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
-    """1 - weighted NCC of a window with its image in another view that holds all of it, -1 where a pixel of
-    it is unknown. That view's ``squares`` begin at ``start``."""
+    """1 - weighted NCC of a window that lies inside the other view, -1 if a pixel of it is unknown.
+
+    The packed pixels of that view begin at ``start``.
+    """
     x0, x1, x2 = np.float32(way[0]), np.float32(way[1]), np.float32(way[2])
     y0, y1, y2 = np.float32(way[3]), np.float32(way[4]), np.float32(way[5])
     z1, z2, one, byte = np.float32(way[6]), np.float32(way[7]), np.float32(1.0), np.uint32(255)
@@ -177,7 +196,7 @@ def _cost_inside(
         x, y = (x0 + dx * x1 + dy * x2) * scale, (y0 + dx * y1 + dy * y2) * scale
         i, j = np.int32(x), np.int32(y)
         fx, fy = x - np.float32(i), y - np.float32(j)
-        # One unsigned place (no wrap-around to test) and one load: several samples are done at once.
+        # An unsigned index (no wrap-around test) and a single load allow vectorisation.
         square = squares[np.uint32(np.int32(start) + j * np.int32(width) + i)]
         if square == 0:
             unknown += np.int32(1)
@@ -206,7 +225,7 @@ def _cost_of(variance: float, other_variance: float, covariance: float) -> float
 def _cost_at_border(
     squares: U32, start: int, size: tuple[int, int], way: F64, offsets: F32, samples: F32
 ) -> float:
-    """The same of the part of a window that the other view holds, -1 where that is too little."""
+    """1 - weighted NCC of the part of a window inside the other view, -1 if that is too small."""
     width, height = size
     held, sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(offsets.shape[1]):
@@ -238,14 +257,9 @@ def _cost_at_border(
 def _view_cost(
     squares: U32, layout: I64, k: int, way: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
-    """1 - weighted NCC of a window with its image in view ``k``, -1 where that is not held.
-
-    ``squares`` of all views (:func:`pack_squares`) row by row; ``layout`` (K, 3) where a view's begin, its
-    width and height; ``way`` (8,) see :func:`_carry`; ``offsets`` (2, S) px, ``samples`` and ``variance`` see
-    :func:`window_samples`.
-    """
+    """1 - weighted NCC of a window with its image in view ``k``, -1 if it is not visible there."""
     start, width, height = layout[k, 0], layout[k, 1], layout[k, 2]
-    # Samples begin in a corner of the window and end in the opposite one.
+    # The first and last sample are opposite corners of the window.
     reach = -offsets[0, 0]
     sx, sy = reach * (abs(way[1]) + abs(way[2])), reach * (abs(way[4]) + abs(way[5]))
     sz = 1.0 - reach * (abs(way[6]) + abs(way[7]))
@@ -267,8 +281,10 @@ def _plane_cost(
     variance: float,
     way: F64,
 ) -> float:
-    """Mean of the least two costs, the second at most ``HIDDEN`` above the first: a neighbour from which the
-    pixel is hidden has no say. ``way`` (8,) is scratch."""
+    """Mean of the two smallest costs, the second at most ``HIDDEN`` above the first.
+
+    A neighbour in which the pixel is occluded has limited influence. ``way`` (8,) is work space.
+    """
     _, squares, layout, H, e = views
     if not plane[0] > 0.0:
         return UNKNOWN
@@ -282,13 +298,13 @@ def _plane_cost(
                 least, second = cost, least
             elif cost < second:
                 second = cost
-    # A single neighbour, or one beside those that are hidden: the worse for it, whatever the others show.
+    # The cap limits the influence of neighbours in which the pixel is occluded.
     return least + 0.5 * min(second - least, HIDDEN) if least < UNKNOWN else UNKNOWN
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _motion_px(H: F64, e: F64, k: int, at: tuple[int, int], rho: float) -> float:
-    """Pixels that the place in view ``k`` moves per unit of inverse depth."""
+    """Motion of the projection in view ``k`` in pixels per unit of inverse depth."""
     u, v = at
     z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2] + rho * e[k, 2]
     x = (H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2] + rho * e[k, 0]) / z
@@ -299,7 +315,7 @@ def _motion_px(H: F64, e: F64, k: int, at: tuple[int, int], rho: float) -> float
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _step(H: F64, e: F64, at: tuple[int, int], rho: float, px: float) -> float:
-    """The step of inverse depth that moves the place in any view by at most ``px``."""
+    """Step of inverse depth that moves the projection by at most ``px`` in any view."""
     most = 0.0
     for k in range(H.shape[0]):
         most = max(most, _motion_px(H, e, k, at, rho))
@@ -308,7 +324,7 @@ def _step(H: F64, e: F64, at: tuple[int, int], rho: float, px: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _continued(planes: F32, a: int, b: int, u: int, v: int, trial: F64) -> bool:
-    """Fill ``trial`` with the plane of pixel (a, b) seen from (u, v); False where there is none."""
+    """Fill ``trial`` with the plane of pixel (a, b) evaluated at (u, v); False if there is none."""
     if not (0 <= a < planes.shape[1] and 0 <= b < planes.shape[0]) or not np.isfinite(planes[b, a, 0]):
         return False
     trial[0] = planes[b, a, 0] + (u - a) * planes[b, a, 1] + (v - b) * planes[b, a, 2]
@@ -326,13 +342,25 @@ def sweep_planes(
     planes: F32,
     cost: F32,
 ) -> None:
-    """One pass over ``planes`` (H, W, 3), inverse depth and its gradient, and their ``cost``, in place.
+    """Propagate and perturb the planes of all pixels in one pass (PatchMatch stereo).
 
-    Every pixel tries the planes of the two neighbours that the pass has been at, continued to it unless they
-    are its own, and its own moved by ``step_px`` in the image (as a whole, and tilted by as much at the rim
-    of the window), unless its cost is at most ``settled``.
-    ``offsets`` (2, S) px are the samples of the window, ``likeness`` (256,) their weight by grey difference;
-    ``squares`` and ``layout`` those of the neighbours, see :func:`view_cost`.
+    Each pixel tries the planes of the two neighbours visited before and perturbations of its own plane:
+    shifted, and tilted by as much at the border of the window.
+
+    Parameters
+    ----------
+    views : PatchViews
+    window : PatchWindow
+    step_px : float
+        Size of the perturbation in pixels of the neighbours.
+    converged_cost : float
+        Planes up to this cost are not changed.
+    backward : bool
+        Pass from the last pixel to the first.
+    planes : ndarray (H, W, 3) float32
+        Inverse depth and its gradient, updated.
+    cost : ndarray (H, W) float32
+        Cost of the planes, updated.
     """
     gray, H, e, offsets = views.gray, views.H, views.e, window.offsets
     height, width = gray.shape
@@ -387,8 +415,23 @@ def rate_planes(
     support: U8,
     slope: F32,
 ) -> None:
-    """``least`` cost (H, W) of planes in a neighbour, in how many it is at most ``accepted`` (``support``),
-    and ``slope``, the root of the sum of the squared pixels per unit of inverse depth over these."""
+    """Compute quality measures of all planes.
+
+    Parameters
+    ----------
+    views : PatchViews
+    window : PatchWindow
+    planes : ndarray (H, W, 3) float32
+        Inverse depth and its gradient.
+    max_cost : float
+        Largest cost of a supporting neighbour.
+    least : ndarray (H, W) float32
+        Receives the smallest cost.
+    support : ndarray (H, W) uint8
+        Receives the number of supporting neighbours.
+    slope : ndarray (H, W) float32
+        Receives the root of the sum of squared pixels per unit of inverse depth over these.
+    """
     gray, squares, layout, H, e = views
     offsets = window.offsets
     height, width = gray.shape
@@ -421,7 +464,17 @@ def begin_planes(
     planes: F32,
     cost: F32,
 ) -> None:
-    """``cost`` (H, W) of the planes that a search begins with, ``UNKNOWN`` where there is none."""
+    """Compute the cost of the initial planes.
+
+    Parameters
+    ----------
+    views : PatchViews
+    window : PatchWindow
+    planes : ndarray (H, W, 3) float32
+        Inverse depth and its gradient, NaN = none.
+    cost : ndarray (H, W) float32
+        Receives the cost, ``UNKNOWN`` without a plane.
+    """
     gray, offsets = views.gray, window.offsets
     height, width = gray.shape
     samples, way, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)

@@ -1,4 +1,4 @@
-"""Slanted windows: every pixel's inverse depth and its gradient made to agree with the neighbours' pixels."""
+"""Refinement of depth maps with slanted windows (PatchMatch multi-view stereo)."""
 
 from __future__ import annotations
 
@@ -24,25 +24,44 @@ from thesisrecon.stereo.plane_kernels import (
 )
 
 ALIKE = 0.03
-"""Share of the inverse depth up to which pixels near each other may be one surface."""
+"""Largest relative difference of inverse depths on one surface."""
 
 
 @dataclass(frozen=True)
 class PlaneRefinement:
-    """Planes are handed from pixel to pixel where they explain the photographs better, and tuned.
+    """Propagation and refinement of a plane per pixel.
 
-    Rectified matching compares upright windows and takes steps between neighbouring disparities for unlikely:
-    ground that is seen at a slant is lost to it. A plane of space is linear in the inverse depth of a view,
-    so a pixel keeps that and its gradient; its window is carried to the neighbours by the homography of the
-    plane and compared by normalised correlation, samples unlike the centre counting less (Bleyer, Rhemann
-    and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al., ECCV 2016). Nothing is drawn at random:
-    what the matching found is the beginning, and ``sweeps`` passes, there and back, spread and tune it with
-    steps that halve from ``first_step_px``; planes of cost (1 - correlation) up to ``settled`` are left.
+    Stereo matching of rectified images assumes fronto-parallel windows and loses slanted surfaces. A plane in
+    space is linear in inverse depth, so each pixel has an inverse depth and its gradient. Its window is
+    transferred to the neighbours by the plane's homography and compared by weighted normalised correlation
+    (Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al., ECCV 2016). The search is
+    deterministic: it starts from the fused correspondences. The cost is 1 - correlation.
 
-    A pixel is kept with two neighbours of cost up to ``accepted``, with one of up to half of it, or if two of
-    the matches that it began with agree. The window is ``radius`` px wide to either side, sampled every
-    ``spacing``; a grey difference of ``intensity_scale`` levels weighs 1/e. ``sigma_px`` is the deviation of a place
-    in the neighbours; the plane counts for what the matching found too within ``gate`` deviations.
+    A pixel is kept if two neighbours have at most ``max_cost``, one has at most half of it, or two of the
+    fused correspondences agree.
+
+    Parameters
+    ----------
+    sweeps : int
+        Passes over the image, alternating in direction.
+    first_step_px : float
+        Perturbation of the first pass; it is halved in every pass.
+    radius : int
+        Radius of the window in pixels.
+    spacing : int
+        Distance of the samples in the window.
+    intensity_scale : float
+        Grey level difference to the centre at which the weight of a sample is 1/e.
+    max_cost : float
+        Largest accepted cost.
+    max_doubtful_cost : float
+        Largest cost of pixels that are accepted if they continue a surface.
+    converged_cost : float
+        Planes up to this cost are not changed.
+    gate : float
+        Standard deviations within which plane and fused correspondences agree.
+    sigma_px : float
+        Standard deviation of a position in the neighbours.
     """
 
     sweeps: int = 4
@@ -59,7 +78,19 @@ class PlaneRefinement:
     def refine(
         self, reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth
     ) -> InverseDepth:
-        """The inverse depths of ``reference`` with those of more pixels, from its neighbours ``others``."""
+        """Refine and extend the inverse depths of a view.
+
+        Parameters
+        ----------
+        reference : PinholeView
+        others : sequence of PinholeView
+        found : InverseDepth
+
+        Returns
+        -------
+        InverseDepth
+            Refined inverse depths.
+        """
         if not others or not np.isfinite(found.value).any():
             return found
         setting = _Setting.of(reference, others, self._offsets(), self.intensity_scale)
@@ -77,12 +108,29 @@ class PlaneRefinement:
         wanted: B8,
         sweeps: int,
     ) -> tuple[F32, F32, U8]:
-        """Inverse depth, deviation and support (H, W) of the pixels that are ``wanted``, begun with ``rho``
-        (H, W); NaN where no plane is accepted. Planes of other pixels stay as they are."""
+        """Search planes of selected pixels from given inverse depths.
+
+        Parameters
+        ----------
+        reference : PinholeView
+        others : sequence of PinholeView
+        rho : ndarray (H, W) float32
+            Initial inverse depths.
+        wanted : ndarray (H, W) bool
+            Pixels to search; the planes of other pixels stay.
+        sweeps : int
+            Passes over the image.
+
+        Returns
+        -------
+        tuple of ndarray (H, W)
+            Inverse depth, its standard deviation, and number of supporting views; NaN where no plane is
+            accepted.
+        """
         setting = _Setting.of(reference, others, self._offsets(), self.intensity_scale)
         planes = self._planes(rho)
         begun = np.where(wanted[..., None], planes, np.float32(np.nan))
-        # Nothing is tried where a plane costs nothing.
+        # Cost 0 excludes the other pixels from the search.
         cost = np.where(wanted, setting.begin(begun), np.float32(0.0))
         self._sweep(setting, planes, cost, sweeps)
         planes[~wanted] = np.nan
@@ -105,7 +153,7 @@ class PlaneRefinement:
             sweep_planes(setting.views, setting.window, step, self.converged_cost, k % 2 == 1, planes, cost)
 
     def _seen(self, least: F32, support: U8) -> B8:
-        """(H, W) planes that two neighbours accept, or one without doubt."""
+        """(H, W) planes that two neighbours support, or one clearly."""
         return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * self.max_cost)))
 
     def _kept(self, found: InverseDepth, setting: _Setting, planes: F32) -> InverseDepth:
@@ -118,7 +166,7 @@ class PlaneRefinement:
             near = np.abs(rho - found.value) <= self.gate * np.hypot(found.std, std)
         seen |= joining
         matched = ~seen & (found.views >= 2)
-        # Where windows say nothing (no texture) the matching has the word.
+        # Without texture the fused correspondences are kept.
         with np.errstate(invalid="ignore"):
             both = seen & near & (found.views >= 2)
         value = np.where(seen, rho, np.where(matched, found.value, np.nan)).astype(np.float32)
@@ -130,28 +178,27 @@ class PlaneRefinement:
         )
 
     def _joining(self, setting: _Setting, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
-        """(H, W) pixels of doubtful planes that continue the surface of those that are seen, and the
-        deviation of their inverse depths."""
-        max_doubtful_cost = ~seen & (least <= self.max_doubtful_cost)
+        """(H, W) doubtful planes that continue the surface of accepted ones; standard deviations."""
+        doubtful = ~seen & (least <= self.max_doubtful_cost)
         slope = setting.rate(
-            np.where(max_doubtful_cost[..., None], planes, np.float32(np.nan)), self.max_doubtful_cost
+            np.where(doubtful[..., None], planes, np.float32(np.nan)), self.max_doubtful_cost
         )[2]
         with np.errstate(divide="ignore"):
             std = (self.sigma_px / slope).astype(np.float32)
         joins = np.zeros(seen.shape, dtype=np.uint8)
-        rho = np.where(seen | max_doubtful_cost, planes[..., 0], np.float32(np.nan))
+        rho = np.where(seen | doubtful, planes[..., 0], np.float32(np.nan))
         surface_continuation(rho, std, seen.astype(np.uint8), self.radius + 1, ALIKE, self.gate, joins)
         return joins > 0, std
 
     def _offsets(self) -> F32:
-        """(2, S) samples of the window, the centre among them."""
+        """(2, S) offsets of the window samples."""
         one = self.spacing * np.arange(-(self.radius // self.spacing), self.radius // self.spacing + 1)
         return np.stack(np.meshgrid(one, one)).reshape(2, -1).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """The grey levels of a view and its neighbours (row by row), and how pixels go from one to the others."""
+    """Kernel arguments of a view and its neighbours."""
 
     views: PatchViews
     window: PatchWindow
@@ -181,7 +228,7 @@ class _Setting:
         return cost
 
     def rate(self, planes: F32, max_cost: float) -> tuple[F32, U8, F32]:
-        """Least cost, support and slope (H, W) of planes (H, W, 3)."""
+        """Smallest cost, support and slope (H, W) of planes (H, W, 3)."""
         shape = planes.shape[:2]
         least, slope = np.full(shape, UNKNOWN, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         support = np.zeros(shape, dtype=np.uint8)
@@ -190,6 +237,6 @@ class _Setting:
 
 
 def _gray(view: PinholeView) -> F32:
-    """(H, W) grey levels, NaN where the photograph has no pixel."""
+    """(H, W) grey levels, NaN outside the original image."""
     gray = view.rgb.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
     return np.where(view.seen, gray, np.float32(np.nan)).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Polar rectification: rows are half epipolar lines, columns the distance from the epipole.
+"""Polar rectification: rows are half epipolar lines, columns are distances from the epipole.
 
-Pollefeys, Koch and Van Gool, "A simple and efficient rectification method for general motion", ICCV 1999:
-epipoles may lie anywhere, and the frame is never larger than a few times the photograph.
+Pollefeys, Koch and Van Gool, "A simple and efficient rectification method for general motion", ICCV 1999.
+Epipoles may lie anywhere, and the size of the frame is bounded.
 """
 
 from __future__ import annotations
@@ -16,18 +16,28 @@ from thesisrecon.stereo.planar import FrameLimits, common_crop, disparity_gradie
 from thesisrecon.stereo.resampling import require_side, warp_image
 
 ANGLES = 4096
-"""Half-planes at which the spacing of rows is computed."""
+"""Number of half-planes at which the row spacing is computed."""
 
 
 @dataclass(frozen=True)
 class PolarRectification:
-    """Rows of half-planes and columns of equal distance from the epipole, or nearly so.
+    """Polar maps of two images to a common rectified frame.
 
-    Row r shows the half-plane ``angles[r]`` (H,) of ``pencil``, rows between are interpolated linearly in
-    the angle. Its point that is s px farther along the half-line than the centre of that photograph is from
-    the epipole (nearer where the pencil is turned) stands in column ``scales[side]`` s + ``shears[side]`` r -
-    ``origins[side]``. ``size`` (width, height) is common to both. The same convention holds as for planar
-    rectification: side 0 is the left one.
+    Row r shows the half-plane ``angles[r]``, with linear interpolation between rows. The point s px farther
+    from the epipole than the image centre (nearer if the pencil is flipped) has the column ``scales[side]`` s
+    + ``shears[side]`` r - ``origins[side]``. Conventions are those of planar rectification: side 0 is the
+    left image.
+
+    Attributes
+    ----------
+    pencil : EpipolarPencil
+        Epipolar lines of the pair.
+    angles : ndarray (H,)
+        Angles of the rows.
+    scales, shears, origins : ndarray (2,)
+        Column coordinates of both images.
+    size : tuple of int
+        (width, height) of the frame.
     """
 
     pencil: EpipolarPencil
@@ -38,8 +48,20 @@ class PolarRectification:
     size: tuple[int, int]
 
     def original_from_rectified(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """Pixels (N, 2) of the photograph at places (N, 2) of the frame; NaN outside the frame and beyond the
-        epipole. With ``within`` False columns may be any."""
+        """Map positions of the frame to pixels of an image.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        xy : ndarray (N, 2)
+        within : bool
+            Return NaN for columns outside the frame too.
+
+        Returns
+        -------
+        ndarray (N, 2)
+            Pixels of the image, NaN beyond the epipole and outside the rows.
+        """
         lines = self.pencil.half_lines(require_side(side), self._angle_of(xy[:, 1]))
         return self._on_lines(side, lines, xy, within)
 
@@ -53,7 +75,19 @@ class PolarRectification:
         return np.where(valid[:, None], pixels, np.nan)
 
     def rectified_from_original(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """The inverse of :meth:`original_from_rectified`, for pixels (N, 2) of the photograph."""
+        """Map pixels of an image to the frame.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        xy : ndarray (N, 2)
+        within : bool
+            Return NaN for columns outside the frame too.
+
+        Returns
+        -------
+        ndarray (N, 2)
+        """
         middle = 0.5 * float(self.angles[0] + self.angles[-1])
         phi = self.pencil.angles(require_side(side), xy, about=middle)
         lines, rows = self.pencil.half_lines(side, phi), self._row_of(phi)
@@ -68,7 +102,17 @@ class PolarRectification:
         return -1.0 if self.pencil.flipped else 1.0
 
     def lookup(self, side: int, rows: range) -> F64:
-        """(len(rows), width, 2) px in the photograph for the pixels of these rows."""
+        """Return the image positions of some rows of the frame.
+
+        Parameters
+        ----------
+        side : {0, 1}
+        rows : range
+
+        Returns
+        -------
+        ndarray (len(rows), width, 2)
+        """
         width = self.size[0]
         lines = self.pencil.half_lines(require_side(side), self.angles[rows.start : rows.stop])
         foot, direction, distance = (
@@ -84,11 +128,22 @@ class PolarRectification:
         )
 
     def warp(self, image: F32, side: int) -> F32:
-        """``image`` (H, W) or (H, W, C) in the frame: float32, NaN outside."""
+        """Resample an image into the frame.
+
+        Parameters
+        ----------
+        image : ndarray (H, W) or (H, W, C)
+        side : {0, 1}
+
+        Returns
+        -------
+        ndarray float32
+            The rectified image, NaN outside.
+        """
         return warp_image(self, image, require_side(side))
 
     def _angle_of(self, rows: F64) -> F64:
-        """Half-planes of rows (N,), which may be fractions; NaN half a row beyond the first and last."""
+        """Angles of rows (N,), which may be fractional; NaN more than half a row outside."""
         last = len(self.angles) - 1
         valid = (rows >= -0.5) & (rows <= last + 0.5)
         k = np.clip(np.floor(np.where(valid, rows, 0.0)), 0, last - 1).astype(np.int64)
@@ -96,7 +151,7 @@ class PolarRectification:
         return np.where(valid, self.angles[k] + (rows - k) * step, np.nan)
 
     def _row_of(self, phi: F64) -> F64:
-        """The inverse of :meth:`_angle_of`."""
+        """Inverse of :meth:`_angle_of`."""
         last = len(self.angles) - 1
         k = np.clip(
             np.searchsorted(self._sign * self.angles, self._sign * phi, side="right") - 1, 0, last - 1
@@ -107,15 +162,20 @@ class PolarRectification:
 
 @dataclass(frozen=True)
 class PolarRectifier:
-    """Half epipolar lines in either photograph, no pixel shrinking by more than ``limits.most_shrink``.
+    """Polar rectification with bounded reduction.
 
-    Neighbouring rows are at most a pixel apart at the middle of what either view shows of them, and nearer
-    where a far end would shrink by more (up to 1 % more just at corners). With ``most_shrink`` 1 no pixel is
-    lost, as Pollefeys et al. have it, at the price of rows that are too near elsewhere. They walk from line
-    to line; here the spacing is a function of the angle whose integral counts the rows.
+    Adjacent rows are at most one pixel apart in the middle of each half-line, and closer where its end would
+    be reduced by more than ``limits.max_shrink`` (1: no pixel is lost, as in the paper). The row spacing is a
+    function of the angle whose integral counts the rows, instead of walking from line to line. Shear and
+    scale along the rows reduce the disparity gradients of the matches.
 
-    Shear, and scale along the rows where a side has less than a pixel for a pixel of the other, make both
-    sides as alike as ``most_scale`` (log) and ``most_shear`` allow, judged by the matches.
+    Parameters
+    ----------
+    limits : FrameLimits
+    max_scale : float
+        Limit of the log scale along the rows.
+    max_shear : float
+        Limit of the shear.
     """
 
     limits: FrameLimits = field(default_factory=FrameLimits)
@@ -123,7 +183,21 @@ class PolarRectifier:
     max_shear: float = 0.06
 
     def rectify(self, pair: EpipolarPair) -> PolarRectification:
-        """The polar frame; ``StageFailure`` where it would be too large or the views share nothing."""
+        """Compute the polar maps.
+
+        Parameters
+        ----------
+        pair : EpipolarPair
+
+        Returns
+        -------
+        PolarRectification
+
+        Raises
+        ------
+        StageFailure
+            If the frame would be too large or the views do not overlap.
+        """
         pencil, sign = pair.pencil, -1 if pair.pencil.flipped else 1
         phi = _half_planes(pair)
         chords = [_chord(pencil, side, phi) for side in (0, 1)]
@@ -144,7 +218,7 @@ class PolarRectifier:
         left, right = _matches_in(bare, pair)
         if len(left) < MIN_MATCHES:
             return bare
-        # d changes by the difference of both scales along x and of both shears along y.
+        # The disparity slope is the difference of the scales along x and of the shears along y.
         slope = disparity_gradients(left, right).mean(axis=0)
         scale = np.exp(np.clip(-slope[0], -self.max_scale, self.max_scale))
         shear = np.clip(-0.5 * slope[1], -self.max_shear, self.max_shear)
@@ -159,7 +233,7 @@ def _matches_in(frame: PolarRectification, pair: EpipolarPair) -> tuple[F64, F64
 
 
 def _half_planes(pair: EpipolarPair) -> F64:
-    """Half-planes over the arc, those of the corners among them: there the spacing of rows has its peaks."""
+    """Angles over the arc, including those of the image corners, where the row spacing is extreme."""
     low, high = pair.arc
     corners = [
         np.array([[0.0, 0.0], [w - 1.0, 0.0], [w - 1.0, h - 1.0], [0.0, h - 1.0]]) for w, h in pair.sizes
@@ -172,7 +246,7 @@ def _half_planes(pair: EpipolarPair) -> F64:
 
 
 def _chord(pencil: EpipolarPencil, side: int, phi: F64) -> tuple[HalfLines, F64, F64]:
-    """The half-lines and where they enter and leave the photograph, in places, the later first where not."""
+    """Half-lines with the positions of entry into and exit from the image; entry > exit if they miss it."""
     width, height = pencil.sizes[side]
     lines = pencil.half_lines(side, phi)
     low = pencil.normalized(side, np.zeros(2))
@@ -183,7 +257,7 @@ def _chord(pencil: EpipolarPencil, side: int, phi: F64) -> tuple[HalfLines, F64,
 def _rows_of(
     pencil: EpipolarPencil, phi: F64, chords: list[tuple[HalfLines, F64, F64]], max_shrink: float
 ) -> F64:
-    """Half-planes of the rows, increasing (H,)."""
+    """Angles of the rows, increasing (H,)."""
     per_radian = np.zeros(len(phi))
     for side, (lines, enter, leave) in enumerate(chords):
         met = leave >= enter
@@ -191,7 +265,7 @@ def _rows_of(
             at = np.where(met, t, 0.0)[:, None]
             sweep_rate = pencil.sweep_rate(side, phi, lines.foot + at * lines.direction) * pencil.units[side]
             per_radian = np.maximum(per_radian, np.where(met, sweep_rate / shrink, 0.0))
-    # The most that neighbours need, so that nothing shrinks between the sampled half-planes either.
+    # The maximum of both ends bounds the reduction between the samples.
     each = np.maximum(per_radian[:-1], per_radian[1:]) * np.diff(phi)
     rows = np.concatenate([[0.0], np.cumsum(np.maximum(each, 1e-12))])
     count = max(int(np.ceil(rows[-1])) + 1, 2)

@@ -1,7 +1,4 @@
-"""Compiled last steps: the best disparity of both sides, sub-pixel fit, checks, smoothing.
-
-Left-right check, peak filter, pinholes, smoothing, confidence.
-"""
+"""Postprocessing of disparities: sub-pixel fit, left-right check, speckle filter, smoothing, confidence."""
 
 from __future__ import annotations
 
@@ -15,31 +12,31 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.cost import StereoImage
 from thesisrecon.stereo.cost_kernels import LEVELS
 
-NONE = np.uint16(65535)
-BLANK = np.float32(0.05)
-"""What is left of the confidence where there is no texture."""
-EVIDENT = 20
-"""At least one pixel in so many of a surface must have texture."""
+UNREACHED = np.uint16(65535)
+MIN_FACTOR = np.float32(0.05)
+"""Factor of the confidence without texture."""
+MIN_TEXTURED = 20
+"""A region needs texture in at least one of so many pixels."""
 
 
 @njit(cache=True, nogil=True)
 def _keep_best(total: U16, q: np.int16, best: U16, index: I16) -> None:
     for x in range(len(best)):
-        # Read before the choice: a read inside of it would be a branch, and no vector instruction.
+        # Loads precede the selections: a load inside one would prevent vectorisation.
         value, least, at = total[x], best[x], index[x]
         index[x] = q if value < least else at
         best[x] = value if value < least else least
 
 
 @njit(cache=True, nogil=True)
-def _keep_rival(total: U16, q: np.int16, index: I16, rival: U16) -> None:
-    """Least total of a disparity that is no neighbour of the best one."""
-    for x in range(len(rival)):
+def _keep_second_best(total: U16, q: np.int16, index: I16, second: U16) -> None:
+    """Least total of a disparity that is not adjacent to the best one."""
+    for x in range(len(second)):
         apart = np.int16(index[x] - q)
         apart = np.int16(-apart) if apart < 0 else apart
-        value, least = total[x], rival[x]
-        value = value if apart > 1 else NONE
-        rival[x] = value if value < least else least
+        value, least = total[x], second[x]
+        value = value if apart > 1 else UNREACHED
+        second[x] = value if value < least else least
 
 
 @njit(cache=True, nogil=True)
@@ -56,11 +53,11 @@ def _add_bytes(values: U8, total: U16) -> None:
 
 @njit(cache=True, nogil=True)
 def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tuple[U16, I16]) -> None:
-    """Least totals and their places for the pixels of both sides, and the left one's rivals."""
+    """Least totals and their disparities for both images, and the second best totals of the left one."""
     n, width = total.shape
-    best, index, rival = left
-    best[:], index[:], rival[:] = NONE, 0, NONE
-    right[0][:], right[1][:] = NONE, -1
+    best, index, second = left
+    best[:], index[:], second[:] = UNREACHED, 0, UNREACHED
+    right[0][:], right[1][:] = UNREACHED, -1
     for q in range(n):
         d = first + q
         _keep_best(total[q], np.int16(q), best, index)
@@ -68,29 +65,41 @@ def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tupl
         if hi > lo:
             _keep_best(total[q, lo:hi], np.int16(q), right[0][lo - d : hi - d], right[1][lo - d : hi - d])
     for q in range(n):
-        _keep_rival(total[q], np.int16(q), index, rival)
+        _keep_second_best(total[q], np.int16(q), index, second)
 
 
 @njit(cache=True, nogil=True)
 def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32], half: float) -> None:
-    """From path sums (P, N, D, W), row ``start`` and those below, to ``out``, each (H, W): the disparities of
-    the left pixels, sub-pixel; those of the right ones, whole, NaN where the range leaves the image; and the
-    confidence m / (m + ``half``), m by how much the best rival costs more.
+    """Select the best disparity of every pixel from the path sums.
 
-    The sub-pixel place is the corner of two lines of equal and opposite slope through the best three totals;
-    at an end of the range there is none.
+    The sub-pixel position is the vertex of two lines of opposite slope through the best three totals; there
+    is none at the ends of the range.
+
+    Parameters
+    ----------
+    sums : ndarray (P, N, D, W) uint8
+        Path sums.
+    start : int
+        First row used.
+    first : int
+        First disparity.
+    out : tuple of ndarray (H, W) float32
+        Receives the sub-pixel disparities of the left image, the integer disparities of the right image (NaN
+        if out of range) and the confidence m / (m + ``half``), m the margin to the second best disparity.
+    half : float
+        Margin of confidence 1/2.
     """
     pairs, _, n, width = sums.shape
     left, right, confidence = out
     total = np.empty((n, width), np.uint16)
-    best, index, rival = np.empty(width, np.uint16), np.empty(width, np.int16), np.empty(width, np.uint16)
+    best, index, second = np.empty(width, np.uint16), np.empty(width, np.int16), np.empty(width, np.uint16)
     best_r, index_r = np.empty(width, np.uint16), np.empty(width, np.int16)
     for y in range(len(left)):
         for q in range(n):
             _set_sum(sums[0, start + y, q], sums[1, start + y, q], total[q])
             for k in range(2, pairs):
                 _add_bytes(sums[k, start + y, q], total[q])
-        _best_of_row(total, first, (best, index, rival), (best_r, index_r))
+        _best_of_row(total, first, (best, index, second), (best_r, index_r))
         for x in range(width):
             q = int(index[x])
             value = np.float32(first + q)
@@ -101,15 +110,24 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
                 if steep > 0:
                     value += np.float32(0.5) * (a - b) / steep
             left[y, x] = value
-            margin = np.float32(rival[x]) - np.float32(best[x])
+            margin = np.float32(second[x]) - np.float32(best[x])
             confidence[y, x] = margin / (margin + np.float32(half))
             right[y, x] = np.float32(first + index_r[x]) if index_r[x] >= 0 else np.float32(np.nan)
 
 
 @njit(cache=True, nogil=True)
 def check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> None:
-    """NaN to the disparities (H, W) of left pixels whose partner in the right image has one that differs by
-    more than ``limits[0]``, and to those of less confidence than ``limits[1]``."""
+    """Invalidate disparities that fail the left-right check or the confidence threshold.
+
+    Parameters
+    ----------
+    left, right : ndarray (H, W) float32
+        Disparities of both images; ``left`` is set to NaN where rejected.
+    confidence : ndarray (H, W) float32
+        Confidence of the left disparities.
+    limits : ndarray (2,) float32
+        Largest difference in pixels, and least confidence.
+    """
     height, width = left.shape
     for y in range(height):
         for x in range(width):
@@ -123,14 +141,26 @@ def check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> Non
 
 
 @njit(cache=True, nogil=True)
-def rate(confidence: F32, confirmed: F32, disparity: F32, texture: F32) -> None:
-    """Confidence (H, W) once all is known: 0 where there is no disparity, half where it was filled in and
-    the neighbours alone speak for it, and less where ``texture`` is little more than 1."""
+def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F32) -> None:
+    """Compute the final confidence in place.
+
+    Parameters
+    ----------
+    confidence : ndarray (H, W) float32
+        Confidence, 0 where no disparity is known, halved where it was filled in, reduced where texture is
+        weak.
+    confirmed : ndarray (H, W) float32
+        Disparities before filling, NaN = unknown.
+    disparity : ndarray (H, W) float32
+        Final disparities.
+    texture : ndarray (H, W) float32
+        Texture measure of :func:`texture_of`.
+    """
     height, width = confidence.shape
     for y in range(height):
         for x in range(width):
             excess = max(texture[y, x] - np.float32(1.0), np.float32(0.0))
-            share = max(excess / (excess + np.float32(1.0)), BLANK)
+            share = max(excess / (excess + np.float32(1.0)), MIN_FACTOR)
             share = share * np.float32(0.5) if np.isnan(confirmed[y, x]) else share
             confidence[y, x] = np.float32(0.0) if np.isnan(disparity[y, x]) else confidence[y, x] * share
 
@@ -144,13 +174,21 @@ def _add_squares(before: I16, after: I16, sign: int, out: I32) -> None:
 
 @njit(cache=True, nogil=True)
 def squared_gradient(channels: I16, radius: int, out: F32) -> None:
-    """Mean over channels and a square window of (I(x + 1) - I(x - 1))^2, (H, W); beyond the image there is
-    nothing."""
+    """Compute the mean squared horizontal difference I(x + 1) - I(x - 1) in a window.
+
+    Parameters
+    ----------
+    channels : ndarray (K, H, W) int16
+    radius : int
+        Radius of the square window; zeros outside the image.
+    out : ndarray (H, W) float32
+        Receives the mean over window and channels.
+    """
     n, height, width = channels.shape
     columns = np.zeros(width, np.int32)
     share = np.float32(1.0) / np.float32(n * (2 * radius + 1) ** 2)
     for y in range(-radius, height):
-        # The window goes down: a row comes, another goes.
+        # Running sum: one row enters the window, another leaves it.
         for row, sign in ((y + radius, 1), (y - radius - 1, -1)):
             if 0 <= row < height and width > 2:
                 for k in range(n):
@@ -167,19 +205,29 @@ def squared_gradient(channels: I16, radius: int, out: F32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def remove_peaks(disparity: F32, evident: B8, step: np.float32, smallest: int) -> None:
-    """NaN to connected pieces of fewer than ``smallest`` pixels, or with fewer ``evident`` ones, in them and
-    around them, than one in twenty; neighbours are connected where their disparities differ by no more than
-    ``step``."""
+def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: int) -> None:
+    """Invalidate small or untextured connected regions.
+
+    Parameters
+    ----------
+    disparity : ndarray (H, W) float32
+        Disparities; set to NaN where removed.
+    textured : ndarray (H, W) bool
+        Pixels with texture; a region needs one in twenty, in or next to it.
+    step : float32
+        Largest disparity difference of connected neighbours.
+    smallest : int
+        Regions of fewer pixels are removed.
+    """
     height, width = disparity.shape
-    # A frame of unknown pixels, one column for both sides: every pixel then has four neighbours.
+    # Padding with unknown pixels gives every pixel four neighbours; one column serves both sides.
     line = width + 1
     flat = np.full((height + 2) * line, np.float32(np.nan), np.float32)
     counted = np.zeros((height + 2) * line, np.bool_)
     for y in range(height):
         start = (y + 1) * line
         flat[start : start + width] = disparity[y]
-        counted[start : start + width] = evident[y]
+        counted[start : start + width] = textured[y]
     open_ = ~np.isnan(flat)
     queue = np.empty(height * width, np.int32)
     for seed in range(line, (height + 1) * line):
@@ -201,7 +249,7 @@ def remove_peaks(disparity: F32, evident: B8, step: np.float32, smallest: int) -
                     open_[other] = False
                     queue[n] = other
                     n += 1
-        if n < smallest or EVIDENT * size < n:
+        if n < smallest or MIN_TEXTURED * size < n:
             for k in range(n):
                 y, x = queue[k] // line - 1, queue[k] % line
                 disparity[y, x] = np.nan
@@ -210,7 +258,17 @@ def remove_peaks(disparity: F32, evident: B8, step: np.float32, smallest: int) -
 
 @njit(cache=True, nogil=True)
 def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
-    """Unknown pixels with at least ``least`` of 8 neighbours known take the median of these; (H, W)."""
+    """Fill unknown pixels with the median of their 8 neighbours.
+
+    Parameters
+    ----------
+    disparity : ndarray (H, W) float32
+        Disparities, NaN = unknown.
+    least : int
+        Known neighbours required.
+    out : ndarray (H, W) float32
+        Receives the result.
+    """
     height, width = disparity.shape
     around = np.empty(8, np.float32)
     out[:] = disparity
@@ -239,19 +297,30 @@ def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _gather_alike(centre: F32, other: F32, step: np.float32, total: F32, count: F32) -> None:
+def _gather_similar(centre: F32, other: F32, step: np.float32, total: F32, count: F32) -> None:
     for x in range(len(centre)):
         value, summed, counted = other[x], total[x], count[x]
-        # A comparison with NaN is false: unknown pixels neither give nor take.
-        alike = abs(value - centre[x]) <= step
-        total[x] = summed + (value if alike else np.float32(0.0))
-        count[x] = counted + (np.float32(1.0) if alike else np.float32(0.0))
+        # A comparison with NaN is false: unknown pixels do not contribute.
+        similar = abs(value - centre[x]) <= step
+        total[x] = summed + (value if similar else np.float32(0.0))
+        count[x] = counted + (np.float32(1.0) if similar else np.float32(0.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def smooth_alike(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
-    """Mean over the square window of the disparities that differ from the centre's by no more than ``step``,
-    (H, W): what varies on one surface is averaged, an edge is left."""
+def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
+    """Average the disparities of a window that differ little from the centre.
+
+    Parameters
+    ----------
+    disparity : ndarray (H, W) float32
+        Disparities, NaN = unknown.
+    step : float32
+        Largest difference to the centre.
+    radius : int
+        Radius of the square window.
+    out : ndarray (H, W) float32
+        Receives the means.
+    """
     height, width = disparity.shape
     total, count = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(height):
@@ -260,7 +329,7 @@ def smooth_alike(disparity: F32, step: np.float32, radius: int, out: F32) -> Non
             for dx in range(-radius, radius + 1):
                 lo, hi = min(max(-dx, 0), width), max(min(width, width - dx), 0)
                 if hi > lo:
-                    _gather_alike(
+                    _gather_similar(
                         disparity[y, lo:hi],
                         disparity[b, lo + dx : hi + dx],
                         step,
@@ -272,30 +341,35 @@ def smooth_alike(disparity: F32, step: np.float32, radius: int, out: F32) -> Non
 
 
 STEP_PX = np.float32(1.0)
-"""Neighbours on one surface differ by no more."""
-SPARSE = 5
-"""Every fifth pixel of every fifth row suffices for a median."""
-AROUND = 4
-"""Pixels to each side that speak for the texture of a pixel: as far as its costs look."""
-DIGITISATION = float(1.0 / np.sqrt(12.0))
-"""Noise of whole grey levels."""
+"""Largest disparity difference of neighbours on one surface."""
+SUBSAMPLING = 5
+"""Row and column step of the pixels used for a median."""
+TEXTURE_RADIUS = 4
+"""Radius of the window in which texture is measured, equal to that of the costs."""
+QUANTISATION = float(1.0 / np.sqrt(12.0))
+"""Quantisation noise of integer grey levels."""
 TEXTURED = np.float32(1.7)
-"""Texture that noise does not make, in units of its own."""
+"""Texture measure that noise does not reach."""
 LOCKING_PX = 0.17
-"""What pixels draw a sub-pixel fit towards them: measured on pairs whose disparity is known."""
-SURROUNDED = 5
-"""Of eight neighbours that must be known for a pinhole to be closed."""
+"""Standard deviation of the pixel-locking error of the sub-pixel fit, measured on known disparities."""
+MIN_NEIGHBOURS = 5
+"""Known neighbours required to fill a pinhole."""
 
 
 @dataclass(frozen=True)
 class DisparityPostprocessing:
-    """What is believed of the best disparities.
+    """Parameters of the postprocessing of disparities.
 
-    ``left_right_px``: the partner's own best disparity may differ by as much. ``smallest_piece``: connected
-    pieces of fewer pixels are peaks and go, as do larger ones all but without texture. ``min_confidence``:
-    less is unknown. ``radius``: every
-    disparity becomes the mean of those within so many pixels that differ from it by a pixel at most, which
-    takes the noise of the sub-pixel fit from a surface and leaves its edges.
+    Parameters
+    ----------
+    left_right_px : float
+        Largest difference in the left-right check.
+    min_region_px : int
+        Connected regions of fewer pixels are removed, as are larger ones without texture.
+    min_confidence : float
+        Disparities of less confidence are unknown.
+    radius : int
+        Radius of the edge-preserving mean over disparities within 1 px of the centre; 0 = none.
     """
 
     left_right_px: float = 1.0
@@ -310,36 +384,58 @@ class DisparityPostprocessing:
             raise ValueError(f"min_confidence must be in [0, 1); got {self.min_confidence}")
 
     def apply(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
-        """The map of disparities (H, W) of the left pixels, given those of the right ones, NaN = none.
+        """Check, filter and smooth the disparities of the left image.
 
-        ``texture`` (H, W) from :func:`texture_of`: what surfaces without any inherit from their rims is kept,
-        with little confidence. Takes possession of ``left`` and ``confidence``.
+        Parameters
+        ----------
+        left, right : ndarray (H, W) float32
+            Disparities of both images, NaN = none; ``left`` is overwritten.
+        confidence : ndarray (H, W) float32
+            Confidence of the left disparities; overwritten.
+        texture : ndarray (H, W) float32
+            Texture measure of :func:`texture_of`. Values propagated into untextured regions get low
+            confidence.
+
+        Returns
+        -------
+        DisparityMap
+            Disparities of the left image.
         """
         limits = np.array([self.left_right_px, self.min_confidence], np.float32)
         check_left_right(left, right, confidence, limits)
-        remove_peaks(left, texture > TEXTURED, STEP_PX, self.min_region_px)
+        remove_speckles(left, texture > TEXTURED, STEP_PX, self.min_region_px)
         closed = np.empty_like(left)
-        fill_pinholes(left, SURROUNDED, closed)
+        fill_pinholes(left, MIN_NEIGHBOURS, closed)
         closed[np.isnan(texture)] = np.nan
         smooth = np.empty_like(left)
-        smooth_alike(closed, STEP_PX, self.radius, smooth)
-        rate(confidence, left, smooth, texture)
+        edge_preserving_mean(closed, STEP_PX, self.radius, smooth)
+        final_confidence(confidence, left, smooth, texture)
         return DisparityMap(smooth, confidence, _noise(closed, smooth))
 
 
-def texture_of(side: StereoImage, noise: float) -> F32:
-    """(H, W) squared horizontal gradient about each pixel in units of what noise alone, of a standard
-    deviation of so many grey levels, makes of it: 1 where there is nothing to match. NaN = no pixel."""
-    out = np.empty(side.valid.shape, np.float32)
-    squared_gradient(side.channels, AROUND, out)
-    out /= np.float32(2.0 * LEVELS**2 * np.hypot(noise, DIGITISATION) ** 2)
-    out[side.valid == 0] = np.nan
+def texture_of(image: StereoImage, noise: float) -> F32:
+    """Measure the texture around each pixel.
+
+    Parameters
+    ----------
+    image : StereoImage
+    noise : float
+        Standard deviation of its noise in grey levels.
+
+    Returns
+    -------
+    ndarray (H, W) float32
+        Squared horizontal gradient relative to that of pure noise: 1 = no texture, NaN = no pixel.
+    """
+    out = np.empty(image.valid.shape, np.float32)
+    squared_gradient(image.channels, TEXTURE_RADIUS, out)
+    out /= np.float32(2.0 * LEVELS**2 * np.hypot(noise, QUANTISATION) ** 2)
+    out[image.valid == 0] = np.nan
     return out
 
 
 def _noise(raw: F32, smooth: F32) -> float:
-    """Deviation of a disparity: about the smooth ones, from the median, and what smoothness does not show;
-    NaN where nothing is known."""
-    apart = np.abs(raw[::SPARSE, ::SPARSE] - smooth[::SPARSE, ::SPARSE])
+    """Standard deviation of the disparities: median deviation from the smoothed ones, plus pixel locking."""
+    apart = np.abs(raw[::SUBSAMPLING, ::SUBSAMPLING] - smooth[::SUBSAMPLING, ::SUBSAMPLING])
     known = apart[np.isfinite(apart)]
     return float(np.hypot(1.4826 * np.median(known), LOCKING_PX)) if len(known) else float("nan")

@@ -1,7 +1,4 @@
-"""What a rectification does to the photographs, in numbers: the better one distorts less.
-
-The front doors of rectification, and the choice among its methods by what they do to the photographs.
-"""
+"""Rectification of image pairs (thesis, section 2.5): methods, distortion measures, selection."""
 
 from __future__ import annotations
 
@@ -15,47 +12,63 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.stereo.epipolar_pair import EpipolarPair, Size, pair_of_cameras, pair_of_fundamental
 from thesisrecon.stereo.planar import (
-    CommonOrientationRectifier,
     FrameLimits,
-    HartleyRectifier,
-    LoopZhangRectifier,
-    MinimumDistortionRectifier,
     PlanarRectification,
     disparity_bounds,
     disparity_gradients,
     singular_values,
 )
+from thesisrecon.stereo.planar_rectifiers import (
+    CommonOrientationRectifier,
+    HartleyRectifier,
+    LoopZhangRectifier,
+    MinimumDistortionRectifier,
+)
 from thesisrecon.stereo.polar import PolarRectification, PolarRectifier
 
 STEP_PX = 0.01
-"""Half the distance over which derivatives of a map are taken."""
+"""Half step of numerical derivatives."""
 
 
 class Rectification(Protocol):
-    """A pair of maps from photographs to a common frame."""
+    """Maps between two images and a common frame."""
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) of the frame."""
 
     def original_from_rectified(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """Pixels (N, 2) of the photograph."""
+        """Map positions (N, 2) of the frame to pixels of an image."""
 
     def rectified_from_original(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """Places (N, 2) in the frame."""
+        """Map pixels (N, 2) of an image to the frame."""
 
 
 @dataclass(frozen=True)
 class RectificationQuality:
-    """Distortion of a rectified pair; pairs of numbers are those of side 0 and 1.
+    """Distortion measures of a rectified pair; pairs of numbers refer to both images.
 
-    ``rms_dy_px`` of the matches in pixels of the frame, NaN without any. ``orthogonality_deg``: the angle of
-    the photograph's midlines in the frame, ``aspect`` their ratio over what it was, NaN where they are not
-    finite. ``kept`` share of each photograph inside the frame, ``growth`` pixels of the frame over those of
-    the larger photograph. ``least_scale, greatest_scale`` pixels of the frame per pixel along any direction.
-    ``stretch`` is the typical factor by which lengths change, exp of the RMS log singular value about their
-    mean, 1 for similarities. ``slant`` (RMS gradient of the quadratic polynomial fitted to the
-    disparities of the matches) says how unlike both sides are, and ``disparities`` their least and greatest.
+    Attributes
+    ----------
+    rms_dy_px : float
+        RMS vertical disparity of the matches, NaN without matches.
+    orthogonality_deg : tuple of float
+        Angle of the mapped image midlines.
+    aspect : tuple of float
+        Ratio of their lengths relative to the original, NaN if not finite.
+    coverage : tuple of float
+        Share of each image inside the frame.
+    size_ratio : float
+        Pixels of the frame relative to the larger image.
+    least_scale, greatest_scale : float
+        Extreme local scales along any direction.
+    stretch : float
+        Typical local scale change: exp of the standard deviation of the log singular values; 1 for
+        similarities.
+    disparity_slope : float
+        RMS gradient of a quadratic polynomial fitted to the disparities: the difference between both images.
+    disparities : tuple of float
+        Disparity range of the matches.
     """
 
     rms_dy_px: float
@@ -71,19 +84,27 @@ class RectificationQuality:
 
     @property
     def distortion(self) -> float:
-        """The number that the choice is made by: what is done to either photograph and between both.
+        """Root of the sum of squares of ``log stretch`` and half the ``disparity_slope``.
 
-        ``log stretch`` and half the ``slant``, as the root of the sum of squares: a slant s stretches windows
-        of one side against the other by s, to first order half of it for either.
+        A slope s stretches windows of one image against the other by s, to first order s / 2 in each.
         """
         disparity_slope = self.disparity_slope if np.isfinite(self.disparity_slope) else 0.0
         return float(np.hypot(np.log(self.stretch), 0.5 * disparity_slope))
 
 
 def measure_quality(rectification: Rectification, pair: EpipolarPair) -> RectificationQuality:
-    """Measure what a rectification does to ``pair``, at the samples of what both photographs see.
+    """Measure the distortion of a rectification over the common field of view of a pair.
 
-    It need not have been made from this pair: the epipolar geometry of ``pair`` says only what both see.
+    Parameters
+    ----------
+    rectification : Rectification
+        The rectification; it may come from another estimate of the epipolar geometry.
+    pair : EpipolarPair
+        The pair, which determines the common field of view.
+
+    Returns
+    -------
+    RectificationQuality
     """
     values, coverage, midlines = [], [], []
     for side in (0, 1):
@@ -113,14 +134,25 @@ def measure_quality(rectification: Rectification, pair: EpipolarPair) -> Rectifi
 
 
 def jacobians(rectification: Rectification, side: int, xy: F64) -> F64:
-    """Derivatives (N, 2, 2) of the frame's coordinates by those of the photograph at pixels (N, 2), NaN
-    where a polar frame begins and ends."""
+    """Compute numerical derivatives of the map from an image to the frame.
+
+    Parameters
+    ----------
+    rectification : Rectification
+    side : {0, 1}
+    xy : ndarray (N, 2)
+
+    Returns
+    -------
+    ndarray (N, 2, 2)
+        Jacobians, NaN at the first and last row of a polar frame.
+    """
     columns = []
     for axis in np.eye(2):
         ahead = rectification.rectified_from_original(side, xy + STEP_PX * axis, within=False)
         behind = rectification.rectified_from_original(side, xy - STEP_PX * axis, within=False)
         step = ahead - behind
-        # A full circle of half-lines is cut somewhere, and neighbours across the cut are far apart.
+        # A full circle of half-lines has a cut, across which neighbours are far apart.
         step[np.abs(step[:, 1]) > 0.5 * rectification.size[1]] = np.nan
         columns.append(step / (2.0 * STEP_PX))
     return np.stack(columns, axis=-1)
@@ -133,7 +165,7 @@ def _share_inside(rectification: Rectification, side: int, size: tuple[int, int]
 
 
 def _midlines(rectification: Rectification, side: int, size: tuple[int, int]) -> tuple[float, float]:
-    """Angle in degrees of the mapped midlines, and their ratio over that of the photograph."""
+    """Angle in degrees of the mapped midlines, and the ratio of their lengths relative to the original."""
     w, h = size[0] - 1.0, size[1] - 1.0
     ends = np.array([[0.0, h / 2.0], [w, h / 2.0], [w / 2.0, 0.0], [w / 2.0, h]])
     a, b, c, d = rectification.rectified_from_original(side, ends, within=False)
@@ -145,7 +177,7 @@ def _midlines(rectification: Rectification, side: int, size: tuple[int, int]) ->
 
 
 def _matches(rectification: Rectification, pair: EpipolarPair) -> tuple[float, float, tuple[float, float]]:
-    """RMS of y1 - y2, slant, and the range of disparities of the matches inside the frame."""
+    """RMS of y1 - y2, disparity slope, and disparity range of the matches inside the frame."""
     left, right = (rectification.rectified_from_original(s, xy) for s, xy in enumerate(pair.matches))
     seen = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
     if int(seen.sum()) < 3:
@@ -161,20 +193,30 @@ Method = Literal["best", "hartley", "loop-zhang", "least-distortion", "polar", "
 
 
 class Rectifier(Protocol):
-    """A way of rectifying a pair."""
+    """A rectification method."""
 
     def rectify(self, pair: EpipolarPair) -> AnyRectification:
-        """Both maps; ``StageFailure`` where the pair cannot be rectified so."""
+        """Compute both maps; raise ``StageFailure`` if the pair cannot be rectified by this method."""
 
 
 @dataclass(frozen=True)
 class BestRectifier:
-    """The one of several methods that distorts a pair least, measured by ``RectificationQuality.distortion``.
+    """Selection of the rectification of least ``RectificationQuality.distortion`` among several methods.
 
-    Methods that keep the angle of a photograph's midlines within ``angle_deg`` of a right one and their ratio
-    within ``aspect`` of its own come before the others, and methods that fail for a pair are passed over.
-    Added are ``bending`` for polar frames, which bend straight lines, and ``size`` times the log of the
-    frame's pixels over the photograph's, which cost time and tell nothing new.
+    Methods within the angle and aspect limits take precedence; methods that fail are skipped.
+
+    Parameters
+    ----------
+    methods : tuple of Rectifier
+        Methods to choose from.
+    angle_deg : float
+        Limit of the midline angle's deviation from 90 degrees.
+    aspect : float
+        Limit of the relative change of the aspect ratio.
+    bending : float
+        Penalty of polar frames, which bend straight lines.
+    size : float
+        Weight of the log of the relative frame size, which costs time.
     """
 
     methods: tuple[Rectifier, ...]
@@ -184,7 +226,22 @@ class BestRectifier:
     size: float = 0.05
 
     def rectify(self, pair: EpipolarPair) -> AnyRectification:
-        """The best of those that succeed; the last one's ``StageFailure`` where none does."""
+        """Apply all methods and return the best result.
+
+        Parameters
+        ----------
+        pair : EpipolarPair
+
+        Returns
+        -------
+        PlanarRectification or PolarRectification
+            The rectification of least distortion.
+
+        Raises
+        ------
+        StageFailure
+            If all methods fail (the failure of the last).
+        """
         best: AnyRectification | None = None
         least, failure = (True, np.inf), None
         for method in self.methods:
@@ -197,7 +254,7 @@ class BestRectifier:
             if best is None or cost < least:
                 best, least = found, cost
         if best is None:
-            raise failure if failure is not None else ValueError("a choice needs methods to choose from")
+            raise failure if failure is not None else ValueError("BestRectifier needs at least one method")
         return best
 
     def _cost(self, found: AnyRectification, quality: RectificationQuality) -> tuple[bool, float]:
@@ -222,9 +279,25 @@ def _methods(limits: FrameLimits) -> Mapping[Method, Rectifier]:
 def rectify(
     pair: EpipolarPair, *, method: Method = "best", limits: FrameLimits | None = None
 ) -> AnyRectification:
-    """Rectify a pair by one method, or by whichever of those it has the data for distorts least.
+    """Rectify a prepared pair.
 
-    Raises ``ValueError`` for an unknown method, ``StageFailure`` for a pair that it cannot rectify.
+    Parameters
+    ----------
+    pair : EpipolarPair
+    method : {"best", "hartley", "loop-zhang", "least-distortion", "polar", "metric"}
+        Method, or the best of all for which the data suffice.
+    limits : FrameLimits, optional
+
+    Returns
+    -------
+    PlanarRectification or PolarRectification
+
+    Raises
+    ------
+    ValueError
+        If the method is unknown.
+    StageFailure
+        If the pair cannot be rectified.
     """
     limits = FrameLimits() if limits is None else limits
     methods = _methods(limits)
@@ -232,29 +305,39 @@ def rectify(
         bare = PolarRectifier(limits, max_scale=0.0, max_shear=0.0)
         return BestRectifier((*methods.values(), bare)).rectify(pair)
     if method not in methods:
-        raise ValueError(f"a method of rectification is one of {['best', *methods]}; got {method!r}")
+        raise ValueError(f"method must be one of {['best', *methods]}; got {method!r}")
     return methods[method].rectify(pair)
 
 
 def rectify_pair(
     F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size, *, method: Method = "best"
 ) -> AnyRectification:
-    """Rectify two photographs of which only F and its inliers are known (thesis, section 2.5).
+    """Rectify two images with known fundamental matrix (thesis, section 2.5).
 
     Parameters
     ----------
-    F : (3, 3) with x2' F x1 = 0. xy1, xy2 : (N >= 8, 2) px matches that obey it.
-    size1, size2 : (width, height) px.
-    method : "hartley", "loop-zhang", "least-distortion" (planar), "polar", or the "best" of them.
+    F : ndarray (3, 3)
+        Fundamental matrix, x2' F x1 = 0.
+    xy1, xy2 : ndarray (N >= 8, 2)
+        Inlier matches in pixels.
+    size1, size2 : tuple of int
+        (width, height) in pixels.
+    method : {"best", "hartley", "loop-zhang", "least-distortion", "polar"}
+        Method, or the best of them.
 
     Returns
     -------
-    Maps between either photograph and a frame common to both in which epipolar lines are rows, side 0 the
-    first photograph and side 1 the second: x_right = x_left - d, d larger for nearer points. With the
-    focal lengths unknown, "nearer" is judged with usual ones.
+    PlanarRectification or PolarRectification
+        Maps to a frame whose rows are epipolar lines; x_right = x_left - d, larger d for nearer points. With
+        unknown focal lengths, "nearer" is judged with usual ones.
 
-    Raises ``ValueError`` for wrong shapes and sizes, ``StageFailure`` for pairs without parallax, too few or
-    contradictory matches, and for planar methods where the epipole is in a photograph.
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape or an image is too small.
+    StageFailure
+        If the pair has no parallax, too few or contradictory matches, or, for planar methods, an epipole
+        inside an image.
     """
     return rectify(pair_of_fundamental(F, xy1, xy2, size1, size2), method=method)
 
@@ -269,10 +352,30 @@ def rectify_cameras(
     xy2: F64 | None = None,
     method: Method = "best",
 ) -> AnyRectification:
-    """Rectify two photographs without lens distortion taken by metric cameras P = K [R t] (3, 4).
+    """Rectify two undistorted images with known metric cameras.
 
-    As :func:`rectify_pair`, with "metric" (a common orientation) as one more method. Matches (N, 2) px that
-    obey the cameras crop the frame to what both see, and "hartley" needs them.
+    Parameters
+    ----------
+    P1, P2 : ndarray (3, 4)
+        Cameras P = K [R t].
+    size1, size2 : tuple of int
+        (width, height) in pixels.
+    xy1, xy2 : ndarray (N, 2), optional
+        Matches in pixels; they crop the frame to the common field of view, and "hartley" needs them.
+    method : {"best", "hartley", "loop-zhang", "least-distortion", "polar", "metric"}
+        Method, or the best of them; "metric" is the common orientation.
+
+    Returns
+    -------
+    PlanarRectification or PolarRectification
+        See :func:`rectify_pair`.
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape or a camera is not finite.
+    StageFailure
+        If the pair cannot be rectified.
     """
     return rectify(pair_of_cameras(P1, P2, size1, size2, xy1=xy1, xy2=xy2), method=method)
 
@@ -280,10 +383,25 @@ def rectify_cameras(
 def disparity_range(
     rectification: AnyRectification, xy1: F64, xy2: F64, *, margin: float = 0.15
 ) -> tuple[int, int]:
-    """Whole disparities (least, greatest) to search in, from matches (N, 2), (N, 2) px of the photographs.
+    """Return the disparity range to search from matches.
 
-    The 1 and 99 % quantiles of those inside the frame, widened at either end by ``margin`` times their
-    difference and 2 px. Raises ``StageFailure`` where no match is inside.
+    Parameters
+    ----------
+    rectification : PlanarRectification or PolarRectification
+    xy1, xy2 : ndarray (N, 2)
+        Matches in pixels of the images.
+    margin : float
+        Widening at both ends as a share of the range, in addition to 2 px.
+
+    Returns
+    -------
+    tuple of int
+        First and last disparity.
+
+    Raises
+    ------
+    StageFailure
+        If no match lies inside the frame.
     """
     left = rectification.rectified_from_original(0, xy1)
     right = rectification.rectified_from_original(1, xy2)
@@ -291,7 +409,7 @@ def disparity_range(
     d = d[np.isfinite(d)]
     if len(d) == 0:
         raise StageFailure(
-            "the range of disparities is not known", "no match is inside the rectified frame", "give one"
+            "the disparity range is unknown", "no match is inside the rectified frame", "specify a range"
         )
     low, high = disparity_bounds(d, margin=margin)
     return int(np.floor(low)) - 2, int(np.ceil(high)) + 2

@@ -1,7 +1,4 @@
-"""Compiled resampling of an image at given places; its NumPy twin stands in the tests.
-
-Resampling a photograph into a rectified frame, strip by strip.
-"""
+"""Resampling of images into rectified or undistorted frames, strip by strip."""
 
 from __future__ import annotations
 
@@ -14,14 +11,14 @@ from thesisrecon.arrays import F32, F64
 from thesisrecon.geometry.raster import cubic_weights
 
 MOST_TAPS = 24
-"""Taps along an axis: images that shrink more than sixfold are undersampled from there on."""
+"""Limit of the filter width: reductions by more than 6 alias."""
 NOT_SHRUNK = 1.1
-"""Distances of neighbours up to this are taken for 1: what aliases is next to nothing."""
+"""Reduction up to which the filter is not widened."""
 
 
 @njit(cache=True, nogil=True)
 def _cubic(x: float) -> float:
-    """Keys' cubic convolution kernel, a = -1/2: third-order accurate, 0 beyond 2."""
+    """Cubic convolution kernel of Keys with a = -1/2, third-order accurate."""
     x = abs(x)
     if x < 1.0:
         return (1.5 * x - 2.5) * x * x + 1.0
@@ -32,7 +29,7 @@ def _cubic(x: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
-    """Weights of the pixels around ``at``, the kernel ``spread`` times as wide; the first, how many."""
+    """Weights of the pixels around ``at`` with the kernel ``spread`` times as wide; first pixel and count."""
     reach = min(2.0 * spread, 0.5 * MOST_TAPS - 1.0)
     first = int(np.ceil(at - reach))
     count = int(np.floor(at + reach)) - first + 1
@@ -47,24 +44,32 @@ def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
 
 @njit(cache=True, nogil=True)
 def _spread(xy: F64, i: int, j: int, axis: int) -> float:
-    """How far neighbours of ``xy[i, j]`` are apart along an axis of the image, at least 1."""
+    """Distance of the neighbours of ``xy[i, j]`` along an axis of the image, at least 1."""
     i1 = i + 1 if i + 1 < xy.shape[0] else i - 1
     j1 = j + 1 if j + 1 < xy.shape[1] else j - 1
     across = xy[i, j1, axis] - xy[i, j, axis] if j1 >= 0 else 0.0
     down = xy[i1, j, axis] - xy[i, j, axis] if i1 >= 0 else 0.0
     squared = across * across + down * down
-    # The comparison is false for NaN, too: at the rim of the lookup.
+    # The comparison is also false for NaN.
     return np.sqrt(squared) if squared > NOT_SHRUNK * NOT_SHRUNK else 1.0
 
 
 @njit(cache=True, nogil=True)
 def sample_image(image: F32, xy: F64, out: F32) -> None:
-    """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C); NaN outside.
+    """Sample an image by cubic convolution.
 
-    ``xy`` holds the places of neighbouring pixels, and may have a row more than ``out``: where neighbours lie
-    farther apart than a pixel the kernel is widened along each axis of the image by as much, so that nothing
-    finer than what ``out`` can show passes. NaN where xy is NaN, beyond the centres of the border pixels, or
-    where one of the four pixels around is NaN; others that are NaN are left out.
+    The kernel is widened along each axis of the image where neighbouring positions are more than a pixel
+    apart, which prevents aliasing. NaN where the position is NaN or outside the pixel centres, or one of the
+    four pixels around is NaN; other NaN pixels are left out.
+
+    Parameters
+    ----------
+    image : ndarray (H, W, C) float32
+        The image, NaN = no pixel.
+    xy : ndarray (>= n, m, 2)
+        Positions of adjacent output pixels; may have one row more than ``out``.
+    out : ndarray (n, m, C) float32
+        Receives the samples.
     """
     height, width, channels = image.shape
     wx, wy = np.empty(MOST_TAPS), np.empty(MOST_TAPS)
@@ -73,7 +78,7 @@ def sample_image(image: F32, xy: F64, out: F32) -> None:
         for j in range(xy.shape[1]):
             out[i, j] = np.nan
             x, y = xy[i, j, 0], xy[i, j, 1]
-            # Rounding of the lookup must not cut off the border pixels.
+            # Rounding of the positions must not remove border pixels.
             if not (x > -1e-6 and y > -1e-6 and x < width - 1 + 1e-6 and y < height - 1 + 1e-6):
                 continue
             x0, y0 = min(max(int(x), 0), width - 1), min(max(int(y), 0), height - 1)
@@ -119,35 +124,49 @@ def sample_image(image: F32, xy: F64, out: F32) -> None:
 
 
 STRIP_ROWS = 64
-"""Rows whose lookup is held in memory at a time."""
+"""Rows whose positions are held in memory at a time."""
 
 
 class Lookup(Protocol):
-    """Where the pixels of a rectified frame come from."""
+    """Maps the pixels of a frame to original images."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the frame, common to both sides."""
+        """(width, height) of the frame."""
 
     def lookup(self, side: int, rows: range) -> F64:
-        """(len(rows), width, 2) px in the photograph of ``side``."""
+        """Return the positions (len(rows), width, 2) in the original image of ``side``."""
 
 
 def warp_image(source: Lookup, image: F32, side: int) -> F32:
-    """``image`` (H, W) or (H, W, C) in the frame of ``source``: float32, NaN outside.
+    """Resample an image into a frame by cubic convolution.
 
-    Cubic convolution; where the photograph shrinks the kernel is widened by as much. Beside the image itself
-    the memory is that of ``STRIP_ROWS`` rows. ``ValueError`` for images of another shape or side.
+    Parameters
+    ----------
+    source : Lookup
+        Maps pixels of the frame to the image.
+    image : ndarray (H, W) or (H, W, C)
+    side : {0, 1}
+
+    Returns
+    -------
+    ndarray float32
+        The frame, NaN outside the image.
+
+    Raises
+    ------
+    ValueError
+        If the image has another number of dimensions or is empty.
     """
     if image.ndim not in (2, 3) or image.size == 0:
-        raise ValueError(f"an image to warp is (H, W) or (H, W, C); got shape {image.shape}")
+        raise ValueError(f"an image must be (H, W) or (H, W, C) and not empty; got shape {image.shape}")
     pixels = np.ascontiguousarray(image, dtype=np.float32)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     width, height = source.size
     out = np.empty((height, width, pixels.shape[2]), np.float32)
     for first in range(0, height, STRIP_ROWS):
         last = min(first + STRIP_ROWS, height)
-        # One row more where there is one: distances of neighbours tell how the photograph shrinks.
+        # One row more, if available: neighbour distances determine the filter width.
         start = first - 1 if last == height and last - first == 1 and first > 0 else first
         places = source.lookup(side, range(start, min(last + 1, height)))
         strip = out[start:last] if start == first else np.empty((last - start, *out.shape[1:]), np.float32)
@@ -157,7 +176,23 @@ def warp_image(source: Lookup, image: F32, side: int) -> F32:
 
 
 def require_side(side: int) -> int:
-    """0 or 1, else ``ValueError``."""
+    """Check the index of an image of a pair.
+
+    Parameters
+    ----------
+    side : int
+        The index.
+
+    Returns
+    -------
+    int
+        The index, 0 or 1.
+
+    Raises
+    ------
+    ValueError
+        If it is neither 0 nor 1.
+    """
     if side not in (0, 1):
-        raise ValueError(f"a side of a rectified pair is 0 or 1; got {side}")
+        raise ValueError(f"side must be 0 or 1; got {side}")
     return side

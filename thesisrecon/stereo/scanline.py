@@ -1,6 +1,7 @@
-"""Compiled maximum-likelihood scanline program (Cox, Hingorani, Rao and Maggs 1996).
+"""Maximum-likelihood scanline matching (thesis, section 2.5).
 
-Maximum likelihood stereo, [26] of the thesis (Cox, Hingorani, Rao and Maggs, CVIU 63, 1996).
+The dynamic program of Cox, Hingorani, Rao and Maggs, "A maximum likelihood stereo algorithm", CVIU 63(3),
+1996, [26] of the thesis.
 """
 
 from __future__ import annotations
@@ -16,17 +17,18 @@ from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.cost import Strip, checked_range, estimate_noise, prepare_pair, run_strips
 from thesisrecon.stereo.cost_kernels import LEVELS
-from thesisrecon.stereo.postprocessing import rate, texture_of
+from thesisrecon.stereo.postprocessing import final_confidence, texture_of
 
-NOTHING = -32768
-"""Disparity of a pixel that is hidden in the other image."""
-FORBIDDEN = -1
-"""Cost of a match where one of the pixels is none."""
-ENDLESS = 1 << 60
+OCCLUDED = -32768
+"""Disparity of an occluded pixel."""
+NO_MATCH = -1
+"""Cost of a match with a missing pixel."""
+INFINITE = 1 << 60
 RADIX = 1 << 24
-"""A likelihood cost in steps times this, plus a number of discontinuities below it, is one key: the smaller
-key has the greater likelihood or, of equal ones, fewer discontinuities."""
-MATCHED, LEFT_HIDDEN, RIGHT_HIDDEN = 0, 1, 2
+"""Keys are cost * RADIX + number of discontinuities: the smaller key has the greater likelihood or, if equal,
+fewer discontinuities.
+"""
+MATCHED, LEFT_OCCLUDED, RIGHT_OCCLUDED = 0, 1, 2
 
 
 @njit(cache=True, nogil=True)
@@ -43,8 +45,8 @@ def _add_row(values: I32, out: I32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def squared_differences(y: int, left: I16, right: I16, first: int, out: I32) -> None:
-    """Squared differences (D, W) of row y of (K, H, W) summed over channels, 0 beyond the image."""
+def _squared_differences(y: int, left: I16, right: I16, first: int, out: I32) -> None:
+    """Squared differences (D, W) of row y of (K, H, W) summed over channels, 0 outside the image."""
     n, _, width = left.shape
     for q in range(len(out)):
         d = first + q
@@ -57,7 +59,7 @@ def squared_differences(y: int, left: I16, right: I16, first: int, out: I32) -> 
 
 @njit(cache=True, nogil=True)
 def _window_costs(columns: I32, lo: int, hi: int, radius: int, scale: float, out: I32) -> None:
-    """Sums of ``columns`` (W,) over 2 radius + 1 columns, the last ones repeated, in steps of ``scale``."""
+    """Sums of ``columns`` (W,) over 2 radius + 1 columns, border columns repeated, in steps of ``scale``."""
     total = 0
     for dx in range(-radius, radius + 1):
         total += int(columns[min(max(lo + dx, lo), hi - 1)])
@@ -75,7 +77,7 @@ def _trace_back(states: U8, last: tuple[int, int, int], first: int, left: I32, r
             left[i - 1] = q + first
             right[i - (q + first) - 1] = q + first
             i -= 1
-        elif state == LEFT_HIDDEN:
+        elif state == LEFT_OCCLUDED:
             i -= 1
             q -= 1
         else:
@@ -84,12 +86,12 @@ def _trace_back(states: U8, last: tuple[int, int, int], first: int, left: I32, r
 
 
 @njit(cache=True, nogil=True)
-def _least(matched: int, left_hidden: int, right_hidden: int) -> tuple[int, int]:
+def _least(matched: int, left_occluded: int, right_occluded: int) -> tuple[int, int]:
     best, state = matched, MATCHED
-    state = LEFT_HIDDEN if left_hidden < best else state
-    best = min(left_hidden, best)
-    state = RIGHT_HIDDEN if right_hidden < best else state
-    return min(right_hidden, best), state
+    state = LEFT_OCCLUDED if left_occluded < best else state
+    best = min(left_occluded, best)
+    state = RIGHT_OCCLUDED if right_occluded < best else state
+    return min(right_occluded, best), state
 
 
 @njit(cache=True, nogil=True)
@@ -97,38 +99,38 @@ def _enter_column(
     i: int,
     first: int,
     costs: I32,
-    prices: tuple[int, int, int],
+    penalties: tuple[int, int, int],
     above: tuple[I32, I32],
     keys: tuple[I64, I64],
     states: U8,
 ) -> None:
-    """Keys (3, D) of the nodes with i > 0 left and j > 0 right pixels behind them, from those with i - 1.
+    """Keys (3, D) of the nodes (i, j) from those with i - 1.
 
-    ``prices`` of a hidden pixel, and of discontinuities along and across, as keys. ``states`` (D,) takes how
-    each of the three states was reached, two bits each.
+    ``penalties`` of an occluded pixel and of discontinuities along and across the row, as keys. ``states``
+    (D,) receives the predecessor of each of the three states, two bits each.
     """
     n, width = costs.shape
     previous, present = keys
-    hidden, along, across = prices
+    occluded, along, across = penalties
     up = above[0][i - 1]
-    left_hidden = hidden + (across if up != NOTHING else 0)
+    left_occluded = occluded + (across if up != OCCLUDED else 0)
     for q in range(min(n - 1, i - first - 1), max(-1, i - first - width - 1), -1):
         d = first + q
         aside = above[1][i - d - 1]
-        # Every unreachable key stays far above all others, so none needs a question.
+        # Unreachable keys stay far above all others and need no test.
         key, state = _least(previous[0, q], previous[1, q] + along, previous[2, q] + along)
-        key += across if up != NOTHING and up != d else 0
-        key += across if aside != NOTHING and aside != d else 0
+        key += across if up != OCCLUDED and up != d else 0
+        key += across if aside != OCCLUDED and aside != d else 0
         cost = costs[q, i - 1]
-        present[0, q] = key + cost * RADIX if cost != FORBIDDEN else ENDLESS
+        present[0, q] = key + cost * RADIX if cost != NO_MATCH else INFINITE
         traced = state
         if q > 0:
             key, state = _least(previous[0, q - 1] + along, previous[1, q - 1], previous[2, q - 1] + along)
-            present[1, q] = key + left_hidden
+            present[1, q] = key + left_occluded
             traced |= state << 2
         if q < n - 1:
             key, state = _least(present[0, q + 1] + along, present[1, q + 1] + along, present[2, q + 1])
-            present[2, q] = key + hidden + (across if aside != NOTHING else 0)
+            present[2, q] = key + occluded + (across if aside != OCCLUDED else 0)
             traced |= state << 4
         states[q] = traced
 
@@ -137,35 +139,45 @@ def _enter_column(
 def solve_row(
     costs: I32,
     first: int,
-    prices: tuple[int, int, int, int],
+    penalties: tuple[int, int, int, int],
     above: tuple[I32, I32],
     left: I32,
     right: I32,
 ) -> None:
-    """The correspondences of one row of greatest likelihood, and of these with the fewest discontinuities.
+    """Find the maximum-likelihood correspondences of one row.
 
-    ``costs`` (D, W) of left pixel x at disparity first + q, in steps, ``FORBIDDEN`` where there is no match.
-    ``prices``: of a pixel without partner and of one at the border of an image, in steps; what a
-    discontinuity along the row and one against the row above counts, 0 or 1. ``above`` are the disparities of
-    both images there. ``left, right`` (W,) take the disparities, ``NOTHING`` where hidden.
+    Among solutions of equal likelihood the one with the fewest discontinuities is taken.
+    A node (i, j) has passed i left and j right pixels, i - j = d. It is entered by a match, by an occluded
+    left pixel or by an occluded right pixel, which are its three states.
 
-    A node (i, j) has i left and j right pixels behind it, i - j = d; it is entered by a match, by a left
-    pixel alone or by a right pixel alone, which are three states of it.
+    Parameters
+    ----------
+    costs : ndarray (D, W) int32
+        Cost of left pixel x at disparity first + q in integer steps, ``NO_MATCH`` without a match.
+    first : int
+        First disparity.
+    penalties : tuple of int
+        Cost of an occluded pixel and of one outside the other image, in steps; count of a discontinuity along
+        the row and against the previous row, 0 or 1.
+    above : tuple of ndarray (W,) int32
+        Disparities of the previous row in the left and right image.
+    left, right : ndarray (W,) int32
+        Receive the disparities, ``OCCLUDED`` where occluded.
     """
     n, width = costs.shape
-    hidden, border, along, across = prices
-    keys = np.full((2, 3, n), ENDLESS, np.int64)
+    occluded, border, along, across = penalties
+    keys = np.full((2, 3, n), INFINITE, np.int64)
     states = np.zeros((width + 1, n), np.uint8)
-    best, last = ENDLESS, (0, 0, MATCHED)
-    left[:], right[:] = NOTHING, NOTHING
+    best, last = INFINITE, (0, 0, MATCHED)
+    left[:], right[:] = OCCLUDED, OCCLUDED
     for i in range(width + 1):
         previous, present = keys[1 - (i & 1)], keys[i & 1]
-        present[:] = ENDLESS
+        present[:] = INFINITE
         if i - first >= 0 and i - first < n:
             present[MATCHED, i - first] = i * border * RADIX
         if i > 0:
-            priced = (hidden * RADIX, along, across)
-            _enter_column(i, first, costs, priced, above, (previous, present), states[i])
+            scaled = (occluded * RADIX, along, across)
+            _enter_column(i, first, costs, scaled, above, (previous, present), states[i])
         else:
             for q in range(min(n, -first)):
                 if first + q >= -width:
@@ -178,26 +190,28 @@ def solve_row(
                     key = present[state, q] + (2 * width - i - j) * border * RADIX
                     if key < best:
                         best, last = key, (i, q, state)
-    if best < ENDLESS:
+    if best < INFINITE:
         _trace_back(states, last, first, left, right)
 
 
 @njit(cache=True, nogil=True)
 def _posterior(costs: I32, first: int, found: I32, likelihood: F64, out: F32) -> None:
-    """Probability (W,) of the disparities found, or of ones beside them, among all of the range;
-    ``likelihood`` of 0, 1, ... steps of cost above the least."""
+    """Probability (W,) of the disparities found, or adjacent ones, among the whole range.
+
+    ``likelihood`` of 0, 1, ... steps of cost above the minimum.
+    """
     n, width = costs.shape
     for x in range(width):
         out[x] = 0.0
-        if found[x] == NOTHING:
+        if found[x] == OCCLUDED:
             continue
         least = costs[found[x] - first, x]
         for q in range(n):
-            if costs[q, x] != FORBIDDEN:
+            if costs[q, x] != NO_MATCH:
                 least = min(least, costs[q, x])
         near, total = 0.0, 0.0
         for q in range(n):
-            if costs[q, x] != FORBIDDEN:
+            if costs[q, x] != NO_MATCH:
                 share = likelihood[min(costs[q, x] - least, len(likelihood) - 1)]
                 total += share
                 near += share if abs(first + q - found[x]) <= 1 else 0.0
@@ -211,11 +225,11 @@ def _forbid(valid_left: U8, valid_right: U8, first: int, costs: I32) -> None:
         for x in range(width):
             j = x - first - q
             if j < 0 or j >= width or valid_left[x] == 0 or valid_right[j] == 0:
-                costs[q, x] = FORBIDDEN
+                costs[q, x] = NO_MATCH
 
 
 @njit(cache=True, nogil=True)
-def solve_rows(
+def _solve_rows(
     left: tuple[I16, U8],
     right: tuple[I16, U8],
     disparities: tuple[int, int],
@@ -223,24 +237,23 @@ def solve_rows(
     likelihood: F64,
     out: tuple[I32, F32],
 ) -> None:
-    """Rows of both images, each (channels (K, H, W), valid (H, W)), from the top, each cohering with the one
-    before.
+    """Solve the rows of a pair from the top, each with cohesion to the previous one.
 
-    ``disparities`` first and last. ``model``: radius of the window, steps per squared unit of the channels,
-    and the prices of :func:`solve_row`. ``out`` takes the disparities (H, W), ``NOTHING`` where hidden, and
-    their probabilities.
+    ``left``, ``right``: (channels (K, H, W), valid (H, W)). ``disparities`` first and last. ``model``: window
+    radius, steps per squared channel unit, and the penalties of :func:`solve_row`. ``out`` receives the
+    disparities (H, W), ``OCCLUDED`` where occluded, and their probabilities.
     """
     first, last = disparities
-    radius, scale, prices = model[0], model[1], (model[2], model[3], model[4], model[5])
+    radius, scale, penalties = model[0], model[1], (model[2], model[3], model[4], model[5])
     height, width = left[1].shape
     n, span = last - first + 1, 2 * radius + 1
     ring, total = np.empty((span, n, width), np.int32), np.empty(width, np.int32)
     costs = np.empty((n, width), np.int32)
-    found = np.full((2, 2, width), NOTHING, np.int32)
+    found = np.full((2, 2, width), OCCLUDED, np.int32)
     done = 0
     for y in range(height):
         while done < min(y + radius + 1, height):
-            squared_differences(done, left[0], right[0], first, ring[done % span])
+            _squared_differences(done, left[0], right[0], first, ring[done % span])
             done += 1
         for q in range(n):
             d = first + q
@@ -252,7 +265,7 @@ def solve_rows(
                 _window_costs(total, lo, hi, radius, scale, costs[q])
         _forbid(left[1][y], right[1][y], first, costs)
         now, before = found[y & 1], found[1 - (y & 1)]
-        solve_row(costs, first, prices, (before[0], before[1]), now[0], now[1])
+        solve_row(costs, first, penalties, (before[0], before[1]), now[0], now[1])
         out[0][y] = now[0]
         _posterior(costs, first, now[0], likelihood, out[1][y])
 
@@ -260,39 +273,44 @@ def solve_rows(
 Cohesion = Literal["none", "along", "along and across"]
 
 GREY_RANGE = 256.0
-"""Values that a hidden pixel may have: its density is uniform over them."""
+"""Grey levels over which the value of an occluded pixel is uniformly distributed."""
 ROUNDING_PX = float(1.0 / np.sqrt(12.0))
-"""Deviation of a disparity that is the nearest whole number."""
+"""Standard deviation of an integer disparity."""
 ROWS, WARM_UP = 96, 8
-"""Rows of a strip, and the rows above that are solved before so that its first row coheres with something."""
+"""Rows of a strip, and rows above it that are solved first to provide a previous row."""
 MATCH_NATS = 0.5
-"""Expected cost of a match, per component: (z - z')^2 / (2 s^2) is the square of a standard normal."""
+"""Expected cost of a match per component: (z - z')^2 / (2 s^2) is chi-square distributed."""
 SIGNIFICANT = 30.0
-"""Nats: what is less probable by more counts as impossible."""
+"""Nats above the minimum from which the probability is taken as 0."""
 
 
 @dataclass(frozen=True)
 class MaximumLikelihoodScanline:
-    """The correspondences of every scanline with the greatest likelihood, by dynamic programming.
+    """Dynamic programming for the maximum-likelihood correspondences of every scanline.
 
-    Two measurements of one thing are normal about its true value with variance s^2 in each of their m
-    components, so with the mean for the unknown true value a match costs |z - z'|^2 / (4 s^2). A pixel
-    without partner costs ln(P_D phi^m / ((1 - P_D) (2 pi s^2)^(m / 2))): it is seen by the other camera with
-    probability P_D (``detection``), and a value of its own is uniform over phi = 256 grey levels. Ordering
-    and uniqueness hold by construction; hidden pixels are found, not guessed.
+    Two measurements of one scene point are normal about its true value with variance s^2 in each of their m
+    components; with the mean as the unknown true value a match costs |z - z'|^2 / (4 s^2). An occluded pixel
+    costs ln(P_D phi^m / ((1 - P_D) (2 pi s^2)^(m / 2))) with the detection probability P_D and values uniform
+    over phi = 256 grey levels. Ordering and uniqueness hold by construction, and occlusions are part of the
+    solution.
 
-    ``cohesion`` decides among solutions of equal likelihood: "along" the row as few discontinuities as
-    possible (MLMH), "along and across" as few as possible along the row and against the row before (MLMH+V).
-    As in the paper equality is that of whole numbers, ``steps_per_nat`` steps a nat; the paper's grey levels
-    and s^2 = 4 make 16.
-
-    A measurement is the colours of the pixel and of those within ``radius``; the paper's is the pixel alone
-    (``radius`` 0), and says that any vector will do. s^2 is ``min_variance`` (the paper's 4) and what the
-    images' own noise adds to it.
-
-    The paper charges a pixel at the border, beyond the other camera's view, as a hidden one. That draws the
-    disparities at both ends of a row to zero, and P_D says nothing of pixels that no camera is pointed at:
-    with ``out_of_view`` they cost what a match is expected to, which draws nowhere.
+    Parameters
+    ----------
+    detection : float
+        Detection probability P_D.
+    min_variance : float
+        Variance s^2 without the measured image noise, which is added; the paper uses 4.
+    radius : int
+        A measurement consists of the colours within this radius; the paper uses single pixels (0).
+    cohesion : {"none", "along", "along and across"}
+        Minimise the discontinuities among solutions of equal likelihood along the row (MLMH), or along the
+        row and against the previous row (MLMH+V).
+    steps_per_nat : float
+        Resolution of equal likelihoods: costs are integers; the grey levels and s^2 = 4 of the paper give 16.
+    out_of_view : bool
+        Pixels outside the other camera's view cost as much as an expected match, which does not bias the
+        disparities; the paper charges them as occluded, which pulls both row ends to disparity 0.
+    threads : int
     """
 
     detection: float = 0.99
@@ -312,24 +330,40 @@ class MaximumLikelihoodScanline:
             raise ValueError(f"cohesion must be none, along, or along and across; got {self.cohesion}")
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
-        """Whole disparities of the left image; the arguments and the result are those of the default variant.
+        """Compute integer disparities of the left image.
 
-        ``confidence`` is the probability of the disparity (or one beside it) against all others of the range,
-        given the two measurements alone: 3 / D where nothing tells them apart; and less where there is no
-        texture, for the errors of neighbouring pixels are not as independent as that takes them to be.
-        Ordered rows are all the memory it takes: a few rows of D costs.
+        The confidence is the probability of the disparity (or an adjacent one) among the range given the two
+        measurements alone, 3 / D if they are indistinguishable. It is reduced where texture is missing,
+        because errors of neighbouring pixels are then not independent. The memory is a few rows of D costs.
+
+        Parameters
+        ----------
+        left, right : array_like (H, W) or (H, W, K <= 4)
+            Grey levels 0 .. 255 of a rectified pair, NaN = no pixel.
+        disparity_range : tuple of int
+            First and last disparity in pixels, both included; x_right = x_left - d.
+
+        Returns
+        -------
+        DisparityMap
+            NaN where the pixel is occluded.
+
+        Raises
+        ------
+        ValueError
+            If the image shapes are invalid or differ, or the range is empty.
         """
         first, last = checked_range(disparity_range)
         sides = prepare_pair(left, right)
         noise = float(np.mean([estimate_noise(side) for side in sides]))
         variance = self.min_variance + noise**2
         components = len(sides[0].channels) * (2 * self.radius + 1) ** 2
-        hidden = self.hidden_cost(components, variance)
+        occluded = self.occlusion_cost(components, variance)
         model = (
             self.radius,
             self.steps_per_nat / (4.0 * variance * LEVELS**2),
-            round(self.steps_per_nat * hidden),
-            round(self.steps_per_nat * (MATCH_NATS * components if self.out_of_view else hidden)),
+            round(self.steps_per_nat * occluded),
+            round(self.steps_per_nat * (MATCH_NATS * components if self.out_of_view else occluded)),
             int(self.cohesion != "none"),
             int(self.cohesion == "along and across"),
         )
@@ -343,17 +377,30 @@ class MaximumLikelihoodScanline:
             rows = [(np.ascontiguousarray(s.channels[:, top:bottom]), s.valid[top:bottom]) for s in sides]
             found = np.empty((bottom - top, width), np.int32)
             probable = np.empty((bottom - top, width), np.float32)
-            solve_rows(rows[0], rows[1], (first, last), model, likelihood, (found, probable))
+            _solve_rows(rows[0], rows[1], (first, last), model, likelihood, (found, probable))
             own = slice(start - top, stop - top)
-            disparity[start:stop] = np.where(found[own] == NOTHING, np.float32(np.nan), found[own])
+            disparity[start:stop] = np.where(found[own] == OCCLUDED, np.float32(np.nan), found[own])
             confidence[start:stop] = probable[own]
 
         run_strips(work, self._strips(height), self.threads)
-        rate(confidence, disparity, disparity, texture_of(sides[0], noise))
+        final_confidence(confidence, disparity, disparity, texture_of(sides[0], noise))
         return DisparityMap(disparity, confidence, ROUNDING_PX)
 
-    def hidden_cost(self, components: int, variance: float) -> float:
-        """Cost in nats of a pixel of so many components that the other camera does not see."""
+    def occlusion_cost(self, components: int, variance: float) -> float:
+        """Compute the cost of an occluded pixel.
+
+        Parameters
+        ----------
+        components : int
+            Components m of a measurement.
+        variance : float
+            Variance s^2 of a component.
+
+        Returns
+        -------
+        float
+            Cost in nats.
+        """
         odds = np.log(self.detection / (1.0 - self.detection))
         return float(odds + components * np.log(GREY_RANGE / np.sqrt(2.0 * np.pi * variance)))
 

@@ -108,7 +108,6 @@ class SemiGlobalMatching:
     paths : int
         4 (rows and columns) or 8 (with diagonals).
     costs : CensusAndColour
-        Matching costs.
     penalties : PathPenalties
         P1 and P2.
     postprocessing : DisparityPostprocessing
@@ -116,7 +115,6 @@ class SemiGlobalMatching:
     memory_mb : float
         Memory limit for costs and path sums of one strip of rows; each thread has its own strip.
     threads : int
-        Number of threads.
     """
 
     paths: int = 4

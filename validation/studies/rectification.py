@@ -21,12 +21,12 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.records import Reconstruction, TwoView
 from thesisrecon.stereo.epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo.planar import (
+from thesisrecon.stereo.planar import PlanarRectification
+from thesisrecon.stereo.planar_rectifiers import (
     CommonOrientationRectifier,
     HartleyRectifier,
     LoopZhangRectifier,
     MinimumDistortionRectifier,
-    PlanarRectification,
 )
 from thesisrecon.stereo.polar import PolarRectifier
 from thesisrecon.stereo.rectification import (
@@ -255,7 +255,11 @@ def check_hand_made(names: Sequence[str]) -> list[Metric]:
             continue
         q = measure_quality(chosen, pair)
         values = {"matches": float(len(found.xy1)), "RMS |dy|": q.rms_dy_px, "distortion": q.distortion}
-        values |= {"kept of A": q.coverage[0], "kept of B": q.coverage[1], "pixels over the image's": q.size_ratio}
+        values |= {
+            "kept of A": q.coverage[0],
+            "kept of B": q.coverage[1],
+            "pixels over the image's": q.size_ratio,
+        }
         rows.add(name, values, note="planar" if isinstance(chosen, PlanarRectification) else "polar")
     return rows
 
