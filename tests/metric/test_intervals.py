@@ -53,7 +53,7 @@ def test_heavy_tails_bring_the_floor():
     xy = t.xy + np.where(wide[:, None], 0.25, 0.0) * rng.normal(size=t.xy.shape)
     focal = refine(replace(scene, tracks=replace(t, xy=xy))).intrinsics[0]["focal_px"]
     assert focal.std > 0.8e-3 * focal.value
-    assert "leaves out" in focal.source
+    assert "error floor" in focal.source
 
 
 def test_the_share_of_model_error_follows_its_signs():
@@ -91,7 +91,7 @@ def test_other_estimates_have_intervals_that_hold_the_truth():
     assert [(usual[n].value, usual[n].std) for n in ("aspect", "skew_px")] == [(1.0, 0.0), (0.0, 0.0)]
 
 
-def test_a_focal_is_borrowed_only_where_its_own_matches_say_less_than_is_stated():
+def test_a_focal_is_shrunk_only_where_its_own_matches_say_less_than_is_stated():
     lent = FocalShrinkage(np.array([0.02, 0.001, 0.02]), np.array([0.1, 0.1, 0.9]))
     assert [lent.is_shrunk(view, 0.005) for view in range(3)] == [True, False, False]
-    assert "8%, one standard deviation" in FocalShrinkage(np.array([0.08]), np.ones(1)).warnings([0], 0.05)[0]
+    assert "8% (1 sigma)" in FocalShrinkage(np.array([0.08]), np.ones(1)).warnings([0], 0.05)[0]

@@ -91,10 +91,10 @@ def test_focal_errors_are_of_the_geometric_mean_and_unknown_without_a_camera():
     assert np.isnan(errors[1])
 
 
-def test_a_camera_is_named_by_a_wide_interval_a_borrowed_value_a_sentence_or_its_absence():
-    values = [(1000.0, 1.0, "own"), (1000.0, 50.0, "own"), (1000.0, 1.0, "borrowed from the others")]
+def test_a_camera_is_named_by_a_wide_interval_a_shrunk_value_a_sentence_or_its_absence():
+    values = [(1000.0, 1.0, "own"), (1000.0, 50.0, "own"), (1000.0, 1.0, "shrunk towards the others")]
     result = result_of([*values, (1000.0, 1.0, "own")])
-    result = replace(result, warnings=("the focal length of view 3 is not determined by its own matches",))
+    result = replace(result, warnings=("Image #3: its own matches determine the focal length only to 20% (1 sigma)",))
     assert [named(result, view) for view in range(5)] == [False, True, True, True, True]
 
 

@@ -1,4 +1,4 @@
-"""Bundle adjustment of a metric model under the user's assumptions, with the noise taken from the data."""
+"""Bundle adjustment of a metric estimate under its prior, with noise and loss measured on the residuals."""
 
 from __future__ import annotations
 
@@ -9,60 +9,95 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.model import CENTRE, FOCAL, K1, WIDTH, MetricModel, residual_norms
+from thesisrecon.metric.model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
 from thesisrecon.numerics.block_scatter import BlockScatter, block_scatter
 from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics.noise import best_huber_width, noise_from_distances
 from thesisrecon.numerics.observations import Observations
 
 MIN_OBSERVATIONS = 40
-# Where Huber's loss never turns, in sigmas.
-NO_LOSS = 20.0
-# 90 % of the lengths of two-dimensional normal noise are within this many sigmas.
+MAX_LOSS_SIGMAS = 20.0
+"""Huber widths above this many sigmas are least squares."""
 RAYLEIGH_90 = 2.1460
-# Views that must share a lens before its higher coefficients are asked for.
-VIEWS_OF_A_LENS = 3
+"""90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
+MIN_VIEWS_PER_LENS = 3
+"""k2 and k3 are estimated only if this many views share them."""
 
 
 @dataclass(frozen=True)
-class Population:
-    """Cameras of one kind: ``rows`` (G,) number of the kind of each row of intrinsics, -1 for none, and
-    ``spread`` (G, 8) of each intrinsic about the mean of its row's kind (relative for the focal, inf = not
-    bound)."""
+class HierarchicalPrior:
+    """Hierarchical prior of cameras of one kind.
 
-    rows: I64
+    Attributes
+    ----------
+    kind : ndarray (G,) of int
+        Kind of each row of intrinsics, -1 for none.
+    spread : ndarray (G, 8)
+        Standard deviation of each intrinsic about the mean of its kind (relative for the focal, inf = none).
+    """
+
+    kind: I64
     spread: F64
 
 
 @dataclass(frozen=True)
-class Adjustment:
-    """Everything bundle adjustment is told beside the model.
+class BundleAdjustment:
+    """Settings of the bundle adjustments of one metric stage.
 
     Parameters
     ----------
-    assumed : of the intrinsics.
-    lens_std : prior standard deviation of k2 and k3 around 0; 0 leaves them out.
-    noise_floor_px : no match is taken to be better than this.
-    population : of the cameras, None before it is known.
-    inflation : by how much the noise counts for more than its size says, since it is not independent.
+    prior : IntrinsicsPrior
+        Prior of the V views.
+    lens_std : float
+        Prior standard deviation of k2 and k3 about 0; 0 fixes them at 0.
+    noise_floor_px : float
+        Lower bound of the measured noise.
+    hierarchical : HierarchicalPrior, optional
+        Prior of cameras of one kind; None before it is estimated.
+    inflation : float
+        Factor on the noise in the weights, for correlated residuals.
     """
 
     prior: IntrinsicsPrior
     lens_std: float
     noise_floor_px: float
-    population: Population | None = None
+    hierarchical: HierarchicalPrior | None = None
     inflation: float = 1.0
 
-    def options(self, model: MetricModel, *, iterations: int = 0) -> BundleOptions:
-        """Weights and loss of the model's noise."""
+    def options(self, model: MetricEstimate, *, iterations: int = 0) -> BundleOptions:
+        """Return weights and loss for the noise of a model.
+
+        Parameters
+        ----------
+        model : MetricEstimate
+            Its noise and loss width are used.
+        iterations : int
+            Maximum number of iterations.
+
+        Returns
+        -------
+        BundleOptions
+            Options of :func:`~thesisrecon.numerics.metric_bundle.refine_metric_bundle`.
+        """
         return BundleOptions(
             sigma_px=self.inflation * model.sigma_px,
             loss_px=model.loss_sigmas * model.sigma_px,
             max_iterations=iterations,
         )
 
-    def row_prior(self, model: MetricModel) -> IntrinsicsPrior:
-        """What is assumed of each row of the model's intrinsics."""
+    def row_prior(self, model: MetricEstimate) -> IntrinsicsPrior:
+        """Return the prior of each row of the model's intrinsics.
+
+        Parameters
+        ----------
+        model : MetricEstimate
+            The model.
+
+        Returns
+        -------
+        IntrinsicsPrior
+            One row per row of ``model.cameras.intrinsics``, 8 columns.
+        """
         group = model.cameras.group
         first = np.unique(group, return_index=True)[1]
         mean, std = np.zeros((len(first), WIDTH)), np.zeros((len(first), WIDTH))
@@ -70,34 +105,65 @@ class Adjustment:
         std[:, K1 + 1 :] = np.where(self._shares_a_lens(model) & (std[:, K1] > 0.0), self.lens_std, 0.0)[
             :, None
         ]
-        # A photograph may be cut out of a larger one: a principal point far from where it is expected is held
-        # by its prior no more (the weight of a Cauchy distribution, (1 + (off / std)^2)^-1).
+        # Images may be crops: a principal point far from its mean gets the weight of a Cauchy distribution,
+        # (1 + (off / std)^2)^-1.
         for column in CENTRE:
             off = model.cameras.intrinsics[:, column] - mean[:, column]
             std[:, column] = np.hypot(std[:, column], np.where(std[:, column] > 0.0, off, 0.0))
-        silent = ~np.isfinite(mean)
-        mean[silent] = model.cameras.intrinsics[silent]
-        p = self.population
-        kind, spread = (None, None) if p is None else (p.rows, p.spread)
-        return IntrinsicsPrior.unshared(mean, std, kind=kind, spread=spread)
+        unknown = ~np.isfinite(mean)
+        mean[unknown] = model.cameras.intrinsics[unknown]
+        if self.hierarchical is None:
+            return IntrinsicsPrior.unshared(mean, std)
+        return IntrinsicsPrior.unshared(
+            mean, std, kind=self.hierarchical.kind, spread=self.hierarchical.spread
+        )
 
-    def free(self, model: MetricModel) -> B8:
-        """(8,) intrinsics that move in some camera."""
+    def free(self, model: MetricEstimate) -> B8:
+        """Return which of the 8 intrinsics are estimated in some camera.
+
+        Parameters
+        ----------
+        model : MetricEstimate
+            The model.
+
+        Returns
+        -------
+        ndarray (8,) of bool
+            Mask of the columns.
+        """
         return np.asarray((self.row_prior(model).std > 0.0).any(axis=0))
 
     def run(
-        self, model: MetricModel, *, free: B8 | None = None, iterations: int
-    ) -> tuple[MetricModel, MetricBundleResult]:
-        """The model after bundle adjustment of the explained observations, its noise measured anew.
+        self, model: MetricEstimate, *, free: B8 | None = None, iterations: int
+    ) -> tuple[MetricEstimate, MetricBundleResult]:
+        """Adjust the model to its inliers and measure the noise again.
 
-        ``free`` (8,) keeps some intrinsics where they are. Raises ``StageFailure`` where hardly anything is
-        explained.
+        Parameters
+        ----------
+        model : MetricEstimate
+            Start.
+        free : ndarray (8,) of bool, optional
+            Intrinsics that may move; None: all that the prior leaves open.
+        iterations : int
+            Maximum number of iterations.
+
+        Returns
+        -------
+        model : MetricEstimate
+            The adjusted model.
+        result : MetricBundleResult
+            The bundle adjustment's own result.
+
+        Raises
+        ------
+        StageFailure
+            If fewer than ``MIN_OBSERVATIONS`` inliers are left.
         """
         prior, moves = self.row_prior(model), self.free(model)
         result = refine_metric_bundle(
             model.cameras,
             model.X,
-            explained(model),
+            inlier_observations(model),
             free=moves if free is None else moves & free,
             prior=prior,
             options=self.options(model, iterations=iterations),
@@ -108,56 +174,120 @@ class Adjustment:
         loss = best_loss(result.residual_px, sigma)
         return replace(model, loss_sigmas=loss, tail=tail_width(norms, sigma)), result
 
-    def scatter(self, model: MetricModel) -> BlockScatter:
-        """How far parts of the scene contradict each other at the end of an adjustment."""
+    def scatter(self, model: MetricEstimate) -> BlockScatter:
+        """Measure how far blocks of the scene disagree about the cameras.
+
+        Parameters
+        ----------
+        model : MetricEstimate
+            An adjusted model.
+
+        Returns
+        -------
+        BlockScatter
+            Covariance of the cameras and its inflation by the blocks.
+        """
         return block_scatter(
             model.cameras,
             model.X,
-            explained(model),
+            inlier_observations(model),
             free=self.free(model),
             prior=self.row_prior(model),
             noise=(self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px),
         )
 
-    def _shares_a_lens(self, model: MetricModel) -> B8:
-        """(G,) rows whose k2 and k3 enough registered views share."""
+    def _shares_a_lens(self, model: MetricEstimate) -> B8:
+        """(G,) rows whose k2 and k3 at least ``MIN_VIEWS_PER_LENS`` registered views share."""
         assert model.cameras.shared is not None
         lens = np.unique(model.cameras.shared[:, K1 + 1], return_inverse=True)[1].reshape(-1)
         views = np.bincount(lens[model.cameras.group[model.registered]], minlength=int(lens.max()) + 1)
-        return np.asarray(views[lens] >= VIEWS_OF_A_LENS)
+        return np.asarray(views[lens] >= MIN_VIEWS_PER_LENS)
 
 
-def explained(model: MetricModel) -> Observations:
-    """The observations that the model explains."""
-    t, k = model.tracks, np.flatnonzero(model.ok)
+def inlier_observations(model: MetricEstimate) -> Observations:
+    """Return the inlier observations.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The model.
+
+    Returns
+    -------
+    Observations
+        Table of the inliers.
+
+    Raises
+    ------
+    StageFailure
+        If there are fewer than ``MIN_OBSERVATIONS``.
+    """
+    t, k = model.tracks, np.flatnonzero(model.inlier)
     if len(k) < MIN_OBSERVATIONS:
         raise StageFailure(
-            "hardly any point survives the metric upgrade",
-            f"{counted(len(k), 'observation')} left that the cameras explain at sufficient angles",
-            "walk further around the scene between photographs",
+            "the metric upgrade leaves too few inliers",
+            f"{counted(len(k), 'inlier observation')} at sufficient triangulation angles; at least "
+            f"{MIN_OBSERVATIONS} are needed",
+            "take images from more different places around the scene",
         )
     return Observations(t.view_index[k], t.point_index[k], t.xy[k])
 
 
 def best_loss(residual_px: F64, sigma: float) -> float:
-    """The turn of Huber's loss, in sigmas, that promises the least variance for the residuals (K, 2)."""
+    """Return the width of Huber's loss with the least predicted variance.
+
+    Parameters
+    ----------
+    residual_px : ndarray (K, 2)
+        Residuals.
+    sigma : float
+        Their noise (px).
+
+    Returns
+    -------
+    float
+        Width in sigmas.
+    """
     width = best_huber_width(np.abs(residual_px).ravel(), sigma)
-    return min(width / sigma, NO_LOSS)
+    return min(width / sigma, MAX_LOSS_SIGMAS)
 
 
 def tail_width(norms: F64, sigma: float) -> float:
-    """How many times wider the tail of residual lengths (K,) is than that of normal noise sigma, 1 to 3.
+    """Return the tail width of residual lengths relative to normal noise, from their 90 % quantile.
 
-    By the 90 % point. Residuals of matches have a tail several times as wide as their core, which is not of
-    wrong matches: a gate in sigmas of the core would cut it off.
+    Correct matches have a tail wider than their core suggests: a gate in sigmas of the core would reject it.
+
+    Parameters
+    ----------
+    norms : ndarray (K,)
+        Residual lengths (px).
+    sigma : float
+        Noise of the core (px).
+
+    Returns
+    -------
+    float
+        Factor from 1 to 3.
     """
     wide = float(np.quantile(norms, 0.9)) / RAYLEIGH_90
     return float(np.clip(wide / sigma, 1.0, 3.0))
 
 
-def with_wide_gate(model: MetricModel) -> MetricModel:
-    """The model with a loss and gates as wide as the residuals that it has before any adjustment, while the
-    noise stays what it is: what is known beforehand must not outweigh the photographs meanwhile."""
+def with_initial_gate(model: MetricEstimate) -> MetricEstimate:
+    """Widen loss and gates to the residuals before the first adjustment.
+
+    ``sigma_px`` stays: a larger one would give the prior too much weight.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The upgraded model.
+
+    Returns
+    -------
+    MetricEstimate
+        The model with new ``tail`` and ``loss_sigmas``.
+    """
     norms = residual_norms(model)
     norms = norms[np.isfinite(norms)]
     if not len(norms):

@@ -1,9 +1,7 @@
-"""What each photograph says of the model, alone: a wrong camera shows here and hides in averages.
+"""The self-check of a metric result: numbers per view and for the whole, and a sentence for each failure.
 
-The self-check: numbers that would be off if the answer were wrong, and a sentence for each that is.
-
-Averages hide a wrong camera, hence every photograph is also looked at alone
-(:mod:`~thesisrecon.metric.checks`). Views are named by their number: "view 10" is ``images[10]``.
+Averages hide a wrong camera, so each view is also measured alone. Sentences name images as ``#number``; the
+pipeline replaces it by the file name.
 """
 
 from __future__ import annotations
@@ -14,36 +12,44 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.metric.model import MetricModel, agreeing_observations, project_observations, residual_norms
+from thesisrecon.metric.model import MetricEstimate, inlier_mask, reproject_observations, residual_norms
 from thesisrecon.metric.uncertainty import USUAL_INFLATION
 from thesisrecon.numerics.noise import MAD_FACTOR, noise_from_distances
-from thesisrecon.numerics.separate_refinement import refine_pose
+from thesisrecon.numerics.partial_bundle import refine_pose
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 
 OWN = np.array([True, True, False, False, False, False])
-"""Focal and aspect: what a camera that is right gives back when nothing but its points is believed."""
-MOST_OBSERVATIONS = 1500
-FEWEST_OBSERVATIONS = 30
-ONE_PLACE = 2e-3
-"""Of the distance to the scene: photographs taken nearer together have no parallax to speak of."""
-LEAST_LEFT = 0.1
-"""Coordinates that keep less than this share of their variance say little of the noise."""
+"""Intrinsics that each view estimates from its own points: focal and aspect."""
+MAX_OBSERVATIONS = 1500
+MIN_OBSERVATIONS = 30
+MIN_BASELINE_RATIO = 2e-3
+"""Baseline over distance to the scene; views nearer together have no usable parallax."""
+MIN_REDUNDANCY = 0.1
+"""Coordinates with a smaller share of their variance left in the residual do not measure the noise."""
 
 
 @dataclass(frozen=True)
 class PerViewChecks:
-    """Per view (V,), NaN where not registered or nothing could be measured.
+    """Measurements of each view (V,), NaN where not registered or not measurable.
 
-    ``explained`` share of the observations within reach that the model explains. ``confirmed`` share of the
-    observations of points that other views fix (two or more of them) which agree with the view too: points
-    of two views agree with any two cameras along their epipolar lines. ``behind`` share of the observations
-    behind the camera. ``noise_px`` of one coordinate, as it was before the points were fitted to it.
-    ``focal_off`` and ``aspect_off``: the logarithm of the view's own focal over the model's and of its own
-    aspect, from its points alone, with their standard deviations ``focal_off_std`` and ``aspect_off_std`` at
-    the noise that is left with them.
+    Attributes
+    ----------
+    inlier_ratio : ndarray
+        Inlier ratio of the triangulable observations.
+    confirmed : ndarray
+        The same for points that two or more other views determine; two-view points fit any two cameras along
+        their epipolar lines.
+    behind : ndarray
+        Share of observations whose point lies behind the camera.
+    noise_px : ndarray
+        Noise of one coordinate, corrected for the redundancy of the points.
+    focal_off, aspect_off : ndarray
+        Log ratio of the view's own focal length (aspect), from its points alone, to the model's.
+    focal_off_std, aspect_off_std : ndarray
+        Their standard deviations.
     """
 
-    explained: F64
+    inlier_ratio: F64
     confirmed: F64
     behind: F64
     noise_px: F64
@@ -53,48 +59,70 @@ class PerViewChecks:
     aspect_off_std: F64
 
 
-def check_views(model: MetricModel, *, sigmas: float) -> PerViewChecks:
-    """Measure every registered view; ``sigmas`` is the gate of an observation that agrees."""
+def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
+    """Measure every registered view.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The final model.
+    sigmas : float
+        Gate of inliers in noise sigmas.
+
+    Returns
+    -------
+    PerViewChecks
+        The measurements.
+    """
     t = model.tracks
     n = t.n_views
-    agree = agreeing_observations(model, sigmas=sigmas)
-    near = within_reach(model)
+    agree = inlier_mask(model, sigmas=sigmas)
+    near = triangulable_observations(model)
     fixed = _fixed_by_others(model, agree)
     known = near & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
-    _, depth = project_observations(model.cameras, model.X, t.view_index, t.point_index)
+    _, depth = reproject_observations(model.cameras, model.X, t.view_index, t.point_index)
     own = [_own_camera(model, view, np.flatnonzero(agree & (t.view_index == view))) for view in range(n)]
     return PerViewChecks(
         _share(t.view_index, agree, near, n),
         _share(t.view_index, agree, near & fixed, n),
         _share(t.view_index, depth <= 0, known, n),
-        noise_of_views(model, agree),
+        noise_per_view(model, agree),
         *(np.array(column) for column in zip(*own, strict=True)),
     )
 
 
-def within_reach(model: MetricModel) -> B8:
-    """(K,) observations in registered views of points that two or more of these see from different places:
-    no others can be explained. Photographs taken from one place share many, which have no depth."""
+def triangulable_observations(model: MetricEstimate) -> B8:
+    """Return the observations whose points can be triangulated.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The model.
+
+    Returns
+    -------
+    ndarray (K,) of bool
+        Observations of points seen by two or more registered views with a baseline between them.
+    """
     t = model.tracks
     near = model.registered[t.view_index]
     seen = np.bincount(t.point_index[near], minlength=t.n_points)
     return np.asarray(near & (seen >= 2)[t.point_index] & _from_two_places(model, near)[t.point_index])
 
 
-def _from_two_places(model: MetricModel, near: B8) -> B8:
-    """(N,) whether the views that see a point stand apart by more than ``ONE_PLACE`` of the distance to the
-    scene."""
+def _from_two_places(model: MetricEstimate, near: B8) -> B8:
+    """(N,) whether the views of a point have a baseline above ``MIN_BASELINE_RATIO`` of the distance."""
     t = model.tracks
     centres = -np.einsum("vba,vb->va", model.cameras.R, model.cameras.t)
     view, point = t.view_index[near], t.point_index[near]
-    known = model.ok[near]
+    known = model.inlier[near]
     if not known.any():
         return np.ones(t.n_points, dtype=bool)
     distance = np.median(np.linalg.norm(model.X[point[known]] - centres[view[known]], axis=1))
     first, apart = np.zeros(t.n_points, dtype=np.int64), np.zeros(t.n_points)
     first[point[::-1]] = view[::-1]
     np.maximum.at(apart, point, np.linalg.norm(centres[view] - centres[first[point]], axis=1))
-    return np.asarray(apart > ONE_PLACE * float(distance))
+    return np.asarray(apart > MIN_BASELINE_RATIO * float(distance))
 
 
 def _share(view: I64, good: B8, counted: B8, n: int) -> F64:
@@ -103,53 +131,64 @@ def _share(view: I64, good: B8, counted: B8, n: int) -> F64:
     return np.where(all_ > 0, right / np.maximum(all_, 1), np.nan)
 
 
-def _fixed_by_others(model: MetricModel, agree: B8) -> B8:
-    """(K,) whether an observation's point is explained in two or more other views."""
+def _fixed_by_others(model: MetricEstimate, agree: B8) -> B8:
+    """(K,) whether an observation's point is an inlier in two or more other views."""
     t = model.tracks
     count = np.bincount(t.point_index[agree], minlength=t.n_points)
     return np.asarray(count[t.point_index] - agree >= 2)
 
 
-def noise_of_views(model: MetricModel, agree: B8) -> F64:
-    """(V,) noise (px) of one coordinate of the observations ``agree`` (K,); NaN where too few tell it.
+def noise_per_view(model: MetricEstimate, agree: B8) -> F64:
+    """Estimate the noise of one coordinate in each view.
 
-    A point that few views see is fitted to their noise, more to that of some views than of others: of three
-    cameras in a row the outer ones keep hardly any residual. Each residual is hence taken over the root of
-    the share 1 - (B V^-1 B')_cc of its variance that the three freedoms of its point leave, B = dx / dX and
-    V = sum B'B.
+    A point seen by few views is fitted to their noise. Each residual is therefore divided by the root of its
+    redundancy 1 - (B V^-1 B')_cc, the share of its variance that is left after fitting the point, with
+    B = dx / dX and V = sum B'B.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The model.
+    agree : ndarray (K,) of bool
+        Inlier observations.
+
+    Returns
+    -------
+    ndarray (V,)
+        Noise (px), NaN with fewer than ``MIN_OBSERVATIONS`` coordinates.
     """
     t, cameras = model.tracks, model.cameras
     k = np.flatnonzero(agree)
     view, point = t.view_index[k], t.point_index[k]
-    seen, depth = project_observations(cameras, model.X, view, point)
+    seen, depth = reproject_observations(cameras, model.X, view, point)
     R = cameras.R[view]
     x = np.einsum("kab,kb->ka", R[:, :2], model.X[point]) + cameras.t[view, :2]
     B = (R[:, :2] - (x / depth[:, None])[:, :, None] * R[:, 2:]) / depth[:, None, None]
     B *= cameras.intrinsics[cameras.group[view], 0][:, None, None]
     V = np.zeros((t.n_points, 3, 3))
     np.add.at(V, point, np.einsum("kca,kcb->kab", B, B))
-    # The ridge keeps points of one view regular; nothing is left of their variance all the same.
+    # The ridge keeps V of one-view points regular; their redundancy is 0 all the same.
     V += (1e-12 * np.trace(V, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(3)
     left = 1.0 - np.einsum("kca,kab,kcb->kc", B, np.linalg.inv(V)[point], B)
-    told = left > LEAST_LEFT
-    size = np.abs(seen - t.xy[k])[told] / np.sqrt(left[told])
-    whose = np.repeat(view[:, None], 2, axis=1)[told]
+    usable = left > MIN_REDUNDANCY
+    size = np.abs(seen - t.xy[k])[usable] / np.sqrt(left[usable])
+    whose = np.repeat(view[:, None], 2, axis=1)[usable]
     noise = np.full(t.n_views, np.nan)
     for v in range(t.n_views):
-        if np.count_nonzero(whose == v) >= FEWEST_OBSERVATIONS:
+        if np.count_nonzero(whose == v) >= MIN_OBSERVATIONS:
             noise[v] = MAD_FACTOR * np.median(size[whose == v])
     return noise
 
 
-def _own_camera(model: MetricModel, view: int, index: I64) -> tuple[float, float, float, float]:
-    """Own focal and aspect of a view with their deviations; NaN where it has too few observations."""
+def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, float, float, float]:
+    """Own log focal and log aspect offsets of a view with standard deviations; NaN with few observations."""
     nothing = (np.nan,) * 4
-    if not model.registered[view] or len(index) < FEWEST_OBSERVATIONS:
+    if not model.registered[view] or len(index) < MIN_OBSERVATIONS:
         return nothing
-    index = index[:: int(np.ceil(len(index) / MOST_OBSERVATIONS))]
+    index = index[:: int(np.ceil(len(index) / MAX_OBSERVATIONS))]
     t, cameras = model.tracks, model.cameras
     X, xy = model.X[t.point_index[index]], t.xy[index]
-    seen, _ = project_observations(cameras, model.X, t.view_index[index], t.point_index[index])
+    seen, _ = reproject_observations(cameras, model.X, t.view_index[index], t.point_index[index])
     noise = max(noise_from_distances(np.linalg.norm(seen - xy, axis=1)), 1e-3)
     intrinsics = cameras.intrinsics[cameras.group[view]]
     free = np.zeros(len(intrinsics), dtype=bool)
@@ -173,16 +212,16 @@ def _own_camera(model: MetricModel, view: int, index: I64) -> tuple[float, float
 
 _FOCAL_RANGE = (0.2, 20.0)
 _MAX_FOCAL_STD = 0.15
-_MIN_EXPLAINED = 0.6
+_MIN_MODEL_INLIER_RATIO = 0.6
 _MAX_SIGMA_REL = 0.0015
-# Cutting a tenth off the middle of a photograph each way moves its principal point by 0.12 long sides.
+# Cropping a tenth of the image on two sides moves the principal point by 0.12 long sides.
 _MAX_PRINCIPAL_SHIFT = 0.15
 _MAX_FOCAL_CHANGE = 0.25
 
-MIN_EXPLAINED_OF_VIEW = 0.5
-"""Of its matches, those with a wrong partner included; a right camera explains nearly all of the others."""
-MIN_CONFIRMED_OF_VIEW = 0.7
-"""Of the points that others fix. Right cameras reach 0.9 and more, wrong ones stay below a half."""
+MIN_INLIER_RATIO = 0.5
+"""Inlier ratio of a view, wrong matches included."""
+MIN_CONFIRMED_RATIO = 0.7
+"""The same for points that others determine: correct cameras reach 0.9, wrong ones stay below 0.5."""
 MAX_BEHIND = 0.05
 MAX_NOISE_RATIO = 3.0
 MAX_OWN_FOCAL = 0.03
@@ -190,21 +229,37 @@ MAX_OWN_SIGMAS = 5.0
 
 
 def self_check(
-    model: MetricModel,
+    model: MetricEstimate,
     calibration: SelfCalibration,
     intervals: Sequence[Mapping[str, IntrinsicInterval]],
     *,
     sigmas: float,
 ) -> tuple[dict[str, float], list[str]]:
-    """Measured numbers by name, and the failed_checks they raise (none: the answer is trusted).
+    """Check a metric model.
 
-    ``sigmas`` is the gate, in noise sigmas, of an observation that agrees with the model.
+    Parameters
+    ----------
+    model : MetricEstimate
+        The final model.
+    calibration : SelfCalibration
+        The self-calibration it came from.
+    intervals : sequence of mapping
+        Intrinsics of each view as in ``MetricResult``.
+    sigmas : float
+        Gate of inliers in noise sigmas.
+
+    Returns
+    -------
+    check : dict
+        Measured numbers by name.
+    failed_checks : list of str
+        A sentence for each failed check; empty if the result is trusted.
     """
     check = _whole(model, calibration, intervals, sigmas)
     views = check_views(model, sigmas=sigmas)
     own = _own_focal_sigmas(views)
     check |= {
-        "explained_share_worst_view": _worst(views.explained, np.nanmin),
+        "explained_share_worst_view": _worst(views.inlier_ratio, np.nanmin),
         "confirmed_share_worst_view": _worst(views.confirmed, np.nanmin),
         "behind_share_worst_view": _worst(views.behind, np.nanmax),
         "noise_ratio_worst_view": _worst(_noise_ratio(views), np.nanmax),
@@ -212,11 +267,11 @@ def self_check(
         "own_focal_sigmas_worst_view": _worst(own, np.nanmax),
     }
     failed_checks = list(calibration.reasons) if not calibration.identifiable else []
-    return check, [*failed_checks, *_doubts_of_views(views, model), *_doubts(check)]
+    return check, [*failed_checks, *_failed_views(views, model), *_failed_model(check)]
 
 
 def _whole(
-    model: MetricModel,
+    model: MetricEstimate,
     calibration: SelfCalibration,
     intervals: Sequence[Mapping[str, IntrinsicInterval]],
     sigmas: float,
@@ -225,7 +280,7 @@ def _whole(
     views = [int(v) for v in np.flatnonzero(model.registered)]
     longest = model.sizes[views].max(axis=1)
     rows = model.cameras.intrinsics[model.cameras.group[views]]
-    near = within_reach(model)
+    near = triangulable_observations(model)
     before = calibration.K[views, 0, 0]
     both = before > 0
     return {
@@ -234,11 +289,9 @@ def _whole(
         "focal_std_rel_max": max(
             intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views
         ),
-        "explained_share": float(agreeing_observations(model, sigmas=sigmas)[near].mean())
-        if near.any()
-        else 0.0,
+        "explained_share": float(inlier_mask(model, sigmas=sigmas)[near].mean()) if near.any() else 0.0,
         "sigma_rel": float(noise_from_distances(residual_norms(model)) / np.median(longest))
-        if model.ok.any()
+        if model.inlier.any()
         else np.inf,
         "principal_shift_max_long_sides": float(
             (np.linalg.norm(rows[:, 3:5] - (model.sizes[views] - 1) / 2, axis=1) / longest).max()
@@ -264,8 +317,8 @@ def _own_focal_sigmas(views: PerViewChecks) -> F64:
     return np.asarray(np.abs(views.focal_off) / np.maximum(USUAL_INFLATION * views.focal_off_std, 1e-9))
 
 
-def _doubts_of_views(views: PerViewChecks, model: MetricModel) -> list[str]:
-    """A sentence for the views that are doubted for one reason; of several reasons a view has the gravest."""
+def _failed_views(views: PerViewChecks, model: MetricEstimate) -> list[str]:
+    """A sentence for the views that fail a check; each view is reported once, for the gravest failure."""
     ratio, own = _noise_ratio(views), _own_focal_sigmas(views)
     left = model.registered.copy()
 
@@ -275,16 +328,16 @@ def _doubts_of_views(views: PerViewChecks, model: MetricModel) -> list[str]:
         return taken
 
     failed_checks = []
-    if len(wrong := take(views.confirmed < MIN_CONFIRMED_OF_VIEW)):
+    if len(wrong := take(views.confirmed < MIN_CONFIRMED_RATIO)):
         failed_checks.append(
-            f"{_named(wrong)}: only {_range(views.confirmed[wrong])} of the points that other views fix are "
-            "where they are seen; the camera is wrong or its matches are: leave the photograph out, or take "
-            "others between it and the rest"
+            f"{_named(wrong)}: only {_range(views.confirmed[wrong])} of the points that other images "
+            "determine agree: the camera or its matches are wrong. Leave the image out, or add images "
+            "between it and the rest"
         )
-    if len(wrong := take(~(views.explained >= MIN_EXPLAINED_OF_VIEW))):
+    if len(wrong := take(~(views.inlier_ratio >= MIN_INLIER_RATIO))):
         failed_checks.append(
-            f"{_named(wrong)}: the model explains only {_range(views.explained[wrong])} of the matches; the "
-            "camera is wrong, or that of the views it is matched with"
+            f"{_named(wrong)}: only {_range(views.inlier_ratio[wrong])} of the matches are inliers: the "
+            "camera, or one it is matched with, is wrong"
         )
     if len(wrong := take(views.behind > MAX_BEHIND)):
         failed_checks.append(
@@ -293,23 +346,23 @@ def _doubts_of_views(views: PerViewChecks, model: MetricModel) -> list[str]:
     for view in take((np.abs(views.focal_off) > MAX_OWN_FOCAL) & (own > MAX_OWN_SIGMAS)):
         off = float(np.expm1(views.focal_off[view]))
         failed_checks.append(
-            f"view {view} alone asks for a focal length {abs(off):.1%} "
-            f"{'longer' if off > 0.0 else 'shorter'} than the model's: it is of another camera or zoomed, "
-            "or the model is bent"
+            f"Image #{view}: its own focal length is {abs(off):.1%} "
+            f"{'longer' if off > 0.0 else 'shorter'} than the model's: it is from another camera or zoomed, "
+            "or the model is deformed"
         )
     if len(wrong := take(ratio > MAX_NOISE_RATIO)):
         failed_checks.append(
-            f"{_named(wrong)}: explained with {ratio[wrong].max():.1f} times the noise of the others"
+            f"{_named(wrong)}: reprojection noise is {ratio[wrong].max():.1f} times that of the other images"
         )
     return failed_checks
 
 
 def _named(views: I64) -> str:
-    """ "view 3" or "views 1, 4 and 7"."""
-    numbers = [str(int(view)) for view in views]
+    """ "Image #3" or "Images #1, #4 and #7"."""
+    numbers = [f"#{view}" for view in views]
     if len(numbers) == 1:
-        return f"view {numbers[0]}"
-    return f"views {', '.join(numbers[:-1])} and {numbers[-1]}"
+        return f"Image {numbers[0]}"
+    return f"Images {', '.join(numbers[:-1])} and {numbers[-1]}"
 
 
 def _range(shares: F64) -> str:
@@ -317,28 +370,26 @@ def _range(shares: F64) -> str:
     return f"{low} %" if low == high else f"{low} to {high} %"
 
 
-def _doubts(check: Mapping[str, float]) -> list[str]:
-    """The failed_checks about the model as a whole."""
+def _failed_model(check: Mapping[str, float]) -> list[str]:
+    """A sentence for each failed check of the model as a whole."""
     failed_checks = []
     low, high = check["focal_min_long_sides"], check["focal_max_long_sides"]
     if not (_FOCAL_RANGE[0] < low and high < _FOCAL_RANGE[1]):
         failed_checks.append(
-            f"a focal length of {low:.2f} to {high:.2f} long sides is not that of a photograph"
+            f"Focal lengths of {low:.2f} to {high:.2f} long sides are implausible for images"
         )
     if not check["focal_std_rel_max"] < _MAX_FOCAL_STD:
-        failed_checks.append(f"a focal length is known only to {check['focal_std_rel_max']:.0%}")
-    if not check["explained_share"] > _MIN_EXPLAINED:
-        failed_checks.append(
-            f"the model explains only {check['explained_share']:.0%} of the matches it should"
-        )
+        failed_checks.append(f"A focal length is determined only to {check['focal_std_rel_max']:.0%}")
+    if not check["explained_share"] > _MIN_MODEL_INLIER_RATIO:
+        failed_checks.append(f"Only {check['explained_share']:.0%} of the triangulable matches are inliers")
     if not check["sigma_rel"] < _MAX_SIGMA_REL:
-        failed_checks.append(f"the reprojection noise is {check['sigma_rel']:.2%} of the long side")
+        failed_checks.append(f"The reprojection noise is {check['sigma_rel']:.2%} of the long side")
     shift = check["principal_shift_max_long_sides"]
     if not shift < _MAX_PRINCIPAL_SHIFT:
-        failed_checks.append(f"the principal point lies {shift:.0%} of the long side off the image centre")
+        failed_checks.append(f"A principal point is {shift:.0%} of the long side away from the image centre")
     if not check["focal_change_since_calibration"] < _MAX_FOCAL_CHANGE:
         failed_checks.append(
-            f"bundle adjustment moved the focal by {check['focal_change_since_calibration']:.0%} "
-            "from what self-calibration found"
+            f"Bundle adjustment changed a focal length by {check['focal_change_since_calibration']:.0%} "
+            "since self-calibration"
         )
     return failed_checks

@@ -1,9 +1,4 @@
-"""The metric model while it is refined: cameras with shared intrinsics, points, and which observations
-agree.
-
-The upgrade of chapter 7 as a metric model: rotations, translations, and intrinsics that views share as is
-assumed.
-"""
+"""The metric estimate under refinement: cameras with shared intrinsics, points, inlier observations."""
 
 from __future__ import annotations
 
@@ -19,17 +14,37 @@ from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.partial_bundle import refine_points
 from thesisrecon.records import Reconstruction, Tracks, Upgrade
 
-# Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1 and the two radial coefficients that nothing
-# is assumed of in words.
+# Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.
 FOCAL, ASPECT, SKEW, CENTRE, K1, WIDTH = 0, 1, 2, (3, 4), 5, 8
 
 
 @dataclass(frozen=True)
-class MetricModel:
-    """All views have a camera entry; only those ``registered`` count. ``X`` (N, 3), zero where not ``valid``;
-    ``ok`` (K,) observations of registered views that the model explains; ``sigma_px`` their noise,
-    ``loss_sigmas`` where a robust loss should turn, and ``tail`` how many times wider than that of normal
-    noise its tail is, which gates allow for."""
+class MetricEstimate:
+    """Metric cameras and points of one adjustment round.
+
+    Attributes
+    ----------
+    tracks : Tracks
+        All K observations.
+    sizes : ndarray (V, 2)
+        Image sizes (width, height).
+    cameras : MetricCameras
+        One entry per view, valid where ``registered``.
+    registered : ndarray (V,) of bool
+        Registered views.
+    X : ndarray (N, 3)
+        Points, zero where not ``valid``.
+    valid : ndarray (N,) of bool
+        Triangulated points.
+    inlier : ndarray (K,) of bool
+        Inlier observations in registered views.
+    sigma_px : float
+        Noise of the inliers.
+    loss_sigmas : float
+        Width of Huber's loss in sigmas.
+    tail : float
+        Width of the residuals' tail relative to normal noise; gates are widened by it.
+    """
 
     tracks: Tracks
     sizes: I64
@@ -37,40 +52,85 @@ class MetricModel:
     registered: B8
     X: F64
     valid: B8
-    ok: B8
+    inlier: B8
     sigma_px: float
     loss_sigmas: float = 2.0
     tail: float = 1.0
 
     @property
     def gate_px(self) -> float:
-        """The unit of gates in sigmas."""
+        """Noise times tail width: the unit of gates in sigmas."""
         return self.sigma_px * self.tail
 
-    def with_cameras(self, cameras: MetricCameras, registered: B8 | None = None) -> MetricModel:
-        """The same with other cameras."""
+    def with_cameras(self, cameras: MetricCameras, registered: B8 | None = None) -> MetricEstimate:
+        """Return a copy with other cameras.
+
+        Parameters
+        ----------
+        cameras : MetricCameras
+            New cameras.
+        registered : ndarray (V,) of bool, optional
+            New mask; None: unchanged.
+
+        Returns
+        -------
+        MetricEstimate
+            The copy.
+        """
         return replace(
             self, cameras=cameras, registered=self.registered if registered is None else registered
         )
 
 
-def project_observations(cameras: MetricCameras, X: F64, view: I64, point: I64) -> tuple[F64, F64]:
-    """Pixels (K, 2) and depths (K,) of the observations' points, with distortion."""
+def reproject_observations(cameras: MetricCameras, X: F64, view: I64, point: I64) -> tuple[F64, F64]:
+    """Project the points of observations, with distortion.
+
+    Parameters
+    ----------
+    cameras : MetricCameras
+        Cameras of all views.
+    X : ndarray (N, 3)
+        Points.
+    view, point : ndarray (K,) of int
+        View and point of each observation.
+
+    Returns
+    -------
+    xy : ndarray (K, 2)
+        Pixels.
+    depth : ndarray (K,)
+        Depths in the camera frame.
+    """
     Y = np.einsum("kab,kb->ka", cameras.R[view], X[point]) + cameras.t[view]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         xy = Y[:, :2] / Y[:, 2:]
         distortion = cameras.intrinsics[cameras.group[view], K1:]
-        return apply_calibration(cameras, view, distort(xy, distortion)), Y[:, 2]
+        return _apply_calibration(cameras, view, distort(xy, distortion)), Y[:, 2]
 
 
-def apply_calibration(cameras: MetricCameras, view: I64, xy: F64) -> F64:
+def _apply_calibration(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     """Normalised image points to pixels."""
     f, aspect, skew, cx, cy = cameras.intrinsics[cameras.group[view], :K1].T
     return np.column_stack([f * xy[:, 0] + skew * xy[:, 1] + cx, aspect * f * xy[:, 1] + cy])
 
 
 def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
-    """Pixels to normalised image points without distortion (K, 2)."""
+    """Return the undistorted normalised image points of observations.
+
+    Parameters
+    ----------
+    cameras : MetricCameras
+        Cameras of all views.
+    view : ndarray (K,) of int
+        View of each observation.
+    xy : ndarray (K, 2)
+        Pixels.
+
+    Returns
+    -------
+    ndarray (K, 2)
+        Normalised image points.
+    """
     rows = cameras.intrinsics[cameras.group[view]]
     f, aspect, skew, cx, cy = rows[:, :K1].T
     y = (xy[:, 1] - cy) / (aspect * f)
@@ -79,12 +139,24 @@ def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     return undistort(distorted, distortion) if distortion.any() else distorted
 
 
-def retriangulate(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
-    """All points afresh from all observations in registered views, then the gate of ``sigmas`` noise sigmas.
+def retriangulate_tracks(model: MetricEstimate, *, sigmas: float, min_angle: float) -> MetricEstimate:
+    """Triangulate all tracks from the registered views and select the inliers.
 
-    Distortion is taken off the observations first, so that triangulation sees pinhole cameras. A point with
-    a wrong observation is triangulated once more from those that agreed; points seen under less than
-    ``min_angle`` (rad) have no reliable depth and are left out.
+    Observations are undistorted first. Points with outliers are triangulated again from their inliers.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        Cameras and tracks.
+    sigmas : float
+        Gate in noise sigmas.
+    min_angle : float
+        Smallest triangulation angle in radians.
+
+    Returns
+    -------
+    MetricEstimate
+        The model with new points and inliers.
     """
     t = model.tracks
     near = np.flatnonzero(model.registered[t.view_index])
@@ -94,13 +166,15 @@ def retriangulate(model: MetricModel, *, sigmas: float, min_angle: float) -> Met
     scale = np.median(model.cameras.intrinsics[model.cameras.group[model.registered], 0])
     loss = model.sigma_px / scale
     X = _triangulate(poses, normalized, view, point, t.n_points, loss)
-    model = mark(replace(model, X=X), sigmas=sigmas, min_angle=min_angle)
-    spoiled = np.bincount(point[~model.ok[near]], minlength=t.n_points) > 0
-    again = model.ok[near] & spoiled[point]
+    model = select_inliers(replace(model, X=X), sigmas=sigmas, min_angle=min_angle)
+    spoiled = np.bincount(point[~model.inlier[near]], minlength=t.n_points) > 0
+    again = model.inlier[near] & spoiled[point]
     if again.any():
         Y = _triangulate(poses, normalized[again], view[again], point[again], t.n_points, loss)
         better = np.bincount(point[again], minlength=t.n_points) >= 2
-        model = mark(replace(model, X=np.where(better[:, None], Y, X)), sigmas=sigmas, min_angle=min_angle)
+        model = select_inliers(
+            replace(model, X=np.where(better[:, None], Y, X)), sigmas=sigmas, min_angle=min_angle
+        )
     return model
 
 
@@ -112,65 +186,139 @@ def _triangulate(poses: F64, xy: F64, view: I64, point: I64, n_points: int, loss
     return np.where(np.isfinite(X).all(axis=1, keepdims=True), X, 0.0)
 
 
-def agreeing_observations(model: MetricModel, *, sigmas: float) -> B8:
-    """(K,) observations of registered views in front of their camera and within the gate, at any angle."""
+def inlier_mask(model: MetricEstimate, *, sigmas: float) -> B8:
+    """Return the observations within the gate and in front of their camera, at any angle.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        Cameras and points.
+    sigmas : float
+        Gate in noise sigmas.
+
+    Returns
+    -------
+    ndarray (K,) of bool
+        Mask of the observations; False in views that are not registered.
+    """
     t = model.tracks
     k = np.flatnonzero(model.registered[t.view_index])
     view, point = t.view_index[k], t.point_index[k]
-    xy, depth = project_observations(model.cameras, model.X, view, point)
+    xy, depth = reproject_observations(model.cameras, model.X, view, point)
     residual = np.nan_to_num(np.linalg.norm(xy - t.xy[k], axis=1), nan=np.inf)
     known = np.abs(model.X[point]).sum(axis=1) > 0
-    ok = np.zeros(len(t.xy), dtype=bool)
-    ok[k] = (residual < sigmas * model.gate_px) & (depth > 0) & known
-    return ok
+    inlier = np.zeros(len(t.xy), dtype=bool)
+    inlier[k] = (residual < sigmas * model.gate_px) & (depth > 0) & known
+    return inlier
 
 
-def mark(model: MetricModel, *, sigmas: float, min_angle: float) -> MetricModel:
-    """Mark the observations that agree, and the points with two of them at ``min_angle`` (rad) or more."""
+def select_inliers(model: MetricEstimate, *, sigmas: float, min_angle: float) -> MetricEstimate:
+    """Update inliers and valid points.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        Cameras and points.
+    sigmas : float
+        Gate in noise sigmas.
+    min_angle : float
+        Smallest triangulation angle (rad) of a valid point, which also needs two inliers.
+
+    Returns
+    -------
+    MetricEstimate
+        The model with new ``inlier`` and ``valid``.
+    """
     t = model.tracks
-    ok = agreeing_observations(model, sigmas=sigmas)
-    angle = _largest_angle(model, ok)
-    valid = (np.bincount(t.point_index[ok], minlength=t.n_points) >= 2) & (angle > min_angle)
-    return replace(model, ok=ok & valid[t.point_index], valid=valid)
+    inlier = inlier_mask(model, sigmas=sigmas)
+    angle = _largest_angle(model, inlier)
+    valid = (np.bincount(t.point_index[inlier], minlength=t.n_points) >= 2) & (angle > min_angle)
+    return replace(model, inlier=inlier & valid[t.point_index], valid=valid)
 
 
-def _largest_angle(model: MetricModel, ok: B8) -> F64:
+def _largest_angle(model: MetricEstimate, inlier: B8) -> F64:
     t = model.tracks
     centres = -np.einsum("vba,vb->va", model.cameras.R, model.cameras.t)
-    return triangulation_angles(centres, t.view_index[ok], t.point_index[ok], model.X, t.n_points)
+    return triangulation_angles(centres, t.view_index[inlier], t.point_index[inlier], model.X, t.n_points)
 
 
-def residual_norms(model: MetricModel) -> F64:
-    """Reprojection residual (px) of every explained observation."""
+def residual_norms(model: MetricEstimate) -> F64:
+    """Return the reprojection residuals of the inliers.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The model.
+
+    Returns
+    -------
+    ndarray (number of inliers,)
+        Lengths in pixels.
+    """
     t = model.tracks
-    view, point = t.view_index[model.ok], t.point_index[model.ok]
-    xy, _ = project_observations(model.cameras, model.X, view, point)
-    return np.asarray(np.linalg.norm(xy - t.xy[model.ok], axis=1))
+    view, point = t.view_index[model.inlier], t.point_index[model.inlier]
+    xy, _ = reproject_observations(model.cameras, model.X, view, point)
+    return np.asarray(np.linalg.norm(xy - t.xy[model.inlier], axis=1))
 
 
-def truncated_cost(model: MetricModel, gate_px: float) -> float:
-    """Mean of min(r^2, gate^2) / gate^2 over ALL observations; those without a camera or a point count fully.
+def truncated_cost(model: MetricEstimate, gate_px: float) -> float:
+    """Return the truncated quadratic cost, mean of min(r^2, gate^2) / gate^2 over all observations.
 
-    What cannot be explained costs as much as what is explained badly: a wrong answer cannot win by refusing.
+    Observations without a camera or a point cost 1, so that a model cannot win by rejecting observations.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The model.
+    gate_px : float
+        Truncation in pixels.
+
+    Returns
+    -------
+    float
+        Cost in [0, 1].
     """
     squared = np.ones(len(model.tracks.xy))
-    squared[model.ok] = np.minimum(residual_norms(model) ** 2 / gate_px**2, 1.0)
+    squared[model.inlier] = np.minimum(residual_norms(model) ** 2 / gate_px**2, 1.0)
     return float(squared.mean())
 
 
-def explained_shares(model: MetricModel) -> F64:
-    """(V,) share of each view's observations of valid points that are explained; 1 where it has none."""
+def inlier_ratios(model: MetricEstimate) -> F64:
+    """Return the inlier ratio of each view.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The model.
+
+    Returns
+    -------
+    ndarray (V,)
+        Inliers over observations of valid points; 1 for a view without any.
+    """
     t = model.tracks
     seen = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
-    good = np.bincount(t.view_index[model.ok], minlength=t.n_views)
+    good = np.bincount(t.view_index[model.inlier], minlength=t.n_views)
     return np.asarray(np.where(seen > 0, good / np.maximum(seen, 1), 1.0))
 
 
 def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
-    """Row of each view (V,) in a table of intrinsics, and which rows share their values (G, 8).
+    """Return the parameter table of the intrinsics that views share.
 
-    Views have a row in common where they share all that is not known beforehand and have the same knowledge.
-    k2 and k3 are shared as k1 is.
+    Views share a row if they share all unknown intrinsics and have the same prior. k2 and k3 are shared as
+    k1 is.
+
+    Parameters
+    ----------
+    prior : IntrinsicsPrior
+        Prior of the V views.
+
+    Returns
+    -------
+    group : ndarray (V,) of int
+        Row of each view.
+    shared : ndarray (G, 8) of int
+        Rows with equal numbers in a column share the value.
     """
     moves = (prior.std > 0.0).any(axis=0)
     knowledge = np.nan_to_num(np.concatenate([prior.mean, prior.std], axis=1), nan=-1.0, posinf=-1.0)
@@ -183,11 +331,25 @@ def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
 
 def upgraded_model(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior, max_rotation_residual: float
-) -> MetricModel | None:
-    """The model of an upgraded projective reconstruction; None where fewer than three cameras are sound.
+) -> MetricEstimate | None:
+    """Upgrade a projective reconstruction to a metric model.
 
-    A camera K^-1 P H that is further from a scaled rotation than ``max_rotation_residual`` (Frobenius norm of
-    3 C C' / tr - I) is left out.
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    upgrade : Upgrade
+        Candidate calibration.
+    prior : IntrinsicsPrior
+        Prior of the views.
+    max_rotation_residual : float
+        Cameras C = K^-1 P H further from a scaled rotation (Frobenius norm of 3 C C' / tr(C C') - I) are
+        left out.
+
+    Returns
+    -------
+    MetricEstimate or None
+        None if fewer than three cameras remain.
     """
     views = np.flatnonzero(reconstruction.registered)
     P = reconstruction.P[views] @ np.linalg.inv(upgrade.metric_from_projective)
@@ -209,27 +371,26 @@ def upgraded_model(
         X = Xm[:, :3] / Xm[:, 3:]
     finite = reconstruction.valid & np.isfinite(X).all(axis=1)
     X = np.where(finite[:, None], X, 0.0)
-    # The upgrade fixes the frame up to scale: bring the scene's spread to 1.
+    # The scale of the frame is free: set the median distance of the points to 1.
     spread = float(np.median(np.linalg.norm(X[finite] - np.median(X[finite], axis=0), axis=1)))
     group, shared = camera_rows(prior)
     rows = _intrinsics(upgrade.K, reconstruction.registered, reconstruction.sizes, prior)
     cameras = MetricCameras(R, t / spread, rows[np.unique(group, return_index=True)[1]], group, shared)
-    ok = reconstruction.inlier & registered[reconstruction.tracks.view_index]
-    return MetricModel(
+    inlier = reconstruction.inlier & registered[reconstruction.tracks.view_index]
+    return MetricEstimate(
         reconstruction.tracks,
         reconstruction.sizes,
         cameras,
         registered,
         X / spread,
         finite,
-        ok,
+        inlier,
         reconstruction.sigma_px,
     )
 
 
 def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F64:
-    """(V, 8) from the focals of the registered views that share them; a camera without any starts from the
-    others' field of view. The rest is as assumed."""
+    """(V, 8) start values: calibrated focals, else the median field of view; prior means for the rest."""
     group, longest = prior.group, sizes.max(axis=1)
     typical = float(np.median(K[registered, 0, 0] / longest[registered]))
     rows = np.zeros((len(K), WIDTH))

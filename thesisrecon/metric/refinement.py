@@ -1,10 +1,8 @@
-"""From the upgrade of chapter 7 to the final metric model.
+"""The metric stage: from self-calibration (chapter 7) to the final metric model.
 
-Every candidate calibration is tried on the cameras it came from; the best goes on: cameras that the
-projective stage postponed join by calibrated resection, all tracks are triangulated, what is assumed to vary
-is freed under its priors and everything is adjusted together until what is explained settles. Where cameras
-of one kind have values of their own, how much these scatter is measured and binds them. The end is a
-self-check in numbers.
+Every candidate calibration is adjusted on its cameras; the best is completed by calibrated resection of the
+missing cameras, triangulated and adjusted under the prior until the inliers settle. A hierarchical prior
+binds cameras of one kind that have own values. The result is checked.
 """
 
 from __future__ import annotations
@@ -15,56 +13,70 @@ import numpy as np
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.adjustment import FOCAL_AND_CENTRE, Adjustment, with_wide_gate
+from thesisrecon.metric.adjustment import FOCAL_AND_CENTRE, BundleAdjustment, with_initial_gate
 from thesisrecon.metric.checks import self_check
 from thesisrecon.metric.model import (
     K1,
-    MetricModel,
-    mark,
+    MetricEstimate,
     residual_norms,
-    retriangulate,
+    retriangulate_tracks,
+    select_inliers,
     truncated_cost,
     upgraded_model,
 )
-from thesisrecon.metric.resection import Completion
-from thesisrecon.metric.shared_camera import centre_of_a_bent_model, check_shared_cameras, contradicted_focals
+from thesisrecon.metric.resection import MissingCameraRegistration
+from thesisrecon.metric.shared_camera import (
+    check_shared_cameras,
+    contradicted_focal_priors,
+    inconsistent_principal_point,
+)
 from thesisrecon.metric.uncertainty import (
-    OwnValues,
-    bind,
-    borrowing,
-    estimate_population,
+    PerCameraEstimates,
+    apply_hierarchical_prior,
+    estimate_hierarchical_prior,
+    focal_shrinkage,
     intrinsic_intervals,
-    own_values,
-    with_open_sharing,
+    per_camera_estimates,
+    widen_unverified_focals,
 )
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Upgrade
 
-SETTLED = 0.002
+MIN_CHANGE = 0.002
+"""Share of observations that change sides below which the rounds end."""
 START_ROUNDS = 3
-# Zoomed photographs lie in a long valley: the last adjustment must reach its bottom.
 LAST_ITERATIONS = 25
+"""Zoomed images lie in a long valley of the cost: the last adjustment must reach its bottom."""
+NO_COMMON_POINTS = "shares no points with the model"
 
 
 @dataclass(frozen=True)
 class MetricRefinement:
-    """The metric stage.
+    """Metric refinement of a calibrated projective reconstruction.
 
     Parameters
     ----------
-    outlier_sigmas : residual gates of the early and the late rounds, in noise sigmas.
-    noise_floor_px : the noise is never taken to be below this.
-    min_angle_deg : points under a smaller triangulation angle are left out.
-    min_points : points of the model that a postponed camera must see.
-    max_rotation_residual : an upgraded camera further from a scaled rotation than this (Frobenius norm of
-        3 C C' / tr - I) was made wrong by bad matches and is postponed too.
-    rounds : final rounds of triangulation and adjustment of everything, at the most.
-    lens_std : prior standard deviation around 0 of the radial coefficients k2 and k3 of a camera that took
-        several photographs; 0 leaves them out.
-    model_floor_rel : floor of every stated standard deviation, relative to the focal, where the data show
-        that the camera model is not the whole truth: pixels are square to one or two parts in a thousand.
-    undetermined_rel : a focal whose own matches leave it open by more than this (95 %, relative) is named.
+    outlier_sigmas : tuple of float
+        Residual gates of the early and the late rounds in noise sigmas.
+    noise_floor_px : float
+        Lower bound of the estimated noise.
+    min_angle_deg : float
+        Smallest triangulation angle of a point.
+    min_points : int
+        Points of the model that a missing camera must see.
+    max_rotation_residual : float
+        Upgraded cameras further from a scaled rotation (Frobenius norm of 3 C C' / tr(C C') - I) are
+        resected again.
+    rounds : int
+        Maximum number of final rounds of triangulation and adjustment.
+    lens_std : float
+        Prior standard deviation about 0 of k2 and k3 of a camera with several images; 0 fixes them at 0.
+    model_floor_rel : float
+        Floor of the stated standard deviations, relative to the focal length, if the data show lack of fit
+        (pixels are square to one or two parts in a thousand).
+    undetermined_rel : float
+        Focal lengths that their own matches determine worse than this (95 %, relative) are reported.
     """
 
     outlier_sigmas: tuple[float, float] = (12.0, 7.0)
@@ -85,113 +97,133 @@ class MetricRefinement:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> MetricResult:
-        """The final model of one projective reconstruction; ``StageFailure`` where no candidate survives."""
-        adjustment = Adjustment(prior, self.lens_std, self.noise_floor_px)
+        """Refine a projective reconstruction to the final metric model.
+
+        Parameters
+        ----------
+        reconstruction : Reconstruction
+            Projective reconstruction.
+        calibration : SelfCalibration
+            Its self-calibration; all candidates are tried.
+        prior : IntrinsicsPrior
+            Prior of the views.
+        rng : numpy.random.Generator
+            Random numbers.
+
+        Returns
+        -------
+        MetricResult
+            Cameras, points, intrinsics with intervals, and the self-check.
+
+        Raises
+        ------
+        StageFailure
+            If no candidate gives a metric model.
+        """
+        adjustment = BundleAdjustment(prior, self.lens_std, self.noise_floor_px)
         trials = [self._start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
         if not models:
             raise _no_candidate(prior, len(trials))
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         costs = np.array([truncated_cost(m, gate) for m in models])
-        completion = Completion(self.outlier_sigmas, np.radians(self.min_angle_deg), self.min_points)
-        model, refused = completion.run(models[int(costs.argmin())], adjustment, rng)
+        registration = MissingCameraRegistration(
+            self.outlier_sigmas, np.radians(self.min_angle_deg), self.min_points
+        )
+        model, rejected = registration.run(models[int(costs.argmin())], adjustment, rng)
         reasons = [
-            "" if model.registered[v] else refused.get(v, reconstruction.reasons[v] or NOTHING_SHARED)
+            "" if model.registered[v] else rejected.get(v, reconstruction.reasons[v] or NO_COMMON_POINTS)
             for v in range(len(model.registered))
         ]
         model, adjustment, own, scatter = self._finish(model, adjustment)
-        model = mark(model, sigmas=self.outlier_sigmas[1], min_angle=np.radians(self.min_angle_deg))
+        model = select_inliers(model, sigmas=self.outlier_sigmas[1], min_angle=np.radians(self.min_angle_deg))
         sharing = check_shared_cameras(model, adjustment)
-        borrowed = borrowing(own, adjustment.population, model.cameras.group)
+        shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
         intervals = intrinsic_intervals(
             model,
             scatter,
             adjustment.row_prior(model),
             floor_rel=self.model_floor_rel,
-            borrowed=borrowed,
+            shrinkage=shrinkage,
             noise_inflation=adjustment.inflation,
         )
-        intervals = with_open_sharing(intervals, sharing.focal_std)
+        intervals = widen_unverified_focals(intervals, sharing.focal_std)
         check, failed_checks = self_check(model, calibration, intervals, sigmas=self.outlier_sigmas[1])
-        failed_checks += [*contradicted_focals(model, adjustment), *sharing.failed_checks]
-        failed_checks += centre_of_a_bent_model(model, adjustment, scatter)
+        failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
+        failed_checks += inconsistent_principal_point(model, adjustment, scatter)
+        views = np.flatnonzero(model.registered).tolist()
+        warnings = shrinkage.warnings(views, self.undetermined_rel / 1.96) + sharing.warnings
         final = _as_reconstruction(model, reasons)
-        said = borrowed.warnings(np.flatnonzero(model.registered).tolist(), self.undetermined_rel / 1.96)
-        said += sharing.warnings
-        return MetricResult(final, intervals, check, not failed_checks, tuple(failed_checks), said)
+        return MetricResult(final, intervals, check, not failed_checks, tuple(failed_checks), warnings)
 
     def _start(
-        self, reconstruction: Reconstruction, upgrade: Upgrade, adjustment: Adjustment
-    ) -> MetricModel | None:
-        """The core cameras upgraded, on the points and observations of the projective stage.
+        self, reconstruction: Reconstruction, upgrade: Upgrade, adjustment: BundleAdjustment
+    ) -> MetricEstimate | None:
+        """Upgrade the core cameras and adjust them on the inliers of the projective stage.
 
-        These explain the photographs with cameras of any principal point, and so do not say how far off an
-        image centre is: all of them are kept at first, the principal point is free with the focal, and the
-        gate narrows as the residuals shrink.
+        Projective inliers fit any principal point: all are kept at first, the principal point is free, and
+        the gate narrows as the residuals shrink.
         """
         model = upgraded_model(reconstruction, upgrade, adjustment.prior, self.max_rotation_residual)
         if model is None:
             return None
         early, _ = self.outlier_sigmas
-        # Without a lens the noise looks larger than it is: the gate must not be narrower than before.
+        # Without distortion the noise is overestimated: keep the gate at least as wide as before.
         gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
-        model = with_wide_gate(model)
+        model = with_initial_gate(model)
         for _ in range(START_ROUNDS):
             if model.valid.sum() < 20:
                 return None
-            model = mark(model, sigmas=early, min_angle=0.0)
+            model = select_inliers(model, sigmas=early, min_angle=0.0)
             model = gentle.run(model, free=FOCAL_AND_CENTRE, iterations=15)[0]
-        return mark(model, sigmas=early, min_angle=0.0)
+        return select_inliers(model, sigmas=early, min_angle=0.0)
 
     def _finish(
-        self, model: MetricModel, adjustment: Adjustment
-    ) -> tuple[MetricModel, Adjustment, OwnValues, BlockScatter]:
-        """Everything free under its priors; then, where cameras of one kind have values of their own, bound
-        to their kind."""
+        self, model: MetricEstimate, adjustment: BundleAdjustment
+    ) -> tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockScatter]:
+        """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
         model = self._settle(model, adjustment)
         scatter = adjustment.scatter(model)
-        own = own_values(model, adjustment, scatter, self.model_floor_rel)
+        own = per_camera_estimates(model, adjustment, scatter, self.model_floor_rel)
         assert model.cameras.shared is not None
-        population = estimate_population(own, model.cameras.shared)
-        if population is None:
+        hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
+        if hierarchical is None:
             return model, adjustment, own, scatter
         inflation = float(np.sqrt(max(scatter.median_ratio, 1.0)))
-        model, adjustment = bind(model, replace(adjustment, inflation=inflation), population)
+        model, adjustment = apply_hierarchical_prior(
+            model, replace(adjustment, inflation=inflation), hierarchical
+        )
         model = self._settle(model, adjustment)
         return model, adjustment, own, adjustment.scatter(model)
 
-    def _settle(self, model: MetricModel, adjustment: Adjustment) -> MetricModel:
-        """Rounds of adjustment and triangulation until the explained observations stay the same, ended by an
-        adjustment."""
+    def _settle(self, model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate:
+        """Adjust and triangulate until the inliers stay the same, then adjust to convergence."""
         late, angle = self.outlier_sigmas[1], np.radians(self.min_angle_deg)
         for _ in range(self.rounds):
-            before = model.ok
+            before = model.inlier
             model = adjustment.run(model, iterations=10)[0]
-            model = retriangulate(model, sigmas=late, min_angle=angle)
-            if np.count_nonzero(before != model.ok) < SETTLED * len(before):
+            model = retriangulate_tracks(model, sigmas=late, min_angle=angle)
+            if np.count_nonzero(before != model.inlier) < MIN_CHANGE * len(before):
                 break
         return adjustment.run(model, iterations=LAST_ITERATIONS)[0]
-
-
-NOTHING_SHARED = "shares no points with the model"
 
 
 def _no_candidate(prior: IntrinsicsPrior, tried: int) -> StageFailure:
     if not prior.focal_known.any():
         return StageFailure(
-            "no candidate calibration survives metric bundle adjustment",
+            "no candidate calibration gives a metric model",
             f"{tried} were tried",
-            "photograph the scene from more directions",
+            "take images from more directions",
         )
     wide = float(prior.std[prior.focal_known, 0].max())
     return StageFailure(
-        "the photographs contradict the focal length that was given",
-        f"none of {tried} calibrations near it (+- {wide:.1%}) explains them",
-        "leave the prior out, or give it a larger focal_std_rel",
+        "the images contradict the given focal length",
+        f"none of {tried} calibrations near it (+- {wide:.1%}) fits them",
+        "leave it out, or set a larger focal_std_rel",
     )
 
 
-def _as_reconstruction(model: MetricModel, reasons: list[str]) -> Reconstruction:
+def _as_reconstruction(model: MetricEstimate, reasons: list[str]) -> Reconstruction:
     registered = model.registered
     P = np.where(registered[:, None, None], model.cameras.P, 0.0)
     K = np.where(registered[:, None, None], model.cameras.K, 0.0)
@@ -205,7 +237,7 @@ def _as_reconstruction(model: MetricModel, reasons: list[str]) -> Reconstruction
         X,
         registered,
         model.valid,
-        model.ok,
+        model.inlier,
         model.tracks,
         model.sizes,
         sigma,

@@ -1,9 +1,4 @@
-"""Calibrated resection of the cameras that the projective stage had to postpone (P3P in RANSAC, then
-refinement).
-
-From the certain core to all photographs: postponed cameras join, all tracks are triangulated, and a camera
-that the rest contradicts is found again or refused.
-"""
+"""Registration of the cameras that the projective stage left out, by P3P, RANSAC and refinement."""
 
 from __future__ import annotations
 
@@ -14,29 +9,43 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import counted
 from thesisrecon.geometry.resection import pose_from_three_points
-from thesisrecon.metric.adjustment import Adjustment
+from thesisrecon.metric.adjustment import BundleAdjustment
 from thesisrecon.metric.model import (
     K1,
     WIDTH,
-    MetricModel,
-    explained_shares,
+    MetricEstimate,
+    inlier_ratios,
     normalized_observations,
-    retriangulate,
+    retriangulate_tracks,
 )
-from thesisrecon.numerics.separate_refinement import refine_pose
+from thesisrecon.numerics.partial_bundle import refine_pose
 
-# What the focal of a camera that shares none is multiplied with in turn.
 ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
+"""Factors tried on the focal length of a camera that shares it with no registered view."""
 
 
 def resect_calibrated(
     X: F64, normalized: F64, *, threshold: float, rng: np.random.Generator, samples: int = 300
 ) -> tuple[F64, F64, B8] | None:
-    """Pose R, t and inliers of a calibrated camera; X (M, 3), normalised image points (M, 2), threshold in
-    their unit.
+    """Estimate the pose of a calibrated camera by P3P in RANSAC with a truncated quadratic score.
 
-    Truncated-quadratic score over all candidates of ``samples`` three-point samples; None below four points
-    or where no sample has a pose.
+    Parameters
+    ----------
+    X : ndarray (M, 3)
+        Points.
+    normalized : ndarray (M, 2)
+        Their normalised image points.
+    threshold : float
+        Inlier threshold in the same unit.
+    rng : numpy.random.Generator
+        Random numbers.
+    samples : int
+        Number of three-point samples.
+
+    Returns
+    -------
+    tuple (R, t, inliers) or None
+        R (3, 3), t (3,), inliers (M,); None below four points or if no sample has a pose.
     """
     if len(X) < 4:
         return None
@@ -59,42 +68,62 @@ def _squared(R: F64, t: F64, X: F64, xy: F64) -> F64:
     return np.where((Y[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
 
 
-def add_missing_cameras(
-    model: MetricModel,
+def register_missing_cameras(
+    model: MetricEstimate,
     *,
     sigmas: float,
     min_points: int,
     rng: np.random.Generator,
     allowed: B8 | None = None,
-) -> tuple[MetricModel, dict[int, str]]:
-    """Register by calibrated resection every view that sees enough of the model; the reasons of the others.
+) -> tuple[MetricEstimate, dict[int, str]]:
+    """Register every view that sees enough of the model by calibrated resection.
 
-    A camera is taken with the intrinsics that it shares; a focal that no registered view shares is refined
-    with the pose. Views are tried with most points first; ``allowed`` (V,) says which may join (all).
+    Views are tried in order of their number of points. Shared intrinsics are kept; a focal length that no
+    registered view shares is refined with the pose.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The model.
+    sigmas : float
+        Gate in noise sigmas.
+    min_points : int
+        Smallest number of points and inliers.
+    rng : numpy.random.Generator
+        Random numbers.
+    allowed : ndarray (V,) of bool, optional
+        Views that may be registered; None: all.
+
+    Returns
+    -------
+    model : MetricEstimate
+        The model with the new cameras.
+    rejected : dict
+        View -> reason for every view that was not registered.
     """
     t = model.tracks
     counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
-    refused: dict[int, str] = {}
+    rejected: dict[int, str] = {}
     for view in np.argsort(-counts, kind="stable"):
         if model.registered[view] or not (allowed is None or allowed[view]):
             continue
         if counts[view] < min_points:
-            refused[int(view)] = (
-                f"sees only {counted(counts[view], 'point')} of the model (needs {min_points}): "
+            rejected[int(view)] = (
+                f"sees only {counted(counts[view], 'point')} of the model (at least {min_points} needed): "
                 "too little overlap"
             )
             continue
-        added = _add(model, int(view), sigmas, rng, min_points)
+        added = _register(model, int(view), sigmas, rng, min_points)
         if isinstance(added, str):
-            refused[int(view)] = added
+            rejected[int(view)] = added
         else:
             model = added
-    return model, refused
+    return model, rejected
 
 
-def _add(
-    model: MetricModel, view: int, sigmas: float, rng: np.random.Generator, min_points: int
-) -> MetricModel | str:
+def _register(
+    model: MetricEstimate, view: int, sigmas: float, rng: np.random.Generator, min_points: int
+) -> MetricEstimate | str:
     t, cameras = model.tracks, model.cameras
     k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
     row = int(cameras.group[view])
@@ -103,7 +132,7 @@ def _add(
     found = _pose_and_focal(model, k, row, 2.0 * sigmas * model.gate_px, (ZOOMS if alone else (1.0,), rng))
     support = 0 if found is None else int(found[3].sum())
     if found is None or support < min_points or support < 0.3 * len(k):
-        return f"only {support} of its {counted(len(k), 'point')} agree with one camera"
+        return f"only {support} of its {counted(len(k), 'point')} are inliers of one camera"
     R, translation, start, inlier = found
     pose = refine_pose(
         R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
@@ -117,13 +146,13 @@ def _add(
 
 
 def _pose_and_focal(
-    model: MetricModel,
+    model: MetricEstimate,
     k: I64,
     row: int,
     threshold_px: float,
     tried: tuple[tuple[float, ...], np.random.Generator],
 ) -> tuple[F64, F64, F64, B8] | None:
-    """The best supported R, t, intrinsics and inliers of observations ``k`` over zooms of the row's focal."""
+    """R, t, intrinsics and inliers with most support of observations ``k`` over the tried focal lengths."""
     t, best = model.tracks, None
     zooms, rng = tried
     for zoom in zooms:
@@ -132,7 +161,7 @@ def _pose_and_focal(
         cameras = replace(model.cameras, intrinsics=table)
         normalized = normalized_observations(cameras, t.view_index[k], t.xy[k])
         threshold = threshold_px / table[row, 0]
-        # A focal that is off by some per cent needs a wider gate to show that it is the nearest.
+        # The nearest of the tried focals may be some per cent off: widen the gate.
         threshold = max(threshold, 0.01) if len(zooms) > 1 else threshold
         pose = resect_calibrated(model.X[t.point_index[k]], normalized, threshold=threshold, rng=rng)
         if pose is not None and (best is None or pose[2].sum() > best[3].sum()):
@@ -140,75 +169,101 @@ def _pose_and_focal(
     return best
 
 
-# Lenses are freed early: a camera taken for a pinhole is fitted to its distortion, and its gate then lets
-# wrong points in.
-BEFORE_LENS = np.arange(WIDTH) <= K1
-MOST_ROUNDS = 6
-SETTLED = 0.003
-LEAST_SHARE = 0.5
+WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
+"""k1 is free from the start: without it gates would have to admit wrong points."""
+MAX_ROUNDS = 6
+MIN_GAIN = 0.003
+"""Increase of the inlier ratio below which the rounds end."""
+MIN_INLIER_RATIO = 0.5
 
 
 @dataclass(frozen=True)
-class Completion:
-    """Parameters of the rounds: gates in sigmas, early and late; ``min_angle`` rad; ``min_points`` that a
-    joining camera sees."""
+class MissingCameraRegistration:
+    """Rounds of triangulation, resection and adjustment that register the missing cameras.
+
+    Parameters
+    ----------
+    gates : tuple of float
+        Gates in noise sigmas of the early and the late rounds.
+    min_angle : float
+        Smallest triangulation angle in radians.
+    min_points : int
+        Points of the model that a new camera must see.
+    """
 
     gates: tuple[float, float]
     min_angle: float
     min_points: int
 
     def run(
-        self, model: MetricModel, adjustment: Adjustment, rng: np.random.Generator
-    ) -> tuple[MetricModel, dict[int, str]]:
-        """The completed model and the reason of every view that did not join."""
-        model, refused = self._grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
-        suspects = model.registered & (explained_shares(model) < LEAST_SHARE)
+        self, model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator
+    ) -> tuple[MetricEstimate, dict[int, str]]:
+        """Register missing cameras, and those again that disagree with the rest.
+
+        Parameters
+        ----------
+        model : MetricEstimate
+            The upgraded core.
+        adjustment : BundleAdjustment
+            Settings of the adjustments.
+        rng : numpy.random.Generator
+            Random numbers.
+
+        Returns
+        -------
+        model : MetricEstimate
+            The complete model.
+        rejected : dict
+            View -> reason for every view that was not registered.
+        """
+        model, rejected = self._grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
+        suspects = model.registered & (inlier_ratios(model) < MIN_INLIER_RATIO)
         if suspects.any() and (model.registered & ~suspects).sum() >= 3:
-            model, refused = self._seek_again(model, adjustment, rng, suspects)
-        return model, refused
+            model, rejected = self._register_again(model, adjustment, rng, suspects)
+        return model, rejected
 
     def _grow(
-        self, model: MetricModel, adjustment: Adjustment, rng: np.random.Generator, allowed: B8
-    ) -> tuple[MetricModel, dict[int, str]]:
-        """Rounds of triangulation, resection of ``allowed`` views and adjustment until what is explained
-        stops growing."""
+        self, model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, allowed: B8
+    ) -> tuple[MetricEstimate, dict[int, str]]:
+        """Triangulate, resect ``allowed`` views and adjust until the inlier ratio stops growing."""
         early, late = self.gates
-        model = retriangulate(model, sigmas=early, min_angle=self.min_angle)
-        refused: dict[int, str] = {}
+        model = retriangulate_tracks(model, sigmas=early, min_angle=self.min_angle)
+        rejected: dict[int, str] = {}
         share = 0.0
-        for n in range(MOST_ROUNDS):
+        for n in range(MAX_ROUNDS):
             before = int(model.registered.sum())
-            model, refused = add_missing_cameras(
+            model, rejected = register_missing_cameras(
                 model, sigmas=early, min_points=self.min_points, rng=rng, allowed=allowed
             )
             joined = int(model.registered.sum()) > before
             if joined:
-                model = retriangulate(model, sigmas=early, min_angle=self.min_angle)
-            model = adjustment.run(model, free=BEFORE_LENS, iterations=6)[0]
-            # What fitted a wrong model comes back under the right one only if the gate is wide meanwhile.
-            model = retriangulate(model, sigmas=early if n == 0 else late, min_angle=self.min_angle)
-            now = float(model.ok.mean())
-            if not joined and n > 0 and now - share < SETTLED:
+                model = retriangulate_tracks(model, sigmas=early, min_angle=self.min_angle)
+            model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=6)[0]
+            # A wide gate in the first round readmits observations that a wrong model had excluded.
+            model = retriangulate_tracks(model, sigmas=early if n == 0 else late, min_angle=self.min_angle)
+            now = float(model.inlier.mean())
+            if not joined and n > 0 and now - share < MIN_GAIN:
                 break
             share = now
-        return model, refused
+        return model, rejected
 
-    def _seek_again(
-        self, model: MetricModel, adjustment: Adjustment, rng: np.random.Generator, suspects: B8
-    ) -> tuple[MetricModel, dict[int, str]]:
-        """Views that explain less than half of their observations are taken out, the rest settles without
-        them, and they may join where they then fit."""
+    def _register_again(
+        self, model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, suspects: B8
+    ) -> tuple[MetricEstimate, dict[int, str]]:
+        """Remove suspects, adjust the rest without them, then register them again if they fit."""
         none = np.zeros(len(suspects), dtype=bool)
         model = replace(
-            model, registered=model.registered & ~suspects, ok=model.ok & ~suspects[model.tracks.view_index]
+            model,
+            registered=model.registered & ~suspects,
+            inlier=model.inlier & ~suspects[model.tracks.view_index],
         )
         model, _ = self._grow(model, adjustment, rng, none)
-        model, refused = self._grow(model, adjustment, rng, ~none)
-        share = explained_shares(model)
-        wrong = model.registered & (share < LEAST_SHARE)
+        model, rejected = self._grow(model, adjustment, rng, ~none)
+        share = inlier_ratios(model)
+        wrong = model.registered & (share < MIN_INLIER_RATIO)
         if wrong.any():
             for view in np.flatnonzero(wrong):
-                refused[int(view)] = f"only {share[view]:.0%} of its matches agree with the other photographs"
+                rejected[int(view)] = f"only {share[view]:.0%} of its matches agree with the other images"
             model = replace(model, registered=model.registered & ~wrong)
-            model = retriangulate(model, sigmas=self.gates[1], min_angle=self.min_angle)
-        return model, refused
+            model = retriangulate_tracks(model, sigmas=self.gates[1], min_angle=self.min_angle)
+        return model, rejected

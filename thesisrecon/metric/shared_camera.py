@@ -1,17 +1,8 @@
-"""A finished model adjusted once more with values of their own for the photographs, to hold against what they
-are said to share.
+"""Tests of shared intrinsics and given focal lengths against the images.
 
-Whether the photographs contradict that they share a camera, and whether they can tell at all: zooms that
-differ by a few percent, and crops, bend a model quietly, since each photograph fits points that were bent
-with it.
-
-The word is hence tested as a hypothesis: the model is adjusted once more as it is, with a focal length, and
-with a principal point of its own for every photograph that shares one, column by column. Twice the cost that
-the freedom saves is chi-square where the word is true (a likelihood ratio, which holds in the long valleys
-where a bent model lies and single values and their deviations mean little). Where own focal lengths stay open
-the photographs cannot tell, and the shared one is as uncertain as that of cameras that were zoomed a little.
-
-Whether the photographs contradict what was said of a focal length: a wrong word bends a model quietly.
+Small zoom differences and crops deform a model quietly. The model is adjusted again with own values per view
+(:class:`PerViewFit`): twice the decrease in cost is chi-square under the hypothesis of one camera (likelihood
+ratio). If own focal lengths stay undetermined, the test cannot decide and the interval is widened.
 """
 
 from __future__ import annotations
@@ -23,44 +14,76 @@ import scipy
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.adjustment import Adjustment
-from thesisrecon.metric.model import CENTRE, FOCAL, WIDTH, MetricModel
-from thesisrecon.metric.uncertainty import LEAST_BLOCKS, USUAL_INFLATION
+from thesisrecon.metric.adjustment import BundleAdjustment
+from thesisrecon.metric.model import CENTRE, FOCAL, WIDTH, MetricEstimate
+from thesisrecon.metric.uncertainty import MIN_BLOCKS, USUAL_INFLATION
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.metric_bundle import MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 
 CENTRE_STD = 0.1
-"""Long sides; a photograph may be cut out of a larger one anywhere."""
-MOST_OBSERVATIONS = 15000
-ROUNDS = 30
-"""A model that is bent lies in a long valley: a dozen rounds leave the values where they were."""
+"""Prior of free principal points in long sides; images may be crops."""
+MAX_OBSERVATIONS = 15000
+ITERATIONS = 30
+"""A deformed model lies in a long valley of the cost: a dozen iterations do not suffice."""
 
 
-def part_of_explained(model: MetricModel) -> I64:
-    """Explained observations, those of every n-th point where they are many."""
-    index = np.flatnonzero(model.ok)
+def subsample_inliers(model: MetricEstimate) -> I64:
+    """Return the inliers of every n-th point, at most about ``MAX_OBSERVATIONS``.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The model.
+
+    Returns
+    -------
+    ndarray of int
+        Numbers of observations.
+    """
+    index = np.flatnonzero(model.inlier)
     point = model.tracks.point_index[index]
     chosen = np.zeros(model.tracks.n_points, dtype=bool)
-    chosen[np.unique(point)[:: int(np.ceil(len(index) / MOST_OBSERVATIONS))]] = True
+    chosen[np.unique(point)[:: int(np.ceil(len(index) / MAX_OBSERVATIONS))]] = True
     return np.asarray(index[chosen[point]], dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class PerViewFit:
-    """The registered ``views`` of a model; rows of every answer are in their order."""
+    """Bundle adjustments of the registered views with own intrinsics per view.
 
-    model: MetricModel
-    adjustment: Adjustment
+    Attributes
+    ----------
+    model : MetricEstimate
+        The model.
+    adjustment : BundleAdjustment
+        Its settings.
+    views : ndarray of int
+        Registered views; rows of the results are in this order.
+    """
+
+    model: MetricEstimate
+    adjustment: BundleAdjustment
     views: I64
 
     def adjusted(self, columns: tuple[int, ...], *, focal_spread: float = np.inf) -> MetricBundleResult:
-        """With a value of its own in ``columns`` for every view, of which nothing is known but, where it is
-        finite, the ``focal_spread`` (relative) of the focals that were shared about one that is not
-        known."""
-        model, views, adjustment = self.model, self.views, replace(self.adjustment, population=None)
-        t, cameras, index = model.tracks, model.cameras, part_of_explained(model)
+        """Adjust with own, unknown values in some columns.
+
+        Parameters
+        ----------
+        columns : tuple of int
+            Columns of intrinsics with a value per view.
+        focal_spread : float
+            Relative scatter of the formerly shared focals about their common mean; inf: no prior.
+
+        Returns
+        -------
+        MetricBundleResult
+            The adjustment with covariances.
+        """
+        model, views, adjustment = self.model, self.views, replace(self.adjustment, hierarchical=None)
+        t, cameras, index = model.tracks, model.cameras, subsample_inliers(model)
         assert cameras.shared is not None
         rows = cameras.group[views]
         shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
@@ -74,7 +97,7 @@ class PerViewFit:
         if np.isfinite(focal_spread):
             spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
             known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
-        options = replace(adjustment, inflation=1.0).options(model, iterations=ROUNDS)
+        options = replace(adjustment, inflation=1.0).options(model, iterations=ITERATIONS)
         return refine_metric_bundle(
             MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),
             model.X,
@@ -85,24 +108,32 @@ class PerViewFit:
         )
 
 
-ALARM = 1e-3
-"""Chance of a false alarm where the deviations are right."""
-FLOOR = 2e-3
-"""Of the deviation of an own focal, relative, or principal point, long sides."""
-LEAST_APART = {"focal": 0.01, "centre": 0.015}
-"""Relative and in long sides: what differs by less does no harm that a person would mend."""
-OPEN = 0.03
-"""Own focals that are open by more (relative, one deviation) cannot tell whether they are one."""
+FALSE_ALARM_RATE = 1e-3
+STD_FLOOR = 2e-3
+"""Floor of the relative standard deviation of an own focal."""
+MIN_FOCAL_DIFFERENCE = 0.01
+"""Relative; smaller differences are harmless."""
+MIN_CENTRE_DIFFERENCE = 0.015
+"""In long sides; smaller differences are harmless."""
+MAX_OWN_FOCAL_STD = 0.03
+"""Relative; with less certain own focals the sharing cannot be tested."""
 ZOOM_STD = 0.03
-"""Relative scatter of the focals of photographs that somebody took for those of one zoom, where they cannot
-tell."""
+"""Assumed relative scatter of focals that cannot be tested."""
 
 
 @dataclass(frozen=True)
 class SharedCameraTest:
-    """``failed_checks``: a sentence for every set of photographs that contradict what they are said to share.
-    ``warnings``: one for every set that cannot tell, whose views have in ``focal_std`` (V,) the relative
-    standard deviation of a focal length that may differ between them; NaN elsewhere."""
+    """Result of :func:`check_shared_cameras`.
+
+    Attributes
+    ----------
+    failed_checks : tuple of str
+        A sentence for each set of views that contradicts a shared value.
+    warnings : tuple of str
+        A sentence for each set of views that cannot be tested.
+    focal_std : ndarray (V,)
+        Relative standard deviation of focal lengths whose sharing cannot be tested, NaN elsewhere.
+    """
 
     failed_checks: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -111,7 +142,7 @@ class SharedCameraTest:
 
 @dataclass(frozen=True)
 class _Set:
-    """``places`` among the registered views of those that share a value, or of which one is ``known``."""
+    """Registered views (``places`` in their list) that share a value, or whose value is ``known``."""
 
     places: I64
     known: bool = False
@@ -121,10 +152,22 @@ class _Set:
         return len(self.places) - (0 if self.known else 1)
 
 
-def check_shared_cameras(model: MetricModel, adjustment: Adjustment) -> SharedCameraTest:
-    """Hold shared focals, and shared or known principal points, against the photographs.
+def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) -> SharedCameraTest:
+    """Test shared focals, and shared or known principal points, against the images.
 
-    Sets of less than three views are not looked at. Empty where nothing is shared.
+    A chi-square test of the decrease in cost with own values per view, for sets of at least three views.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The final model.
+    adjustment : BundleAdjustment
+        Its settings.
+
+    Returns
+    -------
+    SharedCameraTest
+        Empty if nothing is shared.
     """
     views = np.flatnonzero(model.registered)
     focal_std = np.full(len(model.registered), np.nan)
@@ -138,9 +181,9 @@ def check_shared_cameras(model: MetricModel, adjustment: Adjustment) -> SharedCa
         alone = fit.adjusted(freed)
         apart = [s for s in _contradicted(before, alone, focals, 1) if _focals_apart(alone, s)]
         failed_checks += [_focals_differ(views, alone, s) for s in apart]
-        for s in [s for s in focals if s not in apart and _focal_std(alone, s).max() > OPEN]:
+        for s in [s for s in focals if s not in apart and _focal_std(alone, s).max() > MAX_OWN_FOCAL_STD]:
             focal_std[views[s.places]] = _std_of_a_kind(model, fit, s)
-            warnings.append(_cannot_tell(float(_focal_std(alone, s).max())))
+            warnings.append(_untestable(float(_focal_std(alone, s).max())))
         before = alone
         bent = [set(s.places.tolist()) for s in apart]
         centres = [s for s in centres if not any(b & set(s.places.tolist()) for b in bent)]
@@ -148,57 +191,59 @@ def check_shared_cameras(model: MetricModel, adjustment: Adjustment) -> SharedCa
         both = fit.adjusted((*freed, *CENTRE))
         for s in _contradicted(before, both, centres, 2):
             off = _centres_off(model, adjustment, views, both, s)
-            if np.abs(off).max() > LEAST_APART["centre"]:
+            if np.abs(off).max() > MIN_CENTRE_DIFFERENCE:
                 failed_checks.append(_centres_differ(s, off))
     return SharedCameraTest(tuple(failed_checks), tuple(warnings), focal_std)
 
 
-def _sets(model: MetricModel, adjustment: Adjustment, views: I64, column: int) -> list[_Set]:
+def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, column: int) -> list[_Set]:
     """Views that share a column; those whose principal point is known."""
     assert model.cameras.shared is not None
     rows = model.cameras.group[views]
-    held = adjustment.row_prior(model).std[rows, column] == 0.0
+    known = adjustment.row_prior(model).std[rows, column] == 0.0
     number = model.cameras.shared[rows, column]
-    sets = [_Set(np.flatnonzero((number == k) & ~held)) for k in np.unique(number)]
+    sets = [_Set(np.flatnonzero((number == k) & ~known)) for k in np.unique(number)]
     if column != FOCAL:
-        sets.append(_Set(np.flatnonzero(held), known=True))
+        sets.append(_Set(np.flatnonzero(known), known=True))
     return [s for s in sets if len(s.places) >= 3]
 
 
 def _contradicted(
     before: MetricBundleResult, after: MetricBundleResult, sets: list[_Set], values: int
 ) -> list[_Set]:
-    """All sets where values of their own explain more than chance lets expect, else none."""
+    """All sets if own values reduce the cost by more than chance, else none."""
     saved = 2.0 * (before.cost - after.cost) / USUAL_INFLATION**2
-    return sets if saved > scipy.special.chdtri(values * sum(s.freedoms for s in sets), ALARM) else []
+    return (
+        sets if saved > scipy.special.chdtri(values * sum(s.freedoms for s in sets), FALSE_ALARM_RATE) else []
+    )
 
 
 def _focal_std(alone: MetricBundleResult, s: _Set) -> F64:
-    """Relative deviations of own focals as photographs need them; infinite where nothing is told."""
+    """Inflated relative standard deviations of own focals; inf where undetermined."""
     variance = alone.intrinsics_covariance[s.places, FOCAL, FOCAL]
     focal = alone.cameras.intrinsics[s.places, FOCAL]
-    std = np.hypot(USUAL_INFLATION * np.sqrt(np.maximum(variance, 0.0)) / focal, FLOOR)
+    std = np.hypot(USUAL_INFLATION * np.sqrt(np.maximum(variance, 0.0)) / focal, STD_FLOOR)
     return np.where(np.isfinite(std) & (variance > 0.0), std, np.inf)
 
 
 def _focals_apart(alone: MetricBundleResult, s: _Set) -> bool:
     log = np.log(alone.cameras.intrinsics[s.places, FOCAL])
-    return bool(np.abs(log - np.median(log)).max() > LEAST_APART["focal"])
+    return bool(np.abs(log - np.median(log)).max() > MIN_FOCAL_DIFFERENCE)
 
 
-def _std_of_a_kind(model: MetricModel, fit: PerViewFit, s: _Set) -> float:
-    """Relative deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
-    # The scatter is not inflated as the deviations are.
-    alike = fit.adjusted((FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
+def _std_of_a_kind(model: MetricEstimate, fit: PerViewFit, s: _Set) -> float:
+    """Relative standard deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
+    # Standard deviations are inflated afterwards, the assumed scatter must not be.
+    scattered = fit.adjusted((FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
     rows = model.cameras.group[fit.views[s.places]]
-    off = np.log(alike.cameras.intrinsics[s.places, FOCAL] / model.cameras.intrinsics[rows, FOCAL])
-    return float(np.hypot(_focal_std(alike, s), off).max())
+    off = np.log(scattered.cameras.intrinsics[s.places, FOCAL] / model.cameras.intrinsics[rows, FOCAL])
+    return float(np.hypot(_focal_std(scattered, s), off).max())
 
 
 def _centres_off(
-    model: MetricModel, adjustment: Adjustment, views: I64, both: MetricBundleResult, s: _Set
+    model: MetricEstimate, adjustment: BundleAdjustment, views: I64, both: MetricBundleResult, s: _Set
 ) -> F64:
-    """(n, 2) long sides: own principal points from the known one, or from the median of the set."""
+    """(n, 2) offsets, in long sides, of own principal points from the known one or the median."""
     rows = model.cameras.group[views[s.places]]
     off = (both.cameras.intrinsics[s.places] - adjustment.row_prior(model).mean[rows])[:, CENTRE]
     off /= model.sizes[views[s.places]].max(axis=1, keepdims=True)
@@ -209,98 +254,120 @@ def _focals_differ(views: I64, alone: MetricBundleResult, s: _Set) -> str:
     focal, std = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s)
     low, high = int(focal.argmin()), int(focal.argmax())
     return (
-        f"the photographs contradict that they have one focal length: view {views[s.places[high]]} asks for "
-        f"one {focal[high] / focal[low] - 1.0:.1%} longer than view {views[s.places[low]]} (each within "
-        f"{max(std[low], std[high]):.1%}, one standard deviation); let every photograph have its own "
-        "(cameras = per-image), or leave out those that were zoomed"
+        f"The images contradict a shared focal length: that of image #{views[s.places[high]]} is "
+        f"{focal[high] / focal[low] - 1.0:.1%} longer than that of image #{views[s.places[low]]} (1 sigma: "
+        f"{max(std[low], std[high]):.1%}). Use one camera per image (cameras = per-image), or leave the "
+        "zoomed images out"
     )
 
 
 def _centres_differ(s: _Set, off: F64) -> str:
     if s.known:
         return (
-            "the photographs contradict the principal point that was given: those of "
-            f"{len(s.places)} views lie up to {np.abs(off).max():.1%} of the long side off; leave it out, or "
-            "where they were cropped one by one let every photograph have its own (cameras = per-image)"
+            "The images contradict the given principal point: those of "
+            f"{len(s.places)} views are up to {np.abs(off).max():.1%} of the long side away. Leave it out, "
+            "or use one camera per image (cameras = per-image) if the images were cropped individually"
         )
     return (
-        f"the photographs contradict that they have one principal point: those of {len(s.places)} views lie "
-        f"up to {np.ptp(off, axis=0).max():.1%} of the long side apart, as of photographs cropped one by "
-        "one; let every photograph have its own (cameras = per-image)"
+        f"The images contradict a shared principal point: those of {len(s.places)} views are "
+        f"up to {np.ptp(off, axis=0).max():.1%} of the long side apart, as in individually cropped images. "
+        "Use one camera per image (cameras = per-image)"
     )
 
 
-def _cannot_tell(std: float) -> str:
-    alone = f"open by {std:.0%} (one standard deviation)" if np.isfinite(std) and std < 1.0 else "wide open"
+def _untestable(std: float) -> str:
+    alone = f"only to {std:.0%} (1 sigma)" if np.isfinite(std) and std < 1.0 else "not at all"
     return (
-        f"that they share one focal length cannot be checked from these photographs: alone each leaves its "
-        f"own {alone}; the interval allows for zooms that differ by {ZOOM_STD:.0%}; more photographs, from "
-        "more directions, would tell"
+        f"The shared focal length cannot be verified: single images determine their own {alone}. The "
+        f"interval allows for zoom differences of {ZOOM_STD:.0%}. Add images from more directions"
     )
 
 
 MAX_SIGMAS = 3.0
-LEAST_DIFFERENCE = 0.01
-"""A prior wrong by less than a hundredth does no harm that a person would mend."""
 MAX_CENTRE_SIGMAS = 5.0
-MOST_CONTRADICTION = 8.0
-"""Variance ratio of blocks over points; right models of photographs have 1.5 to 5, bent ones 11 to 28."""
-WIDEN = "leave it out, or give it a larger focal_std_rel"
+MAX_OVERDISPERSION = 8.0
+"""Variance ratio of blocks over points: 1.5 to 5 for correct models of real images, 11 to 28 if deformed."""
 
 
-def contradicted_focals(model: MetricModel, adjustment: Adjustment) -> list[str]:
-    """A sentence for every focal length of which something was said that the photographs contradict.
+def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustment) -> list[str]:
+    """Test given focal lengths against an adjustment without them.
 
-    The model is adjusted once more with nothing known of any focal, from where it is; what comes out is
-    compared with what was said, both uncertainties together. Empty where nothing was said.
+    Parameters
+    ----------
+    model : MetricEstimate
+        The final model.
+    adjustment : BundleAdjustment
+        Its settings.
+
+    Returns
+    -------
+    list of str
+        A sentence for each focal length that differs by more than ``MAX_SIGMAS`` of both uncertainties.
     """
     prior = adjustment.prior
-    said = np.flatnonzero(prior.focal_known & model.registered)
-    if len(said) == 0:
+    given = np.flatnonzero(prior.focal_known & model.registered)
+    if len(given) == 0:
         return []
     number = _numbers_when_free(model, adjustment)
     focal, std = _free_focals(model, adjustment, number)
     number = number[model.cameras.group]
     failed_checks = []
-    for k in np.unique(number[said]):
-        view = int(said[number[said] == k][0])
+    for k in np.unique(number[given]):
+        view = int(given[number[given] == k][0])
         mean, deviation = float(prior.mean[view, 0]), float(prior.std[view, 0])
         off = float(np.log(focal[view] / mean))
-        if abs(off) > LEAST_DIFFERENCE and abs(off) > MAX_SIGMAS * float(np.hypot(std[view], deviation)):
-            whose = "" if len(np.unique(number[said])) == 1 else f" of view {view}"
+        if abs(off) > MIN_FOCAL_DIFFERENCE and abs(off) > MAX_SIGMAS * float(np.hypot(std[view], deviation)):
+            whose = "" if len(np.unique(number[given])) == 1 else f" of image #{view}"
             failed_checks.append(
-                f"the photographs contradict the focal length{whose} that was given: they ask for one "
-                f"{abs(np.expm1(off)):.1%} {'longer' if off > 0 else 'shorter'} (within {std[view]:.1%}, one "
-                f"standard deviation); {'leave it out' if deviation == 0.0 else WIDEN}"
+                f"The images contradict the given focal length{whose}: their estimate is "
+                f"{abs(np.expm1(off)):.1%} {'longer' if off > 0 else 'shorter'} (1 sigma: {std[view]:.1%}). "
+                f"Leave it out{'' if deviation == 0.0 else ', or set a larger focal_std_rel'}"
             )
     return failed_checks
 
 
-def centre_of_a_bent_model(model: MetricModel, adjustment: Adjustment, scatter: BlockScatter) -> list[str]:
-    """A sentence where a principal point lies far off what was said of it and parts of the scene contradict
-    each other as well: photographs cropped alike do the first, but not the second."""
+def inconsistent_principal_point(
+    model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter
+) -> list[str]:
+    """Detect a deformed model by its principal point and the disagreement of blocks of the scene.
+
+    Images cropped in the same way move the principal point, but their blocks agree.
+
+    Parameters
+    ----------
+    model : MetricEstimate
+        The final model.
+    adjustment : BundleAdjustment
+        Its settings.
+    scatter : BlockScatter
+        Scatter of the last adjustment.
+
+    Returns
+    -------
+    list of str
+        One sentence, or none.
+    """
     views = np.flatnonzero(model.registered)
-    if scatter.blocks < LEAST_BLOCKS or not scatter.overdispersion > MOST_CONTRADICTION:
+    if scatter.blocks < MIN_BLOCKS or not scatter.overdispersion > MAX_OVERDISPERSION:
         return []
-    said = adjustment.prior.std[views][:, CENTRE]
+    std = adjustment.prior.std[views][:, CENTRE]
     values = model.cameras.intrinsics[model.cameras.group[views]][:, CENTRE]
     off = np.abs(values - adjustment.prior.mean[views][:, CENTRE])
-    sigmas = np.where(said > 0.0, off / np.where(said > 0.0, said, 1.0), 0.0).max(axis=1)
+    sigmas = np.where(std > 0.0, off / np.where(std > 0.0, std, 1.0), 0.0).max(axis=1)
     worst = int(sigmas.argmax())
     if not sigmas[worst] > MAX_CENTRE_SIGMAS:
         return []
     share = float(off[worst].max() / model.sizes[views[worst]].max())
     return [
-        f"the principal point lies {share:.0%} of the long side off ({sigmas[worst]:.0f} standard deviations "
-        f"of what is said of it) and parts of the scene contradict each other by {scatter.overdispersion:.0f} "
-        "times what their points let expect: photographs were zoomed or cropped one by one, or the model is "
-        "bent"
+        f"The principal point of image #{views[worst]} is {share:.0%} of the long side off "
+        f"({sigmas[worst]:.0f} sigma of its prior) and blocks of the scene disagree "
+        f"{scatter.overdispersion:.0f} times more than their noise: images were zoomed or cropped "
+        "individually, or the model is deformed"
     ]
 
 
-def _numbers_when_free(model: MetricModel, adjustment: Adjustment) -> I64:
-    """(G,) numbers of the focals when nothing is known of them: known ones, which are not tied, are one where
-    one value was given for them."""
+def _numbers_when_free(model: MetricEstimate, adjustment: BundleAdjustment) -> I64:
+    """(G,) numbers of the focals without prior; known focals of one value share a number."""
     assert model.cameras.shared is not None
     prior, number = adjustment.row_prior(model), model.cameras.shared[:, FOCAL].copy()
     known = np.flatnonzero(prior.std[:, FOCAL] == 0.0)
@@ -308,11 +375,10 @@ def _numbers_when_free(model: MetricModel, adjustment: Adjustment) -> I64:
     return np.asarray(number)
 
 
-def _free_focals(model: MetricModel, adjustment: Adjustment, number: I64) -> tuple[F64, F64]:
-    """Focals (V,) and relative deviations (V,) when nothing is known of them; rows of one ``number`` share
-    theirs."""
+def _free_focals(model: MetricEstimate, adjustment: BundleAdjustment, number: I64) -> tuple[F64, F64]:
+    """Focals (V,) and relative standard deviations (V,) without prior; equal ``number``: shared."""
     t, cameras = model.tracks, model.cameras
-    index = part_of_explained(model)
+    index = subsample_inliers(model)
     assert cameras.shared is not None
     shared = cameras.shared.copy()
     shared[:, FOCAL] = number
@@ -324,10 +390,10 @@ def _free_focals(model: MetricModel, adjustment: Adjustment, number: I64) -> tup
         Observations(t.view_index[index], t.point_index[index], t.xy[index]), free=free,
         prior=IntrinsicsPrior.unshared(prior.mean, std),
         options=replace(
-            adjustment.options(model, iterations=ROUNDS), covariance=True, noise_floor_px=model.sigma_px
+            adjustment.options(model, iterations=ITERATIONS), covariance=True, noise_floor_px=model.sigma_px
         ),
     )  # fmt: skip
     focal = result.cameras.intrinsics[:, FOCAL]
     variance = np.maximum(result.intrinsics_covariance[:, FOCAL, FOCAL], 0.0)
-    deviation = np.hypot(USUAL_INFLATION * np.sqrt(variance) / focal, FLOOR)
+    deviation = np.hypot(USUAL_INFLATION * np.sqrt(variance) / focal, STD_FLOOR)
     return focal[cameras.group], deviation[cameras.group]

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.model import MetricModel, camera_rows
+from thesisrecon.metric.model import MetricEstimate, camera_rows
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.records import Reconstruction
 
 
-def model_from_reconstruction(found: Reconstruction, prior: IntrinsicsPrior) -> MetricModel:
+def model_from_reconstruction(found: Reconstruction, prior: IntrinsicsPrior) -> MetricEstimate:
     """The working model of a metric reconstruction."""
     assert found.K is not None
     assert found.distortion is not None
@@ -31,18 +31,18 @@ def model_from_reconstruction(found: Reconstruction, prior: IntrinsicsPrior) -> 
     cameras = MetricCameras(
         np.where(views[:, None, None], Q[:, :, :3], np.eye(3)), Q[:, :, 3], rows, group, shared
     )
-    return MetricModel(
+    return MetricEstimate(
         found.tracks, found.sizes, cameras, views.copy(), found.X[:, :3].copy(), found.valid.copy(),
         found.inlier.copy(), max(found.sigma_px, 0.02),
     )  # fmt: skip
 
 
-def centres(model: MetricModel) -> F64:
+def centres(model: MetricEstimate) -> F64:
     """(V, 3)."""
     return np.asarray(-np.einsum("vba,vb->va", model.cameras.R, model.cameras.t))
 
 
-def _spread(model: MetricModel) -> float:
+def _spread(model: MetricEstimate) -> float:
     C = centres(model)[model.registered]
     return float(np.sqrt(np.mean(np.sum((C - C.mean(axis=0)) ** 2, axis=1))))
 
@@ -52,12 +52,12 @@ def _direction(rng: np.random.Generator) -> F64:
     return np.asarray(v / np.linalg.norm(v))
 
 
-def _placed(model: MetricModel, R: F64, C: F64) -> MetricModel:
+def _placed(model: MetricEstimate, R: F64, C: F64) -> MetricEstimate:
     t = -np.einsum("vab,vb->va", R, C)
     return model.with_cameras(replace(model.cameras, R=R, t=t))
 
 
-def move_cameras(model: MetricModel, rng: np.random.Generator, views: I64, degrees: float) -> MetricModel:
+def move_cameras(model: MetricEstimate, rng: np.random.Generator, views: I64, degrees: float) -> MetricEstimate:
     """Views turned by up to ``degrees`` (at least a quarter) and moved by a fifth to a half of the path."""
     R, C = model.cameras.R.copy(), centres(model)
     for v in views:
@@ -67,17 +67,17 @@ def move_cameras(model: MetricModel, rng: np.random.Generator, views: I64, degre
     return _placed(model, R, C)
 
 
-def one_moved(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+def one_moved(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     """One camera stands and looks elsewhere."""
     return move_cameras(model, rng, rng.choice(np.flatnonzero(model.registered), 1), 20.0)
 
 
-def all_moved(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+def all_moved(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     """Every camera does: what adjusts from there ends in some local minimum."""
     return move_cameras(model, rng, np.flatnonzero(model.registered), 8.0)
 
 
-def two_swapped(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+def two_swapped(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     """Two cameras change places."""
     i, j = rng.choice(np.flatnonzero(model.registered), 2, replace=False)
     R, C = model.cameras.R.copy(), centres(model)
@@ -85,7 +85,7 @@ def two_swapped(model: MetricModel, rng: np.random.Generator) -> MetricModel:
     return _placed(model, R, C)
 
 
-def mirrored(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+def mirrored(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     """The depth reversal of weak perspective: the scene mirrored at a plane across one optical axis, cameras
     turned the other way."""
     z = model.cameras.R[rng.choice(np.flatnonzero(model.registered)), 2]
@@ -97,7 +97,7 @@ def mirrored(model: MetricModel, rng: np.random.Generator) -> MetricModel:
     return _placed(model, R, C - 2.0 * ((C - o) @ z)[:, None] * z)
 
 
-def _transformed(model: MetricModel, H: F64, focal_factor: float) -> MetricModel:
+def _transformed(model: MetricEstimate, H: F64, focal_factor: float) -> MetricEstimate:
     """Cameras nearest to those of the model in the frame H X, all focals multiplied."""
     intrinsics = model.cameras.intrinsics.copy()
     intrinsics[:, 0] *= focal_factor
@@ -109,7 +109,7 @@ def _transformed(model: MetricModel, H: F64, focal_factor: float) -> MetricModel
     return _placed(model.with_cameras(cameras), U @ Vt, C)
 
 
-def wrong_infinity(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+def wrong_infinity(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     """The upgrade with a plane at infinity 2.5 to 10 path lengths away."""
     H = np.eye(4)
     H[3, :3] = _direction(rng) * rng.uniform(0.1, 0.4) / _spread(model)
@@ -117,7 +117,7 @@ def wrong_infinity(model: MetricModel, rng: np.random.Generator) -> MetricModel:
     return _transformed(model, H, 1.0)
 
 
-def wrong_focal(model: MetricModel, rng: np.random.Generator) -> MetricModel:
+def wrong_focal(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     """The bas-relief: half or double the focal, and the scene as deep as suits it."""
     factor = float(rng.choice([0.5, 2.0]))
     z = model.cameras.R[rng.choice(np.flatnonzero(model.registered)), 2]
@@ -131,7 +131,7 @@ class Spoiling:
     """A way to go wrong: its ``name``, and what it makes of a model."""
 
     name: str
-    spoil: Callable[[MetricModel, np.random.Generator], MetricModel]
+    spoil: Callable[[MetricEstimate, np.random.Generator], MetricEstimate]
 
 
 SPOILINGS = (

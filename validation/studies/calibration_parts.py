@@ -219,16 +219,16 @@ def _judge(weak: Weak, K: F64, alike: bool) -> tuple[float, float, float, bool, 
 def named(result: MetricResult, view: int) -> bool:
     """Return whether the result marks the focal length of a view as uncertain.
 
-    The view is not registered, a sentence names it, its value is borrowed, or its standard deviation is
+    The view is not registered, a sentence names it, its value is shrunk, or its standard deviation is
     large.
     """
     if not result.reconstruction.registered[view]:
         return True
-    sentence = re.compile(rf"\bviews?\b[^;:]*\b{view}\b")
+    sentence = re.compile(rf"#{view}\b")
     if any(sentence.search(said) for said in (*result.warnings, *result.failed_checks)):
         return True
     interval = result.intrinsics[view]["focal_px"]
-    return interval.source.startswith("borrowed") or interval.std / interval.value >= WIDE_REL
+    return interval.source.startswith("shrunk") or interval.std / interval.value >= WIDE_REL
 
 
 COVERAGE = 0.92, 0.98

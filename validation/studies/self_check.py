@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import thesisrecon
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for
 from thesisrecon.metric.adjustment import BundleAdjustment
 from thesisrecon.metric.checks import self_check
 from thesisrecon.metric.model import MetricEstimate, retriangulate_tracks
@@ -169,7 +168,8 @@ def self_check_study(out: Path, scenes: Sequence[str] = SCENES, seeds: int = 5) 
     yield text_table(["made", "models", "nothing left", "wrong", "doubted", "right", "doubted"], lines)
     every = [o for outcomes in table.values() for o in outcomes if o is not None]
     doubted = {
-        name: [100.0 * o.doubted for o in every if o.wrong is (name == "wrong")] for name in ("wrong", "right")
+        name: [100.0 * o.doubted for o in every if o.wrong is (name == "wrong")]
+        for name in ("wrong", "right")
     }
     for name, values in doubted.items():
         rows, share = Rows(f"{len(values)} {name}", OURS), float(np.mean(values))
