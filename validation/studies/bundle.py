@@ -49,18 +49,9 @@ ENOUGH_S = 1.0
 class Case:
     """One problem.
 
-    Attributes
-    ----------
-    copies : int
-            How often each point is repeated.
-    loss : str
-            Name of the loss.
-    centre : bool
-            Whether the principal point is free.
-    threads : int
-            Number of threads.
-    shared : bool
-            One camera for all images, or one for each.
+    ``copies``: how often each point is repeated; ``loss``: name of the loss; ``centre``: whether the
+    principal point is free; ``threads``: number of threads; ``shared``: one camera for all images, or one
+    for each.
     """
 
     copies: int

@@ -36,7 +36,7 @@ from validation.studies.calibration_parts import (
     check_parts,
     named,
 )
-from validation.studies.main_job import COLMAP, COLMAP_PP, OURS
+from validation.studies.main_job import COLMAP, COLMAP_PP, OURS, centre_mm_of
 from validation.studies.runner import Part, Rows, scenes_here
 
 Config = Callable[[PipelineConfig], PipelineConfig]
@@ -156,7 +156,7 @@ class CameraRows(Rows):
 
     def poses(self, centre_mm: float | None = None, rotation_deg: float | None = None) -> None:
         """Add errors of centres and rotations."""
-        self.error("camera centres, mean", "mm", _centre_mm, centre_mm)
+        self.error("camera centres, mean", "mm", centre_mm_of, centre_mm)
         self.error("camera rotations, median", "deg", lambda e: e.rotation_error_deg, rotation_deg)
 
     def principal_point(self, bound: float | None = None) -> None:
@@ -180,10 +180,6 @@ class CameraRows(Rows):
 def reduced(reduce: Callable[[np.ndarray], float], values: np.ndarray | None) -> float | None:
     """Reduce values to one number; None without values."""
     return None if values is None or not len(values) else float(reduce(values))
-
-
-def _centre_mm(errors: CameraErrors) -> float | None:
-    return None if errors.centre_error is None else 1000.0 * errors.centre_error
 
 
 WINDOW = 0.3, 0.45

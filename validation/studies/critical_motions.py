@@ -46,14 +46,8 @@ WITHOUT_PARALLAX = (Motion.ROTATION, Motion.PLANE)
 class Trial:
     """One scene.
 
-    Attributes
-    ----------
-    named : str
-        Reported critical motion, empty for none.
-    identifiable : bool
-        Whether the focal length is reported as identifiable.
-    focal_error : float
-        |log f / f_true| of the median view, NaN without an answer.
+    ``named``: reported critical motion, empty for none; ``identifiable``: whether the focal length is
+    reported as identifiable; ``focal_error``: |log f / f_true| of the median view, NaN without an answer.
     """
 
     named: str

@@ -67,20 +67,11 @@ class CubePair:
 class CubeRow:
     """One method at one noise over all pairs.
 
-    Attributes
-    ----------
-    distance_px, worst_px : float
-        Median and 90 % quantile over pairs of the RMS distance of the exact points to their epipolar lines.
-    residual_px : float
-        Median over pairs of the same for the noisy points that F is estimated from.
-    ratio : float
-        RMS over pairs of the distance over the KCR bound.
-    epipole_deg : float
-        Median angle between the rays of the true and the estimated epipole.
-    within : float
-        Share of pairs with a distance below 1 px.
-    failures : int
-        Pairs without F.
+    ``distance_px``, ``worst_px``: median and 90 % quantile over pairs of the RMS distance of the exact
+    points to their epipolar lines; ``residual_px``: median over pairs of the same for the noisy points that
+    F is estimated from; ``ratio``: RMS over pairs of the distance over the KCR bound; ``epipole_deg``:
+    median angle between the rays of the true and the estimated epipole; ``within``: share of pairs with a
+    distance below 1 px; ``failures``: pairs without F.
     """
 
     method: str
@@ -223,7 +214,6 @@ def draw(rows: Sequence[CubeRow]) -> go.Figure:
     figure.update_yaxes(type="log", title="RMS distance of the exact points over the bound", dtick="D2")
     figure.update_layout(title="The cube sequence: how far each method is from the bound")
     return figure
-
 
 
 def report(rows: Sequence[CubeRow]) -> Iterator[str]:

@@ -62,16 +62,8 @@ THRESHOLD_PX, MATCHED_SIGMAS = 1.0, 3.0
 class Method:
     """A named estimator of F.
 
-    Parameters
-    ----------
-    name : str
-        Name in the tables.
-    estimate : callable
-        The estimator.
-    robust : bool
-        Whether it accepts wrong matches.
-    thresholded : bool
-        Whether it uses the inlier threshold.
+    ``name``: name in the tables; ``estimate``: the estimator; ``robust``: whether it accepts wrong matches;
+    ``thresholded``: whether it uses the inlier threshold.
     """
 
     name: str
@@ -199,16 +191,9 @@ class Setting:
 class Result:
     """One method in one setting.
 
-    Attributes
-    ----------
-    matched_threshold : bool
-        Whether the inlier threshold is :data:`MATCHED_SIGMAS` times the noise.
-    rms_ratio, median_ratio : float
-        Distance of the exact points over the bound, over all trials with an F.
-    time_ms : float
-        Median processor time.
-    failures, trials : int
-        Trials without an F, and all trials.
+    ``matched_threshold``: whether the inlier threshold is :data:`MATCHED_SIGMAS` times the noise;
+    ``rms_ratio``, ``median_ratio``: distance of the exact points over the bound, over all trials with an F;
+    ``time_ms``: median processor time; ``failures``, ``trials``: trials without an F, and all trials.
     """
 
     method: str

@@ -2,8 +2,8 @@
 
 Each method runs with several seeds on three sets. ``kusvod2``: errors on hand-made correspondences;
 ``strecha``: errors on noise-free correspondences of the true cameras; ``adelaide``: inliers against labels.
-An error is the RMS distance to the epipolar lines over both images. The bounds are the best of OpenCV's two USAC
-variants, COLMAP and PoseLib; PoseLib; and the reference with the best F1.
+An error is the RMS distance to the epipolar lines over both images. The bounds are the best of OpenCV's two
+USAC variants, COLMAP and PoseLib; PoseLib; and the reference with the best F1.
 """
 
 from __future__ import annotations
@@ -177,7 +177,6 @@ def check_adelaide(methods: list[str], seeds: int) -> list[Metric]:
                 target = values[best] if best else None
                 rows.append(Metric("adelaide", name, "", values, OURS, target, at_most=False, note=note))
     return rows
-
 
 
 def epipolar_real_study(

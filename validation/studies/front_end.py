@@ -29,8 +29,6 @@ from scipy.spatial import cKDTree
 from thesisrecon import reconstruct
 from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
-from thesisrecon.geometry.camera_matrix import undistort
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.io.images import list_images, read_images
 from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
@@ -54,6 +52,7 @@ from validation.studies.front_end_pairs import (
 )
 from validation.studies.measuring import ONE_BLAS_THREAD as BLAS
 from validation.studies.measuring import call_apart
+from validation.studies.rectification import undistorted
 from validation.studies.runner import CACHE, Part, Rows, load_scene, text_table
 
 OUR_MODEL, COLMAP_MODEL = "our model", "COLMAP's"
@@ -120,16 +119,8 @@ def disagreement(view: TwoView, model: Reconstruction) -> float:
     if view.inliers == 0 or not (model.registered[view.i] and model.registered[view.j]):
         return float("nan")
     F = fundamental_from_cameras(model.P[view.i], model.P[view.j])
-    d = sampson_residuals(F, _undistorted(view.xy1, model, view.i), _undistorted(view.xy2, model, view.j))
+    d = sampson_residuals(F, undistorted(model, view.i, view.xy1), undistorted(model, view.j, view.xy2))
     return float(np.sqrt(np.mean(d**2)))
-
-
-def _undistorted(xy: F64, model: Reconstruction, i: int) -> F64:
-    assert model.K is not None
-    if model.distortion is None:
-        return xy
-    normalized = dehomogenize(homogenize(xy) @ np.linalg.inv(model.K[i]).T)
-    return dehomogenize(homogenize(undistort(normalized, model.distortion[i])) @ model.K[i].T)
 
 
 def check_kermit(run: KermitRun) -> list[Metric]:
@@ -188,14 +179,8 @@ CPU = "processor time"
 class Timed:
     """Time of one front end.
 
-    Attributes
-    ----------
-    seconds : mapping
-            Wall seconds by stage.
-    cpu_s : float
-            Processor seconds of the stages (COLMAP: of the process).
-    peak_mb : float
-            Peak memory.
+    ``seconds``: wall seconds by stage; ``cpu_s``: processor seconds of the stages (COLMAP: of the process);
+    ``peak_mb``: peak memory.
     """
 
     seconds: Mapping[str, float]
@@ -209,7 +194,7 @@ class Timed:
 
 
 def relate_all(folder: str, threads: int) -> dict[str, float]:
-    """Read, detect, prepare and match all pairs in this process; return wall seconds by stage and CPU seconds.
+    """Read, detect, prepare and match all pairs in this process; return seconds by stage.
 
     One pair is related first, so that the compiled kernels are loaded.
     """
@@ -325,14 +310,9 @@ def _scaled(rgb: U8, scale: float) -> Copy:
 class CopyScore:
     """One front end on one copy.
 
-    Attributes
-    ----------
-    repeated : float
-            Share of the corners that are found in both images.
-    corners : int
-            Corners in the part of the image that the copy shows.
-    right, verified : int
-            Verified matches within ``RIGHT_PX`` of their place, and all of them.
+    ``repeated``: share of the corners that are found in both images; ``corners``: corners in the part of
+    the image that the copy shows; ``right``, ``verified``: verified matches within ``RIGHT_PX`` of their
+    place, and all of them.
     """
 
     repeated: float

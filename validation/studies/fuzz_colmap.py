@@ -58,16 +58,9 @@ atheris.Fuzz()
 class Findings:
     """Result of one run.
 
-    Attributes
-    ----------
-    how : str
-        Random or guided.
-    inputs, kept : int
-        Inputs that were read, and new inputs that were kept.
-    branches : int
-        Branches of the reader that were reached; 0 if not counted.
-    found : str
-        Traceback and input of a finding; empty if there is none.
+    ``how``: random or guided; ``inputs``, ``kept``: inputs that were read, and new inputs that were kept;
+    ``branches``: branches of the reader that were reached; 0 if not counted; ``found``: traceback and input
+    of a finding; empty if there is none.
     """
 
     how: str

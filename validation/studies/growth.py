@@ -45,16 +45,10 @@ SHARED = 0.3
 class Growth:
     """One set and one method.
 
-    Attributes
-    ----------
-    features_s, pairs_s, matches_s, cpu_s : float
-        Wall seconds by stage, and processor seconds of all.
-    overlapping_tried : float or None
-        Tried share of the pairs known to overlap (crops of one image), None without such pairs.
-    pair_list : tuple
-        Tried pairs (i, j, accepted).
-    recall : float or None
-        Tried share of the pairs that are accepted when all are tried, None if not all were tried.
+    ``features_s``, ``pairs_s``, ``matches_s``, ``cpu_s``: wall seconds by stage, and processor seconds of
+    all; ``overlapping_tried``: tried share of the pairs known to overlap (crops of one image), None without
+    such pairs; ``pair_list``: tried pairs (i, j, accepted); ``recall``: tried share of the pairs that are
+    accepted when all are tried, None if not all were tried.
     """
 
     method: str
@@ -222,14 +216,8 @@ def _reset_peak() -> None:
 class Cost:
     """One number of images.
 
-    Attributes
-    ----------
-    cpu_s, peak_mb : mapping
-        Processor seconds and highest memory by stage.
-    counts : mapping
-        Numbers of pairs, matches, cameras and points.
-    failure : str
-        Message of a run without cameras.
+    ``cpu_s``, ``peak_mb``: processor seconds and highest memory by stage; ``counts``: numbers of pairs,
+    matches, cameras and points; ``failure``: message of a run without cameras.
     """
 
     images: int

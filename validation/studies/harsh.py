@@ -1,23 +1,18 @@
-"""Harsh image sets: trusted answers whose focal length is wrong and outside its interval.
+"""Harsh synthetic image sets: trusted answers whose focal length is wrong and outside its interval.
 
-``harsh``: random sets (:mod:`validation.scenes.harsh`) with noisy tracks and verified pairs become metric
-cameras as in the pipeline. A trusted focal length that errs by more than 3 % and by more than its 95 %
-interval is a silent error.
-``harsh-images``: tracks and verified pairs of real images, as if fewer had been taken or as if they had been
-cropped, zoomed or stretched. Noise and wrong matches are real, focal lengths are known, the assumed camera
-mode may be wrong.
+Random sets (:mod:`validation.scenes.harsh`) with noisy tracks and verified pairs become metric cameras as in
+the pipeline. A trusted focal length that errs by more than 3 % and by more than its 95 % interval is a silent
+error.
 """
 
 from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -26,8 +21,8 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from validation.scenes.dinosaur import pairs_from_tracks
 from validation.scenes.harsh import KINDS
-from validation.studies.runner import Part, Rows, scenes_here, text_table
-from validation.studies.subsets import Matched, match_scene, solve, take_views
+from validation.studies.runner import Part, Rows, text_table
+from validation.studies.subsets import Matched, solve
 
 OURS = "ours"
 OFF = 0.03
@@ -38,16 +33,9 @@ LEVEL = 1.96
 class Trial:
     """One set and its outcome.
 
-    Attributes
-    ----------
-    said : str
-        "refused", "doubted" or "trusted".
-    worst, median : float
-        Relative focal errors of the registered cameras.
-    quiet : int
-        Cameras that err by more than 3 % and by more than their 95 % intervals.
-    failed_checks : tuple of str
-        Failed checks, or the refusal.
+    ``said``: "refused", "doubted" or "trusted"; ``worst``, ``median``: relative focal errors of the
+    registered cameras; ``quiet``: cameras that err by more than 3 % and by more than their 95 % intervals;
+    ``failed_checks``: failed checks, or the refusal.
     """
 
     number: int
@@ -108,107 +96,6 @@ def focal_errors(result: MetricResult, matched: Matched) -> tuple[F64, F64]:
     return error, LEVEL * np.array([interval.std for interval in found]) / value
 
 
-SCENES = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
-CameraMode = Literal["shared", "per-image"]
-
-
-@dataclass(frozen=True)
-class Made:
-    """Affine maps x -> scale x + shift of the pixels of each view, (V, 2), and the assumed camera mode."""
-
-    scale: F64
-    shift: F64
-    cameras: CameraMode
-
-
-def _maps(sizes: F64, factors: F64, crop: F64, cameras: CameraMode) -> Made:
-    """Zoom about the middle by ``factors`` (V,) or (V, 2) and shift by ``crop`` (V, 2) image sizes."""
-    scale = np.ones((len(sizes), 2)) * np.reshape(factors, (len(sizes), -1))
-    middle = (sizes - 1.0) / 2.0
-    return Made(scale, middle - scale * middle + crop * sizes, cameras)
-
-
-def apply_map(matched: Matched, made: Made) -> Matched:
-    """Move the pixels of all views; a focal length is the geometric mean of both directions."""
-    t = matched.tracks
-    T = np.zeros((len(made.scale), 3, 3))
-    T[:, 0, 0], T[:, 1, 1], T[:, 2, 2] = made.scale[:, 0], made.scale[:, 1], 1.0
-    T[:, :2, 2] = made.shift
-    back = np.linalg.inv(T)
-    pairs = []
-    for pair in matched.pairs:
-        F = back[pair.j].T @ pair.F @ back[pair.i]
-        xy1 = made.scale[pair.i] * pair.xy1 + made.shift[pair.i]
-        xy2 = made.scale[pair.j] * pair.xy2 + made.shift[pair.j]
-        pairs.append(replace(pair, F=F / np.linalg.norm(F), xy1=xy1, xy2=xy2))
-    xy = made.scale[t.view_index] * t.xy + made.shift[t.view_index]
-    focal = matched.focal_px * np.sqrt(made.scale.prod(axis=1))
-    return replace(matched, tracks=replace(t, xy=xy), pairs=pairs, focal_px=focal)
-
-
-def _as_they_are(sizes: F64, rng: np.random.Generator) -> Made:  # noqa: ARG001 - one signature for all kinds
-    return _maps(sizes, np.ones(len(sizes)), np.zeros(2), "shared")
-
-
-def _by_turns(sizes: F64, rng: np.random.Generator) -> Made:
-    factors = np.where(np.arange(len(sizes)) % 2 == 0, 1.0, rng.uniform(1.04, 1.5))
-    return _maps(sizes, factors, np.zeros(2), "shared")
-
-
-def _one_other(sizes: F64, rng: np.random.Generator) -> Made:
-    factors = np.ones(len(sizes))
-    factors[rng.integers(len(sizes))] = rng.uniform(1.05, 1.4)
-    return _maps(sizes, factors, np.zeros(2), "shared")
-
-
-def _cropped_alike(sizes: F64, rng: np.random.Generator) -> Made:
-    return _maps(sizes, np.ones(len(sizes)), rng.uniform(-0.12, 0.12, 2), "shared")
-
-
-def _own_crops(sizes: F64, rng: np.random.Generator, cameras: CameraMode = "shared") -> Made:
-    return _maps(sizes, np.ones(len(sizes)), rng.uniform(-0.1, 0.1, (len(sizes), 2)), cameras)
-
-
-def _own_zooms(sizes: F64, rng: np.random.Generator) -> Made:
-    factors = np.exp(rng.uniform(-0.3, 0.3, len(sizes)))
-    return _maps(sizes, factors, rng.uniform(-0.1, 0.1, (len(sizes), 2)), "per-image")
-
-
-def _stretched(sizes: F64, rng: np.random.Generator) -> Made:
-    high = np.array([1.0, 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.01, 0.05)])
-    return _maps(sizes, np.tile(high, (len(sizes), 1)), np.zeros(2), "shared")
-
-
-MAKERS: Mapping[str, tuple[Callable[[F64, np.random.Generator], Made], tuple[int, int]]] = {
-    "three or four, one camera": (_as_they_are, (3, 4)),
-    "three or four, each its zoom and crop": (_own_zooms, (3, 4)),
-    "two zooms by turns, one camera assumed": (_by_turns, (5, 8)),
-    "one of another zoom, one camera assumed": (_one_other, (4, 8)),
-    "cropped alike": (_cropped_alike, (4, 8)),
-    "each cropped for itself, one camera assumed": (_own_crops, (4, 8)),
-    "each zoomed and cropped for itself": (_own_zooms, (5, 8)),
-    "stretched by 1 to 5 %": (_stretched, (5, 8)),
-}
-"""Name -> how the images are changed, and the fewest and most images."""
-
-
-def run_image_trial(matched: Matched, kind: str, number: int) -> Trial:
-    """Go from the tracks of one modified subset to the self-check."""
-    rng = np.random.default_rng([number, list(MAKERS).index(kind), 8])
-    make, (fewest, most) = MAKERS[kind]
-    count = int(rng.integers(fewest, min(most, matched.tracks.n_views) + 1))
-    # Neighbours, because few images with gaps have no common points.
-    first = int(rng.integers(0, matched.tracks.n_views - count + 1))
-    views = np.arange(first, first + count)
-    subset = take_views(matched, views, np.ones(matched.tracks.n_points, dtype=bool))
-    made = make(subset.sizes.astype(np.float64), rng)
-    config = PipelineConfig()
-    config = replace(config, intrinsics=replace(config.intrinsics, cameras=made.cameras))
-    harsh = apply_map(subset, made)
-    result, failures, _ = solve(harsh, config, seed=number, first=0)
-    return judge(number, result, failures, harsh)
-
-
 def table_row(kind: str, trials: Sequence[Trial]) -> list[object]:
     """Return one row of the table."""
     count = Counter(t.said for t in trials)
@@ -249,12 +136,3 @@ def harsh_study(trials: int = 20, workers: int = 1, kinds: Sequence[str] | None 
     chosen = [k for k in KINDS if kinds is None or any(word in k for word in kinds)]
     with ProcessPoolExecutor(workers) as pool:
         yield from _report((k, list(pool.map(partial(run_trial, k), range(trials)))) for k in chosen)
-
-
-def harsh_images_study(out: Path, trials: int = 5, scenes: Sequence[str] = SCENES) -> Iterator[Part]:
-    """Look for the same errors on real matches of images that are cropped, zoomed or stretched."""
-    sets = [match_scene(scene, out, threads=1) for scene in scenes_here(scenes)]
-    if sets:
-        yield from _report(
-            (k, [run_image_trial(m, k, n) for m in sets for n in range(trials)]) for k in MAKERS
-        )

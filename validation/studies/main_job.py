@@ -54,20 +54,10 @@ TIMED_SCENES = ("fountain-P11", "Herz-Jesus-P8")
 class Outcome:
     """Result of one method on one scene.
 
-    Attributes
-    ----------
-    reconstruction : Reconstruction or None
-            None after a failure.
-    wall_s, seconds : float, mapping
-            The time that counts, and its parts.
-    cpu_s : float
-            Processor time of the whole process.
-    failure : str
-            Message of the failure.
-    reasons : mapping
-            Unregistered image -> reason that the method gives.
-    claimed_rms_px : float or None
-            Reprojection error that the method states.
+    ``reconstruction``: none after a failure; ``wall_s``, ``seconds``: the time that counts, and its parts;
+    ``cpu_s``: processor time of the whole process; ``failure``: message of the failure; ``reasons``:
+    unregistered image -> reason that the method gives; ``claimed_rms_px``: reprojection error that the
+    method states.
     """
 
     reconstruction: Reconstruction | None
@@ -101,7 +91,7 @@ def check_reconstruction(
         quantities: tuple[tuple[str, str, Callable[[CameraErrors], float | None], float | None], ...] = (
             ("focal error", "%", lambda e: e.focal_error_pct, focal),
             ("principal point error", "px", lambda e: e.principal_point_error_px, None),
-            ("mean camera-centre error", "mm", _centre_mm, centre),
+            ("mean camera-centre error", "mm", centre_mm_of, centre),
             ("median rotation error", "deg", lambda e: e.rotation_error_deg, None),
         )
         for label, unit, read, bound in quantities:
@@ -119,7 +109,8 @@ def check_reconstruction(
     return rows
 
 
-def _centre_mm(errors: CameraErrors) -> float | None:
+def centre_mm_of(errors: CameraErrors) -> float | None:
+    """Return the mean error of the camera centres in millimetres."""
     return None if errors.centre_error is None else 1000.0 * errors.centre_error
 
 

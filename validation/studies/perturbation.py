@@ -98,18 +98,9 @@ def disturbed(config: PipelineConfig, stage: str, repeat: int) -> PipelineConfig
 class Moved:
     """Distance of one perturbed result from the unperturbed one.
 
-    Attributes
-    ----------
-    intrinsics_std : float
-        Largest movement of an intrinsic in its standard deviations.
-    centres_rel : float
-        Mean movement of the camera centres over their spread.
-    rotation_deg : float
-        Median rotation.
-    registered : int
-        Views that only one result registered.
-    points_rel : float
-        Relative change of the number of points.
+    ``intrinsics_std``: largest movement of an intrinsic in its standard deviations; ``centres_rel``: mean
+    movement of the camera centres over their spread; ``rotation_deg``: median rotation; ``registered``:
+    views that only one result registered; ``points_rel``: relative change of the number of points.
     """
 
     intrinsics_std: float

@@ -22,7 +22,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -51,7 +51,7 @@ def torn(descriptor):
         os.kill(os.getpid(), signal.SIGKILL)
     sync(descriptor)
 os.fsync = torn
-from thesisrecon.cli import run_command
+from thesisrecon.cli.main import run_command
 sys.exit(run_command(sys.argv[1:]))
 """
 """Program that kills itself with its n-th file half written."""
@@ -172,18 +172,9 @@ GRACE_S = 0.5
 class Stop:
     """An interrupted run.
 
-    Attributes
-    ----------
-    seconds : float
-        From the signal to the end.
-    code, said : int, str
-        Exit code and error stream.
-    left : int
-        Processes left behind.
-    kept : int
-        Finished stage files.
-    different : tuple of str
-        Outputs that differ after the resume.
+    ``seconds``: from the signal to the end; ``code``, ``said``: exit code and error stream; ``left``:
+    processes left behind; ``kept``: finished stage files; ``different``: outputs that differ after the
+    resume.
     """
 
     when: str
@@ -309,16 +300,8 @@ SMALL_MODEL = ["--set", "dense.max_side=160", "--set", "dense.match_side=160"]
 class Refusal:
     """A run that could not write.
 
-    Attributes
-    ----------
-    when : str
-        Where the disk was full or read-only.
-    code, said : int, str
-        Exit code and error stream.
-    strange : tuple of str
-        Files that a whole run does not have.
-    different : tuple of str
-        Outputs that differ after the resume.
+    ``when``: where the disk was full or read-only; ``code``, ``said``: exit code and error stream;
+    ``strange``: files that a whole run does not have; ``different``: outputs that differ after the resume.
     """
 
     when: str
@@ -471,6 +454,15 @@ def refusal_table(rows: Sequence[Refusal]) -> str:
     return text_table(["the run could not write", "exit code", "message", "wrong"], cells)
 
 
+def _printed(rows: Iterable[Any]) -> list[Any]:
+    """Collect the rows and print each on the error stream."""
+    found = []
+    for row in rows:
+        found.append(row)
+        print(row, file=sys.stderr, flush=True)
+    return found
+
+
 def _count(scene: str, name: str, wrong: int, total: int) -> Rows:
     rows = Rows(scene, "ours")
     rows.add(f"{name}, of {total}", wrong, at_most=0.0)
@@ -490,10 +482,7 @@ def kill_anywhere_study(
         Runs killed in the middle of a write.
     """
     options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
-    rows = []
-    for row in kill_runs(Runs(out, options), kills, writes):
-        rows.append(row)
-        print(row, file=sys.stderr, flush=True)
+    rows = _printed(kill_runs(Runs(out, options), kills, writes))
     yield kill_table(rows)
     yield _count("killed runs", "runs that differ", sum(bool(r.different) for r in rows), len(rows))
 
@@ -530,10 +519,7 @@ def stop_anywhere_study(
     asked = signal.Signals[f"SIG{signal_}"]
     options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
     options += ["--executor", executor, *(word for value in set_ for word in ("--set", value))]
-    rows = []
-    for row in stop_runs(Runs(out, options, images), moments, asked, cold=cold):
-        rows.append(row)
-        print(row, file=sys.stderr, flush=True)
+    rows = _printed(stop_runs(Runs(out, options, images), moments, asked, cold=cold))
     yield stop_table(rows, asked)
     yield _count("interrupted runs", "runs with faults", sum(bool(r.wrong(asked)) for r in rows), len(rows))
 
@@ -552,9 +538,6 @@ def full_disk_study(
     views : int
         Number of images.
     """
-    rows = []
-    for row in refuse_runs(SmallRuns(out, views, max_size, until), every, disks):
-        rows.append(row)
-        print(row, file=sys.stderr, flush=True)
+    rows = _printed(refuse_runs(SmallRuns(out, views, max_size, until), every, disks))
     yield refusal_table(rows)
     yield _count("runs without room", "runs with faults", sum(bool(r.wrong) for r in rows), len(rows))

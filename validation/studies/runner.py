@@ -51,7 +51,6 @@ MODULES = {
     "growth": "growth",
     "growth-of-cost": "growth",
     "harsh": "harsh",
-    "harsh-images": "harsh",
     "initial-cameras": "projective",
     "interpolation": "interpolation",
     "kill-anywhere": "robustness",
@@ -72,7 +71,6 @@ MODULES = {
     "surfaces": "surfaces",
     "tensor-views": "tensor_views",
     "triangulation": "triangulation",
-    "trifocal": "trifocal",
 }
 """Name of a study -> the module of this folder that holds its function."""
 CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
@@ -87,6 +85,7 @@ HELP = {
     "parts": "parts of the study (default: all)",
     "points": "numbers of points or matches",
     "repeats": "repetitions; the least or the median counts",
+    "results": "JSON file whose rows are kept, and replaced by those of this run",
     "scenes": "names of image sets (default: all on this machine)",
     "seed": "random seed",
     "seeds": "random seeds, or their number",

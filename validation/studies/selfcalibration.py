@@ -30,8 +30,8 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for, prior_from_options
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.records import Image, Reconstruction
-from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
@@ -83,13 +83,9 @@ class Cell:
 class Trial:
     """One method on one draw.
 
-    Attributes
-    ----------
-    median_pct, worst_pct : float
-        Median and largest |f / f_true - 1| over the cameras that see more than a plane, NaN after a refusal.
-        For the bound, 0.6745 times the Cramer-Rao standard deviation: the median of |error|.
-    sure : bool
-        Whether the method calls its result identifiable (the whole: trusted).
+    ``median_pct``, ``worst_pct``: median and largest |f / f_true - 1| over the cameras that see more than a
+    plane, NaN after a refusal. For the bound, 0.6745 times the Cramer-Rao standard deviation: the median of
+    |error|; ``sure``: whether the method calls its result identifiable (the whole: trusted).
     """
 
     scene: str
@@ -337,14 +333,8 @@ K_METHODS: dict[str, LinearAbsoluteConic | FixedPlaneQuadric] = {
 class Row:
     """One method on one image set.
 
-    Attributes
-    ----------
-    focal_pct : float
-        Focal error, median over the views.
-    principal_px : float
-        Error of the principal point.
-    refusal : str
-        Reason of a refusal.
+    ``focal_pct``: focal error, median over the views; ``principal_px``: error of the principal point;
+    ``refusal``: reason of a refusal.
     """
 
     plane: str

@@ -34,7 +34,7 @@ MODES: tuple[Mode, ...] = ("shared", "per-image")
 SUCCESS_PCT = 3.0
 LEAST_SUCCESS = 0.98
 MIN_VIEWS, MAX_VIEWS = 5, 8
-SHIFTED_REASONS = ("pure translation", "leaves the focal length open", "at least 3 registered images")
+SHIFTED_REASONS = ("pure translation", "not determine the focal length", "at least 3 registered images")
 LEAST_SHARE = 0.3
 LATEST_START = 4
 
@@ -43,14 +43,8 @@ LATEST_START = 4
 class Matched:
     """An image set after its front end.
 
-    Attributes
-    ----------
-    sizes : (V, 2)
-        Image sizes.
-    focal_px : (V,)
-        True focal lengths at working size.
-    reasons : tuple of str
-        Accepted reasons of a refusal; empty if any reason will do.
+    ``sizes`` (V, 2): image sizes; ``focal_px`` (V,): true focal lengths at working size; ``reasons``:
+    accepted reasons of a refusal; empty if any reason will do.
     """
 
     name: str
@@ -70,14 +64,9 @@ an answer) for an accepted reason or another one; within 3 % and not trusted; wr
 class Trial:
     """One subset and its outcome.
 
-    Attributes
-    ----------
-    median_pct, worst_pct : float
-        Focal errors over the registered cameras, NaN without an answer.
-    failed_checks : tuple of str
-        Empty if the answer is trusted.
-    interval_pct : float
-        Half of the median 95 % interval of the focal lengths.
+    ``median_pct``, ``worst_pct``: focal errors over the registered cameras, NaN without an answer;
+    ``failed_checks``: empty if the answer is trusted; ``interval_pct``: half of the median 95 % interval of
+    the focal lengths.
     """
 
     number: int
@@ -156,7 +145,7 @@ def solve(
     Returns
     -------
     tuple
-        The first trusted result, else the one with most cameras, or None; the failures; the number of attempts.
+        The first trusted result, else the one with most cameras; the failures; the number of attempts.
     """
     n = len(matched.sizes)
     sizes = [(int(width), int(height)) for width, height in matched.sizes]

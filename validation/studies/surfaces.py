@@ -20,7 +20,7 @@ from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera
 from thesisrecon.records import DepthMap
 from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.linear import DepthSurface, LinearSurface, surface_normals, resample_surface
+from thesisrecon.surface.linear import DepthSurface, LinearSurface, resample_surface, surface_normals
 from validation.metrics.depth import SAME, true_depth, true_from_maps
 from validation.metrics.record import Metric
 from validation.scenes.real import Scene, load_fixture_scene

@@ -119,18 +119,9 @@ def squared_distances(P: F64, X: F64, xy: F64) -> F64:
 class DrawnRig:
     """One draw.
 
-    Attributes
-    ----------
-    G : (4, 4)
-        Transform of space.
-    P : (V, 3, 4)
-        Cameras in the transformed frame.
-    xy : (V, N, 2)
-        Noisy pixels.
-    X : (N, 3)
-        True points before the transform.
-    centre : (3,)
-        Centre of the first camera.
+    ``G`` (4, 4): transform of space; ``P`` (V, 3, 4): cameras in the transformed frame; ``xy`` (V, N, 2):
+    noisy pixels; ``X`` (N, 3): true points before the transform; ``centre`` (3,): centre of the first
+    camera.
     """
 
     G: F64

@@ -32,7 +32,7 @@ print(f"{{spent.ru_utime + spent.ru_stime:.3f}}", file=sys.stderr)
 """
 COMMAND = """
 import contextlib, io
-from thesisrecon.cli import run_command
+from thesisrecon.cli.main import run_command
 with contextlib.redirect_stdout(io.StringIO()):
     run_command({!r})
 """
@@ -111,7 +111,7 @@ def log_event(event, given):
     elif event in ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn"):
         say("process", f"{event} {given[0]}")
 sys.addaudithook(log_event)
-from thesisrecon.cli import main
+from thesisrecon.cli.main import main
 sys.argv[0] = "thesisrecon"
 main()
 """
@@ -122,16 +122,8 @@ main()
 class Watched:
     """A watched run.
 
-    Attributes
-    ----------
-    code, said : int, str
-            Exit code and output.
-    written : frozenset of Path
-            Written files.
-    network, processes : tuple of str
-            Network calls and started programs.
-    left : tuple of Path
-            Files in the watched folders after the run.
+    ``code``, ``said``: exit code and output; ``written``: written files; ``network``, ``processes``:
+    network calls and started programs; ``left``: files in the watched folders after the run.
     """
 
     code: int
