@@ -20,7 +20,7 @@ from validation.studies import main_job
 from validation.studies.main_job import COLMAP, OURS
 from validation.studies.runner import run_study
 
-from .test_cameras import N, V, _reconstruction, _truth
+from .test_metrics import N, V, _reconstruction, _truth
 
 
 def test_a_process_reports_memory_time_and_output(tmp_path):
