@@ -161,7 +161,7 @@ def test_3_4_2_cross_ratio_at_the_base_point_and_where_it_does_not_exist():
     assert cross_ratio(x[[0, 1, 2, 0]]) == np.inf
     with pytest.raises(ValueError, match="three of the four"):
         cross_ratio(x[[0, 0, 0, 1]])
-    with pytest.raises(ValueError, match="one line"):
+    with pytest.raises(ValueError, match="collinear"):
         cross_ratio(np.eye(4))
     with pytest.raises(ValueError, match="four finite points"):
         cross_ratio(np.eye(3))

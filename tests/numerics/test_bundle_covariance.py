@@ -52,7 +52,7 @@ def test_the_banded_way_gives_the_covariances_of_the_dense_one(monkeypatch, popu
         )
 
     dense = fit()
-    monkeypatch.setattr(bundle_covariance, "DENSE", 0)
+    monkeypatch.setattr(bundle_covariance, "MAX_DENSE", 0)
     banded = fit()
     scale = np.abs(dense.intrinsics_covariance).max(axis=0) + 1e-30
     assert (np.abs(banded.intrinsics_covariance - dense.intrinsics_covariance) / scale).max() < 1e-3

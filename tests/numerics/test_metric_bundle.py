@@ -239,7 +239,7 @@ def test_wrong_calls_are_refused():
             _refine(cameras, block.X, observations, free=FOCAL, prior=prior, **options)
 
     refused("metric bundle needs", MetricCameras(c.R, c.t[:2], q, c.group))
-    refused("shared has a number", MetricCameras(c.R, c.t, q, c.group, np.zeros(6, dtype=np.int64)))
+    refused("shared needs the shape", MetricCameras(c.R, c.t, q, c.group, np.zeros(6, dtype=np.int64)))
     refused("groups must lie", MetricCameras(c.R, c.t, q, c.group + 1))
     refused("observations need", observations=Observations(block.view, block.point[1:], block.xy))
     refused("fixed_views is one flag", fixed_views=np.zeros(3, bool))
@@ -348,7 +348,7 @@ def test_the_population_is_the_quadratic_form_of_deviations_from_its_mean():
     prior = IntrinsicsPrior.unshared(cameras.intrinsics, std, kind=population, spread=spread)
     values, x, table = number_unknowns(cameras, np.ones(6, bool), FOCAL, prior)
     np.testing.assert_allclose(table, cameras.intrinsics, rtol=1e-14)
-    assert (values.seen, values.size) == (5, 6)
+    assert (values.n_table, values.size) == (5, 6)
     log_f = np.log(cameras.intrinsics[:4, 0])
     x[-1] = log_f.mean()
     expected = np.sum((log_f - log_f.mean()) ** 2) / 0.05**2 / 2.0

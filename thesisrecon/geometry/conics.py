@@ -162,7 +162,7 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
         float(bilinear_form(C, y, y)),
     )
     size = max(abs(sxx), abs(sxy), abs(syy))
-    # Each of the three forms is known to some 1e-15, being of unit vectors.
+    # The forms of unit vectors have rounding errors of about 1e-15.
     discriminant, rounding = sxy**2 - sxx * syy, 1e-14 * size
     if size <= 1e-15 or discriminant < -rounding:
         return np.zeros((0, len(x)))
@@ -357,7 +357,9 @@ def calibration_from_dual_image(dual_image: F64) -> F64:
     try:
         lower = np.linalg.cholesky((symmetric / symmetric[2, 2])[::-1, ::-1])
     except np.linalg.LinAlgError as error:
-        raise ValueError("calibration_from_dual_image needs a definite conic; no camera has this") from error
+        raise ValueError(
+            "calibration_from_dual_image needs a definite conic; no real camera has this image"
+        ) from error
     K = lower[::-1, ::-1]
     return np.asarray(K / K[2, 2])
 

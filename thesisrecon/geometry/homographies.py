@@ -28,7 +28,7 @@ def image_from_plane(P: F64, plane: F64) -> F64:
         The plane contains the origin, so that x is no coordinate; use :func:`plane_homography`.
     """
     if not abs(plane[3]) > 1e-14 * np.linalg.norm(plane):
-        raise ValueError("image_from_plane needs a plane that does not hold the origin")
+        raise ValueError("image_from_plane needs a plane that does not contain the origin")
     return np.asarray(P[:, :3] - np.outer(P[:, 3], plane[:3] / plane[3]))
 
 
@@ -62,7 +62,7 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
     P1, P2, plane = (checked_unit(array, "plane_homography") for array in (P1, P2, plane))
     centre = checked_unit(camera_centre(P1), "plane_homography, for the centre of its first camera,")
     if not abs(plane @ centre) > 1e-14:
-        raise ValueError("plane_homography needs a plane that does not hold the first camera's centre")
+        raise ValueError("plane_homography needs a plane that does not contain the first camera's centre")
     meet = (plane @ centre) * np.eye(4) - np.outer(centre, plane)
     return unit_norm(np.asarray(P2 @ meet @ np.linalg.pinv(P1)))
 
@@ -235,7 +235,7 @@ def plane_of_homography(H: F64, P2: F64) -> tuple[F64, float]:
     squared = float(m @ m)
     if not squared > 1e-28 * float(np.sum(M**2)):
         raise ValueError("plane_of_homography needs cameras with different centres")
-    # Orthogonally to m the unknown plane has no effect, so s is found there alone.
+    # The unknown plane has no effect orthogonally to m, which determines s.
     away = np.eye(3) - np.outer(m, m) / squared
     h, g = away @ H, away @ M
     size = float(np.sum(h**2))

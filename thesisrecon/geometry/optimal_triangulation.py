@@ -58,7 +58,7 @@ def _root_between(c: F64, low: float, high: float, rising: bool) -> float:
         moved = x - value / slope
         if not low < moved < high:
             moved = 0.5 * (low + high)
-        # Both neighbours of the limit have been seen: nothing lies between.
+        # The bracket has no number between its ends.
         if abs(moved - x) <= 1e-16 + 2e-16 * abs(x):
             break
         x = moved
@@ -156,7 +156,7 @@ def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
     if whole:
         for k in range(DEGREE + 1):
             backward[k] = c[DEGREE - k]
-        # The reversed polynomial may vanish at 0 without a change of sign there: infinity is tried anyway.
+        # The reversed polynomial may vanish at 0 without a sign change: infinity is always tried.
         count = roots_in_unit_interval(backward, roots)
         roots[count] = 0.0
         for k in range(count + 1):
@@ -428,7 +428,7 @@ def _pencil(P: F64, to: F64) -> _Pencil:
     if not s[3] > _RANK * s[0]:
         raise ValueError("the polynomial method needs two cameras with different centres")
     Q = np.ascontiguousarray(U.reshape(2, 3, 4))
-    # Eigenvalues 0 and 1 belong to the centres of the second and the first camera, which the other one sees.
+    # Eigenvalues 0 and 1 belong to the centres of the second and the first camera.
     values, vectors = np.linalg.eigh(Q[1].T @ Q[1])
     if not (values[1] > _RANK and 1.0 - values[2] > _RANK):
         raise ValueError("the polynomial method needs cameras of rank 3")

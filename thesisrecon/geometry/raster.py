@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32
 
-# Sums may be reordered; assuming that no NaN exists would undo the bounds checks.
+# Sums may be reordered; the flag "nnan" would remove the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 

@@ -357,13 +357,13 @@ def cross_ratio(X: F64, *, tolerance: float = 1e-6) -> float:
     unit = X / np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300)
     _, s, Vt = np.linalg.svd(unit)
     if len(s) > 2 and s[2] > tolerance:
-        raise ValueError(f"cross_ratio needs points of one line; they miss it by {s[2]:.2g}")
+        raise ValueError(f"cross_ratio needs collinear points; they deviate by {s[2]:.2g}")
     a, b = Vt[:2] @ unit.T
     difference = np.outer(a, b) - np.outer(b, a)
     above = difference[0, 2] * difference[1, 3]
     below = difference[0, 3] * difference[1, 2]
     if max(abs(above), abs(below)) < 1e-24:
-        raise ValueError("cross_ratio does not exist where three of the four points are one")
+        raise ValueError("cross_ratio does not exist if three of the four points are equal")
     return float(above / below) if below != 0.0 else np.inf
 
 

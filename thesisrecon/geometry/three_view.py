@@ -508,7 +508,7 @@ def _line_moves(ends: F64) -> F64:
     """Derivatives (M, 2, 3) of the unit-normal lines through ends (M, 2, 3) by a move of each across them."""
     along = (ends[:, 1] - ends[:, 0])[:, :2]
     along = along / np.sum(along**2, axis=1, keepdims=True)
-    # The share of the other end in a point of the line, as a function of the point.
+    # Weight of the other end in a point of the line, as a function of the point.
     share = np.column_stack([along, -np.sum(along * ends[:, 0, :2], axis=1)])
     return np.stack([np.eye(3)[2] - share, share], axis=1)
 
@@ -541,7 +541,7 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
     if not (np.isfinite(points).all() and np.isfinite(segments).all()):
         raise ValueError("points and segments must be finite; some are NaN or infinite")
     if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > LARGEST_PX:
-        raise ValueError(f"points and segments must be pixels of an image; some exceed {LARGEST_PX:g}")
+        raise ValueError(f"points and segments must be pixels of an image; some are beyond {LARGEST_PX:g}")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
     return points, segments

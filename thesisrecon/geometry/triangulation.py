@@ -460,7 +460,7 @@ def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
         "optimal": triangulate_optimal,
     }
     if method not in methods:
-        raise ValueError(f"triangulate knows {', '.join(methods)}; got method={method!r}")
+        raise ValueError(f"method must be one of {', '.join(methods)}; got {method!r}")
     return methods[method](*_checked(P, xy))
 
 
@@ -526,7 +526,7 @@ def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
     P = np.ascontiguousarray(P, dtype=np.float64)
     counts = np.maximum(np.bincount(view, minlength=len(P)), 1)
     middle = np.stack([np.bincount(view, xy[:, i], minlength=len(P)) / counts for i in range(2)], axis=1)
-    # The fourth column would bring in where the origin of space lies.
+    # The fourth column would depend on the origin of space.
     size = np.linalg.norm(P[:, :2, :3] - middle[:, :, None] * P[:, 2:, :3], axis=(1, 2))
     X = np.empty((len(start) - 1, 4))
     _triangulate_each_linear(P, 1.0 / np.where(size > 0.0, size, 1.0), start, view, xy, passes, _AT_REST, X)

@@ -393,7 +393,7 @@ def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -
 
 
 PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
-"""Least displacement not explained by a homography (90 % quantile): over the epipolar distances, and in px."""
+"""Least displacement that no homography explains (90 % quantile), over the epipolar distances and in px."""
 
 
 def require_parallax_of_matches(

@@ -191,7 +191,7 @@ def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
             right, below = min(left + 1, width - 1), min(top + 1, height - 1)
             s, t = u - np.float32(left), v - np.float32(top)
             for k in range(3):
-                # Differences of whole numbers without a sign would wrap around.
+                # Differences of unsigned integers would wrap around.
                 a, b = np.float32(texture[top, left, k]), np.float32(texture[top, right, k])
                 c, d = np.float32(texture[below, left, k]), np.float32(texture[below, right, k])
                 upper, lower = a + s * (b - a), c + s * (d - c)

@@ -1,1 +1,1 @@
-"""Optimisation and robust statistics."""
+"""Estimation: losses, Levenberg-Marquardt, bundle adjustment with its covariances, noise, RANSAC."""

@@ -1,10 +1,10 @@
-"""How far parts of the scene contradict each other after bundle adjustment, against what noise lets expect.
+"""Contradictions between parts of the scene after bundle adjustment, compared with the expected noise.
 
-The covariance of a bundle adjustment is right for independent noise of one size and a right camera model.
-Matches of photographs err together, their noise has heavy tails, and lenses have more coefficients than a
-model. What remains visible of that is that the points of one part of the scene want other cameras than those
-of the next: their gradients, summed by parts, are larger than independent noise would make them (the sandwich
-covariance of Huber 1967 and White 1980, its terms summed by clusters; Liang and Zeger 1986).
+The covariance of a bundle adjustment is right for independent noise of one size and a correct camera model.
+Matches of images have correlated errors and heavy tails, and lenses have more coefficients than the model.
+These effects appear as disagreement between parts of the scene: gradients summed by parts are larger than
+independent noise allows (the sandwich covariance of Huber 1967 and White 1980, its terms summed by clusters;
+Liang and Zeger 1986).
 """
 
 from __future__ import annotations
@@ -23,20 +23,24 @@ from thesisrecon.numerics.losses import LOSS_CODES
 from thesisrecon.numerics.metric_cameras import POSE_DOF, MetricCameras, MetricModel, linearize_metric
 from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
 
-# Unknowns of poses that take part in the judgement beside all of the intrinsics.
+# Number of pose unknowns tested besides all intrinsics.
 MAX_POSES = 30
 
 
 @dataclass(frozen=True)
 class BlockScatter:
-    """Variances of the intrinsics after a bundle adjustment and how far the data contradict them.
+    """Variances of the intrinsics and their scatter between blocks of points.
 
-    ``model`` (G, C) as the information matrix has it for noise of the given sigma, the focal's relative;
-    ``shared_variance`` (C,) the same were one camera behind all photographs, 0 for what does not move;
-    ``ratio`` (G, C) by how much the scatter between blocks of points exceeds it, NaN for what does not move;
-    ``contradiction`` how much larger the scatter between blocks is, over all unknowns, than that between
-    single points lets expect: 1 where the noise of different points is independent, whatever its
-    distribution. ``blocks`` how many blocks speak.
+    Attributes
+    ----------
+    variance : ndarray (G, C)
+        Variances by the information matrix for the given noise, relative for the focal length.
+    shared_variance : ndarray (C,), variances if all views shared one camera, 0 for fixed intrinsics
+    ratio : ndarray (G, C), scatter between blocks of points over its expectation, NaN for fixed intrinsics
+    overdispersion : float
+        Scatter between blocks over that between single points, for all unknowns: 1 if the noise of different
+        points is independent, for any distribution.
+    blocks : int, number of blocks
     """
 
     variance: F64
@@ -47,16 +51,24 @@ class BlockScatter:
 
     @property
     def median_ratio(self) -> float:
-        """The median of the ratios, 1 where there is none."""
+        """Median of the ratios, 1 without any."""
         known = self.ratio[np.isfinite(self.ratio)]
         return float(np.median(known)) if len(known) else 1.0
 
 
 def point_blocks(X: F64, used: B8, *, most: int = 32, least_points: int = 12) -> I64:
-    """(N,) number of the block of neighbours in space that a point belongs to, -1 where it is not ``used``.
+    """Divide points into blocks of neighbours by median splits along the longest robust axis.
 
-    Median splits along the longest axis, robust against far points; at most ``most`` blocks (a power of two)
-    of at least ``least_points`` points.
+    Parameters
+    ----------
+    X : ndarray (N, 3), points
+    used : ndarray (N,) of bool, points to divide
+    most : int, largest number of blocks, a power of two
+    least_points : int, least points in a block
+
+    Returns
+    -------
+    ndarray (N,) of int, block of each point, -1 if not used
     """
     block = np.where(used, 0, -1)
     count = 1
@@ -73,8 +85,11 @@ def point_blocks(X: F64, used: B8, *, most: int = 32, least_points: int = 12) ->
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Weighted residuals (2K,) at the optimal points, their sparse Jacobian on the cameras (2K, D), what the
-    elimination of the points takes from it (3N, D), and which point each residual is of."""
+    """Linearised bundle with the points eliminated.
+
+    Weighted residuals (2K,) at the optimal points, sparse Jacobian by the cameras (2K, D), the part ``taken``
+    by the elimination of the points (3N, D), and the point of each residual.
+    """
 
     residual: F64
     J: scipy.sparse.csr_matrix
@@ -91,15 +106,26 @@ def block_scatter(
     prior: IntrinsicsPrior,
     noise: tuple[float, float],
 ) -> BlockScatter:
-    """Scatter of the blocks' pulls on the intrinsics at the end of a bundle adjustment.
+    """Measure the scatter of the intrinsics' gradients between blocks of points.
 
     With S_b the information of block b on the cameras (its points eliminated), g_b its gradient and C the
-    covariance, the pull of a block on value a is c_a' g_b, and without any correlation between blocks sum
-    (c_a' g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a: the ratio of the two is 1. Huber's loss
-    weighs as if its weight were its slope; the ratio of their means corrects the covariance for it.
+    covariance, the pull of a block on value a is c_a' g_b; without correlation between blocks sum (c_a'
+    g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a, and the ratio of the two is 1. Huber's loss
+    weights as if its weight were its slope; the ratio of their means corrects the covariance. The matrix of
+    all cameras is dense: for a few hundred of them.
 
-    Arguments are those of :func:`refine_metric_bundle`; ``noise`` its sigma and the turn of Huber's loss, px.
-    The matrix of all cameras is dense here: meant for a few hundred of them.
+    Parameters
+    ----------
+    cameras : MetricCameras, cameras after the adjustment
+    X : ndarray (N, 3), points after the adjustment
+    observations : Observations, observations
+    free : ndarray (C,) of bool, intrinsics that move
+    prior : IntrinsicsPrior, prior of the intrinsics
+    noise : tuple of float, sigma and the turning point of Huber's loss, px
+
+    Returns
+    -------
+    BlockScatter, variances and their scatter
     """
     o, group = observations, np.asarray(cameras.group)
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
@@ -107,30 +133,30 @@ def block_scatter(
     values = number_unknowns(cameras, used, np.asarray(free, dtype=bool), prior)[0]
     views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
     frame = _centred(cameras, X, o)
-    found = _linearise(*frame, o, (values, np.where(observed, np.cumsum(observed) - 1, -1)), noise)
-    S = (found.J.T @ found.J).toarray() - (found.taken.T @ found.taken).toarray()
+    system = _linearise(*frame, o, (values, np.where(observed, np.cumsum(observed) - 1, -1)), noise)
+    S = (system.J.T @ system.J).toarray() - (system.taken.T @ system.taken).toarray()
     S[first:, first:] += values.terms.information(values.size)
     C = _covariance(S, frame[0], views)
     poses = np.arange(0, first, max(first // MAX_POSES, 1))
-    chosen = np.concatenate([poses, np.arange(first, len(C))])
+    tested = np.concatenate([poses, np.arange(first, len(C))])
     block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
-    curvature = _loss_correction(found.residual.reshape(-1, 2), noise[1] / noise[0])
-    ratio = curvature * _block_ratio(found, C[chosen], C, block)
-    alone = curvature * _point_ratio(found, C[chosen])
-    judged = np.isfinite(ratio) & (alone > 0.0)
+    curvature = _loss_correction(system.residual.reshape(-1, 2), noise[1] / noise[0])
+    ratio = curvature * _block_ratio(system, C[tested], C, block)
+    alone = curvature * _point_ratio(system, C[tested])
+    valid = np.isfinite(ratio) & (alone > 0.0)
     number = values.number
     place = np.maximum(number, 0)
     return BlockScatter(
         np.where(number >= 0, np.diag(C)[first + place], 0.0),
-        _tied_variances(S, values, frame[0], views),
+        _shared_variances(S, values, frame[0], views),
         np.where(number >= 0, ratio[len(poses) + place], np.nan),
-        float(np.mean(ratio[judged]) / np.mean(alone[judged])) if judged.any() else np.nan,
+        float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
     )
 
 
 def _centred(cameras: MetricCameras, X: F64, o: Observations) -> tuple[MetricCameras, F64]:
-    """The same scene in the middle of the frame and of size 1, for the numbers' sake."""
+    """Return the scene centred and scaled to size 1."""
     origin, scale = scene_frame(X[np.unique(o.point_index)])
     t = scale * (cameras.t + cameras.R @ origin)
     return replace(cameras, t=t), scale * (X - origin)
@@ -167,7 +193,7 @@ def _linearise(
 
 
 def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:
-    """Rows (2K, width) with values (K, 2, n) in the columns (K, n)."""
+    """Return rows (2K, width) with values (K, 2, n) in the columns (K, n)."""
     K, _, n = values.shape
     rows = np.repeat(np.arange(2 * K), n)
     return scipy.sparse.csr_matrix(
@@ -176,7 +202,7 @@ def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:
 
 
 def _orthonormal(B: F64, point: I64, n: int) -> F64:
-    """B (K, 2, 3) times the inverse root of its points' information: their columns become orthonormal."""
+    """Return B (K, 2, 3) times the inverse root of its points' information: orthonormal columns."""
     outer = np.einsum("kra,krb->kab", B, B).reshape(-1, 9)
     V = np.stack([np.bincount(point, c, minlength=n) for c in outer.T], axis=1).reshape(n, 3, 3)
     w, U = np.linalg.eigh(V)
@@ -185,15 +211,15 @@ def _orthonormal(B: F64, point: I64, n: int) -> F64:
 
 
 def _covariance(S: F64, cameras: MetricCameras, views: I64) -> F64:
-    """The inverse of S without the freedoms of the frame."""
+    """Return the inverse of S without the gauge freedoms."""
     poses = gauge_directions(cameras.R[views], cameras.t[views])
     N = np.zeros((len(S), poses.shape[1]))
     N[: len(poses)] = poses
     return invert_in_inner_gauge(S, N)
 
 
-def _tied_variances(S: F64, values: IntrinsicUnknowns, cameras: MetricCameras, views: I64) -> F64:
-    """(C,) variances of the intrinsics were all cameras one."""
+def _shared_variances(S: F64, values: IntrinsicUnknowns, cameras: MetricCameras, views: I64) -> F64:
+    """Return the variances (C,) of the intrinsics if all cameras were one."""
     first = len(S) - values.size
     column = values.column[: values.n_table]
     T = np.zeros((len(S), first + values.number.shape[1]))
@@ -201,37 +227,40 @@ def _tied_variances(S: F64, values: IntrinsicUnknowns, cameras: MetricCameras, v
     T[first + np.arange(values.n_table), first + column] = 1.0
     moves = np.concatenate([np.ones(first, dtype=bool), np.isin(np.arange(values.number.shape[1]), column)])
     C = _covariance(T[:, moves].T @ S @ T[:, moves], cameras, views)
-    tied = np.zeros(T.shape[1])
-    tied[moves] = np.diag(C)
-    return tied[first:]
+    shared = np.zeros(T.shape[1])
+    shared[moves] = np.diag(C)
+    return shared[first:]
 
 
-def _block_ratio(found: _Linearised, rows: F64, C: F64, block: I64) -> F64:
-    """Squared pulls of the blocks on some unknowns (``rows`` of C) over what independent noise gives them
-    after the fit, the diagonal of sum C (S_b - S_b C S_b) C; NaN where that is nothing."""
+def _block_ratio(system: _Linearised, rows: F64, C: F64, block: I64) -> F64:
+    """Return squared pulls of the blocks on some unknowns (``rows`` of C) over their expectation.
+
+    The expectation for independent noise after the fit is the diagonal of sum C (S_b - S_b C S_b) C; NaN if
+    it is 0.
+    """
     squares, expected = np.zeros(len(rows)), np.zeros(len(rows))
-    of_residual, of_point = block[found.point], np.repeat(block, 3)
+    of_residual, of_point = block[system.point], np.repeat(block, 3)
     for b in range(int(block.max()) + 1):
         here = np.flatnonzero(of_residual == b)
-        J, taken = found.J[here], found.taken[np.flatnonzero(of_point == b)]
+        J, taken = system.J[here], system.taken[np.flatnonzero(of_point == b)]
         half = (J.T @ (J @ rows.T) - taken.T @ (taken @ rows.T)).T
         expected += np.sum(half * rows, axis=1) - np.sum((half @ C) * half, axis=1)
-        squares += (rows @ (J.T @ found.residual[here])) ** 2
+        squares += (rows @ (J.T @ system.residual[here])) ** 2
     return np.where(expected > 0.0, squares / np.maximum(expected, 1e-300), np.nan)
 
 
-def _point_ratio(found: _Linearised, rows: F64) -> F64:
-    """The same with every point a block of its own, whose part in the fit is nothing."""
+def _point_ratio(system: _Linearised, rows: F64) -> F64:
+    """Return the same ratio with every point a block of its own, whose effect on the fit is negligible."""
     squares = np.zeros(len(rows))
     for n, c in enumerate(rows):
-        squares[n] = np.sum(np.bincount(found.point, (found.J @ c) * found.residual) ** 2)
-    # Not the variance: priors and populations have a part in that, and no points that pull.
-    expected = np.sum((found.J @ rows.T) ** 2, axis=0) - np.sum((found.taken @ rows.T) ** 2, axis=0)
+        squares[n] = np.sum(np.bincount(system.point, (system.J @ c) * system.residual) ** 2)
+    # Not the variance: priors contribute to it without points.
+    expected = np.sum((system.J @ rows.T) ** 2, axis=0) - np.sum((system.taken @ rows.T) ** 2, axis=0)
     return np.asarray(squares / np.maximum(expected, 1e-300))
 
 
 def _loss_correction(weighted: F64, delta: float) -> float:
-    """(mean weight / mean slope)^2 of Huber's loss from residuals multiplied by the root of their weight."""
+    """Return (mean weight / mean slope)^2 of Huber's loss from weighted residuals."""
     squared = np.sum(weighted**2, axis=1)
     # Outside, |w r|^2 = delta |r|, hence the weight delta / |r| = delta^2 / |w r|^2.
     outside = squared > delta**2

@@ -1,4 +1,4 @@
-"""Covariance of poses and intrinsics after bundle adjustment, and the noise scale from the residuals."""
+"""Covariance of poses and intrinsics after bundle adjustment, and the noise from the residuals."""
 
 from __future__ import annotations
 
@@ -13,30 +13,38 @@ from thesisrecon.numerics.metric_cameras import FOCAL, POSE_DOF
 from thesisrecon.numerics.reduced_solvers import ReducedSystem, order_views
 
 SIMILARITY_DOF = 7
-# Unknowns up to which the whole matrix is inverted.
-DENSE = 1200
+# Largest number of unknowns for dense inversion.
+MAX_DENSE = 1200
 MAD_TO_SIGMA = 1.4826
-# Variance of a standard normal variable cut at +-2.5.
+# Trimming point and variance of a standard normal variable trimmed there.
 TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
-# Coordinates that keep less than this share of their variance say little of the noise.
-LEAST_SHARE = 0.1
+# Least fraction of the variance that a coordinate must keep to contribute.
+LEAST_KEPT = 0.1
 
 
-def robust_sigma(residual: F64, leverage: F64, freedoms: int) -> float:
-    """Standard deviation of one image coordinate from residuals (K, 2) after a fit.
+def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
+    """Estimate the standard deviation of one image coordinate from residuals after a fit.
 
-    ``leverage`` (K, 2) is the share of a coordinate's variance that the fit of its point took, ``freedoms``
-    those of the cameras, which take theirs from all alike. Of the residuals scaled up by what was left to
-    them the root mean square within 2.5 sigma, sigma starting from the median, corrected for the trimming of
-    a normal distribution. 0 where nothing is left over.
+    The root mean square within 2.5 sigma of the residuals scaled up by their remaining variance, from a start
+    at the median, corrected for the trimming of a normal distribution.
+
+    Parameters
+    ----------
+    residual : ndarray (K, 2), residuals, px
+    leverage : ndarray (K, 2), fraction of a coordinate's variance absorbed by its point
+    dof : int, camera unknowns, which absorb variance of all coordinates equally
+
+    Returns
+    -------
+    float, standard deviation, px; 0 if no variance is left
     """
     if not len(residual):
         return 0.0
-    kept = 1.0 - leverage - max(freedoms, 0) / residual.size
-    told = kept > LEAST_SHARE
-    if not told.any():
+    kept = 1.0 - leverage - max(dof, 0) / residual.size
+    informative = kept > LEAST_KEPT
+    if not informative.any():
         return 0.0
-    size = np.abs(residual[told]) / np.sqrt(kept[told])
+    size = np.abs(residual[informative]) / np.sqrt(kept[informative])
     sigma = MAD_TO_SIGMA * float(np.median(size))
     for _ in range(5):
         within = size[size <= TRIM * sigma]
@@ -47,31 +55,50 @@ def robust_sigma(residual: F64, leverage: F64, freedoms: int) -> float:
 
 @dataclass(frozen=True)
 class CovarianceInput:
-    """The ``reduced`` information; ``block`` (V,) of each view whose pose moves, -1 for others; poses ``R``
-    (V, 3, 3), ``t`` (V, 3); ``held``: observed views are fixed, so that the frame is too."""
+    """Information matrix and poses of a bundle adjustment.
+
+    Attributes
+    ----------
+    reduced : ReducedSystem, information of the cameras
+    block : ndarray (V,) of int, block of each view whose pose moves, -1 for others
+    R : ndarray (V, 3, 3), rotations
+    t : ndarray (V, 3), translations
+    fixed_frame : bool, whether observed views are fixed, and the frame with them
+    """
 
     reduced: ReducedSystem
     block: I64
     R: F64
     t: F64
-    held: bool
+    fixed_frame: bool
 
 
-def bundle_covariances(found: CovarianceInput, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
-    """Covariances of intrinsics (G, C, C), entry ``number`` (G, C) a column's, and of poses (V, 6, 6).
+def bundle_covariances(inputs: CovarianceInput, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
+    """Return covariances of intrinsics and poses.
 
-    Poses are taken with respect to the inner gauge: of all solutions that differ by a similarity, that which
-    moved the cameras least. The frame has no part in the intrinsics, so their covariance does not depend on
-    it. ``focal`` (G,) takes log f to f, ``scale`` the lengths.
+    Poses refer to the inner gauge: of all solutions that differ by a similarity, the one that moved the
+    cameras least. The intrinsics do not depend on the frame.
+
+    Parameters
+    ----------
+    inputs : CovarianceInput, information and poses
+    number : ndarray (G, C) of int, column of each intrinsic, -1 if fixed
+    focal : ndarray (G,), focal lengths, which convert log f to f
+    scale : float, unit of length
+
+    Returns
+    -------
+    intrinsics : ndarray (G, C, C), covariances of the intrinsics
+    poses : ndarray (V, 6, 6), covariances of the poses
     """
-    b, C, e = found.reduced.sums.border.shape
+    b, C, e = inputs.reduced.sums.border.shape
     width, edge = (C if b else 0), b * C
-    views = np.flatnonzero(found.block >= 0)
-    blocks = _dense_blocks(found, views) if edge + e <= DENSE or not b else _band_blocks(found, views)
-    poses = np.zeros((len(found.t), POSE_DOF, POSE_DOF))
+    views = np.flatnonzero(inputs.block >= 0)
+    blocks = _dense_blocks(inputs, views) if edge + e <= MAX_DENSE or not b else _band_blocks(inputs, views)
+    poses = np.zeros((len(inputs.t), POSE_DOF, POSE_DOF))
     units = np.array([1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale, 1.0 / scale])
     if len(views):
-        poses[views] = blocks[found.block[views], :POSE_DOF, :POSE_DOF] * units * units[:, None]
+        poses[views] = blocks[inputs.block[views], :POSE_DOF, :POSE_DOF] * units * units[:, None]
     intrinsics = np.zeros((*number.shape, number.shape[1]))
     for g, row in enumerate(number):
         moves = np.flatnonzero(row >= 0)
@@ -83,18 +110,15 @@ def bundle_covariances(found: CovarianceInput, number: I64, focal: F64, scale: f
     return intrinsics, poses
 
 
-def _dense_blocks(found: CovarianceInput, views: I64) -> F64:
-    """(b, C + e, C + e) covariances of each view's columns with the border's, by the whole matrix.
-
-    Directions that the data do not determine get a huge variance.
-    """
-    b, C, e = found.reduced.sums.border.shape
-    S = found.reduced.dense()
+def _dense_blocks(inputs: CovarianceInput, views: I64) -> F64:
+    """Return the covariance blocks of each view and the border by dense inversion."""
+    b, C, e = inputs.reduced.sums.border.shape
+    S = inputs.reduced.dense()
     S = np.triu(S) + np.triu(S, 1).T
-    if found.held or not len(views):
+    if inputs.fixed_frame or not len(views):
         covariance = invert_information(S)
     else:
-        covariance = invert_in_inner_gauge(S, _gauge(found, views))
+        covariance = invert_in_inner_gauge(S, _gauge_basis(inputs, views))
     index = np.concatenate(
         [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
     )
@@ -103,30 +127,42 @@ def _dense_blocks(found: CovarianceInput, views: I64) -> F64:
 
 
 def invert_in_inner_gauge(information: F64, N: F64) -> F64:
-    """Covariance (D, D) of an information matrix singular along the orthonormal N (D, 7) of the frame.
+    """Invert an information matrix that is singular along the gauge freedoms.
 
-    (S + w N N')^-1 is S's generalised inverse with the frame's freedoms at variance 1 / w, which are then
-    removed.
+    (S + w N N')^-1 is the generalised inverse of S with variance 1 / w along the gauge freedoms, which are
+    then removed.
+
+    Parameters
+    ----------
+    information : ndarray (D, D), information matrix S
+    N : ndarray (D, 7), orthonormal gauge directions
+
+    Returns
+    -------
+    ndarray (D, D), covariance
     """
     weight = float(np.median(np.diag(information)))
     C = invert_information(information + weight * N @ N.T)
     return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
 
 
-def _band_blocks(found: CovarianceInput, views: I64) -> F64:
-    """The same from a banded factor: any seven coordinates hold the frame, then Baarda's S-transformation
-    takes the covariance Q to the inner gauge, (I - N N') Q (I - N N')."""
-    reduced = found.reduced
+def _band_blocks(inputs: CovarianceInput, views: I64) -> F64:
+    """Return the covariance blocks from a banded factor.
+
+    Any seven coordinates fix the frame; Baarda's S-transformation (I - N N') Q (I - N N') then takes the
+    covariance Q to the inner gauge.
+    """
+    reduced = inputs.reduced
     b, C, e = reduced.sums.border.shape
-    if not found.held:
-        _hold_frame(found, views)
+    if not inputs.fixed_frame:
+        _fix_gauge(inputs, views)
     factored = order_views(reduced.row, reduced.column, b).factor(reduced)
     if factored is None:
         return np.full((b, C + e, C + e), np.inf)
     blocks = factored.inverse_blocks()
-    if found.held:
+    if inputs.fixed_frame:
         return blocks
-    N = _gauge(found, views)
+    N = _gauge_basis(inputs, views)
     moved = factored.solve(N)
     if moved is None:
         return np.full((b, C + e, C + e), np.inf)
@@ -140,31 +176,40 @@ def _band_blocks(found: CovarianceInput, views: I64) -> F64:
     return np.asarray(blocks - cross - np.swapaxes(cross, 1, 2) + n @ middle @ np.swapaxes(n, 1, 2))
 
 
-def _hold_frame(found: CovarianceInput, views: I64) -> None:
-    """Weight on seven coordinates that fix the frame: one pose, and the position of the camera farthest from
-    it along the line between them."""
-    sums, C = found.reduced.sums, found.reduced.sums.border.shape[1]
-    centres = -np.einsum("vba,vb->va", found.R[views], found.t[views])
+def _fix_gauge(inputs: CovarianceInput, views: I64) -> None:
+    """Add weight to seven coordinates: one pose, and the distance to the farthest camera."""
+    sums, C = inputs.reduced.sums, inputs.reduced.sums.border.shape[1]
+    centres = -np.einsum("vba,vb->va", inputs.R[views], inputs.t[views])
     far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
-    line = found.R[views[far]] @ (centres[far] - centres[0])
-    held = (found.reduced.row == found.reduced.column).nonzero()[0]
-    weight = float(np.median(sums.blocks[held][:, np.arange(C), np.arange(C)]))
-    first, other = held[found.block[views[0]]], held[found.block[views[far]]]
+    line = inputs.R[views[far]] @ (centres[far] - centres[0])
+    diagonal = (inputs.reduced.row == inputs.reduced.column).nonzero()[0]
+    weight = float(np.median(sums.blocks[diagonal][:, np.arange(C), np.arange(C)]))
+    first, other = diagonal[inputs.block[views[0]]], diagonal[inputs.block[views[far]]]
     sums.blocks[first, np.arange(POSE_DOF), np.arange(POSE_DOF)] += weight
     sums.blocks[other, 3:6, 3:6] += weight * np.outer(line, line) / max(float(line @ line), 1e-300)
 
 
-def _gauge(found: CovarianceInput, views: I64) -> F64:
-    """Orthonormal (D, 7): how all columns move when the world is shifted, turned and scaled."""
-    width = found.reduced.sums.border.shape[1]
-    N = np.zeros((len(found.reduced.sums.rhs), SIMILARITY_DOF))
-    columns = width * found.block[views, None] + np.arange(POSE_DOF)
-    N[columns.ravel()] = gauge_directions(found.R[views], found.t[views])
+def _gauge_basis(inputs: CovarianceInput, views: I64) -> F64:
+    """Return the orthonormal motion (D, 7) of all columns under similarities of the world."""
+    width = inputs.reduced.sums.border.shape[1]
+    N = np.zeros((len(inputs.reduced.sums.rhs), SIMILARITY_DOF))
+    columns = width * inputs.block[views, None] + np.arange(POSE_DOF)
+    N[columns.ravel()] = gauge_directions(inputs.R[views], inputs.t[views])
     return N
 
 
 def gauge_directions(R: F64, t: F64) -> F64:
-    """Orthonormal (6 V, 7): how poses move when the world is shifted, turned and scaled."""
+    """Return the orthonormal motion of poses under translations, rotations and scalings of the world.
+
+    Parameters
+    ----------
+    R : ndarray (V, 3, 3), rotations
+    t : ndarray (V, 3), translations
+
+    Returns
+    -------
+    ndarray (6 V, 7), orthonormal columns
+    """
     directions = np.zeros((len(t), POSE_DOF, SIMILARITY_DOF))
     directions[:, 3:, 0:3] = -R
     directions[:, :3, 3:6] = -R

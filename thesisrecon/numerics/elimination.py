@@ -1,9 +1,9 @@
-"""Elimination of the points from the normal equations, and their steps once the cameras' are known.
+"""Elimination of the points from the normal equations, and their steps for given camera steps.
 
-A residual's Jacobian has three parts: ``A`` (K, 2, C), columns of its view's own block; ``E`` (K, 2, F),
-columns that views have in common, F may be 0; and ``B`` (K, 2, 3) of its point. The reduced system is kept in
-three parts accordingly: C x C blocks for pairs of views that see a point together, a border between views and
-common columns, and a corner. Residuals and Jacobians come multiplied by sqrt(rho').
+A residual's Jacobian has three parts: ``A`` (K, 2, C), columns of its view's block; ``E`` (K, 2, F), columns
+that views have in common, F may be 0; and ``B`` (K, 2, 3) of its point. The reduced system has three parts
+accordingly: C x C blocks for pairs of views with a common point, a border between views and common columns,
+and a corner. Residuals and Jacobians are multiplied by sqrt(rho').
 
 With V = sum B'B + damping = L L' of one point, B~ = B L^-T and Q_kl = delta_kl I - B~_k B~_l' (2 x 2), the
 reduced system is S_kl = A_k' Q_kl A_l: rank-two updates instead of the rank-three ones of W V^-1 W'.
@@ -23,11 +23,12 @@ from thesisrecon.numerics.small_solvers import invert_cholesky_3x3, multiply_tra
 
 
 class BlockIndex(NamedTuple):
-    """Where observations, sorted by point, go.
+    """Blocks of observations sorted by point.
 
-    ``start`` (N + 1,) the first of each point; ``view_index`` (K,); ``block`` (V,) number of the view's
-    block, -1 for one held fixed; ``pair`` (b, b) number of the block of two views, upper triangle;
-    ``common`` (V, F) columns of the border, -1 for one that does not move."""
+    ``start`` (N + 1,) first observation of each point; ``view_index`` (K,); ``block`` (V,) block of each
+    view, -1 if fixed; ``pair`` (b, b) block of two views, upper triangle; ``common`` (V, F) border columns,
+    -1 if fixed.
+    """
 
     start: I64
     view_index: I64
@@ -37,8 +38,11 @@ class BlockIndex(NamedTuple):
 
 
 class ReducedSums(NamedTuple):
-    """The reduced system: ``blocks`` (n, C, C), ``border`` (b, C, e), ``corner`` (e, e), ``rhs`` (D,) with
-    D = b C + e; and, before elimination, ``diagonal`` (D,) of J'J and ``gradient`` (D,)."""
+    """The reduced system, summed over points.
+
+    ``blocks`` (n, C, C), ``border`` (b, C, e), ``corner`` (e, e), ``rhs`` (D,) with D = b C + e; and, before
+    elimination, ``diagonal`` (D,) of J'J and ``gradient`` (D,).
+    """
 
     blocks: F64
     border: F64
@@ -49,8 +53,11 @@ class ReducedSums(NamedTuple):
 
 
 class PointSums(NamedTuple):
-    """Of each point: ``inverse`` (N, 3, 3) of its damped J'J, zeros where the data do not hold it;
-    ``gradient`` (N, 3) and ``diagonal`` (N, 3) of J'J."""
+    """Sums of each point.
+
+    ``inverse`` (N, 3, 3) of its damped J'J, zeros if undetermined; ``gradient`` and ``diagonal`` (N, 3) of
+    J'J.
+    """
 
     inverse: F64
     gradient: F64
@@ -58,8 +65,11 @@ class PointSums(NamedTuple):
 
 
 class _Elimination(NamedTuple):
-    """What the steps of their points leave: ``Bt`` (k, 2, 3) = B~ and ``residual`` (k, 2) of the observations
-    from ``first`` on, ``g`` (n, 3) = L^-1 h of the points."""
+    """Residuals after the points' own steps.
+
+    ``Bt`` (k, 2, 3) = B~ and ``residual`` (k, 2) of the observations from ``first`` on, ``g`` (n, 3) = L^-1
+    h.
+    """
 
     first: int
     Bt: F64
@@ -77,10 +87,19 @@ def eliminate_points(
     sums: ReducedSums,
     points: PointSums,
 ) -> None:
-    """Add the points first..last, eliminated, to ``sums``; fill their ``points``.
+    """Add the eliminated points ``first`` to ``last`` to the reduced system.
 
-    The diagonal of a point's J'J is multiplied by 1 + damping; a point whose block is not positive stays
-    where it is.
+    The diagonal of a point's J'J is multiplied by 1 + damping; a point whose block is not positive does not
+    move.
+
+    Parameters
+    ----------
+    first, last : int, range of points
+    damping : float, levenberg-Marquardt damping
+    J : Jacobians, residuals and Jacobians
+    index : BlockIndex, blocks
+    sums : ReducedSums, reduced system, updated
+    points : PointSums, output for the points of the range
     """
     k = index.start[first]
     n = index.start[last] - k
@@ -91,7 +110,7 @@ def eliminate_points(
         _add_common(first, last, J, index, sums, left)
 
 
-# A call costs more than a point, for all the arrays that go with it: the loops over the points are inside.
+# A call with these arrays costs more than a point, so the loops over points are inside.
 
 
 @njit(cache=True, nogil=True)
@@ -104,7 +123,7 @@ def _sum_points(
     points: PointSums,
     left: _Elimination,
 ) -> None:
-    """J'J and J'r of each point, its inverse, B~ and the residuals that its own step leaves."""
+    """Compute J'J and J'r of each point, its inverse, B~ and the residuals after its own step."""
     M, more = np.empty((3, 3)), 1.0 + damping
     for j in range(first, last):
         v00 = v01 = v02 = v11 = v12 = v22 = h0 = h1 = h2 = 0.0
@@ -136,7 +155,7 @@ def _sum_points(
 def _add_views(
     first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
 ) -> None:
-    """The blocks of all pairs of views that see a point, and the views' part of the right-hand side."""
+    """Add the blocks of all pairs of views that observe a point, and the views' right-hand side."""
     C = J.A.shape[2]
     for j in range(first, last):
         for k in range(index.start[j], index.start[j + 1]):
@@ -169,7 +188,7 @@ def _add_views(
 
 @njit(cache=True, nogil=True, inline="always", fastmath={"contract"}, forceinline=True)
 def _add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float, q11: float) -> None:
-    """S (C, C) += left' Q right for left, right (2, C)."""
+    """Add left' Q right to S (C, C) for left, right (2, C)."""
     C = S.shape[0]
     for a in range(C):
         p0 = left[0, a] * q00 + left[1, a] * q10
@@ -182,7 +201,7 @@ def _add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float
 def _add_common(
     first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
 ) -> None:
-    """Border, corner and right-hand side of the columns that views have in common.
+    """Add border, corner and right-hand side of the common columns.
 
     Those of one point side by side are E (2m, n). With p = B~' E the point's own step leaves T = E - B~ p of
     them, and E' T = E'E - p'p.
@@ -225,8 +244,10 @@ def _add_common(
 def _gather_common(
     s: int, e: int, J_E: F64, view_index: I64, common: I64, E: F64, column: I64, slot: I64
 ) -> int:
-    """The common columns of observations s..e side by side in E (m, 2, n), their ``column`` in the border;
-    returns n. ``slot`` (columns of the border,) is -1 all over, before and after."""
+    """Collect the common columns of observations s..e in E (m, 2, n) and their border ``column``; return n.
+
+    ``slot`` (border columns,) is -1 before and after.
+    """
     F, n = common.shape[1], 0
     for k in range(s, e):
         for f in range(F):
@@ -250,7 +271,7 @@ def _gather_common(
 
 @njit(cache=True, nogil=True)
 def _add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[F64, F64, F64, F64]) -> None:
-    """What the common columns of one point add to (corner, rhs, diagonal, gradient) of the border."""
+    """Add the common columns of one point to (corner, rhs, diagonal, gradient) of the border."""
     corner, rhs, diagonal, gradient = ends
     n = len(column)
     for c in range(n):
@@ -274,7 +295,17 @@ def _add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[
 def substitute_points(
     first: int, last: int, camera_step: F64, J: Jacobians, index: BlockIndex, points: PointSums, step: F64
 ) -> None:
-    """Steps of the points first..last (N, 3) for a step of the cameras (D,): -V^-1 (h + B' J step)."""
+    """Compute the steps -V^-1 (h + B' J step) of points for a camera step.
+
+    Parameters
+    ----------
+    first, last : int, range of points
+    camera_step : ndarray (D,), step of the camera unknowns
+    J : Jacobians, residuals and Jacobians
+    index : BlockIndex, blocks
+    points : PointSums, inverses and gradients of the points
+    step : ndarray (N, 3), output
+    """
     C, F = J.A.shape[2], index.common.shape[1]
     border = len(index.pair) * C
     for j in range(first, last):
@@ -303,7 +334,14 @@ def substitute_points(
 
 @njit(cache=True, nogil=True)
 def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
-    """Share of the variance of each coordinate (K, 2) that its point's own three freedoms take, B V^-1 B'."""
+    """Compute the fraction of each coordinate's variance that its point's three unknowns absorb, B V^-1 B'.
+
+    Parameters
+    ----------
+    start : ndarray (N + 1,) of int, first observation of each point
+    B : ndarray (K, 2, 3), jacobians by the points
+    leverage : ndarray (K, 2), output
+    """
     M = np.empty((3, 3))
     for j in range(len(start) - 1):
         v00 = v01 = v02 = v11 = v12 = v22 = 0.0
@@ -323,7 +361,15 @@ def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def mark_pairs(start: I64, view: I64, block: I64, seen: NDArray[np.bool_]) -> None:
-    """Mark in ``seen`` (b, b), upper triangle, the blocks of views that see a point together."""
+    """Mark the pairs of blocks whose views observe a common point.
+
+    Parameters
+    ----------
+    start : ndarray (N + 1,) of int, first observation of each point
+    view : ndarray (K,) of int, view of each observation
+    block : ndarray (V,) of int, block of each view, -1 if fixed
+    seen : ndarray (b, b) of bool, output, upper triangle
+    """
     for j in range(len(start) - 1):
         for k in range(start[j], start[j + 1]):
             v = block[view[k]]
@@ -337,9 +383,15 @@ def mark_pairs(start: I64, view: I64, block: I64, seen: NDArray[np.bool_]) -> No
 def revert_crossing_points(
     start: I64, view_index: I64, row_before: F64, row_after: F64, X_before: F64, X_after: F64
 ) -> None:
-    """Put back the points whose step takes them through the focal plane of a view that sees them.
+    """Undo the steps of points that cross the focal plane of a view that observes them.
 
-    ``row`` (V, 4) third rows of the cameras; X (N, 4), or (N, 3) with a fourth coordinate 1.
+    Parameters
+    ----------
+    start : ndarray (N + 1,) of int, first observation of each point
+    view_index : ndarray (K,) of int, view of each observation
+    row_before, row_after : ndarray (V, 4), third rows of the cameras
+    X_before : ndarray (N, 4) or (N, 3), points before the step; (N, 3) have a fourth coordinate 1
+    X_after : ndarray (N, 4) or (N, 3), points after the step, changed in place
     """
     d = X_before.shape[1]
     for j in range(len(start) - 1):

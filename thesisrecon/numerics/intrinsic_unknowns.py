@@ -1,9 +1,9 @@
-"""The distinct unknown values behind a table of intrinsics, and Gaussian knowledge about them.
+"""The distinct unknowns behind a table of intrinsics, their Gaussian prior and their columns in the bundle.
 
-The unknowns are numbered so that rows of the table that share a value name the same one; the focal is
-unknown as log f. Everything that is known of them is a list of terms, w (x_a - x_b - c)^2 / 2, where either
-end may be missing. The mean of a population is an unknown like the others, seen by no photograph: with it
-the prior stays sparse, and marginalising it is left to the linear algebra.
+Unknowns are numbered so that rows of the table that share a value have the same number; the focal length is
+unknown as log f. The prior is a list of terms w (x_a - x_b - c)^2 / 2, either of which may be missing. The
+common mean of a hierarchical prior is an unknown of its own, seen by no image: the prior stays sparse, and
+marginalising it is left to the linear algebra.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.metric_cameras import FOCAL, POSE_DOF, MetricCameras
 
 NONE = -1
-# exp of more than this is never a focal; the bound only matters for steps that will be refused.
+# Larger steps of log f are rejected anyway; the bound avoids overflow.
 MAX_LOG_STEP = 3.0
 
 
 @dataclass(frozen=True)
 class _PriorTerms:
-    """Terms w (x_first - x_second - offset)^2 / 2; ``second`` -1 where a term binds one value to a number."""
+    """Terms w (x_first - x_second - offset)^2 / 2; ``second`` is -1 if a term binds one value to a number."""
 
     first: I64
     second: I64
@@ -31,22 +31,22 @@ class _PriorTerms:
     weight: F64
 
     def residual(self, x: F64) -> F64:
-        """(L,) x_first - x_second - offset."""
+        """Return x_first - x_second - offset; (L,)."""
         return np.asarray(x[self.first] - np.where(self.second >= 0, x[self.second], 0.0) - self.offset)
 
     def cost(self, x: F64) -> float:
-        """The sum of all terms."""
+        """Return the sum of all terms."""
         return 0.5 * float(self.weight @ self.residual(x) ** 2) if len(self.first) else 0.0
 
     def gradient(self, x: F64) -> F64:
-        """(n,) derivative of the cost."""
+        """Return the derivative of the cost; (n,)."""
         pull = self.weight * self.residual(x) if len(self.first) else np.zeros(0)
         both = self.second >= 0
         g = np.bincount(self.first, pull, minlength=len(x))
         return np.asarray(g - np.bincount(self.second[both], pull[both], minlength=len(x)))
 
     def information(self, n: int) -> F64:
-        """(n, n) second derivative of the cost."""
+        """Return the second derivative of the cost; (n, n)."""
         Q = np.zeros((n, n))
         a, b, w = self.first, self.second, self.weight
         both = b >= 0
@@ -59,8 +59,15 @@ class _PriorTerms:
 
 @dataclass(frozen=True)
 class IntrinsicUnknowns:
-    """``number`` (G, C) names the unknown of every entry, -1 where it does not move; ``column`` (n,) says
-    which intrinsic an unknown is; ``seen`` of the n stand in the table, the rest are means of populations."""
+    """The unknowns of a table of intrinsics.
+
+    Attributes
+    ----------
+    number : ndarray (G, C) of int, unknown of every entry, -1 if it does not move
+    column : ndarray (n,) of int, intrinsic of every unknown
+    n_table : int, unknowns in the table; the rest are means of a hierarchical prior
+    terms : _PriorTerms, Gaussian prior
+    """
 
     number: I64
     column: I64
@@ -69,11 +76,21 @@ class IntrinsicUnknowns:
 
     @property
     def size(self) -> int:
-        """n."""
+        """Number of unknowns n."""
         return len(self.column)
 
     def write(self, intrinsics: F64, x: F64) -> F64:
-        """The table (G, C) with the unknowns x (n,) put in their places."""
+        """Return the table with the unknowns put in.
+
+        Parameters
+        ----------
+        intrinsics : ndarray (G, C), table
+        x : ndarray (n,), unknowns
+
+        Returns
+        -------
+        ndarray (G, C), new table
+        """
         table = intrinsics.copy()
         moves = self.number >= 0
         table[moves] = x[self.number[moves]]
@@ -81,7 +98,17 @@ class IntrinsicUnknowns:
         return table
 
     def step(self, x: F64, step: F64) -> F64:
-        """x moved by a step; a log focal never by more than ``MAX_LOG_STEP``."""
+        """Return the unknowns after a step; a log focal length moves by ``MAX_LOG_STEP`` at most.
+
+        Parameters
+        ----------
+        x : ndarray (n,), unknowns
+        step : ndarray (n,), step
+
+        Returns
+        -------
+        ndarray (n,), moved unknowns
+        """
         limit = np.where(self.column == FOCAL, MAX_LOG_STEP, np.inf)
         return np.asarray(x + np.clip(step, -limit, limit))
 
@@ -89,12 +116,25 @@ class IntrinsicUnknowns:
 def number_unknowns(
     cameras: MetricCameras, used: B8, free: B8, prior: IntrinsicsPrior | None
 ) -> tuple[IntrinsicUnknowns, F64, F64]:
-    """The unknowns of a problem, where they start (n,), and the table (G, C) with what is known put in.
+    """Number the unknowns of a problem and choose their starting values.
 
-    ``used`` (G,) rows that a photograph speaks of. A value starts at the mean of the used rows that share it;
-    one that no photograph sees is no unknown.
+    A value starts at the mean of the used rows that share it; a value that no image observes is not an
+    unknown.
+
+    Parameters
+    ----------
+    cameras : MetricCameras, cameras
+    used : ndarray (G,) of bool, rows with observations
+    free : ndarray (C,) of bool, intrinsics that move
+    prior : IntrinsicsPrior or None, prior
+
+    Returns
+    -------
+    unknowns : IntrinsicUnknowns, numbering and prior
+    start : ndarray (n,), starting values
+    table : ndarray (G, C), table of intrinsics with known values put in
     """
-    table = _with_log_focal(cameras.intrinsics)
+    table = _log_focal(cameras.intrinsics)
     nothing = IntrinsicsPrior.unshared(cameras.intrinsics, np.full_like(table, np.inf))
     prior = prior or nothing
     number = np.full(table.shape, NONE, dtype=np.int64)
@@ -104,7 +144,7 @@ def number_unknowns(
         sharing = names if cameras.shared is None else cameras.shared[:, c]
         value = np.unique(sharing, return_inverse=True)[1].astype(np.int64)
         table[:, c], number[:, c] = _number_column(int(c), value, (table[:, c], used), prior, parts)
-    seen = len(parts.start)
+    observed = len(parts.start)
     if prior.spread is not None:
         spread = np.broadcast_to(prior.spread, table.shape)
         for c in np.flatnonzero(free):
@@ -114,23 +154,25 @@ def number_unknowns(
                     continue
                 sharing = rows if cameras.shared is None else cameras.shared[rows, c]
                 rows = rows[np.unique(sharing, return_index=True)[1]]
-                parts.bind_population(int(c), number[rows, c], table[rows, c], float(spread[rows[0], c]))
+                parts.add_hierarchical_prior(
+                    int(c), number[rows, c], table[rows, c], float(spread[rows[0], c])
+                )
     table[:, FOCAL] = np.exp(table[:, FOCAL])
     table = np.where(np.asarray(free), table, cameras.intrinsics)
     column = np.array(parts.column, dtype=np.int64)
-    return IntrinsicUnknowns(number, column, seen, parts.collect()), np.array(parts.start), table
+    return IntrinsicUnknowns(number, column, observed, parts.collect()), np.array(parts.start), table
 
 
 @dataclass(frozen=True)
 class _Parts:
-    """Unknowns and terms while they are gathered."""
+    """Unknowns and prior terms while they are collected."""
 
     column: list[int]
     start: list[float]
     terms: list[tuple[I64, I64, F64, F64]]
 
-    def bind_population(self, c: int, number: I64, at: F64, spread: float) -> None:
-        """One more unknown, the population's mean, and a link from every distinct value to it."""
+    def add_hierarchical_prior(self, c: int, number: I64, at: F64, spread: float) -> None:
+        """Add the common mean as an unknown, and a term between it and every distinct value."""
         moves = number >= 0
         if len(number) < 2 or not moves.any():
             return
@@ -142,7 +184,7 @@ class _Parts:
         self.start.append(float(at.mean()))
 
     def collect(self) -> _PriorTerms:
-        """All terms in one table."""
+        """Return all terms in one table."""
         none = (np.zeros(0, dtype=np.int64),) * 2 + (np.zeros(0),) * 2
         first, second, offset, weight = (np.concatenate(a) for a in zip(none, *self.terms, strict=True))
         return _PriorTerms(first, second, offset, weight)
@@ -151,28 +193,28 @@ class _Parts:
 def _number_column(
     c: int, value: I64, rows: tuple[F64, B8], prior: IntrinsicsPrior, parts: _Parts
 ) -> tuple[F64, I64]:
-    """Start and unknown of each row for one intrinsic; ``value`` (G,) says which share."""
+    """Return start and unknown of each row for one intrinsic; rows of equal ``value`` (G,) share it."""
     at, used = rows
     std = prior.std[:, c]
     tightest = np.lexsort((std, value))
     tightest = tightest[np.unique(value[tightest], return_index=True)[1]]
-    width, mean = std[tightest], _with_log_focal(prior.mean)[tightest, c]
-    silent = np.bincount(value[used], minlength=len(width)) == 0
-    counted = used | silent[value]
+    width, mean = std[tightest], _log_focal(prior.mean)[tightest, c]
+    unobserved = np.bincount(value[used], minlength=len(width)) == 0
+    counted = used | unobserved[value]
     average = np.bincount(value[counted], at[counted]) / np.bincount(value[counted])
-    known, still = width == 0.0, silent | (width == 0.0)
-    own = np.where(still, NONE, len(parts.start) + np.cumsum(~still) - 1)
-    bound = np.isfinite(width) & ~still
+    known, fixed = width == 0.0, unobserved | (width == 0.0)
+    own = np.where(fixed, NONE, len(parts.start) + np.cumsum(~fixed) - 1)
+    bound = np.isfinite(width) & ~fixed
     none = np.full(np.count_nonzero(bound), NONE)
     parts.terms.append((own[bound], none, mean[bound], width[bound] ** -2.0))
     start = np.where(known, mean, average)
-    parts.start.extend(start[~still].tolist())
-    parts.column.extend([c] * int(np.count_nonzero(~still)))
+    parts.start.extend(start[~fixed].tolist())
+    parts.column.extend([c] * int(np.count_nonzero(~fixed)))
     return start[value], own[value]
 
 
-def _with_log_focal(intrinsics: F64) -> F64:
-    """The table with log f; focals that are not known stay NaN."""
+def _log_focal(intrinsics: F64) -> F64:
+    """Return the table with log f; unknown focal lengths stay NaN."""
     table = np.array(intrinsics, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         table[:, FOCAL] = np.log(table[:, FOCAL])
@@ -181,12 +223,17 @@ def _with_log_focal(intrinsics: F64) -> F64:
 
 @dataclass(frozen=True)
 class IntrinsicColumns:
-    """Where the unknowns stand among the columns of the reduced system.
+    """Columns of the unknowns in the reduced system.
 
-    ``own`` lists the intrinsics that no two views share: they join the poses in the ``block`` (V,) of their
-    view, -1 for a view that nothing moves. ``common`` lists the others, in the columns ``border`` (V, F), -1
-    for one that does not move, of ``n_border`` in all. ``pinned`` (V, C) marks columns of a block that do not
-    move. ``place`` (n,) is the column of every unknown.
+    Attributes
+    ----------
+    own : ndarray of int, intrinsics that no two views share; they join the pose in the block of their view
+    common : ndarray (F,) of int, the other intrinsics
+    block : ndarray (V,) of int, block of each view, -1 if nothing moves
+    border : ndarray (V, F) of int, border columns of the common intrinsics, -1 if fixed
+    n_border : int, number of border columns
+    pinned : ndarray (V, C) of bool, columns of a block that do not move
+    place : ndarray (n,) of int, column of every unknown
     """
 
     own: I64
@@ -197,34 +244,51 @@ class IntrinsicColumns:
     pinned: B8
     place: I64
 
-    def of(self, number: I64) -> I64:
-        """The columns of unknowns of these numbers; -1 for none."""
+    def columns_of(self, number: I64) -> I64:
+        """Return the columns of unknowns.
+
+        Parameters
+        ----------
+        number : ndarray of int, unknowns, -1 for none
+
+        Returns
+        -------
+        ndarray of int, columns, -1 for none
+        """
         return np.append(self.place, NONE)[number]
 
 
 def assign_columns(
-    values: IntrinsicUnknowns, group: I64, free: I64, seen: B8, free_views: B8
+    values: IntrinsicUnknowns, group: I64, free: I64, observed: B8, free_views: B8
 ) -> IntrinsicColumns:
-    """Share the unknowns of the views (``group`` (V,) their rows) out to blocks and border.
+    """Distribute the unknowns of the views over blocks and border.
 
-    ``free`` lists the intrinsics that move somewhere, ``seen`` and ``free_views`` (V,) mark views with
-    observations and those whose pose moves.
+    Parameters
+    ----------
+    values : IntrinsicUnknowns, unknowns
+    group : ndarray (V,) of int, row of each view
+    free : ndarray of int, intrinsics that move in some view
+    observed, free_views : ndarray (V,) of bool, views with observations, and views whose pose moves
+
+    Returns
+    -------
+    IntrinsicColumns, columns
     """
-    number = np.where(seen[:, None], values.number[group], NONE)
+    number = np.where(observed[:, None], values.number[group], NONE)
     repeated = [len(np.unique(m)) < len(m) for m in (number[number[:, c] >= 0, c] for c in free)]
     own, common = free[np.logical_not(repeated)], free[np.array(repeated, dtype=bool)]
-    mine = number[:, own]
-    moves = free_views | (mine >= 0).any(axis=1)
+    own_unknowns = number[:, own]
+    moves = free_views | (own_unknowns >= 0).any(axis=1)
     block = np.where(moves, np.cumsum(moves) - 1, NONE)
     pose = np.repeat(~free_views[:, None], POSE_DOF, axis=1)
-    pinned = np.concatenate([pose, mine < 0], axis=1) & moves[:, None]
+    pinned = np.concatenate([pose, own_unknowns < 0], axis=1) & moves[:, None]
     width, n_blocks = POSE_DOF + len(own), int(moves.sum())
     place = np.full(values.size, NONE, dtype=np.int64)
     for c in range(len(own)):
-        v = np.flatnonzero(mine[:, c] >= 0)
-        place[mine[v, c]] = width * block[v] + POSE_DOF + c
+        v = np.flatnonzero(own_unknowns[:, c] >= 0)
+        place[own_unknowns[v, c]] = width * block[v] + POSE_DOF + c
     rest = np.flatnonzero(place < 0)
     place[rest] = width * n_blocks + np.arange(len(rest))
-    theirs = number[:, common]
-    border = np.where(theirs >= 0, np.append(place, NONE)[theirs] - width * n_blocks, NONE)
+    common_unknowns = number[:, common]
+    border = np.where(common_unknowns >= 0, np.append(place, NONE)[common_unknowns] - width * n_blocks, NONE)
     return IntrinsicColumns(own, common, block, border, len(rest), pinned, place)

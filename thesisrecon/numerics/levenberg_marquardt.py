@@ -1,16 +1,9 @@
-"""Robust losses rho(s) of a squared residual s and their weights rho'(s).
+"""Levenberg-Marquardt: one damping loop for every problem, and a dense solver for small ones.
 
-The cost of a set of residuals r is 1/2 sum rho(|r|^2). Its gradient is that of a least-squares problem whose
-residuals and Jacobians are multiplied by sqrt(rho'), which is how every solver here uses them (reweighting;
-the second derivative of rho is left out, so the system stays positive). Each loss behaves as s near 0 and
-turns where sqrt(s) = delta.
-
-Levenberg-Marquardt: one damping loop for every problem, and a dense solver for small ones.
-
-The loop knows nothing of the problem's structure. A problem linearises itself at a state, its linear system
-answers for a damping, and the problem moves the state; the dense problem below, the sparse bundle problems
-and the refinements of one camera differ in these three only. Damping follows Nielsen (IMM-REP-1999-05): it
-shrinks smoothly with the quality of the predicted gain and grows ever faster while steps fail.
+A problem linearises itself at a state, its linear system is solved for a damping, and the problem moves the
+state; the dense problem below, the sparse bundle problems and the refinements of one camera differ only in
+these three. Damping follows Nielsen (IMM-REP-1999-05): it shrinks smoothly with the quality of the predicted
+gain and grows faster with each failed step.
 """
 
 from __future__ import annotations
@@ -40,25 +33,70 @@ class LinearSystem(Protocol[StepOut]):
         """1/2 sum rho at the state."""
 
     def solve(self, damping: float) -> tuple[StepOut, float] | None:
-        """Step and the gain of cost it promises, or None where the damped system is not positive."""
+        """Solve the damped system.
+
+        Parameters
+        ----------
+        damping : float, factor of the diagonal
+
+        Returns
+        -------
+        tuple or None, step and predicted gain of cost; None if the damped system is not positive
+        """
 
 
 class Problem(Protocol[State, Step]):
-    """What the loop asks of a problem; states are never changed in place."""
+    """A problem of the loop; states are never changed in place."""
 
     def linearize(self, state: State) -> LinearSystem[Step]:
-        """The normal equations at ``state``."""
+        """Return the normal equations.
+
+        Parameters
+        ----------
+        state : State, point of linearisation
+
+        Returns
+        -------
+        LinearSystem, normal equations
+        """
 
     def retract(self, state: State, step: Step) -> State:
-        """``state`` moved by ``step``."""
+        """Move a state.
+
+        Parameters
+        ----------
+        state : State, start
+        step : Step, solution of the linear system
+
+        Returns
+        -------
+        State, moved state
+        """
 
     def cost(self, state: State) -> float:
-        """1/2 sum rho at ``state``; inf or NaN refuses it."""
+        """Evaluate 1/2 sum rho.
+
+        Parameters
+        ----------
+        state : State, point of evaluation
+
+        Returns
+        -------
+        float, cost; inf or NaN rejects the state
+        """
 
 
 @dataclass(frozen=True)
 class Solution(Generic[State]):
-    """Where the loop ended; ``iterations`` counts linear solves, ``cost`` <= ``initial_cost`` always."""
+    """End of the loop.
+
+    Attributes
+    ----------
+    state : State, final state
+    cost, initial_cost : float, 1/2 sum rho at the end and the start, cost <= initial_cost
+    iterations : int, linear solves
+    converged : bool, whether a tolerance or the numerical floor was reached
+    """
 
     state: State
     cost: float
@@ -75,11 +113,23 @@ def run_levenberg_marquardt(
     tolerance: float = 1e-7,
     initial_damping: float = 1e-4,
 ) -> Solution[State]:
-    """Minimise a problem from ``state``; the cost never rises and nothing is raised for singular systems.
+    """Minimise a problem by Levenberg-Marquardt; the cost never rises and singular systems raise nothing.
 
-    Converged where the promised or the reached gain is below ``tolerance`` times the cost, or where no
-    damping gives a better state (the numerical floor). Damping multiplies the diagonal (Marquardt 1963), so
-    the answer does not depend on the units of the parameters, and gauge freedoms need no other care.
+    Converged if the predicted or the actual gain is below ``tolerance`` times the cost, or no damping gives a
+    better state (the numerical floor). The damping multiplies the diagonal (Marquardt 1963), so that the
+    result does not depend on the units of the parameters and gauge freedoms need no other treatment.
+
+    Parameters
+    ----------
+    problem : Problem, problem to minimise
+    state : State, initial state
+    max_iterations : int, maximum number of linear solves
+    tolerance : float, relative gain of cost at convergence
+    initial_damping : float, first damping
+
+    Returns
+    -------
+    Solution, final state and cost
     """
     system = problem.linearize(state)
     cost = initial_cost = system.cost
@@ -112,14 +162,30 @@ def run_levenberg_marquardt(
 
 @dataclass(frozen=True)
 class DenseSystem:
-    """J'J and J'r of a small problem, residuals and Jacobian already weighted by sqrt(rho')."""
+    """Normal equations of a small problem, weighted by sqrt(rho').
+
+    Attributes
+    ----------
+    cost : float, 1/2 sum rho
+    hessian : ndarray (D, D), J'J
+    gradient : ndarray (D,), J'r
+    """
 
     cost: float
     hessian: F64
     gradient: F64
 
     def solve(self, damping: float) -> tuple[F64, float] | None:
-        """The damped step by Cholesky; parameters without effect (zero diagonal) stay."""
+        """Solve the damped system by Cholesky; parameters without effect (zero diagonal) do not move.
+
+        Parameters
+        ----------
+        damping : float, factor of the diagonal
+
+        Returns
+        -------
+        tuple or None, step (D,) and predicted gain of cost; None if the damped system is not positive
+        """
         diagonal = damping * floored_diagonal(np.diag(self.hessian))
         step = solve_positive(self.hessian + np.diag(diagonal), -self.gradient)
         if step is None:
@@ -128,14 +194,32 @@ class DenseSystem:
 
 
 def floored_diagonal(diagonal: F64) -> F64:
-    """Diagonal of J'J kept away from 0, so that the damped matrix is positive."""
+    """Floor the diagonal of J'J away from 0, so that the damped matrix is positive.
+
+    Parameters
+    ----------
+    diagonal : ndarray (D,), diagonal of J'J
+
+    Returns
+    -------
+    ndarray (D,), floored diagonal
+    """
     largest = float(diagonal.max(initial=0.0))
     return np.maximum(diagonal, 1e-12 * largest if largest > 0.0 else 1.0)
 
 
 def solve_positive(A: F64, b: F64) -> F64 | None:
-    """x with A x = b for a symmetric positive A (D, D), or None where Cholesky meets a pivot that is not
-    positive."""
+    """Solve A x = b for a symmetric positive A.
+
+    Parameters
+    ----------
+    A : ndarray (D, D), matrix
+    b : ndarray (D,) or (D, M), right-hand side
+
+    Returns
+    -------
+    ndarray or None, x, of the shape of ``b``; None if a pivot of the Cholesky factorisation is not positive
+    """
     if not (np.isfinite(A).all() and np.isfinite(b).all()):
         return None
     if len(b) == 0:
@@ -145,11 +229,19 @@ def solve_positive(A: F64, b: F64) -> F64 | None:
 
 
 def invert_information(information: F64, *, floor: float = 1e-14) -> F64:
-    """Covariance of an information matrix (D, D): its inverse, with eigenvalues floored relative to the
-    largest.
+    """Invert an information matrix, eigenvalues floored relative to the largest.
 
     Directions that the data do not determine get a huge variance instead of a failure. The matrix is first
-    scaled to a unit diagonal, so that units do not decide what counts as undetermined.
+    scaled to a unit diagonal, so that units do not decide which directions are undetermined.
+
+    Parameters
+    ----------
+    information : ndarray (D, D), information matrix
+    floor : float, relative floor of the eigenvalues
+
+    Returns
+    -------
+    ndarray (D, D), covariance; inf if an entry is not finite
     """
     if len(information) == 0:
         return np.zeros_like(information)
@@ -163,8 +255,17 @@ def invert_information(information: F64, *, floor: float = 1e-14) -> F64:
 
 @dataclass(frozen=True)
 class ResidualMinimum:
-    """``x`` (D,), ``cost`` 1/2 sum rho, ``covariance`` (D, D) = sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M -
-    D)."""
+    """Result of :func:`minimize_residuals`.
+
+    Attributes
+    ----------
+    x : ndarray (D,), minimum
+    cost, initial_cost : float, 1/2 sum rho at the end and the start
+    covariance : ndarray (D, D), sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M - D)
+    residual : ndarray (M,), residuals at the minimum
+    iterations : int, linear solves
+    converged : bool, whether the loop converged
+    """
 
     x: F64
     cost: float
@@ -199,7 +300,7 @@ class _VectorProblem:
 
 
 def _difference_jacobian(residual_fn: Callable[[F64], F64], x: F64, residual: F64) -> F64:
-    """Forward differences (M, D) with steps of sqrt(eps) (1 + |x|); columns that leave the domain are 0."""
+    """Return forward differences (M, D), steps sqrt(eps) (1 + |x|); columns outside the domain are 0."""
     J = np.zeros((len(residual), len(x)))
     for d in range(len(x)):
         h = 1.5e-8 * (1.0 + abs(x[d]))
@@ -220,11 +321,32 @@ def minimize_residuals(
     max_iterations: int = 50,
     tolerance: float = 1e-10,
 ) -> ResidualMinimum:
-    """Minimise 1/2 sum rho(r_m(x)^2) over x from ``x0`` (D,) by dense Levenberg-Marquardt.
+    """Minimise 1/2 sum rho(r_m(x)^2) by dense Levenberg-Marquardt.
 
-    ``residual_fn`` (D,) -> (M,), ``jacobian`` (D,) -> (M, D) (forward differences where it is None); ``loss``
-    with its turning point ``loss_scale`` in units of the residuals. States with residuals that are not finite
-    are refused. Raises ``ValueError`` where x0 or its residuals are not finite.
+    Parameters
+    ----------
+    residual_fn : callable, (D,) -> (M,); states with residuals that are not finite are rejected
+    x0 : ndarray (D,), start
+    jacobian : callable, optional, (D,) -> (M, D); forward differences by default
+    loss : str, name in :data:`~thesisrecon.numerics.losses.LOSSES`
+    loss_scale : float, turning point of the loss, in units of the residuals
+    max_iterations : int, maximum number of linear solves
+    tolerance : float, relative gain of cost at convergence
+
+    Returns
+    -------
+    ResidualMinimum, minimum with its covariance
+
+    Raises
+    ------
+    ValueError
+        x0 or its residuals are not finite.
+
+    Examples
+    --------
+    >>> result = minimize_residuals(lambda x: x - np.array([1.0, 2.0]), np.zeros(2))
+    >>> result.x.round(6).tolist(), result.converged
+    ([1.0, 2.0], True)
     """
     loss_code(loss, loss_scale)
     x0 = np.array(x0, dtype=np.float64)

@@ -1,4 +1,10 @@
-"""Robust losses."""
+"""Robust losses rho(s) of a squared residual s, and their weights rho'(s).
+
+The cost of residuals r is 1/2 sum rho(|r|^2). Its gradient is that of a least-squares problem whose residuals
+and Jacobians are multiplied by sqrt(rho'); all solvers here use this reweighting, which leaves out rho'' and
+keeps the system positive. Each loss is s near 0 and turns at sqrt(s) = delta. The compiled functions take a
+number of :data:`LOSS_CODES`.
+"""
 
 from __future__ import annotations
 
@@ -18,31 +24,85 @@ LossFunction = Callable[[F64, float], tuple[F64, F64]]
 
 
 def squared(s: F64, delta: float) -> tuple[F64, F64]:  # noqa: ARG001 - one signature for all losses
-    """rho = s: least squares; ``delta`` has no effect."""
+    """Evaluate rho = s, least squares.
+
+    Parameters
+    ----------
+    s : ndarray, squared residuals
+    delta : float, no effect
+
+    Returns
+    -------
+    rho, weight : ndarray, loss and its derivative
+    """
     return s, np.ones_like(s)
 
 
 def huber(s: F64, delta: float) -> tuple[F64, F64]:
-    """rho = s below delta^2, 2 delta sqrt(s) - delta^2 above (Huber 1964); convex."""
+    """Evaluate rho = s below delta^2, 2 delta sqrt(s) - delta^2 above; convex.
+
+    Parameters
+    ----------
+    s : ndarray, squared residuals
+    delta : float, turning point
+
+    Returns
+    -------
+    rho, weight : ndarray, loss and its derivative
+
+    References
+    ----------
+    Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35, 1964.
+    """
     root = np.sqrt(np.maximum(s, delta**2))
     inside = s <= delta**2
     return np.where(inside, s, 2.0 * delta * root - delta**2), np.where(inside, 1.0, delta / root)
 
 
 def soft_l1(s: F64, delta: float) -> tuple[F64, F64]:
-    """rho = 2 delta^2 (sqrt(1 + s / delta^2) - 1): the smooth relative of Huber's loss; convex."""
+    """Evaluate rho = 2 delta^2 (sqrt(1 + s / delta^2) - 1), the smooth relative of Huber's loss; convex.
+
+    Parameters
+    ----------
+    s : ndarray, squared residuals
+    delta : float, turning point
+
+    Returns
+    -------
+    rho, weight : ndarray, loss and its derivative
+    """
     root = np.sqrt(1.0 + s / delta**2)
     return 2.0 * delta**2 * (root - 1.0), 1.0 / root
 
 
 def cauchy(s: F64, delta: float) -> tuple[F64, F64]:
-    """rho = delta^2 log(1 + s / delta^2): outliers lose their pull; not convex, needs a good start."""
+    """Evaluate rho = delta^2 log(1 + s / delta^2): not convex, needs a good start.
+
+    Parameters
+    ----------
+    s : ndarray, squared residuals
+    delta : float, turning point
+
+    Returns
+    -------
+    rho, weight : ndarray, loss and its derivative
+    """
     ratio = s / delta**2
     return delta**2 * np.log1p(ratio), 1.0 / (1.0 + ratio)
 
 
 def truncated(s: F64, delta: float) -> tuple[F64, F64]:
-    """rho = min(s, delta^2): outliers have no pull at all (the score of MSAC, Torr and Zisserman 2000)."""
+    """Evaluate rho = min(s, delta^2), the score of MSAC (Torr and Zisserman 2000).
+
+    Parameters
+    ----------
+    s : ndarray, squared residuals
+    delta : float, turning point
+
+    Returns
+    -------
+    rho, weight : ndarray, loss and its derivative
+    """
     return np.minimum(s, delta**2), np.where(s <= delta**2, 1.0, 0.0)
 
 
@@ -59,9 +119,21 @@ LOSS_CODES = {name: code for code, name in enumerate(LOSSES)}
 
 
 def loss_code(loss: str, delta: float) -> int:
-    """The number by which the compiled kernels know a loss.
+    """Return the number of a loss in the compiled kernels.
 
-    Raises ``ValueError`` for an unknown name or a scale that is not positive.
+    Parameters
+    ----------
+    loss : str, name in :data:`LOSSES`
+    delta : float, turning point
+
+    Returns
+    -------
+    int, number
+
+    Raises
+    ------
+    ValueError
+        The name is unknown or the turning point is not positive.
     """
     if loss not in LOSS_CODES:
         raise ValueError(f"loss must be one of {', '.join(LOSS_CODES)}; got {loss!r}")
@@ -72,7 +144,18 @@ def loss_code(loss: str, delta: float) -> int:
 
 @njit(cache=True, nogil=True, inline="always")
 def loss_value(code: int, s: float, delta: float) -> float:
-    """rho(s) of the losses of losses.py, numbered in its order."""
+    """Evaluate rho(s).
+
+    Parameters
+    ----------
+    code : int, number of the loss
+    s : float, squared residual
+    delta : float, turning point
+
+    Returns
+    -------
+    float, loss
+    """
     d2 = delta * delta
     if code == 1:
         return s if s <= d2 else 2.0 * delta * math.sqrt(s) - d2
@@ -87,7 +170,18 @@ def loss_value(code: int, s: float, delta: float) -> float:
 
 @njit(cache=True, nogil=True, inline="always")
 def loss_weight(code: int, s: float, delta: float) -> float:
-    """rho'(s)."""
+    """Evaluate rho'(s).
+
+    Parameters
+    ----------
+    code : int, number of the loss
+    s : float, squared residual
+    delta : float, turning point
+
+    Returns
+    -------
+    float, weight
+    """
     d2 = delta * delta
     if code == 1:
         return 1.0 if s <= d2 else delta / math.sqrt(s)
@@ -102,7 +196,18 @@ def loss_weight(code: int, s: float, delta: float) -> float:
 
 @njit(cache=True, nogil=True, inline="always")
 def loss_curvature(code: int, s: float, delta: float) -> float:
-    """1 + 2 s rho'' / rho': how much of the curvature along a residual its loss leaves."""
+    """Evaluate 1 + 2 s rho'' / rho', the fraction of the curvature along a residual that its loss leaves.
+
+    Parameters
+    ----------
+    code : int, number of the loss
+    s : float, squared residual
+    delta : float, turning point
+
+    Returns
+    -------
+    float, fraction <= 1
+    """
     u = s / (delta * delta)
     if code == 1:
         return 1.0 if u <= 1.0 else 0.0

@@ -1,6 +1,4 @@
-"""Metric bundle adjustment: poses, points and intrinsics that views share or have on their own, with
-priors.
-"""
+"""Metric bundle adjustment: poses, points and intrinsics, shared or separate, with priors."""
 
 from __future__ import annotations
 
@@ -52,25 +50,26 @@ from thesisrecon.numerics.schur import (
     build_layout,
 )
 
-# Where a robust loss bends, this share of the curvature along a residual is kept once the gain of a step has
-# fallen below NEWTON_GAIN of the cost. Reweighting goes safely towards the minimum, but near it Newton is faster.
+# Below a relative gain of NEWTON_GAIN, MIN_CURVATURE of the curvature along a residual is kept if its loss
+# bends: reweighting is safe far from the minimum, Newton's method is faster near it.
 MIN_CURVATURE, NEWTON_GAIN = 0.3, 1e-3
 CURVED_LOSSES = ("huber", "soft_l1", "cauchy")
 
 
 @dataclass(frozen=True)
 class BundleOptions:
-    """How a metric bundle is weighed and when it ends.
+    """Weighting and end of a metric bundle adjustment.
 
-    Parameters
+    Attributes
     ----------
-    sigma_px : standard deviation of one image coordinate, the weight of the data against the priors.
-    loss, loss_px : the robust loss and where it turns, px.
-    max_iterations : linear systems at the most.
-    fixed_views : (V,) True for poses that must not move; None: all move.
-    covariance : whether to compute the covariances (one more linear system).
-    noise_floor_px : the covariances take the noise to be at least this, whatever the residuals say.
-    threads : how many may work on it; the answer does not depend on them.
+    sigma_px : float, standard deviation of one image coordinate, the weight of the data against the priors
+    loss : str, robust loss
+    loss_px : float, turning point of the loss, px
+    max_iterations : int, maximum number of linear solves
+    fixed_views : ndarray (V,) of bool, optional, poses that must not move
+    covariance : bool, whether to compute covariances (one more linear system)
+    noise_floor_px : float, least noise assumed for the covariances, px
+    threads : int, worker threads; the result does not depend on them
     """
 
     sigma_px: float = 1.0
@@ -96,12 +95,19 @@ class BundleOptions:
 class MetricBundleResult:
     """Refined cameras and points with their uncertainty.
 
-    ``residual_px`` (K, 2) projection minus observation in the caller's order; ``cost``, ``initial_cost`` 1/2
-    sum rho in units of the given sigma, priors included; ``sigma_px`` the standard deviation of one image
-    coordinate estimated from the residuals. With ``covariance``: ``intrinsics_covariance`` (G, C, C), zero
-    for entries that do not move, and ``pose_covariance`` (V, 6, 6) of (rotation vector in rad, translation)
-    of x -> exp(w) x + d in each camera's frame, with respect to the centre of all poses (the inner gauge: no
-    camera is taken as exact).
+    Attributes
+    ----------
+    cameras : MetricCameras, refined cameras
+    X : ndarray (N, 3), refined points
+    residual_px : ndarray (K, 2), projection minus observation in the caller's order
+    cost, initial_cost : float, 1/2 sum rho in units of the given sigma, priors included
+    iterations : int, linear solves
+    converged : bool, whether the loop converged
+    intrinsics_covariance : ndarray (G, C, C), zero for entries that do not move, and without ``covariance``
+    pose_covariance : ndarray (V, 6, 6) or None
+        Of (rotation vector in rad, translation) of x -> exp(w) x + d in each camera frame, with respect to
+        the centre of all poses (the inner gauge: no camera is taken as exact).
+    sigma_px : float, standard deviation of one image coordinate, estimated from the residuals
     """
 
     cameras: MetricCameras
@@ -124,8 +130,11 @@ class _State:
 
 @dataclass(frozen=True)
 class _MetricProblem:
-    """Reprojection in units of sigma plus the priors; the columns of a view are its pose and the intrinsics
-    that no other shares, the rest of the unknowns are common columns."""
+    """Reprojection in units of sigma plus the priors.
+
+    The columns of a view are its pose and the intrinsics that no other view shares; other unknowns are common
+    columns.
+    """
 
     layout: BundleLayout
     columns: IntrinsicColumns
@@ -153,7 +162,10 @@ class _MetricProblem:
         gradient = np.zeros(self.layout.size)
         gradient[place] = terms.gradient(state.values)
         return CameraPrior(
-            self.columns.of(terms.first), self.columns.of(terms.second), terms.weight, gradient
+            self.columns.columns_of(terms.first),
+            self.columns.columns_of(terms.second),
+            terms.weight,
+            gradient,
         )
 
     def retract(self, state: _State, step: BundleStep) -> _State:
@@ -172,7 +184,7 @@ class _MetricProblem:
         return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
 
     def residual(self, state: _State) -> F64:
-        """Residuals (K, 2) in px."""
+        """Return residuals (K, 2), px."""
         K = len(self.layout.observations.xy)
         residual, depth = np.empty((K, 2)), np.empty(K)
 
@@ -183,13 +195,15 @@ class _MetricProblem:
         return residual
 
     def sigma(self, state: _State, residual: F64) -> float:
-        """The noise of one coordinate, px, from the residuals at the minimum."""
+        """Return the noise of one coordinate, px, from the residuals at the minimum."""
         leverage = np.empty_like(residual)
         self.linearize(state)
         sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
-        held = not self.free_views[self.layout.observations.view_index].all()
+        fixed_frame = not self.free_views[self.layout.observations.view_index].all()
         poses = POSE_DOF * int(self.free_views.sum())
-        return robust_sigma(residual, leverage, poses + self.values.size - (0 if held else SIMILARITY_DOF))
+        return robust_sigma(
+            residual, leverage, poses + self.values.size - (0 if fixed_frame else SIMILARITY_DOF)
+        )
 
     def cost(self, state: _State) -> float:
         def work(_: slice, obs: Observations) -> float:
@@ -207,22 +221,31 @@ def refine_metric_bundle(
     prior: IntrinsicsPrior | None = None,
     options: BundleOptions | None = None,
 ) -> MetricBundleResult:
-    """Minimise sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 over poses, points and
-    intrinsics q.
+    """Minimise reprojection errors and prior deviations over poses, points and intrinsics.
 
-    Sparse Levenberg-Marquardt; the focal is stepped as log f, the seven freedoms of the frame are left to the
-    damping, and the frame is centred and scaled inside so that they are well conditioned.
+    The cost is sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 with the intrinsics q. Sparse
+    Levenberg-Marquardt; the focal length is stepped as log f, the seven gauge freedoms are left to the
+    damping, and the scene is centred and scaled inside. The cost never rises; singular systems end the
+    iterations.
 
     Parameters
     ----------
-    cameras : where to start, and which intrinsics are shared. X : (N, 3) points.
-    observations : K of them, in any order.
-    free : (C,) which of the intrinsics move at all. prior : what is known of them, which
-    may hold single ones; nothing by default.
+    cameras : MetricCameras, start, and which intrinsics are shared
+    X : ndarray (N, 3), points
+    observations : Observations, observations in any order
+    free : ndarray (C,) of bool, intrinsics that move
+    prior : IntrinsicsPrior, optional, prior of the intrinsics, which may fix single values
+    options : BundleOptions, optional, weighting and end
 
-    Views and points without observations come back untouched. The cost never rises; singular systems end the
-    iterations instead of raising. Raises ``ValueError`` for wrong shapes, values that are not finite or
-    focals that are not positive.
+    Returns
+    -------
+    MetricBundleResult
+        Refined cameras and points; views and points without observations are returned unchanged.
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, values that are not finite, or focal lengths that are not positive.
     """
     options = options or BundleOptions()
     X = np.array(X, dtype=np.float64)
@@ -265,7 +288,7 @@ def refine_metric_bundle(
 
 
 def _refined(cameras: MetricCameras, moved: B8, end: MetricModel, origin: F64, scale: float) -> MetricCameras:
-    """The cameras at the end in the caller's frame; those that did not move as they were."""
+    """Return the final cameras in the caller's frame; cameras that did not move are unchanged."""
     return replace(
         cameras,
         R=np.where(moved[:, None, None], end.R, cameras.R),
@@ -275,7 +298,7 @@ def _refined(cameras: MetricCameras, moved: B8, end: MetricModel, origin: F64, s
 
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Solution[_State]:
-    """Down to the minimum, by reweighting first and nearly Newton's steps at the end."""
+    """Minimise, by reweighting first and nearly Newton's steps at the end."""
     if options.loss not in CURVED_LOSSES:
         return run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations)
     far = run_levenberg_marquardt(
@@ -296,7 +319,7 @@ def _metric_problem(
     prior: IntrinsicsPrior | None,
     options: BundleOptions,
 ) -> tuple[_MetricProblem, F64, F64]:
-    """The problem, where its intrinsic values start, and the table of intrinsics they are put into."""
+    """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics."""
     group = np.asarray(cameras.group, dtype=np.int64)
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
@@ -322,13 +345,13 @@ def _metric_problem(
 
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
-    """Covariances of intrinsics (G, C, C) and poses (V, 6, 6) for the noise found, t in the caller's unit."""
+    """Return covariances of intrinsics (G, C, C) and poses (V, 6, 6), t in the caller's unit."""
     w = problem.weighting
     problem = replace(problem, weighting=Weighting(sigma_px, w.code, w.delta))
     reduced, _, _ = problem.linearize(state).reduce(1e-10)
     layout, m = problem.layout, state.model
-    held = not problem.free_views[layout.observations.view_index].all()
+    fixed_frame = not problem.free_views[layout.observations.view_index].all()
     block = np.where(problem.free_views, layout.index.block, -1)
-    found = CovarianceInput(reduced, block, m.R, m.t, held)
-    number = problem.columns.of(problem.values.number)
+    found = CovarianceInput(reduced, block, m.R, m.t, fixed_frame)
+    number = problem.columns.columns_of(problem.values.number)
     return bundle_covariances(found, number, m.intrinsics[:, 0], scale)

@@ -1,7 +1,4 @@
-"""Calibrated cameras with radial distortion: projection, cost and Jacobians.
-
-Calibrated cameras as bundle adjustment sees them, and what is known of their intrinsics beforehand.
-"""
+"""Calibrated cameras with radial distortion in bundle adjustment: projection, cost and Jacobians."""
 
 from __future__ import annotations
 
@@ -20,8 +17,11 @@ from thesisrecon.numerics.small_solvers import away_from_zero
 
 
 class MetricModel(NamedTuple):
-    """``R`` (V, 3, 3), ``t`` (V, 3), ``intrinsics`` (G, 6) or (G, 8) with k2 and k3, ``group`` (V,) the row
-    of each view, ``X`` (N, 3)."""
+    """Scene of the kernels: poses, points and the table of intrinsics.
+
+    ``R`` (V, 3, 3), ``t`` (V, 3), ``intrinsics`` (G, 6) or (G, 8) with k2 and k3, ``group`` (V,) the row of
+    each view, ``X`` (N, 3).
+    """
 
     R: F64
     t: F64
@@ -32,7 +32,7 @@ class MetricModel(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def _in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
-    """R x + t."""
+    """Return R x + t."""
     return (
         r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0],
         r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1],
@@ -42,7 +42,7 @@ def _in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
 
 @njit(cache=True, nogil=True, inline="always")
 def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
-    """Pixel of a point in the camera's frame, w away from 0; q a row of intrinsics."""
+    """Return the pixel of a point in the camera frame, w away from 0; q is a row of intrinsics."""
     a, b = x0 / w, x1 / w
     r2 = a * a + b * b
     d = 1.0 + q[5] * r2
@@ -53,7 +53,15 @@ def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True)
 def project_metric(model: MetricModel, obs: Observations, residual: F64, depth: F64) -> None:
-    """Fill residual (K, 2) px, projection minus observation, and depth (K,)."""
+    """Compute residuals, projection minus observation.
+
+    Parameters
+    ----------
+    model : MetricModel, cameras and points
+    obs : Observations, observations
+    residual : ndarray (K, 2), output, px
+    depth : ndarray (K,), output
+    """
     for k in range(len(obs.xy)):
         v, x = obs.view_index[k], model.X[obs.point_index[k]]
         x0, x1, x2 = _in_camera(model.R[v], model.t[v], x)
@@ -65,7 +73,18 @@ def project_metric(model: MetricModel, obs: Observations, residual: F64, depth: 
 
 @njit(cache=True, nogil=True)
 def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> float:
-    """1/2 sum rho of the residuals."""
+    """Return 1/2 sum rho of the residuals.
+
+    Parameters
+    ----------
+    model : MetricModel, cameras and points
+    obs : Observations, observations
+    weighting : Weighting, noise and loss
+
+    Returns
+    -------
+    float, cost
+    """
     cost = 0.0
     for k in range(len(obs.xy)):
         v, x = obs.view_index[k], model.X[obs.point_index[k]]
@@ -78,11 +97,19 @@ def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> 
 
 @njit(cache=True, nogil=True)
 def move_poses(R: F64, t: F64, step: F64, R_out: F64, t_out: F64) -> None:
-    """Poses R (V, 3, 3), t (V, 3) followed by x -> exp(w) x + d for the steps (w, d) (V, 6)."""
+    """Apply x -> exp(w) x + d in the camera frames after the poses.
+
+    Parameters
+    ----------
+    R : ndarray (V, 3, 3), rotations
+    t : ndarray (V, 3), translations
+    step : ndarray (V, 6), (w, d) of each view
+    R_out, t_out : ndarray, outputs, of the shapes of ``R`` and ``t``
+    """
     for v in range(len(t)):
         w = step[v, :3]
         angle = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-        # Rodrigues: exp(w) = I + a [w]x + b [w]x^2, with their series where the quotients lose digits.
+        # Rodrigues: exp(w) = I + a [w]x + b [w]x^2, by series if the quotients lose digits.
         a, b = 1.0 - angle * angle / 6.0, 0.5 - angle * angle / 24.0
         if angle > 1e-4:
             a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
@@ -101,10 +128,23 @@ def move_poses(R: F64, t: F64, step: F64, R_out: F64, t_out: F64) -> None:
 def linearize_metric(
     model: MetricModel, obs: Observations, weighting: Weighting, own: I64, common: I64, J: Jacobians
 ) -> float:
-    """Fill J with weighted residuals in units of sigma and the Jacobians; returns the cost.
+    """Compute weighted residuals, in units of sigma, and their Jacobians.
 
-    A pose moves by x -> exp(w) x + d in the camera's frame: columns (w, d) of A, behind them the intrinsics
-    that ``own`` lists of (log f, aspect, skew, cx, cy, k1, k2, k3); those that ``common`` lists make E.
+    A pose moves by x -> exp(w) x + d in the camera frame: columns (w, d) of A, then the intrinsics of
+    ``own``.
+
+    Parameters
+    ----------
+    model : MetricModel, cameras and points
+    obs : Observations, observations
+    weighting : Weighting, noise and loss
+    own, common : ndarray of int
+        Intrinsics among (log f, aspect, skew, cx, cy, k1, k2, k3) in the columns of A and of E.
+    J : Jacobians, output
+
+    Returns
+    -------
+    float, 1/2 sum rho
     """
     cost = 0.0
     D = np.empty((2, 10))
@@ -148,8 +188,7 @@ def linearize_metric(
 
 @njit(cache=True, nogil=True)
 def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
-    """Fill D (2, 10): derivatives of the pixel by the eight intrinsics and by the normalised point (a, b),
-    times root."""
+    """Fill D (2, 10): derivatives of the pixel by eight intrinsics and the normalised point, times root."""
     f, g, skew = root * q[0], root * q[0] * q[1], root * q[2]
     r2 = a * a + b * b
     # d is the distortion, slope its derivative over r^2.
@@ -171,20 +210,26 @@ def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
 
 
 POSE_DOF = 6
-# Columns of a table of intrinsics: with k1 alone, and with k2 and k3.
+# Columns of a table of intrinsics: with k1, or with k1, k2 and k3.
 INTRINSIC_DOFS = (6, 8)
 FOCAL = 0
 
 
 @dataclass(frozen=True)
 class MetricCameras:
-    """Calibrated cameras whose views share what they are said to share.
+    """Calibrated cameras with shared or separate intrinsics.
 
-    ``R`` (V, 3, 3) world-to-camera, ``t`` (V, 3); ``intrinsics`` (G, C) rows [focal_px, aspect fy/fx,
-    skew_px, cx_px, cy_px, k1] (C = 6), with k2 and k3 after them where the lens needs these (C = 8);
-    ``group`` (V,) the row of each view. A normalised point (x, y) is obs at (x, y) (1 + k1 r^2 + k2 r^4 + k3
-    r^6), then at K = [[f, skew, cx], [0, aspect f, cy], [0, 0, 1]]. ``shared`` (G, C): rows with equal
-    numbers in a column hold one and the same value there; None: every row has values of its own.
+    A normalised point (x, y) is distorted to (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6) and multiplied by
+    K = [[f, skew, cx], [0, aspect f, cy], [0, 0, 1]].
+
+    Attributes
+    ----------
+    R : ndarray (V, 3, 3), rotations world-to-camera
+    t : ndarray (V, 3), translations
+    intrinsics : ndarray (G, C), rows [focal_px, aspect fy/fx, skew_px, cx_px, cy_px, k1], and k2, k3 if C = 8
+    group : ndarray (V,) of int, row of each view
+    shared : ndarray (G, C) of int, optional
+        Rows with equal numbers in a column have one value there; by default every row has its own.
     """
 
     R: F64
@@ -195,7 +240,7 @@ class MetricCameras:
 
     @property
     def K(self) -> F64:
-        """(V, 3, 3) calibration matrices."""
+        """Calibration matrices (V, 3, 3)."""
         f, aspect, skew, cx, cy = self.intrinsics[self.group].T[:5]
         zero, one = np.zeros_like(f), np.ones_like(f)
         rows = [f, skew, cx, zero, aspect * f, cy, zero, zero, one]
@@ -203,12 +248,24 @@ class MetricCameras:
 
     @property
     def P(self) -> F64:
-        """(V, 3, 4) cameras before distortion, K [R t]."""
+        """Cameras before distortion, K [R t]; (V, 3, 4)."""
         return np.asarray(self.K @ np.concatenate([self.R, self.t[:, :, None]], axis=2))
 
 
 def check_cameras(cameras: MetricCameras, X: F64, free: B8) -> None:
-    """Refuse wrong shapes and values with ``ValueError``."""
+    """Raise ``ValueError`` for wrong shapes and values of cameras and points.
+
+    Parameters
+    ----------
+    cameras : MetricCameras, cameras
+    X : ndarray (N, 3), points
+    free : ndarray (C,) of bool, intrinsics that move
+
+    Raises
+    ------
+    ValueError
+        A shape is wrong, a value is not finite or a focal length is not positive.
+    """
     n_views, n_rows, width = len(cameras.R), len(cameras.intrinsics), cameras.intrinsics.shape[-1]
     shapes = (cameras.R.shape, cameras.t.shape, cameras.intrinsics.shape, cameras.group.shape, X.shape[1:])
     if width not in INTRINSIC_DOFS or shapes != (
@@ -218,20 +275,31 @@ def check_cameras(cameras: MetricCameras, X: F64, free: B8) -> None:
             f"a metric bundle needs R (V, 3, 3), t (V, 3), intrinsics (G, 6 or 8), group (V,); got {shapes}"
         )
     if np.shape(free) != (width,):
-        raise ValueError(f"free is one flag for each of the {width} intrinsics; got shape {np.shape(free)}")
-    if cameras.shared is not None and np.shape(cameras.shared) != cameras.intrinsics.shape:
         raise ValueError(
-            f"shared has a number for each of the intrinsics; got shape {np.shape(cameras.shared)}"
+            f"free needs one flag for each of the {width} intrinsics; got shape {np.shape(free)}"
         )
+    if cameras.shared is not None and np.shape(cameras.shared) != cameras.intrinsics.shape:
+        raise ValueError(f"shared needs the shape of the intrinsics; got shape {np.shape(cameras.shared)}")
     finite = (np.isfinite(a).all() for a in (cameras.R, cameras.t, cameras.intrinsics, X))
     if not all(finite) or not (cameras.intrinsics[:, FOCAL] > 0.0).all():
-        raise ValueError("cameras and points must be finite and focals positive")
+        raise ValueError("cameras and points must be finite and focal lengths positive")
     if n_views and (cameras.group.min() < 0 or cameras.group.max() >= n_rows):
         raise ValueError(f"groups must lie in 0..{n_rows - 1}")
 
 
 def check_prior(prior: IntrinsicsPrior, shape: tuple[int, ...]) -> None:
-    """Refuse wrong shapes and values with ``ValueError``."""
+    """Raise ``ValueError`` for wrong shapes and values of a prior.
+
+    Parameters
+    ----------
+    prior : IntrinsicsPrior, prior
+    shape : tuple of int, required shape (G, C)
+
+    Raises
+    ------
+    ValueError
+        A shape, standard deviation, mean or focal length is invalid.
+    """
     known = np.isfinite(prior.std) if np.shape(prior.std) == shape else np.ones(shape, dtype=bool)
     if not (
         np.shape(prior.mean) == np.shape(prior.std) == shape

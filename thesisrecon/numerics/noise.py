@@ -1,7 +1,4 @@
-"""Compiled pieces of robust estimation: random samples, how many are needed, the noise of residuals.
-
-Section 5.4: the standard deviation of the noise from residuals that hold wrong matches too.
-"""
+"""Section 5.4: standard deviation of the noise from residuals that contain wrong matches."""
 
 from __future__ import annotations
 
@@ -13,18 +10,28 @@ from numba import njit
 from thesisrecon.arrays import F64
 
 TAIL, SEPARATION = 4.0, 12.0
-"""Standard deviations of the tail of the noise, and the least of wrong residuals, in those of the noise."""
+"""Standard deviations of the noise's tail, and the least of wrong residuals, relative to the noise."""
 CORE_COUNT, TAIL_COUNT, WRONG_COUNT = 1.0, 0.5, 1.0
-"""What is thought to have been seen of each before the first residual."""
+"""Prior counts of each component."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_noise_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
-    """Expectation-maximisation of three normals with mean 0 on residuals (N,) >= 0; mean log-likelihood.
+    """Fit three zero-mean normals to residuals by expectation-maximisation.
 
-    ``mixture`` (5,) holds sigma, the spread of the wrong residuals and the shares of noise, of its tail (TAIL
-    times as wide) and of the wrong; it is read and updated. ``parameters`` were fitted to the residuals,
-    ``spread`` is what the one wrong residual thought to have been seen has.
+    Parameters
+    ----------
+    residuals : ndarray (N,), residuals >= 0
+    parameters : float, parameters fitted to the residuals
+    spread : float, prior standard deviation of wrong residuals
+    rounds : int, EM rounds
+    mixture : ndarray (5,)
+        Sigma, standard deviation of wrong residuals, fractions of noise, its tail (TAIL times as wide) and
+        wrong residuals; updated.
+
+    Returns
+    -------
+    float, mean log-likelihood
     """
     n = len(residuals)
     likelihood = 0.0
@@ -64,23 +71,47 @@ def fit_noise_mixture(residuals: F64, parameters: float, spread: float, rounds: 
 
 MAD_FACTOR = 1.4826022185056018
 """1 / Phi^-1(0.75): the thesis' text divides by Phi(0.75), which is not consistent."""
-ENDED, WIDENINGS = 0.22, 6
+MEDIAN_RATIO, MAX_WIDENINGS = 0.22, 6
 RAYLEIGH_MEDIAN = 1.1774
-CUT, CUT_VARIANCE, TRIMMINGS = 2.5, 0.91125, 5
-"""Where the noise is cut, and the variance of a standard normal variable cut there."""
-ROUNDS, QUANTILES = 6, 300
-"""Rounds of a mixture's fit, and the residuals (evenly spaced in order) that stand for more of them."""
+TRIM, TRIMMED_VARIANCE, TRIM_ROUNDS = 2.5, 0.91125, 5
+"""Trimming point in standard deviations, variance of a standard normal variable trimmed there, and rounds."""
+EM_ROUNDS, QUANTILES = 6, 300
+"""EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more."""
 BISECTIONS = 20
 HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
 
 
 def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
-    """Robust standard deviation 1.4826 (1 + 5 / (n - p)) median |r| of residuals with mean 0.
+    """Estimate the standard deviation by 1.4826 (1 + 5 / (n - p)) median |r|.
 
-    ``residuals`` (N,), of any sign, ``parameters`` the p degrees of freedom that were fitted to them
-    (Rousseeuw and Leroy 1987; Torr and Murray, IJCV 1997). The factor is 1 / Phi^-1(0.75), where the thesis'
-    text has 1 / Phi(0.75). Breaks down where half of the residuals are wrong. Raises ``ValueError`` where
-    N <= p, since nothing is left to estimate from, and for residuals that are not finite.
+    Breaks down if half of the residuals are wrong.
+
+    Parameters
+    ----------
+    residuals : ndarray (N,), residuals of mean 0, any sign
+    parameters : int, degrees of freedom p fitted to them
+
+    Returns
+    -------
+    float, standard deviation, in units of the residuals
+
+    Raises
+    ------
+    ValueError
+        N <= p, or a residual is not finite.
+
+    Notes
+    -----
+    The factor is 1 / Phi^-1(0.75); the thesis' text has 1 / Phi(0.75).
+
+    References
+    ----------
+    Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987; Torr and Murray, IJCV 24(3), 1997.
+
+    Examples
+    --------
+    >>> round(noise_scale(np.array([-1.0, 1.0] * 500)), 2)
+    1.49
     """
     n = len(residuals)
     if n <= parameters:
@@ -91,55 +122,85 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
 
 
 def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
-    """The width within which residuals (N,) >= 0 are of the noise: ``threshold``, or more if they go on.
+    """Return the width that contains the noise: ``threshold``, or more if the residuals continue.
 
-    Normal noise has its median at no more than 0.22 of a width of 3 standard deviations or more; a higher
-    one (the ``parameters`` that were fitted allowed for) says that the width cuts the noise off, or that the
-    residuals are of wrong matches and spread evenly.
-    The width grows, by 1.5 a step, until the noise ends; where it does not end within 11 thresholds they are
-    wrong matches, and the threshold stands.
+    Normal noise has its median at no more than 0.22 of a width of 3 standard deviations or more (the fitted
+    ``parameters`` allowed for); a higher median shows that the width cuts the noise off, or that the
+    residuals are of wrong matches and spread evenly. The width grows by steps of 1.5 until the noise ends; if
+    it does not end within 11 thresholds, the residuals are wrong matches and the threshold is kept.
+
+    Parameters
+    ----------
+    residuals : ndarray (N,), residuals >= 0
+    threshold : float, least width
+    parameters : int, degrees of freedom fitted to the residuals
+
+    Returns
+    -------
+    float, width, in units of the residuals
     """
     width, ordered = threshold, np.sort(residuals)
-    for _ in range(WIDENINGS + 1):
+    for _ in range(MAX_WIDENINGS + 1):
         n = int(np.searchsorted(ordered, width))
         if n <= parameters:
             return threshold
         median = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
-        if median <= ENDED * width * np.sqrt(1.0 - parameters / n):
+        if median <= MEDIAN_RATIO * width * np.sqrt(1.0 - parameters / n):
             return width
         width *= 1.5
     return threshold
 
 
 def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
-    """Standard deviation of residuals (N,) >= 0 from those within 2.5 of it, where they are normal.
+    """Estimate the standard deviation from the residuals within 2.5 of it.
 
-    The root of the mean square, corrected for the cut and the ``parameters`` fitted, repeated from ``start``
-    until the cut stays: half the variance of the median's estimate. Returns ``start`` where too few are left.
+    The root mean square, corrected for the trimming and the fitted ``parameters``, repeated from ``start``:
+    half the variance of the median's estimate.
+
+    Parameters
+    ----------
+    residuals : ndarray (N,), residuals >= 0
+    start : float, initial standard deviation
+    parameters : int, degrees of freedom fitted to the residuals
+
+    Returns
+    -------
+    float, standard deviation; ``start`` if too few residuals are left
     """
     sigma = start
-    for _ in range(TRIMMINGS):
-        kept = residuals[residuals <= CUT * sigma]
+    for _ in range(TRIM_ROUNDS):
+        kept = residuals[residuals <= TRIM * sigma]
         if len(kept) <= 2 * parameters:
             return start
-        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / CUT_VARIANCE))
+        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / TRIMMED_VARIANCE))
     return sigma
 
 
 def noise_from_distances(distances: F64) -> float:
-    """Standard deviation of one coordinate from the lengths (N,) of two-dimensional residuals, N > 0.
+    """Estimate the standard deviation of one coordinate from lengths of two-dimensional residuals.
 
-    The median of a Rayleigh variable is 1.1774 sigma.
+    Parameters
+    ----------
+    distances : ndarray (N,), lengths, N > 0
+
+    Returns
+    -------
+    float, median / 1.1774, the median of a Rayleigh variable
     """
     return float(np.median(distances)) / RAYLEIGH_MEDIAN
 
 
 @dataclass(frozen=True)
 class NoiseMixture:
-    """Residuals as normal noise of ``sigma``, its tail four times as wide, and wrong ones of ``spread``.
+    """Residuals as normal noise, its tail four times as wide, and wrong matches.
 
-    ``core``, ``tail`` and ``wrong`` are the shares, ``log_likelihood`` the mean over the residuals: of two
-    models of the same data the one with the higher explains them better, whatever its noise.
+    Attributes
+    ----------
+    sigma : float, standard deviation of the noise
+    spread : float, standard deviation of wrong residuals
+    core, tail, wrong : float, fractions of the components
+    log_likelihood : float
+        Mean over the residuals: of two models of the same data the higher one explains them better.
     """
 
     sigma: float
@@ -151,22 +212,30 @@ class NoiseMixture:
 
     @classmethod
     def fit(cls, residuals: F64, sigma: float, *, spread: float, parameters: int = 7) -> NoiseMixture:
-        """The mixture of residuals (N > 0,) >= 0 in ascending order, by expectation-maximisation.
+        """Fit the mixture by expectation-maximisation (McLachlan and Peel, 2000).
 
-        ``sigma`` > 0 is where it starts, ``spread`` what wrong residuals are thought to have before any was
-        seen, ``parameters`` how many were fitted to the residuals (McLachlan and Peel, 2000).
+        Parameters
+        ----------
+        residuals : ndarray (N,), residuals >= 0 in ascending order, N > 0
+        sigma : float, initial standard deviation of the noise, > 0
+        spread : float, prior standard deviation of wrong residuals
+        parameters : int, degrees of freedom fitted to the residuals
+
+        Returns
+        -------
+        NoiseMixture, fitted mixture
         """
         step = max(len(residuals) // QUANTILES, 1)
         some = residuals[step // 2 :: step]
         share = float(np.count_nonzero(some < 3.0 * sigma)) / len(some)
         mixture = np.array([sigma, spread, 0.9 * share, 0.1 * share, 1.0 - share])
-        likelihood = fit_noise_mixture(some, parameters / step, spread, ROUNDS, mixture)
+        likelihood = fit_noise_mixture(some, parameters / step, spread, EM_ROUNDS, mixture)
         sigma, spread, core, tail, wrong = mixture.tolist()
         return cls(sigma, spread, core, tail, wrong, float(likelihood))
 
     @property
     def limit(self) -> float:
-        """The residual at which noise, with its tail, and wrong ones are equally likely."""
+        """Residual at which noise, with its tail, and wrong matches are equally likely."""
         low, high = self.sigma, self.spread
         for _ in range(BISECTIONS):
             middle = float(np.sqrt(low * high))
@@ -178,18 +247,27 @@ class NoiseMixture:
 
     @property
     def core_limit(self) -> float:
-        """The residual at which noise and its tail are equally likely."""
+        """Residual at which noise and its tail are equally likely."""
         odds = max(TAIL * self.core / self.tail, 1.5)
         return self.sigma * float(np.sqrt(2.0 * np.log(odds) / (1.0 - TAIL**-2)))
 
 
 def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> float:
-    """Width of Huber's loss that promises the least variance for residuals (N > 0,) >= 0 of noise ``sigma``.
+    """Return the width of Huber's loss with the least expected variance.
 
-    The asymptotic variance of an M-estimator is mean(psi^2) / mean(psi')^2 (Huber, 1964), judged here from
-    the residuals themselves (Jaeckel, 1971). Least squares (infinite width) is left only for a gain of more
-    than twice the chance of N residuals to which ``parameters`` were fitted: few of them look heavy-tailed
-    too easily, and the variance would be judged too small with them.
+    The asymptotic variance of an M-estimator is mean(psi^2) / mean(psi')^2 (Huber, 1964), estimated from the
+    residuals (Jaeckel, 1971). Least squares (infinite width) is abandoned only for a gain of more than twice
+    the chance of N residuals to which ``parameters`` were fitted: few residuals look heavy-tailed too easily.
+
+    Parameters
+    ----------
+    residuals : ndarray (N,), residuals >= 0
+    sigma : float, standard deviation of the noise
+    parameters : int, degrees of freedom fitted to the residuals
+
+    Returns
+    -------
+    float, width, in units of the residuals; inf for least squares
     """
     n = len(residuals)
     if n <= 2 * parameters:
@@ -204,10 +282,19 @@ def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> fl
 
 
 def effective_noise(residuals: F64, width: float, *, parameters: int = 0) -> float:
-    """Standard deviation of normal noise with which least squares would be as uncertain as Huber's loss is.
+    """Return the normal noise with which least squares would be as uncertain as Huber's loss.
 
-    sqrt(sum(psi^2) / (N - p)) / mean(psi') for residuals (N > 0,) >= 0 to which ``parameters`` p were fitted
-    under the loss of ``width`` (Huber, 1973).
+    sqrt(sum(psi^2) / (N - p)) / mean(psi') (Huber, 1973).
+
+    Parameters
+    ----------
+    residuals : ndarray (N,), residuals >= 0, N > 0
+    width : float, width of Huber's loss
+    parameters : int, degrees of freedom p fitted to the residuals
+
+    Returns
+    -------
+    float, standard deviation
     """
     n = len(residuals)
     psi = np.minimum(residuals, width)

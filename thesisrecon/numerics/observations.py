@@ -1,9 +1,4 @@
-"""Observations of points in views, checked and sorted for the kernels.
-
-Arrays that travel together into the kernels.
-
-Frames in which projective problems are well conditioned: scaled pixels and whitened space.
-"""
+"""Image observations of scene points, checked and sorted, and the other arrays that kernels take together."""
 
 from __future__ import annotations
 
@@ -17,7 +12,13 @@ from thesisrecon.arrays import F64, I64
 
 
 class Observations(NamedTuple):
-    """Image observations of scene points, in any order; sorted by point is fastest."""
+    """Image observations of scene points, in any order; sorted by point is fastest.
+
+    Attributes
+    ----------
+    view_index, point_index : ndarray (K,) of int, view and point of each observation
+    xy : ndarray (K, 2), pixels
+    """
 
     view_index: I64
     point_index: I64
@@ -30,9 +31,14 @@ class Observations(NamedTuple):
 
 @dataclass(frozen=True)
 class SortedObservations:
-    """Observations sorted by (point, view), checked; ``order`` (K,) takes the caller's order to this one.
+    """Checked observations, sorted by (point, view).
 
-    ``start`` (N + 1,) is where the observations of each point begin.
+    Attributes
+    ----------
+    view_index, point_index : ndarray (K,) of int, view and point of each observation
+    xy : ndarray (K, 2), pixels
+    start : ndarray (N + 1,) of int, first observation of each point
+    order : ndarray (K,) of int, position of each observation in the caller's order
     """
 
     view_index: I64
@@ -42,7 +48,16 @@ class SortedObservations:
     order: I64
 
     def unsort(self, values: F64) -> F64:
-        """Values per observation (K, ...) in the caller's order."""
+        """Return values of observations in the caller's order.
+
+        Parameters
+        ----------
+        values : ndarray (K, ...), values in sorted order
+
+        Returns
+        -------
+        ndarray (K, ...), values in the caller's order
+        """
         out = np.empty_like(values)
         out[self.order] = values
         return out
@@ -51,8 +66,23 @@ class SortedObservations:
 def sort_observations(
     view_index: I64, point_index: I64, xy: F64, n_views: int, n_points: int
 ) -> SortedObservations:
-    """Check and sort observations by (point, view); raises ``ValueError`` for wrong shapes, indices or
-    NaN."""
+    """Check observations and sort them by (point, view).
+
+    Parameters
+    ----------
+    view_index, point_index : ndarray (K,) of int, view and point of each observation
+    xy : ndarray (K, 2), pixels
+    n_views, n_points : int, numbers of views and points
+
+    Returns
+    -------
+    SortedObservations, sorted observations
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, indices out of range, or pixels that are not finite.
+    """
     view = np.ascontiguousarray(view_index, dtype=np.int64)
     point = np.ascontiguousarray(point_index, dtype=np.int64)
     xy = np.ascontiguousarray(xy, dtype=np.float64)
@@ -63,9 +93,7 @@ def sort_observations(
     if not np.isfinite(xy).all():
         raise ValueError("observations must be finite")
     if len(view) and (view.min() < 0 or view.max() >= n_views or point.min() < 0 or point.max() >= n_points):
-        raise ValueError(
-            f"observations name views or points beyond the {n_views} views and {n_points} points"
-        )
+        raise ValueError(f"observation indices are beyond the {n_views} views or {n_points} points")
     key = point * max(n_views, 1) + view
     order = np.arange(len(key))
     if np.any(key[1:] < key[:-1]):
@@ -86,20 +114,20 @@ class Jacobians(NamedTuple):
 
     @classmethod
     def empty(cls, n: int, own: int, common: int) -> Jacobians:
-        """Buffers of n observations with ``own`` columns in A and ``common`` ones in E."""
+        """Allocate buffers of n observations with ``own`` columns in A and ``common`` ones in E."""
         return cls(*(np.empty((n, *shape)) for shape in [(2,), (2, own), (2, common), (2, 3)]))
 
     def part(self, first: int, last: int) -> Jacobians:
-        """Those of observations first..last, without a copy."""
+        """Return observations ``first`` to ``last`` without a copy."""
         return Jacobians(*(a[first:last] for a in self))
 
 
 class Weighting(NamedTuple):
-    """Residuals are counted in units of ``sigma`` under loss number ``code``, which turns at ``delta``.
+    """Weighting of residuals: in units of ``sigma``, under loss number ``code`` that turns at ``delta``.
 
-    ``least`` is the share of the curvature along a residual that is kept at least where its loss bends
-    (Triggs et al., Bundle Adjustment, 1999, equation 11): 1 is plain reweighting, less comes closer to
-    Newton's steps.
+    ``min_curvature`` is the least fraction of the curvature along a residual that is kept if its loss bends
+    (Triggs et al., Bundle Adjustment, 1999, equation 11): 1 is plain reweighting, less is closer to Newton's
+    steps.
     """
 
     sigma: float
@@ -112,11 +140,22 @@ _MORTON_BITS = 31
 
 
 def morton_pair_order(first: ArrayLike, second: ArrayLike) -> I64:
-    """(M,) the pairs of views in an order in which what was made of a view serves again.
+    """Return an order of view pairs in which cached data of a view are reused.
 
-    Along Morton's curve (G. M. Morton, A computer oriented geodetic data base, IBM, 1966) through the table
-    of pairs, a pair and its turned one together: parts of any size hold few different views, so that of V
-    views with room for M of them some V^2 / M are made, and not one for each pair, whatever M is.
+    Along Morton's curve through the table of pairs, ranges of any size contain few different views: of V
+    views with a cache of M some V^2 / M are computed, instead of one for each pair.
+
+    Parameters
+    ----------
+    first, second : array_like (M,) of int, views of each pair
+
+    Returns
+    -------
+    ndarray (M,) of int, indices of the pairs; a pair and its reverse are adjacent
+
+    References
+    ----------
+    Morton, "A computer oriented geodetic data base", IBM, 1966.
     """
     i, j = np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)
     low, high = np.minimum(i, j), np.maximum(i, j)

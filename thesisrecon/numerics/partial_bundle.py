@@ -1,6 +1,4 @@
-"""Refinement of one kind of unknown with the rest held: points, one projective camera, one calibrated
-pose.
-"""
+"""Structure-only and motion-only bundle adjustment: points, one projective camera or one calibrated pose."""
 
 from __future__ import annotations
 
@@ -43,7 +41,11 @@ MAX_ITERATIONS = 200
 
 
 class PointOptions(NamedTuple):
-    """Huber or another loss (number, turning point) and when the refinement of a point ends."""
+    """Loss and end of a refinement of points.
+
+    ``patience`` is the number of consecutive relative gains below ``tolerance`` that end it;
+    ``keep_cheirality`` rejects steps that change the number of views a point lies behind.
+    """
 
     loss_code: int
     delta: float
@@ -54,8 +56,7 @@ class PointOptions(NamedTuple):
 
 
 class PointObservations(NamedTuple):
-    """Observations ``first`` to ``last`` of one point, among all sorted by point: ``view_index`` (K,), ``xy``
-    (K, 2)."""
+    """Observations ``first`` to ``last`` of one point among all, sorted by point."""
 
     first: int
     last: int
@@ -65,7 +66,7 @@ class PointObservations(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _point_cost(P: F64, x: F64, obs: PointObservations, options: PointOptions) -> tuple[float, int]:
-    """1/2 sum rho of one point's observations, and how many of them lie behind their camera."""
+    """Return 1/2 sum rho of one point's observations and the number of cameras it lies behind."""
     first, last, view_index, xy = obs
     code, delta = options.loss_code, options.delta
     cost, behind = 0.0, 0
@@ -86,8 +87,7 @@ def _point_cost(P: F64, x: F64, obs: PointObservations, options: PointOptions) -
 def _linearize_point(
     P: F64, x: F64, tangent: tuple[F64, float], obs: PointObservations, options: PointOptions, H: F64, g: F64
 ) -> None:
-    """Fill J'J (3, 3) and J'r (3,) of one unit point in its ``tangent`` space (Householder vector v, factor
-    beta)."""
+    """Fill J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space (Householder vector, factor)."""
     v, beta = tangent
     first, last, view_index, xy = obs
     code, delta = options.loss_code, options.delta
@@ -165,11 +165,17 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
 
 @dataclass(frozen=True)
 class CameraRefinement:
-    """A refined camera ``P`` (3, 4), at the norm and sign of its start.
+    """Refined projective camera.
 
-    ``covariance`` (12, 12) of P's row-major entries in the caller's frame for noise of 1 px in each image
-    coordinate: multiply by sigma^2. It has no part along P itself (the scale); directions that the points do
-    not determine have huge variances. ``residual_px`` (M, 2) projection minus observation; ``cost`` px^2.
+    Attributes
+    ----------
+    P : ndarray (3, 4), camera at the norm and sign of its start
+    covariance : ndarray (12, 12)
+        Of P's row-major entries for image noise of 1 px; multiply by sigma^2. No part along P itself (the
+        scale); huge variances in undetermined directions.
+    residual_px : ndarray (M, 2), projection minus observation
+    cost : float, 1/2 sum rho, px^2
+    iterations : int, linear solves
     """
 
     P: F64
@@ -181,11 +187,19 @@ class CameraRefinement:
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """A refined calibrated camera: ``R`` (3, 3), ``t`` (3,), ``intrinsics`` (6,).
+    """Refined calibrated camera.
 
-    ``covariance`` (6 + F, 6 + F) for noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x +
-    d in the camera's frame, then the F free intrinsics, the focal as log f. ``residual_px`` (M, 2); ``cost``
-    px^2.
+    Attributes
+    ----------
+    R : ndarray (3, 3), rotation world-to-camera
+    t : ndarray (3,), translation
+    intrinsics : ndarray (6,) or (8,), row of intrinsics as in :class:`MetricCameras`
+    covariance : ndarray (6 + F, 6 + F)
+        For noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x + d in the camera frame,
+        then the F free intrinsics, the focal length as log f.
+    residual_px : ndarray (M, 2), projection minus observation
+    cost : float, 1/2 sum rho, px^2
+    iterations : int, linear solves
     """
 
     R: F64
@@ -207,7 +221,31 @@ def refine_points(
     loss_px: float = 1.0,
     iterations: int = 5,
 ) -> F64:
-    """Refine each point with the cameras fixed (structure-only bundle adjustment)."""
+    """Refine each point with the cameras fixed: least sum of rho(|x - P X|^2), Huber's loss.
+
+    Damped Gauss-Newton in the tangent space of the whitened unit 4-vector. The cost of no point rises and no
+    point crosses the focal plane of a view that observes it.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    X : ndarray (N, 4), homogeneous starting points
+    view_index, point_index : ndarray (K,) of int, view and point of each observation
+    xy : ndarray (K, 2), pixels
+    loss_px : float, turning point of Huber's loss, px
+    iterations : int, steps per point
+
+    Returns
+    -------
+    ndarray (N, 4)
+        Points with the norms and signs of the starts; unchanged if zero, not finite or observed less than
+        twice.
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes.
+    """
     P, X, o = _checked_points("refine_points", P, X, (view_index, point_index, xy))
     used = _observed_twice(X, o)
     if not used.any():
@@ -217,7 +255,29 @@ def refine_points(
 
 
 def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy: F64) -> F64:
-    """Run each point to its least sum of squared reprojection errors."""
+    """Move each point to its least sum of squared reprojection errors (a local minimum), cameras fixed.
+
+    Works in a frame in which the cameras' rows are orthonormal and repeats until two steps bring no gain
+    above rounding; points may cross focal planes.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    X : ndarray (N, 4), homogeneous starting points
+    view_index, point_index : ndarray (K,) of int, view and point of each observation
+    xy : ndarray (K, 2), pixels
+
+    Returns
+    -------
+    ndarray (N, 4)
+        Points with the norms and signs of the starts; unchanged if zero, not finite or observed less than
+        twice.
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes.
+    """
     P, X, o = _checked_points("minimize_reprojection", P, X, (view_index, point_index, xy))
     used = _observed_twice(X, o)
     if not used.any():
@@ -225,7 +285,7 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
     cameras = pixel_conditioning(o.xy) @ P
     norms = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
     M = np.asarray(np.linalg.qr((cameras / np.where(norms > 0.0, norms, 1.0)).reshape(-1, 4))[1])
-    # Two cameras with one centre leave a direction of space without images.
+    # Cameras with one centre leave a direction of space undetermined.
     if len(M) < 4 or not np.abs(np.diag(M)).min() > 1e-13 * np.abs(M).max():
         M = np.eye(4)
     options = PointOptions(loss_code("squared", 1.0), 1.0, MAX_ITERATIONS, 1e-14, 2, False)
@@ -235,6 +295,7 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
 def _checked_points(
     caller: str, P: F64, X: F64, observations: tuple[I64, I64, F64]
 ) -> tuple[F64, F64, SortedObservations]:
+    """Check cameras, points and observations."""
     P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
     if P.ndim != 3 or P.shape[1:] != (3, 4) or X.ndim != 2 or X.shape[1] != 4:
         raise ValueError(f"{caller} needs (V, 3, 4) cameras and (N, 4) points; got {P.shape}, {X.shape}")
@@ -242,6 +303,7 @@ def _checked_points(
 
 
 def _observed_twice(X: F64, o: SortedObservations) -> B8:
+    """Return the finite non-zero points with two observations or more."""
     norms = np.linalg.norm(X, axis=1)
     return np.asarray(np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2))
 
@@ -249,7 +311,7 @@ def _observed_twice(X: F64, o: SortedObservations) -> B8:
 def _refine_in_frame(P: F64, X: F64, o: SortedObservations, used: B8, M: F64, options: PointOptions) -> F64:
     """Refine the ``used`` points in conditioned pixels and the space M X; norms and signs are kept."""
     norms, T = np.linalg.norm(X, axis=1), pixel_conditioning(o.xy)
-    # The scale of a camera does not change its projections, but it must not push depths below rounding.
+    # The scale of a camera has no effect on its projections, but must not push depths below rounding.
     cameras = T @ P @ np.linalg.inv(M)
     sizes = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
     cameras = np.ascontiguousarray(cameras / np.where(sizes > 0.0, sizes, 1.0))
@@ -266,7 +328,7 @@ def _refine_in_frame(P: F64, X: F64, o: SortedObservations, used: B8, M: F64, op
 
 @dataclass(frozen=True)
 class _CameraProblem:
-    """One unit camera (1, 12) against whitened unit points, conditioned pixels."""
+    """One unit camera (1, 12) and fixed whitened unit points, conditioned pixels."""
 
     X: F64
     obs: Observations
@@ -292,22 +354,38 @@ class _CameraProblem:
 
 
 def _one_view_observations(xy: F64) -> Observations:
-    """Every point once, by the only view."""
+    """Return observations of every point by the only view."""
     return Observations(np.zeros(len(xy), dtype=np.int64), np.arange(len(xy)), np.ascontiguousarray(xy))
 
 
 def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
-    """Normal equations of the camera's columns."""
+    """Return the normal equations of the camera columns."""
     A, r = J.A.reshape(-1, J.A.shape[2]), J.residual.ravel()
     return DenseSystem(cost, A.T @ A, A.T @ r)
 
 
 def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> CameraRefinement:
-    """Minimise sum rho(|x - P X|^2) over one camera's 11 freedoms, points held (resection, section 6.4).
+    """Refine one projective camera with the points fixed: resection (section 6.4), 11 unknowns, Huber's loss.
 
-    P (3, 4) start; X (M, 4) homogeneous points; xy (M, 2) px; rho = Huber's loss at ``loss_px``. Conditioned
-    and whitened inside. Too few points or points on one plane do not raise: their covariance says so. Raises
-    ``ValueError`` for wrong shapes or zero or infinite values.
+    Conditioned and whitened inside. Too few points or points on one plane raise nothing: the covariance shows
+    them.
+
+    Parameters
+    ----------
+    P : ndarray (3, 4), start
+    X : ndarray (M, 4), homogeneous points
+    xy : ndarray (M, 2), pixels
+    loss_px : float, turning point of Huber's loss, px
+    iterations : int, maximum number of linear solves
+
+    Returns
+    -------
+    CameraRefinement, camera with covariance
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, or values that are zero or not finite.
     """
     P, X, xy = (np.array(a, dtype=np.float64) for a in (P, X, xy))
     if P.shape != (3, 4) or X.ndim != 2 or X.shape[1] != 4 or xy.shape != (len(X), 2) or len(X) == 0:
@@ -331,7 +409,7 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     raw = back @ solution.state[0]
     back *= size / np.linalg.norm(raw)
     raw *= size / np.linalg.norm(raw)
-    # The norm is held at that of the start, so the part of an error along P is only a change of scale.
+    # The norm is fixed, so the part of an error along P is only a change of scale.
     back -= np.outer(raw, raw @ back) / size**2
     covariance = back @ _camera_covariance(problem, solution.state) @ back.T * scale**2
     return CameraRefinement(
@@ -344,7 +422,7 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
 
 
 def _camera_covariance(problem: _CameraProblem, state: F64) -> F64:
-    """(12, 12) covariance of the unit camera for unit noise in conditioned pixels."""
+    """Return the covariance (12, 12) of the unit camera for unit noise in conditioned pixels."""
     v, beta = np.empty_like(state), np.empty(1)
     tangent_reflectors(state, v, beta)
     basis = (np.eye(12) - beta[0] * np.outer(v[0], v[0]))[:, 1:]
@@ -353,7 +431,7 @@ def _camera_covariance(problem: _CameraProblem, state: F64) -> F64:
 
 @dataclass(frozen=True)
 class _PoseProblem:
-    """One calibrated camera against points held still; a state's model has one view and one row."""
+    """One calibrated camera and fixed points; a state's model has one view and one row."""
 
     obs: Observations
     free: I64
@@ -393,12 +471,27 @@ def refine_pose(
     loss_px: float = 1.0,
     iterations: int = 20,
 ) -> PoseRefinement:
-    """Minimise sum rho(|x - project(X)|^2) over one pose and the free intrinsics, points held.
+    """Refine one pose and its free intrinsics with the points fixed, Huber's loss.
 
-    R (3, 3) world-to-camera, t (3,), intrinsics (6,) or (8,) as in ``MetricCameras``; X (M,
-    3); xy (M, 2) px; free (6,) or (8,) which intrinsics move (none by default); rho =
-    Huber's loss at ``loss_px``. Raises ``ValueError`` for wrong shapes, values that are not finite or a focal
-    that is not positive.
+    Parameters
+    ----------
+    R : ndarray (3, 3), rotation world-to-camera
+    t : ndarray (3,), translation
+    intrinsics : ndarray (6,) or (8,), row of intrinsics as in :class:`MetricCameras`
+    X : ndarray (M, 3), points
+    xy : ndarray (M, 2), pixels
+    free : ndarray (6,) or (8,) of bool, optional, intrinsics that move; none by default
+    loss_px : float, turning point of Huber's loss, px
+    iterations : int, maximum number of linear solves
+
+    Returns
+    -------
+    PoseRefinement, pose with covariance
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, values that are not finite, or a focal length that is not positive.
     """
     R, t, q, X, xy = (np.array(a, dtype=np.float64) for a in (R, t, intrinsics, X, xy))
     shapes = R.shape, t.shape, q.shape, X.shape
@@ -409,7 +502,7 @@ def refine_pose(
             f"refine_pose needs finite (M, 2) pixels and a positive focal; got {xy.shape}, {q[0]}"
         )
     columns = np.flatnonzero(np.zeros(len(q), bool) if free is None else free)
-    # Centred and scaled points: the pose's freedoms are of one size and well separated.
+    # With centred and scaled points the pose unknowns are well conditioned.
     origin = X.mean(axis=0)
     size = float(np.linalg.norm(X - origin, axis=1).mean())
     scale = 1.0 / size if size > 0.0 else 1.0

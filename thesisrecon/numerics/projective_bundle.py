@@ -1,5 +1,6 @@
-"""Projective bundle adjustment (section 6.7): 11 degrees of freedom per camera, 3 per point, no gauge
-fixed.
+"""Projective bundle adjustment (section 6.7): 11 unknowns per camera, 3 per point, no gauge fixed.
+
+Unit cameras and points move in their tangent spaces, spanned by Householder reflections.
 """
 
 from __future__ import annotations
@@ -29,8 +30,7 @@ VIEW_DOF = 11
 
 
 class UnitState(NamedTuple):
-    """Unit cameras ``P`` (V, 12) and points ``X`` (N, 4) with the Householder vectors and factors that span
-    their tangent spaces."""
+    """Unit cameras ``P`` (V, 12) and points ``X`` (N, 4) with Householder vectors and factors."""
 
     P: F64
     X: F64
@@ -41,7 +41,7 @@ class UnitState(NamedTuple):
 
     @classmethod
     def at(cls, P: F64, X: F64) -> UnitState:
-        """The state of unit cameras (V, 12) and points (N, 4)."""
+        """Return the state of unit cameras (V, 12) and points (N, 4)."""
         vP, vX, bP, bX = np.empty_like(P), np.empty_like(X), np.empty(len(P)), np.empty(len(X))
         tangent_reflectors(P, vP, bP)
         tangent_reflectors(X, vX, bX)
@@ -50,8 +50,14 @@ class UnitState(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def tangent_reflectors(p: F64, v: F64, beta: F64) -> None:
-    """Householder vectors (n, d) and factors (n,) that take unit rows p to -+e0: columns 1.. span p's tangent
-    space."""
+    """Compute the Householder reflections that take unit rows to -+e0; columns 1.. span the tangent spaces.
+
+    Parameters
+    ----------
+    p : ndarray (n, d), unit rows
+    v : ndarray (n, d), output: Householder vectors
+    beta : ndarray (n,), output: Householder factors
+    """
     for i in range(p.shape[0]):
         for c in range(p.shape[1]):
             v[i, c] = p[i, c]
@@ -64,7 +70,16 @@ def tangent_reflectors(p: F64, v: F64, beta: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
-    """Unit rows moved along their tangent space: normalise(p + H[:, 1:] step); signs are kept."""
+    """Move unit rows along their tangent spaces: normalise(p + H[:, 1:] step); signs are kept.
+
+    Parameters
+    ----------
+    p : ndarray (n, d), unit rows
+    v : ndarray (n, d), householder vectors
+    beta : ndarray (n,), householder factors
+    step : ndarray (n, d - 1), steps
+    out : ndarray (n, d), output: moved unit rows
+    """
     d = p.shape[1]
     for i in range(p.shape[0]):
         along = 0.0
@@ -84,7 +99,16 @@ def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def project_projective(P: F64, X: F64, obs: Observations, residual: F64, depth: F64) -> None:
-    """Fill residual (K, 2) = projection - xy and depth (K,) = third row of P X; P (V, 3, 4), X (N, 4)."""
+    """Compute residuals, projection minus observation.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4), cameras
+    X : ndarray (N, 4), homogeneous points
+    obs : Observations, observations
+    residual : ndarray (K, 2), output
+    depth : ndarray (K,), output: third row of P X
+    """
     for k in range(len(obs.xy)):
         p, x = P[obs.view_index[k]], X[obs.point_index[k]]
         z0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]
@@ -98,9 +122,20 @@ def project_projective(P: F64, X: F64, obs: Observations, residual: F64, depth: 
 
 @njit(cache=True, nogil=True)
 def linearize_projective(state: UnitState, obs: Observations, weighting: Weighting, J: Jacobians) -> float:
-    """Fill J with weighted residuals, A (K, 2, 11) and B (K, 2, 3) in the tangent spaces; returns the cost.
+    """Compute weighted residuals and their Jacobians in the tangent spaces.
 
-    With u = P X: d pi = (1 / u2) [[1, 0, -x], [0, 1, -y]] du (methods 6.7). ``weighting.sigma`` is not used.
+    With u = P X: d pi = (1 / u2) [[1, 0, -x], [0, 1, -y]] du (methods 6.7).
+
+    Parameters
+    ----------
+    state : UnitState, cameras and points
+    obs : Observations, observations
+    weighting : Weighting, loss; ``sigma`` is not used
+    J : Jacobians, output: A (K, 2, 11), B (K, 2, 3)
+
+    Returns
+    -------
+    float, 1/2 sum rho
     """
     cost = 0.0
     for k in range(len(obs.xy)):
@@ -144,7 +179,18 @@ def linearize_projective(state: UnitState, obs: Observations, weighting: Weighti
 
 @njit(cache=True, nogil=True)
 def projective_cost(state: UnitState, obs: Observations, weighting: Weighting) -> float:
-    """1/2 sum rho of the residuals."""
+    """Return 1/2 sum rho of the residuals.
+
+    Parameters
+    ----------
+    state : UnitState, cameras and points
+    obs : Observations, observations
+    weighting : Weighting, loss; ``sigma`` is not used
+
+    Returns
+    -------
+    float, cost
+    """
     cost = 0.0
     for k in range(len(obs.xy)):
         p, x = state.P[obs.view_index[k]], state.X[obs.point_index[k]]
@@ -158,9 +204,17 @@ def projective_cost(state: UnitState, obs: Observations, weighting: Weighting) -
 
 @dataclass(frozen=True)
 class ProjectiveBundleResult:
-    """Cameras ``P`` (V, 3, 4) and points ``X`` (N, 4) in the caller's frame, norms and signs; ``residual_px``
-    (K, 2) projection minus observation in the caller's order; ``cost`` and ``initial_cost`` are 1/2 sum rho
-    in px^2."""
+    """Result of a projective bundle adjustment.
+
+    Attributes
+    ----------
+    P : ndarray (V, 3, 4), cameras in the caller's frame, norms and signs
+    X : ndarray (N, 4), points in the caller's frame, norms and signs
+    residual_px : ndarray (K, 2), projection minus observation in the caller's order
+    cost, initial_cost : float, 1/2 sum rho, px^2
+    iterations : int, linear solves
+    converged : bool, whether the loop converged
+    """
 
     P: F64
     X: F64
@@ -173,7 +227,7 @@ class ProjectiveBundleResult:
 
 @dataclass(frozen=True)
 class _ProjectiveProblem:
-    """Reprojection in conditioned pixels; states hold unit vectors, steps lie in their tangent spaces."""
+    """Reprojection in conditioned pixels; states are unit vectors, steps lie in their tangent spaces."""
 
     layout: BundleLayout
     weighting: Weighting
@@ -225,20 +279,32 @@ def refine_projective_bundle(
     max_iterations: int = 10,
     fixed_views: B8 | None = None,
 ) -> ProjectiveBundleResult:
-    """Minimise sum rho(|x - P X|^2) over all cameras and points, rho = Huber's loss turning at ``loss_px``.
+    """Minimise sum rho(|x - P X|^2) over all cameras and points with Huber's loss.
 
-    Sparse Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1), stepping
-    in the tangent spaces; the damping takes care of the 15 freedoms of the frame (methods 6.7).
+    Sparse Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1); the
+    damping handles the 15 gauge freedoms (methods 6.7). The cost never rises; singular systems end the
+    iterations.
 
     Parameters
     ----------
-    P : (V, 3, 4) cameras. X : (N, 4) homogeneous points. Both at any scale and sign, which are kept.
-    view_index, point_index : (K,) of each observation; xy : (K, 2) px. Any order; sorted by point is fastest.
-    fixed_views : (V,) True for cameras that must not move.
+    P : ndarray (V, 3, 4), cameras of any scale and sign, which are kept
+    X : ndarray (N, 4), homogeneous points of any scale and sign, which are kept
+    view_index, point_index : ndarray (K,) of int
+        View and point of each observation, in any order; sorted by point is fastest.
+    xy : ndarray (K, 2), pixels
+    loss_px : float, turning point of Huber's loss, px
+    max_iterations : int, maximum number of linear solves
+    fixed_views : ndarray (V,) of bool, optional, cameras that must not move
 
-    Views and points without observations come back untouched. The cost never rises; singular systems end the
-    iterations instead of raising. Raises ``ValueError`` for wrong shapes, values that are not finite, or an
-    observed camera or point that is all zero.
+    Returns
+    -------
+    ProjectiveBundleResult
+        Refined cameras and points; views and points without observations are returned unchanged.
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, values that are not finite, or an observed camera or point that is all zero.
     """
     P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
     if P.ndim != 3 or P.shape[1:] != (3, 4) or X.ndim != 2 or X.shape[1] != 4:
@@ -275,7 +341,7 @@ def refine_projective_bundle(
 def _projective_problem(
     observations: SortedObservations, T: F64, free: B8, loss_px: float
 ) -> _ProjectiveProblem:
-    """The problem in conditioned pixels, with buffers."""
+    """Set up the problem in conditioned pixels."""
     conditioned = replace(observations, xy=observations.xy * T[0, 0] + T[:2, 2])
     block = np.where(free, np.cumsum(free) - 1, -1)
     none = np.zeros((len(free), 0), dtype=np.int64)
@@ -285,7 +351,7 @@ def _projective_problem(
 
 
 def _unit_rows(rows: F64, used: B8, what: str) -> tuple[F64, F64]:
-    """Rows at unit norm and their norms; rows that are not used may be zero."""
+    """Return rows at unit norm and their norms; unused rows may be zero."""
     norms = np.linalg.norm(rows, axis=1)
     if not (np.isfinite(norms[used]).all() and (norms[used] > 0.0).all()):
         raise ValueError(f"every observed {what} must be finite and not zero")
@@ -294,7 +360,7 @@ def _unit_rows(rows: F64, used: B8, what: str) -> tuple[F64, F64]:
 
 
 def _with_norms(moved: NDArray[Any], original: F64, *, axis: int | tuple[int, ...]) -> F64:
-    """``moved`` scaled to the norms of ``original``: homogeneous scales are the caller's."""
+    """Scale ``moved`` to the norms of ``original``: homogeneous scales are the caller's."""
     wanted = np.linalg.norm(original, axis=axis, keepdims=True)
     have = np.linalg.norm(moved, axis=axis, keepdims=True)
     return np.asarray(moved * wanted / np.where(have > 0.0, have, 1.0))

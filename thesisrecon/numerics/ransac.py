@@ -1,4 +1,4 @@
-"""Section 5.4, Algorithm 2: the loop of random sampling consensus; what is sampled is the caller's."""
+"""Section 5.4, Algorithm 2: random sample consensus (RANSAC) for any model."""
 
 from __future__ import annotations
 
@@ -14,9 +14,15 @@ from thesisrecon.arrays import B8, F64, I64
 
 @njit(cache=True, nogil=True)
 def draw_sample(uniforms: F64, n: int, out: I64) -> None:
-    """Turn uniform numbers (s,) in [0, 1) into s distinct indices below n (``out``, sorted).
+    """Turn uniform random numbers into distinct sorted indices.
 
-    The k-th number picks one of the n - k indices not yet taken, so every subset is equally likely.
+    The k-th number picks one of the n - k indices left, so that every subset is equally likely.
+
+    Parameters
+    ----------
+    uniforms : ndarray (s,), numbers in [0, 1)
+    n : int, number of data
+    out : ndarray (s,) of int, output, indices below n
     """
     for k in range(len(out)):
         index = min(int(uniforms[k] * (n - k)), n - k - 1)
@@ -30,12 +36,23 @@ def draw_sample(uniforms: F64, n: int, out: I64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def required_samples(inlier_share: float, sample_size: int, confidence: float, largest: int) -> int:
-    """Samples after which one is free of outliers with probability ``confidence``, at most ``largest``.
+def required_samples(inlier_ratio: float, sample_size: int, confidence: float, largest: int) -> int:
+    """Return the number of samples of which one is free of outliers with probability ``confidence``.
 
-    N = log(1 - confidence) / log(1 - share^size) (Fischler and Bolles 1981).
+    N = log(1 - confidence) / log(1 - ratio^size) (Fischler and Bolles 1981).
+
+    Parameters
+    ----------
+    inlier_ratio : float, fraction of inliers
+    sample_size : int, data in a minimal sample
+    confidence : float, required probability
+    largest : int, upper bound
+
+    Returns
+    -------
+    int, number of samples
     """
-    good = inlier_share**sample_size
+    good = inlier_ratio**sample_size
     if good <= 1e-12:
         return largest
     if good >= 1.0:
@@ -48,22 +65,47 @@ Model = TypeVar("Model")
 
 
 class SampledProblem(Protocol[Model]):
-    """What is estimated: models through a minimal sample, and how far the data are from a model."""
+    """Model estimation from minimal samples."""
 
     @property
     def sample_size(self) -> int:
         """Data in a minimal sample."""
 
     def solve(self, sample: I64) -> list[Model]:
-        """Models through the data of these indices (sample_size,), possibly none."""
+        """Solve for the model of a minimal sample.
+
+        Parameters
+        ----------
+        sample : ndarray (sample_size,) of int, indices of the data
+
+        Returns
+        -------
+        list, models, possibly none
+        """
 
     def residuals(self, model: Model) -> F64:
-        """Distance of every datum from the model; (N,)."""
+        """Evaluate a model.
+
+        Parameters
+        ----------
+        model : Model, model
+
+        Returns
+        -------
+        ndarray (N,), distance of every datum
+        """
 
 
 @dataclass(frozen=True)
 class Consensus(Generic[Model]):
-    """The model with the most data within the threshold, which they are (N,), and the samples drawn."""
+    """Best model of a search.
+
+    Attributes
+    ----------
+    model : Model, model with the most data within the threshold
+    inliers : ndarray (N,) of bool, data within the threshold
+    samples : int, samples drawn
+    """
 
     model: Model
     inliers: B8
@@ -72,22 +114,11 @@ class Consensus(Generic[Model]):
 
 @dataclass(frozen=True)
 class SampleConsensus:
-    """Random sample consensus (Algorithm 2 of the thesis; Fischler and Bolles, 1981).
+    """Algorithm 2: the model with the most data within a threshold.
 
-    The model with the most residuals within ``threshold`` wins; of two with equal counts, the one whose
-    inliers have the lower standard deviation. Trying every sample would take n! / (s! (n - s)!) samples of
-    size s (the thesis has n! / s!).
-
-    Parameters
-    ----------
-    threshold : float
-        Residual below which a datum is an inlier.
-    max_samples : int
-        Maximum number of samples.
-    stop_inlier_ratio : float
-        Sampling stops once the inlier ratio exceeds this.
-    least_median : bool
-        Rank models by their median residual instead (Rousseeuw, 1984); ``threshold`` is then not used.
+    Of two models with equally many inliers the one with the lower standard deviation wins (Fischler and
+    Bolles, 1981). An exhaustive search would need n! / (s! (n - s)!) samples of size s (the thesis' text has
+    n! / s!).
     """
 
     threshold: float
@@ -96,9 +127,22 @@ class SampleConsensus:
     least_median: bool = False
 
     def search(self, problem: SampledProblem[Model], n: int, rng: Generator) -> Consensus[Model] | None:
-        """The best model of ``n`` data, or None where no sample gave one.
+        """Search the best model.
 
-        Raises ``ValueError`` for fewer data than a sample has.
+        Parameters
+        ----------
+        problem : SampledProblem, minimal solver and residuals
+        n : int, number of data
+        rng : numpy.random.Generator, source of randomness
+
+        Returns
+        -------
+        Consensus or None, best model; None if no sample gave one
+
+        Raises
+        ------
+        ValueError
+            There are fewer data than in a sample.
         """
         if n < problem.sample_size:
             raise ValueError(f"sampling needs at least {problem.sample_size} data; got {n}")
@@ -120,5 +164,5 @@ class SampleConsensus:
             median = float(np.partition(residuals, len(residuals) // 2)[len(residuals) // 2])
             return (-median, 0.0), residuals <= median
         inliers = np.abs(residuals) < self.threshold
-        spread = float(np.sqrt(np.mean(residuals[inliers] ** 2))) if inliers.any() else 0.0
-        return (int(inliers.sum()), -spread), inliers
+        rms = float(np.sqrt(np.mean(residuals[inliers] ** 2))) if inliers.any() else 0.0
+        return (int(inliers.sum()), -rms), inliers

@@ -1,10 +1,8 @@
-"""The reduced system in the forms that its solvers want: dense, banded, and as a product with a vector.
+"""Solvers of the reduced camera system, and the choice between them by size and sparsity.
 
-Solvers of the reduced camera system, and the choice between them by size and sparsity.
-
-Dense Cholesky serves up to some hundred views. Beyond, views see points with their neighbours only: where an
-order of the views keeps these near the diagonal (corridors, loops, streets) a banded Cholesky factor is exact
-at a cost linear in the views; where none does, conjugate gradients work on the blocks as they are.
+Dense Cholesky serves up to some hundred views. Beyond, views share points with their neighbours only: if an
+order of the views keeps these near the diagonal (corridors, loops, streets), a banded Cholesky factor is
+exact at a cost linear in the views; otherwise conjugate gradients work on the blocks as they are.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from thesisrecon.numerics.levenberg_marquardt import solve_positive
 
 @njit(cache=True, nogil=True)
 def _fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
-    """Blocks (n, C, C) of views row[i] <= column[i] into the upper triangle of S (D, D)."""
+    """Copy blocks (n, C, C) of views row[i] <= column[i] to the upper triangle of S (D, D)."""
     C = blocks.shape[1]
     for i in range(len(blocks)):
         r, c = row[i] * C, column[i] * C
@@ -34,7 +32,15 @@ def _fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def add_diagonal(blocks: F64, pair: I64, corner: F64, values: F64) -> None:
-    """Add values (D,) to the diagonal of the reduced matrix; ``pair`` (b, b) numbers the blocks of views."""
+    """Add values to the diagonal of the reduced matrix.
+
+    Parameters
+    ----------
+    blocks : ndarray (n, C, C), blocks of view pairs, updated
+    pair : ndarray (b, b) of int, number of the block of two views
+    corner : ndarray (e, e), corner, updated
+    values : ndarray (D,), values to add
+    """
     C, b = blocks.shape[1], len(pair)
     for v in range(b):
         for a in range(C):
@@ -45,9 +51,14 @@ def add_diagonal(blocks: F64, pair: I64, corner: F64, values: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None:
-    """Blocks into the lower band of LAPACK, band[j, i - j] = S[i, j], views in the order ``place`` (b,).
+    """Copy blocks to LAPACK's lower band, band[j, i - j] = S[i, j].
 
-    ``band`` (D, width + 1) is row-major, hence the column-major array that LAPACK wants, transposed.
+    Parameters
+    ----------
+    blocks : ndarray (n, C, C), blocks of view pairs
+    row, column : ndarray (n,) of int, views of each block
+    place : ndarray (b,) of int, position of each view in the band
+    band : ndarray (D, width + 1), output, row-major: the transpose of LAPACK's column-major array
     """
     C = blocks.shape[1]
     for i in range(len(blocks)):
@@ -60,7 +71,7 @@ def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None
 
 @njit(cache=True, nogil=True)
 def _multiply_blocks(blocks: F64, row: I64, column: I64, x: F64, y: F64) -> None:
-    """y (b, C) = S x for the symmetric S of which ``blocks`` are the upper triangle; x (b, C)."""
+    """Fill y (b, C) = S x for the symmetric S with upper triangle ``blocks``; x (b, C)."""
     C = blocks.shape[1]
     y[:] = 0.0
     for i in range(len(blocks)):
@@ -79,9 +90,12 @@ def _multiply_blocks(blocks: F64, row: I64, column: I64, x: F64, y: F64) -> None
 
 @njit(cache=True, nogil=True)
 def invert_band(L: F64, Z: F64) -> None:
-    """The entries inside the band of (L L')^-1, by the recursion of Takahashi (1973) from the last column on.
+    """Compute the entries inside the band of (L L')^-1 by the recursion of Takahashi (1973).
 
-    L and Z (D, width) hold column j from the diagonal down: L[j, i - j].
+    Parameters
+    ----------
+    L : ndarray (D, width), factor, column j from the diagonal down: L[j, i - j]
+    Z : ndarray (D, width), output in the same layout
     """
     D, width = L.shape
     for j in range(D - 1, -1, -1):
@@ -100,8 +114,7 @@ def invert_band(L: F64, Z: F64) -> None:
         Z[j, 0] = pivot * (pivot - total)
 
 
-# What an operation costs beside one of a dense Cholesky factorisation: narrow bands keep the processor less
-# busy, and the blocks of a product with a vector come from memory.
+# Cost of an operation relative to dense Cholesky: narrow bands compute slower, products read from memory.
 BAND_COST, PRODUCT_COST = 2.0, 8.0
 TYPICAL_PRODUCTS = 150
 SMALL = 600
@@ -109,15 +122,25 @@ SMALL = 600
 
 @dataclass(frozen=True)
 class ReducedSystem:
-    """A symmetric positive system in blocks: ``row`` <= ``column`` (n,) the views of each of ``sums.blocks``;
-    ``sums.border`` and ``sums.corner`` what they have in common; ``sums.rhs`` the right-hand side."""
+    """Symmetric positive system in blocks.
+
+    Attributes
+    ----------
+    row, column : ndarray (n,) of int, views of each block, row <= column
+    sums : ReducedSums, blocks, border, corner and right-hand side
+    """
 
     row: I64
     column: I64
     sums: ReducedSums
 
     def dense(self) -> F64:
-        """The matrix (D, D), upper triangle."""
+        """Assemble the matrix.
+
+        Returns
+        -------
+        ndarray (D, D), matrix, upper triangle
+        """
         edge, D = self.sums.border.shape[0] * self.sums.border.shape[1], len(self.sums.rhs)
         S = np.zeros((D, D))
         _fill_dense(self.sums.blocks, self.row, self.column, S)
@@ -127,29 +150,38 @@ class ReducedSystem:
 
 
 class ReducedSolver(Protocol):
-    """Solves a reduced system; None where it is not positive."""
+    """Solver of a reduced system."""
 
     def solve(self, system: ReducedSystem) -> F64 | None:
-        """x (D,)."""
+        """Return x (D,), or None if the system is not positive."""
 
 
 @dataclass(frozen=True)
 class DenseCholesky:
-    """The whole matrix by LAPACK: D^3 / 3 operations."""
+    """Dense factorisation by LAPACK: D^3 / 3 operations."""
 
     def solve(self, system: ReducedSystem) -> F64 | None:
-        """x (D,) or None."""
+        """Solve the system.
+
+        Parameters
+        ----------
+        system : ReducedSystem, system
+
+        Returns
+        -------
+        ndarray (D,) or None, solution; None if the system is not positive
+        """
         # Row-major upper is column-major lower: LAPACK reads the transpose without a copy.
         return solve_positive(system.dense().T, system.sums.rhs)
 
 
 @dataclass(frozen=True)
 class _BandedFactor:
-    """A reduced system taken apart.
+    """Factored reduced system.
 
-    LAPACK's lower banded ``factor`` (width, b C) of the views' part, views in the order ``place`` (b,);
-    ``border`` (b, C, e); ``moved`` (b C, e) = views^-1 border; ``complement`` (e, e) = corner - border'
-    moved."""
+    LAPACK's lower banded ``factor`` (width, b C) of the views, in the order ``place`` (b,); ``border`` (b, C,
+    e); ``moved`` (b C, e) = views^-1 border; ``complement`` (e, e) = corner - border' moved.
+    """
 
     place: I64
     factor: F64
@@ -158,14 +190,14 @@ class _BandedFactor:
     complement: F64
 
     def solve_views(self, right: F64) -> F64:
-        """views^-1 right for right (b C, m)."""
+        """Return views^-1 right for right (b C, m)."""
         b, C, _ = self.border.shape
         ordered = right.reshape(b, C, -1)[np.argsort(self.place)].reshape(b * C, -1)
         solved, _ = scipy.linalg.lapack.dpbtrs(self.factor, ordered, lower=1)
         return np.asarray(solved.reshape(b, C, -1)[self.place].reshape(b * C, -1))
 
     def solve(self, right: F64) -> F64 | None:
-        """S^-1 right for right (D, m); None where the complement is not positive."""
+        """Return S^-1 right for right (D, m); None if the complement is not positive."""
         edge, flat = len(self.moved), self.border.reshape(len(self.moved), -1)
         views = self.solve_views(right[:edge])
         tail = solve_positive(self.complement, right[edge:] - flat.T @ views)
@@ -174,7 +206,7 @@ class _BandedFactor:
         return np.concatenate([views - self.moved @ tail, tail])
 
     def inverse_blocks(self) -> F64:
-        """(b, C + e, C + e): of S^-1 the rows and columns of each view and of the border."""
+        """Return the rows and columns of S^-1 of each view and of the border; (b, C + e, C + e)."""
         b, C, e = self.border.shape
         band = np.zeros(self.factor.T.shape)
         invert_band(np.ascontiguousarray(self.factor.T), band)
@@ -193,20 +225,43 @@ class _BandedFactor:
 
 @dataclass(frozen=True)
 class BandedCholesky:
-    """The views in the order ``place`` (b,), neighbours at most ``reach`` places apart, by LAPACK's banded
-    factorisation; the border by its Schur complement."""
+    """Banded factorisation by LAPACK, the border by its Schur complement.
+
+    Attributes
+    ----------
+    place : ndarray (b,) of int, position of each view
+    reach : int, largest distance of neighbours
+    """
 
     place: I64
     reach: int
 
     def solve(self, system: ReducedSystem) -> F64 | None:
-        """x (D,) or None."""
+        """Solve the system.
+
+        Parameters
+        ----------
+        system : ReducedSystem, system
+
+        Returns
+        -------
+        ndarray (D,) or None, solution; None if the system is not positive
+        """
         factored = self.factor(system)
         found = None if factored is None else factored.solve(system.sums.rhs[:, None])
         return None if found is None else found[:, 0]
 
     def factor(self, system: ReducedSystem) -> _BandedFactor | None:
-        """The system taken apart; None where it is not positive."""
+        """Factor the system.
+
+        Parameters
+        ----------
+        system : ReducedSystem, system
+
+        Returns
+        -------
+        _BandedFactor or None, factors; None if the system is not positive
+        """
         s, (b, C, e) = system.sums, system.sums.border.shape
         band = np.zeros((b * C, (self.reach + 1) * C))
         fill_band(s.blocks, system.row, system.column, self.place, band)
@@ -223,18 +278,32 @@ class BandedCholesky:
 
 @dataclass(frozen=True)
 class ConjugateGradients:
-    """Preconditioned by the inverses of the views' blocks and of the corner (block Jacobi), from zero, until
-    the residual in that norm has fallen by ``tolerance``."""
+    """Conjugate gradients with a block Jacobi preconditioner (views' blocks and the corner), from zero.
+
+    Attributes
+    ----------
+    tolerance : float, decrease of the residual in the preconditioner's norm
+    max_products : int, maximum number of matrix products
+    """
 
     tolerance: float = 1e-3
     max_products: int = 1000
 
     def solve(self, system: ReducedSystem) -> F64 | None:
-        """x (D,) or None."""
+        """Solve the system.
+
+        Parameters
+        ----------
+        system : ReducedSystem, system
+
+        Returns
+        -------
+        ndarray (D,) or None, solution; None if the system is not positive
+        """
         s, (b, C, _) = system.sums, system.sums.border.shape
         own = s.blocks[system.row == system.column]
         try:
-            # Inverses of what is not positive exist, but say nothing of descent: Cholesky refuses them.
+            # Cholesky rejects blocks that are not positive, whose inverses give no descent.
             np.linalg.cholesky(own), np.linalg.cholesky(s.corner)
             inverse, corner = np.linalg.inv(own), np.linalg.inv(s.corner)
         except np.linalg.LinAlgError:
@@ -265,7 +334,17 @@ class ConjugateGradients:
 
 
 def multiply(system: ReducedSystem, x: F64) -> F64:
-    """S x (D,)."""
+    """Return S x.
+
+    Parameters
+    ----------
+    system : ReducedSystem, system
+    x : ndarray (D,), vector
+
+    Returns
+    -------
+    ndarray (D,), product
+    """
     s, (b, C, e) = system.sums, system.sums.border.shape
     border, y = s.border.reshape(b * C, e), np.empty((b, C))
     _multiply_blocks(s.blocks, system.row, system.column, x[: b * C].reshape(b, C), y)
@@ -273,7 +352,18 @@ def multiply(system: ReducedSystem, x: F64) -> F64:
 
 
 def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) -> ReducedSolver:
-    """The solver with the least work for this pattern of blocks; dense for all small systems."""
+    """Choose the solver with the least work for a pattern of blocks; dense for all small systems.
+
+    Parameters
+    ----------
+    row, column : ndarray (n,) of int, views of each block
+    n_views : int, number of views
+    width, border : int, columns of a view and of the border
+
+    Returns
+    -------
+    ReducedSolver, solver
+    """
     D = float(n_views * width + border)
     if D <= SMALL:
         return DenseCholesky()
@@ -288,7 +378,17 @@ def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) 
 
 
 def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:
-    """The order of the views in which neighbours stand close (reverse Cuthill-McKee)."""
+    """Order the views such that neighbours stand close (reverse Cuthill-McKee).
+
+    Parameters
+    ----------
+    row, column : ndarray (n,) of int, views of each block
+    n_views : int, number of views
+
+    Returns
+    -------
+    BandedCholesky, solver with this order
+    """
     graph = scipy.sparse.coo_array((np.ones(len(row)), (row, column)), shape=(n_views, n_views)).tocsr()
     order = scipy.sparse.csgraph.reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
     place = np.empty(n_views, dtype=np.int64)

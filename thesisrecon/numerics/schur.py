@@ -1,9 +1,9 @@
 """The sparse linear system of bundle adjustment: points are eliminated, cameras are solved together.
 
-[[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then
-b = -V^-1 (h + W' a). The reduced matrix holds a block for every pair of views that see a point together, and
-a border for what views have in common. Points are eliminated in chunks whose number depends on the problem
-alone, added up in their order: the same bytes whatever the number of threads.
+[[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then b = -V^-1 (h
++ W' a). The reduced matrix has a block for every pair of views that observe a common point, and a border for
+common unknowns. Points are eliminated in chunks whose number depends on the problem alone, summed in order:
+the same bytes for any number of threads.
 """
 
 from __future__ import annotations
@@ -33,17 +33,25 @@ from thesisrecon.numerics.reduced_solvers import ReducedSolver, ReducedSystem, a
 Result = TypeVar("Result")
 
 CHUNK = 16384
-# Every chunk has sums of its own: few chunks where these are large.
+# Every chunk has its own sums: few chunks if these are large.
 MOST_CHUNKS, CHUNK_BYTES = 16, 128e6
 
 
 @dataclass(frozen=True)
 class BundleLayout:
-    """Where everything of one problem stands.
+    """Structure of one problem.
 
-    The unknowns of the cameras are ``width`` columns for each of b views' blocks, then ``border`` columns
-    that views have in common. ``row``, ``column`` (n,) name the views of each block of the reduced matrix;
-    ``chunks`` are ranges of points (first, last); ``threads`` may work on them.
+    The camera unknowns are ``width`` columns for each view's block, then ``border`` common columns.
+
+    Attributes
+    ----------
+    observations : SortedObservations, observations
+    index : BlockIndex, blocks of the observations
+    width, border : int, columns of a block and of the border
+    row, column : ndarray (n,) of int, views of each block of the reduced matrix
+    chunks : tuple of (int, int), ranges of points
+    solver : ReducedSolver, solver of the reduced system
+    threads : int, worker threads
     """
 
     observations: SortedObservations
@@ -58,18 +66,36 @@ class BundleLayout:
 
     @property
     def size(self) -> int:
-        """Unknowns of the cameras, D."""
+        """Number of camera unknowns D."""
         return len(self.index.pair) * self.width + self.border
 
     def over_chunks(self, work: Callable[[int, int], Result]) -> list[Result]:
-        """work(first, last) for every range of points, in their order."""
+        """Call a function for every range of points.
+
+        Parameters
+        ----------
+        work : callable, called with the first and last + 1 point
+
+        Returns
+        -------
+        list, results in the order of the ranges
+        """
         if self.threads == 1 or len(self.chunks) == 1:
             return [work(*chunk) for chunk in self.chunks]
         with ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(lambda chunk: work(*chunk), self.chunks))
 
     def over_observations(self, work: Callable[[slice, Observations], Result]) -> list[Result]:
-        """work(which, they) for the observations of every range of points, in their order."""
+        """Call a function for the observations of every range of points.
+
+        Parameters
+        ----------
+        work : callable, called with the slice of the observations and the observations
+
+        Returns
+        -------
+        list, results in the order of the ranges
+        """
         start, o = self.observations.start, self.observations
         obs = Observations(o.view_index, o.point_index, o.xy)
 
@@ -79,7 +105,14 @@ class BundleLayout:
         return self.over_chunks(run)
 
     def revert_cheirality_violations(self, before: F64, after: F64, X_before: F64, X_after: F64) -> None:
-        """Undo the steps of points that cross the focal plane of a view that observes them."""
+        """Undo the steps of points that cross the focal plane of a view that observes them.
+
+        Parameters
+        ----------
+        before, after : ndarray (V, 4), third rows of the cameras
+        X_before : ndarray (N, 4) or (N, 3), points before the step
+        X_after : ndarray (N, 4) or (N, 3), points after the step, changed in place
+        """
         start, view = self.observations.start, self.observations.view_index
 
         def work(first: int, last: int) -> None:
@@ -89,11 +122,21 @@ class BundleLayout:
         self.over_chunks(work)
 
     def jacobians(self) -> Jacobians:
-        """Buffers of one linearisation."""
+        """Allocate the buffers of one linearisation.
+
+        Returns
+        -------
+        Jacobians, buffers
+        """
         return Jacobians.empty(len(self.observations.xy), self.width, self.index.common.shape[1])
 
     def sums(self) -> ReducedSums:
-        """A reduced system of zeros."""
+        """Return a reduced system of zeros.
+
+        Returns
+        -------
+        ReducedSums, zeros
+        """
         C, b, e, D = self.width, len(self.index.pair), self.border, self.size
         shapes = [(len(self.row), C, C), (b, C, e), (e, e), (D,), (D,), (D,)]
         return ReducedSums(*(np.zeros(shape) for shape in shapes))
@@ -108,10 +151,20 @@ def build_layout(
     border: int,
     threads: int = 1,
 ) -> BundleLayout:
-    """Find the pairs of views that share points, cut the points into chunks and choose a solver.
+    """Find the pairs of views with common points, divide the points into chunks and choose a solver.
 
-    ``block`` (V,) is the number of a view's block, -1 for one that does not move; ``common`` (V, F) its
-    columns of the border, -1 for none.
+    Parameters
+    ----------
+    observations : SortedObservations, observations
+    block : ndarray (V,) of int, block of each view, -1 if it does not move
+    width : int, columns of a block
+    common : ndarray (V, F) of int, border columns of each view, -1 for none
+    border : int, number of border columns
+    threads : int, worker threads
+
+    Returns
+    -------
+    BundleLayout, structure
     """
     o, n = observations, int(block.max(initial=-1)) + 1
     marked = np.eye(n, dtype=bool)
@@ -132,8 +185,15 @@ def build_layout(
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """Gaussian terms between camera columns: ``weight`` (L,) on the differences of columns ``first`` and
-    ``second`` (L,), -1 for a number instead; the second always one of the border. ``gradient`` (D,)."""
+    """Gaussian terms between camera columns.
+
+    Attributes
+    ----------
+    first, second : ndarray (L,) of int
+        Columns whose difference is weighted; ``second`` is one of the border, or -1 for a number instead.
+    weight : ndarray (L,), weights
+    gradient : ndarray (D,), gradient of all terms
+    """
 
     first: I64
     second: I64
@@ -159,7 +219,18 @@ class BundleSystem:
     prior: CameraPrior | None = None
 
     def reduce(self, damping: float) -> tuple[ReducedSystem, PointSums, F64]:
-        """The damped reduced system, what back substitution needs, and the damping of each column (D,)."""
+        """Eliminate the points for a damping.
+
+        Parameters
+        ----------
+        damping : float, factor of the diagonal
+
+        Returns
+        -------
+        reduced : ReducedSystem, damped system of the cameras
+        points : PointSums, inverses and gradients of the points
+        damped : ndarray (D,), values added to the diagonal
+        """
         N, layout = len(self.layout.observations.start) - 1, self.layout
         points = PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
 
@@ -175,13 +246,22 @@ class BundleSystem:
         if self.prior is not None:
             _add_prior(layout, total, self.prior)
         damped = damping * floored_diagonal(total.diagonal)
-        # A column nothing acts upon stays: any positive pivot does.
+        # A column without effect does not move: any positive pivot will do.
         _add_diagonal(layout, total, np.where(total.diagonal == 0.0, 1.0, damped))
         system = ReducedSystem(layout.row, layout.column, total)
         return system, points, damped
 
     def solve(self, damping: float) -> tuple[BundleStep, float] | None:
-        """The damped step and its promised gain, or None where the reduced matrix is not positive."""
+        """Solve the damped system.
+
+        Parameters
+        ----------
+        damping : float, factor of the diagonal
+
+        Returns
+        -------
+        tuple or None, step and predicted gain of cost; None if the reduced matrix is not positive
+        """
         reduced, points, damped = self.reduce(damping)
         cameras = self.layout.solver.solve(reduced)
         if cameras is None:
@@ -200,7 +280,7 @@ class BundleSystem:
 
 
 def _add_prior(layout: BundleLayout, total: ReducedSums, prior: CameraPrior) -> None:
-    """The prior's information and gradient."""
+    """Add the information and gradient of the prior."""
     first, second, w, edge = prior.first, prior.second, prior.weight, layout.size - layout.border
     total.rhs[:] -= prior.gradient
     total.gradient[:] += prior.gradient
@@ -218,5 +298,5 @@ def _add_prior(layout: BundleLayout, total: ReducedSums, prior: CameraPrior) -> 
 
 
 def _add_diagonal(layout: BundleLayout, total: ReducedSums, values: F64) -> None:
-    """values (D,) on the diagonal of the reduced matrix."""
+    """Add values (D,) to the diagonal of the reduced matrix."""
     add_diagonal(total.blocks, layout.index.pair, total.corner, values)

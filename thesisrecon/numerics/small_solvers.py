@@ -1,4 +1,4 @@
-"""Losses and guards of a single residual or matrix, inlined into the loops of the other modules."""
+"""Compiled solvers of small dense systems and guards, for loops over points or samples."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ TINY = 1e-12
 
 @njit(cache=True, nogil=True, inline="always")
 def away_from_zero(w: float) -> float:
-    """w, moved off 0: a point in the focal plane gets a huge residual instead of a division by zero."""
+    """Move a projective depth off 0, so that a point in the focal plane gets a huge residual.
+
+    Parameters
+    ----------
+    w : float, depth
+
+    Returns
+    -------
+    float, w, or +-TINY with its sign
+    """
     if w >= 0.0:
         return max(w, TINY)
     return min(w, -TINY)
@@ -22,7 +31,17 @@ def away_from_zero(w: float) -> float:
 def invert_cholesky_3x3(
     m00: float, m10: float, m20: float, m11: float, m21: float, m22: float, out: F64
 ) -> bool:
-    """Fill ``out`` with L^-1."""
+    """Fill ``out`` with L^-1 of a symmetric matrix L L' given by its lower triangle.
+
+    Parameters
+    ----------
+    m00, m10, m20, m11, m21, m22 : float, matrix entries
+    out : ndarray (3, 3), output; zeros if a pivot is not positive
+
+    Returns
+    -------
+    bool, whether the matrix is positive definite
+    """
     out[:] = 0.0
     if not m00 > 0.0:
         return False
@@ -45,7 +64,18 @@ def invert_cholesky_3x3(
 
 @njit(cache=True, nogil=True)
 def invert_positive_3x3(M: F64, root: F64, out: F64) -> bool:
-    """Fill ``out`` with M^-1."""
+    """Invert a symmetric positive matrix by Cholesky factorisation.
+
+    Parameters
+    ----------
+    M : ndarray (3, 3), matrix, lower triangle used
+    root : ndarray (3, 3), output L^-1 with M = L L'
+    out : ndarray (3, 3), output M^-1; zeros if a pivot is not positive
+
+    Returns
+    -------
+    bool, whether the matrix is positive definite
+    """
     positive = invert_cholesky_3x3(M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2], root)
     multiply_transposed_3x3(root, out)
     return positive
@@ -53,7 +83,13 @@ def invert_positive_3x3(M: F64, root: F64, out: F64) -> bool:
 
 @njit(cache=True, nogil=True, inline="always")
 def multiply_transposed_3x3(L: F64, out: F64) -> None:
-    """Fill ``out`` with L' L."""
+    """Fill ``out`` with L' L.
+
+    Parameters
+    ----------
+    L : ndarray (3, 3), matrix
+    out : ndarray (3, 3), output
+    """
     for a in range(3):
         for b in range(3):
             out[a, b] = L[0, a] * L[0, b] + L[1, a] * L[1, b] + L[2, a] * L[2, b]
@@ -61,7 +97,19 @@ def multiply_transposed_3x3(L: F64, out: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
-    """Solve (H + damping diag H) step = -g by Cholesky; False if the matrix is not positive definite."""
+    """Solve (H + damping diag H) step = -g by Cholesky factorisation.
+
+    Parameters
+    ----------
+    H : ndarray (n, n), symmetric matrix J'J
+    g : ndarray (n,), gradient J'r
+    damping : float, levenberg-Marquardt damping
+    step : ndarray (n,), output
+
+    Returns
+    -------
+    bool, false if the damped matrix is not positive definite
+    """
     n = len(g)
     L = np.zeros((n, n))
     floor = 0.0
