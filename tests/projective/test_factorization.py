@@ -12,12 +12,12 @@ from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.projective.factorization import (
     Factorization,
-    balance_depths,
+    _balance_depths,
+    _factorize_robustly,
+    _grow_core,
+    _is_planar,
     depths_from_fundamentals,
     factorize,
-    factorize_robustly,
-    grow_core,
-    is_planar,
 )
 from thesisrecon.records import Tracks
 
@@ -78,7 +78,7 @@ def test_balanced_depths_weigh_every_view_and_every_point_alike():
     depths = (
         rng.uniform(0.5, 2.0, (4, 30)) * 10.0 ** rng.uniform(-3, 3, (4, 1)) * 10.0 ** rng.uniform(-3, 3, 30)
     )
-    squared = (balance_depths(depths, sizes) * sizes) ** 2
+    squared = (_balance_depths(depths, sizes) * sizes) ** 2
     np.testing.assert_allclose(squared.sum(axis=0), 4.0, rtol=1e-3)
     np.testing.assert_allclose(squared.sum(axis=1), 30.0, rtol=1e-12)
 
@@ -104,7 +104,7 @@ def test_points_that_disagree_are_left_out():
     scene, xy = complete_tracks(1, sigma_px=0.5)
     xy[3, :6] += 25.0
     depths = depths_from_fundamentals(xy, fundamentals(scene), STAR)
-    factors, kept = factorize_robustly(xy, depths, 7.0, 50)
+    factors, kept = _factorize_robustly(xy, depths, 7.0, 50)
     assert not kept[:6].any()
     assert kept[6:].mean() > 0.95
     assert factors.rms_px < 0.8
@@ -114,12 +114,12 @@ def test_the_core_grows_by_the_view_that_shares_most_as_long_as_enough_is_shared
     seen = np.zeros((4, 100), dtype=bool)
     seen[0], seen[1, :80], seen[2, :60], seen[3, :20] = True, True, True, True
     pairs = [replace(p, homography_inlier_ratio=0.2) for p in true_pairs(make_scene(views=4, points=30))]
-    assert grow_core(seen, pairs, pairs[0], least=50)[1][1] == 2
-    assert len(grow_core(seen, pairs, pairs[0], least=50)) == 2
-    assert len(grow_core(seen, pairs, pairs[0], least=10)) == 3
+    assert _grow_core(seen, pairs, pairs[0], min_tracks=50)[1][1] == 2
+    assert len(_grow_core(seen, pairs, pairs[0], min_tracks=50)) == 2
+    assert len(_grow_core(seen, pairs, pairs[0], min_tracks=10)) == 3
     # Views that no accepted pair ties to the core stay out.
     untied = [replace(p, accepted=2 not in (p.i, p.j)) for p in pairs]
-    assert [j for _, j in grow_core(seen, untied, pairs[0], least=10)] == [1, 3]
+    assert [j for _, j in _grow_core(seen, untied, pairs[0], min_tracks=10)] == [1, 3]
 
 
 @pytest.mark.parametrize("iterations", [0, 50])
@@ -150,8 +150,8 @@ def test_tracks_of_a_plane_that_all_of_a_core_share_do_not_begin_alone():
     tracks = Tracks(view, point, xy + np.random.default_rng(0).normal(0, 0.3, xy.shape), 4, 300)
     planar = replace(scene, X=X, tracks=tracks)
     images = np.stack([project(P, X) for P in scene.P])
-    assert is_planar(images[:, flat], STAR[:3], 1.0)
-    assert not is_planar(images, STAR[:3], 1.0)
+    assert _is_planar(images[:, flat], STAR[:3], 1.0)
+    assert not _is_planar(images, STAR[:3], 1.0)
     found = Factorization().reconstruct(tracks, true_pairs(planar), scene.sizes, rng=np.random.default_rng(0))
     assert found.registered.all()
     assert found.inlier.mean() > 0.98

@@ -16,15 +16,15 @@ from tests.synthetic import TrueScene, make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.images import read_images
 from thesisrecon.records import Tracks
-from thesisrecon.selfcalibration.line_segments import LineSegments, fit_segments
+from thesisrecon.selfcalibration.line_segments import LineSegments, _fit_segments
 from thesisrecon.selfcalibration.parallel_lines import (
     ParallelLines,
     VanishingPoints,
+    _normalize_segments,
+    _refine_plane,
+    _triangulate_directions,
     find_parallel_directions,
-    normalize_segments,
     propose_vanishing_points,
-    refine_plane,
-    triangulate_directions,
 )
 from thesisrecon.selfcalibration.stratified import Stratified, projective_scene
 from validation.scenes.real import load_fixture_scene
@@ -111,7 +111,7 @@ def test_triangulated_points_are_seen_where_they_were():
     scene = make_scene(seed=4)
     v = np.einsum("vij,dj->dvi", scene.K @ scene.R, TURN)
     v /= np.linalg.norm(v, axis=2, keepdims=True)
-    X = triangulate_directions(np.tile(scene.P / 1500.0, (3, 1, 1, 1)), v)
+    X = _triangulate_directions(np.tile(scene.P / 1500.0, (3, 1, 1, 1)), v)
     np.testing.assert_allclose(np.abs(np.sum(X[:, :3] * TURN, axis=1)), 1.0, atol=1e-9)
     np.testing.assert_allclose(X[:, 3], 0.0, atol=1e-8)
 
@@ -121,15 +121,15 @@ def test_directions_are_found_among_strays(sigma, stray, limit):
     scene = make_scene(seed=5, views=6)
     found, plane, _ = setup(scene, seed=5)
     frame = found.frame
-    segments = normalize_segments(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
+    segments = _normalize_segments(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
     rng = np.random.default_rng(1)
     proposals = [
         propose_vanishing_points(
-            segments.subset(segments.camera == k), keep=5, samples=300, tolerance_px=1.5, rng=rng
+            segments.subset(segments.camera == k), max_points=5, samples=300, tolerance_px=1.5, rng=rng
         )
         for k in range(6)
     ]
-    X, direction = find_parallel_directions(frame, segments, proposals, keep=3, tolerance_px=1.5)
+    X, direction = find_parallel_directions(frame, segments, proposals, max_directions=3, tolerance_px=1.5)
     truth = np.tile(np.concatenate([np.repeat([0, 1, 2], 40), np.full(stray, -1)]), 6)
     for d in range(3):
         mine = truth[direction == d]
@@ -138,7 +138,7 @@ def test_directions_are_found_among_strays(sigma, stray, limit):
         assert right > max(0.7 * 240, 0.85 * len(mine))
     v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)
     start = np.linalg.svd(X)[2][-1]
-    refined, _, noise = refine_plane(frame, segments, direction, start[:3] / start[3], v)
+    refined, _, noise = _refine_plane(frame, segments, direction, start[:3] / start[3], v)
     np.testing.assert_allclose(refined, plane, atol=limit)
     assert noise == pytest.approx(sigma, rel=0.5, abs=0.01)
 
@@ -170,7 +170,7 @@ def test_fitted_segments_run_through_their_points():
     t = np.linspace(0.0, 30.0, 31)
     lines = np.column_stack([5 + 0.6 * t, 7 + 0.8 * t]), np.column_stack([t, np.full(31, 3.0)])
     xy = np.concatenate([*lines, [[1.0, 2.0]]])
-    segments, rms = fit_segments(xy, np.repeat([4, 9, 11], [31, 31, 1]))
+    segments, rms = _fit_segments(xy, np.repeat([4, 9, 11], [31, 31, 1]))
     assert segments.shape == (2, 4)
     np.testing.assert_allclose(rms, 0.0, atol=1e-6)
     np.testing.assert_allclose(segments[0], [5.0, 7.0, 23.0, 31.0], atol=1e-9)

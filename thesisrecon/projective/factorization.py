@@ -1,14 +1,11 @@
-"""Projective factorisation: all cameras and points of a complete table of matches at once.
+"""Projective factorization: cameras and points of a complete table of matches at once.
 
-Sturm and Triggs, "A factorization based algorithm for multi-image projective structure and motion", ECCV
-1996: with the right projective depths w the matrix of all w (u, v, 1) has rank 4, and its factors are the
-cameras and the points. Fundamental matrices give the depths; or one begins anywhere and takes them from the
-factors, over and over (Triggs, CVPR 1996; Oliensis and Hartley, PAMI 29(12), 2007, on when that converges).
-
-Chapter 6 by factorisation: a core of views at once, then the others one by one.
-
-The incremental way trusts one pair of views to begin with. Here many views that see the same points begin
-together (:mod:`thesisrecon.projective.factorization`); only what none of them tells depends on an order.
+P. Sturm, B. Triggs, "A factorization based algorithm for multi-image projective structure and motion", ECCV
+1996 (HZ 18.4): with the right projective depths w the matrix of all w (u, v, 1) has rank 4, and its factors
+are cameras and points. Fundamental matrices give the depths; or they are iterated with the factors from any
+start (B. Triggs, CVPR 1996; J. Oliensis, R. Hartley, PAMI 29(12), 2007, on convergence).
+:class:`Factorization` reconstructs a core of views this way and adds the others incrementally, which depends
+less on one initial pair.
 """
 
 from __future__ import annotations
@@ -38,17 +35,27 @@ from thesisrecon.projective.model import (
 )
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
-_BALANCING = 10
-_AT_REST = 1e-4
-"""Relative gain of an iteration below which the factors rest."""
+_BALANCING_ITERATIONS = 10
+# Relative gain of an iteration below which the factors have converged.
+_MIN_GAIN_REL = 1e-4
 
 
 @dataclass(frozen=True)
 class Factors:
-    """Cameras ``P`` (V, 3, 4) for pixels and points ``X`` (N, 4) of unit norm, found with the balance_depths
-    ``depths`` (V, N); ``residual_px`` (V, N) distances of the projections from the matches.
+    """Result of a factorization.
 
-    ``gap`` is the fifth singular value over the fourth: 0 for exact matches and right depths.
+    Attributes
+    ----------
+    P, X : ndarray (V, 3, 4), (N, 4)
+        Cameras for pixels and points of unit norm.
+    depths : ndarray (V, N)
+        Balanced projective depths.
+    residual_px : ndarray (V, N)
+        Reprojection distances.
+    gap : float
+        Fifth over fourth singular value: 0 for exact matches and right depths.
+    iterations : int
+        Number of iterations.
     """
 
     P: F64
@@ -67,13 +74,33 @@ class Factors:
 def depths_from_fundamentals(
     xy: F64, F: Mapping[tuple[int, int], F64], tree: Sequence[tuple[int, int]]
 ) -> F64:
-    """Projective depths (V, N) of matches xy (V, N, 2) px from fundamental matrices along a ``tree``.
+    """Compute projective depths from fundamental matrices along a tree of views.
 
-    Of an edge (i, j), i reached before j: w_i F x_i = w_j (e_j x x_j) in every point, whose least-squares
-    solution is w_j = w_i (e_j x x_j) . (F x_i) / |e_j x x_j|^2 (Sturm and Triggs, eq. 3). ``F[i, j]`` (3, 3)
-    has x_j' F x_i = 0; its scale and sign are those of a whole view. The first view of the tree has depth 1.
-    Points near an epipole get bad depths. Raises ``ValueError`` for a tree that does not reach every view,
-    each once, from its first.
+    For an edge (i, j): w_i F x_i = w_j (e_j x x_j), with the least-squares solution w_j = w_i (e_j x x_j) .
+    (F x_i) / |e_j x x_j|^2 (Sturm and Triggs, eq. 3). Points near an epipole get inaccurate depths.
+
+    Parameters
+    ----------
+    xy : ndarray (V, N, 2)
+        Matches in pixels.
+    F : mapping of (int, int) to ndarray (3, 3)
+        ``F[i, j]`` with x_j' F x_i = 0; its scale and sign are those of a whole view.
+    tree : sequence of (int, int)
+        Edges (i, j), i reached before j.
+
+    Returns
+    -------
+    ndarray (V, N)
+        Depths, 1 in the first view of the tree.
+
+    Raises
+    ------
+    ValueError
+        If the tree does not reach every view once from its first.
+
+    References
+    ----------
+    P. Sturm, B. Triggs, ECCV 1996, eq. 3.
     """
     x = homogenize(xy)
     depths = np.full(xy.shape[:2], np.nan)
@@ -81,42 +108,56 @@ def depths_from_fundamentals(
     for i, j in tree:
         if np.isnan(depths[i]).any() or not np.isnan(depths[j]).all():
             raise ValueError(f"depths_from_fundamentals needs a tree that grows from view {tree[0][0]}")
-        turned = np.cross(epipoles(F[i, j])[1], x[j])
-        squared = np.maximum(np.sum(turned**2, axis=1), 1e-300)
-        depths[j] = depths[i] * np.sum(turned * (x[i] @ F[i, j].T), axis=1) / squared
+        e_cross_x = np.cross(epipoles(F[i, j])[1], x[j])
+        squared = np.maximum(np.sum(e_cross_x**2, axis=1), 1e-300)
+        depths[j] = depths[i] * np.sum(e_cross_x * (x[i] @ F[i, j].T), axis=1) / squared
     if np.isnan(depths).any():
         raise ValueError("depths_from_fundamentals needs a tree that reaches every view")
     return depths
 
 
-def balance_depths(depths: F64, sizes: F64) -> F64:
-    """Depths (V, N) rescaled by views and by points until every view and every point weighs the same.
+def _balance_depths(depths: F64, sizes: F64) -> F64:
+    """Return depths (V, N) rescaled by views and points until all views and all points have equal weight.
 
-    ``sizes`` (V, N) are the norms of the vectors that the depths multiply. Scales of views are those of
-    cameras, scales of points those of points, so nothing is changed but the weights of the residuals.
+    ``sizes`` (V, N) are the norms of the vectors that the depths multiply. Only the weights of the residuals
+    change.
     """
     views, points = depths.shape
     squared = (depths * sizes) ** 2
     a, b = np.ones(views), np.ones(points)
-    for _ in range(_BALANCING):
+    for _ in range(_BALANCING_ITERATIONS):
         b = np.sqrt(views / np.maximum(a**2 @ squared, 1e-300))
         a = np.sqrt(points / np.maximum(squared @ b**2, 1e-300))
     return np.asarray(depths * a[:, None] * b)
 
 
 def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Factors:
-    """Cameras and points of matches seen in every view, xy (V, N, 2) px, by a rank-4 factorisation.
+    """Factorize matches seen in every view into cameras and points (rank 4).
 
     Parameters
     ----------
-    depths : (V, N) projective depths to begin with (:func:`depths_from_fundamentals`); all equal where None,
-        which is the affine camera and needs ``iterations``.
-    iterations : most times that the depths are taken anew from the factors; 0 is Sturm and Triggs' own
-        algorithm. It ends when the rank-4 residual of the balance_depths matrix, an approximation of the
-        reprojection error, falls no more.
+    xy : ndarray (V, N, 2)
+        Matches in pixels; the points of a view must not coincide.
+    depths : ndarray (V, N), optional
+        Initial depths (:func:`depths_from_fundamentals`); equal by default, an affine camera, which needs
+        ``iterations``.
+    iterations : int
+        Maximum number of depth updates; 0 is the published algorithm. Stops when the rank-4 residual of the
+        balanced matrix, which approximates the reprojection error, no longer falls.
 
-    Raises ``ValueError`` for fewer than two views or eight points, other shapes, and values that are not
-    finite. All pixels of a view may not be equal.
+    Returns
+    -------
+    Factors
+        Cameras, points and residuals.
+
+    Raises
+    ------
+    ValueError
+        Below two views or eight points, or for other shapes or non-finite values.
+
+    References
+    ----------
+    P. Sturm, B. Triggs, ECCV 1996; HZ 18.4.
     """
     if xy.ndim != 3 or xy.shape[2] != 2 or xy.shape[0] < 2 or xy.shape[1] < 8:
         raise ValueError(f"factorize needs xy (V >= 2, N >= 8, 2); got {xy.shape}")
@@ -130,11 +171,11 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Fac
     least, best, done = np.inf, depths, -1
     while done < iterations:
         done += 1
-        depths = balance_depths(depths, sizes)
+        depths = _balance_depths(depths, sizes)
         fitted, residual = _rank_four(depths[:, :, None] * x)
         if residual < least:
             best = depths
-        if not residual < least * (1.0 - _AT_REST):
+        if not residual < least * (1.0 - _MIN_GAIN_REL):
             break
         least = residual
         depths = np.einsum("vna,vna->vn", fitted, x) / sizes**2
@@ -142,12 +183,12 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Fac
 
 
 def _measurements(wx: F64) -> F64:
-    """(V, N, 3) -> (3 V, N)."""
+    """Return (3 V, N) from (V, N, 3)."""
     return np.asarray(wx.swapaxes(1, 2).reshape(-1, wx.shape[1]))
 
 
 def _rank_four(wx: F64) -> tuple[F64, float]:
-    """The nearest matrix of rank 4, as (V, N, 3), and its squared distance."""
+    """Return the nearest matrix of rank 4 as (V, N, 3), and its squared distance."""
     W = _measurements(wx)
     basis = np.linalg.eigh(W @ W.T)[1][:, -4:]
     fitted = basis @ (basis.T @ W)
@@ -157,7 +198,7 @@ def _rank_four(wx: F64) -> tuple[F64, float]:
 
 def _factors(xy: F64, x: F64, T: F64, depths: F64, iterations: int) -> Factors:
     U, s, Vt = np.linalg.svd(_measurements(depths[:, :, None] * x), full_matrices=False)
-    # Equal shares of the singular values whiten the points as far as they go.
+    # Whitens the points approximately.
     P, X = np.linalg.solve(T, U[:, :4].reshape(-1, 3, 4)), Vt[:4].T * s[:4]
     lengths = np.linalg.norm(X, axis=1, keepdims=True)
     X = X / np.where(lengths > 0.0, lengths, 1.0)
@@ -170,23 +211,29 @@ def _factors(xy: F64, x: F64, T: F64, depths: F64, iterations: int) -> Factors:
 
 Edge = tuple[int, int]
 
-_LEAST_POINTS = 16
-"""Complete tracks below which a table says too little to be factorised."""
-_ROUNDS = 5
+_MIN_POINTS = 16
+"""Minimum number of complete tracks of a factorization."""
+_MAX_ROUNDS = 5
 _PLANE_SIGMAS = 3.0
 """Whitened distances from a homography, in noise sigmas, of the points that it explains."""
 
 
 @dataclass(frozen=True)
 class Factorization:
-    """Projective factorisation of a core of views, the other views joined by resection.
+    """Projective factorization of a core of views; the others are added by resection.
 
     Parameters
     ----------
-    core_points : views join the core as long as this many tracks are seen in all of it.
-    iterations : most times that the projective depths are taken anew from the factors; 0 is Sturm and Triggs'
-        algorithm as published, whose depths are those of the fundamental matrices.
-    growth : what adds the other views, adjusts and discards; its own parameters say how.
+    core_points : int
+        Views join the core while this many tracks are seen in all of it.
+    iterations : int
+        Maximum number of depth updates; 0 is the published algorithm of Sturm and Triggs.
+    growth : IncrementalProjective
+        Adds the other views.
+
+    References
+    ----------
+    P. Sturm, B. Triggs, ECCV 1996; HZ 18.4.
     """
 
     core_points: int = 100
@@ -194,9 +241,9 @@ class Factorization:
     growth: IncrementalProjective = field(default_factory=IncrementalProjective)
 
     def __post_init__(self) -> None:
-        if self.core_points < _LEAST_POINTS or self.iterations < 0:
+        if self.core_points < _MIN_POINTS or self.iterations < 0:
             raise ValueError(
-                f"a factorisation needs core_points >= {_LEAST_POINTS} and iterations >= 0; got "
+                f"Factorization needs core_points >= {_MIN_POINTS} and iterations >= 0; got "
                 f"{self.core_points} and {self.iterations}"
             )
 
@@ -209,14 +256,32 @@ class Factorization:
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """As :meth:`IncrementalProjective.reconstruct`; ``attempt`` grows the core from another pair."""
+        """Reconstruct cameras and points from tracks and verified pairs.
+
+        Parameters
+        ----------
+        tracks, pairs, sizes, rng
+            As in :meth:`~thesisrecon.projective.incremental.IncrementalProjective.reconstruct`.
+        attempt : int
+            Number of the attempt; each grows the core from another pair.
+
+        Returns
+        -------
+        Reconstruction
+            Projective reconstruction.
+
+        Raises
+        ------
+        StageFailure
+            If no pair shows parallax or is left, or the initial pair shares too few tracks.
+        """
         ranked = rank_initial_pairs(tracks, pairs)
         require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             raise StageFailure(
-                "no two photographs to begin a factorisation with",
-                f"accepted: {len(ranked)} of {counted(len(pairs), 'pair')}",
-                "take photographs that overlap by more than half and show texture",
+                "no initial pair is left for the factorization",
+                f"{len(ranked)} of {counted(len(pairs), 'image pair')} accepted",
+                "take images that overlap by more than half and show texture",
             )
         usable = select_tracks_with_parallax(tracks, pairs)
         keep = select_tracks(tracks, usable, points_per_view=self.growth.points_per_view)
@@ -226,36 +291,55 @@ class Factorization:
         return expand_to_all_tracks(to_reconstruction(model), tracks, keep)
 
     def begin(self, tracks: Tracks, pairs: Sequence[TwoView], start: TwoView, sizes: I64) -> ProjectiveModel:
-        """Cameras and points of the core, adjusted.
+        """Reconstruct the core by factorization and adjust it.
 
-        ``StageFailure`` where the pair ``start`` itself shares too few tracks.
+        Parameters
+        ----------
+        tracks : Tracks
+            Observations.
+        pairs : sequence of TwoView
+            Verified pairs.
+        start : TwoView
+            Initial pair.
+        sizes : ndarray (V, 2) of int
+            Width and height.
+
+        Returns
+        -------
+        ProjectiveModel
+            Model of the core.
+
+        Raises
+        ------
+        StageFailure
+            If ``start`` shares too few tracks.
         """
         xy = np.full((tracks.n_views, tracks.n_points, 2), np.nan)
         xy[tracks.view_index, tracks.point_index] = tracks.xy
         F = {(p.i, p.j): p.F for p in pairs} | {(p.j, p.i): p.F.T for p in pairs}
-        tree = grow_core(np.isfinite(xy[:, :, 0]), pairs, start, least=self.core_points)
+        tree = _grow_core(np.isfinite(xy[:, :, 0]), pairs, start, min_tracks=self.core_points)
         sigma_px = max(start.sigma_px, self.growth.noise_floor_px)
-        table, edges = complete_tracks(xy, tree)
-        while len(tree) > 1 and is_planar(table, edges, _PLANE_SIGMAS * sigma_px):
-            # Fewer views have more points in common.
+        table, edges = _complete_tracks(xy, tree)
+        while len(tree) > 1 and _is_planar(table, edges, _PLANE_SIGMAS * sigma_px):
+            # Fewer views have more common points.
             tree = tree[:-1]
-            table, edges = complete_tracks(xy, tree)
-        if table.shape[1] < _LEAST_POINTS:
+            table, edges = _complete_tracks(xy, tree)
+        if table.shape[1] < _MIN_POINTS:
             raise StageFailure(
-                "the photographs to begin with share too few tracks for a factorisation",
-                f"{table.shape[1]} of {_LEAST_POINTS}",
+                "the initial images share too few tracks for a factorization",
+                f"{table.shape[1]} tracks, at least {_MIN_POINTS} are needed",
             )
         depths = depths_from_fundamentals(table, {e: F[v] for e, v in zip(edges, tree, strict=True)}, edges)
-        factors, _ = factorize_robustly(table, depths, self.growth.outlier_sigmas[1], self.iterations)
-        return self._adjusted(tracks, sizes, _views(tree), factors, sigma_px)
+        factors, _ = _factorize_robustly(table, depths, self.growth.outlier_sigmas[1], self.iterations)
+        return self._adjusted(tracks, sizes, _tree_views(tree), factors, sigma_px)
 
     def _adjusted(
         self, tracks: Tracks, sizes: I64, views: list[int], factors: Factors, sigma_px: float
     ) -> ProjectiveModel:
-        """The core with all its points, those that only some of its views see included."""
+        """Return the adjusted core with all its points, including those seen by some of its views only."""
         growth, early = self.growth, self.growth.outlier_sigmas[0]
         model = ProjectiveModel.empty(tracks, sizes, sigma_px=sigma_px, noise_floor_px=growth.noise_floor_px)
-        # Until the bundle has done its work, the residuals are those of the factors.
+        # Before bundle adjustment the residuals are those of the factors.
         model.sigma_px = max(model.sigma_px, noise_from_distances(factors.residual_px.ravel()))
         every = np.indices(factors.depths.shape).reshape(2, -1)
         signs, _, _ = orient_signs(factors.P, factors.X, every[0], every[1])
@@ -267,15 +351,15 @@ class Factorization:
         return model
 
 
-def _views(tree: Sequence[Edge]) -> list[int]:
+def _tree_views(tree: Sequence[Edge]) -> list[int]:
     return [tree[0][0], *(j for _, j in tree)]
 
 
-def grow_core(seen: B8, pairs: Sequence[TwoView], start: TwoView, *, least: int) -> list[Edge]:
-    """The tree of views (i, j), i before j, that share at least ``least`` tracks; it begins with ``start``.
+def _grow_core(seen: B8, pairs: Sequence[TwoView], start: TwoView, *, min_tracks: int) -> list[Edge]:
+    """Return the tree of views (i, j), i before j, that share ``min_tracks``; it begins with ``start``.
 
-    ``seen`` (V, N). The next view is the one that leaves most tracks common to all, as long as an accepted
-    pair ties it; of such pairs the one that most matches off a plane determine.
+    ``seen`` (V, N). The next view leaves most tracks common to all, if an accepted pair connects it; of such
+    pairs the one with most non-planar matches.
     """
     tree, views = [(start.i, start.j)], {start.i, start.j}
     weight: dict[Edge, float] = {}
@@ -289,28 +373,27 @@ def grow_core(seen: B8, pairs: Sequence[TwoView], start: TwoView, *, least: int)
         edges = [(i, j) for i, j in weight if i in views and j not in views]
         counts = {j: int((common & seen[j]).sum()) for _, j in edges}
         view = max(counts, key=lambda j: (counts[j], -j), default=-1)
-        if view < 0 or counts[view] < least:
+        if view < 0 or counts[view] < min_tracks:
             return tree
         tree.append(max((e for e in edges if e[1] == view), key=lambda e: (weight[e], -e[0])))
         views.add(view)
         common &= seen[view]
 
 
-def complete_tracks(xy: F64, tree: Sequence[Edge]) -> tuple[F64, list[Edge]]:
-    """The tracks (V', N', 2) that all views of the tree see, of xy (V, N, 2), and its edges renumbered."""
-    views = _views(tree)
+def _complete_tracks(xy: F64, tree: Sequence[Edge]) -> tuple[F64, list[Edge]]:
+    """Return the tracks (V', N', 2) that all views of the tree see, and its edges renumbered."""
+    views = _tree_views(tree)
     table = xy[views]
     place = {view: k for k, view in enumerate(views)}
     return table[:, np.isfinite(table).all(axis=(0, 2))], [(place[i], place[j]) for i, j in tree]
 
 
-def is_planar(xy: F64, edges: Sequence[Edge], gate_px: float) -> bool:
-    """Whether a homography explains nearly all points of xy (V, N, 2) in every pair of views of ``edges``.
+def _is_planar(xy: F64, edges: Sequence[Edge], gate_px: float) -> bool:
+    """Return whether a homography explains nearly all points (V, N, 2) in every pair of ``edges``.
 
-    Then they lie on one plane (or the camera only turned), which determines no projective camera: rank 4
-    would be made of noise.
+    Then the scene is planar or the camera only rotated: rank 4 would be fitted to noise.
     """
-    if xy.shape[1] < _LEAST_POINTS:
+    if xy.shape[1] < _MIN_POINTS:
         return False
     shares = []
     for i, j in edges:
@@ -323,18 +406,17 @@ def is_planar(xy: F64, edges: Sequence[Edge], gate_px: float) -> bool:
     return bool(min(shares) >= NO_PARALLAX)
 
 
-def factorize_robustly(xy: F64, depths: F64, sigmas: float, iterations: int) -> tuple[Factors, B8]:
-    """Factors of xy (V, N, 2) without the points that disagree, and which are kept (N,).
+def _factorize_robustly(xy: F64, depths: F64, sigmas: float, iterations: int) -> tuple[Factors, B8]:
+    """Return factors without inconsistent points, and the kept points (N,).
 
-    A point with a residual beyond ``sigmas`` times the noise is left out and the rest factorised anew, until
-    no further one is, or too few would be left.
+    Points with a residual beyond ``sigmas`` times the noise are removed and the rest is factorized again.
     """
     kept = np.ones(xy.shape[1], dtype=bool)
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         factors = factorize(xy[:, kept], depths[:, kept], iterations=iterations)
         worst = factors.residual_px.max(axis=0)
         within = worst <= sigmas * noise_from_distances(factors.residual_px.ravel())
-        if within.all() or within.sum() < _LEAST_POINTS:
+        if within.all() or within.sum() < _MIN_POINTS:
             break
         kept[np.flatnonzero(kept)[~within]] = False
     return factors, kept

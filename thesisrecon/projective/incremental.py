@@ -1,22 +1,10 @@
-"""Section 6.4, robust: the camera that most points of the model agree with.
+"""Incremental projective reconstruction (chapter 6; P. Beardsley, A. Zisserman, D. Murray, IJCV 23, 1997).
 
-The covariance gate: is a resected camera determined, or does it only fit?
-
-A camera that sees a single plane fits its points at sub-pixel residual with an arbitrary P. What tells is the
-covariance of P: where it would put points of the *whole* scene, not only those it sees.
-
-Whether the cameras of a model agree with the epipolar geometry that was found without it.
-
-A camera that a crowd of wrong matches placed fits those matches, and may well be determined by them. What it
-does not fit are the matches of its pairs, verified pair by pair before there was a model.
-
-Chapter 6 as a whole: from tracks and fundamental matrices to cameras and points in one projective frame.
-
-Begin with a pair, add one camera after the other by resection, triangulate, adjust, discard (Beardsley,
-Zisserman and Murray, IJCV 23, 1997). What makes it hold on photographs are its gates: a camera enters only
-when its covariance says that it is determined, and stays only while it explains what it sees and agrees with
-the epipolar geometry of its pairs; the others wait, and those still waiting at the end are left to
-calibrated resection.
+An initial pair, then one camera after the other: resection, triangulation, bundle adjustment, outlier
+removal. A camera is accepted if its covariance shows that it is determined: a view of a single plane fits its
+points at subpixel residuals with an arbitrary P. It is kept if it explains its points and agrees with the
+verified matches of its pairs, since many wrong matches can determine a wrong camera. Other views are deferred
+to calibrated resection.
 """
 
 from __future__ import annotations
@@ -58,18 +46,35 @@ _SAMPLE = 6
 def resect_ransac(
     X: F64, xy: F64, *, threshold_px: float, rng: np.random.Generator, batch: int = 64, max_batches: int = 12
 ) -> tuple[F64 | None, B8]:
-    """RANSAC over six-point samples with a truncated-quadratic score; X (M, 4), xy (M, 2) px.
+    """Resect a camera by RANSAC over six-point samples with a truncated-quadratic score (6.4; HZ 7.1).
 
-    The signs of X must be such that their depths have one sign; points of the other one count as outliers.
-    Samples are drawn and solved a batch at a time; it stops when a sample free of outliers has been drawn
-    with probability 0.999 at the best inlier share so far. Returns the camera of the best sample
-    re-estimated from its inliers, depths positive (None where there are fewer than six), and the inliers
-    (M,).
+    Samples are drawn in batches until one without outliers was drawn with probability 0.999 at the best
+    inlier ratio.
+
+    Parameters
+    ----------
+    X : ndarray (M, 4)
+        Points, signed so that depths have one sign; points of the other sign are outliers.
+    xy : ndarray (M, 2)
+        Pixels.
+    threshold_px : float
+        Inlier threshold.
+    rng : numpy.random.Generator
+        Draws the samples.
+    batch, max_batches : int
+        Samples per batch and maximum number of batches.
+
+    Returns
+    -------
+    P : ndarray (3, 4) or None
+        Camera estimated from the inliers, depths positive; None below six inliers.
+    inlier : ndarray (M,) of bool
+        Inliers.
     """
     none = np.zeros(len(X), dtype=bool)
     if len(X) < _SAMPLE:
         return None, none
-    # The points of one view may crowd in a corner of the model's frame: whitened anew, no digits are lost.
+    # The points of one view may fill a corner of the frame: whitening keeps all digits.
     M = whitening_transform(X)
     Y = X @ M.T
     Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
@@ -89,11 +94,11 @@ def resect_ransac(
             break
     if best is None:
         return None, none
-    found, inlier = _polish(best, Y, xy, threshold_px)
+    found, inlier = _refit(best, Y, xy, threshold_px)
     return (None if found is None else found @ M), inlier
 
 
-def _polish(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8]:
+def _refit(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8]:
     inlier = _squared_residuals(P[None], X, xy)[0] < threshold_px**2
     for _ in range(2):
         if inlier.sum() < _SAMPLE:
@@ -108,7 +113,7 @@ def _polish(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B
 
 
 def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
-    """(B, M) squared reprojection residuals, infinite for a point on or behind the principal plane."""
+    """Return squared reprojection residuals (B, M), inf on or behind the principal plane."""
     xh = np.einsum("bij,mj->bmi", P, X)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         squared = np.sum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=-1)
@@ -116,10 +121,23 @@ def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
 
 
 def projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
-    """Standard deviation (px) of the projection of each point under the camera's covariance.
+    """Compute the standard deviation of projections under the covariance of a camera.
 
-    P (3, 4), covariance (12, 12) of its row-major entries, X (N, 4) -> (N,): root of half the trace of J C
-    J'. Points near the camera's principal plane come out infinite.
+    The root of half the trace of J C J'.
+
+    Parameters
+    ----------
+    P : ndarray (3, 4)
+        Camera.
+    covariance : ndarray (12, 12)
+        Covariance of its entries, row-major.
+    X : ndarray (N, 4)
+        Points of the whole scene.
+
+    Returns
+    -------
+    ndarray (N,)
+        Standard deviations in pixels; inf near the principal plane.
     """
     xh = X @ P.T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -133,11 +151,10 @@ def projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
     return np.where(np.isfinite(spread), spread, np.inf)
 
 
-def epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float) -> F64:
-    """Share of the verified matches of each pair within ``gate_px`` (Sampson) of the cameras' F; -> (M,).
+def _epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float) -> F64:
+    """Return the share (M,) of verified matches of each pair within ``gate_px`` (Sampson) of the cameras' F.
 
-    P (V, 3, 4). NaN for pairs that are not accepted, of which a view is not registered, or whose cameras
-    have one centre.
+    NaN for pairs that are not accepted, not registered, or have one camera centre.
     """
     shares = np.full(len(pairs), np.nan)
     for n, pair in enumerate(pairs):
@@ -154,14 +171,31 @@ def epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *, 
 
 
 def find_inconsistent_view(
-    P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float, least: float
+    P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float, min_ratio: float
 ) -> tuple[int, float] | None:
-    """The registered view that agrees least with its pairs, and its share; None where all reach ``least``.
+    """Find the registered view that agrees least with the verified matches of its pairs.
 
-    A view's share is that of all its verified matches with other registered views. One view at a time: the
-    partners of a wrong camera look worse than they are as long as it is there.
+    One view at a time, since a wrong camera also lowers the ratios of its partners.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4)
+        Cameras.
+    registered : ndarray (V,) of bool
+        Views with a camera.
+    pairs : sequence of TwoView
+        Verified pairs.
+    gate_px : float
+        Largest Sampson distance of an inlier.
+    min_ratio : float
+        Required inlier ratio over all matches of a view with registered views.
+
+    Returns
+    -------
+    tuple of (int, float) or None
+        The view and its ratio; None if all views reach ``min_ratio``.
     """
-    shares = epipolar_inlier_ratios(P, registered, pairs, gate_px=gate_px)
+    shares = _epipolar_inlier_ratios(P, registered, pairs, gate_px=gate_px)
     total, agreed = np.zeros(len(P)), np.zeros(len(P))
     for pair, share in zip(pairs, shares, strict=True):
         if np.isfinite(share):
@@ -169,35 +203,46 @@ def find_inconsistent_view(
             agreed[[pair.i, pair.j]] += share * pair.inliers
     share_of_view = np.where(total > 0, agreed / np.maximum(total, 1.0), 1.0)
     worst = int(np.argmin(share_of_view))
-    return (worst, float(share_of_view[worst])) if share_of_view[worst] < least else None
+    return (worst, float(share_of_view[worst])) if share_of_view[worst] < min_ratio else None
 
 
-MIN_SHARE = 0.3
-"""Share of the points a camera sees that must agree with it."""
-QUANTILE = 0.8
-"""The gate looks at the spread that this share of the points keeps below."""
+# Required share of inliers among the points that a camera sees.
+_MIN_INLIER_RATIO = 0.3
+# Quantile over all points of the projection standard deviations that is tested.
+_STD_QUANTILE = 0.8
 
 
 @dataclass(frozen=True)
 class IncrementalProjective:
-    """Incremental projective reconstruction behind a covariance gate.
+    """Incremental projective reconstruction with a covariance test of each camera.
 
     Parameters
     ----------
-    points_per_view : tracks that take part, longest first, so that each view has about this many (the others
-        are triangulated in the metric stage, where all are used).
-    min_points : matches a resection needs: twice the six that always agree; the gate judges their worth.
-    outlier_sigmas : residual gates in noise sigmas of the early and the late rounds.
-    noise_floor_px : the noise is never taken to be below this (localisation of corners).
-    max_projection_std_rel : gate on a camera: the 80 % quantile of its predicted spread over all points, as a share of
-        the long side of the image. None lets every camera in.
-    min_epipolar_inlier_ratio : share of a camera's verified matches that must lie on the epipolar lines of the finished
-        model.
-    bundle_iterations, final_rounds : Levenberg-Marquardt steps after each camera; rounds of re-triangulation,
-        adjustment and filtering at the end.
-    adjust_growth : everything is adjusted whenever the cameras have grown by this factor; in between only the
-        new camera and its ``neighbours`` nearest, which keeps the cost of a long sequence down.
-    restarts : initial pairs that one attempt tries as long as views that could take part stay out.
+    points_per_view : int
+        Approximate number of tracks per view, longest first; the metric stage uses all.
+    min_points : int
+        Matches needed for resection: twice the six that always agree.
+    outlier_sigmas : (float, float)
+        Inlier thresholds in noise sigmas of the early and late rounds.
+    noise_floor_px : float
+        Lower bound of the noise (localization of corners).
+    max_projection_std_rel : float, optional
+        Largest 80 % quantile of the projection standard deviations over all points, as a share of the long
+        side; None accepts every camera.
+    min_epipolar_inlier_ratio : float
+        Required share of verified matches on the epipolar lines of the finished model.
+    bundle_iterations, final_rounds : int
+        Levenberg-Marquardt steps after each camera; final rounds of triangulation, adjustment and filtering.
+    global_bundle_growth : float
+        Growth factor of the number of cameras after which everything is adjusted.
+    local_bundle_views : int
+        Number of views adjusted with a new one in between.
+    max_initial_pairs : int
+        Initial pairs tried in one attempt while usable views are missing.
+
+    References
+    ----------
+    P. Beardsley, A. Zisserman, D. Murray, IJCV 23, 1997; HZ 18.
     """
 
     points_per_view: int = 1500
@@ -221,30 +266,50 @@ class IncrementalProjective:
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """Cameras and points from tracks (the whole of them; a selection does the work) and verified pairs.
+        """Reconstruct cameras and points from tracks and verified pairs.
 
-        ``sizes`` (V, 2) width, height; each ``attempt`` begins with other initial pairs. ``StageFailure``
-        where no pair begins.
+        Parameters
+        ----------
+        tracks : Tracks
+            All tracks; a selection is used.
+        pairs : sequence of TwoView
+            Verified pairs.
+        sizes : ndarray (V, 2) of int
+            Width and height.
+        rng : numpy.random.Generator
+            Draws the resection samples.
+        attempt : int
+            Number of the attempt; each begins with other initial pairs.
+
+        Returns
+        -------
+        Reconstruction
+            Projective reconstruction.
+
+        Raises
+        ------
+        StageFailure
+            If no pair is accepted, shows parallax or is left.
         """
         ranked = rank_initial_pairs(tracks, pairs)
         if not ranked:
             raise StageFailure(
-                "no two photographs could be tied together",
-                f"none of {counted(len(pairs), 'pair')} was accepted",
-                "take photographs that overlap by more than half and show texture",
+                "no image pair was accepted",
+                f"none of {counted(len(pairs), 'pair')} was verified",
+                "take images that overlap by more than half and show texture",
             )
         require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             raise StageFailure(
-                "no other pair of photographs to begin with", f"{len(ranked)} accepted pairs, all tried"
+                "no other initial pair is left", f"all {len(ranked)} accepted image pairs were tried"
             )
         usable = select_tracks_with_parallax(tracks, pairs)
         keep = select_tracks(tracks, usable, points_per_view=self.points_per_view)
         selected = subset_tracks(tracks, keep)
-        best = self._best_start(selected, pairs, sizes, ranked[attempt:], rng)
+        best = self._best_model(selected, pairs, sizes, ranked[attempt:], rng)
         return expand_to_all_tracks(to_reconstruction(best), tracks, keep)
 
-    def _best_start(
+    def _best_model(
         self,
         tracks: Tracks,
         pairs: Sequence[TwoView],
@@ -252,10 +317,10 @@ class IncrementalProjective:
         starts: Sequence[TwoView],
         rng: np.random.Generator,
     ) -> ProjectiveModel:
-        """The model with most cameras, then most explained observations, over the initial pairs tried.
+        """Return the model with most cameras, then most inliers, over the initial pairs tried.
 
-        Another pair is tried only where it may give more: one with a view that is out and that was not
-        merely postponed by the gate; and once half of the views are in, no other part of them is larger.
+        Another pair is tried only if it may add a view that was not merely deferred; once half of the views
+        are registered, no other part is larger.
         """
         best, left, half = None, list(starts), len(sizes) // 2 + 1
         for tried in range(self.max_initial_pairs):
@@ -282,14 +347,39 @@ class IncrementalProjective:
         return model
 
     def complete(self, model: ProjectiveModel, pairs: Sequence[TwoView], rng: np.random.Generator) -> None:
-        """Add, in place, what views can be added to a model begun in any way; discard what proves wrong."""
+        """Add views to a model in place and remove those that prove wrong.
+
+        Parameters
+        ----------
+        model : ProjectiveModel
+            Model with at least two cameras.
+        pairs : sequence of TwoView
+            Verified pairs.
+        rng : numpy.random.Generator
+            Draws the resection samples.
+        """
         self._grow(model, rng)
         while self._discard_camera(model, pairs):
             adjust_all(model, self.bundle_iterations, self.outlier_sigmas[0])
             self._grow(model, rng)
 
     def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> ProjectiveModel:
-        """Cameras (3.42) and points of the first two views."""
+        """Reconstruct the initial pair: cameras (3.42) and points.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Observations.
+        pair : TwoView
+            Initial pair.
+        sizes : ndarray (V, 2) of int
+            Width and height.
+
+        Returns
+        -------
+        ProjectiveModel
+            Model of two views.
+        """
         model = ProjectiveModel.empty(
             tracks, sizes, sigma_px=pair.sigma_px, noise_floor_px=self.noise_floor_px
         )
@@ -302,7 +392,7 @@ class IncrementalProjective:
         return model
 
     def _grow(self, model: ProjectiveModel, rng: np.random.Generator) -> None:
-        """Camera after camera, with a bundle adjustment after each; then the final rounds."""
+        """Add cameras one by one with bundle adjustment after each, then run the final rounds."""
         early, late = self.outlier_sigmas
         adjusted = int(model.registered.sum())
         while (view := self.add_next_camera(model, rng)) is not None:
@@ -310,26 +400,37 @@ class IncrementalProjective:
                 adjust_all(model, self.bundle_iterations, early)
                 adjusted = int(model.registered.sum())
             else:
-                adjust_locally(
-                    model, view, self.bundle_iterations, early, local_bundle_views=self.local_bundle_views
-                )
+                adjust_locally(model, view, self.bundle_iterations, early, n_views=self.local_bundle_views)
         for round_number in range(self.final_rounds):
             adjust_all(model, 2 * self.bundle_iterations, late if round_number else early)
 
     def add_next_camera(self, model: ProjectiveModel, rng: np.random.Generator) -> int | None:
-        """Resect the view that sees most of the model, widest spread, and passes the gate; None when none
-        does."""
+        """Resect the view with the best coverage by model points that passes the covariance test.
+
+        Parameters
+        ----------
+        model : ProjectiveModel
+            Model, changed in place.
+        rng : numpy.random.Generator
+            Draws the resection samples.
+
+        Returns
+        -------
+        int or None
+            The view; None if no view can be added.
+        """
         t = model.tracks
         ready = model.valid[t.point_index]
         counts = np.bincount(t.view_index[ready], minlength=t.n_views)
         waiting = ~model.registered & ~model.rejected
-        spread = np.where(waiting, coverage_of_views(model.cell, ready, t.n_views), 0.0)
-        for view in np.argsort(-spread, kind="stable"):
-            if spread[view] <= 0.0:
+        coverage = np.where(waiting, coverage_of_views(model.cell, ready, t.n_views), 0.0)
+        for view in np.argsort(-coverage, kind="stable"):
+            if coverage[view] <= 0.0:
                 return None
             if counts[view] < self.min_points:
                 model.reasons[view] = (
-                    f"sees only {counted(counts[view], 'point')} of the model (needs {self.min_points})"
+                    f"sees only {counted(counts[view], 'point')} of the model (at least {self.min_points} "
+                    f"needed)"
                 )
             elif self._try_camera(model, int(view), rng):
                 return int(view)
@@ -340,12 +441,12 @@ class IncrementalProjective:
         k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
         X, xy = model.X[t.point_index[k]], t.xy[k]
         P, inlier = resect_ransac(X, xy, threshold_px=early * model.sigma_px, rng=rng)
-        if P is None or inlier.sum() < self.min_points or inlier.mean() < MIN_SHARE:
+        if P is None or inlier.sum() < self.min_points or inlier.mean() < _MIN_INLIER_RATIO:
             model.reasons[view] = (
-                f"only {int(inlier.sum())} of {len(k)} points of the model agree with one camera"
+                f"only {int(inlier.sum())} of {len(k)} points of the model are inliers of its resection"
             )
             return False
-        model.deferred[view], P = self._gate(model, view, P, X[inlier], xy[inlier])
+        model.deferred[view], P = self._covariance_test(model, view, P, X[inlier], xy[inlier])
         if model.deferred[view]:
             return False
         model.P[view] = P
@@ -356,42 +457,43 @@ class IncrementalProjective:
         retriangulate_points(model, early, points=seen)
         return True
 
-    def _gate(self, model: ProjectiveModel, view: int, P: F64, X: F64, xy: F64) -> tuple[bool, F64]:
-        """Whether the camera must wait, and the camera refined, oriented so that its points have positive
-        depth."""
+    def _covariance_test(
+        self, model: ProjectiveModel, view: int, P: F64, X: F64, xy: F64
+    ) -> tuple[bool, F64]:
+        """Return whether to defer the camera, and the refined camera with positive depths."""
         refined = refine_camera(P, X, xy, loss_px=LOSS_SIGMAS * model.sigma_px, iterations=20)
         P = refined.P * np.sign(np.median(X @ refined.P[2]))
         if self.max_projection_std_rel is None:
             return False, P
         covariance = refined.covariance * model.sigma_px**2
-        spread = projection_std_px(refined.P, covariance, model.X[model.valid])
+        std_px = projection_std_px(refined.P, covariance, model.X[model.valid])
         limit = self.max_projection_std_rel * float(model.sizes[view].max())
-        quantile = float(np.quantile(spread, QUANTILE))
+        quantile = float(np.quantile(std_px, _STD_QUANTILE))
         if quantile < limit:
             return False, P
         model.reasons[view] = (
-            f"its {len(X)} points, near one plane, do not determine its camera before calibration "
-            f"(predicted spread {min(quantile, 1e6):.0f} px, limit {limit:.0f} px)"
+            f"its {len(X)} points lie near one plane and do not determine its camera before calibration "
+            f"(predicted standard deviation {min(quantile, 1e6):.0f} px, limit {limit:.0f} px)"
         )
         return True, P
 
     def _discard_camera(self, model: ProjectiveModel, pairs: Sequence[TwoView]) -> bool:
-        """Take out, for good, a camera that proved wrong; False where all hold, or too few are left."""
+        """Remove a wrong camera permanently; False if none is wrong or only two are left."""
         if model.registered.sum() <= 2:
             return False
-        counts, shares = model.explained()
+        counts, shares = model.inlier_ratios()
         shares[~model.registered] = 1.0
         view = int(np.argmin(shares))
-        reason = f"the finished model explains only {counts[view]} of its points ({shares[view]:.0%})"
-        if shares[view] >= MIN_SHARE:
+        reason = f"only {counts[view]} of its points are inliers of the finished model ({shares[view]:.0%})"
+        if shares[view] >= _MIN_INLIER_RATIO:
             found = find_inconsistent_view(
                 model.P, model.registered, pairs,
-                gate_px=self.outlier_sigmas[0] * model.sigma_px, least=self.min_epipolar_inlier_ratio,
+                gate_px=self.outlier_sigmas[0] * model.sigma_px, min_ratio=self.min_epipolar_inlier_ratio,
             )  # fmt: skip
             if found is None:
                 return False
             view, share = found
-            reason = f"the model agrees with only {share:.0%} of its verified matches"
+            reason = f"only {share:.0%} of its verified matches agree with the epipolar geometry of the model"
         model.registered[view] = False
         model.rejected[view] = True
         model.reasons[view] = reason

@@ -1,7 +1,7 @@
-"""Section 6.2: which two views to begin with, and their cameras.
+"""Initial image pair and its cameras (section 6.2).
 
-The pair must be tied by many points that go on into other views and must not look like a plane or a pure
-rotation, since a homography then explains it and F, hence the cameras, is not determined.
+The pair needs many points that continue into other views, and its matches must not be explained by a
+homography (plane or pure rotation), which leaves F and the cameras undetermined.
 """
 
 from __future__ import annotations
@@ -20,25 +20,39 @@ from thesisrecon.records import Tracks, TwoView
 
 # Share of a pair's matches that one homography explains beyond which the pair shows no parallax: what is left
 # is of the size of the wrong matches that verification lets through.
+# Homography inlier ratio beyond which a pair shows no parallax: the rest are as many as undetected wrong
+# matches.
 NO_PARALLAX = 0.95
 
-NO_PARALLAX_BECAUSE = {
-    "pure rotation": "the camera only turned about one point (a pure rotation)",
+# Explanation of the configurations of image pairs.
+_NO_PARALLAX_REASONS = {
+    "pure rotation": "the camera only rotated about its centre (pure rotation)",
     "plane": (
-        "all that is matched lies in one plane (a planar scene), or the camera hardly moved, "
-        "or it turned about one point while it zoomed (a pure rotation)"
+        "all matches lie on one plane (planar scene), the camera hardly moved, or it rotated about its "
+        "centre "
+        "while zooming (pure rotation)"
     ),
 }
-"""What the configurations that are found in pairs of views mean."""
 
 
 def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView]:
-    """Accepted pairs, best beginning first, and each next one unlike those before it.
+    """Rank the accepted pairs as initial pairs, best first.
 
-    The score is the number of points the pair shares, those seen in a third view counting twice, times the
-    share that no single homography explains; a pair whose matches leave F undetermined counts a tenth. Where
-    a beginning fails, one from the same view would likely fail with it: a pair counts half as much for every
-    time that one of its views has begun.
+    The score is the number of shared points (those seen in a third view count twice) times the share that no
+    homography explains; pairs whose matches leave F undetermined count a tenth. If one initial pair fails,
+    another one with the same view would probably fail too: each use of a view halves the score of its pairs.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        All tracks.
+    pairs : sequence of TwoView
+        Verified pairs.
+
+    Returns
+    -------
+    list of TwoView
+        Accepted pairs, best first.
     """
     table = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
     table[tracks.view_index, tracks.point_index] = True
@@ -62,37 +76,59 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
     return ranked
 
 
-def require_pair_with_parallax(pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> None:
-    """``StageFailure`` where every accepted pair was found to show a plane or a camera that only turned, or
-    where one homography explains at least the share ``most`` of every one.
+def require_pair_with_parallax(pairs: Sequence[TwoView], *, max_ratio: float = NO_PARALLAX) -> None:
+    """Raise an error if no accepted pair shows parallax.
 
-    Then the cameras turned about one point, hardly moved, or see a single plane: no F is determined, and
-    whatever is reconstructed from one is arbitrary, however small its residuals.
+    Without parallax (rotation about the camera centre, a static camera, a planar scene) no F is determined,
+    and a reconstruction would be arbitrary even with small residuals.
+
+    Parameters
+    ----------
+    pairs : sequence of TwoView
+        Verified pairs.
+    max_ratio : float
+        Homography inlier ratio from which a pair shows no parallax.
+
+    Raises
+    ------
+    StageFailure
+        If all accepted pairs are planar, pure rotations, or explained by a homography.
     """
     accepted = [pair for pair in pairs if pair.accepted]
     if not accepted:
         return
     shares = [pair.homography_inlier_ratio for pair in accepted]
     kinds = Counter(pair.configuration for pair in accepted)
-    if min(shares) >= most or all(kind in NO_PARALLAX_BECAUSE for kind in kinds):
-        meaning = NO_PARALLAX_BECAUSE.get(
-            kinds.most_common(1)[0][0], "the camera only turns, hardly moves, or sees one plane"
+    if min(shares) >= max_ratio or all(kind in _NO_PARALLAX_REASONS for kind in kinds):
+        meaning = _NO_PARALLAX_REASONS.get(
+            kinds.most_common(1)[0][0], "the camera only rotates, hardly moves, or sees one plane"
         )
         raise StageFailure(
-            f"the photographs show no parallax: {meaning}",
+            f"the images show no parallax: {meaning}",
             f"in the least planar of {counted(len(shares), 'pair')} a homography explains "
-            f"{min(shares):.0%} of all",
-            "walk around the scene between photographs, and have things at different depths in the picture",
+            f"{min(shares):.0%} of the matches",
+            "walk around the scene between images, and include objects at different depths",
         )
 
 
 def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:
-    """Initial cameras (3.42), P1 = [I | 0] and P2 = [[e]x F + e pi' | e], in pixels.
+    """Compute initial cameras (3.42): P1 = [I | 0], P2 = [[e]x F + e pi' | e], in pixels (HZ 9.5).
 
-    ``sizes`` (2, 2) width and height of the two images. The plane pi is chosen in unit-free pixels, such that
-    the left part of P2 comes near a rotation: the frame is then near a metric one, whose focal length is the
-    long side. Of the two such planes the one is taken that fewer of the pair's points lie beyond, and the
-    sign of P2 that puts most of them in front of both cameras.
+    The plane pi is chosen in unit-free pixels so that the left part of P2 is nearest to a rotation: the frame
+    is then nearly metric with a focal length of one long side. Of the two such planes the one with fewer
+    points beyond it is taken, and the sign of P2 that places most points in front of both cameras.
+
+    Parameters
+    ----------
+    pair : TwoView
+        Verified pair.
+    sizes : ndarray (2, 2) of int
+        Width and height of both images.
+
+    Returns
+    -------
+    P1, P2 : ndarray (3, 4)
+        Projective cameras.
     """
     T1, T2 = pixel_from_unit(sizes)
     F = T2.T @ pair.F @ T1

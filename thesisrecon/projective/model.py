@@ -1,9 +1,4 @@
-"""What is asked of all observations after every camera.
-
-Which tracks take part while the cameras are found: long ones, spread over every view.
-
-Sections 6.3 to 6.7 on a reconstruction that grows: its points, its outliers, its adjustment.
-"""
+"""Projective model in progress: track selection, triangulation, outliers, adjustment (6.3 to 6.7)."""
 
 from __future__ import annotations
 
@@ -25,10 +20,27 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 @njit(cache=True, nogil=True)
 def project_observations(P: F64, X: F64, view: I64, point: I64, xy: F64, chosen: B8) -> tuple[F64, F64]:
-    """Of the ``chosen`` (K,) observations the depth w and the distance px of (u, v) / w from ``xy`` (K, 2).
+    """Project the points of some observations.
 
-    (u, v, w) = P (V, 3, 4) of the view times X (N, 4) of the point. Of others, and in the focal plane, the
-    depth is 0 and the distance infinite.
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4)
+        Cameras.
+    X : ndarray (N, 4)
+        Points.
+    view, point : ndarray (K,) of int
+        View and point of each observation.
+    xy : ndarray (K, 2)
+        Observed pixels.
+    chosen : ndarray (K,) of bool
+        Observations to project.
+
+    Returns
+    -------
+    depth : ndarray (K,)
+        Third coordinate w of P X; 0 if not chosen.
+    distance : ndarray (K,)
+        Distance in pixels; inf if not chosen or in the focal plane.
     """
     depth, distance = np.zeros(len(xy)), np.full(len(xy), np.inf)
     for k in range(len(xy)):
@@ -46,43 +58,74 @@ def project_observations(P: F64, X: F64, view: I64, point: I64, xy: F64, chosen:
     return depth, distance
 
 
-CELLS = 8
-"""Of the grid over a view, along each side."""
+# Cells of the grid over an image, along each side.
+_CELLS = 8
 
 
-def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView], *, most: float = NO_PARALLAX) -> B8:
-    """Tracks that are not seen from one standpoint only; -> (n_points,) bool.
+def select_tracks_with_parallax(
+    tracks: Tracks, pairs: Sequence[TwoView], *, max_ratio: float = NO_PARALLAX
+) -> B8:
+    """Select tracks that are seen from more than one position.
 
-    Two views whose matches one homography explains to the share ``most`` show a point without parallax, or on
-    one plane: it may lie anywhere along its ray, and a crowd of such points bends the frame in which cameras
-    are judged. They come back in the metric stage where a ray of another view fixes them.
+    A pair with a homography inlier ratio of at least ``max_ratio`` shows its points without parallax or on
+    one plane: their depths are free, and many of them distort the frame in which cameras are tested. The
+    metric stage adds them again if another view determines them.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        All tracks.
+    pairs : sequence of TwoView
+        Verified pairs.
+    max_ratio : float
+        Homography inlier ratio from which a pair shows no parallax.
+
+    Returns
+    -------
+    ndarray (N,) of bool
+        Selected tracks.
     """
     apart = np.ones((tracks.n_views, tracks.n_views), dtype=np.float32)
     np.fill_diagonal(apart, 0.0)
     for pair in pairs:
-        if pair.accepted and pair.homography_inlier_ratio >= most:
+        if pair.accepted and pair.homography_inlier_ratio >= max_ratio:
             apart[pair.i, pair.j] = apart[pair.j, pair.i] = 0.0
     seen = np.zeros((tracks.n_views, tracks.n_points), dtype=np.float32)
     seen[tracks.view_index, tracks.point_index] = 1.0
     return np.asarray(((apart @ seen) * seen).any(axis=0))
 
 
-def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int, cells: int = CELLS) -> B8:
-    """The longest ``usable`` tracks, until each view has about ``points_per_view``; -> (n_points,) bool.
+def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int, cells: int = _CELLS) -> B8:
+    """Select the longest tracks, spread over each image.
 
-    Every view's points are spread over a grid of ``cells`` x ``cells`` of its own extent: within a cell the
-    longest tracks come first, and all cells get their turn before a cell gets its next, so that detail in a
-    corner of the picture is not starved by a textured middle.
+    Each image is divided into a grid over the extent of its points; longest tracks come first within a cell,
+    and all cells contribute in turn.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        All tracks.
+    usable : ndarray (N,) of bool
+        Tracks to select from.
+    points_per_view : int
+        Approximate number of tracks per view.
+    cells : int
+        Grid cells along each side.
+
+    Returns
+    -------
+    ndarray (N,) of bool
+        Selected tracks.
     """
     length = np.bincount(tracks.point_index, minlength=tracks.n_points)
     keep = np.zeros(tracks.n_points, dtype=bool)
     for view in range(tracks.n_views):
         k = np.flatnonzero((tracks.view_index == view) & usable[tracks.point_index])
-        keep[tracks.point_index[k][_first_in_turn(tracks, k, length, cells)[:points_per_view]]] = True
+        keep[tracks.point_index[k][_by_cell_and_length(tracks, k, length, cells)[:points_per_view]]] = True
     return keep
 
 
-def _first_in_turn(tracks: Tracks, k: I64, length: I64, cells: int) -> I64:
+def _by_cell_and_length(tracks: Tracks, k: I64, length: I64, cells: int) -> I64:
     if len(k) == 0:
         return k
     xy = tracks.xy[k]
@@ -92,13 +135,25 @@ def _first_in_turn(tracks: Tracks, k: I64, length: I64, cells: int) -> I64:
     by_length = np.lexsort((k, -length[tracks.point_index[k]], cell_number))
     sorted_cells = cell_number[by_length]
     start = np.searchsorted(sorted_cells, sorted_cells)
-    turn = np.arange(len(k)) - start
-    return by_length[np.lexsort((by_length, -length[tracks.point_index[k]][by_length], turn))]
+    rank = np.arange(len(k)) - start
+    return by_length[np.lexsort((by_length, -length[tracks.point_index[k]][by_length], rank))]
 
 
-def observation_cells(tracks: Tracks, *, cells: int = CELLS) -> I64:
-    """(K,) the cell of each observation in a grid of ``cells`` x ``cells`` of its view's extent, the cells of
-    all views counted through."""
+def observation_cells(tracks: Tracks, *, cells: int = _CELLS) -> I64:
+    """Return the grid cell of each observation in the extent of its view.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    cells : int
+        Grid cells along each side.
+
+    Returns
+    -------
+    ndarray (K,) of int
+        Cell numbers, consecutive over all views.
+    """
     low, high = np.full((2, tracks.n_views, 2), np.inf)
     np.minimum.at(low, tracks.view_index, tracks.xy)
     np.minimum.at(high, tracks.view_index, -tracks.xy)
@@ -107,18 +162,44 @@ def observation_cells(tracks: Tracks, *, cells: int = CELLS) -> I64:
     return np.asarray((view * cells + cell[:, 0]) * cells + cell[:, 1], dtype=np.int64)
 
 
-def coverage_of_views(cell: I64, chosen: B8, n_views: int, *, cells: int = CELLS) -> F64:
-    """How much of each view its ``chosen`` (K,) observations hold, from :func:`observation_cells`; -> (V,).
+def coverage_of_views(cell: I64, chosen: B8, n_views: int, *, cells: int = _CELLS) -> F64:
+    """Compute how well observations cover each view: the sum over its cells of the root of their number.
 
-    The sum over the grid of the root of their number in the cell: many points count, and points all over the
-    picture count more than a crowd in a corner.
+    Parameters
+    ----------
+    cell : ndarray (K,) of int
+        Cells of :func:`observation_cells`.
+    chosen : ndarray (K,) of bool
+        Observations to count.
+    n_views : int
+        Number of views.
+    cells : int
+        Grid cells along each side.
+
+    Returns
+    -------
+    ndarray (V,)
+        Coverage; spread points count more than clustered ones.
     """
     counts = np.bincount(cell[chosen], minlength=n_views * cells * cells).reshape(n_views, -1)
     return np.asarray(np.sqrt(counts).sum(axis=1))
 
 
 def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:
-    """The tracks marked in ``keep`` (n_points,) bool, numbered anew in the same order."""
+    """Return some of the tracks, renumbered in the same order.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        All tracks.
+    keep : ndarray (N,) of bool
+        Tracks to keep.
+
+    Returns
+    -------
+    Tracks
+        The subset.
+    """
     chosen = keep[tracks.point_index]
     number = np.cumsum(keep) - 1
     return Tracks(
@@ -131,7 +212,22 @@ def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:
 
 
 def expand_to_all_tracks(reconstruction: Reconstruction, tracks: Tracks, keep: B8) -> Reconstruction:
-    """A reconstruction of the tracks marked in ``keep``, told in the numbers of all ``tracks``."""
+    """Express the reconstruction of a subset of tracks in the numbers of all tracks.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Reconstruction of :func:`subset_tracks`.
+    tracks : Tracks
+        All tracks.
+    keep : ndarray (N,) of bool
+        Tracks of the subset.
+
+    Returns
+    -------
+    Reconstruction
+        The same cameras and points.
+    """
     X = np.zeros((tracks.n_points, 4))
     X[keep] = reconstruction.X
     valid = np.zeros(tracks.n_points, dtype=bool)
@@ -141,21 +237,39 @@ def expand_to_all_tracks(reconstruction: Reconstruction, tracks: Tracks, keep: B
     return replace(reconstruction, X=X, valid=valid, inlier=inlier, tracks=tracks)
 
 
-# The bundle's loss turns from squares to distances here, in noise sigmas.
+# Residual beyond which the loss of bundle adjustment is linear, in noise sigmas.
 LOSS_SIGMAS = 2.0
-# Pairs of views tried for a point one of whose observations is wrong: all of them up to five observations.
-HYPOTHESES = 10
-POINT_ITERATIONS = 4
+# View pairs tried for a point with a wrong observation: all of them up to five observations.
+_HYPOTHESES = 10
+_POINT_ITERATIONS = 4
 
 
 @dataclass
 class ProjectiveModel:
-    """The reconstruction while it grows.
+    """Projective reconstruction in progress.
 
-    ``P`` (V, 3, 4) and ``X`` (N, 4), zeros where there is none yet, their signs such that depths are
-    positive; ``ok`` (K,) marks the observations that the current cameras explain. ``reasons`` says of each
-    view why it waits; the gate ``postponed`` it, or it was in the model, proved wrong, and is ``barred``.
-    ``cell`` (K,) is the observation's cell in a grid of its view.
+    Attributes
+    ----------
+    tracks : Tracks
+        Observations.
+    sizes : ndarray (V, 2) of int
+        Image sizes.
+    P, X : ndarray (V, 3, 4), (N, 4)
+        Cameras and points, zeros if missing, signed so that depths are positive.
+    registered : ndarray (V,) of bool
+        Views with a camera.
+    inlier : ndarray (K,) of bool
+        Observations that agree with the current cameras.
+    sigma_px, noise_floor_px : float
+        Noise and its lower bound.
+    reasons : list of str
+        Why a view is not registered.
+    deferred : ndarray (V,) of bool
+        Views whose camera failed the covariance test.
+    rejected : ndarray (V,) of bool
+        Views that were removed as wrong.
+    cell : ndarray (K,) of int
+        Grid cell of each observation.
     """
 
     tracks: Tracks
@@ -173,7 +287,22 @@ class ProjectiveModel:
 
     @staticmethod
     def empty(tracks: Tracks, sizes: I64, *, sigma_px: float, noise_floor_px: float) -> ProjectiveModel:
-        """A model without cameras."""
+        """Create a model without cameras.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Observations.
+        sizes : ndarray (V, 2) of int
+            Image sizes.
+        sigma_px, noise_floor_px : float
+            Noise and its lower bound.
+
+        Returns
+        -------
+        ProjectiveModel
+            Empty model.
+        """
         n = tracks.n_views
         return ProjectiveModel(
             tracks, sizes, np.zeros((n, 3, 4)), np.zeros((tracks.n_points, 4)), np.zeros(n, dtype=bool),
@@ -183,16 +312,24 @@ class ProjectiveModel:
 
     @property
     def used(self) -> B8:
-        """(K,) observations of registered views that are explained."""
+        """(K,) inlier observations of registered views."""
         return self.inlier & self.registered[self.tracks.view_index]
 
     @property
     def valid(self) -> B8:
-        """(N,) points with at least two explained observations."""
+        """(N,) points with at least two inlier observations."""
         return np.bincount(self.tracks.point_index[self.used], minlength=self.tracks.n_points) >= 2
 
-    def explained(self) -> tuple[I64, F64]:
-        """Per view the explained observations, and their share of its observations of valid points."""
+    def inlier_ratios(self) -> tuple[I64, F64]:
+        """Count the inliers of each view.
+
+        Returns
+        -------
+        counts : ndarray (V,) of int
+            Inlier observations.
+        ratios : ndarray (V,)
+            Their share of the observations of valid points.
+        """
         t, n = self.tracks, self.tracks.n_views
         ready = self.valid[t.point_index]
         counts = np.bincount(t.view_index[ready & self.used], minlength=n)
@@ -200,8 +337,18 @@ class ProjectiveModel:
 
 
 def retriangulate_points(model: ProjectiveModel, sigmas: float, *, points: B8 | None = None) -> None:
-    """Points afresh from all observations in registered views (all, or those of ``points`` (N,) bool), then
-    the gate of ``sigmas`` noise sigmas; a point with a wrong observation once more from those that agree.
+    """Triangulate points from all registered views and update the inliers (6.3).
+
+    A point with a wrong observation is triangulated again from :func:`consistent_observations`.
+
+    Parameters
+    ----------
+    model : ProjectiveModel
+        Model, changed in place.
+    sigmas : float
+        Inlier threshold in noise sigmas.
+    points : ndarray (N,) of bool, optional
+        Points to triangulate; all by default.
     """
     t = model.tracks
     near = model.registered[t.view_index]
@@ -218,21 +365,34 @@ def retriangulate_points(model: ProjectiveModel, sigmas: float, *, points: B8 | 
 
 
 def _triangulate(model: ProjectiveModel, chosen: B8) -> None:
-    """Linear, then least reprojection, of the points with two of the ``chosen`` (K,) observations."""
+    """Triangulate points from the ``chosen`` (K,) observations: linear, then least reprojection error."""
     t = model.tracks
     view, point, xy = t.view_index[chosen], t.point_index[chosen], t.xy[chosen]
     X = triangulate_observations(model.P, view, point, xy, t.n_points)
-    X = refine_points(model.P, X, view, point, xy, loss_px=model.sigma_px, iterations=POINT_ITERATIONS)
+    X = refine_points(model.P, X, view, point, xy, loss_px=model.sigma_px, iterations=_POINT_ITERATIONS)
     found = np.bincount(point, minlength=t.n_points) >= 2
     model.X = np.where(found[:, None], X, model.X)
 
 
 def consistent_observations(model: ProjectiveModel, chosen: B8, gate_px: float) -> B8:
-    """Of the ``chosen`` (K,) observations those that agree with the best of ``HYPOTHESES`` two-view points.
+    """Find the observations of each point that agree with its best two-view triangulation.
 
-    A wrong observation spoils a least-squares point, sometimes so far that its right ones look wrong: each
-    point is triangulated from pairs of its observations, and the pair that most others agree with (truncated
-    squares) tells which are right.
+    A wrong observation can shift a least-squares point so far that right ones look wrong. Each point is
+    triangulated from pairs of its observations; the pair with the lowest truncated squares over all selects.
+
+    Parameters
+    ----------
+    model : ProjectiveModel
+        Model.
+    chosen : ndarray (K,) of bool
+        Observations to test.
+    gate_px : float
+        Largest accepted distance.
+
+    Returns
+    -------
+    ndarray (K,) of bool
+        Consistent observations.
     """
     t = model.tracks
     k = np.flatnonzero(chosen)
@@ -242,10 +402,10 @@ def consistent_observations(model: ProjectiveModel, chosen: B8, gate_px: float) 
     first, place = np.cumsum(counts) - counts, np.tile(np.arange(len(number)), 2)
     best = np.full(len(number), np.inf)
     agree = np.zeros(len(k), dtype=bool)
-    for h in range(HYPOTHESES):
+    for h in range(_HYPOTHESES):
         one = h % counts
-        # Up to five observations every pair has its turn; of more, pairs near and far.
-        apart = np.where(counts <= 5, h // counts % (counts - 1), h * (counts - 1) // HYPOTHESES)
+        # Up to five observations all pairs are tried; of more, near and far pairs.
+        apart = np.where(counts <= 5, h // counts % (counts - 1), h * (counts - 1) // _HYPOTHESES)
         pair = np.concatenate([first + one, first + (one + 1 + apart) % counts])
         X = triangulate_observations(model.P, view[pair], place, xy[pair], len(number))
         squared = np.minimum(_residuals(P, X[point], xy) / gate_px, 1.0) ** 2
@@ -259,7 +419,7 @@ def consistent_observations(model: ProjectiveModel, chosen: B8, gate_px: float) 
 
 
 def _residuals(P: F64, X: F64, xy: F64) -> F64:
-    """Distances (K,) px of the images of X (K, 4) by P (K, 3, 4) from xy; infinite in the focal plane."""
+    """Return distances (K,) px of the images of X (K, 4) by P (K, 3, 4) from xy; inf in the focal plane."""
     xh = np.einsum("kab,kb->ka", P, X)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         distance = np.linalg.norm(xh[:, :2] / xh[:, 2:] - xy, axis=1)
@@ -267,7 +427,15 @@ def _residuals(P: F64, X: F64, xy: F64) -> F64:
 
 
 def update_inliers(model: ProjectiveModel, sigmas: float) -> None:
-    """Signs of the points made those of their cameras, then ``ok`` = in front and within the gate (6.5)."""
+    """Orient the points with their cameras and mark inliers: in front and within the gate (6.5).
+
+    Parameters
+    ----------
+    model : ProjectiveModel
+        Model, changed in place.
+    sigmas : float
+        Inlier threshold in noise sigmas.
+    """
     t = model.tracks
     chosen = model.registered[t.view_index] & (np.abs(model.X).sum(axis=1) > 0)[t.point_index]
     depth, distance = project_observations(model.P, model.X, t.view_index, t.point_index, t.xy, chosen)
@@ -278,7 +446,17 @@ def update_inliers(model: ProjectiveModel, sigmas: float) -> None:
 
 
 def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
-    """Bundle adjustment of everything (6.7), the noise estimated afresh, all points anew under the gate."""
+    """Run bundle adjustment of everything (6.7), estimate the noise and retriangulate.
+
+    Parameters
+    ----------
+    model : ProjectiveModel
+        Model, changed in place.
+    iterations : int
+        Maximum number of steps.
+    sigmas : float
+        Inlier threshold in noise sigmas.
+    """
     t, used = model.tracks, model.used
     if used.sum() < 2 * 8:
         return
@@ -288,24 +466,37 @@ def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
     )  # fmt: skip
     model.P, model.X = _whitened(result.P, result.X, model)
     norm = np.asarray(np.linalg.norm(result.residual_px, axis=1))
-    # Two-view points carry less residual than noise: hence the floor.
+    # Residuals of two-view points underestimate the noise: hence the floor.
     model.sigma_px = max(noise_from_distances(norm), model.noise_floor_px)
     retriangulate_points(model, sigmas)
 
 
 def adjust_locally(
-    model: ProjectiveModel, view: int, iterations: int, sigmas: float, *, local_bundle_views: int
+    model: ProjectiveModel, view: int, iterations: int, sigmas: float, *, n_views: int
 ) -> None:
-    """Bundle adjustment of one view, the ``neighbours`` that share most points with it, and their points.
+    """Run bundle adjustment of one view, the views that share most points with it, and their points.
 
-    The other cameras that see these points are held and hold the frame.
+    The other cameras that see these points are fixed and define the frame.
+
+    Parameters
+    ----------
+    model : ProjectiveModel
+        Model, changed in place.
+    view : int
+        New view.
+    iterations : int
+        Maximum number of steps.
+    sigmas : float
+        Inlier threshold in noise sigmas.
+    n_views : int
+        Number of other free views.
     """
     t, used = model.tracks, model.used
     its = np.zeros(t.n_points, dtype=bool)
     its[t.point_index[used & (t.view_index == view)]] = True
     shared = np.bincount(t.view_index[used & its[t.point_index]], minlength=t.n_views)
     free = np.zeros(t.n_views, dtype=bool)
-    free[np.argsort(-shared, kind="stable")[: local_bundle_views + 1]] = True
+    free[np.argsort(-shared, kind="stable")[: n_views + 1]] = True
     free &= shared > 0
     local = np.zeros(t.n_points, dtype=bool)
     local[t.point_index[used & free[t.view_index]]] = True
@@ -321,7 +512,7 @@ def adjust_locally(
 
 
 def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
-    """Keep the frame well-conditioned: sum XX' = I over the valid points, unit norms, signs kept."""
+    """Transform to a well-conditioned frame: sum XX' = I over the valid points, unit norms, signs kept."""
     T = whitening_transform(X[model.valid])
     X = X @ T.T
     P = P @ np.linalg.inv(T)
@@ -331,7 +522,18 @@ def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
 
 
 def to_reconstruction(model: ProjectiveModel) -> Reconstruction:
-    """The record of a grown model, with a reason for every view that is not in it."""
+    """Return the reconstruction record, with a reason for every unregistered view.
+
+    Parameters
+    ----------
+    model : ProjectiveModel
+        Finished model.
+
+    Returns
+    -------
+    Reconstruction
+        Projective reconstruction.
+    """
     for view in np.flatnonzero(~model.registered):
         if not model.reasons[view]:
             model.reasons[view] = "shares no points with the model"

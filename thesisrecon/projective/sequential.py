@@ -1,4 +1,4 @@
-"""Chapter 6 to the letter: the sequential variant of the preset ``thesis``."""
+"""Chapter 6 as in the thesis: sequential projective reconstruction, used by the preset ``thesis``."""
 
 from __future__ import annotations
 
@@ -17,11 +17,18 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 @dataclass(frozen=True)
 class SequentialProjective:
-    """Chapter 6 as the thesis has it: one view after the other in the order of the photographs.
+    """Projective reconstruction of one view after the other in image order.
 
-    The pair of neighbours with most matches begins; each further view is resected from the points there
-    are, new points are triangulated, outliers discarded. No covariance gate; one bundle adjustment at the
-    end, since the thesis' chapter on it is lost and without any the later chapters have nothing to work on.
+    The pair of neighbours with most matches begins; each further view is resected, new points are
+    triangulated and outliers removed. There is no covariance test. One bundle adjustment at the end replaces
+    the lost chapter of the thesis on it.
+
+    Parameters
+    ----------
+    min_points : int
+        Matches needed for resection.
+    outlier_sigmas : float
+        Inlier threshold in noise sigmas.
     """
 
     min_points: int = 12
@@ -36,24 +43,42 @@ class SequentialProjective:
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """As :meth:`IncrementalProjective.reconstruct`; ``attempt`` takes the next best pair of neighbours."""
+        """Reconstruct cameras and points from tracks and verified pairs.
+
+        Parameters
+        ----------
+        tracks, pairs, sizes, rng
+            As in :meth:`IncrementalProjective.reconstruct`.
+        attempt : int
+            Number of the attempt; each begins with the next best pair of neighbours.
+
+        Returns
+        -------
+        Reconstruction
+            Projective reconstruction.
+
+        Raises
+        ------
+        StageFailure
+            If no pair shows parallax or is left.
+        """
         require_pair_with_parallax(pairs)
-        local_bundle_views = [p for p in pairs if p.accepted and p.j == p.i + 1]
-        candidates = local_bundle_views or [p for p in pairs if p.accepted]
+        neighbours = [p for p in pairs if p.accepted and p.j == p.i + 1]
+        candidates = neighbours or [p for p in pairs if p.accepted]
         candidates = sorted(candidates, key=lambda p: (-p.inliers, p.i, p.j))
         if attempt >= len(candidates):
             raise StageFailure(
-                "no pair of photographs to begin with", f"{counted(len(candidates), 'pair')} accepted"
+                "no initial pair is left", f"{counted(len(candidates), 'image pair')} accepted"
             )
-        engine = IncrementalProjective(
+        incremental = IncrementalProjective(
             min_points=self.min_points,
             outlier_sigmas=(self.outlier_sigmas, self.outlier_sigmas),
             max_projection_std_rel=None,
             bundle_iterations=0,
             final_rounds=0,
         )
-        state = engine.begin(tracks, candidates[attempt], sizes)
-        while engine.add_next_camera(state, rng) is not None:
+        model = incremental.begin(tracks, candidates[attempt], sizes)
+        while incremental.add_next_camera(model, rng) is not None:
             pass
-        adjust_all(state, 10, self.outlier_sigmas)
-        return to_reconstruction(state)
+        adjust_all(model, 10, self.outlier_sigmas)
+        return to_reconstruction(model)

@@ -1,17 +1,10 @@
-"""What the ways to the plane at infinity are given, and what they give.
+"""Cheirality bounds on the plane at infinity, and Hartley's search within them (HZ 21).
 
-Chapter 7, stratified: the planes that leave all points and camera centres on one side.
-
-Hartley, "Chirality", IJCV 26(1), 1998, and Hartley, Hayman, de Agapito, Reid, "Camera calibration and the
-search for infinity", ICCV 1999. The inequalities X'v > 0, delta C'v > 0 make a polytope, bounded in a
-quasi-affine frame; the orientation delta is not known beforehand, so there are two of them, of which one is
-usually empty.
-
-Chapter 7, stratified: cheirality bounds the plane at infinity, a search in the bounds finds it (Hartley).
-
-R. Hartley, E. Hayman, L. de Agapito, I. Reid, "Camera calibration and the search for infinity", ICCV 1999.
-Each plane of a grid gives infinite homographies, these give the image of the absolute conic linearly, and the
-planes whose linear equations have a solution, and one alone, are the candidates.
+R. Hartley, "Chirality", IJCV 26(1), 1998; R. Hartley, E. Hayman, L. de Agapito, I. Reid, "Camera calibration
+and the search for infinity", ICCV 1999. The inequalities X'v > 0, delta C'v > 0 form a polytope, bounded in a
+quasi-affine frame. The orientation delta is unknown: of the two polytopes one is usually empty. Each plane of
+a grid gives infinite homographies and, linearly, the image of the absolute conic; planes whose equations have
+exactly one solution are the candidates.
 """
 
 from __future__ import annotations
@@ -26,27 +19,43 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs
 from thesisrecon.records import Reconstruction
+from thesisrecon.selfcalibration.absolute_conic import ConicBatch, infinite_homographies, solve_conic_batch
 from thesisrecon.selfcalibration.frame import ReferenceFrame
-from thesisrecon.selfcalibration.hartley import ConicBatch, infinite_homographies, solve_conic_batch
 from thesisrecon.selfcalibration.refinement import minimize_batch
 from thesisrecon.selfcalibration.unknowns import ConicConstraints, square_pixel_constraints
 
 
 @dataclass(frozen=True)
 class ProjectiveScene:
-    """A projective reconstruction, its registered cameras in a reference frame, what is assumed of them."""
+    """Input of the methods for the plane at infinity.
+
+    Attributes
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    frame : ReferenceFrame
+        Its registered cameras in a reference frame.
+    constraints : ConicConstraints
+        Prior knowledge of the cameras.
+    """
 
     reconstruction: Reconstruction
     frame: ReferenceFrame
-    knowledge: ConicConstraints
+    constraints: ConicConstraints
 
 
 @dataclass(frozen=True)
 class PlaneCandidates:
-    """Planes at infinity p (B, 3), each (p, 1) in the reference frame, the best first with their ``scores``.
+    """Candidate planes at infinity, best first.
 
-    ``orthogonal`` (M, 2, 3): pairs of vanishing points in the reference view, unit-free, whose directions are
-    taken to be at right angles.
+    Attributes
+    ----------
+    planes : ndarray (B, 3)
+        Planes (p, 1) in the reference frame.
+    scores : ndarray (B,)
+        Scores, smaller is better.
+    orthogonal : ndarray (M, 2, 3)
+        Pairs of unit-free vanishing points in the reference view of orthogonal directions.
     """
 
     planes: F64
@@ -54,15 +63,15 @@ class PlaneCandidates:
     orthogonal: F64 = field(default_factory=lambda: np.zeros((0, 2, 3)))
 
 
-SAME_PLANE = 1e-3
-"""Planes at infinity nearer than this, relative to 1 + |p|, are one."""
+# Planes closer than this, relative to 1 + |p|, are the same.
+_SAME_PLANE = 1e-3
 
 
 @dataclass(frozen=True)
-class CheiralityPolytope:
-    """Planes v with ``rows`` (M, 4) v > 0, in a quasi-affine frame where all of them are (v1, v2, v3, 1).
+class _Polytope:
+    """Planes (v, 1) with ``rows`` (M, 4) (v, 1) > 0 in a quasi-affine frame.
 
-    ``quasi_affine`` (4, 4) takes points of the reference frame there; ``box`` (3, 2) bounds of v1, v2, v3.
+    ``quasi_affine`` (4, 4) transforms points of the reference frame there; ``box`` (3, 2) bounds v.
     """
 
     rows: F64
@@ -70,18 +79,18 @@ class CheiralityPolytope:
     box: F64
 
     def contains(self, v: F64) -> B8:
-        """Whether planes (B, 3) of the quasi-affine frame satisfy every inequality."""
+        """Return whether planes (B, 3) of the quasi-affine frame satisfy every inequality."""
         planes = np.column_stack([v, np.ones(len(v))])
         parts = np.array_split(planes, max(1, len(planes) // 512))
         return np.concatenate([(part @ self.rows.T > 0).all(axis=1) for part in parts])
 
     def reference_planes(self, v: F64) -> F64:
-        """Planes p (B, 3), each (p, 1) in the reference frame, of planes (B, 3) of the quasi-affine one."""
+        """Return planes p (B, 3) of the reference frame from planes (B, 3) of the quasi-affine frame."""
         back = np.column_stack([v, np.ones(len(v))]) @ self.quasi_affine
         return np.asarray(back[:, :3] / np.where(back[:, 3:] == 0, 1e-12, back[:, 3:]))
 
     def sample(self, n: int, rng: np.random.Generator) -> F64:
-        """``n`` planes (n, 3) of the quasi-affine frame inside, by hit-and-run from the origin's plane."""
+        """Return ``n`` planes (n, 3) inside, by hit-and-run from the plane of the origin."""
         v = np.zeros((n, 3))
         for _ in range(12):
             direction = rng.normal(size=(n, 3))
@@ -97,12 +106,19 @@ class CheiralityPolytope:
 
 @dataclass(frozen=True)
 class CheiralityRegion:
-    """The polytopes of both orientations that are not empty, and the inequalities of all points (M, 4) and
-    centres (R, 4) in the reference frame."""
+    """Planes that keep all points and camera centres on one side.
+
+    Attributes
+    ----------
+    points, centres : ndarray (M, 4), (R, 4)
+        Inequalities of the points and centres in the reference frame.
+    polytopes : tuple
+        Non-empty polytopes of both orientations.
+    """
 
     points: F64
     centres: F64
-    polytopes: tuple[CheiralityPolytope, ...]
+    polytopes: tuple[_Polytope, ...]
 
     @classmethod
     def of(
@@ -113,21 +129,61 @@ class CheiralityRegion:
         max_points: int,
         rng: np.random.Generator,
     ) -> CheiralityRegion:
-        """The region of a reconstruction; without polytopes where fewer than eight points are of use."""
-        X, C = cheirality_inequalities(frame, reconstruction, max_points=max_points, rng=rng)
-        found = [polytope_of(X, sign * C) for sign in (1.0, -1.0)] if len(X) >= 8 else []
+        """Compute the region of a reconstruction.
+
+        Parameters
+        ----------
+        frame : ReferenceFrame
+            Cameras.
+        reconstruction : Reconstruction
+            Projective reconstruction.
+        max_points : int
+            Maximum number of points in the linear programs.
+        rng : numpy.random.Generator
+            Selects the points.
+
+        Returns
+        -------
+        CheiralityRegion
+            The region, without polytopes below eight usable points.
+        """
+        X, C = _cheirality_inequalities(frame, reconstruction, max_points=max_points, rng=rng)
+        found = [_polytope_of(X, sign * C) for sign in (1.0, -1.0)] if len(X) >= 8 else []
         return cls(X, C, tuple(part for part in found if part is not None))
 
     def sample(self, n: int, rng: np.random.Generator) -> F64:
-        """``n`` planes p (n, 3) in the reference frame: from the polytopes in equal shares, or where both are
-        empty from a broad distribution about no perspective at all."""
+        """Draw planes from the polytopes in equal shares.
+
+        Parameters
+        ----------
+        n : int
+            Number of planes.
+        rng : numpy.random.Generator
+            Source of randomness.
+
+        Returns
+        -------
+        ndarray (n, 3)
+            Planes p of the reference frame; standard normal if both polytopes are empty.
+        """
         if not self.polytopes:
             return rng.normal(size=(n, 3))
         share = -(-n // len(self.polytopes))
         return np.concatenate([p.reference_planes(p.sample(share, rng)) for p in self.polytopes])[:n]
 
     def wrong_side_ratio(self, planes: F64) -> F64:
-        """Share (B,) of points and cameras on the wrong side of planes p (B, 3), for the better signs."""
+        """Return the share of points and cameras on the wrong side of planes.
+
+        Parameters
+        ----------
+        planes : ndarray (B, 3)
+            Planes p of the reference frame.
+
+        Returns
+        -------
+        ndarray (B,)
+            Shares for the better choice of signs.
+        """
         v = np.column_stack([planes, np.ones(len(planes))])
         behind = (v @ self.points.T <= 0).sum(axis=1), (v @ self.centres.T <= 0).sum(axis=1)
         n, m = len(self.points), len(self.centres)
@@ -135,37 +191,56 @@ class CheiralityRegion:
         return np.asarray(wrong / max(n + m, 1))
 
 
-def polytope_of(X: F64, C: F64) -> CheiralityPolytope | None:
-    """The polytope of oriented points (N, 4) and centres (R, 4), by linear programs; None where empty."""
-    v = deepest_plane(X, C)
+def _polytope_of(X: F64, C: F64) -> _Polytope | None:
+    """Return the polytope of oriented points (N, 4) and centres (R, 4) by linear programs; None if empty."""
+    v = _deepest_plane(X, C)
     if v is None:
         return None
-    T = quasi_affine_frame(X, v)
+    T = _quasi_affine_frame(X, v)
     rows = _unit_rows(np.concatenate([X, C]) @ T.T)
-    box = plane_box(rows[: len(X)], rows[len(X) :])
-    return None if box is None else CheiralityPolytope(rows, T, box)
+    box = _plane_box(rows[: len(X)], rows[len(X) :])
+    return None if box is None else _Polytope(rows, T, box)
 
 
 def distinct_planes(planes: F64, cost: F64) -> list[int]:
-    """Indices of planes p (B, 3) that differ and whose cost (B,) is finite, the least cost first."""
+    """Select planes that differ, lowest cost first.
+
+    Parameters
+    ----------
+    planes : ndarray (B, 3)
+        Planes p.
+    cost : ndarray (B,)
+        Costs; non-finite ones are rejected.
+
+    Returns
+    -------
+    list of int
+        Indices of the selected planes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> distinct_planes(np.array([[1.0, 0, 0], [1.0001, 0, 0], [0, 2, 0]]), np.array([0.3, 0.1, 0.2]))
+    [1, 2]
+    """
     kept: list[int] = []
     for k in np.argsort(cost, kind="stable"):
-        limit = SAME_PLANE * (1.0 + np.linalg.norm(planes[k]))
+        limit = _SAME_PLANE * (1.0 + np.linalg.norm(planes[k]))
         if np.isfinite(cost[k]) and all(np.linalg.norm(planes[k] - planes[m]) > limit for m in kept):
             kept.append(int(k))
     return kept
 
 
-def cheirality_inequalities(
+def _cheirality_inequalities(
     frame: ReferenceFrame, reconstruction: Reconstruction, *, max_points: int, rng: np.random.Generator
 ) -> tuple[F64, F64]:
-    """Oriented points (N, 4) and camera centres (R, 4) in the reference frame, unit norm.
+    """Return oriented points (N, 4) and camera centres (R, 4) in the reference frame, unit norm.
 
-    Only points of three or more views take part: one wrong two-view point, which nothing contradicts, would
-    cut the true plane away. Points that the orientation cannot satisfy in every view are left out.
+    Only points of at least three views take part: one wrong two-view point, which nothing contradicts, would
+    cut the true plane away. Points whose depths have no consistent sign are omitted.
     """
-    tracks, max_candidates = reconstruction.tracks, reconstruction.inlier
-    view, point = tracks.view_index[max_candidates], tracks.point_index[max_candidates]
+    tracks, inlier = reconstruction.tracks, reconstruction.inlier
+    view, point = tracks.view_index[inlier], tracks.point_index[inlier]
     views, points, _ = orient_signs(reconstruction.P, reconstruction.X, view, point)
     P = reconstruction.P * views[:, None, None]
     X = reconstruction.X * points[:, None]
@@ -187,22 +262,20 @@ def _unit_rows(A: F64) -> F64:
     return np.asarray(A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300), dtype=np.float64)
 
 
-def deepest_plane(X: F64, C: F64) -> F64 | None:
-    """Plane v with X v >= d, C v >= d, |v| <= 1 and the largest d (a linear program); None where no d > 0
-    exists."""
+def _deepest_plane(X: F64, C: F64) -> F64 | None:
+    """Return the plane v with X v >= d, C v >= d, |v| <= 1 and the largest d (HZ 21.7); None unless d > 0."""
     rows = np.concatenate([X, C])
     A = np.column_stack([-rows, np.ones(len(rows))])
-    answer = scipy.optimize.linprog(
+    solution = scipy.optimize.linprog(
         [0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=[(-1, 1)] * 4 + [(None, None)]
     )
-    if answer.x is None or not answer.x[4] > 0:
+    if solution.x is None or not solution.x[4] > 0:
         return None
-    return np.asarray(answer.x[:4], dtype=np.float64)
+    return np.asarray(solution.x[:4], dtype=np.float64)
 
 
-def quasi_affine_frame(X: F64, v: F64) -> F64:
-    """Transform (4, 4) that sends the plane v to infinity and makes the points' centroid 0 and covariance
-    1."""
+def _quasi_affine_frame(X: F64, v: F64) -> F64:
+    """Return the transform (4, 4) that sends the plane v to infinity and whitens the points."""
     basis = np.linalg.svd(v[None])[2][1:]
     Y = X @ basis.T / (X @ v)[:, None]
     centre = Y.mean(axis=0)
@@ -214,30 +287,41 @@ def quasi_affine_frame(X: F64, v: F64) -> F64:
     return T
 
 
-def plane_box(X: F64, C: F64) -> F64 | None:
-    """Bounds (3, 2) of v for planes (v, 1) that satisfy the inequalities (six linear programs); None if
-    unbounded."""
+def _plane_box(X: F64, C: F64) -> F64 | None:
+    """Return bounds (3, 2) of v for planes (v, 1) that satisfy the inequalities; None if unbounded."""
     rows = np.concatenate([X, C])
     box = np.zeros((3, 2))
     for k in range(3):
         for side, sign in enumerate((1.0, -1.0)):
             goal = np.zeros(3)
             goal[k] = sign
-            answer = scipy.optimize.linprog(
+            solution = scipy.optimize.linprog(
                 goal, A_ub=-rows[:, :3], b_ub=rows[:, 3], bounds=[(None, None)] * 3
             )
-            if answer.x is None or not answer.success:
+            if solution.x is None or not solution.success:
                 return None
-            box[k, side] = answer.x[k]
+            box[k, side] = solution.x[k]
     return box
 
 
 @dataclass(frozen=True)
 class CheiralitySearch:
-    """Grid search for the plane at infinity inside the cheirality bounds.
+    """Grid search for the plane at infinity within the cheirality bounds (Hartley).
 
-    ``steps`` per axis of the box; ``keep`` local minima at most; ``descent`` steps that follow each of
-    them to where it ends, 0 for the grid alone; ``max_points`` in the linear programs.
+    Parameters
+    ----------
+    steps : int
+        Grid steps per axis of the bounding box.
+    max_candidates : int
+        Maximum number of local minima.
+    refine_iterations : int
+        Descent steps from each of them; 0 for the grid alone.
+    max_points : int
+        Maximum number of points in the linear programs.
+
+    References
+    ----------
+    R. Hartley, E. Hayman, L. de Agapito, I. Reid, ICCV 1999; HZ 21.
     """
 
     steps: int = 16
@@ -246,20 +330,55 @@ class CheiralitySearch:
     max_points: int = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """Candidates, the best first; ``StageFailure`` where the inequalities leave no plane with a conic."""
-        planes, _, scores = self._search(scene.frame, scene.reconstruction, scene.knowledge, rng)
+        """Find candidate planes at infinity.
+
+        Parameters
+        ----------
+        scene : ProjectiveScene
+            Cameras, points and prior.
+        rng : numpy.random.Generator
+            Selects the points.
+
+        Returns
+        -------
+        PlaneCandidates
+            Candidates, best first.
+
+        Raises
+        ------
+        StageFailure
+            If no plane within the bounds gives a real image of the absolute conic.
+        """
+        planes, _, scores = self._search(scene.frame, scene.reconstruction, scene.constraints, rng)
         if not len(planes):
             raise StageFailure(
-                "Hartley's search found no plane at infinity",
-                "no plane leaves all points and cameras on one side with a real image of the absolute conic",
-                "use the default preset, which does not depend on every single point being right",
+                "the cheirality search found no plane at infinity",
+                "no plane keeps points and cameras on one side and gives a real image of the absolute conic",
+                "use the default preset, which tolerates wrong points",
             )
         return PlaneCandidates(planes, scores)
 
     def search(
         self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
     ) -> tuple[F64, F64]:
-        """Planes p (B, 3) and reference focals (B,) for square pixels, best first; possibly none."""
+        """Find planes and focal lengths for square pixels.
+
+        Parameters
+        ----------
+        frame : ReferenceFrame
+            Cameras.
+        reconstruction : Reconstruction
+            Projective reconstruction.
+        rng : numpy.random.Generator
+            Selects the points.
+
+        Returns
+        -------
+        planes : ndarray (B, 3)
+            Planes p, best first; possibly none.
+        focals : ndarray (B,)
+            Unit-free focal lengths of the reference camera.
+        """
         planes, focals, _ = self._search(frame, reconstruction, square_pixel_constraints(frame), rng)
         return planes, focals
 
@@ -267,11 +386,11 @@ class CheiralitySearch:
         self,
         frame: ReferenceFrame,
         reconstruction: Reconstruction,
-        knowledge: ConicConstraints,
+        constraints: ConicConstraints,
         rng: np.random.Generator,
     ) -> tuple[F64, F64, F64]:
         region = CheiralityRegion.of(frame, reconstruction, max_points=self.max_points, rng=rng)
-        parts = [self._minima(frame, knowledge, polytope) for polytope in region.polytopes]
+        parts = [self._minima(frame, constraints, polytope) for polytope in region.polytopes]
         if not parts:
             return np.zeros((0, 3)), np.zeros(0), np.zeros(0)
         planes, f2, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -279,28 +398,28 @@ class CheiralitySearch:
         return planes[kept], np.sqrt(f2[kept]), scores[kept]
 
     def _minima(
-        self, frame: ReferenceFrame, knowledge: ConicConstraints, polytope: CheiralityPolytope
+        self, frame: ReferenceFrame, constraints: ConicConstraints, polytope: _Polytope
     ) -> tuple[F64, F64, F64]:
-        """Local minima of the score over the grid, each followed to where it ends."""
+        """Return planes, squared focal lengths and scores of the refined local minima of the grid."""
 
         def scan(v: F64) -> ConicBatch:
-            found = solve_conic_batch(infinite_homographies(frame, polytope.reference_planes(v)), knowledge)
+            found = solve_conic_batch(infinite_homographies(frame, polytope.reference_planes(v)), constraints)
             outside = ~polytope.contains(v)
             return ConicBatch(found.f2, np.where(outside[:, None], np.nan, found.residuals))
 
         axes = [np.linspace(low, high, self.steps + 2)[1:-1] for low, high in polytope.box]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        best = local_minima(scan(grid.reshape(-1, 3)).score.reshape(grid.shape[:3]))[: self.max_candidates]
+        best = _local_minima(scan(grid.reshape(-1, 3)).score.reshape(grid.shape[:3]))[: self.max_candidates]
         v = grid.reshape(-1, 3)[best]
         if len(v):
-            # The score is flat along valleys that no finer grid along the axes would follow.
+            # The score is flat along valleys that are not aligned with the axes of the grid.
             v = minimize_batch(lambda x: scan(x).residuals, v, iterations=self.refine_iterations)[0]
         found = scan(v)
         return polytope.reference_planes(v), found.f2, found.score
 
 
-def local_minima(score: F64) -> NDArray[np.int64]:
-    """Flat indices of cells of a grid (S, S, S) not worse than their 6 neighbours, best first."""
+def _local_minima(score: F64) -> NDArray[np.int64]:
+    """Return flat indices of grid cells (S, S, S) not worse than their 6 neighbours, best first."""
     padded = np.pad(score, 1, constant_values=np.inf)
     core = padded[1:-1, 1:-1, 1:-1]
     minimum = np.isfinite(core)

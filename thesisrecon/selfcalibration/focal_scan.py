@@ -1,8 +1,8 @@
-"""Plane at infinity from guessed focals of two cameras (Gherardi and Fusiello, "Practical autocalibration",
-ECCV 2010).
+"""Self-calibration by scanning focal lengths of two cameras.
 
-Two cameras with known K fix the plane at infinity in closed form; scanning the two focals over the plausible
-range and looking at all the other cameras replaces every nonconvex search.
+R. Gherardi, A. Fusiello, "Practical autocalibration", ECCV 2010: two cameras with known K determine the plane
+at infinity in closed form; scanning both focal lengths and checking all other cameras replaces a nonconvex
+search.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from thesisrecon.selfcalibration.candidates import (
 from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
 
+# Weights of skew, aspect and principal point (x, y).
 SCAN_WEIGHTS = (1.0 / 0.01, 1.0 / 0.2, 1.0 / 0.1, 1.0 / 0.1)
-"""Of skew, aspect and the two coordinates of the principal point."""
 
 
 def _rotation_to_first_axis(t: F64) -> F64:
-    """Rotations R (B, 3, 3) with R t = (|t|, 0, 0); rows t/|t| and any two orthonormal to it."""
+    """Return rotations R (B, 3, 3) with R t = (|t|, 0, 0)."""
     first = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
     helper = np.eye(3)[np.abs(first).argmin(axis=1)]
     second = np.cross(first, helper)
@@ -38,10 +38,34 @@ def _rotation_to_first_axis(t: F64) -> F64:
 
 
 def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
-    """Planes at infinity p (2 B, 3) for guessed unit-free focals (B,) of the reference and of camera
-    ``other``.
+    """Compute planes at infinity from the focal lengths of the reference and another camera.
 
-    Both signs of the second camera are returned, since a projective camera has none.
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    other : int
+        Place of the other camera.
+    f_reference, f_other : ndarray (B,)
+        Unit-free focal lengths.
+
+    Returns
+    -------
+    ndarray (2 B, 3)
+        Planes for both signs of the other camera, since a projective camera has none.
+
+    References
+    ----------
+    R. Gherardi, A. Fusiello, ECCV 2010.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.selfcalibration.frame import _example_frame
+    >>> frame, p = _example_frame(f=1.2)
+    >>> planes = plane_from_focals(frame, 1, np.array([1.2]), np.array([1.2]))
+    >>> bool(np.abs(planes - p).max(axis=1).min() < 1e-9)
+    True
     """
     K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
     K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
@@ -58,12 +82,38 @@ def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_oth
 
 
 def log_grid(focal_range: tuple[float, float], steps: int) -> F64:
-    """Evenly spaced log focals (steps,) over a range of focals."""
+    """Return evenly spaced log focal lengths.
+
+    Parameters
+    ----------
+    focal_range : (float, float)
+        First and last focal length.
+    steps : int
+        Number of values.
+
+    Returns
+    -------
+    ndarray (steps,)
+        Log focal lengths.
+    """
     return np.linspace(np.log(focal_range[0]), np.log(focal_range[1]), steps)
 
 
 def focal_pairs(focals: F64, same_camera: bool) -> tuple[F64, F64]:
-    """Focals (B,) of two cameras to try: equal ones, or every other one with every other one."""
+    """Return pairs of focal lengths to scan.
+
+    Parameters
+    ----------
+    focals : ndarray (N,)
+        Focal lengths.
+    same_camera : bool
+        Equal focal lengths only; else all pairs of every other value.
+
+    Returns
+    -------
+    first, second : ndarray (B,)
+        Focal lengths of both cameras.
+    """
     if same_camera:
         return focals, focals
     first, second = np.meshgrid(focals[::2], focals[::2])
@@ -73,9 +123,27 @@ def focal_pairs(focals: F64, same_camera: bool) -> tuple[F64, F64]:
 def planes_for_focals(
     frame: ReferenceFrame, criterion: RotationCriterion, log_f: F64, *, max_refined: int = 8
 ) -> tuple[F64, float]:
-    """The plane at infinity (3,) that suits known log focals (G,) best, and the criterion's cost there.
+    """Fit the plane at infinity for known focal lengths.
 
-    Started from the reference with every other camera and both signs of it; the focals stay.
+    Starts from the reference with every other camera and both signs.
+
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    criterion : RotationCriterion
+        Criterion to minimize.
+    log_f : ndarray (G,)
+        Log focal lengths of the camera groups.
+    max_refined : int
+        Number of starts to refine.
+
+    Returns
+    -------
+    plane : ndarray (3,)
+        Best plane, NaN if there is none.
+    cost : float
+        Its cost.
     """
     f = np.exp(log_f[frame.group])
     reference = np.array([f[frame.reference]])
@@ -92,9 +160,24 @@ def planes_for_focals(
 
 
 def calibrations_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
-    """Unit-free K (B, R, 3, 3) of all cameras that planes p (B, 3) and reference focals (B,) imply.
+    """Compute the calibrations that planes at infinity imply.
 
-    The triangular factor of C C', C = (A - a p') K_r, written out; what RQ of the upgraded camera gives.
+    K is the triangular factor of C C', C = (A - a p') K_r, written out: the result of RQ of the upgraded
+    camera.
+
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    p : ndarray (B, 3)
+        Planes at infinity.
+    f_reference : ndarray (B,)
+        Unit-free focal lengths of the reference camera.
+
+    Returns
+    -------
+    ndarray (B, R, 3, 3)
+        Unit-free calibrations.
     """
     C = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
     C[..., :2] *= f_reference[:, None, None, None]
@@ -110,10 +193,29 @@ def calibrations_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) ->
 
 
 def scan_cost(K: F64) -> F64:
-    """The criterion of the scan (B,): sum over cameras of (w_s |k12| + w_a |k11 - k22| + w_u |k13| + w_v
-    |k23|)^2 for K (B, R, 3, 3).
+    """Compute sum over cameras of (w_s |k12| + w_a |k11 - k22| + w_u |k13| + w_v |k23|)^2.
 
-    All four are taken over k22: the paper's cameras have a focal near 1, ours any.
+    All terms are divided by k22: the paper's cameras have a focal length near 1, these any.
+
+    Parameters
+    ----------
+    K : ndarray (B, R, 3, 3)
+        Calibrations.
+
+    Returns
+    -------
+    ndarray (B,)
+        Costs.
+
+    References
+    ----------
+    R. Gherardi, A. Fusiello, ECCV 2010.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> scan_cost(np.diag([2.0, 2.0, 1.0])[None, None])
+    array([0.])
     """
     parts = np.stack([K[..., 0, 1], K[..., 0, 0] - K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]], axis=-1)
     total = np.sum(np.abs(parts) * SCAN_WEIGHTS, axis=-1) / K[..., 1, 1]
@@ -122,11 +224,22 @@ def scan_cost(K: F64) -> F64:
 
 @dataclass(frozen=True)
 class FocalScan:
-    """Gherardi's and Fusiello's method alone: the focals of the reference camera and of another are scanned,
-    the best of every pair are refined over the plane at infinity and all focals.
+    """Self-calibration by the focal scan of Gherardi and Fusiello, refined over plane and focal lengths.
 
-    ``focal_range`` in long sides, ``focal_steps`` of the scan (each of two focals where the cameras differ:
-    every other step), ``refined`` hypotheses that are refined.
+    Parameters
+    ----------
+    focal_range : (float, float)
+        Scanned focal lengths in long sides.
+    focal_steps : int
+        Number of focal lengths; every other one for two different cameras.
+    max_refined : int
+        Number of hypotheses to refine.
+    criterion : RotationCriterion
+        Criterion of the refinement.
+
+    References
+    ----------
+    R. Gherardi, A. Fusiello, ECCV 2010.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
@@ -142,8 +255,23 @@ class FocalScan:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
-        """Upgrade by the scan; ``StageFailure`` below three cameras and where no answer puts the scene in
-        front of the cameras."""
+        """Upgrade a projective reconstruction.
+
+        Parameters
+        ----------
+        reconstruction, prior, rng
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
+
+        Returns
+        -------
+        SelfCalibration
+            The upgrade with its identifiability.
+
+        Raises
+        ------
+        StageFailure
+            Below three cameras, or if no candidate places the points in front of the cameras.
+        """
         require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         focals = np.geomspace(*self.focal_range, self.focal_steps)
@@ -157,9 +285,9 @@ class FocalScan:
         p, f = p[good], f[good]
         best = np.argsort(scan_cost(calibrations_from_planes(frame, p, f)), kind="stable")[: self.max_refined]
         theta = np.concatenate([p[best], group_focals_from_planes(frame, p[best], f[best])], axis=1)
-        answers = candidates_from_parameters(
+        candidates = candidates_from_parameters(
             frame, *refine_hypotheses(self.criterion, frame, theta), "Gherardi and Fusiello's scan"
         )
         return select_candidate(
-            frame, reconstruction, self.criterion, answers, max_candidates=1, min_in_front_ratio=0.5
+            frame, reconstruction, self.criterion, candidates, max_candidates=1, min_in_front_ratio=0.5
         )

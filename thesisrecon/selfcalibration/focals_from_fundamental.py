@@ -1,23 +1,15 @@
-"""Focal lengths from fundamental matrices, each with its own uncertainty.
+"""Focal lengths from fundamental matrices, each with its uncertainty.
 
-S. Bougnoux, "From projective to Euclidean space under any practical situation, a criticism of
-self-calibration", ICCV 1998, has the closed form for one pair. It is singular where the optical axes meet or
-are parallel, which is how most photographs are taken, and then says anything with the air of a result. So a
-pair is also asked how well each focal explains its F, given the F's covariance and what is known of the
-principal points (the idea of Kocur, Kyselica and Kukelova, CVPR 2024, "Robust self-calibration of focal
-lengths from the fundamental matrix", without its iteration): the answer of a pair that does not know is flat,
-and pairs vote with what they know.
-
-Focals of all cameras by a vote of all pairs, each with what its F knows.
-
-Every pair gives the likelihood of the focals on a grid (:mod:`focal_from_fundamental`); a pair whose F is
-wrong or says nothing changes little, and a camera for which no pair speaks keeps its wide interval and is
-named.
+The closed form of S. Bougnoux ("From projective to Euclidean space under any practical situation, a criticism
+of self-calibration", ICCV 1998) is singular if the optical axes meet or are parallel, as in most image sets.
+Therefore each pair gives the likelihood of the focal lengths on a grid, from the covariance of F and the
+prior of the principal points (the idea of Kocur, Kyselica, Kukelova, "Robust self-calibration of focal
+lengths from the fundamental matrix", CVPR 2024, without its iteration). An uninformative pair has a flat
+likelihood; the likelihoods of all pairs are combined.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -51,21 +43,36 @@ from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
 _ROOT2 = np.sqrt(2.0)
 
 
-@dataclass(frozen=True)
-class PairFocals:
-    """Focals of the two cameras of a pair in the unit of F, NaN where F has no real one; relative standard
-    deviations ``std`` (2,) to first order, infinite where the numerator or the denominator of the closed form
-    cannot be told from 0."""
-
-    focal: F64
-    std: F64
-
-
 def bougnoux_focals(F: F64) -> F64:
-    """Squared focals (..., 2) of the first and the second camera from F (..., 3, 3), principal points at 0.
+    """Compute squared focal lengths from F by the closed form.
 
     f_1^2 = -(p'[e2]x I F p)(p'F'p) / (p'[e2]x I F I F'p), I = diag(1, 1, 0), p = (0, 0, 1), e2 the epipole in
-    image 2 (F'e2 = 0); f_2 with F' and e1. Negative or infinite where no camera fits.
+    image 2 (F'e2 = 0); f_2 with F' and e1.
+
+    Parameters
+    ----------
+    F : ndarray (..., 3, 3)
+        Fundamental matrices for principal points at 0.
+
+    Returns
+    -------
+    ndarray (..., 2)
+        Squared focal lengths of both cameras; negative or infinite if no camera fits.
+
+    References
+    ----------
+    S. Bougnoux, ICCV 1998.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> from thesisrecon.geometry.homogeneous import cross_matrix
+    >>> R, t = Rotation.from_rotvec([0.2, 0.3, 0.1]).as_matrix(), np.array([1.0, 0.5, 0.2])
+    >>> K1, K2 = np.diag([2.0, 2.0, 1.0]), np.diag([3.0, 3.0, 1.0])
+    >>> F = np.linalg.inv(K2).T @ cross_matrix(t) @ R @ np.linalg.inv(K1)
+    >>> np.round(np.sqrt(bougnoux_focals(F)), 6)
+    array([2., 3.])
     """
     U, _, Vt = np.linalg.svd(F)
     terms = _bougnoux_terms(F, U[..., :, 2], Vt[..., 2, :])
@@ -74,7 +81,7 @@ def bougnoux_focals(F: F64) -> F64:
 
 
 def _bougnoux_terms(F: F64, e2: F64, e1: F64) -> F64:
-    """Numerator and denominator (..., 2 cameras, 2) of the closed form; p'[e]x is (-e_y, e_x, 0)."""
+    """Return numerator and denominator (..., 2 cameras, 2) of the closed form; p'[e]x is (-e_y, e_x, 0)."""
     terms = []
     for G, e in ((F, e2), (np.swapaxes(F, -1, -2), e1)):
         top = -(e[..., 0] * G[..., 1, 2] - e[..., 1] * G[..., 0, 2]) * G[..., 2, 2]
@@ -84,11 +91,28 @@ def _bougnoux_terms(F: F64, e2: F64, e1: F64) -> F64:
     return np.stack(terms, axis=-2)
 
 
-def pair_focals(F: F64, covariance: F64, *, significance: float = 3.0) -> PairFocals:
-    """Focals of one F (3, 3) with the ``covariance`` (9, 9) of vec(F), by the closed form.
+def pair_focals(F: F64, covariance: F64, *, significance: float = 3.0) -> tuple[F64, F64]:
+    """Compute the focal lengths of one F by the closed form, with their uncertainty.
 
-    A focal whose numerator or denominator is within ``significance`` standard deviations of 0 is not
-    determined by the pair: its deviation is infinite.
+    Parameters
+    ----------
+    F : ndarray (3, 3)
+        Fundamental matrix for principal points at 0.
+    covariance : ndarray (9, 9)
+        Covariance of vec(F), row-major.
+    significance : float
+        A numerator or denominator within this many standard deviations of 0 is undetermined.
+
+    Returns
+    -------
+    focal : ndarray (2,)
+        Focal lengths, NaN if not real.
+    std : ndarray (2,)
+        Relative standard deviations to first order, inf if undetermined.
+
+    References
+    ----------
+    S. Bougnoux, ICCV 1998.
     """
     F = F / np.linalg.norm(F)
     centre = _terms_near(F, F[None])[0]
@@ -100,11 +124,11 @@ def pair_focals(F: F64, covariance: F64, *, significance: float = 3.0) -> PairFo
         relative = J[:, :, 0] / centre[:, 0] - J[:, :, 1] / centre[:, 1]
         deviation = 0.5 * np.sqrt(np.maximum(np.einsum("kc,kl,lc->c", relative, covariance, relative), 0.0))
         sure = (np.abs(centre) > significance * std).all(axis=1) & (squared > 0.0) & np.isfinite(deviation)
-        return PairFocals(np.sqrt(squared), np.where(sure, deviation, np.inf))
+        return np.sqrt(squared), np.where(sure, deviation, np.inf)
 
 
 def _terms_near(F0: F64, F: F64) -> F64:
-    """Terms of matrices F (B, 3, 3) near F0, the signs of their epipoles those of F0's."""
+    """Return the terms of F (B, 3, 3) near F0 with epipoles of the same sign."""
     U0, _, Vt0 = np.linalg.svd(F0)
     U, _, Vt = np.linalg.svd(F)
     e2, e1 = U[:, :, 2], Vt[:, 2]
@@ -115,10 +139,10 @@ def _terms_near(F0: F64, F: F64) -> F64:
 
 @dataclass(frozen=True)
 class _PairForms:
-    """What of M pairs the Kruppa equations need, and its derivatives by vec(F).
+    """Matrices of the Kruppa equations of M pairs and their derivatives by vec(F).
 
-    S_i = L w*_i L' and S_j = N w*_j N' with rows L, N (M, 2, 3); dL, dN (M, 9, 2, 3) while the basis (u1, u2)
-    of image 2 stays.
+    S_i = L w*_i L' and S_j = N w*_j N' with L, N (M, 2, 3); dL, dN (M, 9, 2, 3) for a fixed basis (u1, u2) of
+    image 2.
     """
 
     L: F64
@@ -128,7 +152,7 @@ class _PairForms:
 
 
 def _forms(F: F64) -> _PairForms:
-    """L = U2'F and N = U2'[e]x with U2 = (u1, u2), e = u3; de = -(F')^+ dF'e."""
+    """Return L = U2'F and N = U2'[e]x with U2 = (u1, u2), e = u3; de = -(F')^+ dF'e."""
     U, s, Vt = np.linalg.svd(F)
     U2 = U[:, :, :2].swapaxes(1, 2)
     e = U[:, :, 2]
@@ -141,10 +165,7 @@ def _forms(F: F64) -> _PairForms:
 
 
 def _directions(rows: F64, w: F64, d_rows: F64, d_w: F64) -> tuple[F64, F64]:
-    """Unit triples (..., 3) of rows w rows' and their derivatives (..., 9 + E, 3) by F and by E changes of w.
-
-    rows (..., 2, 3), w (..., 3, 3), d_rows (..., 9, 2, 3), d_w (..., E, 3, 3).
-    """
+    """Return unit triples (..., 3) of rows w rows' and derivatives (..., 9 + E, 3) by F and by w."""
     S = rows @ w @ np.swapaxes(rows, -1, -2)
     half = d_rows @ (w @ np.swapaxes(rows, -1, -2))[..., None, :, :]
     of_w = rows[..., None, :, :] @ d_w @ np.swapaxes(rows, -1, -2)[..., None, :, :]
@@ -160,14 +181,13 @@ def _triple(S: F64) -> F64:
     return np.stack([S[..., 0, 0], _ROOT2 * S[..., 0, 1], S[..., 1, 1]], axis=-1)
 
 
-def kruppa_chi_square(
+def _kruppa_chi_square(
     pairs: PairGeometry, log_f_i: F64, log_f_j: F64, *, cell: float, principal_std: float
 ) -> F64:
-    """Squared Kruppa residuals (M, B) over their covariance for focals exp(log_f) (B,) of both cameras.
+    """Return squared Kruppa residuals (M, B) over their covariance for focal lengths exp(log_f) (B,).
 
-    The covariance is propagated from F, from principal points that lie off 0 with standard deviation
-    ``principal_std`` (in the unit of F), and from focals anywhere in a cell of width ``cell`` of log f. About
-    chi-square with two degrees of freedom at the truth, however little the pair knows.
+    Propagates F, principal points off 0 by ``principal_std`` (in the unit of F) and focal lengths anywhere in
+    a cell of width ``cell`` of log f. About chi-square with two degrees of freedom at the truth.
     """
     forms = _forms(pairs.F)
     out = np.empty((len(pairs.i), len(log_f_i)))
@@ -180,15 +200,15 @@ def kruppa_chi_square(
     return out
 
 
-def kruppa_whitening(pairs: PairGeometry, log_f: F64, *, principal_std: float) -> F64:
-    """C^-1/2 (M, 3, 3) of the Kruppa residuals' covariance C at log focals (R,) of the cameras."""
+def _kruppa_whitening(pairs: PairGeometry, log_f: F64, *, principal_std: float) -> F64:
+    """Return C^-1/2 (M, 3, 3) for the covariance C of the Kruppa residuals at log focal lengths (R,)."""
     duals = _dual_with_changes(log_f[pairs.i]), _dual_with_changes(log_f[pairs.j])
     variance = _variances(pairs.covariance, 0.0, principal_std)
     return _inverse_root(_residual_with_covariance(_forms(pairs.F), *duals, variance)[1], power=-0.5)
 
 
 def _variances(covariance: F64, cell: float, principal_std: float) -> F64:
-    """Covariance (M, 15, 15) of vec(F) and of (log f, principal point) of both cameras."""
+    """Return the covariance (M, 15, 15) of vec(F) and of (log f, principal point) of both cameras."""
     full = np.zeros((len(covariance), 15, 15))
     full[:, :9, :9] = covariance
     full[:, range(9, 15), range(9, 15)] = np.tile([cell**2 / 12.0, principal_std**2, principal_std**2], 2)
@@ -196,7 +216,7 @@ def _variances(covariance: F64, cell: float, principal_std: float) -> F64:
 
 
 def _residual_with_covariance(forms: _PairForms, dual_i: F64, dual_j: F64, noise: F64) -> tuple[F64, F64]:
-    """Cross products (B, 3) of the two unit triples and their covariances (B, 3, 3); all broadcasts."""
+    """Return the cross products (B, 3) of the two unit triples and their covariances (B, 3, 3)."""
     n1, d1 = _directions(forms.L, dual_i[:, 0], forms.dL, dual_i[:, 1:])
     n2, d2 = _directions(forms.N, dual_j[:, 0], forms.dN, dual_j[:, 1:])
     by_first, by_second = np.cross(d1, n2[:, None]), np.cross(n1[:, None], d2)
@@ -205,7 +225,7 @@ def _residual_with_covariance(forms: _PairForms, dual_i: F64, dual_j: F64, noise
 
 
 def _dual_with_changes(log_f: F64) -> F64:
-    """w* = diag(f^2, f^2, 1) and its derivatives by log f and by the principal point; (B, 4, 3, 3)."""
+    """Return w* = diag(f^2, f^2, 1) and its derivatives by log f and principal point (B, 4, 3, 3)."""
     out = np.zeros((len(log_f), 4, 3, 3))
     squared = np.exp(2.0 * log_f)
     out[:, 0, 0, 0] = out[:, 0, 1, 1] = squared
@@ -217,9 +237,9 @@ def _dual_with_changes(log_f: F64) -> F64:
 
 
 def _inverse_root(C: F64, *, power: float) -> F64:
-    """C^power of covariances (B, 3, 3) of rank 2; the direction without noise or residual gets 0.
+    """Return C^power of covariances (B, 3, 3) of rank 2.
 
-    Away from the solution that direction has a small variance of second order, which must not count.
+    The third direction has a variance of second order only, which must not count: it gets 0.
     """
     value, vector = np.linalg.eigh(np.where(np.isfinite(C), C, 0.0))
     large = (value > 1e-10 * np.maximum(value[:, 2:], 1e-300)) & np.array([False, True, True])
@@ -227,16 +247,24 @@ def _inverse_root(C: F64, *, power: float) -> F64:
     return np.asarray((vector * root[:, None, :]) @ np.swapaxes(vector, 1, 2))
 
 
-STRAYED = 4.0
-"""Standard deviations of the vote, beyond which the joint answer has left it."""
+# A refined focal length further from the posterior mean, in its standard deviations, is not used.
+_MAX_DEPARTURE_SIGMAS = 4.0
 
-WRONG_PAIR = 1e-2
-"""Chance that a pair's F is wrong, so that no pair alone can forbid a focal."""
+# Probability that F of a pair is wrong: no single pair can exclude a focal length.
+_WRONG_PAIR_PROBABILITY = 1e-2
 
 
 @dataclass(frozen=True)
 class FocalPosterior:
-    """``log_f`` and ``std`` (G,) of the groups' log focals; ``support`` (G, B) log posterior on the grid."""
+    """Posterior of the log focal lengths of the camera groups.
+
+    Attributes
+    ----------
+    log_f, std : ndarray (G,)
+        Means and standard deviations.
+    support : ndarray (G, B)
+        Log posterior on the grid.
+    """
 
     log_f: F64
     std: F64
@@ -251,39 +279,59 @@ def focal_posterior(
     prior: tuple[F64, F64],
     principal_std: float = 0.01,
 ) -> FocalPosterior:
-    """Log focals of G groups of cameras from all pairs.
+    """Combine the likelihoods of all pairs on a grid of log focal lengths.
 
-    group (R,) camera number, dense; grid (B,) of log focals, evenly spaced; ``prior`` finite means and
-    standard deviations (G,) of log focals (:func:`weak_focal_prior`). Pairs within a group are asked about one
-    focal, pairs between groups about two, and the other's is integrated out. Pairs share observations: of
-    V (V - 1) / 2 pairs only 2 V - 3 are independent, and the sum of the votes is scaled down accordingly.
+    Pairs of one group inform one focal length, pairs of two groups two, and the other one is integrated out.
+    Only 2 V - 3 of V (V - 1) / 2 pairs are independent: the sum is scaled down accordingly.
+
+    Parameters
+    ----------
+    pairs : PairGeometry
+        Fundamental matrices with covariances.
+    group : ndarray (R,) of int
+        Camera number of each view, dense.
+    grid : ndarray (B,)
+        Evenly spaced log focal lengths.
+    prior : (ndarray (G,), ndarray (G,))
+        Finite means and standard deviations (:func:`~thesisrecon.selfcalibration.unknowns.weak_focal_prior`).
+    principal_std : float
+        Standard deviation of the principal points, in the unit of F.
+
+    Returns
+    -------
+    FocalPosterior
+        Posterior of each group.
+
+    References
+    ----------
+    V. Kocur, D. Kyselica, Z. Kukelova, CVPR 2024.
     """
     n, cell = int(group.max()) + 1, float(grid[1] - grid[0])
-    # A prior narrower than a cell must not fall between two of them.
+    # Widen a prior narrower than a cell, so that it does not fall between two of them.
     mean, std = prior[0][:, None], np.hypot(prior[1], cell)[:, None]
     log_prior = -0.5 * ((grid[None] - mean) / std) ** 2
     support = np.zeros((n, len(grid)))
     same = group[pairs.i] == group[pairs.j]
     if same.any():
-        chi = kruppa_chi_square(_some(pairs, same), grid, grid, cell=cell, principal_std=principal_std)
+        chi = _kruppa_chi_square(_some(pairs, same), grid, grid, cell=cell, principal_std=principal_std)
         np.add.at(support, group[pairs.i[same]], _robust(-0.5 * chi))
     if (~same).any():
         between = _some(pairs, ~same)
         first, second = (a.ravel() for a in np.meshgrid(grid, grid, indexing="ij"))
         for m in range(len(between.i)):
             one = _some(between, np.arange(len(between.i)) == m)
-            chi = kruppa_chi_square(one, first, second, cell=cell, principal_std=principal_std)
+            chi = _kruppa_chi_square(one, first, second, cell=cell, principal_std=principal_std)
             table = -0.5 * chi.reshape(len(grid), len(grid))
             gi, gj = group[between.i[m]], group[between.j[m]]
             support[gi] += _robust(_marginal(table + log_prior[gj]))
             support[gj] += _robust(_marginal(table.T + log_prior[gi]))
-    posterior = independence_factor(pairs) * support + log_prior
+    posterior = _independence_factor(pairs) * support + log_prior
     log_f, std = _moments(grid, posterior)
     return FocalPosterior(log_f, np.hypot(std, cell / np.sqrt(12.0)), posterior)
 
 
-def independence_factor(pairs: PairGeometry) -> float:
-    """(2 V - 3) / M, at most 1, of M pairs between V cameras: what each says that the others do not."""
+def _independence_factor(pairs: PairGeometry) -> float:
+    """Return (2 V - 3) / M, at most 1, for M pairs of V cameras."""
     views = len(np.unique(np.concatenate([pairs.i, pairs.j])))
     return min(1.0, (2.0 * views - 3.0) / max(len(pairs.i), 1))
 
@@ -293,15 +341,15 @@ def _some(pairs: PairGeometry, chosen: NDArray[np.bool_]) -> PairGeometry:
 
 
 def _marginal(table: F64) -> F64:
-    """Log of the mean over the second axis of exp(table), best cell 0."""
+    """Return the log of the mean of exp(table) over the second axis."""
     top = float(table.max())
     return np.asarray(np.log(np.mean(np.exp(table - top), axis=1) + 1e-300))
 
 
 def _robust(log_likelihood: F64) -> F64:
-    """log((1 - c) L + c) with L at most 1 and c the chance that the pair is wrong; (..., B)."""
+    """Return log((1 - c) L + c), L <= 1, with c the probability of a wrong pair."""
     relative = np.minimum(log_likelihood, 0.0)
-    return np.asarray(np.log((1.0 - WRONG_PAIR) * np.exp(relative) + WRONG_PAIR))
+    return np.asarray(np.log((1.0 - _WRONG_PAIR_PROBABILITY) * np.exp(relative) + _WRONG_PAIR_PROBABILITY))
 
 
 def _moments(grid: F64, posterior: F64) -> tuple[F64, F64]:
@@ -311,22 +359,20 @@ def _moments(grid: F64, posterior: F64) -> tuple[F64, F64]:
     return mean, np.sqrt(np.maximum(np.sum(weight * (grid - mean[:, None]) ** 2, axis=1), 0.0))
 
 
-def refine_focals(
+def _refine_focals(
     pairs: PairGeometry, unknown: SolverUnknowns, log_f: F64, *, principal_std: float = 1e-3
 ) -> tuple[F64, F64]:
-    """Log focals (R,) of the cameras and their standard deviations from all pairs, near a start (R,).
+    """Return log focal lengths (R,) and their standard deviations from all pairs, near a start (R,).
 
-    Least squares of the Kruppa residuals over all that is ``unknown``, each residual whitened by its own
-    covariance at the last answer. A principal point that all views share is one unknown: its error pulls all
-    pairs the same way, and no number of them averages it out. ``principal_std`` (long sides) is what may be
-    wrong with each view's by itself. The loss turns at three sigmas: first that of soft L1, which leads to
-    the minimum from afar, then Cauchy's against wrong pairs.
+    Least squares of whitened Kruppa residuals over all unknowns. A shared principal point is one unknown: its
+    error biases all pairs alike. ``principal_std`` (long sides) is the independent error of each view's. The
+    loss turns at three sigmas: soft L1 for convergence, then Cauchy against wrong pairs.
     """
     unknown = unknown.with_focal_prior()
-    x, share = unknown.from_log_focals(log_f[None])[0], independence_factor(pairs)
+    x, share = unknown.from_log_focals(log_f[None])[0], _independence_factor(pairs)
     covariance = np.zeros((len(x), len(x)))
     for loss in ("soft_l1", "soft_l1", "cauchy", "cauchy") if len(x) else ():
-        whitening = kruppa_whitening(pairs, unknown.log_focals(x[None])[0], principal_std=principal_std)
+        whitening = _kruppa_whitening(pairs, unknown.log_focals(x[None])[0], principal_std=principal_std)
         root = np.sqrt(share) * whitening
 
         def residuals(batch: F64, root: F64 = root) -> F64:
@@ -336,27 +382,44 @@ def refine_focals(
             return np.concatenate([white, unknown.prior_residuals(batch)], axis=1)
 
         found = minimize_residuals(
-            lambda y: residuals(y[None])[0], x, jacobian=lambda y: central_differences(residuals, y, np.full(len(y), 1e-6)), loss=loss,
-            loss_scale=3.0 * np.sqrt(share), max_iterations=40,
+            lambda y: residuals(y[None])[0], x,
+            jacobian=lambda y: central_differences(residuals, y, np.full(len(y), 1e-6)),
+            loss=loss, loss_scale=3.0 * np.sqrt(share), max_iterations=40,
         )  # fmt: skip
         x = found.x
-        # The noise is known: in place of the scale that the minimiser estimated stands 1, or what the pairs
-        # (two equations each) contradict each other more than their noise allows.
+        # The noise is known: the scale estimated by the minimizer is replaced by 1, or by the excess of the
+        # residuals (two equations per pair) over their noise.
         variance = 2.0 * found.cost / max(len(found.residual) - len(x), 1)
-        contradiction = 2.0 * found.cost / (share * max(2 * len(pairs.i) - len(x), 1))
-        covariance = found.covariance / max(variance, 1e-300) * max(contradiction, 1.0)
+        excess = 2.0 * found.cost / (share * max(2 * len(pairs.i) - len(x), 1))
+        covariance = found.covariance / max(variance, 1e-300) * max(excess, 1.0)
     variances = np.append(np.maximum(covariance.diagonal(), 0.0), 0.0)
     return unknown.log_focals(x[None])[0], np.sqrt(variances[unknown.index[:, 0]])
 
 
 @dataclass(frozen=True)
 class FocalsFromFundamental:
-    """Focals from fundamental matrices alone, each camera's with its own uncertainty.
+    """Self-calibration by focal lengths from all fundamental matrices, each with its uncertainty.
 
-    All pairs vote on a grid of ``focal_steps`` focals in ``focal_range`` (long sides; a quarter of them where
-    cameras differ), the joint answer is refined, and the plane at infinity fitted to it. A camera whose focal
-    stays open by more than ``max_std`` (of its logarithm) is named in the reasons. ``min_common``
-    observations make a pair; ``min_principal_std``: the principal point is never trusted more (long sides).
+    The posterior on a grid is refined jointly, and a plane at infinity is fitted to the focal lengths.
+
+    Parameters
+    ----------
+    focal_range : (float, float)
+        Focal lengths of the grid in long sides.
+    focal_steps : int
+        Number of focal lengths; a quarter of them if cameras differ.
+    max_std : float
+        A view whose log focal length has a larger standard deviation is reported as undetermined.
+    min_common_points : int
+        Minimum number of common observations of a pair.
+    min_principal_point_std : float
+        Lower bound of the standard deviation of the principal point, in long sides.
+    criterion : RotationCriterion
+        Criterion of the plane.
+
+    References
+    ----------
+    S. Bougnoux, ICCV 1998; V. Kocur, D. Kyselica, Z. Kukelova, CVPR 2024.
     """
 
     focal_range: tuple[float, float] = (0.1, 60.0)
@@ -374,8 +437,24 @@ class FocalsFromFundamental:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
-        """Upgrade by the vote; ``StageFailure`` below three cameras, without pairs, and where no answer puts
-        the scene in front of the cameras."""
+        """Upgrade a projective reconstruction.
+
+        Parameters
+        ----------
+        reconstruction, prior, rng
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
+
+        Returns
+        -------
+        SelfCalibration
+            The upgrade with its identifiability.
+
+        Raises
+        ------
+        StageFailure
+            Below three cameras or two pairs, or if the candidate does not place the points in front of the
+            cameras.
+        """
         require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         pairs = pair_geometries(frame, reconstruction, min_common_points=self.min_common_points)
@@ -383,14 +462,29 @@ class FocalsFromFundamental:
         log_f, std = self.focals(pairs, frame, prior)
         log_f = np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
         plane, cost = planes_for_focals(frame, self.criterion, log_f)
-        answer = Candidate(plane, square_pixel_calibrations(log_f[frame.group]), cost, "focals from F")
+        candidate = Candidate(plane, square_pixel_calibrations(log_f[frame.group]), cost, "focals from F")
         found = select_candidate(
-            frame, reconstruction, self.criterion, [answer], max_candidates=1, min_in_front_ratio=0.5
+            frame, reconstruction, self.criterion, [candidate], max_candidates=1, min_in_front_ratio=0.5
         )
-        return self._with_own_deviations(found, frame, std)
+        return self._with_focal_std(found, frame, std)
 
     def focals(self, pairs: PairGeometry, frame: ReferenceFrame, prior: IntrinsicsPrior) -> tuple[F64, F64]:
-        """Log focals (R,) of the cameras, unit-free, and their standard deviations."""
+        """Estimate the focal lengths of all cameras.
+
+        Parameters
+        ----------
+        pairs : PairGeometry
+            Fundamental matrices with covariances.
+        frame : ReferenceFrame
+            Cameras.
+        prior : IntrinsicsPrior
+            Prior of all views.
+
+        Returns
+        -------
+        log_f, std : ndarray (R,)
+            Unit-free log focal lengths and their standard deviations.
+        """
         several = frame.n_groups > 1
         grid = log_grid(self.focal_range, self.focal_steps // 4 if several else self.focal_steps)
         offset = np.median(prior.std[frame.views, 3]) / frame.pixel_from_unit[frame.views[0], 0, 0]
@@ -400,24 +494,22 @@ class FocalsFromFundamental:
             frame.focal_mean, frame.focal_std,
         )  # fmt: skip
         weak = weak_focal_prior(*known)
-        vote = focal_posterior(pairs, frame.group, grid, principal_std=principal_std, prior=weak)
+        posterior = focal_posterior(pairs, frame.group, grid, principal_std=principal_std, prior=weak)
         unknown = solver_unknowns(frame, prior)
-        start, spread = vote.log_f[frame.group], vote.std[frame.group]
-        log_f, std = refine_focals(pairs, unknown, start, principal_std=self.min_principal_point_std)
-        # Residuals also vanish where everything is blurred, at focals near 0: there the vote stands.
-        strayed = np.abs(log_f - start) > STRAYED * np.maximum(spread, 0.1)
-        return np.where(strayed, start, log_f), np.where(strayed, np.maximum(spread, self.max_std), std)
+        start, spread = posterior.log_f[frame.group], posterior.std[frame.group]
+        log_f, std = _refine_focals(pairs, unknown, start, principal_std=self.min_principal_point_std)
+        # Whitened residuals also vanish at focal lengths near 0: keep the posterior mean there.
+        departed = np.abs(log_f - start) > _MAX_DEPARTURE_SIGMAS * np.maximum(spread, 0.1)
+        return np.where(departed, start, log_f), np.where(departed, np.maximum(spread, self.max_std), std)
 
-    def _with_own_deviations(
-        self, found: SelfCalibration, frame: ReferenceFrame, std: F64
-    ) -> SelfCalibration:
+    def _with_focal_std(self, found: SelfCalibration, frame: ReferenceFrame, std: F64) -> SelfCalibration:
         K_std = focal_only_std(frame, found.K, std)
         open_views = frame.views[std >= self.max_std]
         if not len(open_views):
             return replace(found, K_std=K_std)
         names = ", ".join(str(v) for v in open_views[:10])
         reason = (
-            f"fundamental matrices leave the focal of {len(open_views)} of {len(frame.views)} photographs "
-            f"open by more than {self.max_std:.0%} (number {names})"
+            f"fundamental matrices do not determine the focal length of {len(open_views)} of "
+            f"{len(frame.views)} images to {self.max_std:.0%} (view {names})"
         )
         return replace(found, K_std=K_std, identifiable=False, reasons=(*found.reasons, reason))

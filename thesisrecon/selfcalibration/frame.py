@@ -171,7 +171,7 @@ def normalized_frame(
 ) -> ReferenceFrame:
     """Build a reference frame whose coordinates absorb the prior aspect ratio and principal point.
 
-    In these coordinates K = diag(f, f, 1) as far as the prior holds.
+    In these coordinates K = diag(f, f, 1) if the prior holds.
 
     Parameters
     ----------

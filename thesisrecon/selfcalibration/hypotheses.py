@@ -1,7 +1,7 @@
-"""Chapter 7 as a whole: many hypotheses, one refinement, the survivors with their order.
+"""Chapter 7 combined: hypotheses of all methods, one refinement, cheirality.
 
-Every closed form of the chapter fails on some photographs; together they do not. All of them only propose;
-what decides is one robust criterion over all cameras, cheirality, and later the metric bundle adjustment.
+Each closed form fails on some image sets. All of them only propose hypotheses; one robust criterion over all
+cameras, cheirality and later the metric bundle adjustment decide.
 """
 
 from __future__ import annotations
@@ -30,21 +30,38 @@ from thesisrecon.selfcalibration.quadric import minimize_quadric, quadric_hypoth
 from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
 from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
 
-LOOSE = 0.02
-"""Deviation of a principal point (long sides), an aspect or a skew beyond which focals alone do not do."""
+# Standard deviation of principal point (long sides), aspect or skew beyond which estimating focal lengths
+# alone is insufficient.
+_MAX_OFFSET_STD = 0.02
 
 
 @dataclass(frozen=True)
 class HypothesesAndRefinement:
     """Self-calibration by hypotheses of every method, one refinement and cheirality.
 
-    The refinement knows focals; where the assumptions leave more open than a slight displacement of the
-    principal point, the best answers go on to the nonlinear quadric over everything that is open.
+    The refinement estimates focal lengths. If the prior leaves more undetermined than a small offset of the
+    principal point, the best candidates are refined by the nonlinear quadric over all unknown intrinsics.
 
-    ``focal_range`` (in long sides) and ``focal_steps`` of the scans; ``subsets`` random camera subsets for
-    the quadric; ``refined`` hypotheses that are refined, and ``freed`` distinct answers over all intrinsics;
-    ``kept`` answers that go on to bundle adjustment; ``min_positive`` share of points in front that an answer
-    needs; ``search`` Hartley's search, None to leave it out.
+    Parameters
+    ----------
+    focal_range : (float, float)
+        Scanned focal lengths in long sides.
+    focal_steps : int
+        Number of scanned focal lengths.
+    camera_subsets : int
+        Number of random camera subsets for the quadric.
+    max_refined : int
+        Number of hypotheses to refine.
+    max_candidates : int
+        Maximum number of candidates for bundle adjustment.
+    max_full_refined : int
+        Number of distinct candidates to refine over all unknown intrinsics.
+    min_in_front_ratio : float
+        Required share of observations with positive depth.
+    criterion : RotationCriterion
+        Criterion of the refinement.
+    search : CheiralitySearch, optional
+        Hartley's search; None to omit it.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
@@ -65,8 +82,23 @@ class HypothesesAndRefinement:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> SelfCalibration:
-        """Upgrade a projective reconstruction of at least three cameras; ``StageFailure`` where nothing
-        holds."""
+        """Upgrade a projective reconstruction.
+
+        Parameters
+        ----------
+        reconstruction, prior, rng
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
+
+        Returns
+        -------
+        SelfCalibration
+            The upgrade with its identifiability.
+
+        Raises
+        ------
+        StageFailure
+            Below three cameras, or if no candidate places the points in front of the cameras.
+        """
         require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         planes, log_f = self._propose(frame, reconstruction, rng)
@@ -74,27 +106,27 @@ class HypothesesAndRefinement:
         best = np.argsort(cost, kind="stable")[: self.max_refined]
         theta = np.concatenate([planes[best], log_f[best]], axis=1)
         theta, cost = refine_hypotheses(self.criterion, frame, theta)
-        answers = candidates_from_parameters(frame, theta, cost, "hypotheses and refinement")
+        candidates = candidates_from_parameters(frame, theta, cost, "hypotheses and refinement")
         unknown = solver_unknowns(frame, prior)
-        if unknown.max_nonfocal_std > LOOSE:
-            answers = self._with_all_intrinsics(frame, unknown, answers)
+        if unknown.max_nonfocal_std > _MAX_OFFSET_STD:
+            candidates = self._with_all_intrinsics(frame, unknown, candidates)
         return select_candidate(
             frame,
             reconstruction,
             self.criterion,
-            answers,
+            candidates,
             max_candidates=self.max_candidates,
             min_in_front_ratio=self.min_in_front_ratio,
         )
 
     def _with_all_intrinsics(
-        self, frame: ReferenceFrame, unknown: SolverUnknowns, answers: Sequence[Candidate]
+        self, frame: ReferenceFrame, unknown: SolverUnknowns, candidates: Sequence[Candidate]
     ) -> list[Candidate]:
-        """The best distinct answers under the nonlinear quadric, over all that the assumptions leave open."""
+        """Return the best distinct candidates, refined over all unknown intrinsics."""
         found: list[Candidate] = []
-        for answer in distinct_candidates(frame, answers, self.max_full_refined):
-            log_f = answer.log_focals(frame)[frame.group]
-            best = minimize_quadric(frame, unknown, answer.plane, log_f, loss_scale=self.criterion.scale)
+        for candidate in distinct_candidates(frame, candidates, self.max_full_refined):
+            log_f = candidate.log_focals(frame)[frame.group]
+            best = minimize_quadric(frame, unknown, candidate.plane, log_f, loss_scale=self.criterion.scale)
             found.append(
                 Candidate(best.plane, best.K, best.cost, "hypotheses and nonlinear quadric", best.K_std)
             )
@@ -103,7 +135,7 @@ class HypothesesAndRefinement:
     def _propose(
         self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
     ) -> tuple[F64, F64]:
-        """Hypotheses (p (B, 3), log focal per group (B, G)) of every method."""
+        """Return planes (B, 3) and log focal lengths (B, G) of all methods."""
         focals = np.geomspace(*self.focal_range, self.focal_steps)
         found = [quadric_hypotheses(frame, focals)]
         others = np.delete(np.arange(len(frame.views)), frame.reference)

@@ -1,11 +1,10 @@
-"""Whether the photographs determine the calibration at all, with the evidence, before anything rests on it.
+"""Identifiability of the calibration from the images, checked before anything depends on it.
 
-Two questions with two answers. Which critical motion do the cameras come nearest to
-(:mod:`~thesisrecon.selfcalibration.critical_motions`)? And is the answer determined under what is assumed of
-the intrinsics? The second is read off the information that the photographs hold about the focal lengths once
-poses and points are free, since what a critical motion leaves open may be settled by an assumption: a
-turntable leaves the scale along its axis and with it the shape of the pixels, and pixels that are known to
-be square settle both.
+Two questions are answered: which critical motion is nearest
+(:mod:`~thesisrecon.selfcalibration.critical_motions`), and is the calibration determined under the prior of
+the intrinsics? The second follows from the covariance of the focal lengths with free poses and points,
+because the prior may resolve a critical motion: a turntable leaves the scale along its axis and the aspect
+ratio undetermined; square pixels resolve both.
 """
 
 from __future__ import annotations
@@ -34,75 +33,118 @@ from thesisrecon.selfcalibration.critical_motions import (
 )
 from thesisrecon.selfcalibration.frame import build_frame
 
-NOISE_FLOOR_PX = 0.05
-"""Corners are not found better than this, however well a few of them agree."""
-NOISE_FLOOR_REL = 3e-5
-"""The same in long sides, below which no ratio of noises means anything."""
-MOST_OBSERVATIONS = 12000
-ROUNDS = 12
-NEEDED_EQUATIONS = 8
-FREE_STD = 1e3
-FREE = np.array([True, True, False, True, True, False])
+# Localisation of corners; a few of them may agree better by chance.
+_NOISE_FLOOR_PX = 0.05
+# The same in long sides, for ratios of noise.
+_NOISE_FLOOR_REL = 3e-5
+_MAX_OBSERVATIONS = 12000
+_MAX_ITERATIONS = 12
+_NEEDED_EQUATIONS = 8
+_FREE_STD = 1e3
+_FREE = np.array([True, True, False, True, True, False])
 
 
 def check_identifiability(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> IdentifiabilityReport:
-    """The verdict on an answer of self-calibration.
+    """Check whether a self-calibration is determined by the images and the prior.
 
-    A metric bundle adjustment of part of the observations gives cameras, and the covariance of their focal
-    lengths under ``assumed``; the same with nothing known of aspect and principal point tells what rests on
-    knowing these. ``evidence`` holds the measures of
-    :data:`~thesisrecon.selfcalibration.critical_motions.TOLERANCES`, ``focal_long_sides`` (median, adjusted),
-    ``focal_std_rel`` (worst view),
-    ``focal_std_rel_median``, ``focal_std_rel_free`` (median, aspect and principal point free),
-    ``principal_point_std_free`` (long sides), ``rotation_significance``, ``excess_equations`` of the counting
-    argument, and ``noise_px``.
+    A metric bundle adjustment of a subset of the observations gives cameras and the covariance of their focal
+    lengths under the prior; a second covariance, with free aspect ratio and principal point, shows what
+    depends on these.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    upgrade : Upgrade
+        Metric upgrade to check.
+    prior : IntrinsicsPrior
+        Prior of the intrinsics of every view.
+
+    Returns
+    -------
+    IdentifiabilityReport
+        ``evidence`` holds the measures of :data:`~thesisrecon.selfcalibration.critical_motions.TOLERANCES`,
+        ``focal_long_sides`` (median), ``focal_std_rel`` (worst view), ``focal_std_rel_median``,
+        ``focal_std_rel_free`` (median, free aspect ratio and principal point), ``principal_point_std_free``
+        (long sides), ``rotation_significance``, ``excess_equations`` and ``noise_px``.
     """
-    problem = _core_problem(reconstruction, upgrade, prior)
-    spare = excess_equations(prior, reconstruction.registered)
+    problem = _bundle_problem(reconstruction, upgrade, prior)
+    excess = excess_equations(prior, reconstruction.registered)
     if problem is None:
         return identifiability_without_calibration(reconstruction, prior)
-    fit = problem.adjust(rounds=ROUNDS)
-    free = problem.with_nothing_known(fit).adjust(rounds=0)
-    return _verdict(problem, fit, free, spare)
+    fit = problem.adjust(iterations=_MAX_ITERATIONS)
+    free = problem.with_free_intrinsics(fit).adjust(iterations=0)
+    return _report(problem, fit, free, excess)
 
 
 def identifiability_without_calibration(
     reconstruction: Reconstruction, prior: IntrinsicsPrior
 ) -> IdentifiabilityReport:
-    """The verdict where self-calibration found nothing: what the projective cameras alone tell."""
+    """Report the identifiability from projective cameras alone, after self-calibration failed.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    prior : IntrinsicsPrior
+        Prior of the intrinsics of every view.
+
+    Returns
+    -------
+    IdentifiabilityReport
+        Not identifiable; with the nearest critical motion if there is one.
+    """
     frame = build_frame(reconstruction, prior.group)
     evidence = projective_infinity_shifts(frame.A, frame.a)
-    motion, nearness = nearest_critical_motion(evidence)
-    motion = motion if nearness < 1.0 else ""
+    motion, distance = nearest_critical_motion(evidence)
+    motion = motion if distance < 1.0 else ""
     evidence |= {
-        "nearness": nearness,
+        "critical_motion_distance": distance,
         "excess_equations": float(excess_equations(prior, reconstruction.registered)),
     }
     given = _given_focal_std(prior.std[reconstruction.registered, 0])
     sentences = motion_sentences(motion, evidence, identifiable=False, focal_std=given)
-    return IdentifiabilityReport(False, motion, nearness < 1.0, evidence, sentences)
+    return IdentifiabilityReport(False, motion, distance < 1.0, evidence, sentences)
 
 
 def excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
-    """How many equations the counting argument has beyond the 8 it needs: m n_known + (m - 1) n_constant - 8.
+    """Count the equations beyond the 8 that self-calibration needs: m n_known + (m - 1) n_constant - 8.
 
-    Written for any pattern of sharing: five intrinsics of each of m views less the number of values that are
-    not known (a standard deviation counts as knowing). Negative: too few views for what is assumed.
+    Written for any pattern of sharing: five intrinsics of each of m views minus the number of unknown values
+    (a standard deviation makes a value known).
+
+    Parameters
+    ----------
+    prior : IntrinsicsPrior
+        Prior of the intrinsics of V views.
+    registered : ndarray (V,) of bool
+        Registered views.
+
+    Returns
+    -------
+    int
+        Excess; negative if there are too few views.
+
+    References
+    ----------
+    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
     """
     unknown = 0
     for column in range(5):
         open_ = registered & ~np.isfinite(prior.std[:, column])
         unknown += len(np.unique(prior.shared[open_, column]))
-    return 5 * int(registered.sum()) - unknown - NEEDED_EQUATIONS
+    return 5 * int(registered.sum()) - unknown - _NEEDED_EQUATIONS
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """The registered ``views``, each with a row of intrinsics of its own; ``share`` of the observations that
-    is taken; ``longest`` (V,) side in px; ``projective_px`` the noise that the projective cameras leave in
-    the same observations."""
+    """Bundle adjustment of the registered ``views``, each with its own row of intrinsics.
+
+    ``share`` is the fraction of observations used, ``longest`` (V,) the long side in pixels,
+    ``projective_px`` the noise that the projective cameras leave in the same observations.
+    """
 
     cameras: MetricCameras
     X: F64
@@ -114,26 +156,26 @@ class _Problem:
     views: I64
     projective_px: float
 
-    def adjust(self, *, rounds: int) -> MetricBundleResult:
-        """Focal, aspect and principal point as far as the prior lets them, with their covariance."""
+    def adjust(self, *, iterations: int) -> MetricBundleResult:
+        """Adjust focal length, aspect ratio and principal point under the prior, with their covariance."""
         return refine_metric_bundle(
-            self.cameras, self.X, self.observations, free=FREE, prior=self.prior,
+            self.cameras, self.X, self.observations, free=_FREE, prior=self.prior,
             options=BundleOptions(
-                sigma_px=self.sigma_px, loss_px=2.0 * self.sigma_px, max_iterations=rounds, covariance=True,
-                noise_floor_px=NOISE_FLOOR_PX,
+                sigma_px=self.sigma_px, loss_px=2.0 * self.sigma_px, max_iterations=iterations,
+                covariance=True, noise_floor_px=_NOISE_FLOOR_PX,
             ),
         )  # fmt: skip
 
-    def with_nothing_known(self, fit: MetricBundleResult) -> _Problem:
-        """At the answer of ``fit``, one aspect and principal point for each focal, and nothing known of them.
+    def with_free_intrinsics(self, fit: MetricBundleResult) -> _Problem:
+        """Return the problem at the solution ``fit`` with a free aspect and principal point per focal.
 
-        Wide deviations in place of none keep the system regular where nothing is determined.
+        Large finite standard deviations keep the system regular.
         """
-        std = np.full_like(self.prior.std, FREE_STD)
+        std = np.full_like(self.prior.std, _FREE_STD)
         std[:, 3:5] *= self.longest.max()
         shared = np.array(fit.cameras.shared)
         shared[:, 1:5] = shared[:, :1]
-        # Values of one number are one value: those of the first of its views.
+        # Shared values take those of the first view.
         first = np.unique(shared[:, 0], return_index=True)[1][np.unique(shared[:, 0], return_inverse=True)[1]]
         intrinsics = np.column_stack([fit.cameras.intrinsics[:, 0], fit.cameras.intrinsics[first, 1:]])
         return replace(
@@ -145,15 +187,15 @@ class _Problem:
         )
 
 
-def _core_problem(
+def _bundle_problem(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> _Problem | None:
-    """The upgraded cameras and points with some of their observations; None where hardly any is usable."""
+    """Return upgraded cameras and points with a subset of their observations; None with too few of them."""
     views = np.flatnonzero(reconstruction.registered)
-    cameras, X, usable = _upgraded(reconstruction, upgrade, views)
+    cameras, X, usable = _metric_frame(reconstruction, upgrade, views)
     index = _usable_observations(reconstruction, cameras, X, usable)
     t, total = reconstruction.tracks, len(index)
-    index = index[_thinned(t.point_index[index], np.bincount(t.point_index[index], minlength=t.n_points))]
+    index = index[_subsample(t.point_index[index], np.bincount(t.point_index[index], minlength=t.n_points))]
     seen = np.isin(views, t.view_index[index])
     if len(index) < 4 * len(views) + 20 or seen.sum() < 3:
         return None
@@ -173,10 +215,10 @@ def _core_problem(
 
 
 def _projective_noise(reconstruction: Reconstruction, index: I64) -> float:
-    """Noise (px) of one coordinate of the observations ``index`` about the projective cameras and points.
+    """Return the noise (px) of one coordinate about the projective cameras and points.
 
-    Measured, and corrected for the 3 N + 11 V - 15 freedoms that fitted it: what the stage that made the
-    cameras worked with is never below a floor, and says little of photographs whose noise is.
+    Corrected for the 3 N + 11 V - 15 fitted parameters; the noise estimate of the projective stage has a
+    floor.
     """
     t = reconstruction.tracks
     view, point = t.view_index[index], t.point_index[index]
@@ -187,8 +229,7 @@ def _projective_noise(reconstruction: Reconstruction, index: I64) -> float:
 
 
 def _usable_observations(reconstruction: Reconstruction, cameras: MetricCameras, X: F64, usable: B8) -> I64:
-    """Observations, explained so far, of finite points in front of their cameras, at least two a point and
-    ten a view."""
+    """Return inliers of finite points in front of their cameras, at least two per point and ten per view."""
     t, views = reconstruction.tracks, np.flatnonzero(reconstruction.registered)
     index = np.flatnonzero(
         reconstruction.inlier & reconstruction.registered[t.view_index] & usable[t.point_index]
@@ -201,24 +242,24 @@ def _usable_observations(reconstruction: Reconstruction, cameras: MetricCameras,
     return np.asarray(index[seen[t.point_index[index]] >= 2], dtype=np.int64)
 
 
-def _thinned(point: I64, seen: I64) -> I64:
-    """Places of about ``MOST_OBSERVATIONS`` observations, of points drawn evenly over how often they were
-    seen."""
-    if len(point) <= MOST_OBSERVATIONS:
+def _subsample(point: I64, seen: I64) -> I64:
+    """Return about ``_MAX_OBSERVATIONS`` places, of points spread evenly over track length."""
+    if len(point) <= _MAX_OBSERVATIONS:
         return np.arange(len(point))
     numbers = np.unique(point)
-    step = len(point) / MOST_OBSERVATIONS
+    step = len(point) / _MAX_OBSERVATIONS
     order = numbers[np.argsort(-seen[numbers], kind="stable")]
-    # Every other of all, not those seen most often alone: these may lie in one corner of the scene.
+    # Every k-th track rather than the longest ones, which may lie in one corner of the scene.
     wanted = order[np.unique(np.arange(0, len(order), step).astype(np.int64))]
     chosen = np.zeros(int(point.max()) + 1, dtype=bool)
     chosen[wanted] = True
     return np.flatnonzero(chosen[point])
 
 
-def _upgraded(reconstruction: Reconstruction, upgrade: Upgrade, views: I64) -> tuple[MetricCameras, F64, B8]:
-    """Poses of the registered views and points (N, 3) after the upgrade, and which of the points are
-    finite."""
+def _metric_frame(
+    reconstruction: Reconstruction, upgrade: Upgrade, views: I64
+) -> tuple[MetricCameras, F64, B8]:
+    """Return upgraded poses of the registered views, points (N, 3), and which points are finite."""
     P = reconstruction.P[views] @ np.linalg.inv(upgrade.metric_from_projective)
     Q = np.linalg.inv(upgrade.K[views]) @ P
     Q *= np.where(np.linalg.det(Q[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
@@ -229,15 +270,15 @@ def _upgraded(reconstruction: Reconstruction, upgrade: Upgrade, views: I64) -> t
     usable = reconstruction.valid & np.isfinite(X).all(axis=1)
     X = np.where(usable[:, None], X, 0.0)
     spread = float(np.median(np.linalg.norm(X[usable] - np.median(X[usable], axis=0), axis=1)))
-    # A point far behind the others says nothing and spoils every scale.
+    # A point far behind the others is uninformative and distorts every scale.
     usable &= np.linalg.norm(X - np.median(X[usable], axis=0), axis=1) < 100.0 * spread
     t = Q[:, :, 3] / S.mean(axis=1)[:, None]
     empty = MetricCameras(U @ Vt, t / spread, np.zeros((0, 6)), np.zeros(0, dtype=np.int64))
     return empty, X / spread, usable
 
 
-def _verdict(
-    problem: _Problem, fit: MetricBundleResult, free: MetricBundleResult, spare: int
+def _report(
+    problem: _Problem, fit: MetricBundleResult, free: MetricBundleResult, excess: int
 ) -> IdentifiabilityReport:
     cameras, views = fit.cameras, problem.views
     focal = cameras.intrinsics[cameras.group, 0]
@@ -245,8 +286,8 @@ def _verdict(
         focal / problem.longest, cameras.R, -np.einsum("vba,vb->va", cameras.R, cameras.t), fit.X
     )
     evidence = measure_motion(metric)
-    motion, nearness = nearest_critical_motion(evidence)
-    evidence["nearness"] = nearness
+    motion, distance = nearest_critical_motion(evidence)
+    evidence["critical_motion_distance"] = distance
     std = _focal_std(fit, problem)
     own = _focal_std(free, problem)
     centre = np.sqrt(
@@ -260,38 +301,38 @@ def _verdict(
         "principal_point_std_free": float(np.median(centre / problem.longest) * np.sqrt(problem.share)),
         "rotation_significance": rotation_significance(cameras.R, fit.pose_covariance)
         / float(np.sqrt(problem.share)),
-        "excess_equations": float(spare),
+        "excess_equations": float(excess),
         "noise_px": fit.sigma_px,
         "noise_ratio_to_projective": fit.sigma_px
-        / max(problem.projective_px, NOISE_FLOOR_REL * float(np.median(problem.longest))),
+        / max(problem.projective_px, _NOISE_FLOOR_REL * float(np.median(problem.longest))),
     }
     undetermined = views[std >= MAX_FOCAL_STD]
-    # A prior that fixes the focal does so whatever the cameras did.
-    turned = (
+    # A prior that fixes the focal length does so for any motion.
+    rotated = (
         evidence["rotation_significance"] >= MIN_ROTATION_SIGNIFICANCE
         and evidence["infinity_shift_beyond_roll"] >= MIN_INFINITY_SHIFT
     )
-    settled = bool((problem.prior.std[:, 0] < MAX_FOCAL_STD).all())
+    known_focal = bool((problem.prior.std[:, 0] < MAX_FOCAL_STD).all())
     identifiable = (
         len(views) - len(undetermined) >= max(3, (len(views) + 1) // 2)
-        and spare >= 0
-        and (turned or settled)
+        and excess >= 0
+        and (rotated or known_focal)
         and evidence["noise_ratio_to_projective"] < MAX_NOISE_RATIO
     )
     given = _given_focal_std(problem.prior.std[:, 0])
     sentences = motion_sentences(motion, evidence, identifiable=identifiable, focal_std=given)
     return IdentifiabilityReport(
-        identifiable, motion, nearness < 1.0, evidence, sentences, tuple(int(v) for v in undetermined)
+        identifiable, motion, distance < 1.0, evidence, sentences, tuple(int(v) for v in undetermined)
     )
 
 
 def _given_focal_std(std: F64) -> float:
-    """The largest of the deviations of focal lengths beforehand, inf without any view."""
+    """Return the largest prior standard deviation of the focal lengths, inf without a view."""
     return float(std.max(initial=0.0)) if len(std) else float("inf")
 
 
 def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:
-    """(V,) relative standard deviations that all observations would give."""
+    """Return the relative standard deviations (V,) that all observations would give."""
     group = fit.cameras.group
     variance = np.maximum(fit.intrinsics_covariance[group, 0, 0], 0.0)
     std = np.sqrt(variance) / fit.cameras.intrinsics[group, 0] * np.sqrt(problem.share)
@@ -299,11 +340,29 @@ def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:
 
 
 def rotation_significance(R: F64, covariance: F64 | None) -> float:
-    """By how many of its standard deviations the tilt of the optical axes against each other stands out
-    (rms).
+    """Compute the rms rotation of the optical axes in units of its standard deviation.
 
-    Without such tilts, in a pure translation or with a camera that only rolled, nothing tells the focal
-    length. ``covariance`` (V, 6, 6) of the poses.
+    Without such rotations (pure translation, or roll only) the focal length is undetermined.
+
+    Parameters
+    ----------
+    R : ndarray (V, 3, 3)
+        Rotations, world to camera.
+    covariance : ndarray (V, 6, 6) or None
+        Covariances of the poses.
+
+    Returns
+    -------
+    float
+        Significance, 0 without a covariance.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> R = Rotation.from_rotvec([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]).as_matrix()
+    >>> round(rotation_significance(R, np.tile(1e-4 * np.eye(6), (2, 1, 1))), 3)
+    7.059
     """
     if covariance is None:
         return 0.0

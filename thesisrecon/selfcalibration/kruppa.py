@@ -106,7 +106,7 @@ def pair_geometries(
 
 
 def _unit_free_table(frame: ReferenceFrame, reconstruction: Reconstruction) -> tuple[F64, I64]:
-    """Return inlier observations (R, N, 2) in unit-free coordinates, NaN if not observed, and the views (R,)."""
+    """Return inlier observations (R, N, 2) in unit-free coordinates, NaN if not observed, and the views."""
     tracks, keep = reconstruction.tracks, reconstruction.inlier
     place = np.full(tracks.n_views, -1)
     place[frame.views] = np.arange(len(frame.views))
@@ -121,8 +121,8 @@ def _unit_free_table(frame: ReferenceFrame, reconstruction: Reconstruction) -> t
 def _fit_fundamental(F: F64, x1: F64, x2: F64, *, iterations: int = 5) -> tuple[F64, F64]:
     """Refine F (3, 3) to minimum Sampson distances (5.4); return F and the covariance (9, 9) of vec(F).
 
-    Gauss-Newton in the seven-dimensional tangent space of unit-norm matrices of rank 2, Huber weights at 2.5
-    sigma.
+    Gauss-Newton in the seven-dimensional tangent space of unit-norm matrices of rank 2, with Huber weights at
+    2.5 sigma.
     """
     F = unit_norm(F)
     B, r, J = _linearised(F, x1, x2)
@@ -210,7 +210,7 @@ def kruppa_residuals(F: F64, dual_i: F64, dual_j: F64) -> F64:
 
 
 def _direction(rows: F64, dual: F64) -> F64:
-    """Return unit triples (s11, sqrt2 s12, s22) of S = rows dual rows' for rows (M, 2, 3), dual (B, M, 3, 3)."""
+    """Return unit triples (s11, sqrt2 s12, s22) of S = rows dual rows', rows (M, 2, 3), dual (B, M, 3, 3)."""
     S = rows[None] @ dual @ rows[None].swapaxes(-1, -2)
     triple = np.stack([S[..., 0, 0], _ROOT2 * S[..., 0, 1], S[..., 1, 1]], axis=-1)
     return np.asarray(triple / np.maximum(np.linalg.norm(triple, axis=-1, keepdims=True), 1e-300))
@@ -313,12 +313,8 @@ class KruppaEquations:
 
         Parameters
         ----------
-        reconstruction : Reconstruction
-            Projective reconstruction.
-        prior : IntrinsicsPrior
-            Prior of the intrinsics of every view.
-        rng : numpy.random.Generator
-            Not used.
+        reconstruction, prior, rng
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
 
         Returns
         -------

@@ -1,9 +1,9 @@
-"""Straight line segments of a photograph, for vanishing points.
+"""Straight line segments of an image, for vanishing points.
 
-Burns, Hanson and Riseman, "Extracting straight lines", PAMI 8(4), 1986: neighbouring pixels whose gradients
-point alike support one line. Two overlapping partitions of the directions are made, and each pixel votes for
-the longer of its two regions. The line itself is fitted to the edge points of its region, which are located
-to a fraction of a pixel on a parabola along the gradient (Devernay, INRIA RR-2724, 1995).
+Burns, Hanson and Riseman, "Extracting straight lines", PAMI 8(4), 1986: connected pixels with similar
+gradient directions support one line. Two overlapping partitions of the directions are made, and each pixel
+votes for the longer of its two regions. The line is fitted to the subpixel edge points of its region, found
+on a parabola along the gradient (Devernay, INRIA RR-2724, 1995).
 """
 
 from __future__ import annotations
@@ -21,10 +21,22 @@ _ANY_NEIGHBOUR = np.ones((3, 3), dtype=np.int64)
 
 @dataclass(frozen=True)
 class LineSegments:
-    """Detector of straight segments.
+    """Detector of straight line segments.
 
-    ``sigma_px`` of the smoothing; ``min_gradient`` in grey levels a pixel; ``min_length`` of a segment as a
-    share of the long side; ``max_rms_px`` of its edge points about the line.
+    Parameters
+    ----------
+    sigma_px : float
+        Standard deviation of the smoothing.
+    min_gradient : float
+        Minimum gradient in grey levels per pixel.
+    min_length : float
+        Minimum length as a share of the long side.
+    max_rms_px : float
+        Largest rms distance of the edge points from the line.
+
+    References
+    ----------
+    Burns, Hanson, Riseman, PAMI 8(4), 1986; Devernay, INRIA RR-2724, 1995.
     """
 
     sigma_px: float = 1.0
@@ -33,28 +45,46 @@ class LineSegments:
     max_rms_px: float = 0.5
 
     def detect(self, gray: F32) -> F64:
-        """Segments (S, 4) = (x1, y1, x2, y2) px of a grey image (H, W), the longest first."""
+        """Detect line segments.
+
+        Parameters
+        ----------
+        gray : ndarray (H, W) of float32
+            Grey image.
+
+        Returns
+        -------
+        ndarray (S, 4)
+            x1, y1, x2, y2 in pixels, longest first.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> image = np.zeros((40, 60), dtype=np.float32)
+        >>> image[:, 30:] = 100.0
+        >>> np.round(LineSegments().detect(image)[:, [0, 2]], 3)
+        array([[29.5, 29.5]])
+        """
         gx, gy = (scipy.ndimage.gaussian_filter(gray, self.sigma_px, order=o) for o in ((0, 1), (1, 0)))
         size = np.hypot(gx, gy)
-        region = support_regions(np.arctan2(gy, gx), size > self.min_gradient)
-        xy, of = edge_points(gx, gy, size, region)
-        segments, rms = fit_segments(xy, of)
+        region = _support_regions(np.arctan2(gy, gx), size > self.min_gradient)
+        xy, of = _edge_points(gx, gy, size, region)
+        segments, rms = _fit_segments(xy, of)
         length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
         good = (length >= self.min_length * max(gray.shape)) & (rms <= self.max_rms_px)
         order = np.argsort(-length[good], kind="stable")
         return np.asarray(segments[good][order])
 
 
-def support_regions(angle: F32, strong: B8) -> I64:
-    """Line-support region (H, W) of each strong pixel, from 1; 0 where there is none.
+def _support_regions(angle: F32, strong: B8) -> I64:
+    """Return the line-support region (H, W) of each strong pixel, from 1; 0 for none.
 
-    Regions are connected pixels whose gradient angles lie in one of eight bins. They are made for two
-    partitions half a bin apart; a pixel votes for the larger of its two regions, and the regions are kept
-    that have more than half of their pixels' votes.
+    Regions are connected pixels whose gradient angles lie in one of eight bins, for two partitions half a bin
+    apart. A pixel votes for the larger of its two regions; regions with most of their pixels' votes are kept.
     """
-    turn = 2.0 * np.pi / _BINS
+    width = 2.0 * np.pi / _BINS
     both = [
-        _label_bins(np.floor(angle / turn + shift).astype(np.int64) % _BINS, strong) for shift in (0.0, 0.5)
+        _label_bins(np.floor(angle / width + shift).astype(np.int64) % _BINS, strong) for shift in (0.0, 0.5)
     ]
     offset = int(both[0].max())
     both[1] = np.where(both[1] > 0, both[1] + offset, 0)
@@ -77,10 +107,10 @@ def _label_bins(bins: I64, strong: B8) -> I64:
     return labels
 
 
-def edge_points(gx: F32, gy: F32, size: F32, region: I64) -> tuple[F64, I64]:
-    """Points (E, 2) px where the gradient of a region's pixels is largest across the edge, with their region.
+def _edge_points(gx: F32, gy: F32, size: F32, region: I64) -> tuple[F64, I64]:
+    """Return edge points (E, 2) px of the regions with their region numbers.
 
-    The maximum along the nearest of the eight directions to the gradient, on a parabola through three pixels.
+    The maximum along the nearest of eight directions to the gradient, on a parabola through three pixels.
     """
     h, w = region.shape
     y, x = np.nonzero(region)
@@ -96,10 +126,10 @@ def edge_points(gx: F32, gy: F32, size: F32, region: I64) -> tuple[F64, I64]:
     return np.column_stack([x + shift * dx, y + shift * dy]), region[y, x]
 
 
-def fit_segments(xy: F64, region: I64) -> tuple[F64, F64]:
-    """Total least squares lines through the points (E, 2) of each region, cut at its ends.
+def _fit_segments(xy: F64, region: I64) -> tuple[F64, F64]:
+    """Return total-least-squares segments (S, 4) of the regions and rms distances (S,) of their points.
 
-    Returns segments (S, 4) and the RMS distance (S,) of their points; regions of fewer than five have none.
+    Regions of fewer than five points have none.
     """
     n = np.bincount(region)
     regions = np.flatnonzero(n >= 5)

@@ -1,11 +1,11 @@
-"""Chapter 7, stratified: the plane at infinity by the modulus constraint.
+"""Plane at infinity by the modulus constraint (chapter 7, stratified; HZ 19.5).
 
-M. Pollefeys and L. Van Gool, "Stratified self-calibration with the modulus constraint", PAMI 21(8), 1999.
+M. Pollefeys, L. Van Gool, "Stratified self-calibration with the modulus constraint", PAMI 21(8), 1999.
 Between views of one constant K the infinite homography is conjugate to a rotation times c, so its eigenvalues
-have one modulus. With det(lambda H_i - H_j) = l3 lambda^3 + l2 lambda^2 + l1 lambda + l0, each affine in the
-plane, this is the quartic l3 l1^3 = l2^3 l0. Both sides are third powers: -l2 / (l3 c) and l1 / (l3 c^2),
-c^3 = -l0 / l3, are then the same number 1 + 2 cos(angle), and their difference is a residual of the first
-degree near the solution, where the quartic itself is flat.
+have equal modulus. With det(lambda H_i - H_j) = l3 lambda^3 + l2 lambda^2 + l1 lambda + l0, each affine in
+the plane, this is the quartic l3 l1^3 = l2^3 l0. With c^3 = -l0 / l3 both -l2 / (l3 c) and l1 / (l3 c^2)
+equal 1 + 2 cos(angle); their difference is a residual of first degree near the solution, where the quartic is
+flat.
 """
 
 from __future__ import annotations
@@ -28,10 +28,22 @@ _SLACK = _LOSS_SCALE = 0.05
 
 
 def modulus_coefficients(A: F64, a: F64, pairs: I64) -> F64:
-    """Affine coefficients (M, 4, 4): l_k(p) = c[k, :3] . p + c[k, 3], k = 0..3, for pairs (M, 2) of cameras.
+    """Compute the affine coefficients of l0 ... l3 for pairs of cameras.
 
-    From det(lambda X - Y) = lambda^3 det X - lambda^2 tr(adj(X) Y) + lambda tr(X adj(Y)) - det Y with X =
-    A_i - a_i p' and Y = A_j - a_j p'; affine since both are changed by a matrix of rank 1 with the same p.
+    From det(lambda X - Y) = lambda^3 det X - lambda^2 tr(adj(X) Y) + lambda tr(X adj(Y)) - det Y, X = A_i -
+    a_i p', Y = A_j - a_j p'; affine, since p changes both by matrices of rank 1.
+
+    Parameters
+    ----------
+    A, a : ndarray (R, 3, 3), (R, 3)
+        Cameras [A | a].
+    pairs : ndarray (M, 2) of int
+        Pairs of cameras.
+
+    Returns
+    -------
+    ndarray (M, 4, 4)
+        c with l_k(p) = c[k, :3] . p + c[k, 3].
     """
     probes = np.concatenate([np.eye(3), np.zeros((1, 3))])
     H = A[None] - a[None, :, :, None] * probes[:, None, None, :]
@@ -47,7 +59,20 @@ def _adjugate(M: F64) -> F64:
 
 
 def modulus_quartic(coefficients: F64, planes: F64) -> F64:
-    """l3 l1^3 - l2^3 l0 (B, M), the constraint as it is published, over the squared size of its terms."""
+    """Evaluate the published constraint l3 l1^3 - l2^3 l0, divided by the size of its terms.
+
+    Parameters
+    ----------
+    coefficients : ndarray (M, 4, 4)
+        Result of :func:`modulus_coefficients`.
+    planes : ndarray (B, 3)
+        Planes p.
+
+    Returns
+    -------
+    ndarray (B, M)
+        Residuals in [-1, 1].
+    """
     l0, l1, l2, l3 = np.moveaxis(_values(coefficients, planes), -1, 0)
     left, right = l3 * l1**3, l2**3 * l0
     return np.asarray((left - right) / np.maximum(np.abs(left) + np.abs(right), 1e-300))
@@ -58,10 +83,35 @@ def _values(coefficients: F64, planes: F64) -> F64:
 
 
 def modulus_residuals(coefficients: F64, planes: F64) -> tuple[F64, F64]:
-    """Residuals r = t1 - t2 (B, M) and t = (t1 + t2) / 2 (B, M) of planes (B, 3).
+    """Evaluate the constraint in the form -l2 / (l3 c) = l1 / (l3 c^2).
 
-    t1 = -l2 / (l3 c) and t2 = l1 / (l3 c^2) are both 1 + 2 cos of the angle of the rotation where the plane
-    is right; then also |t| <= 3, which is to say that two of the eigenvalues are complex.
+    Parameters
+    ----------
+    coefficients : ndarray (M, 4, 4)
+        Result of :func:`modulus_coefficients`.
+    planes : ndarray (B, 3)
+        Planes p.
+
+    Returns
+    -------
+    residuals : ndarray (B, M)
+        Difference of the two sides.
+    trace : ndarray (B, M)
+        Their mean; 1 + 2 cos(angle) of the rotation at a solution, so at most 3 in size.
+
+    References
+    ----------
+    M. Pollefeys, L. Van Gool, PAMI 21(8), 1999.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.selfcalibration.frame import _example_frame
+    >>> frame, p = _example_frame(n=3)
+    >>> coefficients = modulus_coefficients(frame.A, frame.a, np.array([[0, 1], [0, 2], [1, 2]]))
+    >>> residuals, trace = modulus_residuals(coefficients, p[None])
+    >>> bool(np.abs(residuals).max() < 1e-9 and (np.abs(trace) <= 3).all())
+    True
     """
     l0, l1, l2, l3 = np.moveaxis(_values(coefficients, planes), -1, 0)
     l3 = np.where(np.abs(l3) < 1e-12, 1e-12, l3)
@@ -73,29 +123,56 @@ def modulus_residuals(coefficients: F64, planes: F64) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class ModulusConstraint:
-    """The plane at infinity as a least-squares solution of the modulus constraint of all pairs of views that
-    share one constant K.
+    """Plane at infinity by least squares of the modulus constraint over all pairs of one constant K.
 
-    ``starts`` planes are drawn from the cheirality bounds (of either orientation); solutions that leave the
-    bounds by more than the share ``max_outside`` of points and cameras, or whose rotations have no angle, are
-    dropped. Three views have up to 21 solutions, of which ``keep`` at most are handed on for the calibration
-    to choose from; four or more views have one, and local minima.
+    Parameters
+    ----------
+    starts : int
+        Number of planes drawn from the cheirality bounds of either orientation.
+    max_candidates : int
+        Maximum number of solutions: three views have up to 21, four or more have one.
+    max_wrong_side_ratio : float
+        Largest accepted share of points and cameras on the wrong side of a plane.
+    max_points : int
+        Maximum number of points in the linear programs.
+
+    References
+    ----------
+    M. Pollefeys, L. Van Gool, PAMI 21(8), 1999.
     """
 
     starts: int = 300
-    keep: int = 21
+    max_candidates: int = 21
     max_wrong_side_ratio: float = 0.02
     max_points: int = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """Candidates, the best first; ``StageFailure`` below three views of one constant K."""
+        """Find candidate planes at infinity.
+
+        Parameters
+        ----------
+        scene : ProjectiveScene
+            Cameras, points and prior.
+        rng : numpy.random.Generator
+            Draws the starts.
+
+        Returns
+        -------
+        PlaneCandidates
+            Candidates, best first.
+
+        Raises
+        ------
+        StageFailure
+            Below three views of one constant K, or if no solution keeps the scene on one side.
+        """
         frame = scene.frame
-        pairs = pairs_of_constant_cameras(scene.knowledge.first)
+        pairs = _pairs_of_constant_cameras(scene.constraints.first)
         if len(pairs) < 3:
             raise StageFailure(
-                "the modulus constraint needs three photographs of one camera with constant intrinsics",
-                f"{counted(len(pairs), 'pair')} of views with all intrinsics in common",
-                "assume a constant camera, or use another way to the plane at infinity",
+                "the modulus constraint needs three images of one camera with constant intrinsics",
+                f"{counted(len(pairs), 'pair')} of views share all intrinsics",
+                "set constant intrinsics, or use another method for the plane at infinity",
             )
         region = CheiralityRegion.of(frame, scene.reconstruction, max_points=self.max_points, rng=rng)
         starts = region.sample(self.starts, rng)
@@ -103,22 +180,22 @@ class ModulusConstraint:
         planes, cost = minimize_batch(
             lambda p: modulus_residuals(coefficients, p)[0], starts, iterations=60, loss_scale=_LOSS_SCALE
         )
-        turning = np.abs(modulus_residuals(coefficients, planes)[1]) <= 3.0 + _SLACK
-        fit = np.isfinite(cost) & (turning.mean(axis=1) >= 0.9)
+        is_rotation = np.abs(modulus_residuals(coefficients, planes)[1]) <= 3.0 + _SLACK
+        fit = np.isfinite(cost) & (is_rotation.mean(axis=1) >= 0.9)
         fit[fit] = region.wrong_side_ratio(planes[fit]) <= self.max_wrong_side_ratio
         planes, cost = planes[fit], cost[fit]
-        kept = distinct_planes(planes, cost)[: self.keep]
+        kept = distinct_planes(planes, cost)[: self.max_candidates]
         if not len(planes):
             raise StageFailure(
-                "the modulus constraint has no solution that keeps the scene on one side of infinity",
+                "the modulus constraint has no solution with the scene on one side of the plane at infinity",
                 f"{len(starts)} starts over {len(pairs)} pairs of views",
-                "use another way to the plane at infinity",
+                "use another method for the plane at infinity",
             )
         return PlaneCandidates(planes[kept], cost[kept])
 
 
-def pairs_of_constant_cameras(first: I64) -> I64:
-    """Pairs (M, 2) of places whose camera has the same constant K."""
+def _pairs_of_constant_cameras(first: I64) -> I64:
+    """Return pairs (M, 2) of places whose cameras have the same constant K."""
     i, j = np.triu_indices(len(first), 1)
     same = first[i] == first[j]
     return np.column_stack([i[same], j[same]])

@@ -1,14 +1,10 @@
-"""Parallel lines found in photographs: vanishing points of each, matched over all through the cameras.
+"""Plane at infinity from parallel lines, given or detected in the images (chapter 7, stratified).
 
-Every photograph proposes vanishing points (pairs of segments, the consensus of all). A vanishing point of one
-photograph and one of another make a point of projective space if they are the same direction, and that point
-is seen by every other camera: the segments of all photographs that run towards it are its support. No
-calibration is needed for this; the points of three directions span the plane at infinity.
-
-Chapter 7, stratified: the plane at infinity from parallel lines.
-
-Parallel lines meet in a point at infinity, which is seen as their vanishing point; three such points that are
-not on a line span the plane. Directions at right angles determine the calibration as well: v_a' w v_b = 0.
+Parallel lines meet in a point at infinity, imaged as their vanishing point; three such points that are not
+collinear span the plane. Each image proposes vanishing points (pairs of segments, consensus of all).
+Proposals of two images triangulate to a point of projective space; its support are the segments of all images
+that point to it, without calibration. Orthogonal directions constrain the calibration too: v_a' w v_b = 0 (HZ
+8.6).
 """
 
 from __future__ import annotations
@@ -27,10 +23,10 @@ from thesisrecon.selfcalibration.frame import ReferenceFrame
 from thesisrecon.selfcalibration.line_segments import LineSegments
 from thesisrecon.selfcalibration.refinement import minimize_batch
 
-NEAR = 4.0
-"""Segments within this many tolerances of a direction are not offered to another one."""
+# Segments within this many tolerances of a direction are not offered to another one.
+_NEAR_TOLERANCES = 4.0
 
-NEARLY = -2
+_AMBIGUOUS = -2
 
 _FIRST_NOISE_PX, _LEAST_NOISE_PX = 0.5, 1e-3
 _MIN_SEGMENTS = 6
@@ -38,8 +34,17 @@ _MIN_SEGMENTS = 6
 
 @dataclass(frozen=True)
 class SegmentSet:
-    """Segments of all photographs in unit-free coordinates: ``camera`` (S,) place in the frame, ``middle``
-    (S, 2), unit ``along`` (S, 2), ``half`` (S,) half the length in px."""
+    """Line segments of all images in unit-free coordinates.
+
+    Attributes
+    ----------
+    camera : ndarray (S,) of int
+        Place in the frame.
+    middle, along : ndarray (S, 2)
+        Midpoint and unit direction.
+    half : ndarray (S,)
+        Half the length in pixels.
+    """
 
     camera: I64
     middle: F64
@@ -47,20 +52,41 @@ class SegmentSet:
     half: F64
 
     def subset(self, keep: B8 | I64) -> SegmentSet:
-        """The kept ones."""
+        """Return some of the segments.
+
+        Parameters
+        ----------
+        keep : ndarray of bool or int
+            Segments to keep.
+
+        Returns
+        -------
+        SegmentSet
+            The segments.
+        """
         return SegmentSet(self.camera[keep], self.middle[keep], self.along[keep], self.half[keep])
 
     def endpoint_distances_px(self, v: F64) -> F64:
-        """Distance (..., S) px by which a segment, turned about its middle to the points v (..., S, 3),
-        misses its ends."""
+        """Compute the endpoint distances of the segments from lines through their midpoints and given points.
+
+        Parameters
+        ----------
+        v : ndarray (..., S, 3)
+            Homogeneous points.
+
+        Returns
+        -------
+        ndarray (..., S)
+            Signed distances in pixels.
+        """
         towards = v[..., :2] - v[..., 2:] * self.middle
         norm = np.maximum(np.linalg.norm(towards, axis=-1), 1e-300)
         across = towards[..., 0] * self.along[:, 1] - towards[..., 1] * self.along[:, 0]
         return np.asarray(across / norm * self.half)
 
 
-def normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> SegmentSet:
-    """Pixel segments (S_i, 4) of each registered camera in the frame's coordinates."""
+def _normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> SegmentSet:
+    """Return pixel segments (S_i, 4) of each registered camera in the coordinates of the frame."""
     parts = []
     for place, pixels in enumerate(segments):
         unit = np.linalg.inv(frame.pixel_from_unit[frame.views[place]])
@@ -73,20 +99,38 @@ def normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> SegmentSet
     return SegmentSet(camera.astype(np.int64), middle, along, half)
 
 
-def support(segments: SegmentSet, v: F64, tolerance_px: float) -> F64:
-    """Support (..., S) of points v (..., S, 3): length times how well it fits, 0 beyond the tolerance."""
+def _support(segments: SegmentSet, v: F64, tolerance_px: float) -> F64:
+    """Return the support (..., S) of points v (..., S, 3): length times fit, 0 beyond the tolerance."""
     miss = segments.endpoint_distances_px(v) / tolerance_px
     return np.asarray(segments.half * np.maximum(1.0 - miss**2, 0.0))
 
 
 def propose_vanishing_points(
-    segments: SegmentSet, *, keep: int, samples: int, tolerance_px: float, rng: np.random.Generator
+    segments: SegmentSet, *, max_points: int, samples: int, tolerance_px: float, rng: np.random.Generator
 ) -> F64:
-    """Vanishing points (K, 3) of one photograph, the best supported first: each is refined on its segments,
-    which then are taken away."""
+    """Find vanishing points of one image by consensus, best supported first.
+
+    Parameters
+    ----------
+    segments : SegmentSet
+        Segments of one image; those of a point are removed before the next.
+    max_points : int
+        Maximum number of points.
+    samples : int
+        Number of segment pairs per point.
+    tolerance_px : float
+        Largest endpoint distance of a supporting segment.
+    rng : numpy.random.Generator
+        Draws the pairs.
+
+    Returns
+    -------
+    ndarray (K, 3)
+        Homogeneous unit-free points.
+    """
     found: list[F64] = []
     left = segments
-    while len(found) < keep and len(left.half) >= 5:
+    while len(found) < max_points and len(left.half) >= 5:
         weight = left.half / left.half.sum()
         first, second = (rng.choice(len(weight), samples, p=weight) for _ in range(2))
         lines = np.cross(_homogeneous(left.middle), np.column_stack([left.along, np.zeros(len(left.half))]))
@@ -95,14 +139,16 @@ def propose_vanishing_points(
         if not len(v):
             break
         v /= np.linalg.norm(v, axis=1, keepdims=True)
-        total = support(left, v[:, None], tolerance_px).sum(axis=1)
+        total = _support(left, v[:, None], tolerance_px).sum(axis=1)
         best = v[total.argmax()]
-        mine = support(left, best[None], tolerance_px) > 0
+        mine = _support(left, best[None], tolerance_px) > 0
         if mine.sum() < 4:
             break
         best = _nearest_to_lines(lines[mine], left.half[mine])
         found.append(best)
-        left = left.subset(~mine & (np.abs(left.endpoint_distances_px(best[None])) > NEAR * tolerance_px))
+        left = left.subset(
+            ~mine & (np.abs(left.endpoint_distances_px(best[None])) > _NEAR_TOLERANCES * tolerance_px)
+        )
     return np.array(found).reshape(-1, 3)
 
 
@@ -115,10 +161,11 @@ def _nearest_to_lines(lines: F64, weight: F64) -> F64:
     return np.asarray(np.linalg.svd(scaled, full_matrices=False)[2][2])
 
 
-def triangulate_directions(P: F64, v: F64) -> F64:
-    """Space points (B, 4) of unit norm from image points v (B, n, 3) in cameras P (B, n, 3, 4).
+def _triangulate_directions(P: F64, v: F64) -> F64:
+    """Return space points (B, 4) of unit norm from image points v (B, n, 3) in cameras P (B, n, 3, 4).
 
-    v x P X = 0 by least squares; any of them may be at infinity."""
+    Least squares of v x P X = 0; points may be at infinity.
+    """
     rows = np.cross(v[..., None], P, axisa=-2, axisb=-2, axisc=-2)
     normal = np.einsum("bnri,bnrj->bij", rows, rows)
     return np.asarray(np.linalg.eigh(normal)[1][:, :, 0])
@@ -127,101 +174,110 @@ def triangulate_directions(P: F64, v: F64) -> F64:
 def find_parallel_directions(
     frame: ReferenceFrame,
     segments: SegmentSet,
-    vanishing_points_per_image: list[F64],
+    proposals: list[F64],
     *,
-    keep: int,
+    max_directions: int,
     tolerance_px: float,
 ) -> tuple[F64, I64]:
-    """Points at infinity (D, 4) in the reference frame, the best supported first, and the direction (S,) of
-    every segment, -1 for none.
+    """Match vanishing points over all images through the cameras.
 
-    ``proposals`` are the vanishing points (K_i, 3) of each camera. A point needs support in three cameras,
-    so that the third confirms what two made.
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    segments : SegmentSet
+        Segments of all images.
+    proposals : list of ndarray (K_i, 3)
+        Vanishing points of each camera.
+    max_directions : int
+        Maximum number of directions.
+    tolerance_px : float
+        Largest endpoint distance of a supporting segment.
+
+    Returns
+    -------
+    X : ndarray (D, 4)
+        Points at infinity in the reference frame, best supported first; each has support in three cameras,
+        since the third confirms the two that define it.
+    direction : ndarray (S,) of int
+        Direction of each segment, -1 for none.
     """
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
-    candidates = _triangulated_pairs(P, vanishing_points_per_image)
+    candidates = _triangulated_pairs(P, proposals)
     direction = np.full(len(segments.half), -1, dtype=np.int64)
     found: list[F64] = []
-    while len(found) < keep and len(candidates):
+    while len(found) < max_directions and len(candidates):
         free = np.flatnonzero(direction == -1)
         left = segments.subset(free)
         total = np.concatenate([
-            support(left, np.einsum("sij,bj->bsi", P[left.camera], part), tolerance_px).sum(axis=1)
+            _support(left, np.einsum("sij,bj->bsi", P[left.camera], part), tolerance_px).sum(axis=1)
             for part in np.array_split(candidates, max(1, len(candidates) // 64))
         ])  # fmt: skip
         X = _refined_point(P, left, candidates[total.argmax()], tolerance_px)
-        mine = support(left, (P @ X)[left.camera], tolerance_px) > 0
+        mine = _support(left, (P @ X)[left.camera], tolerance_px) > 0
         if mine.sum() < 8 or len(np.unique(left.camera[mine])) < 3:
             break
         direction[free[mine]] = len(found)
         found.append(X)
-        # What nearly fits belongs to it too; left over, it would come up again as a direction of its own.
-        near = np.abs(left.endpoint_distances_px((P @ X)[left.camera])) < NEAR * tolerance_px
-        direction[free[near & ~mine]] = NEARLY
+        # Segments that nearly fit must not form another direction.
+        near = np.abs(left.endpoint_distances_px((P @ X)[left.camera])) < _NEAR_TOLERANCES * tolerance_px
+        direction[free[near & ~mine]] = _AMBIGUOUS
     return np.array(found).reshape(-1, 4), np.maximum(direction, -1)
 
 
-def _triangulated_pairs(P: F64, vanishing_points_per_image: list[F64]) -> F64:
-    """Points (B, 4) of every two vanishing points of different cameras that lie on each other's epipolar
-    line to a few degrees."""
+def _triangulated_pairs(P: F64, proposals: list[F64]) -> F64:
+    """Return points (B, 4) of all pairs of vanishing points that nearly lie on each other's epipolar line."""
     i, j, v1, v2 = [], [], [], []
     for a in range(len(P)):
         for b in range(a + 1, len(P)):
-            first, second = np.indices(
-                (len(vanishing_points_per_image[a]), len(vanishing_points_per_image[b]))
-            ).reshape(2, -1)
+            first, second = np.indices((len(proposals[a]), len(proposals[b]))).reshape(2, -1)
             i.append(np.full(len(first), a))
             j.append(np.full(len(first), b))
-            v1.append(vanishing_points_per_image[a][first])
-            v2.append(vanishing_points_per_image[b][second])
+            v1.append(proposals[a][first])
+            v2.append(proposals[b][second])
     pair = np.column_stack([np.concatenate(i), np.concatenate(j)])
     v = np.stack([np.concatenate(v1), np.concatenate(v2)], axis=1)
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
-    X = triangulate_directions(P[pair], v)
+    X = _triangulate_directions(P[pair], v)
     seen = np.einsum("bnij,bj->bni", P[pair], X)
     sine = np.linalg.norm(np.cross(seen, v), axis=-1) / np.maximum(np.linalg.norm(seen, axis=-1), 1e-300)
     return np.asarray(X[sine.max(axis=1) < 0.1])
 
 
 def _refined_point(P: F64, segments: SegmentSet, X: F64, tolerance_px: float) -> F64:
-    """X (4,) moved to least misses of its segments, whose choice widens with the better point."""
+    """Return X (4,) refined to minimum distances of its segments, which are selected again each time."""
     for _ in range(3):
-        mine = segments.subset(support(segments, (P @ X)[segments.camera], tolerance_px) > 0)
+        mine = segments.subset(_support(segments, (P @ X)[segments.camera], tolerance_px) > 0)
         if len(mine.half) < 4:
             break
         tangent = np.linalg.svd(X[None])[2][1:]
 
-        def endpoint_distances_px(
-            step: F64, X: F64 = X, tangent: F64 = tangent, mine: SegmentSet = mine
-        ) -> F64:
+        def residuals(step: F64, X: F64 = X, tangent: F64 = tangent, mine: SegmentSet = mine) -> F64:
             return mine.endpoint_distances_px(np.einsum("sij,bj->bsi", P[mine.camera], X + step @ tangent))
 
-        step = minimize_batch(
-            endpoint_distances_px, np.zeros((1, 3)), iterations=10, loss_scale=tolerance_px / 2.0
-        )[0][0]
+        step = minimize_batch(residuals, np.zeros((1, 3)), iterations=10, loss_scale=tolerance_px / 2.0)[0][0]
         X = X + step @ tangent
         X = X / np.linalg.norm(X)
     return X
 
 
-def refine_plane(
+def _refine_plane(
     frame: ReferenceFrame, segments: SegmentSet, direction: I64, plane: F64, v: F64
 ) -> tuple[F64, F64, float]:
-    """Plane p (3,) and vanishing points v (D, 3) in the reference view that fit all segments together.
+    """Return plane p (3,) and vanishing points v (D, 3) fitted to all segments, and the noise (px).
 
-    A direction seen at v in the reference view is seen at H_i v in view i, so plane and directions share the
-    least squares over the segments of every photograph (``direction`` (S,), -1 for none). After each of four
-    passes the noise is estimated, robustly, and segments beyond 2.5 times it are left out of the next.
-    Returns also the noise in px.
+    A direction at v in the reference view is at H_i v in view i, so all share one least-squares problem. In
+    each of four passes the noise is estimated robustly, and segments beyond 2.5 times it are left out of the
+    next.
     """
     kept, noise = direction >= 0, _FIRST_NOISE_PX
     for _ in range(4):
         plane, v = _fit_plane(frame, segments.subset(kept), direction[kept], (plane, v), noise)
-        endpoint_distances_px = np.abs(
-            _plane_misses(frame, segments, np.maximum(direction, 0), plane[None], v[None])[0]
+        distances = np.abs(
+            _plane_residuals(frame, segments, np.maximum(direction, 0), plane[None], v[None])[0]
         )
-        noise = max(1.4826 * float(np.median(endpoint_distances_px[direction >= 0])), _LEAST_NOISE_PX)
-        trimmed = (direction >= 0) & (endpoint_distances_px <= 2.5 * noise)
+        noise = max(1.4826 * float(np.median(distances[direction >= 0])), _LEAST_NOISE_PX)
+        trimmed = (direction >= 0) & (distances <= 2.5 * noise)
         counts = np.bincount(direction[trimmed], minlength=len(v))
         if counts.min() < _MIN_SEGMENTS:
             break
@@ -229,8 +285,8 @@ def refine_plane(
     return plane, v, noise
 
 
-def _plane_misses(frame: ReferenceFrame, segments: SegmentSet, of: I64, plane: F64, v: F64) -> F64:
-    """Misses (B, S) px of segments of directions ``of`` (S,) under planes (B, 3) and points v (B, D, 3)."""
+def _plane_residuals(frame: ReferenceFrame, segments: SegmentSet, of: I64, plane: F64, v: F64) -> F64:
+    """Return endpoint distances (B, S) px: directions ``of`` (S,), planes (B, 3), points v (B, D, 3)."""
     w, camera = v[:, of], segments.camera
     depth = np.einsum("bsi,bi->bs", w, plane)
     return segments.endpoint_distances_px(
@@ -248,7 +304,7 @@ def _fit_plane(
         return np.asarray(v + np.einsum("bdk,dki->bdi", x[:, 3:].reshape(len(x), len(v), 2), tangents))
 
     x, _ = minimize_batch(
-        lambda x: _plane_misses(frame, segments, of, plane + x[:, :3], moved(x)),
+        lambda x: _plane_residuals(frame, segments, of, plane + x[:, :3], moved(x)),
         np.zeros((1, 3 + 2 * len(v))), iterations=30, loss_scale=noise,
     )  # fmt: skip
     points = moved(x)[0]
@@ -260,8 +316,15 @@ _MIN_SPREAD = 1e-3
 
 @dataclass(frozen=True)
 class VanishingPoints:
-    """Vanishing points that somebody knows: ``view`` (M,) number, ``direction`` (M,) number of the parallel
-    lines, ``xyh`` (M, 3) homogeneous pixels (third coordinate 0 for one at infinity)."""
+    """Given vanishing points.
+
+    Attributes
+    ----------
+    view, direction : ndarray (M,) of int
+        View number and number of the parallel lines.
+    xyh : ndarray (M, 3)
+        Homogeneous pixels, third coordinate 0 at infinity.
+    """
 
     view: I64
     direction: I64
@@ -270,14 +333,28 @@ class VanishingPoints:
 
 @dataclass(frozen=True)
 class ParallelLines:
-    """The plane at infinity through the vanishing points of three or more directions.
+    """Plane at infinity through the vanishing points of three or more directions.
 
-    ``points`` are given ones, each direction in two views or more; without them directions are found in the
-    ``photographs`` (one per view), by ``detector`` for the segments, up to ``proposals`` vanishing points a
-    photograph and ``directions`` in all, with a tolerance of ``tolerance_px`` at the ends of a segment. With
-    ``right_angles`` the three best supported directions (of given points: the first three) are taken to be
-    at right angles, and help the calibration. Planes that leave more than the share ``max_outside`` of the
-    scene on the wrong side are dropped, ``keep`` at most are handed on.
+    Parameters
+    ----------
+    points : VanishingPoints, optional
+        Given points, each direction in at least two views; otherwise directions are detected in the images.
+    images : tuple of Image
+        One image per view.
+    detector : LineSegments
+        Segment detector.
+    orthogonal_directions : bool
+        The three best supported (of given points: first) directions are orthogonal, which constrains K.
+    vanishing_points_per_image, max_directions : int
+        Maximum numbers of proposals per image and of directions.
+    samples : int
+        Number of segment pairs per proposal.
+    tolerance_px : float
+        Largest endpoint distance of a supporting segment.
+    max_wrong_side_ratio : float
+        Largest accepted share of points and cameras on the wrong side of a plane.
+    max_candidates : int
+        Maximum number of planes.
     """
 
     points: VanishingPoints | None = field(default=None, metadata={"given": True})
@@ -289,29 +366,56 @@ class ParallelLines:
     samples: int = 400
     tolerance_px: float = 1.5
     max_wrong_side_ratio: float = 0.02
-    keep: int = 5
+    max_candidates: int = 5
 
     def with_images(self, images: Iterable[Image]) -> ParallelLines:
-        """The same with the photographs to look at, one per view."""
+        """Return the same method with images.
+
+        Parameters
+        ----------
+        images : iterable of Image
+            One image per view.
+
+        Returns
+        -------
+        ParallelLines
+            Method with images.
+        """
         return replace(self, images=tuple(images))
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """One candidate from given points, one or more from photographs, the best supported first.
+        """Find candidate planes at infinity: one from given points, one or more from images.
 
-        ``StageFailure`` where there are no three directions, or they do not span a plane that keeps the scene
-        on one side; ``ValueError`` where neither points nor photographs were given.
+        Parameters
+        ----------
+        scene : ProjectiveScene
+            Cameras, points and prior.
+        rng : numpy.random.Generator
+            Draws pairs of segments.
+
+        Returns
+        -------
+        PlaneCandidates
+            Candidates, best supported first.
+
+        Raises
+        ------
+        StageFailure
+            If fewer than three directions are found, or no plane keeps the scene on one side.
+        ValueError
+            If neither points nor images were given.
         """
         if self.points is not None:
             return self._from_points(scene.frame, self.points)
         if len(self.images) != len(scene.reconstruction.P):
             raise ValueError(
-                f"ParallelLines needs vanishing points, or a photograph for each of the "
-                f"{len(scene.reconstruction.P)} views; got {len(self.images)} photographs"
+                f"ParallelLines needs vanishing points, or an image for each of the "
+                f"{len(scene.reconstruction.P)} views; got {len(self.images)} images"
             )
-        return self._from_photographs(scene, rng)
+        return self._from_images(scene, rng)
 
     def _from_points(self, frame: ReferenceFrame, given: VanishingPoints) -> PlaneCandidates:
-        X = points_at_infinity(frame, given)
+        X = _points_at_infinity(frame, given)
         plane = plane_through_points(X)
         v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)
         return PlaneCandidates(plane[None], np.zeros(1), self._orthogonal(v))
@@ -320,22 +424,22 @@ class ParallelLines:
         pairs = list(combinations(range(3), 2)) if self.orthogonal_directions else []
         return np.array([[v[a], v[b]] for a, b in pairs]).reshape(-1, 2, 3)
 
-    def _from_photographs(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
+    def _from_images(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         frame = scene.frame
         pixels = [self.detector.detect(self.images[view].gray) for view in frame.views]
-        segments = normalize_segments(frame, pixels)
-        vanishing_points_per_image = [
+        segments = _normalize_segments(frame, pixels)
+        proposals = [
             propose_vanishing_points(
-                segments.subset(segments.camera == place), keep=self.vanishing_points_per_image, samples=self.samples,
-                tolerance_px=self.tolerance_px, rng=rng,
+                segments.subset(segments.camera == place), samples=self.samples,
+                max_points=self.vanishing_points_per_image, tolerance_px=self.tolerance_px, rng=rng,
             )
             for place in range(len(frame.views))
         ]  # fmt: skip
         X, direction = find_parallel_directions(
             frame,
             segments,
-            vanishing_points_per_image,
-            keep=self.max_directions,
+            proposals,
+            max_directions=self.max_directions,
             tolerance_px=self.tolerance_px,
         )
         region = CheiralityRegion.of(frame, scene.reconstruction, max_points=2000, rng=rng)
@@ -344,8 +448,7 @@ class ParallelLines:
     def _best_triples(
         self, frame: ReferenceFrame, segments: SegmentSet, region: CheiralityRegion, X: F64, direction: I64
     ) -> PlaneCandidates:
-        """Planes of triples of directions that keep the scene on one side, the best supported triple first;
-        each refined on all its segments."""
+        """Return planes of triples of directions with the scene on one side, refined on their segments."""
         counts = np.bincount(direction[direction >= 0], minlength=len(X))
         planes, scores, points = [], [], []
         for triple in combinations(range(len(X)), 3):
@@ -358,29 +461,26 @@ class ParallelLines:
             renumbered = np.full(len(direction), -1)
             for k, old in enumerate(chosen):
                 renumbered[direction == old] = k
-            plane, v, _ = refine_plane(frame, segments, renumbered, plane, v)
+            plane, v, _ = _refine_plane(frame, segments, renumbered, plane, v)
             if region.wrong_side_ratio(plane[None])[0] <= self.max_wrong_side_ratio:
                 planes.append(plane)
                 scores.append(1.0 / float(counts[chosen].min()))
                 points.append(v)
         if not planes:
             raise StageFailure(
-                "no three directions of parallel lines were found whose plane keeps the scene on one side",
+                "no three directions of parallel lines give a plane with the scene on one side",
                 f"{len(X)} directions, with {', '.join(str(c) for c in counts) or 'no'} segments, in "
-                f"{len(frame.views)} photographs",
-                "give vanishing points, or use another way to the plane at infinity",
+                f"{len(frame.views)} images",
+                "give vanishing points, or use another method for the plane at infinity",
             )
-        order = np.argsort(scores, kind="stable")[: 1 if self.orthogonal_directions else self.keep]
+        order = np.argsort(scores, kind="stable")[: 1 if self.orthogonal_directions else self.max_candidates]
         return PlaneCandidates(
             np.array(planes)[order], np.array(scores)[order], self._orthogonal(points[order[0]])
         )
 
 
-def points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
-    """Points (D, 4) in the reference frame of given vanishing points, triangulated; D in order of direction.
-
-    ``StageFailure`` for fewer than three directions seen in two registered views each.
-    """
+def _points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
+    """Return triangulated points (D, 4) in the reference frame, one per given direction."""
     place = {int(view): k for k, view in enumerate(frame.views)}
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
     unit = np.linalg.inv(frame.pixel_from_unit)
@@ -391,28 +491,48 @@ def points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
             continue
         v = np.array([unit[given.view[m]] @ given.xyh[m] for m in mine])
         v /= np.linalg.norm(v, axis=1, keepdims=True)
-        found.append(triangulate_directions(P[[place[int(given.view[m])] for m in mine]][None], v[None])[0])
+        found.append(_triangulate_directions(P[[place[int(given.view[m])] for m in mine]][None], v[None])[0])
     if len(found) < 3:
         raise StageFailure(
             "the plane at infinity needs three directions of parallel lines",
-            f"{len(found)} have vanishing points in two registered photographs",
+            f"{len(found)} have vanishing points in two registered images",
             "give the vanishing points of a third direction",
         )
     return np.array(found)
 
 
 def plane_through_points(X: F64) -> F64:
-    """p (3,) of the plane (p, 1) nearest to points (D, 4) at infinity, D >= 3, by SVD.
+    """Fit a plane to points at infinity by SVD.
 
-    ``StageFailure`` where they lie on a line: directions parallel to one plane do not fix it.
+    Parameters
+    ----------
+    X : ndarray (D, 4)
+        At least three points.
+
+    Returns
+    -------
+    ndarray (3,)
+        p of the plane (p, 1).
+
+    Raises
+    ------
+    StageFailure
+        If the points are collinear: directions parallel to one plane do not determine it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> plane_through_points(np.array([[1.0, 0, 0, -1], [0, 1, 0, -2], [0, 0, 1, 0]])).round(6) + 0.0
+    array([1., 2., 0.])
     """
     _, s, Vt = np.linalg.svd(X / np.linalg.norm(X, axis=1, keepdims=True))
     plane = Vt[-1]
     if not s[2] > _MIN_SPREAD * s[0] or abs(plane[3]) < 1e-9:
         raise StageFailure(
-            "the directions of the parallel lines lie in one plane, so their vanishing points do not fix the "
-            "plane at infinity",
+            "the directions of the parallel lines lie in one plane, so their vanishing points do not "
+            "determine "
+            "the plane at infinity",
             f"the third singular value is {s[2] / s[0]:.1e} of the first",
-            "give lines of a direction out of that plane",
+            "give lines of a direction outside that plane",
         )
     return np.asarray(plane[:3] / plane[3])

@@ -1,15 +1,13 @@
-"""Section 7.3, direct: the absolute dual quadric by weighted linear equations.
+"""Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3).
 
-Pollefeys, Verbiest and Van Gool (ECCV 2002): each camera that is square, without skew and with its principal
-point in the middle gives six equations linear in the quadric. The weights suppose a focal near 1; scanning a
-normalising focal over the plausible range makes them right for one of the scanned values whatever the lens.
+Linear: M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002. A camera with square pixels, no skew and a central
+principal point gives six equations linear in the quadric. Their weights assume a focal length near 1;
+scanning a normalizing focal length makes them right for one scanned value.
 
-Section 7.3, direct: the absolute quadric by a nonlinear criterion over all unknown intrinsics.
-
-M. Pollefeys, R. Koch, L. Van Gool, "Self-calibration and metric reconstruction in spite of varying and
-unknown internal camera parameters", IJCV 32(1), 1999: min sum |K_i K_i' / |K_i K_i'| - P_i Q P_i' / |P_i Q
-P_i'||^2 over the plane at infinity and whatever of the intrinsics is unknown. Q is parametrised by the plane
-and the reference camera's K, so that its rank is 3 and it is positive by construction.
+Nonlinear: M. Pollefeys, R. Koch, L. Van Gool, "Self-calibration and metric reconstruction in spite of varying
+and unknown internal camera parameters", IJCV 32(1), 1999: min sum |K_i K_i' / |K_i K_i'| - P_i Q P_i' / |P_i
+Q P_i'||^2 over the plane at infinity and all unknown intrinsics. Q is parametrized by the plane and the
+reference K: rank 3 and positive by construction.
 """
 
 from __future__ import annotations
@@ -39,8 +37,7 @@ _PAIRS = [(a, b) for a in range(4) for b in range(a, 4)]
 
 
 def _quadratic_rows(x: F64, y: F64) -> F64:
-    """Rows r with r . q = x' Q y for the upper-triangle vector q of a symmetric Q; (..., 4), (..., 4) ->
-    (..., 10)."""
+    """Return rows r (..., 10) with r . q = x' Q y for the upper-triangle vector q of a symmetric Q."""
     terms = [x[..., a] * y[..., b] + (x[..., b] * y[..., a] if a != b else 0.0) for a, b in _PAIRS]
     return np.stack(terms, axis=-1)
 
@@ -53,13 +50,39 @@ def _symmetric(q: F64) -> F64:
 
 
 def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -> F64:
-    """Absolute dual quadrics (B, 4, 4) in the reference frame for normalising focals (B,) or (B, R).
+    """Solve the weighted linear equations of the absolute dual quadric.
 
-    The rows are those of Pollefeys et al. with uncertainties 9 (focal), 0.2 (aspect), 0.01 (skew), 0.1
-    (principal point), divided by the w33 of the previous iterate. The first iterate divides by the norm of
-    the row that gives w33 in place of their 1, which would depend on the scale of each camera. The sign is
-    that with which the reference camera's image has a positive trace, the norm is 1, the rank is 4 with noise
-    (:func:`rank_three` makes it 3).
+    The uncertainties are 9 (focal length), 0.2 (aspect), 0.01 (skew) and 0.1 (principal point), and rows are
+    divided by w33 of the previous iterate. The first iterate divides by the norm of the row of w33 instead of
+    the paper's 1, which would depend on the scale of each camera.
+
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    focals : ndarray (B,) or (B, R)
+        Normalizing focal lengths.
+    iterations : int
+        Number of reweighted solutions.
+
+    Returns
+    -------
+    ndarray (B, 4, 4)
+        Quadrics of unit norm in the reference frame, of rank 4 under noise (see :func:`rank_three`); the
+        image in the reference camera has a positive trace.
+
+    References
+    ----------
+    M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002; HZ 19.3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.selfcalibration.frame import _example_frame
+    >>> frame, p = _example_frame(f=1.2)
+    >>> Q = linear_quadric(frame, np.array([1.2]))[0]
+    >>> bool(np.abs(Q @ np.append(p, 1.0)).max() < 1e-9)
+    True
     """
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
     P[:, :, :2] /= (focals if focals.ndim == 2 else focals[:, None])[:, :, None, None]
@@ -74,7 +97,7 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
     for _ in range(iterations):
         weighted = rows / np.maximum(nu, 1e-9 * nu.max(axis=1, keepdims=True))[:, :, None, None]
         A = weighted.reshape(len(focals), -1, 10)
-        # Of A, not of A'A, which would leave half the digits.
+        # SVD of A, since A'A would lose half the digits.
         q = np.linalg.svd(A, full_matrices=A.shape[1] < 10)[2][:, 9]
         nu = np.abs(np.einsum("bvk,bk->bv", w33, q))
     Q = _symmetric(q)
@@ -83,9 +106,26 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
 
 
 def rank_three(Q: F64) -> tuple[F64, F64]:
-    """Nearest quadrics of rank 3 to Q (B, 4, 4) and their null vectors (B, 4), the planes at infinity.
+    """Set the eigenvalue of smallest magnitude to 0.
 
-    The eigenvalue of least magnitude is set to 0.
+    Parameters
+    ----------
+    Q : ndarray (B, 4, 4)
+        Symmetric matrices.
+
+    Returns
+    -------
+    Q : ndarray (B, 4, 4)
+        Nearest quadrics of rank 3.
+    null : ndarray (B, 4)
+        Their null vectors, the planes at infinity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> Q, null = rank_three(np.diag([3.0, 2.0, 1.0, 0.1])[None])
+    >>> np.diag(Q[0]), null[0]
+    (array([3., 2., 1., 0.]), array([0., 0., 0., 1.]))
     """
     value, vector = np.linalg.eigh(Q)
     smallest = np.abs(value).argmin(axis=1)
@@ -95,10 +135,30 @@ def rank_three(Q: F64) -> tuple[F64, F64]:
 
 
 def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
-    """Planes at infinity (B, 3) and reference focals (B,) from the linear quadric scanned over ``focals``.
+    """Propose planes at infinity and reference focal lengths from scanned linear quadrics.
 
-    The plane is the null vector of the nearest quadric of rank 3; a quadric whose w* of the reference camera
-    is not positive keeps the normalising focal.
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    focals : ndarray (B,) or (B, R)
+        Normalizing focal lengths.
+
+    Returns
+    -------
+    p : ndarray (B', 3)
+        Planes at infinity: null vectors of the nearest quadrics of rank 3.
+    f : ndarray (B',)
+        Focal lengths of the reference camera; the normalizing one if w* is not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.selfcalibration.frame import _example_frame
+    >>> frame, p = _example_frame(f=1.2)
+    >>> planes, f = quadric_hypotheses(frame, np.array([1.2]))
+    >>> np.round(planes, 6), np.round(f, 6)
+    (array([[ 0.1, -0.2,  0.3]]), array([1.2]))
     """
     try:
         Q, null = rank_three(linear_quadric(frame, focals))
@@ -115,11 +175,23 @@ def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class LinearQuadric:
-    """The linear quadric alone: one normalising focal, no refinement.
+    """Self-calibration by the linear quadric for one normalizing focal length, without refinement.
 
-    ``normalising_focal`` in long sides; 1.67 is the 60 mm lens of Pollefeys et al. on 36 mm film. The
-    equation that expects it pulls the answer even without noise, by tens of percent with another lens: its
-    focals have no standard deviation (NaN).
+    Parameters
+    ----------
+    normalising_focal : float
+        In long sides; 1.67 is the 60 mm lens of Pollefeys et al. on 36 mm film.
+    criterion : RotationCriterion
+        Criterion that orders the candidates.
+
+    Notes
+    -----
+    The equation that expects this focal length biases the result even without noise, by tens of percent for
+    another lens: the focal lengths have no standard deviation (NaN).
+
+    References
+    ----------
+    M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002.
     """
 
     normalising_focal: float = 1.67
@@ -133,13 +205,29 @@ class LinearQuadric:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
-        """Upgrade by the quadric; ``StageFailure`` below three cameras and where no answer puts the scene in
-        front of the cameras."""
+        """Upgrade a projective reconstruction.
+
+        Parameters
+        ----------
+        reconstruction, prior, rng
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
+
+        Returns
+        -------
+        SelfCalibration
+            The upgrade with its identifiability.
+
+        Raises
+        ------
+        StageFailure
+            Below three cameras, or if no candidate places the points in front of the cameras.
+        """
         require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
-        p, log_f = _with_cameras(frame, *quadric_hypotheses(frame, np.array([self.normalising_focal])))
-        found = _conclude_best(frame, reconstruction, self.criterion, p, log_f)
-        # What pulls the answer is no noise: nothing here tells how far off it is.
+        p, f = quadric_hypotheses(frame, np.array([self.normalising_focal]))
+        log_f = group_focals_from_planes(frame, p, f)
+        found = _select(frame, reconstruction, self.criterion, p, log_f)
+        # The error is a bias, not noise: it has no standard deviation.
         K_std = found.K_std.copy()
         K_std[frame.views[:, None], (0, 1), (0, 1)] = np.nan
         return replace(found, K_std=K_std)
@@ -147,11 +235,22 @@ class LinearQuadric:
 
 @dataclass(frozen=True)
 class ScannedQuadric:
-    """The linear quadric for each of ``focal_steps`` normalising focals in ``focal_range`` (long sides), the
-    one whose cameras are nearest to rotations, solved again with every camera normalised by its own focal.
+    """Self-calibration by the linear quadric over a range of normalizing focal lengths.
 
-    Up to ``repeats`` times, until the focals stay: then no equation pulls any more, and exact cameras give
-    the exact answer.
+    The quadric whose cameras are nearest to rotations is solved again with every camera normalized by its own
+    focal length until the focal lengths converge: then no equation biases the result, and exact cameras give
+    the exact calibration.
+
+    Parameters
+    ----------
+    focal_range : (float, float)
+        Normalizing focal lengths in long sides.
+    focal_steps : int
+        Number of normalizing focal lengths.
+    repeats : int
+        Maximum number of further solutions.
+    criterion : RotationCriterion
+        Criterion that selects the quadric.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
@@ -167,11 +266,28 @@ class ScannedQuadric:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
-        """As :meth:`LinearQuadric.calibrate`."""
+        """Upgrade a projective reconstruction.
+
+        Parameters
+        ----------
+        reconstruction, prior, rng
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
+
+        Returns
+        -------
+        SelfCalibration
+            The upgrade with its identifiability.
+
+        Raises
+        ------
+        StageFailure
+            Below three cameras, or if no candidate places the points in front of the cameras.
+        """
         require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         focals = np.geomspace(*self.focal_range, self.focal_steps)
-        p, log_f = _with_cameras(frame, *quadric_hypotheses(frame, focals))
+        p, f = quadric_hypotheses(frame, focals)
+        log_f = group_focals_from_planes(frame, p, f)
         best = int(np.nan_to_num(self.criterion.cost(frame, p, log_f), nan=np.inf).argmin()) if len(p) else 0
         log_f = log_f[best : best + 1]
         for _ in range(self.repeats if len(p) else 0):
@@ -179,39 +295,51 @@ class ScannedQuadric:
             again = quadric_hypotheses(frame, np.exp(log_f[:, frame.group]))
             if not len(again[0]):
                 break
-            p, log_f = _with_cameras(frame, *again)
+            p, log_f = again[0], group_focals_from_planes(frame, *again)
             if np.abs(log_f - before).max() < 1e-12:
                 break
-        return _conclude_best(frame, reconstruction, self.criterion, p, log_f)
+        return _select(frame, reconstruction, self.criterion, p, log_f)
 
 
-def _with_cameras(frame: ReferenceFrame, p: F64, f_reference: F64) -> tuple[F64, F64]:
-    return p, group_focals_from_planes(frame, p, f_reference)
-
-
-def _conclude_best(
+def _select(
     frame: ReferenceFrame, reconstruction: Reconstruction, criterion: RotationCriterion, p: F64, log_f: F64
 ) -> SelfCalibration:
-    answers = candidates_from_parameters(
+    candidates = candidates_from_parameters(
         frame, np.concatenate([p, log_f], axis=1), criterion.cost(frame, p, log_f), "linear quadric"
     )
     return select_candidate(
-        frame, reconstruction, criterion, answers, max_candidates=1, min_in_front_ratio=0.5
+        frame, reconstruction, criterion, candidates, max_candidates=1, min_in_front_ratio=0.5
     )
 
 
 _UPPER = np.triu_indices(3)
 _ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
-_LEAST_NOISE = 1e-9
-PASSES = 6
-"""Estimates of the noise at the most."""
+_MIN_NOISE = 1e-9
+# Maximum number of noise estimates.
+_NOISE_PASSES = 6
 
 
 @dataclass(frozen=True)
 class QuadricFit:
-    """``plane`` (3,) p of the plane at infinity (p, 1), ``unknowns`` (D,), unit-free ``K`` (R, 3, 3), the
-    ``cost`` (mean squared residual of a camera), the ``noise`` of one residual entry, ``covariance``
-    (3 + D, 3 + D) and what it means for the entries of K, ``K_std`` (R, 3, 3)."""
+    """Minimum of the nonlinear quadric criterion.
+
+    Attributes
+    ----------
+    plane : ndarray (3,)
+        Plane at infinity.
+    unknowns : ndarray (D,)
+        Unknown intrinsics.
+    K : ndarray (R, 3, 3)
+        Unit-free calibrations.
+    cost : float
+        Mean squared residual of a camera.
+    noise : float
+        Noise of one residual entry.
+    covariance : ndarray (3 + D, 3 + D)
+        Covariance of plane and unknowns.
+    K_std : ndarray (R, 3, 3)
+        Standard deviations of the entries of K.
+    """
 
     plane: F64
     unknowns: F64
@@ -223,11 +351,27 @@ class QuadricFit:
 
 
 def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -> F64:
-    """Entries (B, R, 6) of K K'/|K K'| - P Q P'/|P Q P'|, those off the diagonal times sqrt 2.
+    """Compute the entries of K K' / |K K'| - P Q P' / |P Q P'|, off-diagonal ones times sqrt 2.
 
-    Cameras P = [A | a], A (R, 3, 3), a (R, 3), in a frame whose reference camera is [I | 0]; calibrations K
-    (B, R, 3, 3), K_reference (B, 3, 3), planes (B, 3). The squared sum over a camera is the squared Frobenius
-    norm.
+    Parameters
+    ----------
+    A, a : ndarray (R, 3, 3), (R, 3)
+        Cameras [A | a] in a frame whose reference camera is [I | 0].
+    K : ndarray (B, R, 3, 3)
+        Calibrations.
+    K_reference : ndarray (B, 3, 3)
+        Calibrations of the reference camera.
+    plane : ndarray (B, 3)
+        Planes at infinity.
+
+    Returns
+    -------
+    ndarray (B, R, 6)
+        Residuals; their squared sum over a camera is a squared Frobenius norm.
+
+    References
+    ----------
+    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
     """
     C = (A[None] - a[None, :, :, None] * plane[:, None, None, :]) @ K_reference[:, None]
     difference = _unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2))
@@ -242,16 +386,37 @@ def _unit(conic: F64) -> F64:
 def minimize_quadric(
     frame: ReferenceFrame, unknown: SolverUnknowns, plane: F64, log_f: F64, *, loss_scale: float = 0.05
 ) -> QuadricFit:
-    """The nearest minimum of the criterion from a plane at infinity (3,) and log focals (R,).
+    """Minimize the nonlinear quadric criterion from one starting point.
 
-    Huber's loss turns at ``loss_scale``, so that a camera that bad matches made wrong does not pull the rest.
-    The priors weigh against the residuals by their noise, which is estimated from the residuals themselves: a
-    first pass supposes 1 %, each further one takes what the last one found until that no longer falls.
+    The priors are weighed against the noise of the residuals, which is estimated from the residuals: the
+    first pass assumes 1 %, each further pass uses the previous estimate until it no longer falls.
+
+    Parameters
+    ----------
+    frame : ReferenceFrame
+        Cameras.
+    unknown : SolverUnknowns
+        Unknown intrinsics with their priors.
+    plane : ndarray (3,)
+        Starting plane at infinity.
+    log_f : ndarray (R,)
+        Starting log focal lengths.
+    loss_scale : float
+        Residual beyond which Huber's loss is linear: bad cameras do not bias the rest.
+
+    Returns
+    -------
+    QuadricFit
+        The nearest minimum.
+
+    References
+    ----------
+    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
     """
-    # Both sides also come together where all focals go to 0, which must cost more than the noise.
+    # Both sides also agree as all focal lengths go to 0: the weak prior makes that cost more than noise.
     unknown = unknown.with_focal_prior()
     theta, noise = np.concatenate([plane, unknown.from_log_focals(log_f[None])[0]]), 0.01
-    for _ in range(PASSES):
+    for _ in range(_NOISE_PASSES):
         supposed = noise
         theta, noise, covariance, cost = _minimize(frame, unknown, theta, noise, loss_scale)
         if noise > 0.7 * supposed:
@@ -278,21 +443,34 @@ def _minimize(
         max_iterations=100, tolerance=1e-14,
     )  # fmt: skip
     data = found.residual[: 6 * len(frame.views)]
-    # Five independent entries a camera but the reference, whose term vanishes.
+    # Five independent entries per camera except the reference, whose residuals vanish.
     free = np.isinf(unknown.std).sum() + 3
     dof = max(5 * (len(frame.views) - 1) - int(free), 1)
-    noise = max(float(np.sqrt(np.sum(data**2) / dof)), _LEAST_NOISE)
+    noise = max(float(np.sqrt(np.sum(data**2) / dof)), _MIN_NOISE)
     scale = noise**2 * max(len(found.residual) - len(theta), 1) / max(2.0 * found.cost, 1e-300)
     return found.x, noise, found.covariance * scale, float(np.sum(data**2) / len(frame.views))
 
 
 @dataclass(frozen=True)
 class NonlinearQuadric:
-    """The nonlinear quadric alone, started from the linear one.
+    """Self-calibration by the nonlinear quadric, started from scanned linear quadrics.
 
-    The linear quadric is scanned over ``focal_steps`` normalising focals in ``focal_range`` (long sides); the
-    ``starts`` whose cameras are nearest to rotations are refined over all intrinsics that the assumptions
-    leave unknown, and the least cost wins. ``loss_scale``: residual beyond which an entry counts linearly.
+    Parameters
+    ----------
+    focal_range : (float, float)
+        Normalizing focal lengths of the linear quadrics in long sides.
+    focal_steps : int
+        Number of normalizing focal lengths.
+    starts : int
+        Number of hypotheses to refine over all unknown intrinsics.
+    loss_scale : float
+        Residual beyond which an entry counts linearly (Huber).
+    criterion : RotationCriterion
+        Criterion that selects the starts.
+
+    References
+    ----------
+    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
@@ -309,8 +487,23 @@ class NonlinearQuadric:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
-        """Upgrade by the quadric; ``StageFailure`` below three cameras and where no answer puts the scene in
-        front of the cameras."""
+        """Upgrade a projective reconstruction.
+
+        Parameters
+        ----------
+        reconstruction, prior, rng
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
+
+        Returns
+        -------
+        SelfCalibration
+            The upgrade with its identifiability.
+
+        Raises
+        ------
+        StageFailure
+            Below three cameras, or if no candidate places the points in front of the cameras.
+        """
         require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         unknown = solver_unknowns(frame, prior)
@@ -318,10 +511,10 @@ class NonlinearQuadric:
         log_f = group_focals_from_planes(frame, p, f)
         cost = self.criterion.cost(frame, p, log_f)
         best = np.argsort(cost, kind="stable")[: self.starts]
-        answers = []
+        candidates = []
         for b in best[np.isfinite(cost[best])]:
             found = minimize_quadric(frame, unknown, p[b], log_f[b][frame.group], loss_scale=self.loss_scale)
-            answers.append(Candidate(found.plane, found.K, found.cost, "nonlinear quadric", found.K_std))
+            candidates.append(Candidate(found.plane, found.K, found.cost, "nonlinear quadric", found.K_std))
         return select_candidate(
-            frame, reconstruction, self.criterion, answers, max_candidates=1, min_in_front_ratio=0.5
+            frame, reconstruction, self.criterion, candidates, max_candidates=1, min_in_front_ratio=0.5
         )

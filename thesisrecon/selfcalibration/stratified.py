@@ -1,4 +1,4 @@
-"""Chapter 7, the stratified approach: first the plane at infinity, then the calibration."""
+"""Stratified self-calibration (chapter 7): plane at infinity, affine upgrade, then calibration."""
 
 from __future__ import annotations
 
@@ -9,8 +9,15 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.geometry.strata import affine_from_projective, transform_cameras, transform_points
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
+from thesisrecon.selfcalibration.absolute_conic import (
+    CalibrationProblem,
+    FixedPlaneQuadric,
+    LinearAbsoluteConic,
+)
 from thesisrecon.selfcalibration.candidates import (
     Candidate,
     as_stage_failure,
@@ -19,24 +26,34 @@ from thesisrecon.selfcalibration.candidates import (
 )
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, PlaneCandidates, ProjectiveScene
 from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
-from thesisrecon.selfcalibration.hartley import CalibrationProblem, FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.quadric import dual_image_residuals, minimize_quadric
 from thesisrecon.selfcalibration.refinement import RotationCriterion
 from thesisrecon.selfcalibration.unknowns import SolverUnknowns, conic_constraints, solver_unknowns
 
-REFINED = 3
-"""The best answers in closed form that are worth refining."""
+# Number of closed-form candidates to refine.
+_MAX_REFINED = 3
 
 
 @dataclass(frozen=True)
 class Stratified:
-    """Self-calibration in two steps, as the thesis has it: a plane at infinity, and K given the plane.
+    """Self-calibration in two steps as in the thesis: plane at infinity, then K given the plane.
 
-    ``plane`` is the way to the plane and ``calibration`` the way from it to K; ``refined`` follows every
-    answer with the nonlinear criterion over plane and intrinsics together. ``kept`` answers at most are
-    handed on, with at least the share ``min_positive`` of the points in front of the cameras.
+    Parameters
+    ----------
+    plane : CheiralitySearch, ModulusConstraint or ParallelLines
+        Method for the plane at infinity.
+    calibration : LinearAbsoluteConic or FixedPlaneQuadric
+        Method for K.
+    refine : bool
+        Refine plane and intrinsics together by the nonlinear quadric.
+    max_candidates : int
+        Maximum number of candidates to return.
+    min_in_front_ratio : float
+        Required share of observations with positive depth.
+    criterion : RotationCriterion
+        Criterion for the standard deviations of the focal lengths.
     """
 
     plane: CheiralitySearch | ModulusConstraint | ParallelLines = field(default_factory=CheiralitySearch)
@@ -46,11 +63,22 @@ class Stratified:
     min_in_front_ratio: float = 0.5
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    def with_images(self, photographs: Iterable[Image]) -> Stratified:
-        """The same where the way to the plane looks at the photographs, one per view."""
+    def with_images(self, images: Iterable[Image]) -> Stratified:
+        """Return the same method with the images, if the plane is estimated from them.
+
+        Parameters
+        ----------
+        images : iterable of Image
+            One image per view.
+
+        Returns
+        -------
+        Stratified
+            Method with images.
+        """
         if not isinstance(self.plane, ParallelLines):
             return self
-        return replace(self, plane=self.plane.with_images(photographs))
+        return replace(self, plane=self.plane.with_images(images))
 
     @as_stage_failure
     def calibrate(
@@ -60,64 +88,196 @@ class Stratified:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> SelfCalibration:
-        """Upgrade a projective reconstruction of at least three cameras.
+        """Upgrade a projective reconstruction.
 
-        ``StageFailure`` where no plane is found, and where no plane that was found has a calibration; the
-        reason is that of the best plane.
+        Parameters
+        ----------
+        reconstruction, prior, rng
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
+
+        Returns
+        -------
+        SelfCalibration
+            The upgrade with its identifiability.
+
+        Raises
+        ------
+        StageFailure
+            If no plane is found, or no plane has a calibration (the reason is that of the best plane).
         """
         scene = projective_scene(reconstruction, prior)
         found = self.plane.locate(scene, rng)
         unknown = solver_unknowns(scene.frame, prior)
-        answers = self._answers(scene, found, unknown)
+        candidates = self._candidates(scene, found, unknown)
         return select_candidate(
-            scene.frame, reconstruction, self.criterion, answers,
+            scene.frame, reconstruction, self.criterion, candidates,
             max_candidates=self.max_candidates, min_in_front_ratio=self.min_in_front_ratio,
         )  # fmt: skip
 
     def locate(
         self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
     ) -> F64:
-        """The best plane at infinity alone, unit (4,) in the projective frame; ``StageFailure`` as above."""
+        """Estimate the plane at infinity alone.
+
+        Parameters
+        ----------
+        reconstruction, prior, rng
+            As in :meth:`calibrate`.
+
+        Returns
+        -------
+        ndarray (4,)
+            Unit-norm plane in the projective frame.
+
+        Raises
+        ------
+        StageFailure
+            If no plane is found.
+        """
         scene = projective_scene(reconstruction, prior)
         p = self.plane.locate(scene, rng).planes[0]
         plane = np.append(p, 1.0) @ scene.frame.reference_from_projective
         return np.asarray(plane / np.linalg.norm(plane))
 
-    def _answers(
+    def _candidates(
         self, scene: ProjectiveScene, found: PlaneCandidates, unknown: SolverUnknowns
     ) -> list[Candidate]:
-        strata = CalibrationProblem(scene.frame, scene.knowledge, unknown, found.orthogonal)
-        answers: list[Candidate] = []
-        refusals: list[StageFailure] = []
+        problem = CalibrationProblem(scene.frame, scene.constraints, unknown, found.orthogonal)
+        candidates: list[Candidate] = []
+        failures: list[StageFailure] = []
         for plane in found.planes:
             try:
-                K = self.calibration.calibrations(strata, plane)
-            except StageFailure as refusal:
-                refusals.append(refusal)
+                K = self.calibration.calibrations(problem, plane)
+            except StageFailure as failure:
+                failures.append(failure)
                 continue
-            answers.append(self._answer(scene.frame, plane, K))
-        if not answers:
-            raise refusals[0]
+            candidates.append(self._candidate(scene.frame, plane, K))
+        if not candidates:
+            raise failures[0]
         if not self.refine:
-            return answers
-        best = sorted(answers, key=lambda answer: answer.cost)[: max(self.max_candidates, REFINED)]
-        return [refined_answer(scene.frame, unknown, answer) for answer in best]
+            return candidates
+        best = sorted(candidates, key=lambda candidate: candidate.cost)[
+            : max(self.max_candidates, _MAX_REFINED)
+        ]
+        return [_refined_candidate(scene.frame, unknown, candidate) for candidate in best]
 
-    def _answer(self, frame: ReferenceFrame, plane: F64, K: F64) -> Candidate:
+    def _candidate(self, frame: ReferenceFrame, plane: F64, K: F64) -> Candidate:
         r = dual_image_residuals(frame.A, frame.a, K[None], K[None, frame.reference], plane[None])
         name = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
         return Candidate(plane, K, float(np.mean(np.sum(r**2, axis=-1))), name)
 
 
-def refined_answer(frame: ReferenceFrame, unknown: SolverUnknowns, answer: Candidate) -> Candidate:
-    """The nearest minimum of the nonlinear criterion over plane and intrinsics."""
-    log_f = 0.5 * np.log(answer.K[:, 0, 0] * answer.K[:, 1, 1])
-    least = minimize_quadric(frame, unknown, answer.plane, log_f)
-    return Candidate(least.plane, least.K, least.cost, f"{answer.method}, refined", least.K_std)
+def _refined_candidate(frame: ReferenceFrame, unknown: SolverUnknowns, candidate: Candidate) -> Candidate:
+    """Return the nearest minimum of the nonlinear quadric over plane and intrinsics."""
+    log_f = 0.5 * np.log(candidate.K[:, 0, 0] * candidate.K[:, 1, 1])
+    least = minimize_quadric(frame, unknown, candidate.plane, log_f)
+    return Candidate(least.plane, least.K, least.cost, f"{candidate.method}, refined", least.K_std)
 
 
 def projective_scene(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> ProjectiveScene:
-    """The scene as the ways to the plane see it; ``StageFailure`` below three registered cameras."""
+    """Return the input of the methods for the plane at infinity.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    prior : IntrinsicsPrior
+        Prior of all views.
+
+    Returns
+    -------
+    ProjectiveScene
+        Scene in a normalized reference frame.
+
+    Raises
+    ------
+    StageFailure
+        Below three registered cameras.
+    """
     require_cameras(reconstruction)
     frame = normalized_frame(reconstruction, prior)
     return ProjectiveScene(reconstruction, frame, conic_constraints(frame, prior))
+
+
+_NEAR_INFINITY = 1e-9
+
+
+def upgrade_to_affine(reconstruction: Reconstruction, plane: F64) -> Reconstruction:
+    """Upgrade a projective reconstruction to an affine one (3.4.3): P G^-1, G X by the table of 3.3.
+
+    Parallelism and ratios of lengths on parallel lines are correct, angles are not. The camera with most
+    observations is [I | 0] behind a nominal calibration (focal length of one long side), its points at a
+    median depth of 1.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    plane : ndarray (4,)
+        Plane at infinity; it becomes (0, 0, 0, 1).
+
+    Returns
+    -------
+    Reconstruction
+        Affine reconstruction with X[:, 3] = 1; points on the plane at infinity become invalid.
+
+    Raises
+    ------
+    ValueError
+        If the reconstruction is not projective, or the plane is zero or not finite.
+    """
+    if reconstruction.stratum != "projective":
+        raise ValueError(f"upgrade_to_affine takes a projective reconstruction; got {reconstruction.stratum}")
+    G = affine_from_projective(np.asarray(plane, dtype=np.float64))
+    X = transform_points(G, reconstruction.X)
+    size = np.linalg.norm(X, axis=1)
+    valid = reconstruction.valid & (np.abs(X[:, 3]) > _NEAR_INFINITY * np.maximum(size, 1e-300))
+    X[~valid] = 0.0
+    X[valid] /= X[valid, 3:]
+    P = np.where(reconstruction.registered[:, None, None], transform_cameras(G, reconstruction.P), 0.0)
+    affine = replace(reconstruction, stratum="affine", P=P, X=X, valid=valid)
+    affine = replace(affine, P=_facing(affine))
+    T = _nominal_frame(affine)
+    X[valid] = transform_points(T, X[valid])
+    return replace(affine, P=transform_cameras(T, affine.P), X=X)
+
+
+def _nominal_frame(affine: Reconstruction) -> F64:
+    """Return the affine transform (4, 4) that places the camera with most observations at the origin."""
+    tracks, keep = affine.tracks, affine.inlier & affine.valid[affine.tracks.point_index]
+    seen = np.bincount(tracks.view_index[keep], minlength=len(affine.P)) * affine.registered
+    view = int(np.argmax(seen))
+    T = np.eye(4)
+    T[:3] = np.linalg.solve(pixel_from_unit(affine.sizes)[view], affine.P[view])
+    T[:3] /= max(float(np.linalg.norm(T[:3, :3])), 1e-300)
+    if not seen[view] or abs(np.linalg.det(T)) < _NEAR_INFINITY:
+        return np.eye(4)
+    depth = affine.X[tracks.point_index[keep & (tracks.view_index == view)]] @ T[2]
+    T[:3] /= max(float(np.median(depth)), 1e-300)
+    return T
+
+
+def _facing(affine: Reconstruction) -> F64:
+    """Return cameras (V, 3, 4) with the signs that give the points positive depths."""
+    tracks, keep = affine.tracks, affine.inlier & affine.valid[affine.tracks.point_index]
+    view, point = tracks.view_index[keep], tracks.point_index[keep]
+    depth = np.einsum("kj,kj->k", affine.P[view, 2], affine.X[point])
+    balance = np.bincount(view, np.sign(depth), minlength=len(affine.P))
+    return affine.P * np.where(balance < 0.0, -1.0, 1.0)[:, None, None]
+
+
+def affine_camera_centres(reconstruction: Reconstruction) -> F64:
+    """Return the centres of the registered cameras of an affine or metric reconstruction.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Affine or metric reconstruction.
+
+    Returns
+    -------
+    ndarray (R, 3)
+        Camera centres.
+    """
+    P = reconstruction.P[reconstruction.registered]
+    return np.asarray(-np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0])

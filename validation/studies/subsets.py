@@ -192,11 +192,13 @@ def run_trial(
     subset = take_views(matched, chosen, kept)
     # Two images have a single pair.
     first = int(rng.integers(max(min(LATEST_START, sum(pair.accepted for pair in subset.pairs)), 1)))
-    wish = IntrinsicsOptions(cameras="shared" if mode == "shared" else "per-image")
+    options = IntrinsicsOptions(cameras="shared" if mode == "shared" else "per-image")
     start, names = time.perf_counter(), tuple(int(view) for view in chosen)
     nothing = Trial(number, names, 0, np.nan, np.nan, (), 0, 0.0, reasons=matched.reasons)
     try:
-        result, failures, attempts = solve(subset, PipelineConfig(intrinsics=wish), seed=number, first=first)
+        result, failures, attempts = solve(
+            subset, PipelineConfig(intrinsics=options), seed=number, first=first
+        )
     except Exception as error:  # a crash is one of the results
         seconds = time.perf_counter() - start
         return replace(nothing, seconds=seconds, crash=f"{type(error).__name__}: {error}")
