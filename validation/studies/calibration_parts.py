@@ -9,6 +9,7 @@ focal length and principal point should contain the truth in 95 of 100 cases.
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -87,11 +88,11 @@ def check_subsets(title: str, matched: Matched, K: F64, cameras: Cameras) -> lis
     held = join_scores(scores)
     rows.add("focal error of the worst camera, median over subsets, %", float(np.median(errors)))
     rows.add("focal error of the worst camera of all, %", float(np.max(errors)))
-    for what, columns in (("focal", (0,)), ("principal point", (1, 2))):
+    for label, columns in (("focal", (0,)), ("principal point", (1, 2))):
         share = held.holding(columns)
-        rows.add(f"95 % intervals of the {what} that hold the truth", share, at_least=LEAST_HOLDING)
-        rows.add(f"largest deviation, {what}, stated sigmas", held.worst(columns))
-    rows.add("stated sigma of the focal, median, %", float(100.0 * np.nanmedian(held.std_rel)))
+        rows.add(f"95 % intervals of the {label} that hold the truth", share, at_least=LEAST_HOLDING)
+        rows.add(f"largest error, {label}, stated standard deviations", held.worst(columns))
+    rows.add("stated standard deviation of the focal, median, %", float(100.0 * np.nanmedian(held.std_rel)))
     return rows
 
 
@@ -116,7 +117,7 @@ def _try(matched: Matched, cameras: Cameras, seed: int, *, alike: bool = True) -
     options = replace(PipelineConfig().intrinsics, cameras=cameras, common_prior=alike)
     result, failures, _ = solve(matched, PipelineConfig(intrinsics=options), seed=seed, first=0)
     if result is None:
-        print(f"{matched.name}, seed {seed}: {failures[0]}", flush=True)
+        print(f"{matched.name}, seed {seed}: {failures[0]}", file=sys.stderr, flush=True)
     return result
 
 
@@ -191,10 +192,10 @@ def check_weak(title: str, sets: Sequence[Weak], K: F64, *, alike: bool) -> list
         rows.add(f"{kind}: registered of {len(found)}", float(there.sum()))
         rows.add(f"{kind}: focal error, median, %", float(np.nanmedian(error)))
         rows.add(f"{kind}: focal error, worst, %", float(np.nanmax(error)))
-        rows.add(f"{kind}: stated sigma, median, %", float(np.nanmedian(width)))
+        rows.add(f"{kind}: stated standard deviation, median, %", float(np.nanmedian(width)))
         held = float((z[there] <= LEVEL).mean())
         rows.add(f"{kind}: 95 % intervals that hold the truth", held, at_least=LEAST_HOLDING)
-        rows.add(f"{kind}: largest deviation, stated sigmas", float(np.nanmax(z)))
+        rows.add(f"{kind}: largest error, stated standard deviations", float(np.nanmax(z)))
         rows.add(
             f"{kind}: off by more than {SUCCESS_PCT:.0f} % and not marked", float(unnamed.sum()), at_most=0.0
         )
@@ -311,7 +312,7 @@ def check_weak_coverage(numbers: Iterable[int]) -> list[Metric]:
     rows.add("focal error, worst, %", float(np.max(error[there])))
     held = float(np.mean(z[there] <= LEVEL))
     rows.add("95 % intervals of the focal that hold the truth", held, at_least=COVERAGE[0])
-    rows.add("largest deviation, stated sigmas", float(np.max(z[there])))
+    rows.add("largest error, stated standard deviations", float(np.max(z[there])))
     rows.add(
         "off by more than 3 % and not marked", float(np.sum(there & (error > 3.0) & ~marked)), at_most=0.0
     )
@@ -330,14 +331,14 @@ def check_coverage(cameras: Cameras, numbers: Iterable[int]) -> list[Metric]:
         return rows
     scores = [part[0] for part in trusted]
     joined = join_scores(scores)
-    for what, columns in COLUMNS.items():
+    for label, columns in COLUMNS.items():
         z, share = joined.z[:, columns], joined.holding(columns)
-        name = f"95 % intervals of the {what} that hold the truth"
+        name = f"95 % intervals of the {label} that hold the truth"
         rows.add(name, share, at_least=COVERAGE[0])
         rows.add(f"{name} (no wider than needed)", share, at_most=COVERAGE[1])
         rows.add(f"{name}, 95 % uncertainty of this share", LEVEL * holding_std(scores, columns))
-        rows.add(f"deviation, {what}, rms in stated sigmas", float(np.sqrt(np.nanmean(z**2))))
-    rows.add("stated sigma of the focal, median, %", float(100 * np.nanmedian(joined.std_rel)))
+        rows.add(f"error, {label}, rms in stated standard deviations", float(np.sqrt(np.nanmean(z**2))))
+    rows.add("stated standard deviation of the focal, median, %", float(100 * np.nanmedian(joined.std_rel)))
     return rows
 
 

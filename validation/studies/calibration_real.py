@@ -7,6 +7,7 @@ lengths; and on parts of the set. OUT keeps all runs, which are not repeated.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -76,7 +77,7 @@ class Bench:
                 overwrite=True,
             )
         except StageFailure as failure:
-            print(f"{self.scene.name}: {cameras}: {failure}", flush=True)
+            print(f"{self.scene.name}: {cameras}: {failure}", file=sys.stderr, flush=True)
             return None
 
     def colmap(self, cameras: Cameras, name: str, start: Start) -> Reconstruction | None:
@@ -93,7 +94,7 @@ class Bench:
                 images, place / "matched", place / name, start=start, threads=self.threads
             )
         except StageFailure as failure:
-            print(f"{self.scene.name}: COLMAP, {name}: {failure}", flush=True)
+            print(f"{self.scene.name}: COLMAP, {name}: {failure}", file=sys.stderr, flush=True)
             return None
         return run.reconstruction
 

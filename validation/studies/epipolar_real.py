@@ -168,12 +168,12 @@ def check_adelaide(methods: list[str], seeds: int) -> list[Metric]:
             f1 = {m: float(2.0 * v.prod() / max(v.sum(), 1e-9)) for m, v in shares.items()}
             others = [m for m in methods if m != OURS]
             best = max(others, key=lambda m: f1[m]) if others else None
-            for what, values in (
+            for label, values in (
                 ("precision", {m: float(v[0]) for m, v in shares.items()}),
                 ("recall", {m: float(v[1]) for m, v in shares.items()}),
                 ("F1", f1),
             ):
-                name, note = f"{pair.name}, {what} at {threshold:g} px", best or ""
+                name, note = f"{pair.name}, {label} at {threshold:g} px", best or ""
                 target = values[best] if best else None
                 rows.append(Metric("adelaide", name, "", values, OURS, target, at_most=False, note=note))
     return rows

@@ -127,9 +127,9 @@ def changed(rng: np.random.Generator, whole: bytes) -> bytes:
     for _ in range(int(rng.integers(1, 9))):
         at, size = int(rng.integers(0, len(data) + 1)), int(rng.integers(1, 17))
         number = struct.pack("<d", float(rng.choice(ODD)))
-        what = (rng.bytes(size), rng.bytes(1), b"\xff" * 8, b"\0" * 8, number)[int(rng.integers(0, 5))]
-        end = (at, at + len(what), at + size)[int(rng.integers(0, 3))]
-        data[at:end] = what
+        piece = (rng.bytes(size), rng.bytes(1), b"\xff" * 8, b"\0" * 8, number)[int(rng.integers(0, 5))]
+        end = (at, at + len(piece), at + size)[int(rng.integers(0, 3))]
+        data[at:end] = piece
     return bytes(data[:LARGEST_INPUT])
 
 
@@ -190,8 +190,8 @@ def fuzz_colmap_study(
     else:
         with tempfile.TemporaryDirectory() as place:
             findings = fuzz_guided(seconds, seed, corpus or Path(place) / "corpus", memory)
-    who = resource.RUSAGE_SELF if findings.branches == 0 else resource.RUSAGE_CHILDREN
-    peak_mb = resource.getrusage(who).ru_maxrss / 2**10
+    usage = resource.RUSAGE_SELF if findings.branches == 0 else resource.RUSAGE_CHILDREN
+    peak_mb = resource.getrusage(usage).ru_maxrss / 2**10
     yield (
         f"{findings.how}: {findings.inputs} inputs in {seconds} s, {findings.branches} branches, "
         f"{len(valid_inputs())} valid inputs and {findings.kept} kept, peak {peak_mb:.0f} MB, "

@@ -46,9 +46,9 @@ from validation.studies.tensor_views import (
     Measured,
     Place,
     courtyard,
+    courtyard_image,
     courtyard_table,
     draw,
-    photograph,
     save_beside,
 )
 
@@ -85,7 +85,7 @@ class Yard:
 def prepare_yard() -> Yard:
     """Match the images of the courtyard; exact points come from its true correspondence."""
     truth = courtyard()
-    images = [Image(f"{k}", rgb, SIZE) for k, rgb in zip(VIEWS, truth.photographs, strict=True)]
+    images = [Image(f"{k}", rgb, SIZE) for k, rgb in zip(VIEWS, truth.images, strict=True)]
     y, x = np.indices(truth.places[0].shape[:2])[:, ::8, ::8].reshape(2, -1).astype(np.float64)
     xy1, xy2 = np.stack([x, y], axis=1), truth.places[0][::8, ::8].reshape(-1, 2).astype(np.float64)
     inside = np.all((xy2 > 0.0) & (xy2 < np.array(SIZE)), axis=1)
@@ -127,7 +127,7 @@ def measure_place(yard: Yard, place: Place, out: Path) -> Measured:
     turn = square if H is None else square @ H
     at_end = H is None and s in (0.0, 1.0)
     picture = yard.pair.view(s, turn=None if at_end else turn, threads=2)
-    kept, wanted = within(np.eye(3) if at_end else turn), photograph(yard.truth.world, plain)
+    kept, wanted = within(np.eye(3) if at_end else turn), courtyard_image(yard.truth.world, plain)
     name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
     save_beside(out / name, [wanted, picture])
     likeness = ssim(np.where(kept[..., None], picture, wanted), wanted)
@@ -174,7 +174,7 @@ def measure_courtyard(out: Path) -> tuple[list[Measured], list[str], list[Metric
 def measure_triangle(yard: Yard, out: Path) -> Metric:
     """Interpolate twice, to the middle of the triangle that a third image spans."""
     pose = courtyard_poses()[THIRD]
-    third = Image(str(THIRD), photograph(yard.truth.world, Pose(pose.K, pose.R, pose.C)), SIZE)
+    third = Image(str(THIRD), courtyard_image(yard.truth.world, Pose(pose.K, pose.R, pose.C)), SIZE)
     middle = Image("middle", yard.pair.view(0.5), SIZE)
     P_third = camera_from_centre(pose.K, pose.R, pose.C)
     P_middle = camera_between(yard.pair, cameras_of(yard.truth), 0.5)
@@ -183,10 +183,10 @@ def measure_triangle(yard: Yard, out: Path) -> Metric:
     for name, t in (("a third towards the third", 1.0 / 3.0), ("half way", 0.5)):
         P = camera_between(second, (P_middle, P_third), t)
         plain, turn = square_camera(pose_of(P))
-        wanted, picture = photograph(yard.truth.world, plain), second.view(t, turn=turn)
+        wanted, picture = courtyard_image(yard.truth.world, plain), second.view(t, turn=turn)
         values[name] = psnr_db(picture, wanted, where=within(turn))
         save_beside(out / f"courtyard-triangle-{t:.2f}.jpg", [wanted, picture])
-    return Metric("courtyard, three photographs", "PSNR", "dB", values, "half way")
+    return Metric("courtyard, three images", "PSNR", "dB", values, "half way")
 
 
 def measure_fountain(out: Path) -> list[Metric]:

@@ -233,7 +233,11 @@ def measure_scene(
         for method, folder in METHODS.items():
             place = out / scene.name / folder
             outcome = run_method(method, scene, place, threads=threads, environment=environment)
-            print(f"{scene.name}: {method}: {outcome.wall_s:.1f} s {outcome.failure}", flush=True)
+            print(
+                f"{scene.name}: {method}: {outcome.wall_s:.1f} s {outcome.failure}",
+                file=sys.stderr,
+                flush=True,
+            )
             if method not in outcomes or outcome.wall_s < outcomes[method].wall_s:
                 outcomes[method] = outcome
     truth = None
@@ -247,7 +251,7 @@ def warm_up(scene: Scene, out: Path, *, threads: int, environment: dict[str, str
     shutil.rmtree(environment["NUMBA_CACHE_DIR"], ignore_errors=True)
     cold = run_method(OURS, scene, out / "cold" / "default", threads=threads, environment=environment)
     run_method(THESIS, scene, out / "cold" / "thesis", threads=threads, environment=environment)
-    print(f"{scene.name}: {OURS}, compiling: {cold.wall_s:.1f} s {cold.failure}", flush=True)
+    print(f"{scene.name}: {OURS}, compiling: {cold.wall_s:.1f} s {cold.failure}", file=sys.stderr, flush=True)
     return cold.wall_s
 
 

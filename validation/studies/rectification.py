@@ -194,7 +194,7 @@ QUANTITIES: tuple[tuple[str, str, Callable[[Measured], float], float | None, boo
         True,
     ),
     ("aspect off 1", "", lambda m: _off(m.quality.aspect, 1.0), ASPECT, True),
-    ("kept of what both see", "", lambda m: m.kept, KEPT, False),
+    ("kept of the common region", "", lambda m: m.kept, KEPT, False),
     ("stretch", "", lambda m: m.quality.stretch, None, True),
     ("slant of disparities", "", lambda m: m.quality.disparity_slope, None, True),
     ("distortion", "", lambda m: m.quality.distortion, None, True),

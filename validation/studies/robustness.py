@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from thesisrecon.cli.main import run_command
-from thesisrecon.errors import MEND
+from thesisrecon.errors import REMEDIES
 from thesisrecon.runtime.signals import CODES
 from validation.scenes.real import ROOT
 from validation.studies.runner import Part, Rows, text_table
@@ -317,7 +317,7 @@ class Refusal:
             f"exit code {self.code}": self.code != REFUSED,
             "not one sentence": self.said.count("\n") != 1 or "Traceback" in self.said,
             "names no place": " cannot be written: " not in self.said,
-            "does not say what to do": not any(words in self.said for words in MEND.values()),
+            "does not say what to do": not any(words in self.said for words in REMEDIES.values()),
             f"strange files: {', '.join(self.strange)}": bool(self.strange),
             f"differs: {', '.join(self.different)}": bool(self.different),
         }

@@ -60,6 +60,7 @@ MODULES = {
     "pair-choice": "growth",
     "parallel": "timing",
     "perturbation": "perturbation",
+    "record": "record",
     "rectification": "rectification",
     "rendering": "rendering",
     "self-check": "self_check",

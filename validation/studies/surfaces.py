@@ -130,12 +130,12 @@ def check_courtyard(out: Path, variant: str, views: Sequence[int] | None) -> lis
     return [
         Metric(
             f"courtyard, {variant} maps",
-            what,
+            label,
             "",
-            {word: float(np.mean([one[word][what] for one in measured])) for word in SURFACES},
+            {word: float(np.mean([one[word][label] for one in measured])) for word in SURFACES},
             "b-spline",
         )
-        for what in measured[0]["linear"]
+        for label in measured[0]["linear"]
     ]
 
 

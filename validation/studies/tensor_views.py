@@ -84,7 +84,7 @@ class CourtyardTruth:
 
     world: World
     poses: tuple[Pose, Pose]
-    photographs: tuple[U8, U8]
+    images: tuple[U8, U8]
     places: tuple[F32, F32]
 
     @property
@@ -102,7 +102,7 @@ class CourtyardTruth:
         return Pose(camera.K, camera.rotation @ two.R, two.C - two.R.T @ step)
 
 
-def photograph(world: World, pose: Pose) -> U8:
+def courtyard_image(world: World, pose: Pose) -> U8:
     """Render an image with the exposure of the pose and without white balance."""
     with PIL.Image.open(io.BytesIO(render_photograph(world, pose, 0)[0])) as image:
         return np.asarray(image.convert("RGB"))
@@ -120,7 +120,7 @@ def courtyard() -> CourtyardTruth:
         rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(here.K).T
         X = rays * np.where(depth > 0.0, depth, np.nan)[..., None] @ here.R + here.C
         places.append(dehomogenize((X - there.C) @ (there.K @ there.R).T).astype(np.float32))
-    pictures = photograph(world, one), photograph(world, two)
+    pictures = courtyard_image(world, one), courtyard_image(world, two)
     return CourtyardTruth(world, (one, two), pictures, (places[0], places[1]))
 
 
@@ -138,7 +138,7 @@ class Measured:
 def measure_courtyard(out: Path) -> list[Measured]:
     """Render all places with true cameras, and with F and matches (true and guessed K)."""
     truth = courtyard()
-    found = match_images(*truth.photographs, config=PipelineConfig())
+    found = match_images(*truth.images, config=PipelineConfig())
     dense = found.dense.correspondences(0, SIZE), found.dense.correspondences(1, SIZE)
     K, guess = truth.poses[0].K, default_intrinsics(SIZE)
     matches = found.pair.xy1, found.pair.xy2
@@ -150,7 +150,7 @@ def measure_courtyard(out: Path) -> list[Measured]:
     ready = {
         name: prepare_synthesis(
             pair,
-            truth.photographs,
+            truth.images,
             truth.places if name == "all true" else dense,
             gain=found.dense.gain if name != "all true" else np.ones(3),
             agree_px=np.inf if name == "all true" else AGREE_PX,
@@ -159,7 +159,7 @@ def measure_courtyard(out: Path) -> list[Measured]:
     }
     rows = []
     for place in places_of_courtyard():
-        wanted = photograph(truth.world, truth.pose(place.of(truth.pair)))
+        wanted = courtyard_image(truth.world, truth.pose(place.of(truth.pair)))
         shown = []
         for name, views in ready.items():
             picture = views.render(place.of(views.pair), threads=2)
@@ -217,7 +217,7 @@ def draw(rows: list[Measured]) -> go.Figure:
                 hovertemplate="%{x} baselines: %{y:.1f} dB, displaced by %{customdata[0]:.2f} px",
             )
     figure.update_layout(
-        xaxis_title="baselines beyond the second photograph, or off the middle", yaxis_title="PSNR, dB"
+        xaxis_title="baselines beyond the second image, or off the middle", yaxis_title="PSNR, dB"
     )
     return figure
 
@@ -272,7 +272,7 @@ def measure_time(repeats: int) -> Metric:
     """Time a frame of 1000 x 700 px from images of that size."""
     truth = courtyard()
     width, height = FRAME_SIZE
-    images = tuple(picture[:height, :width] for picture in truth.photographs)
+    images = tuple(picture[:height, :width] for picture in truth.images)
     places = tuple(part[:height, :width] for part in truth.places)
     views = prepare_synthesis(truth.pair, (images[0], images[1]), (places[0], places[1]))
     camera = replace(camera_at(truth.pair, 0.4, sizes=(FRAME_SIZE, FRAME_SIZE)))

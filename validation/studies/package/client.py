@@ -1,6 +1,4 @@
-"""A small program of somebody else's that uses every front door: mypy --strict reads it beside the installed
-package, and ``assert_type`` says that what it gets back has a type, and which.
-"""
+"""Client of the installed package: mypy --strict checks it, ``assert_type`` states every returned type."""
 
 from __future__ import annotations
 
@@ -24,7 +22,7 @@ from thesisrecon.records import (
 
 
 def points_of_two(first: Path, second: Path) -> F64:
-    """Space points of two photographs in a projective frame."""
+    """Return space points of two images in a projective frame."""
     pair = thesisrecon.match_pair(first, second, seed=1)
     assert_type(pair, TwoView)
     assert_type(pair.sigma_px, float)
@@ -35,10 +33,10 @@ def points_of_two(first: Path, second: Path) -> F64:
     return assert_type(X, F64)
 
 
-def focal_lengths(photographs: Path, out: Path) -> dict[str, float]:
-    """Focal length (px) of every photograph of a folder, by the run and by its projective part alone."""
+def focal_lengths(images: Path, out: Path) -> dict[str, float]:
+    """Return the focal length (px) of every image of a folder, by the run and by its projective part."""
     config = thesisrecon.PipelineConfig()
-    result = thesisrecon.reconstruct(photographs, out, config=config, seed=0, until="metric", threads=2)
+    result = thesisrecon.reconstruct(images, out, config=config, seed=0, until="metric", threads=2)
     assert_type(result, RunResult)
     if result.projective is not None:
         calibration = thesisrecon.self_calibrate(result.projective, config=config)
@@ -51,7 +49,7 @@ def focal_lengths(photographs: Path, out: Path) -> dict[str, float]:
 
 
 def pictures(left: U8, right: U8, mesh: TexturedMesh) -> list[U8]:
-    """Views between two rectified photographs, beside them, and of a model."""
+    """Render views between two rectified images, beside them, and of a model."""
     found = thesisrecon.match_rectified(left, right, max_disparity_px=64)
     assert_type(found, DisparityMap)
     between = thesisrecon.interpolate_view(left, right, 0.5, disparity=found)
@@ -63,7 +61,7 @@ def pictures(left: U8, right: U8, mesh: TexturedMesh) -> list[U8]:
 
 
 def main() -> int:
-    """What photographs of a folder tell, or why nothing."""
+    """Describe the result of a folder of images, or its failure."""
     try:
         for name, focal_px in focal_lengths(Path(sys.argv[1]), Path(sys.argv[2])).items():
             print(f"{name}: {focal_px:.1f} px")

@@ -46,9 +46,9 @@ def make_environment(folder: Path, python: str = sys.executable) -> Path:
     return interpreter
 
 
-def install(interpreter: Path, *what: str, constraints: Sequence[str] = ()) -> None:
+def install(interpreter: Path, *packages: str, constraints: Sequence[str] = ()) -> None:
     """Install packages or wheels with pip, under constraints such as ``numpy==1.26``."""
-    command = [str(interpreter), "-m", "pip", "install", "-q", "--disable-pip-version-check", *what]
+    command = [str(interpreter), "-m", "pip", "install", "-q", "--disable-pip-version-check", *packages]
     if constraints:
         file = interpreter.parent.parent / "constraints.txt"
         file.write_text("\n".join(constraints) + "\n", encoding="utf-8")

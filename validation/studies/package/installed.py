@@ -96,8 +96,8 @@ PLACES = {"os.mkdir": 1, "os.rename": 2, "os.link": 2, "os.symlink": 2, "os.remo
           "os.truncate": 1, "os.chmod": 1, "os.chown": 1, "os.utime": 1}
 TALK = ("socket.connect", "socket.bind", "socket.sendto", "socket.getaddrinfo", "socket.gethostbyname",
         "socket.gethostbyaddr", "urllib.Request", "webbrowser.open")
-def say(kind, what):
-    os.write(log, f"{kind}\\t{what}\\n".encode(errors="replace"))
+def say(kind, text):
+    os.write(log, f"{kind}\\t{text}\\n".encode(errors="replace"))
 def log_event(event, given):
     if event == "open" and not isinstance(given[0], int) and given[2] & WRITING:
         say("write", os.path.abspath(os.fsdecode(given[0])))
@@ -159,7 +159,7 @@ def watch(program: str, arguments: Sequence[str], place: Path, **variables: str)
         check=False,
     )
     logged = [line.split("\t", 1) for line in log.read_text(encoding="utf-8").splitlines() if "\t" in line]
-    said = {kind: [what for k, what in logged if k == kind] for kind in ("write", "network", "process")}
+    said = {kind: [text for k, text in logged if k == kind] for kind in ("write", "network", "process")}
     return Watched(
         ended.returncode,
         frozenset(Path(path) for path in said["write"]),
