@@ -11,6 +11,7 @@ from itertools import count
 import numpy as np
 import PIL.Image
 
+from tests.synthetic import reconstruction_of
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import compose_camera, project
@@ -23,7 +24,6 @@ from thesisrecon.records import (
     Matches,
     MetricResult,
     PinholeView,
-    Reconstruction,
     SelfCalibration,
     Tracks,
     TwoView,
@@ -146,18 +146,8 @@ class FakeProjective:
         assert sizes.shape == (tracks.n_views, 2)
         if attempt < self.fail_below:
             raise StageFailure("the initial pair is bad", f"attempt {attempt}")
-        return Reconstruction(
-            stratum="projective",
-            P=np.stack([scene_camera(i) for i in range(tracks.n_views)]),
-            X=scene_points(),
-            registered=np.ones(tracks.n_views, np.bool_),
-            valid=np.ones(POINTS, np.bool_),
-            inlier=np.ones(len(tracks.xy), np.bool_),
-            tracks=tracks,
-            sizes=sizes,
-            sigma_px=0.1,
-            reasons=("",) * tracks.n_views,
-        )
+        P = np.stack([scene_camera(i) for i in range(tracks.n_views)])
+        return reconstruction_of(P, sizes, X=scene_points(), tracks=tracks, stratum="projective")
 
 
 @dataclass(frozen=True)

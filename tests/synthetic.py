@@ -7,6 +7,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import FundamentalFit, Image, Reconstruction, Tracks, TwoView
 
 
@@ -89,6 +90,20 @@ def with_poses(scene, R, centres):
     return replace(scene, R=R, t=t, tracks=replace(scene.tracks, xy=xy))
 
 
+def reconstruction_of(P, size, *, X=None, tracks=None, stratum="metric", **given):
+    """A reconstruction whose views, points and observations are all good, but for the ``given`` fields."""
+    n, X = len(P), np.zeros((0, 4)) if X is None else X
+    if tracks is None:
+        nothing = np.zeros(0, dtype=np.int64)
+        tracks = Tracks(nothing, nothing, np.zeros((0, 2)), n, len(X))
+    fields = {"sizes": np.broadcast_to(size, (n, 2)).copy(), "sigma_px": 0.1, "reasons": ("",) * n}
+    for name, count in (("registered", n), ("valid", len(X)), ("inlier", len(tracks.xy))):
+        fields[name] = np.ones(count, dtype=bool)
+    if "K" in given:
+        fields |= {"distortion": np.zeros((n, 3))}
+    return Reconstruction(stratum=stratum, P=P, X=X, tracks=tracks, **(fields | given))
+
+
 def projective_reconstruction(scene, *, seed=0):
     """The true cameras and points moved by a random projective transform, with random scales and signs."""
     rng = np.random.default_rng(seed)
@@ -97,19 +112,7 @@ def projective_reconstruction(scene, *, seed=0):
     P = P * (rng.uniform(0.5, 2.0, len(P)) * rng.choice([-1.0, 1.0], len(P)))[:, None, None]
     X = np.column_stack([scene.X, np.ones(len(scene.X))]) @ G.T
     X = X * rng.choice([-1.0, 1.0], len(X))[:, None]
-    n = len(P)
-    return Reconstruction(
-        "projective",
-        P,
-        X,
-        np.ones(n, dtype=bool),
-        np.ones(len(X), dtype=bool),
-        np.ones(len(scene.tracks.xy), dtype=bool),
-        scene.tracks,
-        scene.sizes,
-        1.0,
-        ("",) * n,
-    )
+    return reconstruction_of(P, scene.sizes, X=X, tracks=scene.tracks, stratum="projective", sigma_px=1.0)
 
 
 def true_pairs(scene):
@@ -123,30 +126,10 @@ def true_pairs(scene):
             both = np.flatnonzero((table[i] >= 0) & (table[j] >= 0))
             R = scene.R[j] @ scene.R[i].T
             translation = scene.t[j] - R @ scene.t[i]
-            cross = np.array(
-                [
-                    [0, -translation[2], translation[1]],
-                    [translation[2], 0, -translation[0]],
-                    [-translation[1], translation[0], 0],
-                ]
-            )
-            F = np.linalg.inv(scene.K[j]).T @ cross @ R @ np.linalg.inv(scene.K[i])
-            pairs.append(
-                TwoView(
-                    i,
-                    j,
-                    F / np.linalg.norm(F),
-                    0.3,
-                    both,
-                    both,
-                    t.xy[table[i, both]],
-                    t.xy[table[j, both]],
-                    np.tile(np.eye(2), (len(both), 1, 1)),
-                    len(both),
-                    0.2,
-                    True,
-                )
-            )
+            F = np.linalg.inv(scene.K[j]).T @ cross_matrix(translation) @ R @ np.linalg.inv(scene.K[i])
+            F, xy = F / np.linalg.norm(F), (t.xy[table[i, both]], t.xy[table[j, both]])
+            affine, count = np.tile(np.eye(2), (len(both), 1, 1)), len(both)
+            pairs.append(TwoView(i, j, F, 0.3, both, both, *xy, affine, count, 0.2, True))
     return pairs
 
 

@@ -9,10 +9,11 @@ import pytest
 
 import thesisrecon
 from tests import fake_stages as fakes
+from tests.synthetic import reconstruction_of
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions
-from thesisrecon.records import Image, Reconstruction, TexturedMesh, Tracks
+from thesisrecon.records import Image, TexturedMesh, Tracks
 from thesisrecon.report.summary import _original_from_working, point_colors
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
@@ -22,17 +23,15 @@ def small_reconstruction():
     """Two points seen by two views of which the second is of another size."""
     view, point = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
     xy = np.array([[1.0, 2.0], [3.2, 0.4], [0.0, 0.0], [90.0, 90.0]])
-    return Reconstruction(
-        stratum="projective",
-        P=np.stack([fakes.scene_camera(0), fakes.scene_camera(1)]),
+    return reconstruction_of(
+        np.stack([fakes.scene_camera(0), fakes.scene_camera(1)]),
+        [[96, 80], [48, 40]],
         X=fakes.scene_points()[:3],
-        registered=np.array([True, True]),
+        tracks=Tracks(view, point, xy, 2, 3),
+        stratum="projective",
+        sigma_px=1.0,
         valid=np.array([True, True, False]),
         inlier=np.array([True, True, True, False]),
-        tracks=Tracks(view, point, xy, 2, 3),
-        sizes=np.array([[96, 80], [48, 40]]),
-        sigma_px=1.0,
-        reasons=("", ""),
     )
 
 

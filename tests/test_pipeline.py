@@ -502,6 +502,6 @@ def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path):
 
 
 def test_a_list_that_names_no_photograph_is_refused_before_anything_is_computed(tmp_path):
-    with pytest.raises(UsageError, match=r"'9\.png', which is none of the 4 photographs"):
+    with pytest.raises(UsageError, match=r"'9\.png', which is not among the 4 images"):
         run(tmp_path, config=fake_config(pairs=ListedPairs((("00.png", "9.png"),))))
     assert CALLS == []

@@ -173,7 +173,7 @@ def test_the_written_config_runs_again(killed_and_resumed, photographs, capsys):
         (["reconstruct", ".", "-o", "out", "--until", "surface"], "unknown stage"),
         (["reconstruct", ".", "-o", "out", "--executor", "dask://x"], "given as dask://HOST:PORT"),
         (["reconstruct", ".", "-o", "out", "--max-size", "5"], "at least 64"),
-        (["reconstruct", ".", "-o", "out", "--pairs", "window:0"], "a window of 0 gives no pairs"),
+        (["reconstruct", ".", "-o", "out", "--pairs", "window:0"], "must be at least 1; got 0"),
         (["reconstruct", ".", "-o", "out", "--pairs", "window"], "takes a whole number"),
         (["reconstruct", ".", "-o", "out", "--pairs", "window:--5"], "takes a whole number"),
         (["reconstruct", ".", "-o", "out", "--pairs", "most"], "all, overlap, window:N, or a file"),
@@ -299,7 +299,7 @@ def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, cap
     pairs = json.loads((out / "summary.json").read_text(encoding="utf-8"))["pairs"]
     assert (pairs["matched"], pairs["possible"], pairs["selection"]) == (2, 15, "the listed pairs")
     assert "2 of 15 pairs were tried: the listed pairs." in (out / "report.html").read_text(encoding="utf-8")
-    for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is none"), ("", "leaves no pair")):
+    for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is not among"), ("", "leaves no pair")):
         knowledge.write_text(line, encoding="utf-8")
         assert run_command([*given, "--pairs", str(knowledge), "--overwrite"]) == 2
         assert words in capsys.readouterr().err

@@ -9,13 +9,14 @@ import PIL.Image
 import pytest
 
 from tests.surface.sphere import SHAPE, photograph, ring_of
+from tests.synthetic import reconstruction_of
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import RenderOptions, render_run
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.io.files import write_json
 from thesisrecon.io.meshes import write_mesh
-from thesisrecon.records import Image, Reconstruction, TexturedMesh, Tracks
+from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report.summary import cameras_table
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.texture_atlas import TextureAtlas
@@ -28,21 +29,7 @@ def write_cameras(out):
     """``cameras.json`` by the writer of runs."""
     P = np.array([depth_map.P for depth_map in ring_of(COUNT)])
     K = np.array([decompose_camera(p)[0] for p in P])
-    none = np.zeros(0, dtype=np.int64)
-    reconstruction = Reconstruction(
-        stratum="metric",
-        P=P,
-        X=np.zeros((0, 4)),
-        registered=np.arange(COUNT) != 3,
-        valid=np.zeros(0, dtype=bool),
-        inlier=np.zeros(0, dtype=bool),
-        tracks=Tracks(none, none, np.zeros((0, 2)), COUNT, 0),
-        sizes=np.tile(SIZE, (COUNT, 1)),
-        sigma_px=0.1,
-        reasons=("",) * COUNT,
-        K=K,
-        distortion=np.zeros((COUNT, 3)),
-    )
+    reconstruction = reconstruction_of(P, SIZE, K=K, registered=np.arange(COUNT) != 3)
     images = tuple(Image(f"{k}.jpg", np.zeros((*SHAPE, 3), np.uint8), SIZE) for k in range(COUNT))
     write_json(out / "cameras.json", cameras_table(reconstruction, images))
 

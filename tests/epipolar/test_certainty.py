@@ -92,7 +92,7 @@ def test_matches_between_windows_do_not_make_a_facade_sure():
     assert contradicted >= 9
 
 
-def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_rival():
+def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_competing_model():
     """All matches of a plane and few others; a wrong F fits some of these."""
     rng = np.random.default_rng(3)
     flat = make_pair(300, np.random.default_rng(8), planar=True)

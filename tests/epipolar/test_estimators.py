@@ -325,9 +325,9 @@ def test_an_epipole_that_explains_as_many_is_a_reason():
     found = assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(0))
     assert any("another F explains" in reason for reason in found.reasons)
     assert found.competing_model is not None
-    of_rival = np.abs(sampson_residuals(found.competing_model, xy1, xy2))
-    assert (of_rival[-30:] < 1.0).mean() > 0.9
-    assert (of_rival[:100] < 1.0).mean() > 0.9
+    of_competing = np.abs(sampson_residuals(found.competing_model, xy1, xy2))
+    assert (of_competing[-30:] < 1.0).mean() > 0.9
+    assert (of_competing[:100] < 1.0).mean() > 0.9
 
 
 def test_matches_amid_those_of_the_plane_are_a_reason():
@@ -514,7 +514,7 @@ def test_noise_beyond_the_threshold_is_not_invented_for_wrong_matches():
 
 
 def test_other_minima_are_reported_as_competing_models():
-    """Two motions of as many matches each: the one that is not taken is the first rival."""
+    """Two motions of as many matches each: the one that is not taken is the first competing model."""
     rng = np.random.default_rng(0)
     one, other = make_pair(60, rng), make_pair(60, np.random.default_rng(1))
     xy1, xy2 = np.vstack([one.xy1, other.xy1]), np.vstack([one.xy2, other.xy2])

@@ -259,7 +259,7 @@ def test_a_plane_among_wrong_tracks_is_named_and_a_tenth_off_it_is_enough(off):
 
 def test_wrong_calls():
     for wrong in (np.ones((3, 8)), np.full((3, 12, 2), np.nan), np.ones((2, 12, 2))):
-        with pytest.raises(ValueError, match=r"needed points|finite"):
+        with pytest.raises(ValueError, match=r"needs points|finite"):
             TrifocalRansac().estimate(wrong)
     for bad in ({"threshold_px": 0.0}, {"confidence": 1.0}, {"max_samples": 0}, {"threshold_px": np.nan}):
         with pytest.raises(ValueError, match="threshold_px"):

@@ -5,8 +5,8 @@ from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordina
 from tests.synthetic import texture
 from thesisrecon.features.kernels import (
     corner_response,
+    enforce_spacing,
     fit_maxima,
-    keep_apart,
     sample_patches,
     squared_suppression_radii,
 )
@@ -86,7 +86,7 @@ def test_patches_equal_their_numpy_twin():
 
 def test_selected_corners_are_apart_and_none_is_dropped_without_reason():
     xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
-    kept = keep_apart(xy, np.arange(400), 6.0)
+    kept = enforce_spacing(xy, np.arange(400), 6.0)
     distance = np.linalg.norm(xy[:, None] - xy[kept][None], axis=2)
     assert (np.sort(distance[kept], axis=1)[:, 1] >= 6.0).all()
     for dropped in np.setdiff1d(np.arange(400), kept):

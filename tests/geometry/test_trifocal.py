@@ -216,9 +216,9 @@ def test_wrong_triplets_are_refused():
     points, segments = seen_points(P, rng, 6), seen_segments(P, rng, 3)
     with pytest.raises(ValueError, match="26 equations"):
         estimate_tensor_linear(points, NO_SEGMENTS)
-    with pytest.raises(ValueError, match="needed points"):
+    with pytest.raises(ValueError, match="needs points"):
         estimate_tensor_linear(points[:2], segments)
-    with pytest.raises(ValueError, match="needed points"):
+    with pytest.raises(ValueError, match="needs points"):
         estimate_tensor_linear(points, segments[:, :, 0])
     with pytest.raises(ValueError, match="finite"):
         estimate_tensor_linear(np.where(points > points[0, 0, 0], np.nan, points), segments)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thesisrecon.errors import DISK, MEND, OutputError, UsageError
+from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
 from thesisrecon.io.colmap_files import write_colmap_model
 from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints
 from thesisrecon.io.exports import read_cameras, write_point_cloud
@@ -76,7 +76,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, number):
     with disk_ends(1, number), pytest.raises(OutputError) as refused:
         write_json(path, {"a": 2})
     assert entries(tmp_path) == before
-    assert str(refused.value) == f"{path} cannot be written: {os.strerror(number)}; {MEND[number]}"
+    assert str(refused.value) == f"{path} cannot be written: {os.strerror(number)}; {REMEDIES[number]}"
     assert isinstance(refused.value, UsageError)
 
 
@@ -148,7 +148,7 @@ def test_the_sentence_survives_the_way_from_a_worker():
     again = pickle.loads(pickle.dumps(refused))
     assert str(again) == str(refused)
     assert str(refused).endswith("make room there, then the same command goes on from what is kept in out")
-    assert set(DISK) <= set(MEND)
+    assert set(WRITE_ERRNOS) <= set(REMEDIES)
 
 
 def test_json_has_no_nan(tmp_path):

@@ -5,12 +5,12 @@ from scipy.ndimage import map_coordinates
 from tests.synthetic import disparity, photograph, stereo_scene, texture
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.matching.alignment import align_windows
-from thesisrecon.matching.growth import fit_local_affines, grow_corners
-from thesisrecon.matching.prepared import corner_patches, prepare_view
-from thesisrecon.matching.seeds import scan_correlations, update_column_best
+from thesisrecon.matching.alignment import _align_windows
+from thesisrecon.matching.growth import _fit_local_affines, _match_guided
+from thesisrecon.matching.prepared import _corner_patches, prepare_image
+from thesisrecon.matching.seeds import _scan_correlations, _update_column_best
 from thesisrecon.matching.strength import displacement_weight, relative_difference_weight, strength_of_match
-from thesisrecon.matching.tracks import chain_maps, unite
+from thesisrecon.matching.tracks import _chain_affines, _union_corners
 from thesisrecon.records import Features, Image
 
 RNG = np.random.default_rng(0)
@@ -23,25 +23,25 @@ def unit(window):
 
 def prepared(gray):
     image = photograph(gray)
-    return prepare_view(image, HarrisCorners(spacing_rel=0.01).detect(image))
+    return prepare_image(image, HarrisCorners(spacing_rel=0.01).detect(image))
 
 
 def test_scan_equals_its_numpy_twin():
     correlation = RNG.uniform(-1, 1, (40, 60)).astype(np.float32)
     xy = RNG.uniform(0, 50, (60, 2)).astype(np.float32)
-    index, value, competing_model = scan_correlations(correlation, xy, np.full(60, 15.0**2, np.float32))
+    index, value, second_best = _scan_correlations(correlation, xy, np.full(60, 15.0**2, np.float32))
     best = correlation.argmax(axis=1)
     elsewhere = ((xy[None] - xy[best][:, None]) ** 2).sum(-1) > 15.0**2
     assert np.array_equal(index, best)
     assert np.array_equal(value, correlation.max(axis=1))
-    assert np.allclose(competing_model, np.where(elsewhere, correlation, -1.0).max(axis=1))
+    assert np.allclose(second_best, np.where(elsewhere, correlation, -1.0).max(axis=1))
 
 
 def test_column_best_over_blocks_equals_the_best_of_all_rows():
     correlation = RNG.uniform(-1, 1, (50, 30)).astype(np.float32)
     value, index = np.full(30, -2.0, np.float32), np.zeros(30, np.int64)
     for first in range(0, 50, 16):
-        update_column_best(correlation[first : first + 16], first, value, index)
+        _update_column_best(correlation[first : first + 16], first, value, index)
     assert np.array_equal(index, correlation.argmax(axis=0))
     assert np.array_equal(value, correlation.max(axis=0))
 
@@ -68,7 +68,7 @@ def test_local_affines_equal_their_numpy_twin():
     xy2 = xy1 @ np.array([[1.1, 0.2], [-0.1, 0.9]]).T + (20, -7) + RNG.normal(size=(80, 2))
     prior = np.tile(np.eye(2), (80, 1, 1)) + 0.05 * RNG.normal(size=(80, 2, 2))
     near = np.linalg.norm(xy[:, None] - xy1[None], axis=2).argsort(axis=1)[:, :10]
-    affine, place, spread = fit_local_affines(xy, near, xy1, xy2, prior)
+    affine, place, spread = _fit_local_affines(xy, near, xy1, xy2, prior)
     for n in range(12):
         a, t, s = affine_twin(xy[n], near[n], xy1, xy2, prior)
         assert np.abs(affine[n] - a).max() < 1e-7
@@ -80,7 +80,7 @@ def test_corner_patches_equal_their_numpy_twin_at_every_level():
     view = prepared(texture(120, 150))
     xy = np.array([[60.3, 50.6], [70.0, 64.5], [3.0, 60.0]])
     scale = np.array([1.0, 2.0, 1.0], np.float32)
-    found = corner_patches(view.pixels, view.levels, view.base, xy, scale)
+    found = _corner_patches(view.pixels, view.levels, view.base, xy, scale)
     b, a = np.mgrid[-7:8, -7:8]
     for n in range(2):
         offset, height, width = view.levels[n]
@@ -94,12 +94,12 @@ def test_corner_patches_equal_their_numpy_twin_at_every_level():
 
 def test_growth_equals_its_numpy_twin():
     images = stereo_scene(200, 260)
-    one, two = (prepare_view(i, HarrisCorners(spacing_rel=0.01).detect(i)) for i in images)
+    one, two = (prepare_image(i, HarrisCorners(spacing_rel=0.01).detect(i)) for i in images)
     xy1, xy2 = one.features.xy, two.features.xy
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     affine, radius = np.tile(np.eye(2), (len(xy1), 1, 1)), np.full(len(xy1), 12.0)
     place = xy1 - (14.0, 0.0)
-    index, score, competing_model = grow_corners(
+    index, score, second_best = _match_guided(
         one.pyramid,
         (xy1, one.features.scale),
         (affine, place, radius),
@@ -119,13 +119,13 @@ def test_growth_equals_its_numpy_twin():
     assert np.abs(score[inside] - np.where(expected >= 0, twin.max(axis=1), 0.0)[inside]).max() < 1e-4
     elsewhere = allowed & (np.linalg.norm(xy2[expected][:, None] - xy2[None], axis=2) > 3.0)
     second = np.where(elsewhere & (expected >= 0)[:, None], correlation, -1.0).max(axis=1)
-    assert np.abs(competing_model[inside] - second[inside]).max() < 1e-4
+    assert np.abs(second_best[inside] - second[inside]).max() < 1e-4
 
 
 @pytest.mark.parametrize("affine_std", [0.0, 0.1])
 def test_alignment_finds_the_true_place_under_gain_and_bias(affine_std):
     left, right = stereo_scene()
-    one, two = (prepare_view(i, MultiScaleCorners().detect(i)) for i in (left, right))
+    one, two = (prepare_image(i, MultiScaleCorners().detect(i)) for i in (left, right))
     xy2 = np.stack(np.meshgrid(np.arange(60, 360, 21), np.arange(40, 260, 21)), -1).reshape(-1, 2) + 0.37
     xy1 = xy2 + np.stack([disparity(xy2), np.zeros(len(xy2))], 1)
     start = xy2 + RNG.uniform(-0.8, 0.8, xy2.shape)
@@ -133,7 +133,7 @@ def test_alignment_finds_the_true_place_under_gain_and_bias(affine_std):
     shear = 4.0 / 45.0 * np.sin(xy2[:, 1] / 45.0)
     affine = np.zeros((len(xy2), 2, 2))
     affine[:, 0, 0], affine[:, 0, 1], affine[:, 1, 1] = slope, shear * slope, 1.0
-    found, maps, score = align_windows(
+    found, maps, score = _align_windows(
         one.pyramid,
         two.pyramid,
         (xy1, np.ones(len(xy1), np.float32), start, affine),
@@ -157,7 +157,7 @@ def test_alignment_recovers_an_unknown_affine_map():
     xy1 = np.stack(np.meshgrid(np.arange(80, 160, 9.0), np.arange(80, 160, 9.0)), -1).reshape(-1, 2)
     xy2 = (xy1 - 120) @ truth.T + 120
     start = np.tile(np.eye(2), (len(xy1), 1, 1))
-    found, maps, score = align_windows(
+    found, maps, score = _align_windows(
         one.pyramid, two.pyramid, (xy1, np.ones(len(xy1), np.float32), xy2 + 0.4, start), (20, 0.1, 3.0, 1.0)
     )
     assert (score > 0.95).mean() > 0.9
@@ -170,8 +170,8 @@ def test_alignment_gives_up_on_blank_windows_and_outside():
     xy = np.array([[50.0, 50.0], [2.0, 50.0], [np.nan, 50.0]])
     args = (xy, np.ones(3, np.float32), xy, np.tile(np.eye(2), (3, 1, 1)))
     for one, two in ((blank, rich), (rich, blank)):
-        assert not align_windows(one.pyramid, two.pyramid, args, (5, 0.1, 3.0, 1.0))[2].any()
-    assert (align_windows(rich.pyramid, rich.pyramid, args, (5, 0.1, 3.0, 1.0))[2] > 0.99).tolist() == [
+        assert not _align_windows(one.pyramid, two.pyramid, args, (5, 0.1, 3.0, 1.0))[2].any()
+    assert (_align_windows(rich.pyramid, rich.pyramid, args, (5, 0.1, 3.0, 1.0))[2] > 0.99).tolist() == [
         True,
         False,
         False,
@@ -186,7 +186,7 @@ def test_alignment_drops_patches_with_weak_gradients():
     kept = []
     for gray in (rich, 128 + 0.05 * (straight - 128)):
         one, two = prepared(gray + noise[0]), prepared(gray + noise[1])
-        kept.append(align_windows(one.pyramid, two.pyramid, args, (12, 0.0, 3.0, 0.12))[2][0] > 0.0)
+        kept.append(_align_windows(one.pyramid, two.pyramid, args, (12, 0.0, 3.0, 0.12))[2][0] > 0.0)
     assert kept == [True, False]
 
 
@@ -255,7 +255,7 @@ def test_products_of_corner_windows_are_normalised_cross_correlations(colour, si
     image = Image("a.png", rgb, (90, 80))
     xy = np.round(rng.uniform(20, 60, (12, 2)))
     features = Features(xy, np.ones(12, np.float32), np.ones(12, np.float32))
-    found = prepare_view(image, features, window=side, colour=colour).patches
+    found = prepare_image(image, features, window=side, colour=colour).patches
     planes = list(np.moveaxis(rgb.astype(np.float64), 2, 0)) if colour else [image.gray.astype(np.float64)]
     k = side // 2
 
@@ -274,7 +274,7 @@ def test_products_of_corner_windows_are_normalised_cross_correlations(colour, si
 def test_union_never_puts_two_corners_of_a_view_together():
     view_of = np.repeat(np.arange(5), 20)
     edges = RNG.integers(0, 100, (150, 2))
-    root = unite(edges, view_of, 5)
+    root = _union_corners(edges, view_of, 5)
     member = [{n} for n in range(100)]
     for a, b in edges:
         together = member[a] | member[b]
@@ -291,7 +291,7 @@ def test_maps_chain_along_the_matches():
     # Observation 1 is the middle: edge 0 leads from 0 to 1 (walked backwards), edge 1 from 1 to 2.
     edges = np.array([[0, 1], [1, 2]])
     xy1, xy2 = xy[:2], np.array([[20.5, 12.25], [31.2, 12.9]])
-    place, maps = chain_maps(edges, xy1, xy2, a, xy, np.array([1]))
+    place, maps = _chain_affines(edges, xy1, xy2, a, xy, np.array([1]))
     assert np.allclose(place[0], xy1[0] + np.linalg.inv(a[0]) @ (xy[1] - xy2[0]))
     assert np.allclose(place[1:], [xy[1], xy2[1]])
     assert np.allclose(maps, [np.linalg.inv(a[0]), np.eye(2), a[1]])

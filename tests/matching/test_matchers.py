@@ -23,7 +23,7 @@ SWITCHED = [
     SeedsAndGrowth(coarse_first=False, rematch=False),
     SeedsAndGrowth(align=False),
     SeedsAndGrowth(growth=False, align=False),
-    StrengthOfMatch(weight="relative-difference", least_correlation=0.7, least_strength=0.15),
+    StrengthOfMatch(weight="relative-difference", min_correlation=0.7, min_strength=0.15),
     StrengthOfMatch(use_direction=False, use_distance=False),
     StrengthOfMatch(window=11, colour=True),
     StrengthOfMatch(align=True),
@@ -163,7 +163,7 @@ def test_relative_difference_and_thresholds_drop_wrong_matches():
     mixed = Image("mixed.png", rgb, right.original_size)
     wrong = []
     for weight, least in (("product", 0.0), ("product", 0.4), ("relative-difference", 0.4)):
-        variant = StrengthOfMatch(weight=weight, least_strength=least)
+        variant = StrengthOfMatch(weight=weight, min_strength=least)
         matches = run(variant, *views(HarrisCorners(), variant, left, mixed))
         wrong.append(int((errors(matches) >= 1.5).sum()))
         assert (errors(matches) < 1.5).sum() > 700
@@ -174,7 +174,7 @@ def test_relative_difference_and_thresholds_drop_wrong_matches():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("window", 8), ("radius_rel", 0.0), ("candidates", 0), ("tolerance", 0.0), ("least_strength", 5.0)],
+    [("window", 8), ("radius_rel", 0.0), ("candidates", 0), ("tolerance", 0.0), ("min_strength", 5.0)],
 )
 def test_a_strength_that_cannot_be_is_refused(field, value):
     with pytest.raises(ValueError, match=field):
@@ -185,7 +185,7 @@ def test_a_strength_that_cannot_be_is_refused(field, value):
     ("field", "value"),
     [
         ("neighbours", 0),
-        ("least_seeds", 0),
+        ("min_seeds", 0),
         ("ratio", 0.0),
         ("grown_ratio", -1.0),
         ("band_rel", 0.0),

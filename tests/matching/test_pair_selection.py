@@ -17,9 +17,8 @@ from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching.overlap import (
     OverlapTest,
+    _count_agreeing,
     bow_similarity,
-    most_agreeing,
-    mutual_best,
     pair_array,
     subset_seeds,
 )
@@ -28,9 +27,10 @@ from thesisrecon.matching.pair_selection import (
     ListedPairs,
     OverlapEstimate,
     SequenceWindow,
-    connecting_pairs,
-    most_alike,
+    _connecting_pairs,
+    _most_similar,
 )
+from thesisrecon.matching.seeds import mutual_best
 from thesisrecon.records import Features
 
 SIDE, CROPS = 260, 14
@@ -87,7 +87,7 @@ def test_listed_pairs_in_any_order_and_without_those_left_out():
 @pytest.mark.parametrize(
     ("listed", "words"),
     [
-        ((("00.jpg", "nope.jpg"),), r"names 'nope.jpg', which is none of the 5 photographs"),
+        ((("00.jpg", "nope.jpg"),), r"names 'nope.jpg', which is not among the 5 images"),
         ((("zz", "nope.jpg"), ("x", "y")), r"names 'nope.jpg' and 3 more"),
         ((), "leaves no pair to match"),
         ((("00.jpg", "blank.jpg"),), "photographs were left out"),
@@ -103,7 +103,7 @@ def test_a_list_that_does_not_fit_the_photographs_is_refused(listed, words):
     [
         (lambda: ListedPairs((("a", "a"),)), "pairs 'a' with itself"),
         (lambda: ListedPairs((("a", "b"), ("b", "a"))), "'b', 'a' twice"),
-        (lambda: SequenceWindow(0), "a window of 0 gives no pairs"),
+        (lambda: SequenceWindow(0), "window .* must be at least 1"),
         (lambda: SequenceWindow(-3), "a window of -3"),
         (lambda: OverlapEstimate(nearest=0), "nearest must be at least 1"),
         (lambda: OverlapEstimate(words=0), "words must be at least 1"),
@@ -159,7 +159,7 @@ def test_pairs_that_overlap_are_chosen_and_few_others(windows):
 
 
 def test_every_photograph_is_paired_and_all_hang_together(windows):
-    strict = replace(ESTIMATE, least_evidence=1e9)
+    strict = replace(ESTIMATE, min_evidence=1e9)
     pairs = choose(strict, CROPS, windows.features).pairs
     assert set(pairs.ravel().tolist()) == set(range(CROPS))
     assert len(pairs) <= 2 * CROPS
@@ -226,7 +226,7 @@ def test_photographs_of_one_wall_use_the_same_words(windows):
 def test_the_most_alike_of_each(n, count, seed):
     alike = np.random.default_rng(seed).random((n, n))
     alike += alike.T
-    pairs = as_set(most_alike(alike, count))
+    pairs = as_set(_most_similar(alike, count))
     for i in range(n):
         others = sorted((j for j in range(n) if j != i), key=lambda j: -alike[i, j])[:count]
         assert {(min(i, j), max(i, j)) for j in others} <= pairs
@@ -240,7 +240,7 @@ def test_connecting_pairs_join_separate_groups_by_their_best_pairs_only(n, seed)
     order += order.T
     every = list(combinations(range(n), 2))
     chosen = pair_array([pair for pair in every if rng.random() < 0.2])
-    added = connecting_pairs(chosen, order)
+    added = _connecting_pairs(chosen, order)
     parts, part = _parts(n, chosen)
     assert len(added) == parts - 1
     assert _parts(n, np.concatenate([chosen, added]))[0] == 1
@@ -258,8 +258,8 @@ def mutual_best_numpy(correlation, xy2, apart2):
     best, back = correlation.argmax(axis=1), correlation.argmax(axis=0)
     mutual = back[best] == np.arange(len(best))
     apart = ((xy2[None] - xy2[best][:, None]) ** 2).sum(axis=2) > apart2[best][:, None]
-    competing_model = np.where(apart, correlation, -1.0).max(axis=1)
-    return np.where(mutual, best, -1), np.where(mutual, competing_model, -1.0)
+    second_best = np.where(apart, correlation, -1.0).max(axis=1)
+    return np.where(mutual, best, -1), np.where(mutual, second_best, -1.0)
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
@@ -268,13 +268,13 @@ def test_mutual_best_is_its_numpy_twin(rows, columns, seed):
     correlation = rng.uniform(-1.0, 1.0, (rows, columns)).astype(np.float32)
     xy2 = rng.uniform(0.0, 10.0, (columns, 2)).astype(np.float32)
     apart2 = rng.uniform(0.0, 40.0, columns).astype(np.float32)
-    index, competing_model = mutual_best(correlation, xy2, apart2)
-    wanted, wanted_rival = mutual_best_numpy(correlation, xy2, apart2)
+    index, _, second_best = mutual_best([correlation[:3], correlation[3:]], xy2, apart2)
+    wanted, wanted_second = mutual_best_numpy(correlation, xy2, apart2)
     assert index.tolist() == wanted.tolist()
-    np.testing.assert_array_equal(competing_model, wanted_rival.astype(np.float32))
+    np.testing.assert_array_equal(second_best, wanted_second.astype(np.float32))
 
 
-def most_agreeing_numpy(xy1, xy2, scale, angle, limits):
+def count_agreeing_numpy(xy1, xy2, scale, angle, limits):
     z1, z2 = xy1 @ [1.0, 1.0j], xy2 @ [1.0, 1.0j]
     turn = scale * np.exp(1j * angle)
     miss = np.abs(z2[:, None] + turn[:, None] * (z1[None] - z1[:, None]) - z2[None])
@@ -286,10 +286,10 @@ def most_agreeing_numpy(xy1, xy2, scale, angle, limits):
 
 
 @given(st.integers(1, 14), st.integers(0, 2**31))
-def test_most_agreeing_is_its_numpy_twin(n, seed):
+def test_count_agreeing_is_its_numpy_twin(n, seed):
     rng = np.random.default_rng(seed)
     xy1, xy2 = rng.uniform(0.0, 30.0, (2, n, 2))
     scale, angle = rng.uniform(0.5, 2.0, n), rng.uniform(-4.0, 4.0, n)
     given_limits = np.array([12.0, 0.6, 0.9])
-    wanted = most_agreeing_numpy(xy1, xy2, scale, angle, given_limits)
-    assert most_agreeing(xy1, xy2, scale, angle, given_limits) == wanted
+    wanted = count_agreeing_numpy(xy1, xy2, scale, angle, given_limits)
+    assert _count_agreeing(xy1, xy2, scale, angle, given_limits) == wanted

@@ -10,17 +10,10 @@ from PIL import ImageDraw
 
 from tests.surface.sphere import SHAPE, photograph, ring_of
 from tests.surface.sphere import K as SPHERE_K
+from tests.synthetic import reconstruction_of
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.records import (
-    HeldOut,
-    IntrinsicInterval,
-    MetricResult,
-    Reconstruction,
-    StageReport,
-    Tracks,
-    TwoView,
-)
+from thesisrecon.records import HeldOut, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
 from thesisrecon.report.data import ReportData, ReportImage
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.mesh import simplify_mesh
@@ -167,15 +160,13 @@ def _reconstruction(X, cameras, xy, seen, rng):
     registered = np.arange(count) < count - 1
     P = np.stack([compose_camera(K, R, t) for R, t in zip(*cameras, strict=True)])
     tracks = Tracks(view, point, clean + rng.normal(0, NOISE_PX, clean.shape), count, len(X))
-    return Reconstruction(
-        stratum="metric",
-        P=P * registered[:, None, None],
+    return reconstruction_of(
+        P * registered[:, None, None],
+        SIZE,
         X=homogenize(X),
-        registered=registered,
-        valid=np.ones(len(X), dtype=bool),
-        inlier=rng.random(len(point)) < 0.97,
         tracks=tracks,
-        sizes=np.tile(np.array(SIZE), (count, 1)),
+        registered=registered,
+        inlier=rng.random(len(point)) < 0.97,
         sigma_px=NOISE_PX,
         reasons=(*[""] * (count - 1), "only 14 matches lead to known points (20 are needed)"),
         K=np.tile(K, (count, 1, 1)) * registered[:, None, None],
@@ -253,24 +244,10 @@ def sphere_model():
 @cache
 def sphere_reconstruction():
     maps = ring_of()
-    count = len(maps)
     X = np.random.default_rng(2).normal(size=(300, 3))
     X /= np.linalg.norm(X, axis=1, keepdims=True)
-    nothing = np.zeros(0, dtype=np.int64)
-    return Reconstruction(
-        stratum="metric",
-        P=np.stack([m.P for m in maps]),
-        X=homogenize(X),
-        registered=np.ones(count, dtype=bool),
-        valid=np.ones(len(X), dtype=bool),
-        inlier=np.zeros(0, dtype=bool),
-        tracks=Tracks(nothing, nothing, np.zeros((0, 2)), count, len(X)),
-        sizes=np.tile(np.array(SPHERE_SIZE), (count, 1)),
-        sigma_px=0.3,
-        reasons=("",) * count,
-        K=np.tile(SPHERE_K, (count, 1, 1)),
-        distortion=np.zeros((count, 3)),
-    )
+    P, K = np.stack([m.P for m in maps]), np.tile(SPHERE_K, (len(maps), 1, 1))
+    return reconstruction_of(P, SPHERE_SIZE, X=homogenize(X), sigma_px=0.3, K=K)
 
 
 def sphere_run():

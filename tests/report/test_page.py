@@ -357,7 +357,7 @@ def test_records_that_disagree_are_refused():
     with pytest.raises(ValueError, match=r"colors must be \(100, 3\)"):
         dataclasses.replace(data, colors=np.zeros((99, 3), dtype=np.uint8))
     wrong = dataclasses.replace(data.pairs[0], j=99)
-    with pytest.raises(ValueError, match="pairs must name views"):
+    with pytest.raises(ValueError, match="pairs must refer to views"):
         dataclasses.replace(data, pairs=[wrong])
 
 

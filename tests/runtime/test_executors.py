@@ -23,7 +23,7 @@ from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io.files import read_json
 from thesisrecon.pipeline import state as preparing
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.pipeline.state import PreparedViews, batches_of_pairs
+from thesisrecon.pipeline.state import PreparedViews, batch_pairs
 from thesisrecon.runtime import dask_cluster as cluster
 from thesisrecon.runtime import executors as workers
 from thesisrecon.runtime.executors import Workers
@@ -279,9 +279,9 @@ def test_prepared_views_stay_within_their_memory_bound(monkeypatch):
     assert [views[5] is views[5], made] == [True, [0, 1, 2, 3, 4, 5]]
     assert len(views[0]) == 100
     assert made[-1] == 0
-    assert len(views.part([4, 5])) == 2
+    assert len(views.subset([4, 5])) == 2
     with pytest.raises(IndexError):
-        views.part([4, 5])[0]
+        views.subset([4, 5])[0]
 
 
 @pytest.mark.parametrize(("pairs", "workers_there"), [(91, 2), (7, 4), (3000, 2)])
@@ -289,7 +289,7 @@ def test_batches_hold_every_pair_once_and_few_views(pairs, workers_there):
     views = next(n for n in range(100) if n * (n - 1) // 2 >= pairs)
     every = [(i, j) for i in range(views) for j in range(i + 1, views)][:pairs]
     numbers = list(range(0, pairs, 2))
-    dealt = batches_of_pairs(every, numbers, workers_there)
+    dealt = batch_pairs(every, numbers, workers_there)
     assert sorted(n for batch in dealt for n in batch) == numbers
     assert len(dealt) >= min(len(numbers), 8 * workers_there)
     assert min(len(batch) for batch in dealt[:-1]) == max(len(batch) for batch in dealt)

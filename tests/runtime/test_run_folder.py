@@ -131,10 +131,10 @@ IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "photographs": {"a.
 
 def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp_path):
     directory = RunDirectory(tmp_path / "new" / "out")
-    with directory.claimed(IDENTITY, overwrite=False):
+    with directory.claim(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
         directory.stage("01").save("a", "key", some_features())
-    with directory.claimed(IDENTITY, overwrite=False):
+    with directory.claim(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
     changed = [
         ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 there and is 6 here"),
@@ -147,24 +147,24 @@ def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp
         ),
     ]
     for identity, words in changed:
-        with pytest.raises(UsageError, match=words), directory.claimed(identity, overwrite=False):
+        with pytest.raises(UsageError, match=words), directory.claim(identity, overwrite=False):
             pass
     assert read_json(directory.path / "run.json") == IDENTITY
     assert directory.stage("01").load("a", "key") is not None
-    with directory.claimed(changed[0][0], overwrite=True):
+    with directory.claim(changed[0][0], overwrite=True):
         assert directory.stage("01").load("a", "key") is not None
 
 
 def test_settings_are_judged_before_the_photographs_are_known(tmp_path):
     directory = RunDirectory(tmp_path)
-    with directory.claimed(IDENTITY, overwrite=False):
+    with directory.claim(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
     wishes = {name: value for name, value in IDENTITY.items() if name != "photographs"}
-    with directory.claimed(wishes, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
+    with directory.claim(wishes, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
         directory.adopt({**IDENTITY, "photographs": {"a.jpg": "1"}}, overwrite=False)
     with (
         pytest.raises(UsageError, match="seed was 0"),
-        directory.claimed({**wishes, "seed": 2}, overwrite=False),
+        directory.claim({**wishes, "seed": 2}, overwrite=False),
     ):
         pass
 
@@ -175,7 +175,7 @@ def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_p
 
     def adopt(seed):
         identity = {**IDENTITY, "seed": seed}
-        with directory.claimed(identity, overwrite=True):
+        with directory.claim(identity, overwrite=True):
             directory.adopt(identity, overwrite=True, results=results)
 
     adopt(0)
@@ -194,7 +194,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
     with (
         pytest.raises(UsageError, match=r"holds 'letter\.txt', which is of no run"),
-        RunDirectory(tmp_path).claimed(IDENTITY, overwrite=True),
+        RunDirectory(tmp_path).claim(IDENTITY, overwrite=True),
     ):
         pass
     assert not (tmp_path / "run.json").exists()
@@ -203,12 +203,12 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
 def test_two_runs_cannot_share_a_folder(tmp_path):
     directory = RunDirectory(tmp_path / "out")
     with (
-        directory.claimed(IDENTITY, overwrite=False),
+        directory.claim(IDENTITY, overwrite=False),
         pytest.raises(UsageError, match="another run is writing"),
-        directory.claimed(IDENTITY, overwrite=False),
+        directory.claim(IDENTITY, overwrite=False),
     ):
         pass
-    with directory.claimed(IDENTITY, overwrite=False):
+    with directory.claim(IDENTITY, overwrite=False):
         pass
 
 
@@ -216,7 +216,7 @@ def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(UsageError, match="cannot be written"),
-        RunDirectory(tmp_path / "file" / "out").claimed(IDENTITY, overwrite=False),
+        RunDirectory(tmp_path / "file" / "out").claim(IDENTITY, overwrite=False),
     ):
         pass
 

@@ -13,7 +13,7 @@ from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime.executors import ProcessPool
-from thesisrecon.runtime.signals import CODES, advised
+from thesisrecon.runtime.signals import CODES, with_resume_advice
 from validation.studies.robustness import Stop, different, outputs, stop_table, stopped
 
 ROOT = Path(__file__).parents[2]
@@ -24,11 +24,11 @@ PROGRAM = """
 import hashlib, sys, time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from thesisrecon.stops import advised, obey_signals
+from thesisrecon.runtime.signals import with_resume_advice, install_signal_handlers
 from thesisrecon.workers import ProcessPool
 if __name__ == "__main__":
-    obey_signals("toy")
-    with advised("it goes on\\nlater"):
+    install_signal_handlers("toy")
+    with with_resume_advice("it goes on\\nlater"):
         {work}
 """
 IGNORING = """
@@ -148,7 +148,11 @@ def test_a_pool_is_abandoned_at_once():
 
 
 def test_an_interrupt_carries_advice():
-    with pytest.raises(KeyboardInterrupt, match="go on"), advised("begin again"), advised("go on"):
+    with (
+        pytest.raises(KeyboardInterrupt, match="go on"),
+        with_resume_advice("begin again"),
+        with_resume_advice("go on"),
+    ):
         raise KeyboardInterrupt
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from tests.synthetic import texture
+from tests.synthetic import reconstruction_of, texture
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import (
     camera_from_centre,
@@ -104,17 +104,5 @@ def _reconstruction(P, lens, depths, seed):
     views, points = np.concatenate(view), np.concatenate(point)
     order = np.lexsort((views, points))
     tracks = Tracks(views[order], points[order], np.concatenate(seen_at)[order], len(P), len(X))
-    return Reconstruction(
-        stratum="metric",
-        P=P,
-        X=homogenize(X),
-        registered=np.ones(len(P), dtype=bool),
-        valid=np.ones(len(X), dtype=bool),
-        inlier=np.ones(len(views), dtype=bool),
-        tracks=tracks,
-        sizes=np.tile(np.array(SIZE), (len(P), 1)),
-        sigma_px=0.1,
-        reasons=("",) * len(P),
-        K=np.tile(K, (len(P), 1, 1)),
-        distortion=np.tile(lens, (len(P), 1)),
-    )
+    lenses = {"K": np.tile(K, (len(P), 1, 1)), "distortion": np.tile(lens, (len(P), 1))}
+    return reconstruction_of(P, SIZE, X=homogenize(X), tracks=tracks, **lenses)

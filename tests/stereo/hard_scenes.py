@@ -7,11 +7,11 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from tests.stereo.depth_scenes import Walled
-from tests.synthetic import texture
+from tests.synthetic import reconstruction_of, texture
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera, project
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.records import Image, Reconstruction, Tracks
+from thesisrecon.records import Image, Tracks
 
 PER_UNIT = 60.0
 """Texels a unit of length."""
@@ -148,17 +148,5 @@ def with_points(P, sizes, X, view, point, xy):
     """A metric reconstruction of points X (N, 3) with observations (K,)."""
     order = np.lexsort((view, point))
     tracks = Tracks(view[order], point[order], xy[order], len(P), len(X))
-    return Reconstruction(
-        stratum="metric",
-        P=P,
-        X=homogenize(X),
-        registered=np.ones(len(P), dtype=bool),
-        valid=np.ones(len(X), dtype=bool),
-        inlier=np.ones(len(view), dtype=bool),
-        tracks=tracks,
-        sizes=sizes,
-        sigma_px=0.1,
-        reasons=("",) * len(P),
-        K=np.stack([decompose_camera(p)[0] for p in P]),
-        distortion=np.zeros((len(P), 3)),
-    )
+    K = np.stack([decompose_camera(p)[0] for p in P])
+    return reconstruction_of(P, sizes, X=homogenize(X), tracks=tracks, K=K)

@@ -139,7 +139,7 @@ def test_the_atlas_is_no_larger_than_allowed_and_the_same_for_any_threads(sphere
 
 def test_an_atlas_that_cannot_be_small_enough_is_rejected(sphere):
     views = [photograph(m) for m in ring_of()]
-    with pytest.raises(StageFailure, match=r"too large; \d+ pieces take \d+ texels, allowed are 40"):
+    with pytest.raises(StageFailure, match=r"too large; \d+ charts need \d+ texels, the limit is 40"):
         TextureAtlas(max_texels=40).texture(sphere, views)
     with pytest.raises(ValueError, match="max_texels >= 1"):
         TextureAtlas(max_texels=0)

@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.synthetic import reconstruction_of
 from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project_camera
 from thesisrecon.io.images import read_images
-from thesisrecon.records import Features, Image, Reconstruction, Tracks, TwoView
+from thesisrecon.records import Features, Image, TwoView
 from validation.scenes.real import load_real_scene
 from validation.studies.front_end import (
     CONTRADICTS_PX,
@@ -111,22 +112,9 @@ def _model_and_pair(k1, moved):
         np.array([[0.0] * 3, [-0.8, 0.0, 0.1]]),
     )
     xy1, xy2 = (project_camera(K, R, t[i], X, distortion=k1) for i in range(2))
-    nothing = np.zeros(0, dtype=np.int64)
     P = np.stack([compose_camera(K, R, t[0]), compose_camera(K, R, t[1] + [0.0, moved, 0.0])])
-    model = Reconstruction(
-        stratum="metric",
-        P=P,
-        X=np.zeros((0, 4)),
-        registered=np.ones(2, bool),
-        valid=np.zeros(0, bool),
-        inlier=np.zeros(0, bool),
-        tracks=Tracks(nothing, nothing, np.zeros((0, 2)), 2, 0),
-        sizes=np.array([[640, 480]] * 2),
-        sigma_px=0.1,
-        reasons=("", ""),
-        K=np.stack([K, K]),
-        distortion=np.tile([k1, 0.0, 0.0], (2, 1)),
-    )
+    lenses = {"K": np.stack([K, K]), "distortion": np.tile([k1, 0.0, 0.0], (2, 1))}
+    model = reconstruction_of(P, (640, 480), **lenses)
     index = np.arange(50)
     affine = np.broadcast_to(np.eye(2), (50, 2, 2))
     pair = TwoView(0, 1, np.eye(3), 0.1, index, index, xy1, xy2, affine, 50, 0.0, True)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.synthetic import reconstruction_of
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
-from thesisrecon.records import IntrinsicInterval, MetricResult, Reconstruction, Tracks
+from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
 from thesisrecon.views.image_similarity import GREY
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection, rotation_errors_deg
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
@@ -54,13 +55,7 @@ K = np.array([[1000.0, 0.0, 500.0], [0.0, 1002.001, 300.0], [0.0, 0.0, 1.0]])
 def result_of(values):
     """A result that states these focals, their sigmas and sources; the last view is not registered."""
     n = len(values) + 1
-    nothing = np.zeros(0, dtype=np.int64)
-    registered = np.arange(n) < n - 1
-    model = Reconstruction(
-        "metric", np.zeros((n, 3, 4)), np.zeros((0, 4)), registered, np.zeros(0, dtype=bool),
-        np.zeros(0, dtype=bool), Tracks(nothing, nothing, np.zeros((0, 2)), n, 0),
-        np.tile(np.array([1000, 600]), (n, 1)), 1.0, ("",) * n,
-    )  # fmt: skip
+    model = reconstruction_of(np.zeros((n, 3, 4)), (1000, 600), registered=np.arange(n) < n - 1, sigma_px=1.0)
     intervals = [
         {
             "focal_px": IntrinsicInterval(value, std, source),
@@ -94,7 +89,9 @@ def test_focal_errors_are_of_the_geometric_mean_and_unknown_without_a_camera():
 def test_a_camera_is_named_by_a_wide_interval_a_shrunk_value_a_sentence_or_its_absence():
     values = [(1000.0, 1.0, "own"), (1000.0, 50.0, "own"), (1000.0, 1.0, "shrunk towards the others")]
     result = result_of([*values, (1000.0, 1.0, "own")])
-    result = replace(result, warnings=("Image #3: its own matches determine the focal length only to 20% (1 sigma)",))
+    result = replace(
+        result, warnings=("Image #3: its own matches determine the focal length only to 20% (1 sigma)",)
+    )
     assert [named(result, view) for view in range(5)] == [False, True, True, True, True]
 
 
@@ -140,22 +137,9 @@ def _reconstruction(truth, *, k1=0.0):
         [project_camera(K, r, s, X[:, :3], distortion=k1) for K, r, s in zip(truth.K, R, t, strict=True)]
     )
     tracks = Tracks(view, point, xy.reshape(V, N, 2).transpose(1, 0, 2).reshape(-1, 2), V, N)
-    every = np.ones
-    return Reconstruction(
-        "metric",
-        # Any positive scale of P is the same camera.
-        3.7 * compose_camera(truth.K, R, t),
-        X,
-        every(V, bool),
-        every(N, bool),
-        every(V * N, bool),
-        tracks,
-        np.tile([1020, 780], (V, 1)),
-        0.1,
-        ("",) * V,
-        truth.K.copy(),
-        np.tile([k1, 0.0, 0.0], (V, 1)),
-    )
+    # Any positive scale of P is the same camera.
+    P, lens = 3.7 * compose_camera(truth.K, R, t), np.tile([k1, 0.0, 0.0], (V, 1))
+    return reconstruction_of(P, (1020, 780), X=X, tracks=tracks, K=truth.K.copy(), distortion=lens)
 
 
 def test_the_truth_in_another_frame_has_no_error():

@@ -21,10 +21,10 @@ import sys
 from pathlib import Path
 from tests.validation.harness.test_harness import toy_wishes
 from tests.validation.harness.test_stops import hanging_stages
-from thesisrecon.stops import advised, obey_signals
+from thesisrecon.runtime.signals import with_resume_advice, install_signal_handlers
 from validation.harness.schedule import run_tasks
-obey_signals("toy")
-with advised("begin again"):
+install_signal_handlers("toy")
+with with_resume_advice("begin again"):
     run_tasks(toy_wishes(Path(sys.argv[1]), quick=False), hanging_stages(), print)
 """
 
