@@ -189,8 +189,8 @@ def test_the_others_become_a_model(folder, tmp_path, capsys):
     assert run_command(command) == 0
     printed = capsys.readouterr()
     assert printed.err == ""
-    assert "5 of 6 photographs registered" in printed.out
-    assert "refused: elsewhere.png" in printed.out
+    assert "5 of 6 images registered" in printed.out
+    assert "not registered: elsewhere.png" in printed.out
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert [entry["name"] for entry in summary["refused"]] == ["elsewhere.png"]
     mesh = next(iter(trimesh.load(out / "model.glb").geometry.values()))

@@ -37,13 +37,13 @@ NO_PHOTOGRAPHS = [
     ("bomb.png", writes(files.bomb()), "claims more than 178 megapixels"),
     ("claim.png", writes(files.png(2**31 - 1, 2**31 - 1)), "claims more than 178 megapixels"),
     ("note.png", writes(files.text_bomb()), "cannot be decoded: Decompressed "),
-    ("one.png", writes(files.encoded("PNG", picture(size=(1, 1)))), "is only 1 x 1 pixels"),
+    ("one.png", writes(files.encoded("PNG", picture(size=(1, 1)))), "has only 1 x 1 pixels"),
     (
         "narrow.png",
         writes(files.encoded("PNG", picture(size=(2, 10_000)))),
-        "is 2 x 10000 pixels: too narrow",
+        "has 2 x 10000 pixels: too narrow",
     ),
-    ("flat.bmp", writes(files.encoded("BMP", picture(size=(1, 30)))), "is only 1 x 30 pixels"),
+    ("flat.bmp", writes(files.encoded("BMP", picture(size=(1, 30)))), "has only 1 x 30 pixels"),
     ("large.jpg", sparse(2**33, files.encoded("JPEG")), "is a file of 8.0 GiB"),
     ("blank.png", writes(files.encoded("PNG", PIL.Image.new("RGB", (99, 99)))), "is blank"),
 ]
@@ -143,7 +143,7 @@ def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, run_
     (folder / "sub" / "a.png").write_bytes(files.encoded("PNG", picture(2)))
     (folder / "sub" / "up").symlink_to(folder)
     said = run_cli(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *FEATURES], 0)
-    assert "2 photographs" in said
+    assert "2 images" in said
     only = tmp_path / "folders only"
     only.mkdir()
     (only / "sub").symlink_to(folder)
@@ -158,7 +158,7 @@ def test_thousands_of_tiny_files_are_one_sentence(tmp_path, run_cli):
     for k in range(2000):
         (tmp_path / "in" / f"{k:04d}.png").write_bytes(tiny)
     said = run_cli(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
-    assert "is only 8 x 8 pixels" in said
+    assert "has only 8 x 8 pixels" in said
     assert "and 1997 more" in said
 
 
@@ -174,8 +174,8 @@ def test_a_file_that_vanishes_while_others_are_read(tmp_path, run_cli, monkeypat
 
     monkeypatch.setattr(PIL.Image, "open", open_and_take_away)
     said = run_cli(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *FEATURES], 0)
-    assert "refused: b1.png: cannot be read: No such file or directory" in said
-    assert "in 3 photographs" in said
+    assert "not registered: b1.png: cannot be read: No such file or directory" in said
+    assert "in 3 images" in said
 
 
 NAMES = [

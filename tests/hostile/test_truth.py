@@ -30,7 +30,7 @@ def test_a_binary_model_that_is_cut_anywhere_is_refused(name, tmp_path, validate
     for size in range(0, len(whole), 100):
         path.write_bytes(whole[:size])
         said = validated(["report", "-o", str(tmp_path / "out"), "--images", str(folder)])
-        assert f"{name}.bin is not a sound COLMAP file; it " in said
+        assert f"{name}.bin is not a valid COLMAP file; it " in said
         assert "export the model again" in said
     assert not (tmp_path / "out").exists()
 
@@ -43,7 +43,7 @@ TEXTS = [
     ("cameras", " 512 384", f" {'9' * 9999} 384", "is no camera"),
     ("images", "\n1 ", "\n1 nan ", "no image"),
     ("images", "a_b.jpg", "x y\x1b[31m.jpg", "missing or doubled: ['x y\\x1b[31m.jpg']"),
-    ("points3D", "\n1 ", "\n1 nan ", "points3D.txt is not a sound COLMAP file"),
+    ("points3D", "\n1 ", "\n1 nan ", "points3D.txt is not a valid COLMAP file"),
     ("points3D", "\n1 ", "\n-1 ", "holds a number out of range"),
 ]
 

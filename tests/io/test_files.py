@@ -237,7 +237,7 @@ def test_the_mark_and_the_line_ends_of_other_systems_belong_to_no_name(tmp_path)
 def test_a_line_that_is_not_a_pair_is_named(tmp_path, line):
     path = tmp_path / "pairs.txt"
     path.write_text(f"a.jpg b.jpg\n{line}\n", encoding="utf-8")
-    with pytest.raises(UsageError, match=r"line 2 of .* takes two file names"):
+    with pytest.raises(UsageError, match=r"line 2 of .* must hold two file names"):
         read_pairs(path)
 
 
@@ -278,7 +278,7 @@ def test_cameras_are_those_of_the_file_in_its_order(tmp_path):
     ("content", "words"),
     [
         ({"cameras": []}, "holds no camera"),
-        ({"cameras": [{**ONE, "K": [[1.0, 0], [0, 1.0]]}]}, "does not hold cameras of this program"),
+        ({"cameras": [{**ONE, "K": [[1.0, 0], [0, 1.0]]}]}, "does not hold valid cameras written by thesisrecon"),
         ({"cameras": [{**ONE, "t": [None, 0, 0]}]}, "does not hold cameras"),
         ({"cameras": [{"name": "a.jpg"}]}, "does not hold cameras"),
         ({"cameras": {"0000.jpg": {}}}, "does not hold cameras"),

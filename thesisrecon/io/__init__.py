@@ -1,1 +1,1 @@
-"""Files: photographs, COLMAP models, the run directory."""
+"""File input and output: images, COLMAP models, meshes, text and JSON."""

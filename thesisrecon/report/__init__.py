@@ -1,1 +1,1 @@
-"""The HTML page of one run."""
+"""The HTML report and the summary of one run."""
