@@ -55,6 +55,8 @@ from validation.studies.measuring import call_apart
 from validation.studies.rectification import undistorted
 from validation.studies.runner import CACHE, Part, Rows, load_scene, text_table
 
+# ---------------------------------------------------------------- kermit
+
 OUR_MODEL, COLMAP_MODEL = "our model", "COLMAP's"
 CONTRADICTS_PX = 3.0
 FEW, MANY = 30, 100
@@ -169,6 +171,8 @@ def _kermit_cell(pair: JudgedPair) -> str:
     return f"{pair.view.inliers} / {models}{'' if pair.view.accepted else ', refused'}"
 
 
+# ---------------------------------------------------------------- time
+
 SCENE = "fountain-P11"
 COLMAP = "COLMAP"
 SHARE = 0.5
@@ -258,6 +262,8 @@ def check_time(runs: Mapping[str, Timed]) -> list[Metric]:
             rows.add(stage, {name: seconds}, "s")
     return rows
 
+
+# ---------------------------------------------------------------- invariance
 
 REPEATED_PX, RIGHT_PX = 1.5, 1.5
 IMAGES = (("fountain-P11", 5), ("Herz-Jesus-P8", 3))
@@ -394,6 +400,8 @@ def check_invariance(title: str, copies: dict[str, dict[str, CopyScore]]) -> lis
             rows.add(f"{copy}: {name}", {m: read(score) for m, score in by.items()}, unit)
     return rows
 
+
+# ---------------------------------------------------------------- the study
 
 Name = Literal["pairs", "kermit", "time", "invariance"]
 

@@ -36,6 +36,8 @@ from validation.scenes.real import REAL_SCENES
 from validation.studies.measuring import call_apart, exponent
 from validation.studies.runner import Part, Rows, load_scene, scenes_here, text_table
 
+# ---------------------------------------------------------------- growth of matching
+
 METHODS = ("overlap-estimate", "all-pairs")
 SHARED = 0.3
 """Crops of one image that share this part of the smaller one must be tried."""
@@ -161,6 +163,8 @@ def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.1f} %"
 
 
+# ---------------------------------------------------------------- growth of all stages
+
 STAGES = (
     "images",
     "features",
@@ -279,6 +283,8 @@ def cost_table(costs: Sequence[Cost]) -> str:
     return "\n".join([text_table(["", *(f"{n:.0f}" for n in sizes), "power of N"], lines), *failures])
 
 
+# ---------------------------------------------------------------- choice of pairs
+
 LEAST_RECALL = 0.97
 ESTIMATE = "overlap estimate"
 
@@ -325,6 +331,9 @@ def to_metrics(choice: Choice) -> list[Metric]:
     name = "accepted pairs that were tried"
     rows.add(name, 100.0 * choice.recall, "%", at_least=100.0 * LEAST_RECALL, note=note)
     return rows
+
+
+# ---------------------------------------------------------------- the studies
 
 
 def growth_study(

@@ -217,6 +217,8 @@ def residual_rms_px(model: Reconstruction) -> float:
     return float(np.sqrt(np.mean(np.sum((xh[:, :2] / xh[:, 2:] - t.xy[k]) ** 2, axis=1))))
 
 
+# ---------------------------------------------------------------- initial cameras
+
 SIZES = np.array([[1280, 960], [1280, 960]])
 FOCALS_PX = (800.0, 1600.0, 3200.0)
 SIGMA_PX, PAIR_POINTS = 0.5, 200
@@ -303,6 +305,8 @@ def check_kind(kind: str, trials: int) -> list[Metric]:
 
 
 OURS, PUBLISHED = "thesisrecon", "published cameras"
+# ---------------------------------------------------------------- the dinosaur
+
 LOSS_PX, WRONG_PX = 1.0, 3.0
 ADJUSTMENT_STEPS = 50
 
@@ -400,6 +404,9 @@ def to_metrics(found: Comparison) -> list[Metric]:
     rows.append(Metric("dinosaur", f"observations used of {len(found.ours.px)}", "", used, OURS))
     rows.append(Metric("dinosaur", "time", "s", {OURS: found.seconds}, OURS))
     return rows
+
+
+# ---------------------------------------------------------------- the studies
 
 
 def factorization_study(out: Path, trials: int = 30, scenes: Sequence[str] = SCENES) -> Iterator[Part]:

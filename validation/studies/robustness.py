@@ -57,6 +57,9 @@ sys.exit(run_command(sys.argv[1:]))
 """Program that kills itself with its n-th file half written."""
 
 
+# ---------------------------------------------------------------- killed runs
+
+
 @dataclass(frozen=True)
 class Kill:
     """A killed run: when, whether it died, finished stage files, outputs that differ after the resume."""
@@ -162,6 +165,8 @@ def kill_table(rows: Sequence[Kill]) -> str:
         cells.append([row.when + late, row.kept, ", ".join(row.different) or "none"])
     return text_table(["killed", "stage files kept", "outputs that differ after the resume"], cells)
 
+
+# ---------------------------------------------------------------- interrupted runs
 
 LIMIT_S, POLL_S = 2.0, 0.005
 GRACE_S = 0.5
@@ -289,6 +294,8 @@ def stop_table(rows: Sequence[Stop], asked: signal.Signals) -> str:
         cells.append([row.when, f"{row.seconds:.2f}", row.code, row.kept, wrong])
     return text_table(["stopped at", "seconds to stop", "exit code", "stage files kept", "wrong"], cells)
 
+
+# ---------------------------------------------------------------- full and read-only disks
 
 REFUSED = 2
 ROOM = "64m"
@@ -452,6 +459,9 @@ def refusal_table(rows: Sequence[Refusal]) -> str:
     """Return every run as a row."""
     cells = ([r.when, r.code, r.said.strip(), r.wrong or "nothing"] for r in rows)
     return text_table(["the run could not write", "exit code", "message", "wrong"], cells)
+
+
+# ---------------------------------------------------------------- the studies
 
 
 def _printed(rows: Iterable[Any]) -> list[Any]:

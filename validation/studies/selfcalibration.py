@@ -316,6 +316,8 @@ def _quiet_cell(job: tuple[Cell, tuple[str, ...], int, int]) -> list[Trial]:
         return run_cell(cell, methods, range(first, first + count))
 
 
+# ---------------------------------------------------------------- stratified methods
+
 PLANES: Mapping[str, CheiralitySearch | ModulusConstraint | ParallelLines] = {
     "cheirality, grid alone": CheiralitySearch(refine_iterations=0),
     "cheirality search": CheiralitySearch(),
@@ -379,6 +381,9 @@ def stratified_table(name: str, rows: Sequence[Row]) -> str:
         cells.append([closed.plane, closed.k_method, *numbers, principal, f"{closed.seconds:.1f}"])
     head = [name, "method for K", "focal, closed form", "focal, refined", "principal point, refined", "s"]
     return text_table(head, cells)
+
+
+# ---------------------------------------------------------------- the studies
 
 
 def selfcalibration_study(
