@@ -153,7 +153,7 @@ class ProjectiveReconstructor(Protocol):
 
 
 class SelfCalibrator(Protocol):
-    """Chapter 7: the transform that makes a projective reconstruction metric."""
+    """Self-calibration of a projective reconstruction (chapter 7)."""
 
     def calibrate(
         self,
@@ -161,7 +161,28 @@ class SelfCalibrator(Protocol):
         *,
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
-    ) -> SelfCalibration: ...
+    ) -> SelfCalibration:
+        """Upgrade a projective reconstruction to a metric one.
+
+        Parameters
+        ----------
+        reconstruction : Reconstruction
+            Projective reconstruction of at least three cameras.
+        prior : IntrinsicsPrior
+            Prior of the intrinsics of every view.
+        rng : numpy.random.Generator
+            Source of randomness; not used by deterministic methods.
+
+        Returns
+        -------
+        SelfCalibration
+            Upgrades and calibrations, best first, with the identifiability report.
+
+        Raises
+        ------
+        StageFailure
+            If no calibration places the points in front of the cameras.
+        """
 
 
 def with_images(variant: SelfCalibrator, photographs: Sequence[Image]) -> SelfCalibrator:

@@ -98,7 +98,7 @@ def test_wrong_calls_and_hopeless_data_are_refused():
     few = replace(given, registered=np.arange(8) < 2)
     with pytest.raises(StageFailure, match="at least 3"):
         thesisrecon.upgrade_affine(few)
-    with pytest.raises(ValueError, match="photograph"):
+    with pytest.raises(ValueError, match="an image for each"):
         thesisrecon.upgrade_affine(given, config=PipelineConfig(selfcalibration=Stratified(ParallelLines())))
 
 

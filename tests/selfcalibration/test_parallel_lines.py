@@ -218,7 +218,7 @@ def test_a_wall_of_nothing_is_refused_with_its_directions():
 
 def test_photographs_must_be_there():
     scene = make_scene()
-    with pytest.raises(ValueError, match="a photograph for each of the 8 views"):
+    with pytest.raises(ValueError, match="an image for each of the 8 views"):
         Stratified(ParallelLines()).calibrate(
             projective_reconstruction(scene), prior=prior_for(scene), rng=np.random.default_rng(0)
         )

@@ -20,7 +20,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conics import calibration_from_image
 from thesisrecon.selfcalibration.frame import ReferenceFrame
-from thesisrecon.selfcalibration.quadric import dual_image_residuals
+from thesisrecon.selfcalibration.quadric import dual_image_residuals, quadratic_rows
 from thesisrecon.selfcalibration.refinement import minimize_batch, numerical_jacobian
 from thesisrecon.selfcalibration.unknowns import HOMOGRAPHY_NOISE, ConicConstraints, SolverUnknowns
 
@@ -99,8 +99,7 @@ def dual_conic_of_constant_camera(H: F64) -> tuple[F64, F64]:
 def _transfer_matrix(M: F64) -> F64:
     """Return the matrices (..., 6, 6) from the entries of a symmetric w to those of M' w M."""
     x, y = (M[..., :, [pair[side] for pair in _PAIRS]].swapaxes(-1, -2) for side in (0, 1))
-    terms = [x[..., i] * y[..., j] + (x[..., j] * y[..., i] if i != j else 0.0) for i, j in _PAIRS]
-    return np.stack(terms, axis=-1)
+    return quadratic_rows(x, y)
 
 
 def _conic_equations(H: F64, constraints: ConicConstraints, focals: F64) -> F64:
@@ -247,7 +246,9 @@ def solve_conic(
         rows = _conic_equations(H[None], constraints, focals)[0]
         back = np.array([focals[0, constraints.first[constraints.reference]]] * 2 + [1.0])
         if orthogonal is not None and len(orthogonal):
-            rows = np.concatenate([rows, _orthogonal_rows(orthogonal / back)])
+            pairs = orthogonal / back
+            x, y = np.swapaxes(pairs / np.linalg.norm(pairs, axis=-1, keepdims=True), 0, 1)
+            rows = np.concatenate([rows, quadratic_rows(x, y)])
         _, s, Vt = np.linalg.svd(rows, full_matrices=False)
         scaled = _positive(Vt[5][_PLACE])
         conic = ImageConic(_unit(scaled / np.outer(back, back)), s)
@@ -255,12 +256,6 @@ def solve_conic(
             break
         focals = np.clip(_focals(H, conic.w), 0.02, 200.0)[None]
     return conic
-
-
-def _orthogonal_rows(pairs: F64) -> F64:
-    x, y = np.swapaxes(pairs / np.linalg.norm(pairs, axis=-1, keepdims=True), 0, 1)
-    terms = [x[:, i] * y[:, j] + (x[:, j] * y[:, i] if i != j else 0.0) for i, j in _PAIRS]
-    return np.stack(terms, axis=-1)
 
 
 def _positive(w: F64) -> F64:

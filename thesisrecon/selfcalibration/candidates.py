@@ -125,28 +125,6 @@ def as_stage_failure(calibrate: Callable[P, SelfCalibration]) -> Callable[P, Sel
     return inner
 
 
-def require_cameras(reconstruction: Reconstruction) -> None:
-    """Raise an error if fewer than three cameras are registered.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-
-    Raises
-    ------
-    StageFailure
-        If fewer than three cameras are registered.
-    """
-    n = int(reconstruction.registered.sum())
-    if n < 3:
-        raise StageFailure(
-            "self-calibration needs at least 3 registered images",
-            f"{n} were registered",
-            "add images with more overlap",
-        )
-
-
 def square_pixel_calibrations(log_f: F64) -> F64:
     """Return K = diag(f, f, 1).
 
@@ -269,8 +247,8 @@ def select_candidate(
     criterion: RotationCriterion,
     candidates: Sequence[Candidate],
     *,
-    max_candidates: int,
-    min_in_front_ratio: float,
+    max_candidates: int = 1,
+    min_in_front_ratio: float = 0.5,
 ) -> SelfCalibration:
     """Select the best candidates with enough points in front and check their identifiability.
 

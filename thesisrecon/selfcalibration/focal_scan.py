@@ -18,7 +18,6 @@ from thesisrecon.selfcalibration.candidates import (
     as_stage_failure,
     candidates_from_parameters,
     group_focals_from_planes,
-    require_cameras,
     select_candidate,
 )
 from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
@@ -272,7 +271,6 @@ class FocalScan:
         StageFailure
             Below three cameras, or if no candidate places the points in front of the cameras.
         """
-        require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         focals = np.geomspace(*self.focal_range, self.focal_steps)
         planes, references = [], []
@@ -288,6 +286,4 @@ class FocalScan:
         candidates = candidates_from_parameters(
             frame, *refine_hypotheses(self.criterion, frame, theta), "Gherardi and Fusiello's scan"
         )
-        return select_candidate(
-            frame, reconstruction, self.criterion, candidates, max_candidates=1, min_in_front_ratio=0.5
-        )
+        return select_candidate(frame, reconstruction, self.criterion, candidates)

@@ -24,7 +24,6 @@ from thesisrecon.selfcalibration.candidates import (
     Candidate,
     as_stage_failure,
     focal_only_std,
-    require_cameras,
     select_candidate,
     square_pixel_calibrations,
 )
@@ -455,7 +454,6 @@ class FocalsFromFundamental:
             Below three cameras or two pairs, or if the candidate does not place the points in front of the
             cameras.
         """
-        require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         pairs = pair_geometries(frame, reconstruction, min_common_points=self.min_common_points)
         require_pairs(pairs, self.min_common_points)
@@ -463,9 +461,7 @@ class FocalsFromFundamental:
         log_f = np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
         plane, cost = planes_for_focals(frame, self.criterion, log_f)
         candidate = Candidate(plane, square_pixel_calibrations(log_f[frame.group]), cost, "focals from F")
-        found = select_candidate(
-            frame, reconstruction, self.criterion, [candidate], max_candidates=1, min_in_front_ratio=0.5
-        )
+        found = select_candidate(frame, reconstruction, self.criterion, [candidate])
         return self._with_focal_std(found, frame, std)
 
     def focals(self, pairs: PairGeometry, frame: ReferenceFrame, prior: IntrinsicsPrior) -> tuple[F64, F64]:

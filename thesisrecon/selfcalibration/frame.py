@@ -186,7 +186,13 @@ def normalized_frame(
     -------
     ReferenceFrame
         Frame with the focal priors of its camera groups.
+
+    Raises
+    ------
+    StageFailure
+        Below three cameras, if one has rank below 3, or if all centres coincide.
     """
+    _require_three_cameras(reconstruction)
     frame = build_frame(
         reconstruction, prior.group, reference=reference, unit=_unit_of(prior, reconstruction.sizes)
     )
@@ -201,6 +207,16 @@ def normalized_frame(
             mean[g] = np.median(log_f[mine])
             std[g] = max(float(np.median(prior.std[frame.views[mine], 0])), _KNOWN_FOCAL_STD)
     return replace(frame, focal_mean=mean, focal_std=std, prior=prior)
+
+
+def _require_three_cameras(reconstruction: Reconstruction) -> None:
+    n = int(reconstruction.registered.sum())
+    if n < 3:
+        raise StageFailure(
+            "self-calibration needs at least 3 registered images",
+            f"{n} were registered",
+            "add images with more overlap",
+        )
 
 
 def _unit_of(prior: IntrinsicsPrior, sizes: I64) -> F64:

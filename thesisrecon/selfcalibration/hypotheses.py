@@ -20,7 +20,6 @@ from thesisrecon.selfcalibration.candidates import (
     candidates_from_parameters,
     distinct_candidates,
     group_focals_from_planes,
-    require_cameras,
     select_candidate,
 )
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
@@ -99,7 +98,6 @@ class HypothesesAndRefinement:
         StageFailure
             Below three cameras, or if no candidate places the points in front of the cameras.
         """
-        require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         planes, log_f = self._propose(frame, reconstruction, rng)
         cost = np.nan_to_num(self.criterion.cost(frame, planes, log_f), nan=np.inf)

@@ -22,12 +22,12 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras, unit_norm
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
+from thesisrecon.numerics.losses import soft_l1
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.candidates import (
     Candidate,
     as_stage_failure,
     group_log_focals,
-    require_cameras,
     select_candidate,
     square_pixel_calibrations,
 )
@@ -236,7 +236,7 @@ def _kruppa_cost(pairs: PairGeometry, K: F64, *, loss_scale: float) -> F64:
     """Return the mean soft-L1 cost (B,) of a pair for calibrations K (B, R, 3, 3)."""
     w = dual_conics(K)
     squared = np.sum(kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j]) ** 2, axis=-1)
-    return np.asarray(np.mean(2.0 * loss_scale**2 * (np.sqrt(1.0 + squared / loss_scale**2) - 1.0), axis=1))
+    return np.asarray(np.mean(soft_l1(squared, loss_scale)[0], axis=1))
 
 
 def _minimize_kruppa(
@@ -326,7 +326,6 @@ class KruppaEquations:
         StageFailure
             Below three cameras or two pairs, or if no candidate places the points in front of the cameras.
         """
-        require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         pairs = pair_geometries(
             frame, reconstruction, min_common_points=self.min_common_points, refit=self.refit_pairs
@@ -340,9 +339,7 @@ class KruppaEquations:
             plane, cost = planes_for_focals(frame, self.criterion, group_log_focals(frame, found.K))
             K_std = unknown.calibration_std(found.unknowns, found.covariance)
             candidates.append(Candidate(plane, found.K, cost, "Kruppa equations", K_std))
-        return select_candidate(
-            frame, reconstruction, self.criterion, candidates, max_candidates=1, min_in_front_ratio=0.5
-        )
+        return select_candidate(frame, reconstruction, self.criterion, candidates)
 
     def _scan(self, pairs: PairGeometry, n: int) -> list[float]:
         """Return the best local minima of one common log focal length."""

@@ -26,19 +26,30 @@ from thesisrecon.selfcalibration.candidates import (
     as_stage_failure,
     candidates_from_parameters,
     group_focals_from_planes,
-    require_cameras,
     select_candidate,
 )
 from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
-from thesisrecon.selfcalibration.refinement import RotationCriterion, central_differences
+from thesisrecon.selfcalibration.refinement import RotationCriterion, central_differences, weighted_entries
 from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
 
 _PAIRS = [(a, b) for a in range(4) for b in range(a, 4)]
 
 
-def _quadratic_rows(x: F64, y: F64) -> F64:
-    """Return rows r (..., 10) with r . q = x' Q y for the upper-triangle vector q of a symmetric Q."""
-    terms = [x[..., a] * y[..., b] + (x[..., b] * y[..., a] if a != b else 0.0) for a, b in _PAIRS]
+def quadratic_rows(x: F64, y: F64) -> F64:
+    """Return rows r with r . q = x' Q y for the upper triangle q of a symmetric Q.
+
+    Parameters
+    ----------
+    x, y : ndarray (..., n)
+        Vectors.
+
+    Returns
+    -------
+    ndarray (..., n (n + 1) / 2)
+        Rows, ordered as ``numpy.triu_indices(n)``.
+    """
+    pairs = zip(*np.triu_indices(x.shape[-1]), strict=True)
+    terms = [x[..., a] * y[..., b] + (x[..., b] * y[..., a] if a != b else 0.0) for a, b in pairs]
     return np.stack(terms, axis=-1)
 
 
@@ -87,10 +98,10 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
     P[:, :, :2] /= (focals if focals.ndim == 2 else focals[:, None])[:, :, None, None]
     p1, p2, p3 = P[:, :, 0], P[:, :, 1], P[:, :, 2]
-    w11, w22, w33 = (_quadratic_rows(p, p) for p in (p1, p2, p3))
+    w11, w22, w33 = (quadratic_rows(p, p) for p in (p1, p2, p3))
     rows = np.stack(
-        [(w11 - w33) / 9, (w22 - w33) / 9, (w11 - w22) / 0.2, _quadratic_rows(p1, p2) / 0.01,
-         _quadratic_rows(p1, p3) / 0.1, _quadratic_rows(p2, p3) / 0.1], axis=2,
+        [(w11 - w33) / 9, (w22 - w33) / 9, (w11 - w22) / 0.2, quadratic_rows(p1, p2) / 0.01,
+         quadratic_rows(p1, p3) / 0.1, quadratic_rows(p2, p3) / 0.1], axis=2,
     )  # fmt: skip
     nu = np.linalg.norm(w33, axis=-1)
     q = np.zeros((len(focals), 10))
@@ -222,7 +233,6 @@ class LinearQuadric:
         StageFailure
             Below three cameras, or if no candidate places the points in front of the cameras.
         """
-        require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         p, f = quadric_hypotheses(frame, np.array([self.normalising_focal]))
         log_f = group_focals_from_planes(frame, p, f)
@@ -283,7 +293,6 @@ class ScannedQuadric:
         StageFailure
             Below three cameras, or if no candidate places the points in front of the cameras.
         """
-        require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         focals = np.geomspace(*self.focal_range, self.focal_steps)
         p, f = quadric_hypotheses(frame, focals)
@@ -307,13 +316,9 @@ def _select(
     candidates = candidates_from_parameters(
         frame, np.concatenate([p, log_f], axis=1), criterion.cost(frame, p, log_f), "linear quadric"
     )
-    return select_candidate(
-        frame, reconstruction, criterion, candidates, max_candidates=1, min_in_front_ratio=0.5
-    )
+    return select_candidate(frame, reconstruction, criterion, candidates)
 
 
-_UPPER = np.triu_indices(3)
-_ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
 _MIN_NOISE = 1e-9
 # Maximum number of noise estimates.
 _NOISE_PASSES = 6
@@ -375,7 +380,7 @@ def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -
     """
     C = (A[None] - a[None, :, :, None] * plane[:, None, None, :]) @ K_reference[:, None]
     difference = _unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2))
-    return np.asarray(difference[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT)
+    return weighted_entries(difference)
 
 
 def _unit(conic: F64) -> F64:
@@ -504,7 +509,6 @@ class NonlinearQuadric:
         StageFailure
             Below three cameras, or if no candidate places the points in front of the cameras.
         """
-        require_cameras(reconstruction)
         frame = normalized_frame(reconstruction, prior)
         unknown = solver_unknowns(frame, prior)
         p, f = quadric_hypotheses(frame, np.geomspace(*self.focal_range, self.focal_steps))
@@ -515,6 +519,4 @@ class NonlinearQuadric:
         for b in best[np.isfinite(cost[best])]:
             found = minimize_quadric(frame, unknown, p[b], log_f[b][frame.group], loss_scale=self.loss_scale)
             candidates.append(Candidate(found.plane, found.K, found.cost, "nonlinear quadric", found.K_std))
-        return select_candidate(
-            frame, reconstruction, self.criterion, candidates, max_candidates=1, min_in_front_ratio=0.5
-        )
+        return select_candidate(frame, reconstruction, self.criterion, candidates)

@@ -14,10 +14,27 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.numerics.losses import soft_l1
 from thesisrecon.selfcalibration.frame import ReferenceFrame
 
 _UPPER = np.triu_indices(3)
 _ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
+
+
+def weighted_entries(M: F64) -> F64:
+    """Return the upper triangles of symmetric matrices, off-diagonal entries times sqrt 2.
+
+    Parameters
+    ----------
+    M : ndarray (..., 3, 3)
+        Symmetric matrices.
+
+    Returns
+    -------
+    ndarray (..., 6)
+        Entries whose Euclidean norm is the Frobenius norm of M.
+    """
+    return np.asarray(M[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -78,7 +95,7 @@ class RotationCriterion:
         CC = C @ C.swapaxes(-1, -2)
         trace = np.trace(CC, axis1=-2, axis2=-1)[..., None, None]
         E = 3.0 * CC / np.maximum(trace, 1e-300) - np.eye(3)
-        return np.asarray(E[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT, dtype=np.float64)
+        return weighted_entries(E)
 
     def cost(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
         """Compute the robust cost per camera of each hypothesis.
@@ -98,7 +115,7 @@ class RotationCriterion:
             Costs.
         """
         norm2 = np.sum(self.camera_residuals(frame, p, log_f) ** 2, axis=-1)
-        robust = 2.0 * self.scale**2 * (np.sqrt(1.0 + norm2 / self.scale**2) - 1.0)
+        robust = soft_l1(norm2, self.scale)[0]
         pull = self._focal_prior_residuals(frame, log_f)
         return np.asarray((robust.sum(axis=1) + np.sum(pull**2, axis=1)) / len(frame.views), dtype=np.float64)
 
@@ -301,7 +318,7 @@ def minimize_batch(
 def _cost(r: F64, loss_scale: float) -> F64:
     squares = r**2
     if np.isfinite(loss_scale):
-        squares = 2.0 * loss_scale**2 * (np.sqrt(1.0 + squares / loss_scale**2) - 1.0)
+        squares = soft_l1(squares, loss_scale)[0]
     return np.asarray(np.nan_to_num(squares.mean(axis=1), nan=np.inf))
 
 

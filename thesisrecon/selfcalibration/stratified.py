@@ -21,7 +21,6 @@ from thesisrecon.selfcalibration.absolute_conic import (
 from thesisrecon.selfcalibration.candidates import (
     Candidate,
     as_stage_failure,
-    require_cameras,
     select_candidate,
 )
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, PlaneCandidates, ProjectiveScene
@@ -194,7 +193,6 @@ def projective_scene(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> 
     StageFailure
         Below three registered cameras.
     """
-    require_cameras(reconstruction)
     frame = normalized_frame(reconstruction, prior)
     return ProjectiveScene(reconstruction, frame, conic_constraints(frame, prior))
 
