@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import read_images
 from thesisrecon.records import Image
 from validation.references.libraries import NoReference, one_thread
 from validation.scenes.real import load_fixture_scene
@@ -31,7 +31,7 @@ def _one_thread() -> None:
 @pytest.fixture(scope="session")
 def photographs() -> tuple[Image, ...]:
     """Two neighbours of the courtyard."""
-    return read_photographs(load_fixture_scene().image_paths[5:7], max_size_px=1024).images
+    return read_images(load_fixture_scene().image_paths[5:7], max_size_px=1024).images
 
 
 @pytest.fixture

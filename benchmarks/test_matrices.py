@@ -16,7 +16,6 @@ from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.geometry.two_view import estimate_homography
-from validation.studies.triangulation import beside, cameras_of
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point
 from validation.references.geometry import (
     colmap_similarity,
@@ -27,6 +26,7 @@ from validation.references.geometry import (
 )
 from validation.references.triangulation import colmap_points
 from validation.scenes.two_views import make_two_views
+from validation.studies.triangulation import beside, cameras_of
 
 Call = Callable[..., Any]
 RADIAL = np.array([-0.1, 0.02, 0.001])

@@ -8,8 +8,8 @@ import pytest
 from benchmarks.conftest import Bench
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
-from validation.studies.rendering import courtyard
 from validation.references.open3d_surfaces import OpenTsdf
+from validation.studies.rendering import courtyard
 
 STEP = 2
 
