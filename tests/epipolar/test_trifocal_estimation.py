@@ -254,8 +254,8 @@ def test_matches_that_cannot_work_are_named():
     for wrong, text in (
         (np.ones((3, 8, 2)), "equal points"),
         (np.full((3, 8, 2), np.nan), "finite"),
-        (np.ones((8, 2)), "needed points"),
-        (np.ones(5), "needed points"),
+        (np.ones((8, 2)), "needs points"),
+        (np.ones(5), "needs points"),
     ):
         with pytest.raises(ValueError, match=text):
             estimate_trifocal(wrong)

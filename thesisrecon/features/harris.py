@@ -1,9 +1,6 @@
-"""Section 4.2.1: the R-matrix, its parameters, and the maxima of the surface fitted to it.
+"""Section 4.2.1: the corner detector of Harris and Stephens with a surface fit and spatial selection.
 
-Section 4.2.1: the corner detector of Harris and Stephens with a surface fit and a selection that covers
-the image.
-
-C. Harris, M. Stephens, A combined corner and edge detector, Alvey Vision Conference 1988.
+C. Harris and M. Stephens, "A combined corner and edge detector", Alvey Vision Conference, 1988.
 """
 
 from __future__ import annotations
@@ -14,33 +11,45 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.features.kernels import corner_response, fit_maxima, keep_apart, squared_suppression_radii
+from thesisrecon.features.kernels import (
+    corner_response,
+    enforce_spacing,
+    fit_maxima,
+    squared_suppression_radii,
+)
 from thesisrecon.geometry.raster import gaussian_taps, smooth
 from thesisrecon.records import Features, Image
 
-# Below this det / trace (grey levels squared) the corners are those of quantisation and compression noise.
+# det / trace (grey levels squared) below which corners are quantisation and compression noise.
 NOISE_RESPONSE = 0.05
 
 
 @dataclass(frozen=True)
 class CornerMeasure:
-    """How much of a corner each pixel is: R of section 4.2.1, and where its maxima lie.
+    """The corner response R of section 4.2.1 and its parameters.
 
     M (2 x 2; the thesis' "4 x 4" is a slip) holds the products of the image gradient, smoothed by a Gaussian.
-    The thesis' formula for R lost two signs: what is left, M, and (M11 + M22), fits both det M / trace M
-    (Noble 1988) and det M - k (trace M)^2 (Harris and Stephens 1988); both are here.
+    The thesis' formula for R lost two signs: M and (M11 + M22) fit both det M / trace M (Noble 1988) and det
+    M - k (trace M)^2 (Harris and Stephens 1988); both are available.
 
     Parameters
     ----------
-    formula : "noble" is det / trace, "harris" is det - k trace^2.
-    harris_k : k of the second, in (0, 0.25).
-    derivative_sigma_px : Gaussian before the derivation; 0 for none.
-    derivative_taps : the derivation kernel along either axis, an odd number of taps whose sum is 0; scaled so
-        that a ramp of one grey level per pixel has slope 1.
-    integration_sigma_px, integration_taps : the Gaussian of M, and its number of taps (odd; 0: three sigma to
-        each side). The thesis' experiments have sigma 1 and 9 taps.
-    colour : M is the mean over red, green and blue of each one's products, else that of the grey values.
-    subpixel : a quadratic surface is fitted to the 3 x 3 pixels of each maximum, else it stays at the pixel.
+    formula : {"noble", "harris"}
+        det / trace, or det - k trace^2.
+    harris_k : float
+        k of the second formula, in (0, 0.25).
+    derivative_sigma_px : float
+        Gaussian before the derivative; 0 for none.
+    derivative_taps : tuple of float
+        Derivative kernel along either axis, odd length, sum 0; scaled to slope 1 for a unit ramp.
+    integration_sigma_px : float
+        Gaussian of M. The thesis' experiments use sigma 1 and 9 taps.
+    integration_taps : int
+        Number of taps of this Gaussian, odd; 0 for three sigma to each side.
+    colour : bool
+        Mean of M over red, green and blue, else M of the grey values.
+    subpixel : bool
+        Fit a quadratic surface to the 3 x 3 pixels of each maximum, else keep the pixel.
     """
 
     formula: Literal["noble", "harris"] = "noble"
@@ -69,19 +78,41 @@ class CornerMeasure:
             raise ValueError(f"integration_taps must be odd, or 0; got {self.integration_taps}")
 
     def channels(self, image: Image) -> F32:
-        """(C, H, W) what of a photograph the corners are found in: its grey values or its three colours."""
+        """Return the channels in which corners are detected.
+
+        Parameters
+        ----------
+        image : Image
+            The image.
+
+        Returns
+        -------
+        ndarray (C, H, W)
+            Grey values or three colours, float32.
+        """
         if not self.colour:
             return image.gray[None]
         return np.ascontiguousarray(np.moveaxis(image.rgb, 2, 0), dtype=np.float32)
 
     def response(self, channels: F32) -> F32:
-        """R (H, W) of ``channels`` (C, H, W); zero near the border."""
+        """Compute the corner response R.
+
+        Parameters
+        ----------
+        channels : ndarray (C, H, W)
+            Channels, float32.
+
+        Returns
+        -------
+        ndarray (H, W)
+            R, zero near the border.
+        """
         derivative = np.array(self.derivative_taps)
         derivative = (derivative / _slope(derivative)).astype(np.float32)
         if self.derivative_sigma_px > 0.0:
             channels = np.stack([smooth(channel, self.derivative_sigma_px) for channel in channels])
-        # The mean over the channels, so that grey photographs have one R whether taken as colour or not.
-        # The taps serve twice, down and across.
+        # Mean over the channels, so that R of a grey image does not depend on ``colour``; the taps are used
+        # twice.
         taps = self._integration() / np.float32(np.sqrt(len(channels)))
         weight = self.harris_k if self.formula == "harris" else 0.0
         return corner_response(channels, derivative, taps, weight)
@@ -102,8 +133,8 @@ class CornerMeasure:
         return normalized
 
     @property
-    def least_side_px(self) -> int:
-        """A side below which no corner is sought: two windows."""
+    def min_side_px(self) -> int:
+        """Smallest image side in which corners are detected: two windows."""
         return 2 * len(self._integration())
 
 
@@ -112,13 +143,31 @@ def _slope(taps: F64) -> float:
 
 
 def find_corners(channels: F32, measure: CornerMeasure) -> tuple[F64, F32]:
-    """All corners of (C, H, W) above the noise, strongest first: ``xy`` (N, 2) px and response (N,).
+    """Detect all corners above the noise, strongest first.
 
-    Maxima of 3 x 3 neighbourhoods of R, refined by a quadratic surface. Equal responses are ordered as they
-    are read, so the result is reproducible. None where the image is smaller than two windows. Values that are
-    not finite are no image: ``ValueError``.
+    Maxima of 3 x 3 neighbourhoods of R, refined by a quadratic surface. Equal responses keep the reading
+    order.
+
+    Parameters
+    ----------
+    channels : ndarray (C, H, W)
+        Channels, float32.
+    measure : CornerMeasure
+        Response and its parameters.
+
+    Returns
+    -------
+    xy : ndarray (N, 2)
+        Positions, px; none if the image is smaller than two windows.
+    response : ndarray (N,)
+        Responses.
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite.
     """
-    if min(channels.shape[1:]) < measure.least_side_px:
+    if min(channels.shape[1:]) < measure.min_side_px:
         return np.empty((0, 2)), np.empty(0, np.float32)
     if not np.isfinite(channels).all():
         raise ValueError("corners are found in finite grey values; got NaN or infinity among them")
@@ -127,24 +176,28 @@ def find_corners(channels: F32, measure: CornerMeasure) -> tuple[F64, F32]:
     return xy[order], value[order]
 
 
-# How many times its share one part of the image may fill of the pool of strong corners.
-SHARE = 1.5
+# Maximum fraction of the pool that one part of the image may fill, relative to an even distribution.
+POOL_LIMIT = 1.5
 
 
 @dataclass(frozen=True)
 class HarrisCorners:
-    """The thesis' detector: one scale, a threshold on R, the strongest corners that are not in each other's
-    way.
+    """The thesis' detector: one scale, a threshold on R, the strongest corners with spatial selection.
 
     Parameters
     ----------
-    max_corners : corners kept.
-    threshold_rel : share of the largest response that a corner must reach; 0 for those above the noise.
-    selection : how the corners are made to cover a large area: "spacing" drops those too near to a stronger
-        one, "spread" is :func:`select_spread`, "strongest" does nothing.
-    spacing_rel : least distance of two corners where ``selection`` is "spacing", as a share of the long side.
-    pool_ratio : corners among which "spread" chooses, as a multiple of ``max_corners``.
-    measure : the R-matrix and its parameters.
+    max_corners : int
+        Maximum number of corners.
+    threshold_rel : float
+        Minimum response relative to the largest one; 0 for all above the noise.
+    selection : {"spacing", "spread", "strongest"}
+        Drop corners too near to a stronger one, use :func:`select_spread`, or neither.
+    spacing_rel : float
+        Minimum distance of two corners for "spacing", relative to the long side.
+    pool_ratio : float
+        Candidates of "spread", as a multiple of ``max_corners``.
+    measure : CornerMeasure
+        Response and its parameters.
     """
 
     max_corners: int = 2000
@@ -166,7 +219,27 @@ class HarrisCorners:
             )
 
     def detect(self, image: Image) -> Features:
-        """Corners of one photograph, strongest first, at scale 1; none where the image has no structure."""
+        """Detect the corners of an image.
+
+        Parameters
+        ----------
+        image : Image
+            The image.
+
+        Returns
+        -------
+        Features
+            Corners at scale 1, strongest first, possibly none.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from thesisrecon.records import Image
+        >>> rgb = np.zeros((40, 40, 3), np.uint8)
+        >>> rgb[10:30, 10:30] = 200
+        >>> HarrisCorners().detect(Image("square", rgb, (40, 40))).xy.round().astype(int).shape
+        (4, 2)
+        """
         xy, response = find_corners(self.measure.channels(image), self.measure)
         if len(xy):
             strong = response >= self.threshold_rel * float(response[0])
@@ -179,18 +252,37 @@ class HarrisCorners:
             return select_spread(xy, response, self.max_corners, pool=int(self.pool_ratio * self.max_corners))
         kept = np.arange(len(xy), dtype=np.int64)
         if self.selection == "spacing":
-            kept = keep_apart(xy, kept, self.spacing_rel * long_side)
+            kept = enforce_spacing(xy, kept, self.spacing_rel * long_side)
         return kept[: self.max_corners]
 
 
 def select_spread(xy: F64, response: F32, count: int, *, pool: int, robustness: float = 0.9) -> I64:
-    """Indices of ``count`` corners that cover the image, strongest first (adaptive non-maximal suppression).
+    """Select corners that cover the image (adaptive non-maximal suppression).
 
-    Among a pool of strong ones, those farthest from any that is stronger by 1 / robustness.
-    No part of the image, of a sixth of its long side, fills the pool beyond ``SHARE`` times its share: else
-    a shaded half gets no corner at all.
+    Among a pool of strong corners those farthest from any that is stronger by 1 / robustness. No sixth of the
+    long side fills the pool beyond ``POOL_LIMIT`` times its part, so that a shaded half still gets corners.
 
-    M. Brown, R. Szeliski, S. Winder, Multi-image matching using multi-scale oriented patches, CVPR 2005,
+    Parameters
+    ----------
+    xy : ndarray (N, 2)
+        Corners, strongest first, px.
+    response : ndarray (N,)
+        Responses.
+    count : int
+        Number of corners to select.
+    pool : int
+        Number of candidates.
+    robustness : float
+        Ratio of responses that counts as clearly stronger.
+
+    Returns
+    -------
+    ndarray (M,) of int
+        Indices, strongest first.
+
+    References
+    ----------
+    M. Brown, R. Szeliski and S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005,
     section 3.
     """
     members = _shared_pool(xy, pool)
@@ -201,7 +293,7 @@ def select_spread(xy: F64, response: F32, count: int, *, pool: int, robustness: 
 
 
 def _shared_pool(xy: F64, pool: int) -> I64:
-    """The first ``pool`` of the corners, no part of the image giving more than its limit."""
+    """The first ``pool`` of the corners, with a limit for each part of the image."""
     if len(xy) <= pool:
         return np.arange(len(xy), dtype=np.int64)
     part = np.floor(6.0 * (xy - xy.min(axis=0)) / (float(np.ptp(xy, axis=0).max()) + 1.0)).astype(np.int64)
@@ -210,5 +302,5 @@ def _shared_pool(xy: F64, pool: int) -> I64:
     cells, start, size = np.unique(cell[by_cell], return_index=True, return_counts=True)
     rank = np.empty(len(xy), np.int64)
     rank[by_cell] = np.arange(len(xy)) - np.repeat(start, size)
-    allowed = np.flatnonzero(rank < max(1, int(SHARE * pool / len(cells))))
+    allowed = np.flatnonzero(rank < max(1, int(POOL_LIMIT * pool / len(cells))))
     return allowed[:pool].astype(np.int64)

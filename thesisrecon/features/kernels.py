@@ -1,4 +1,4 @@
-"""Compiled loops of the corner detector; every one has a NumPy twin in the tests."""
+"""Kernels of the corner detector; each has a NumPy twin in the tests."""
 
 from __future__ import annotations
 
@@ -7,19 +7,33 @@ from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
 
-# Sums may be reordered; assuming that no NaN exists would undo the bounds checks.
+# Sums may be reordered; assuming no NaN would break the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: float) -> F32:
-    """The R-matrix of section 4.2.1, (H, W): M are the products of the gradients of ``channels`` (C, H, W),
-    summed over the channels and smoothed by ``taps``.
+    """Compute the corner response R of section 4.2.1.
 
-    The gradient at x is sum_k derivative[k] I(x + k), k from the middle. R = det M / trace M where
-    ``trace_weight`` is 0, else det M - trace_weight (trace M)^2. One sweep down the image keeps the last
-    2 r + 1 rows of products only, so that they stay in the cache. Rows and columns whose windows leave the
-    image are zero.
+    M holds the products of the gradients, summed over the channels and smoothed by ``taps``; the gradient at
+    x is sum_k derivative[k] I(x + k), k from the middle. One sweep down the image keeps only the last 2 r + 1
+    rows of products, which stay in the cache.
+
+    Parameters
+    ----------
+    channels : ndarray (C, H, W)
+        Channels, float32.
+    derivative : ndarray (k,)
+        Derivative kernel, odd length.
+    taps : ndarray (m,)
+        Smoothing kernel, odd length.
+    trace_weight : float
+        0 for det M / trace M, else det M - trace_weight (trace M)^2.
+
+    Returns
+    -------
+    ndarray (H, W)
+        R, zero where windows leave the image.
     """
     count, height, width = channels.shape
     reach, size = derivative.size // 2, taps.size
@@ -50,7 +64,7 @@ def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: flo
             target = moment[m, border:]
             for k in range(size):
                 weight = taps[k]
-                # Slices that start where they are read keep the checks for negative indices out of the loops.
+                # Slices that start at the first read avoid checks for negative indices in the loops.
                 source = column[m, k + reach :]
                 for x in range(width - 2 * border):
                     target[x] += weight * source[x]
@@ -98,13 +112,26 @@ def _measure(moment: F32, count: int, trace_weight: float, out: F32) -> None:
 
 @njit(cache=True, nogil=True)
 def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[F64, F32]:
-    """Maxima of the quadratic surfaces fitted by least squares to the 3 x 3 neighbourhoods of local maxima.
+    """Find the local maxima of R and refine them by least-squares quadratic surfaces.
 
-    Returns ``xy`` (N, 2) px and the response (N,) at the pixel. A fit without a maximum within one pixel
-    keeps the pixel itself; so do all where not ``subpixel``.
+    Parameters
+    ----------
+    response : ndarray (H, W)
+        R.
+    threshold : float
+        Minimum response.
+    subpixel : bool
+        Refine, else keep the pixels; a fit without a maximum within one pixel keeps its pixel.
+
+    Returns
+    -------
+    xy : ndarray (N, 2)
+        Positions, px.
+    value : ndarray (N,)
+        Responses at the pixels.
     """
     height, width = response.shape
-    # No two maxima touch, so that there is at most one in four pixels.
+    # Maxima do not touch: at most one in four pixels.
     most = (height // 2 + 1) * (width // 2 + 1)
     xy = np.empty((most, 2), np.float64)
     value = np.empty(most, np.float32)
@@ -124,7 +151,7 @@ def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[
 
 @njit(cache=True, nogil=True)
 def _is_maximum(response: F32, x: int, y: int) -> bool:
-    # >= on the one side and > on the other: a plateau of two pixels gives one corner.
+    # > on one side and >= on the other: a plateau of two pixels gives one corner.
     v = response[y, x]
     return bool(
         v > response[y - 1, x - 1]
@@ -163,10 +190,21 @@ def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
-    """(N,) squared distance of each corner to the nearest one that is clearly stronger; inf where none is.
+    """Compute the squared distance of each corner to the nearest clearly stronger one.
 
-    ``xy`` and ``response`` are sorted strongest first; clearly stronger: robustness x its response > this
-    one's.
+    Parameters
+    ----------
+    xy : ndarray (N, 2)
+        Corners, strongest first, px.
+    response : ndarray (N,)
+        Responses.
+    robustness : float
+        A corner is clearly stronger if robustness times its response is larger.
+
+    Returns
+    -------
+    ndarray (N,)
+        Squared distances, inf without a stronger corner.
     """
     n = len(xy)
     x, y = xy[:, 0].copy(), xy[:, 1].copy()
@@ -186,7 +224,26 @@ def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
-    """(N, side^2) bilinear samples on a ``side`` x ``side`` grid turned by ``angle``, clamped."""
+    """Sample rotated square patches bilinearly.
+
+    Parameters
+    ----------
+    image : ndarray (H, W)
+        Image, float32.
+    xy : ndarray (N, 2)
+        Centres, px; samples outside the image are clamped.
+    angle : ndarray (N,)
+        Rotation, rad.
+    side : int
+        Samples per side.
+    spacing : float
+        Distance of samples, px.
+
+    Returns
+    -------
+    ndarray (N, side^2)
+        The patches.
+    """
     height, width = image.shape
     out = np.empty((len(xy), side * side), np.float32)
     centre = 0.5 * (side - 1)
@@ -206,8 +263,23 @@ def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -
 
 
 @njit(cache=True, nogil=True)
-def keep_apart(xy: F64, order: I64, distance: float) -> I64:
-    """The members of ``order`` that lie at least ``distance`` from every earlier one kept."""
+def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
+    """Select corners at least a given distance from every corner selected before.
+
+    Parameters
+    ----------
+    xy : ndarray (N, 2)
+        Corners, px.
+    order : ndarray (M,) of int
+        Indices in order of preference.
+    distance : float
+        Minimum distance, px.
+
+    Returns
+    -------
+    ndarray (K,) of int
+        Selected indices.
+    """
     kept = np.empty(len(order), np.int64)
     n = 0
     for i in order:

@@ -1,4 +1,4 @@
-"""Corners at two sizes for matches in number, and patches of several scales to start the matching from."""
+"""Corners at two image sizes, and oriented multi-scale patches (seeds) to start the matching from."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from thesisrecon.records import Features, Image, Seeds
 
 
 @dataclass(frozen=True)
-class Level:
-    """One size of the photograph: ``channels`` (C, h, w), in which corners are found, ``gray`` (h, w), and
-    how many pixels of the photograph one of its pixels spans."""
+class _PyramidLevel:
+    """One image size: ``channels`` (C, h, w), ``gray`` (h, w) and image pixels per level pixel."""
 
     channels: F32
     gray: F32
@@ -24,7 +23,7 @@ class Level:
     scale_y: float
 
     def to_image(self, xy: F64) -> F64:
-        """Pixels of this level -> pixels of the photograph."""
+        """Convert pixels of this level to pixels of the image."""
         scale = np.array([self.scale_x, self.scale_y])
         inside: F64 = (xy + 0.5) * scale - 0.5
         return inside
@@ -32,22 +31,29 @@ class Level:
 
 @dataclass(frozen=True)
 class MultiScaleCorners:
-    """Harris corners at full and half size, spread over the image, with seed patches at five levels of
-    1/sqrt(2).
+    """Harris corners at full and half size, with seed patches at five levels of 1/sqrt(2).
 
-    Seeds are the multi-scale oriented patches of Brown, Szeliski and Winder (CVPR 2005), each twice: upright
-    and turned to the dominant gradient. Photographs whose long side is under ``upsample_below_px`` are
-    doubled first; all coordinates are in the pixels of the photograph that was given.
+    Seeds are the multi-scale oriented patches of Brown, Szeliski and Winder (CVPR 2005), each upright and
+    rotated to its dominant gradient. Small images are doubled first; all coordinates are pixels of the given
+    image.
 
     Parameters
     ----------
-    full_corners, half_corners : corners kept at full and at half size; 0 for none of a size.
-    spread : corners and seeds are chosen to cover the image (:func:`select_spread`), else the strongest.
-    pool_ratio : where spread, they are chosen among this many times as many of the strongest.
-    seeds_per_level : seeds kept at the finest level; every further level keeps 1/sqrt(2) as many.
-    levels : levels of 1/sqrt(2).
-    upsample_below_px : long side under which the photograph is doubled; 0 for never.
-    measure : the R-matrix and its parameters, the same at every size.
+    full_corners, half_corners : int
+        Number of corners at full and at half size; 0 for none.
+    spread : bool
+        Select corners and seeds that cover the image (:func:`~thesisrecon.features.harris.select_spread`),
+        else the strongest.
+    pool_ratio : float
+        Candidates of the selection, as a multiple of the number selected.
+    seeds_per_level : int
+        Number of seeds at the finest level; each further level has 1/sqrt(2) as many.
+    levels : int
+        Number of levels.
+    upsample_below_px : int
+        Long side below which the image is doubled; 0 for never.
+    measure : CornerMeasure
+        Response and its parameters at every size.
     """
 
     full_corners: int = 3000
@@ -74,7 +80,18 @@ class MultiScaleCorners:
             )
 
     def detect(self, image: Image) -> Features:
-        """Corners, strongest first (scale 1 and 2, or 0.5 and 1 where doubled), and seeds."""
+        """Detect the corners and seeds of an image.
+
+        Parameters
+        ----------
+        image : Image
+            The image.
+
+        Returns
+        -------
+        Features
+            Corners, strongest first, at scales 1 and 2 (0.5 and 1 if doubled), and seeds.
+        """
         levels = self._pyramid(image)
         found = [find_corners(level.channels, self.measure) for level in levels]
         parts = []
@@ -94,34 +111,35 @@ class MultiScaleCorners:
             return select_spread(xy, response, count, pool=int(self.pool_ratio * count))
         return np.arange(min(count, len(xy)), dtype=np.int64)
 
-    def _pyramid(self, image: Image) -> list[Level]:
+    def _pyramid(self, image: Image) -> list[_PyramidLevel]:
         doubled = max(image.size) < self.upsample_below_px
-        grays = shrink(image.gray, self.levels, doubled=doubled)
+        grays = _image_pyramid(image.gray, self.levels, doubled=doubled)
         channels = [gray[None] for gray in grays]
         if self.measure.colour:
             sizes = zip(
-                *(shrink(c, self.levels, doubled=doubled) for c in self.measure.channels(image)), strict=True
+                *(_image_pyramid(c, self.levels, doubled=doubled) for c in self.measure.channels(image)),
+                strict=True,
             )
             channels = [np.stack(size) for size in sizes]
         width, height = image.size
         return [
-            Level(c, gray, *scale)
+            _PyramidLevel(c, gray, *scale)
             for c, gray, scale in zip(channels, grays, _scales(grays, width, height), strict=True)
         ]
 
-    def _seeds(self, levels: list[Level], found: list[tuple[F64, F32]]) -> Seeds:
+    def _seeds(self, levels: list[_PyramidLevel], found: list[tuple[F64, F32]]) -> Seeds:
         xy, scale, angle, upright, turned = [], [], [], [], []
         for index, (level, (corners, response)) in enumerate(zip(levels, found, strict=True)):
             count = int(self.seeds_per_level / np.sqrt(2.0) ** index)
             kept = self._select(corners, response, count)
             blurred = smooth(level.gray, 2.0)
-            direction = dominant_direction(blurred, corners[kept])
+            direction = _dominant_direction(blurred, corners[kept])
             xy.append(level.to_image(corners[kept]))
             scale.append(np.full(len(kept), np.sqrt(level.scale_x * level.scale_y), np.float32))
             angle.append(direction)
             upright.append(sample_patches(blurred, corners[kept], np.zeros_like(direction), 8, 4.0))
             turned.append(sample_patches(blurred, corners[kept], direction, 8, 4.0))
-        patches, structured = normalize_patches(np.concatenate(upright + turned))
+        patches, structured = _normalize_patches(np.concatenate(upright + turned))
         zeros = np.zeros(sum(len(a) for a in angle), np.float32)
         return Seeds(
             xy=np.concatenate(xy + xy)[structured],
@@ -131,8 +149,8 @@ class MultiScaleCorners:
         )
 
 
-def shrink(plane: F32, levels: int, *, doubled: bool) -> list[F32]:
-    """(H, W), or twice that where ``doubled``, and its sizes smaller by 1/sqrt(2) each; no side under 16."""
+def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> list[F32]:
+    """An image (H, W), doubled on request, and smaller sizes by 1/sqrt(2) each; no side below 16."""
     height, width = plane.shape
     sizes = [resample(plane, 2 * width, 2 * height) if doubled else plane]
     for index in range(1, levels):
@@ -140,7 +158,7 @@ def shrink(plane: F32, levels: int, *, doubled: bool) -> list[F32]:
         if min(finer.shape) < 32:
             break
         if index == 1:
-            # A step of sqrt(2) needs a weaker low-pass than halving: sigma 0.6 leaves little to alias.
+            # A step of sqrt(2) needs a weaker low-pass than halving: sigma 0.6 avoids aliasing.
             h, w = finer.shape
             sizes.append(resample(smooth(finer, 0.6), round(w / np.sqrt(2.0)), round(h / np.sqrt(2.0))))
         else:
@@ -149,8 +167,7 @@ def shrink(plane: F32, levels: int, *, doubled: bool) -> list[F32]:
 
 
 def _scales(grays: list[F32], width: int, height: int) -> list[tuple[float, float]]:
-    """Pixels of the photograph that a pixel of each size spans along x and y; halving drops an odd row, so
-    that two there are exactly one."""
+    """Image pixels per pixel of each size along x and y; halving drops an odd row, so its scale is 2."""
     first = (width / grays[0].shape[1], height / grays[0].shape[0])
     scales = [first]
     for index, gray in enumerate(grays[1:], 1):
@@ -162,11 +179,10 @@ def _scales(grays: list[F32], width: int, height: int) -> list[tuple[float, floa
     return scales
 
 
-def dominant_direction(blurred: F32, xy: F64) -> F32:
+def _dominant_direction(blurred: F32, xy: F64) -> F32:
     """Direction (N,) rad of the gradient at ``xy``, averaged over about nine pixels; never exactly 0.
 
-    The image is already smooth by sigma 2; the mean over a 5 x 5 grid of spacing 2 brings it to about sigma
-    4.
+    The image is smoothed with sigma 2; the mean over a 5 x 5 grid of spacing 2 gives about sigma 4.
     """
     around = sample_patches(blurred, xy, np.zeros(len(xy), np.float32), 7, 2.0).reshape(-1, 7, 7)
     gx = (around[:, 1:-1, 2:] - around[:, 1:-1, :-2]).sum(axis=(1, 2))
@@ -175,8 +191,8 @@ def dominant_direction(blurred: F32, xy: F64) -> F32:
     return np.where(angle == 0.0, np.float32(1e-6), angle)
 
 
-def normalize_patches(patches: F32) -> tuple[F32, B8]:
-    """Rows of zero mean and unit norm, and whether each had structure (over a grey level)."""
+def _normalize_patches(patches: F32) -> tuple[F32, B8]:
+    """Rows of zero mean and unit norm, and whether each had contrast above a grey level."""
     centred = patches - patches.mean(axis=1, keepdims=True)
     norm = np.linalg.norm(centred, axis=1, keepdims=True)
     structured = norm[:, 0] > np.sqrt(patches.shape[1])

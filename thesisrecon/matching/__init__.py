@@ -1,1 +1,1 @@
-"""Section 4.2.2: corresponding feature points of two photographs, and tracks over all of them."""
+"""Section 4.2.2: corresponding feature points of two images, and tracks over all of them."""

@@ -1,8 +1,7 @@
-"""Least-squares matching of windows: the place and the local map that make two windows most alike.
+"""Least-squares matching: sub-pixel alignment of windows by position and local affine map.
 
-S. Baker, I. Matthews, Lucas-Kanade 20 years on: a unifying framework, IJCV 56, 2004, section 3.2.
-
-Least-squares matching of corners: at the scale they were found on, then at the finest there is.
+Inverse compositional alignment (S. Baker and I. Matthews, "Lucas-Kanade 20 years on: a unifying framework",
+IJCV 56, 2004, section 3.2), at the scale of the corner and then at the finest scale.
 """
 
 from __future__ import annotations
@@ -18,59 +17,59 @@ from thesisrecon.matching.prepared import (
     FAST,
     SAMPLES,
     SIDE,
-    PreparedView,
+    PreparedImage,
+    affine_determinant,
     dot,
-    level_of,
-    map_determinant,
-    matches_at,
     normalize_window,
+    pyramid_level,
     sample_window,
+    select_matches,
 )
 from thesisrecon.records import Matches
 
-# The parts below are called for every window and step: inlined they cost what one long function would.
+# The kernels below are called for every window and step, so they are inlined.
 WIDE = SIDE + 2
 HALF = SIDE // 2
-# Windows that agree less than this show different things; no step from there leads home.
-LEAST_ALIKE = 0.3
-# Structure along one direction only holds no place: least det / product of the diagonal of the normal matrix.
+# Below this correlation the windows show different things and the iteration does not converge.
+MIN_WINDOW_CORRELATION = 0.3
+# Minimum det / product of the diagonal of the normal matrix: structure in one direction gives no position.
 LEAST_CONDITION = 1e-4
-# Squared step, in pixels of the scale, after which another would change nothing.
+# Squared step in pixels of the scale at which the iteration stops.
 SETTLED = 1e-6
 
 
 @njit(cache=True, nogil=True)
-def align_windows(
+def _align_windows(
     view1: tuple[F32, I64, float],
     view2: tuple[F32, I64, float],
     matches: tuple[F64, F32, F64, F64],
     limits: tuple[int, float, float, float],
 ) -> tuple[F64, F64, F32]:
-    """Least-squares matching of the window around each ``xy1`` with image 2, gain and bias free.
+    """Align the window around each ``xy1`` with image 2, invariant to gain and bias.
 
     ``view*`` = pixels, levels, base; ``matches`` = xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
-    ``limits`` = iterations, prior standard deviation of an affine coefficient (0: translation only), largest
-    shift and largest expected error of the place, both in pixels of the corner's scale. Inverse
-    compositional: the template's gradients, cleared of its mean and of itself (bias and gain), serve every
-    iteration. Returns ``xy2`` (M, 2), affine (M, 2, 2) and the final correlation (M,), 0 where it failed.
+    ``limits`` = iterations, prior standard deviation of an affine coefficient (0: translation only), maximum
+    shift and maximum expected error of the position, both in pixels of the corner's scale. The gradients of
+    the template, orthogonal to a constant (bias) and to the template (gain), serve every iteration. Returns
+    ``xy2`` (M, 2), affine (M, 2, 2) and the final correlation (M,), 0 for failures.
     """
     pixels1, levels1, base1 = view1
     pixels2, levels2, base2 = view2
     xy1, scale1, start, affine_start = matches
-    iterations, affine_std, largest_shift, largest_std = limits
+    iterations, affine_std, max_shift, largest_std = limits
     xy2, affine = start.copy(), affine_start.copy()
     score = np.zeros(len(xy1), np.float32)
     border = np.empty(WIDE * WIDE, np.float32)
     template, window = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
     gradient = np.empty((6 if affine_std > 0.0 else 2, SAMPLES), np.float32)
     for n in range(len(xy1)):
-        determinant = map_determinant(affine[n])
+        determinant = affine_determinant(affine[n])
         if determinant == 0.0:
             continue
         m = np.sqrt(determinant)
-        # The finest size that both images can show: below its own pixels image 2 has nothing to compare.
+        # Finest size that both images resolve.
         size = max(float(scale1[n]), base2 / m)
-        k1, k2 = level_of(size, base1, len(levels1)), level_of(size * m, base2, len(levels2))
+        k1, k2 = pyramid_level(size, base1, len(levels1)), pyramid_level(size * m, base2, len(levels2))
         to1, to2 = 1.0 / (base1 * 2.0**k1), 1.0 / (base2 * 2.0**k2)
         if not _read_template(pixels1, levels1[k1], to1, (xy1[n], size), border, (template, gradient)):
             continue
@@ -82,9 +81,9 @@ def align_windows(
             (pixels2, levels2[k2], to2),
             (template, gradient, normal, window),
             (xy2[n], affine[n]),
-            (iterations, affine_std, largest_shift * size * m, size),
+            (iterations, affine_std, max_shift * size * m, size),
         )
-        # Variance of the place: that of a sample times the trace of the inverse normal matrix.
+        # Variance of the position: that of a sample times the trace of the inverse normal matrix.
         variance = (1.0 - value * value) / SAMPLES * ((normal[0, 0] + normal[1, 1]) / d)
         if value == 0.0 or variance > largest_std * largest_std:
             xy2[n], affine[n] = start[n], affine_start[n]
@@ -102,11 +101,11 @@ def _read_template(
     border: F32,
     out: tuple[F32, F32],
 ) -> bool:
-    """The normalised window around a place of image 1 and its derivatives with respect to the unknowns.
+    """Sample the normalised window of image 1 and its derivatives by the unknowns.
 
-    ``place`` = xy, size of a sample in px. The unknowns: shift x, y in samples, and, where ``gradient`` has
-    six rows, the change of the map in units of half the window, so that all six are of one size. False where
-    the window leaves the image or is blank.
+    ``place`` = xy, sample spacing in px. Unknowns: shift x, y in samples and, if ``gradient`` has six rows,
+    the change of the map in units of half the window, so that all six have equal size. False if the window
+    leaves the image or is blank.
     """
     xy, size = place
     template, gradient = out
@@ -141,7 +140,7 @@ def _read_template(
 
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _clear(gradient: F32, template: F32, norm: float) -> None:
-    """Scale a gradient as the template was and remove its parts along a constant and along the template."""
+    """Scale a gradient like the template and remove its components along a constant and the template."""
     total = np.float32(0.0)
     for n in range(len(gradient)):
         total += gradient[n]
@@ -173,10 +172,11 @@ def _iterate(
     found: tuple[F64, F64],
     limits: tuple[int, float, float, float],
 ) -> float:
-    """Gauss-Newton steps that move ``found`` = xy2, affine in place; the correlation reached, 0 where lost.
+    """Move ``found`` = xy2, affine in place by Gauss-Newton; return the correlation, 0 if lost.
 
-    ``template`` = window of image 1, derivatives, normal matrix, room for the window of image 2; ``limits`` =
-    iterations, prior std of an affine coefficient, largest shift px, size of a sample of image 1 px.
+    ``template`` = window of image 1, derivatives, normal matrix, buffer for the window of image 2; ``limits``
+    = iterations, prior standard deviation of an affine coefficient, maximum shift px, sample spacing of image
+    1 px.
     """
     pixels, level, to_level = level2
     fixed, gradient, normal, window = template
@@ -191,7 +191,7 @@ def _iterate(
         if normalize_window(window) == 0.0:
             return 0.0
         value = dot(window, fixed)
-        if value < LEAST_ALIKE:
+        if value < MIN_WINDOW_CORRELATION:
             return 0.0
         if turn == iterations:
             break
@@ -200,15 +200,14 @@ def _iterate(
         if (xy[0] - x) ** 2 + (xy[1] - y) ** 2 > reach**2:
             return 0.0
         if turn < iterations - 1 and delta[0] ** 2 + delta[1] ** 2 < SETTLED:
-            # One more look at the correlation would cost a window and change nothing.
+            # Another correlation would cost a window and not change the result.
             break
     return value
 
 
 @njit(cache=True, nogil=True, forceinline=True)
 def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tuple[F64, float]) -> F64:
-    """The step of all unknowns; ``prior`` = how far the map has moved (updated), and its standard
-    deviation."""
+    """Step of all unknowns; ``prior`` = change of the map so far (updated) and its standard deviation."""
     moved, affine_std = prior
     unknowns = len(gradient)
     damped = normal.copy()
@@ -229,7 +228,7 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
 
 @njit(cache=True, nogil=True, forceinline=True)
 def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
-    """Take the step back from the map, as the template moved, in place: x2(x) = xy + a x."""
+    """Compose the map x2(x) = xy + a x with the inverse of the step of the template, in place."""
     if len(delta) == 6:
         d = np.empty((2, 2))
         d[0, 0], d[0, 1] = 1.0 + delta[2] / HALF, delta[3] / HALF
@@ -241,90 +240,126 @@ def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
 
 
 ITERATIONS = 12
-# A window of half the width sees less: it must fit better, and not wander from what the wider one found.
+# A window of half the width must fit better and stay near the result of the wider one.
 FINE_CORRELATION = 0.85
 FINE_SHIFT = 1.0
-# Smooth shading correlates with anything and holds no place: what its own gradients cannot place to this many
-# pixels of its scale is dropped. It removes the false matches that a correlation threshold lets through.
-LARGEST_STD = 0.12
+# Maximum standard deviation of the position in pixels of the scale. Removes smooth shading, which correlates
+# with anything and passes a correlation threshold.
+MAX_STD = 0.12
 
 
 def align_corners(
-    view1: PreparedView,
-    view2: PreparedView,
+    view1: PreparedImage,
+    view2: PreparedImage,
     matches: tuple[F64, F32, F64, F64],
     *,
     affine_std: float,
-    largest_shift: float,
+    max_shift: float,
 ) -> tuple[F64, F64, F32]:
-    """Sub-pixel places in image 2 of corners of image 1, with the local maps and the correlations reached.
+    """Align corners of image 1 with image 2 to sub-pixel positions.
 
-    Criterion: the squared difference of two 15 x 15 windows, gain and bias free, over the place and the
-    affine map, the map held to its start by ``affine_std``. Corners found at a coarser scale are aligned
-    there first (a wide basin) and then at the finest scale of the photographs (the noise of the place shrinks
-    with the pixel), where the finer answer is kept if it fits.
+    Minimises the squared difference of two 15 x 15 windows, invariant to gain and bias, over position and
+    affine map, the latter with a prior at its start. Corners of a coarser scale are aligned there first (wide
+    convergence) and then at the finest scale (smaller noise), which is used if it fits.
 
     Parameters
     ----------
-    matches : xy1 (M, 2) px, scale1 (M,), start of xy2 (M, 2) px, start of the affine maps (M, 2, 2).
-    affine_std : prior standard deviation of the affine coefficients (pure numbers); 0 leaves them fixed.
-    largest_shift : from the start, in pixels of the corner's scale.
+    view1, view2 : PreparedImage
+        The images.
+    matches : tuple
+        xy1 (M, 2) px, scale1 (M,), start of xy2 (M, 2) px, start of the affine maps (M, 2, 2).
+    affine_std : float
+        Prior standard deviation of the affine coefficients; 0 keeps them fixed.
+    max_shift : float
+        Maximum distance from the start, in pixels of the corner's scale.
 
     Returns
     -------
-    xy2 (M, 2), affine (M, 2, 2), correlation (M,), 0 where the alignment failed or its expected error
-    exceeds ``LARGEST_STD`` px of the scale, and the start was kept.
+    xy2 : ndarray (M, 2)
+        Positions in image 2, px; the start if the alignment failed.
+    affine : ndarray (M, 2, 2)
+        Local affine maps.
+    score : ndarray (M,)
+        Correlations; 0 if the alignment failed or its expected error exceeds MAX_STD px of the scale.
     """
     xy1, scale1, start, maps = matches
-    xy2, affine, score = align_windows(
+    xy2, affine, score = _align_windows(
         view1.pyramid,
         view2.pyramid,
         (xy1, scale1, start, maps),
-        (ITERATIONS, affine_std, largest_shift, LARGEST_STD),
+        (ITERATIONS, affine_std, max_shift, MAX_STD),
     )
     coarse = np.flatnonzero((scale1 > 1.5 * view1.base) & (score > 0.0))
     if not len(coarse):
         return xy2, affine, score
     finest = np.full(len(coarse), view1.base, np.float32)
-    fine_xy2, _, fine_score = align_windows(
+    fine_xy2, _, fine_score = _align_windows(
         view1.pyramid,
         view2.pyramid,
         (xy1[coarse], finest, xy2[coarse], affine[coarse]),
-        (ITERATIONS, affine_std, FINE_SHIFT, LARGEST_STD),
+        (ITERATIONS, affine_std, FINE_SHIFT, MAX_STD),
     )
     fits = fine_score >= FINE_CORRELATION
     xy2[coarse[fits]] = fine_xy2[fits]
     return xy2, affine, score
 
 
-def aligned_matches(
-    view1: PreparedView,
-    view2: PreparedView,
+def align_matches(
+    view1: PreparedImage,
+    view2: PreparedImage,
     matches: Matches,
     *,
     affine_std: float,
-    least_correlation: float,
-    largest_shift: float = 3.0,
+    min_correlation: float,
+    max_shift: float = 3.0,
 ) -> Matches:
-    """The matches of corners with the places in image 2 moved to sub-pixel by :func:`align_corners`.
+    """Align matches of corners to sub-pixel positions and drop those that fail or repeat a better one.
 
-    Those that do not reach ``least_correlation`` are dropped, and those that the alignment led to the place
-    of a better one.
+    Parameters
+    ----------
+    view1, view2 : PreparedImage
+        The images.
+    matches : Matches
+        Matches at the corners.
+    affine_std : float
+        Prior standard deviation of the affine coefficients.
+    min_correlation : float
+        Minimum correlation after alignment.
+    max_shift : float
+        Maximum distance from the start, in pixels of the corner's scale.
+
+    Returns
+    -------
+    Matches
+        The aligned matches.
     """
     xy2, affine, score = align_corners(
         view1,
         view2,
         (matches.xy1, view1.features.scale[matches.index1], matches.xy2, matches.affine),
         affine_std=affine_std,
-        largest_shift=largest_shift,
+        max_shift=max_shift,
     )
     moved = replace(matches, xy2=xy2, affine=affine, score=score)
-    good = matches_at(moved, np.flatnonzero(score >= least_correlation))
-    return matches_at(good, strongest_distinct(good))
+    good = select_matches(moved, np.flatnonzero(score >= min_correlation))
+    return select_matches(good, strongest_distinct(good))
 
 
 def strongest_distinct(matches: Matches, *, apart_px: float = 1.0) -> I64:
-    """Rows, in order, of the matches that repeat no stronger one within ``apart_px`` in both images."""
+    """Select the matches that do not repeat a stronger one.
+
+    Parameters
+    ----------
+    matches : Matches
+        The matches.
+    apart_px : float
+        Distance in (x1, y1, x2, y2) within which two matches are the same.
+
+    Returns
+    -------
+    ndarray (K,) of int
+        Rows, sorted.
+    """
     rows = np.argsort(-matches.score, kind="stable")
     keep = np.ones(len(rows), np.bool_)
     if len(rows) >= 2:

@@ -1,8 +1,4 @@
-"""Growth: local affine maps from known matches, and the search around the places they predict.
-
-The default matching: seeds without a radius, then growth along the epipolar lines, then sub-pixel
-alignment.
-"""
+"""The default matching: seeds without a search radius, guided matching along epipolar lines, alignment."""
 
 from __future__ import annotations
 
@@ -15,45 +11,44 @@ from numba import njit
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.matching.alignment import aligned_matches, strongest_distinct
+from thesisrecon.matching.alignment import align_matches, strongest_distinct
 from thesisrecon.matching.prepared import (
     SAMPLES,
     SIDE,
     FundamentalEstimator,
-    PreparedView,
+    PreparedImage,
+    affine_determinant,
     dot,
     empty_matches,
-    level_of,
-    map_determinant,
-    matches_at,
     normalize_window,
     one_to_one,
-    prepare_view,
+    prepare_image,
+    pyramid_level,
     sample_window,
+    select_matches,
 )
 from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
 from thesisrecon.records import Features, Image, Matches
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
 APART = 3.0
-# Rounds of least squares of a local map: the first with all neighbours alike, the others re-weighted.
+# Rounds of least squares of a local map: the first unweighted, the others reweighted.
 ROUNDS = 3
-# How much the prior holds a local map, as a share of what its neighbours' weights say along one direction.
+# Weight of the prior of a local map, relative to the neighbours' weights along one direction.
 PRIOR_SHARE = 0.05
 
 
 @njit(cache=True, nogil=True)
-def fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
-    """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its ``neighbours`` (N, K) among
-    matches.
+def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
+    """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its neighbouring matches (N, K).
 
-    Weighted least squares, weights 1 / (d^2 + d_mean^2), rounds of Cauchy re-weighting against neighbours on
-    another surface, held to ``prior`` (M, 2, 2), the mean of the neighbours' own maps, where they are in
-    line. Returns the map (N, 2, 2), the place in image 2 (N, 2) and its uncertainty (N,) px.
+    Weighted least squares, weights 1 / (d^2 + d_mean^2), with Cauchy reweighting against neighbours on
+    another surface and a prior at the mean of the neighbours' maps ``prior`` (M, 2, 2), which matters if they
+    are collinear. Returns the map (N, 2, 2), the position in image 2 (N, 2) and its uncertainty (N,) px.
     """
     count, k = neighbours.shape
     affine = np.empty((count, 2, 2))
-    place = np.empty((count, 2))
+    position = np.empty((count, 2))
     spread = np.empty(count)
     offset = np.empty((k, 2))
     rest = np.empty((k, 2))
@@ -87,14 +82,14 @@ def fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) 
                 residual2[m] = ex * ex + ey * ey
             scale2 = np.median(residual2)
         affine[n] = a
-        place[n] = z[2]
+        position[n] = z[2]
         spread[n] = np.sqrt(scale2)
-    return affine, place, spread
+    return affine, position, spread
 
 
 @njit(cache=True, nogil=True)
 def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: tuple[F64, float]) -> F64:
-    """(3, 2) correction of the prior map, transposed, over the translation, by weighted least squares."""
+    """Correction (3, 2) of the prior map, transposed, above the translation, by weighted least squares."""
     distance2, mean2 = near
     residual2, scale2 = misfit
     s = np.zeros((3, 3))
@@ -126,7 +121,7 @@ def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: t
 
 
 @njit(cache=True, nogil=True)
-def grow_corners(
+def _match_guided(
     view1: tuple[F32, I64, float],
     corners1: tuple[F64, F32],
     predicted: tuple[F64, F64, F64],
@@ -134,32 +129,31 @@ def grow_corners(
     grid2: tuple[float, I64, I64, I64],
     gate: tuple[F64, float, float],
 ) -> tuple[I64, F32, F32]:
-    """The corner of image 2 that looks most like each corner of image 1, near its predicted place and
-    epipolar line.
+    """Most similar corner of image 2 near the predicted position and epipolar line of each corner.
 
     ``view1`` = pixels, levels, base; ``corners1`` = xy (N, 2), scale (N,); ``predicted`` = affine (N, 2, 2),
-    place (N, 2), radius (N,) px; ``corners2`` = xy, scale, patches (C, 225); ``grid2`` = cell size, shape
-    (2,), start, order of the corners of image 2 in cells; ``gate`` = F, half width of the epipolar band px,
-    least correlation. Returns the corner of image 2 (-1: none), the correlation, and that of the best rival
-    that lies elsewhere (-1: none).
+    position (N, 2), radius (N,) px; ``corners2`` = xy, scale, patches (C, 225); ``grid2`` = cell size, shape
+    (2,), start, order of the corners of image 2; ``gate`` = F, half width of the epipolar band px, minimum
+    correlation. Returns the corner of image 2 (-1: none), the correlation and the second best correlation
+    elsewhere (-1: none).
     """
     xy1, scale1 = corners1
-    affine, place, radius = predicted
+    affine, position, radius = predicted
     xy2, scale2, patches2 = corners2
     F, band, least = gate
     count = len(xy1)
     index = np.full(count, -1, np.int64)
     score = np.zeros(count, np.float32)
-    competing_model = np.full(count, -1.0, np.float32)
+    second_best = np.full(count, -1.0, np.float32)
     near, seen = np.empty(len(xy2), np.int64), np.empty(len(xy2), np.float32)
     window = np.empty((2, SAMPLES), np.float32)
     ready = np.zeros(2, np.bool_)
     sizes = np.array([1.0, 2.0]) * float(np.min(scale2))
     for n in range(count):
-        determinant = map_determinant(affine[n])
+        determinant = affine_determinant(affine[n])
         if determinant == 0.0:
             continue
-        found = _corners_in_band(xy1[n], (place[n], radius[n]), (F, band), xy2, grid2, near)
+        found = _corners_in_band(xy1[n], (position[n], radius[n]), (F, band), xy2, grid2, near)
         if found == 0:
             continue
         _warp_windows(view1, (xy1[n], scale1[n]), (affine[n], determinant), sizes, (window, ready))
@@ -174,8 +168,8 @@ def grow_corners(
                     best, top = c, float(seen[t])
         if best >= 0:
             index[n], score[n] = best, top
-            competing_model[n] = _best_elsewhere(xy2, best, APART * scale2[best], near[:found], seen)
-    return index, score, competing_model
+            second_best[n] = _best_elsewhere(xy2, best, APART * scale2[best], near[:found], seen)
+    return index, score, second_best
 
 
 @njit(cache=True, nogil=True)
@@ -187,21 +181,20 @@ def _corners_in_band(
     grid2: tuple[float, I64, I64, I64],
     near: I64,
 ) -> int:
-    """How many corners of image 2 lie within the radius of the place and within the band of the epipolar
-    line; their numbers go to ``near``."""
-    place, radius = search
+    """Write to ``near`` the corners of image 2 inside radius and epipolar band; return their number."""
+    position, radius = search
     F, band = epipolar
     cell, shape, start, order = grid2
     l0 = F[0, 0] * xy1[0] + F[0, 1] * xy1[1] + F[0, 2]
     l1 = F[1, 0] * xy1[0] + F[1, 1] * xy1[1] + F[1, 2]
     l2 = F[2, 0] * xy1[0] + F[2, 1] * xy1[1] + F[2, 2]
     length = np.sqrt(l0 * l0 + l1 * l1) + 1e-300
-    if abs(l0 * place[0] + l1 * place[1] + l2) > (radius + band) * length:
+    if abs(l0 * position[0] + l1 * position[1] + l2) > (radius + band) * length:
         return 0
-    first_x = max(int((place[0] - radius) / cell), 0)
-    last_x = min(int((place[0] + radius) / cell), shape[1] - 1)
-    first_y = max(int((place[1] - radius) / cell), 0)
-    last_y = min(int((place[1] + radius) / cell), shape[0] - 1)
+    first_x = max(int((position[0] - radius) / cell), 0)
+    last_x = min(int((position[0] + radius) / cell), shape[1] - 1)
+    first_y = max(int((position[1] - radius) / cell), 0)
+    last_y = min(int((position[1] + radius) / cell), shape[0] - 1)
     if last_x < first_x:
         return 0
     found = 0
@@ -209,7 +202,7 @@ def _corners_in_band(
         row = cy * shape[1]
         for at in range(start[row + first_x], start[row + last_x + 1]):
             c = order[at]
-            dx, dy = xy2[c, 0] - place[0], xy2[c, 1] - place[1]
+            dx, dy = xy2[c, 0] - position[0], xy2[c, 1] - position[1]
             if dx * dx + dy * dy > radius * radius:
                 continue
             if abs(l0 * xy2[c, 0] + l1 * xy2[c, 1] + l2) > band * length:
@@ -227,8 +220,10 @@ def _warp_windows(
     sizes: F64,
     out: tuple[F32, B8],
 ) -> None:
-    """The window of a corner of image 1 as image 2 shows it, for each of the ``sizes`` of corners there; not
-    ready where the corner would have another size, or the window leaves the image or is blank."""
+    """Sample the window of a corner of image 1 as seen in image 2, for each corner size there.
+
+    Not ready if the corner would have another size, or the window leaves the image or is blank.
+    """
     pixels, levels, base = view1
     xy, scale = corner
     a, determinant = local
@@ -241,7 +236,7 @@ def _warp_windows(
         ready[t] = False
         ratio = scale * m / sizes[t]
         if ratio > 0.6 and ratio < 1.7:
-            k = level_of(sizes[t] / m, base, len(levels))
+            k = pyramid_level(sizes[t] / m, base, len(levels))
             step = inverse * sizes[t]
             if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy, step, SIDE, window[t]):
                 ready[t] = normalize_window(window[t]) > 0.0
@@ -250,51 +245,66 @@ def _warp_windows(
 @njit(cache=True, nogil=True)
 def _best_elsewhere(xy2: F64, best: int, apart: float, near: I64, seen: F32) -> float:
     """Largest of the correlations ``seen`` of corners ``near`` that lie ``apart`` from the best; -1: none."""
-    competing_model = np.float32(-1.0)
+    second_best = np.float32(-1.0)
     for t in range(len(near)):
         dx, dy = xy2[near[t], 0] - xy2[best, 0], xy2[near[t], 1] - xy2[best, 1]
         if dx * dx + dy * dy > apart**2:
-            competing_model = max(competing_model, seen[t])
-    return float(competing_model)
+            second_best = max(second_best, seen[t])
+    return float(second_best)
 
 
 Found = tuple[I64, I64, SeedMatches]
-"""Corners of image 1, corners of image 2, and the matches with their places, maps and correlations."""
+"""Corners of image 1, corners of image 2, and the matches."""
 
 
 @dataclass(frozen=True)
 class SeedsAndGrowth:
-    """Seeds give F, F and the seeds' local affine maps tell each corner where to look, alignment does the
-    rest.
+    """Seeds give F; F and local affine maps of known matches guide the search for each corner.
 
     Parameters
     ----------
-    ratio : distance of a seed to its match as a share of the distance to the best rival, at most.
-    least_support : strength of match (of at most 10) that a seed needs in the filtered trial.
-    least_seeds : verified seeds under which a pair counts as not overlapping.
-    band_rel : half width of the epipolar band, share of the long side.
-    radius_rel : largest search radius around the predicted place, share of the long side.
-    least_correlation : of a grown match at its corner; ``aligned_correlation`` after alignment.
-    grown_ratio : as ``ratio``, for a grown match and the rivals in its part of the epipolar band.
-    neighbours : matches that define a local affine map.
-    affine_std : prior standard deviation of an affine coefficient in the alignment.
-    orientation : seeds by their upright patches, by those turned to their gradient, or "auto": the turned
-        ones too where the upright ones do not relate the pair well.
-    support : whether F is sought among the seeds whose neighbours move as they do ("always"), among all
-        ("never"), or in both ways and the better kept ("auto").
-    growth : corners are sought where the seeds tell, else only those that a seed stands on are matched.
-    coarse_first : the corners of the coarser size grow before all of them, and give a better F to these.
-    rematch : guided rematching: all corners are sought once more with the F and the maps of the matches that
-        grew.
-    align : places in image 2 are moved to sub-pixel by least-squares matching, else stay at the corners.
+    ratio : float
+        Maximum ratio of the distances of a seed to its best and second best match.
+    min_support : float
+        Minimum strength of match (at most 10) of a seed in the filtered trial.
+    min_seeds : int
+        Minimum number of verified seeds of a pair.
+    band_rel : float
+        Half width of the epipolar band, relative to the long side.
+    radius_rel : float
+        Maximum search radius around the prediction, relative to the long side.
+    min_correlation : float
+        Minimum correlation of a guided match at its corner.
+    aligned_correlation : float
+        Minimum correlation after alignment.
+    grown_ratio : float
+        As ``ratio`` for a guided match, within its part of the epipolar band.
+    neighbours : int
+        Number of matches that define a local affine map.
+    affine_std : float
+        Prior standard deviation of an affine coefficient in the alignment.
+    orientation : {"auto", "upright", "turned"}
+        Seeds by upright patches, by patches rotated to their gradient, or the latter too if the upright ones
+        do not relate the pair well.
+    support : {"auto", "always", "never"}
+        Estimate F from seeds whose neighbours move alike, from all seeds, or from both with the better
+        result.
+    growth : bool
+        Match all corners by guided search, else only corners at seeds.
+    coarse_first : bool
+        Match the corners of the coarser scale first; they give a better F for all.
+    rematch : bool
+        Repeat the guided matching with the F and the maps of its own matches.
+    align : bool
+        Align positions in image 2 by least-squares matching, else keep the corners.
     """
 
     ratio: float = 0.8
-    least_support: float = 2.0
-    least_seeds: int = 12
+    min_support: float = 2.0
+    min_seeds: int = 12
     band_rel: float = 0.002
     radius_rel: float = 0.025
-    least_correlation: float = 0.7
+    min_correlation: float = 0.7
     aligned_correlation: float = 0.8
     grown_ratio: float = 0.8
     neighbours: int = 10
@@ -307,7 +317,7 @@ class SeedsAndGrowth:
     align: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("least_seeds", "neighbours"):
+        for name in ("min_seeds", "neighbours"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
         for name in ("ratio", "grown_ratio", "band_rel", "radius_rel"):
@@ -316,26 +326,58 @@ class SeedsAndGrowth:
         if not self.affine_std >= 0.0:
             raise ValueError(f"affine_std must be at least 0; got {self.affine_std}")
 
-    def prepare(self, image: Image, features: Features) -> PreparedView:
-        """What is computed once for a photograph."""
-        return prepare_view(image, features)
+    def prepare(self, image: Image, features: Features) -> PreparedImage:
+        """Prepare an image for matching.
+
+        Parameters
+        ----------
+        image : Image
+            The image.
+        features : Features
+            Its features.
+
+        Returns
+        -------
+        PreparedImage
+            The prepared image.
+        """
+        return prepare_image(image, features)
 
     def match(
         self,
-        view1: PreparedView,
-        view2: PreparedView,
+        view1: PreparedImage,
+        view2: PreparedImage,
         *,
         pair: tuple[int, int],
         estimate_fundamental: FundamentalEstimator,
         rng: np.random.Generator,
     ) -> Matches:
-        """Corner matches of two photographs, one-to-one, aligned to sub-pixel; empty if none.
+        """Match the corners of two images one-to-one.
 
-        Raises :class:`UsageError` for features without seeds.
+        Parameters
+        ----------
+        view1, view2 : PreparedImage
+            The images.
+        pair : tuple of int
+            Numbers of the views.
+        estimate_fundamental : callable
+            Robust estimator of F.
+        rng : numpy.random.Generator
+            Source of the samples.
+
+        Returns
+        -------
+        Matches
+            Matches aligned to sub-pixel, possibly none.
+
+        Raises
+        ------
+        UsageError
+            If the features have no seeds.
         """
         if view1.features.seeds is None or view2.features.seeds is None:
             raise UsageError(
-                "matching by seeds and growth needs features with seeds; set "
+                "seeds-and-growth matching needs features with seeds; set "
                 "features.kind=multi-scale-corners, or matching.kind=strength-of-match"
             )
         start = self._verified_seeds(view1, view2, estimate_fundamental, rng)
@@ -347,19 +389,19 @@ class SeedsAndGrowth:
             one, two, found = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
         matches = Matches(*pair, one, two, found.xy1, found.xy2, found.score, found.affine)
         if not self.align:
-            return matches_at(matches, strongest_distinct(matches))
-        return aligned_matches(
+            return select_matches(matches, strongest_distinct(matches))
+        return align_matches(
             view1,
             view2,
             matches,
             affine_std=self.affine_std,
-            least_correlation=self.aligned_correlation,
+            min_correlation=self.aligned_correlation,
         )
 
     def _verified_seeds(
         self,
-        view1: PreparedView,
-        view2: PreparedView,
+        view1: PreparedImage,
+        view2: PreparedImage,
         estimate: FundamentalEstimator,
         rng: np.random.Generator,
     ) -> tuple[SeedMatches, F64] | None:
@@ -374,32 +416,30 @@ class SeedsAndGrowth:
                     fit = estimate(trial.xy1, trial.xy2, rng)
                 except StageFailure:
                     continue
-                if fit.inliers.sum() >= self.least_seeds and (
-                    best is None or fit.inliers.sum() > len(best[0])
-                ):
+                if fit.inliers.sum() >= self.min_seeds and (best is None or fit.inliers.sum() > len(best[0])):
                     best = trial.at(fit.inliers), fit.F
             if best is not None and len(best[0]) >= max(50, 0.5 * len(seeds)):
                 break
         return best
 
     def _trials(self, seeds: SeedMatches) -> tuple[SeedMatches, ...]:
-        """The sets of seeds among which F is sought; none where there are too few."""
+        """Sets of seeds to estimate F from; none if there are too few."""
         if self.support == "never":
-            return (seeds,) if len(seeds) >= self.least_seeds else ()
-        supported = neighbour_support(seeds) >= self.least_support
-        if supported.sum() < self.least_seeds:
+            return (seeds,) if len(seeds) >= self.min_seeds else ()
+        supported = neighbour_support(seeds) >= self.min_support
+        if supported.sum() < self.min_seeds:
             return ()
         return (seeds.at(supported), seeds) if self.support == "auto" else (seeds.at(supported),)
 
     def _grow_in_rounds(
         self,
-        view1: PreparedView,
-        view2: PreparedView,
+        view1: PreparedImage,
+        view2: PreparedImage,
         start: tuple[SeedMatches, F64],
         estimate: FundamentalEstimator,
         rng: np.random.Generator,
     ) -> Found:
-        """The corners of the coarser size, then all, then all once more, each led by those before it."""
+        """Match the corners of the coarser scale, then all twice, guided by the previous matches."""
         known, F = start
         scale = view1.features.scale
         everything = np.arange(len(scale))
@@ -417,25 +457,25 @@ class SeedsAndGrowth:
         return self._grow(view1, view2, everything, known, F)
 
     def _grow(
-        self, view1: PreparedView, view2: PreparedView, chosen: I64, known: SeedMatches, F: F64
+        self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: SeedMatches, F: F64
     ) -> Found:
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
-        # Asked for a list of ranks, the tree answers with a row a corner even where that is one neighbour.
+        # With a list of ranks the result keeps two dimensions even for one neighbour.
         ranks = np.arange(1, min(self.neighbours, len(known)) + 1)
         near = scipy.spatial.cKDTree(known.xy1).query(xy1, ranks)[1]
-        affine, place, spread = fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
+        affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, self.radius_rel * long_side)
         corners2 = (view2.features.xy, view2.features.scale, view2.patches)
-        index, score, competing_model = grow_corners(
+        index, score, second_best = _match_guided(
             view1.pyramid,
             (xy1, scale1),
-            (affine, place, radius),
+            (affine, position, radius),
             corners2,
             view2.cells,
-            (F, self.band_rel * long_side, self.least_correlation),
+            (F, self.band_rel * long_side, self.min_correlation),
         )
-        index[1.0 - score > self.grown_ratio**2 * (1.0 - competing_model)] = -1
+        index[1.0 - score > self.grown_ratio**2 * (1.0 - second_best)] = -1
         rows = one_to_one(index, score)
         one, two = chosen[rows], index[rows]
         return one, two, SeedMatches(xy1[rows], view2.features.xy[two], affine[rows], score[rows])

@@ -1,12 +1,7 @@
-"""What the ways to choose pairs share.
+"""Estimate which images overlap: geometric test of small patch sets and bag-of-words similarity.
 
-Loops of the overlap estimate; the tests compare each with a NumPy twin.
-
-How much two photographs overlap, told from a few hundred small patches of each.
-
-A vocabulary of patches made from the photographs themselves: which photographs use the same words.
-
-J. Sivic and A. Zisserman, Video Google: a text retrieval approach to object matching in videos, ICCV 2003.
+Bag of words after J. Sivic and A. Zisserman, "Video Google: a text retrieval approach to object matching in
+videos", ICCV 2003, with a vocabulary made from the images themselves.
 """
 
 from __future__ import annotations
@@ -21,67 +16,52 @@ import scipy
 from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.matching.seeds import mutual_best
 from thesisrecon.records import Seeds
 
 MapAll = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
-"""Calls a function on each item, perhaps in several threads, and returns the answers in order."""
+"""Apply a function to each item, possibly in several threads, and return the results in order."""
 
 
 def pair_array(pairs: Iterable[Iterable[int]]) -> I64:
-    """Pairs as (M, 2) with the smaller number first, sorted."""
+    """Return pairs as a sorted array without duplicates.
+
+    Parameters
+    ----------
+    pairs : iterable of pairs of int
+        Pairs in any order.
+
+    Returns
+    -------
+    ndarray (M, 2) of int
+        Pairs with the smaller number first.
+    """
     rows = sorted({(min(pair), max(pair)) for pair in (tuple(p) for p in pairs)})
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
 def every_pair(n: int) -> I64:
-    """All pairs of ``n`` views."""
+    """Return all pairs of views.
+
+    Parameters
+    ----------
+    n : int
+        Number of views.
+
+    Returns
+    -------
+    ndarray (M, 2) of int
+        The pairs.
+    """
     return pair_array(combinations(range(n), 2))
 
 
 @njit(cache=True, nogil=True)
-def mutual_best(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32]:
-    """Of each row of (N, M) correlations its column, -1 where they are not each other's best, and its rival.
+def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> int:
+    """Largest number of other matches predicted by the similarity of one match.
 
-    The rival (N,) is the largest correlation of a row elsewhere: with a column whose place ``xy2`` (M, 2) is
-    farther from that of the best than the square root of the best's ``apart2`` (M,); -1 without any, and
-    where the column is -1. The first of equal values counts.
-    """
-    rows, columns = correlation.shape
-    column_value = np.full(columns, -2.0, np.float32)
-    column_row = np.full(columns, -1, np.int64)
-    index = np.full(rows, -1, np.int64)
-    for r in range(rows):
-        best, place = np.float32(-2.0), -1
-        for c in range(columns):
-            value = correlation[r, c]
-            if value > best:
-                best, place = value, c
-            if value > column_value[c]:
-                column_value[c] = value
-                column_row[c] = r
-        index[r] = place
-    competing_model = np.full(rows, -1.0, np.float32)
-    for r in range(rows):
-        place = index[r]
-        if place < 0 or column_row[place] != r:
-            index[r] = -1
-            continue
-        for c in range(columns):
-            if correlation[r, c] > competing_model[r]:
-                dx, dy = xy2[c, 0] - xy2[place, 0], xy2[c, 1] - xy2[place, 1]
-                if dx * dx + dy * dy > apart2[place]:
-                    competing_model[r] = correlation[r, c]
-    return index, competing_model
-
-
-@njit(cache=True, nogil=True)
-def most_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> int:
-    """The largest number of matches that the similarity of one of them predicts, that one not counted.
-
-    Match m has places ``xy1[m]``, ``xy2[m]`` and a similarity: ``scale[m]`` (pixels of image 2 per pixel of
-    image 1) and ``angle[m]`` (rad). It predicts another whose place in image 2 it foretells within
-    ``limits[0]`` px, and whose scale differs by at most ``limits[1]`` in its logarithm, its angle by at most
-    ``limits[2]`` rad.
+    Match m has positions ``xy1[m]``, ``xy2[m]``, ``scale[m]`` (image 2 per image 1) and ``angle[m]`` rad.
+    ``limits`` are the position error in px, the difference of log scales and the difference of angles.
     """
     most, radius2 = 0, limits[0] * limits[0]
     for h in range(len(xy1)):
@@ -92,24 +72,33 @@ def most_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> in
             dx = xy2[h, 0] + c * x - s * y - xy2[m, 0]
             dy = xy2[h, 1] + s * x + c * y - xy2[m, 1]
             turn = np.cos(angle[m] - angle[h])
-            alike = abs(np.log(scale[m] / scale[h])) <= limits[1] and turn >= np.cos(limits[2])
-            if m != h and alike and dx * dx + dy * dy <= radius2:
+            similarity = abs(np.log(scale[m] / scale[h])) <= limits[1] and turn >= np.cos(limits[2])
+            if m != h and similarity and dx * dx + dy * dy <= radius2:
                 count += 1
         most = max(most, count)
     return most
 
 
-LEAST_CORRELATION = 0.5
-"""Of two patches that may show the same: half of the variance in common."""
-LEAST_LOG10 = -300.0
-"""Below it the tail of the binomial underflows."""
+# Minimum correlation of two patches of the same surface: half of the variance in common.
+MIN_CORRELATION = 0.5
+# Below this the tail of the binomial distribution underflows.
+MIN_LOG10 = -300.0
 
 
 @dataclass(frozen=True)
 class FeatureSubset:
-    """Some seeds of one photograph, of every scale; ``size`` (width, height) px is the extent of all.
+    """Some seeds of one image, of every scale.
 
-    ``xy`` (S, 2) px; ``scale``, ``angle`` (S,); ``patches`` (S, D) float32 of zero mean and unit norm.
+    Parameters
+    ----------
+    xy : ndarray (S, 2)
+        Positions, px.
+    scale, angle : ndarray (S,)
+        Scale and angle, rad.
+    patches : ndarray (S, D)
+        Patches of zero mean and unit norm, float32.
+    size : ndarray (2,)
+        Extent of all seeds, px.
     """
 
     xy: F64
@@ -120,7 +109,22 @@ class FeatureSubset:
 
 
 def subset_seeds(seeds: Seeds, *, turned: bool, per_scale: int) -> FeatureSubset:
-    """The strongest ``per_scale`` seeds of each scale: the turned patches, or the upright ones."""
+    """Select the strongest seeds of each scale.
+
+    Parameters
+    ----------
+    seeds : Seeds
+        Seeds of one image.
+    turned : bool
+        Use the patches rotated to their dominant gradient, else the upright ones.
+    per_scale : int
+        Number of seeds per scale.
+
+    Returns
+    -------
+    FeatureSubset
+        The selected seeds.
+    """
     use = np.flatnonzero((seeds.angle != 0.0) == turned)
     parts = [use[seeds.scale[use] == scale][:per_scale] for scale in np.unique(seeds.scale[use])]
     kept = np.concatenate([np.empty(0, np.int64), *parts])
@@ -136,36 +140,55 @@ def subset_seeds(seeds: Seeds, *, turned: bool, per_scale: int) -> FeatureSubset
 
 @dataclass(frozen=True)
 class OverlapTest:
-    """Patches that are each other's best name a similarity; how many agree with one is judged against chance.
+    """Test of overlap by mutually best patches that agree with one similarity, compared with chance.
 
     Parameters
     ----------
-    ratio : distance of a patch to its match as a share of that to the best rival elsewhere, at most.
-    radius_rel : how far a match may lie from where the similarity of another foretells it, share of the long
-        side: wide, for parallax and perspective are no similarity.
-    log_scale : how far logarithms of their scales may differ; ``angle_rad`` their angles.
-    most_matches : matches, the best by correlation, that are asked.
+    ratio : float
+        Maximum ratio of the distances to the best and to the second best patch.
+    radius_rel : float
+        Maximum deviation of a match from the prediction, relative to the long side; wide because of parallax
+        and perspective.
+    log_scale : float
+        Maximum difference of log scales.
+    angle_rad : float
+        Maximum difference of angles.
+    max_matches : int
+        Maximum number of matches, best correlations first.
     """
 
     ratio: float = 0.8
     radius_rel: float = 0.1
     log_scale: float = 0.8
     angle_rad: float = 0.8
-    most_matches: int = 150
+    max_matches: int = 150
 
     def score(self, a: FeatureSubset, b: FeatureSubset) -> float:
-        """-log10 of how many similarities with as many matches chance would give this pair (at 0: one).
+        """Compute the evidence of overlap, -log10 of the number of false alarms.
 
-        With M matches, each of which is a trial, k that agree with the best, and p the area around a
-        foretold place as a share of the photograph: M B(M - 1, k, p), B the tail of the binomial (the number
-        of false alarms of Desolneux, Moisan and Morel, Meaningful alignments, IJCV 2000).
+        M B(M - 1, k, p) for M matches, k that agree with the best similarity and p the relative area around a
+        prediction, with B the tail of the binomial distribution.
+
+        Parameters
+        ----------
+        a, b : FeatureSubset
+            Seeds of both images.
+
+        Returns
+        -------
+        float
+            0 means one false alarm is expected; larger is stronger evidence.
+
+        References
+        ----------
+        A. Desolneux, L. Moisan and J.-M. Morel, "Meaningful alignments", IJCV 40, 2000.
         """
         one, two = self._matches(a, b)
         if len(one) < 2:
             return -float(np.log10(max(len(one), 1)))
         radius = self.radius_rel * float(b.size.max())
         turn = b.angle[two] - a.angle[one]
-        k = most_agreeing(
+        k = _count_agreeing(
             a.xy[one],
             b.xy[two],
             b.scale[two] / a.scale[one],
@@ -179,21 +202,19 @@ class OverlapTest:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         correlation = a.patches @ b.patches.T
         apart2 = ((8.0 * b.scale) ** 2).astype(np.float32)
-        index, competing_model = mutual_best(correlation, b.xy.astype(np.float32), apart2)
+        index, value, second_best = mutual_best([correlation], b.xy.astype(np.float32), apart2)
         one = np.flatnonzero(index >= 0)
-        value = correlation[one, index[one]]
-        distinct = (value > LEAST_CORRELATION) & (
-            (1.0 - value) < self.ratio**2 * (1.0 - competing_model[one])
-        )
+        value, second_best = value[one], second_best[one]
+        distinct = (value > MIN_CORRELATION) & ((1.0 - value) < self.ratio**2 * (1.0 - second_best))
         one, value = one[distinct], value[distinct]
-        one = one[np.argsort(-value, kind="stable")[: self.most_matches]]
+        one = one[np.argsort(-value, kind="stable")[: self.max_matches]]
         return one, index[one]
 
 
 def _log10_false_alarms(k: int, matches: int, chance: float) -> float:
-    """log10 of M times the probability that of M - 1 others at least k agree by chance."""
+    """log10 of M times the probability that at least k of M - 1 other matches agree by chance."""
     tail = float(scipy.special.bdtrc(k - 1, matches - 1, chance)) if k > 0 else 1.0
-    return float(np.log10(matches)) + max(float(np.log10(max(tail, 1e-320))), LEAST_LOG10)
+    return float(np.log10(matches)) + max(float(np.log10(max(tail, 1e-320))), MIN_LOG10)
 
 
 SAMPLES_PER_WORD = 8
@@ -202,11 +223,26 @@ ROWS_AT_ONCE = 4096
 
 
 def bow_similarity(patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator) -> F64:
-    """(N, N) cosine of the photographs' word counts, each word weighed by how few photographs use it.
+    """Compute the bag-of-words similarity of all pairs of images.
 
-    ``patches[i]`` (S, D) are the unit patches of photograph i. A patch counts for the three words nearest
-    to it, so that one at a border finds its like; roots of the counts keep repeated structure from deciding.
-    The time grows with N, but for one product of (N, words) matrices.
+    Cosine of the weighted word counts; a word is weighted by how few images contain it. A patch counts for
+    its three nearest words, and square roots of the counts limit the effect of repeated structure.
+
+    Parameters
+    ----------
+    patches : sequence of ndarray (S, D)
+        Unit patches of each image.
+    words : int
+        Vocabulary size.
+    map_all : callable
+        Parallel map.
+    rng : numpy.random.Generator
+        Source of the vocabulary sample.
+
+    Returns
+    -------
+    ndarray (N, N)
+        Similarities.
     """
     everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
     if not len(everything):
@@ -216,12 +252,12 @@ def bow_similarity(patches: Sequence[F32], words: int, *, map_all: MapAll, rng: 
     used = np.maximum((counts > 0).sum(axis=0), 1)
     weighed = np.sqrt(counts) * np.log(len(patches) / used)
     weighed /= np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-12)
-    alike: F64 = weighed @ weighed.T
-    return alike
+    similarity: F64 = weighed @ weighed.T
+    return similarity
 
 
 def _vocabulary(patches: F32, words: int, rng: np.random.Generator) -> F32:
-    """(words, D) centres of spherical k-means over a sample of the patches."""
+    """Centres (words, D) of spherical k-means over a sample of the patches."""
     sample = patches[rng.permutation(len(patches))[: SAMPLES_PER_WORD * words]]
     centres = sample[:words]
     for _ in range(ROUNDS):

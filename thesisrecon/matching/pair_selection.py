@@ -1,7 +1,4 @@
-"""Pairs that need no look at the photographs: all of them, neighbours in a sequence, a list of the user.
-
-Pairs that overlap, told from small patches before anything is matched.
-"""
+"""Selection of the image pairs to match: all, a sequence window, a list, or by estimated overlap."""
 
 from __future__ import annotations
 
@@ -24,15 +21,15 @@ from thesisrecon.matching.overlap import (
 )
 from thesisrecon.records import Features, PairChoice
 
-# ruff: noqa: ARG002 (a choice takes what every choice is given)
+# ruff: noqa: ARG002 (all selectors have the same arguments)
 
 
 @dataclass(frozen=True)
 class AllPairs:
-    """Every photograph with every other: N (N - 1) / 2 pairs."""
+    """Every image with every other: N (N - 1) / 2 pairs."""
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Nothing can be wrong."""
+        """Accept all image names."""
 
     def select(
         self,
@@ -42,15 +39,20 @@ class AllPairs:
         map_all: MapAll,
         rng: np.random.Generator,
     ) -> PairChoice:
-        """All pairs."""
+        """Select all pairs."""
         return PairChoice(every_pair(len(names)), "all pairs")
 
 
 @dataclass(frozen=True)
 class SequenceWindow:
-    """Each photograph with the ``window`` that follow it in the order of their names.
+    """Each image with the next ones in the order of the file names.
 
-    ``loop`` : the last ones are followed by the first.
+    Parameters
+    ----------
+    window : int
+        Number of following images.
+    loop : bool
+        Continue with the first image after the last.
     """
 
     window: int = 5
@@ -59,12 +61,11 @@ class SequenceWindow:
     def __post_init__(self) -> None:
         if self.window < 1:
             raise ValueError(
-                f"a window of {self.window} gives no pairs; it is how many of the next photographs each is "
-                "matched with, at least 1"
+                f"window (number of following images to match) must be at least 1; got {self.window}"
             )
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Nothing can be wrong."""
+        """Accept all image names."""
 
     def select(
         self,
@@ -74,22 +75,26 @@ class SequenceWindow:
         map_all: MapAll,
         rng: np.random.Generator,
     ) -> PairChoice:
-        """The pairs of the window; without features."""
+        """Select the pairs of the window."""
         n = len(names)
         steps = range(1, min(self.window, n - 1) + 1)
         ends = n if self.loop else 0
         pairs = {tuple(sorted((i, (i + s) % n))) for i in range(n) for s in steps if i + s < n + ends}
-        what = "the next photograph" if self.window == 1 else f"the next {self.window} photographs"
-        around = ", the first again after the last" if self.loop else ""
-        return PairChoice(pair_array(pairs), f"each with {what} in the order of their names{around}")
+        what = "the next image" if self.window == 1 else f"the next {self.window} images"
+        around = ", continuing at the first" if self.loop else ""
+        return PairChoice(pair_array(pairs), f"each image with {what} by file name{around}")
 
 
 @dataclass(frozen=True)
 class ListedPairs:
-    """The pairs of file names that the user lists, in any order.
+    """The pairs of file names listed by the user.
 
-    A photograph that was left out (unreadable, a copy) takes its pairs with it; one that is not there is
-    refused, as are a photograph paired with itself and a pair listed twice.
+    Pairs of an image that was left out (unreadable, a copy) are dropped.
+
+    Parameters
+    ----------
+    listed : tuple of (str, str)
+        Pairs of file names, each once, in any order.
     """
 
     listed: tuple[tuple[str, str], ...] = ()
@@ -98,25 +103,38 @@ class ListedPairs:
         seen: set[frozenset[str]] = set()
         for one, two in self.listed:
             if one == two:
-                raise ValueError(f"the list pairs {one!r} with itself; a pair is two photographs")
+                raise ValueError(f"the pair list pairs {one!r} with itself; list two different images")
             if (pair := frozenset((one, two))) in seen:
-                raise ValueError(f"the list names the pair {one!r}, {two!r} twice; each pair stands once")
+                raise ValueError(f"the pair list contains {one!r}, {two!r} twice; list each pair once")
             seen.add(pair)
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Raise :class:`UsageError` for a name that is no photograph, and a list that leaves no pair."""
+        """Check the list against the image names.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of the images.
+        left_out : collection of str
+            Names of images that were not used.
+
+        Raises
+        ------
+        UsageError
+            If a name is unknown or no pair remains.
+        """
         known = {*names, *left_out}
         strange = sorted({name for pair in self.listed for name in pair} - known)
         if strange:
             more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
             some = ", ".join(repr(name) for name in sorted(known)[:3])
             raise UsageError(
-                f"the list of pairs names {strange[0]!r}{more}, which is none of the {len(known)} "
-                f"photographs ({some}{', ...' if len(known) > 3 else ''})"
+                f"the pair list names {strange[0]!r}{more}, which is not among the {len(known)} images "
+                f"({some}{', ...' if len(known) > 3 else ''})"
             )
         if not any(set(pair) <= set(names) for pair in self.listed):
-            without = "; its photographs were left out" if self.listed else ""
-            raise UsageError(f"the list of pairs leaves no pair to match{without}")
+            without = "; its images were left out" if self.listed else ""
+            raise UsageError(f"the pair list leaves no pair to match{without}")
 
     def select(
         self,
@@ -126,39 +144,62 @@ class ListedPairs:
         map_all: MapAll,
         rng: np.random.Generator,
     ) -> PairChoice:
-        """The listed pairs whose photographs are both there; without features."""
+        """Select the listed pairs of the images in use.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of the images.
+        features : sequence of Features
+            Features of the images.
+        map_all : callable
+            Parallel map.
+        rng : numpy.random.Generator
+            Random generator.
+
+        Returns
+        -------
+        PairChoice
+            The pairs.
+        """
         number = {name: i for i, name in enumerate(names)}
         there = (pair for pair in self.listed if pair[0] in number and pair[1] in number)
         return PairChoice(pair_array((number[one], number[two]) for one, two in there), "the listed pairs")
 
 
+# Evidence of the upright patches at which the rotated ones are not compared: one false alarm in a million.
 DECIDED = 6.0
-"""Evidence of the upright patches at which the turned ones are not asked: one chance in a million."""
 
 
 @dataclass(frozen=True)
 class OverlapEstimate:
-    """All pairs of a small set; of a larger one, the pairs whose strongest patches agree beyond chance.
+    """All pairs of a small set; in a larger one the pairs whose strongest patches agree beyond chance.
 
-    Each photograph is compared with a fixed number of others, those that use the same words
-    (:mod:`.words`), so that the time grows with the number of photographs and of their overlaps and not with
-    its square. Beside the pairs that pass, the best few of each photograph are taken, and the best ones that
-    hold the set together: no photograph is lost for want of evidence, and a chain of pairs links any two.
+    Each image is compared with a fixed number of others by bag-of-words similarity, so that the time grows
+    with the number of images and not with its square. The best few pairs of each image and the best pairs
+    that connect the set are added: every image is matched, and a chain of pairs connects any two.
 
     Parameters
     ----------
-    all_up_to : photographs up to which all pairs are taken.
-    per_scale : seeds of each scale that stand for a photograph, upright and turned ones.
-    least_evidence : -log10 of how many such agreements chance may give a pair (:class:`OverlapTest`).
-    nearest : pairs of each photograph taken in any case.
-    shortlist : photographs each is compared with, those most alike in words.
-    words : size of the vocabulary.
-    test : how two photographs are compared.
+    all_up_to : int
+        Number of images up to which all pairs are taken.
+    per_scale : int
+        Seeds of each scale that represent an image, upright and rotated.
+    min_evidence : float
+        Minimum -log10 of the number of false alarms (:class:`OverlapTest`).
+    nearest : int
+        Pairs of each image that are always taken.
+    shortlist : int
+        Number of images that each is compared with.
+    words : int
+        Vocabulary size.
+    test : OverlapTest
+        Comparison of two images.
     """
 
     all_up_to: int = 30
     per_scale: int = 200
-    least_evidence: float = 0.5
+    min_evidence: float = 0.5
     nearest: int = 3
     shortlist: int = 40
     words: int = 1024
@@ -171,7 +212,7 @@ class OverlapEstimate:
                 raise ValueError(f"{name} must be at least {bound}; got {getattr(self, name)}")
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Nothing can be wrong."""
+        """Accept all image names."""
 
     def select(
         self,
@@ -181,33 +222,55 @@ class OverlapEstimate:
         map_all: MapAll,
         rng: np.random.Generator,
     ) -> PairChoice:
-        """The pairs worth matching. Raises :class:`UsageError` for features without seeds in a large set."""
+        """Select the pairs that probably overlap.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of the images.
+        features : sequence of Features
+            Features of the images, with seeds in a large set.
+        map_all : callable
+            Parallel map.
+        rng : numpy.random.Generator
+            Source of the vocabulary sample.
+
+        Returns
+        -------
+        PairChoice
+            The pairs.
+
+        Raises
+        ------
+        UsageError
+            If the set is large and the features have no seeds.
+        """
         n = len(names)
         if n <= self.all_up_to:
-            how = f"all pairs, as there are no more than {self.all_up_to} photographs"
+            how = f"all pairs (at most {self.all_up_to} images)"
             return PairChoice(every_pair(n), how)
-        sketches = map_all(self._sketches, features)
-        alike = np.zeros((n, n))
+        subsets = map_all(self._subsets, features)
+        similarity = np.zeros((n, n))
         if n - 1 > self.shortlist:
             for kind in (0, 1):
-                patches = [sketch[kind].patches for sketch in sketches]
-                alike += bow_similarity(patches, self.words, map_all=map_all, rng=rng)
-        compared = most_alike(alike, self.shortlist)
+                patches = [subset[kind].patches for subset in subsets]
+                similarity += bow_similarity(patches, self.words, map_all=map_all, rng=rng)
+        compared = _most_similar(similarity, self.shortlist)
         evidence = np.array(
-            map_all(lambda pair: self._evidence(sketches[pair[0]], sketches[pair[1]]), compared.tolist())
+            map_all(lambda pair: self._evidence(subsets[pair[0]], subsets[pair[1]]), compared.tolist())
         )
-        chosen = self._choose(alike, compared, evidence)
+        chosen = self._choose(similarity, compared, evidence)
         how = (
-            f"those of {len(compared)} compared whose patches agree beyond chance, and the nearest "
-            f"{self.nearest} of each photograph"
+            f"pairs with overlap evidence among {len(compared)} compared pairs, and the best "
+            f"{self.nearest} of each image"
         )
         return PairChoice(chosen, how, compared=len(compared))
 
-    def _sketches(self, features: Features) -> tuple[FeatureSubset, FeatureSubset]:
+    def _subsets(self, features: Features) -> tuple[FeatureSubset, FeatureSubset]:
         if features.seeds is None:
             raise UsageError(
-                f"the overlap of more than {self.all_up_to} photographs is told from their seeds, which "
-                "these features lack; set features.kind=multi-scale-corners, or pairs.kind=all-pairs"
+                f"the overlap of more than {self.all_up_to} images is estimated from seeds, which these "
+                "features do not have; set features.kind=multi-scale-corners, or pairs.kind=all-pairs"
             )
         upright, turned = (
             subset_seeds(features.seeds, turned=turned, per_scale=self.per_scale) for turned in (False, True)
@@ -220,37 +283,37 @@ class OverlapEstimate:
         upright = self.test.score(a[0], b[0])
         return upright if upright >= DECIDED else max(upright, self.test.score(a[1], b[1]))
 
-    def _choose(self, alike: F64, compared: I64, evidence: F64) -> I64:
-        """The pairs (M, 2) that pass, those nearest to each photograph, and those that hold all together."""
-        n = len(alike)
-        # A pair that was not compared comes after all that were, by its words.
-        order = alike - 1e6
+    def _choose(self, similarity: F64, compared: I64, evidence: F64) -> I64:
+        """Pairs (M, 2) with enough evidence, the best of each image, and those that connect the set."""
+        n = len(similarity)
+        # Pairs that were not compared follow all that were, ordered by bag-of-words similarity.
+        order = similarity - 1e6
         order[compared[:, 0], compared[:, 1]] = order[compared[:, 1], compared[:, 0]] = evidence
         np.fill_diagonal(order, -np.inf)
         best = np.argsort(-order, axis=1, kind="stable")[:, : min(self.nearest, n - 1)]
         near = np.column_stack([np.repeat(np.arange(n), best.shape[1]), best.ravel()])
-        chosen = pair_array([*compared[evidence >= self.least_evidence].tolist(), *near.tolist()])
-        return pair_array([*chosen.tolist(), *connecting_pairs(chosen, order).tolist()])
+        chosen = pair_array([*compared[evidence >= self.min_evidence].tolist(), *near.tolist()])
+        return pair_array([*chosen.tolist(), *_connecting_pairs(chosen, order).tolist()])
 
 
-def most_alike(alike: F64, count: int) -> I64:
-    """(M, 2) each photograph with the ``count`` most alike by an (N, N) matrix; sorted."""
-    n = len(alike)
-    others = alike.copy()
+def _most_similar(similarity: F64, count: int) -> I64:
+    """Pairs (M, 2) of each image with the ``count`` most similar ones of an (N, N) matrix; sorted."""
+    n = len(similarity)
+    others = similarity.copy()
     np.fill_diagonal(others, -np.inf)
     best = np.argsort(-others, axis=1, kind="stable")[:, : min(count, n - 1)]
     return pair_array(np.column_stack([np.repeat(np.arange(n), best.shape[1]), best.ravel()]).tolist())
 
 
-def connecting_pairs(chosen: I64, order: F64) -> I64:
-    """The pairs (M, 2) that join the parts which the chosen ones leave apart: those of highest ``order``.
+def _connecting_pairs(chosen: I64, order: F64) -> I64:
+    """Pairs (M, 2) of highest ``order`` that connect the components of the chosen pairs.
 
-    They are what a largest spanning tree of all pairs has beside chosen ones when these count for nothing.
+    The edges that a maximum spanning tree of all pairs adds to the chosen ones if these cost nothing.
     """
     n = len(order)
     i, j = np.triu_indices(n, 1)
     rank = np.empty(len(i))
-    # Ranks for values: no two pairs cost the same, so the tree is one and does not hang on rounding.
+    # Ranks instead of values: no two costs are equal, so the tree is unique and independent of rounding.
     rank[np.argsort(-order[i, j], kind="stable")] = np.arange(1, len(i) + 1)
     cost = np.zeros((n, n))
     cost[i, j] = rank + len(i)

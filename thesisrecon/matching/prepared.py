@@ -1,11 +1,7 @@
-"""Windows of a photograph, sampled from its pyramid and normalised.
+"""Data of an image that the matching needs, its windows, and helpers of all matching variants.
 
-A pyramid travels as ``pixels``, all its levels one after the other, and ``levels`` (L, 3): offset, height and
-width of each; level k spans ``base * 2^k`` pixels of the photograph per pixel.
-
-What the matching needs of one photograph, computed once.
-
-What the variants of this stage share: the types of the values they are given, and the empty answer.
+A pyramid is stored as ``pixels``, all levels one after the other, and ``levels`` (L, 3): offset, height and
+width of each; a pixel of level k spans ``base * 2^k`` pixels of the image.
 """
 
 from __future__ import annotations
@@ -20,26 +16,61 @@ from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.geometry.raster import halve, resample
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
-# Sums may be reordered; assuming that no NaN exists would undo the bounds checks.
+# Sums may be reordered; assuming no NaN would break the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 SIDE = 15
 SAMPLES = SIDE * SIDE
 
 
 @njit(cache=True, nogil=True)
-def level_of(scale: float, base: float, count: int) -> int:
-    """The pyramid level whose pixels are nearest to ``scale``, on a logarithmic measure."""
+def pyramid_level(scale: float, base: float, count: int) -> int:
+    """Return the pyramid level whose pixel size is nearest to a scale (logarithmic).
+
+    Parameters
+    ----------
+    scale : float
+        Scale, px.
+    base : float
+        Pixel size of level 0, px.
+    count : int
+        Number of levels.
+
+    Returns
+    -------
+    int
+        The level.
+    """
     k = int(np.floor(np.log2(scale / base) + 0.5))
     return min(max(k, 0), count - 1)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, side: int, out: F32) -> bool:
-    """Bilinear samples of a ``side`` x ``side`` window around ``xy`` px into ``out`` (side^2,), False where
-    it leaves.
+    """Sample a square window bilinearly.
 
-    Sample (column a, row b), counted from the centre, is at ``xy + step @ (a, b)``; ``level`` is (offset,
-    height, width) and ``to_level`` its pixels per pixel of the photograph.
+    Sample (column a, row b), counted from the centre, is at ``xy + step @ (a, b)``.
+
+    Parameters
+    ----------
+    pixels : ndarray
+        All levels of the pyramid, float32.
+    level : ndarray (3,) of int
+        Offset, height and width of the level.
+    to_level : float
+        Level pixels per image pixel.
+    xy : ndarray (2,)
+        Centre, px.
+    step : ndarray (2, 2)
+        Sample spacing, px.
+    side : int
+        Samples per side, odd.
+    out : ndarray (side^2,)
+        Output: the samples.
+
+    Returns
+    -------
+    bool
+        False if the window leaves the image.
     """
     offset, height, width = level[0], level[1], level[2]
     x0 = (xy[0] + 0.5) * to_level - 0.5
@@ -69,8 +100,18 @@ def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, 
 
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def normalize_window(window: F32) -> float:
-    """Subtract the mean and divide by the norm, in place; returns the norm before (0: no structure, left
-    zero)."""
+    """Subtract the mean and divide by the norm, in place.
+
+    Parameters
+    ----------
+    window : ndarray (n,)
+        Samples; zeros if the contrast is below half a grey level.
+
+    Returns
+    -------
+    float
+        Norm before the division, 0 without contrast.
+    """
     total = np.float32(0.0)
     for n in range(len(window)):
         total += window[n]
@@ -80,7 +121,7 @@ def normalize_window(window: F32) -> float:
         window[n] -= mean
         square += window[n] * window[n]
     norm = np.sqrt(square)
-    # Less contrast than half a grey level per pixel is noise.
+    # Contrast below half a grey level per pixel is noise.
     if norm < 0.5 * np.sqrt(float(len(window))):
         window[:] = np.float32(0.0)
         return 0.0
@@ -92,7 +133,18 @@ def normalize_window(window: F32) -> float:
 
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def dot(a: F32, b: F32) -> float:
-    """Inner product of two float32 vectors."""
+    """Compute the inner product of two float32 vectors.
+
+    Parameters
+    ----------
+    a, b : ndarray (n,)
+        Vectors.
+
+    Returns
+    -------
+    float
+        The product.
+    """
     total = np.float32(0.0)
     for n in range(len(a)):
         total += a[n] * b[n]
@@ -100,13 +152,12 @@ def dot(a: F32, b: F32) -> float:
 
 
 @njit(cache=True, nogil=True)
-def corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, side: int = SIDE) -> F32:
-    """(N, side^2) normalised upright windows of the corners at their scale; zero where they leave the
-    image."""
+def _corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, side: int = SIDE) -> F32:
+    """Normalised upright windows (N, side^2) of the corners at their scale; zero outside the image."""
     out = np.zeros((len(xy), side * side), np.float32)
     step = np.zeros((2, 2))
     for n in range(len(xy)):
-        k = level_of(scale[n], base, len(levels))
+        k = pyramid_level(scale[n], base, len(levels))
         step[0, 0] = step[1, 1] = scale[n]
         if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy[n], step, side, out[n]):
             normalize_window(out[n])
@@ -116,9 +167,19 @@ def corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, s
 
 
 @njit(cache=True, nogil=True)
-def map_determinant(a: F64) -> float:
-    """Determinant of a local map (2, 2); 0 for one that no two photographs of a surface have (mirrored, or
-    five times larger or smaller)."""
+def affine_determinant(a: F64) -> float:
+    """Compute the determinant of a local affine map.
+
+    Parameters
+    ----------
+    a : ndarray (2, 2)
+        The map.
+
+    Returns
+    -------
+    float
+        Determinant; 0 for an implausible map (mirrored, or scaled by more than five).
+    """
     determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
     return determinant if determinant > 0.04 and determinant < 25.0 else 0.0
 
@@ -127,14 +188,28 @@ PYRAMID_LEVELS = 4
 
 
 @dataclass(frozen=True)
-class PreparedView:
-    """A photograph ready to be matched.
+class PreparedImage:
+    """An image prepared for matching.
 
-    ``size`` (width, height) px; ``features`` as detected. The grey pyramid is ``pixels`` (all levels one
-    after the other), ``levels`` (L, 3) offset, height, width, level k spanning ``base 2^k`` px per pixel.
-    ``patches`` (N, 225): the normalised 15 x 15 window of each corner at its scale (zero where it leaves the
-    image); other widths where the matcher asked for them.
-    ``cell_px, cell_shape, cell_start, cell_order``: the corners sorted into square cells.
+    Parameters
+    ----------
+    size : tuple of int
+        Width and height, px.
+    features : Features
+        Features of the image.
+    pixels : ndarray
+        Grey pyramid, all levels one after the other.
+    levels : ndarray (L, 3) of int
+        Offset, height and width of each level.
+    base : float
+        Pixel size of level 0, px.
+    patches : ndarray (N, 225)
+        Normalised 15 x 15 window of each corner at its scale (other sizes on request); zero outside the
+        image.
+    cell_px : float
+        Side of the square cells that the corners are sorted into.
+    cell_shape, cell_start, cell_order : ndarray of int
+        Rows and columns of cells, start of each cell and corners in cell order.
     """
 
     size: tuple[int, int]
@@ -150,42 +225,61 @@ class PreparedView:
 
     @property
     def pyramid(self) -> tuple[F32, I64, float]:
-        """Pixels, levels, base: as the kernels take it."""
+        """Pixels, levels, base: arguments of the kernels."""
         return self.pixels, self.levels, self.base
 
     @property
     def cells(self) -> tuple[float, I64, I64, I64]:
-        """Cell size, shape, start, order: as the kernels take it."""
+        """Cell size, shape, start, order: arguments of the kernels."""
         return self.cell_px, self.cell_shape, self.cell_start, self.cell_order
 
     @property
     def long_side(self) -> int:
-        """The longer of width and height, px."""
+        """Larger of width and height, px."""
         return max(self.size)
 
 
-def prepare_view(
+def prepare_image(
     image: Image, features: Features, *, window: int = SIDE, colour: bool = False
-) -> PreparedView:
-    """Grey pyramid, corner windows and corner cells of one photograph.
+) -> PreparedImage:
+    """Compute the grey pyramid, corner windows and corner cells of an image.
 
-    The pyramid starts at twice the size where the corners were found there (scale below 1). ``window``, odd,
-    is the side of the correlation windows; where ``colour``, they hold the three colours one after the other,
-    each normalised, so that the product of two is the mean of the colours' correlations.
+    The pyramid starts at twice the image size if corners were found there (scale below 1).
+
+    Parameters
+    ----------
+    image : Image
+        The image.
+    features : Features
+        Its features.
+    window : int
+        Side of the correlation windows, odd.
+    colour : bool
+        Windows of the three colours side by side, each normalised: products are mean correlations.
+
+    Returns
+    -------
+    PreparedImage
+        The prepared image.
+
+    Raises
+    ------
+    ValueError
+        If ``window`` is even or below 3.
     """
     if window < 3 or window % 2 == 0:
-        raise ValueError(f"a correlation window has an odd side of at least 3; got {window}")
+        raise ValueError(f"window must be odd and at least 3; got {window}")
     doubled = len(features.scale) > 0 and float(features.scale.min()) < 0.75
     base = 0.5 if doubled else 1.0
     pixels, levels = _pyramid(image.gray, doubled)
     channels = [pixels]
     if colour:
         channels = [_pyramid(image.rgb[:, :, c].astype(np.float32), doubled)[0] for c in range(3)]
-    parts = [corner_patches(c, levels, base, features.xy, features.scale, window) for c in channels]
+    parts = [_corner_patches(c, levels, base, features.xy, features.scale, window) for c in channels]
     patches = np.hstack(parts) / np.float32(np.sqrt(3.0)) if colour else parts[0]
     cell_px = max(4.0, 0.01 * max(image.size))
     shape, start, order = _cells(features.xy, image.size, cell_px)
-    return PreparedView(image.size, features, pixels, levels, base, patches, cell_px, shape, start, order)
+    return PreparedImage(image.size, features, pixels, levels, base, patches, cell_px, shape, start, order)
 
 
 def _pyramid(gray: F32, doubled: bool) -> tuple[F32, I64]:
@@ -200,7 +294,7 @@ def _pyramid(gray: F32, doubled: bool) -> tuple[F32, I64]:
 
 
 def _cells(xy: F64, size: tuple[int, int], cell_px: float) -> tuple[I64, I64, I64]:
-    """Corners in square cells, row by row: those of cell c are ``order[start[c]:start[c + 1]]``."""
+    """Sort corners into square cells, row by row: those of cell c are ``order[start[c]:start[c + 1]]``."""
     shape = np.array([int(size[1] / cell_px) + 1, int(size[0] / cell_px) + 1], dtype=np.int64)
     column, row = (np.clip((xy[:, a] / cell_px).astype(np.int64), 0, shape[1 - a] - 1) for a in (0, 1))
     cell = row * shape[1] + column
@@ -213,20 +307,57 @@ FundamentalEstimator = Callable[[F64, F64, np.random.Generator], FundamentalFit]
 
 
 def empty_matches(pair: tuple[int, int]) -> Matches:
-    """No matches between the two views."""
+    """Return an empty set of matches.
+
+    Parameters
+    ----------
+    pair : tuple of int
+        Numbers of the two views.
+
+    Returns
+    -------
+    Matches
+        No matches.
+    """
     index, xy = np.empty(0, np.int64), np.empty((0, 2))
     return Matches(*pair, index, index, xy, xy, np.empty(0, np.float32), np.empty((0, 2, 2)))
 
 
 def one_to_one(index: I64, score: F32) -> I64:
-    """Rows that keep their claim: of those that want one corner of image 2 the best."""
+    """Select for each corner of image 2 the best of the rows that claim it.
+
+    Parameters
+    ----------
+    index : ndarray (N,) of int
+        Corner of image 2 claimed by each row, -1 for none.
+    score : ndarray (N,)
+        Score of each row.
+
+    Returns
+    -------
+    ndarray (M,) of int
+        Selected rows, sorted.
+    """
     rows = np.flatnonzero(index >= 0)
     rows = rows[np.lexsort((rows, -score[rows]))]
     return np.sort(rows[np.unique(index[rows], return_index=True)[1]])
 
 
-def matches_at(matches: Matches, rows: I64) -> Matches:
-    """A part of the matches."""
+def select_matches(matches: Matches, rows: I64) -> Matches:
+    """Return a subset of matches.
+
+    Parameters
+    ----------
+    matches : Matches
+        The matches.
+    rows : ndarray of int
+        Rows to keep.
+
+    Returns
+    -------
+    Matches
+        The subset.
+    """
     return Matches(
         matches.i,
         matches.j,

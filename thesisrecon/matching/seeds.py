@@ -1,10 +1,8 @@
-"""Best and second best of correlations between patches.
-
-First matches without a search radius: mutual best patches that have no rival elsewhere.
-"""
+"""First matches without a search radius: mutual nearest patches that pass the ratio test."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,18 +12,20 @@ from numba import njit
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.records import Seeds
 
+BLOCK = 256
+
 
 @njit(cache=True, nogil=True)
-def scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
-    """Best column of each row, its value, and the best value of a rival that lies elsewhere.
+def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
+    """Best column (B,) of each row of correlations (B, N), its value (B,) and the second best (B,) elsewhere.
 
-    ``correlation`` (B, N); ``xy2`` (N, 2) px; ``apart2`` (N,) squared distance within which a rival of column
-    n counts as the same place. Returns index (B,), value (B,), rival (B,); -1 where there is no rival.
+    ``xy2`` (N, 2) px are the column positions; a column within the squared distance ``apart2`` (N,) of the
+    best is the same position. -1 without a second best.
     """
     rows, columns = correlation.shape
     index = np.zeros(rows, np.int64)
     value = np.full(rows, -1.0, np.float32)
-    competing_model = np.full(rows, -1.0, np.float32)
+    second_best = np.full(rows, -1.0, np.float32)
     for b in range(rows):
         row = correlation[b]
         best, top = 0, np.float32(-2.0)
@@ -39,13 +39,13 @@ def scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32
                 dx, dy = xy2[n, 0] - x, xy2[n, 1] - y
                 if dx * dx + dy * dy > limit:
                     second = row[n]
-        index[b], value[b], competing_model[b] = best, top, second
-    return index, value, competing_model
+        index[b], value[b], second_best[b] = best, top, second
+    return index, value, second_best
 
 
 @njit(cache=True, nogil=True)
-def update_column_best(correlation: F32, first_row: int, value: F32, index: I64) -> None:
-    """Keep in ``value`` and ``index`` (N,) the best row of each column seen so far."""
+def _update_column_best(correlation: F32, first_row: int, value: F32, index: I64) -> None:
+    """Update the best row ``index`` (N,) of each column and its ``value`` (N,)."""
     for b in range(correlation.shape[0]):
         row = correlation[b]
         for n in range(len(value)):
@@ -54,13 +54,51 @@ def update_column_best(correlation: F32, first_row: int, value: F32, index: I64)
                 index[n] = first_row + b
 
 
-ROWS_AT_ONCE = 256
+def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
+    """Find the pairs of rows and columns that are each other's best correlation.
+
+    Parameters
+    ----------
+    blocks : iterable of ndarray (B, N)
+        Blocks of rows of the correlation matrix.
+    xy2 : ndarray (N, 2)
+        Positions of the columns, px, float32.
+    apart2 : ndarray (N,)
+        Squared distance from the best column beyond which another column counts as elsewhere.
+
+    Returns
+    -------
+    index : ndarray (M,) of int
+        Column of each row, -1 if the best is not mutual. The first of equal values counts.
+    value : ndarray (M,)
+        Best correlation of each row.
+    second_best : ndarray (M,)
+        Best correlation elsewhere; -1 if there is none or the best is not mutual.
+    """
+    column_value, back = np.full(len(xy2), -2.0, np.float32), np.zeros(len(xy2), np.int64)
+    parts, first = [], 0
+    for correlation in blocks:
+        parts.append(_scan_correlations(correlation, xy2, apart2))
+        _update_column_best(correlation, first, column_value, back)
+        first += len(correlation)
+    index, value, second_best = (np.concatenate(column) for column in zip(*parts, strict=True))
+    mutual = back[index] == np.arange(first)
+    return np.where(mutual, index, -1), value, np.where(mutual, second_best, np.float32(-1.0))
 
 
 @dataclass(frozen=True)
 class SeedMatches:
-    """``xy1, xy2`` (M, 2) px, ``affine`` (M, 2, 2) a first guess of the local map, ``score`` (M,)
-    correlation."""
+    """Matches of seeds.
+
+    Parameters
+    ----------
+    xy1, xy2 : ndarray (M, 2)
+        Positions, px.
+    affine : ndarray (M, 2, 2)
+        Initial local affine maps from image 1 to image 2.
+    score : ndarray (M,)
+        Correlations.
+    """
 
     xy1: F64
     xy2: F64
@@ -72,56 +110,80 @@ class SeedMatches:
         return len(self.xy1)
 
     def at(self, chosen: B8 | I64) -> SeedMatches:
-        """A part of them."""
+        """Return a subset of the matches.
+
+        Parameters
+        ----------
+        chosen : ndarray of bool or int
+            Mask or indices.
+
+        Returns
+        -------
+        SeedMatches
+            The subset.
+        """
         return SeedMatches(self.xy1[chosen], self.xy2[chosen], self.affine[chosen], self.score[chosen])
 
 
 def match_seeds(seeds1: Seeds, seeds2: Seeds, *, turned: bool, ratio: float) -> SeedMatches:
-    """Seeds that are each other's best, with every rival elsewhere worse by ``ratio`` in distance.
+    """Match seeds that are mutually nearest and pass the ratio test.
 
-    ``turned`` takes the patches turned to their gradient, else the upright ones. Distance of unit patches:
-    sqrt(2 - 2 correlation). Elsewhere: farther than a quarter of the patch (8 of its level's pixels).
+    The distance of unit patches is sqrt(2 - 2 correlation). Other seeds count as elsewhere beyond a quarter
+    of the patch (8 pixels of its level).
+
+    Parameters
+    ----------
+    seeds1, seeds2 : Seeds
+        Seeds of both images.
+    turned : bool
+        Use the patches rotated to their dominant gradient, else the upright ones.
+    ratio : float
+        Maximum ratio of the distances to the best and to the second best seed.
+
+    Returns
+    -------
+    SeedMatches
+        The matches.
     """
     use1, use2 = (np.flatnonzero((s.angle != 0.0) == turned) for s in (seeds1, seeds2))
     if not (len(use1) and len(use2)):
         none = np.empty((0, 2))
         return SeedMatches(none, none, np.empty((0, 2, 2)), np.empty(0, np.float32))
-    index, value, competing_model, back = _correlate(seeds1, use1, seeds2, use2)
-    mutual = back[index] == np.arange(len(use1))
-    distinct = (1.0 - value) < ratio**2 * (1.0 - competing_model)
-    rows = np.flatnonzero(mutual & distinct & (value > 0.5))
+    xy2, apart2 = seeds2.xy[use2].astype(np.float32), (8.0 * seeds2.scale[use2]) ** 2
+    patches1, patches2 = seeds1.patches[use1], np.ascontiguousarray(seeds2.patches[use2].T)
+    # A block of rows stays in the cache between the product and the scans.
+    blocks = (patches1[first : first + BLOCK] @ patches2 for first in range(0, len(use1), BLOCK))
+    index, value, second_best = mutual_best(blocks, xy2, apart2)
+    distinct = (1.0 - value) < ratio**2 * (1.0 - second_best)
+    rows = np.flatnonzero((index >= 0) & distinct & (value > 0.5))
     one, two = use1[rows], use2[index[rows]]
     turn = (seeds2.angle[two] - seeds1.angle[one]).astype(np.float64)
     grow = (seeds2.scale[two] / seeds1.scale[one]).astype(np.float64)
     return SeedMatches(seeds1.xy[one], seeds2.xy[two], similarity(grow, turn), value[rows])
 
 
-def _correlate(seeds1: Seeds, use1: I64, seeds2: Seeds, use2: I64) -> tuple[I64, F32, F32, I64]:
-    xy2 = seeds2.xy[use2].astype(np.float32)
-    apart2 = (8.0 * seeds2.scale[use2]) ** 2
-    patches1, patches2 = seeds1.patches[use1], np.ascontiguousarray(seeds2.patches[use2].T)
-    column_value = np.full(len(use2), -2.0, np.float32)
-    back = np.zeros(len(use2), np.int64)
-    parts = []
-    # A block of rows stays in the cache between the product and the two scans.
-    for first in range(0, len(use1), ROWS_AT_ONCE):
-        correlation = patches1[first : first + ROWS_AT_ONCE] @ patches2
-        parts.append(scan_correlations(correlation, xy2, apart2))
-        update_column_best(correlation, first, column_value, back)
-    index, value, competing_model = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return index, value, competing_model, back
-
-
 def similarity(scale: F64, angle: F64) -> F64:
-    """Scaled rotations (M, 2, 2)."""
+    """Compute scaled rotations.
+
+    Parameters
+    ----------
+    scale : ndarray (M,)
+        Scales.
+    angle : ndarray (M,)
+        Angles, rad.
+
+    Returns
+    -------
+    ndarray (M, 2, 2)
+        The matrices.
+    """
     c, s = scale * np.cos(angle), scale * np.sin(angle)
     maps: F64 = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
     return maps
 
 
-def common_similarity(matches: SeedMatches) -> F64:
-    """(2, 2) the scaled rotation most matches agree on: medians of log scale and of angle (about the mean
-    one)."""
+def _common_similarity(matches: SeedMatches) -> F64:
+    """Scaled rotation (2, 2) of most matches: medians of log scale and of the angle around its mode."""
     a = matches.affine
     scale = np.exp(np.median(np.log(np.hypot(a[:, 0, 0], a[:, 1, 0]))))
     angle = np.arctan2(a[:, 1, 0], a[:, 0, 0])
@@ -136,14 +198,28 @@ def common_similarity(matches: SeedMatches) -> F64:
 
 
 def neighbour_support(matches: SeedMatches, *, neighbours: int = 10, tolerance: float = 0.3) -> F64:
-    """(M,) strength of each match: how many of its neighbours move as it does (equation 4.1 with c = 1).
+    """Compute the strength of each match: the number of neighbours that move alike ((4.1) with c = 1).
 
-    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (tolerance |u_m - u_k|))^2), d the displacement left
-    after the rotation and scale that the two images have in common; both images serve as the first in turn.
+    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (tolerance |u_m - u_k|))^2), with d the displacement
+    after removing the common rotation and scale; both images serve as the first in turn.
+
+    Parameters
+    ----------
+    matches : SeedMatches
+        The matches.
+    neighbours : int
+        Number of neighbours.
+    tolerance : float
+        Relative difference of displacements.
+
+    Returns
+    -------
+    ndarray (M,)
+        Strengths, at most ``neighbours``.
     """
     if len(matches) < 2:
         return np.zeros(len(matches))
-    a = common_similarity(matches)
+    a = _common_similarity(matches)
     u, v = matches.xy1 @ a.T, matches.xy2
     k = min(neighbours + 1, len(matches))
     support = np.zeros(len(matches))
@@ -158,10 +234,26 @@ def neighbour_support(matches: SeedMatches, *, neighbours: int = 10, tolerance: 
 def corners_of_seeds(
     xy1: F64, xy2: F64, known: SeedMatches, *, reach_px: float = 4.0
 ) -> tuple[I64, I64, SeedMatches]:
-    """Pairs of corners that the seeds stand on: the nearest to each seed in image 1 and the nearest in image
-    2 to where the seed's map takes it, both within ``reach_px``; one-to-one, the best correlations first.
+    """Find the pairs of corners at the positions of seed matches.
 
-    ``xy1`` (N, 2), ``xy2`` (K, 2) the corners px. Returns their numbers (M,), (M,) and the matches.
+    The corner nearest to a seed in image 1 and the corner nearest to its prediction by the local affine map
+    in image 2; one-to-one, best correlations first.
+
+    Parameters
+    ----------
+    xy1, xy2 : ndarray (N, 2), ndarray (K, 2)
+        Corners of both images, px.
+    known : SeedMatches
+        The seed matches.
+    reach_px : float
+        Maximum distance of a corner.
+
+    Returns
+    -------
+    one, two : ndarray (M,) of int
+        Indices of the corners.
+    matches : SeedMatches
+        Matches at the corners.
     """
     apart1, one = scipy.spatial.cKDTree(xy1).query(known.xy1)
     led = known.xy2 + np.einsum("mij,mj->mi", known.affine, xy1[one] - known.xy1)

@@ -1,7 +1,4 @@
-"""Strength of match, equation (4.1), and the weight functions of figure 4.4.
-
-Section 4.2.2: correlation within a radius and strength of match (algorithm 4.1).
-"""
+"""Section 4.2.2: matching by correlation within a radius and strength of match (algorithm 4.1)."""
 
 from __future__ import annotations
 
@@ -13,24 +10,35 @@ import scipy
 from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching.alignment import aligned_matches
+from thesisrecon.matching.alignment import align_matches
 from thesisrecon.matching.prepared import (
     SIDE,
     FundamentalEstimator,
-    PreparedView,
+    PreparedImage,
     empty_matches,
     one_to_one,
-    prepare_view,
+    prepare_image,
 )
 from thesisrecon.records import Features, Image, Matches
 
 
 @njit(cache=True, nogil=True)
 def displacement_weight(a: F64, b: F64, closeness: float, terms: tuple[bool, bool, bool]) -> float:
-    """lambda of figure 4.4: direction x length x distance of two displacement vectors, in [0, 1].
+    """Compute lambda of figure 4.4: direction x length x distance of two displacement vectors.
 
-    ``terms`` says which of the three factors take part. Displacements under one pixel have no direction worth
-    the name; their lengths are taken as one pixel.
+    Parameters
+    ----------
+    a, b : ndarray (2,)
+        Displacements, px; below one pixel they have no direction and count as one pixel long.
+    closeness : float
+        Distance factor, 1 for equal positions.
+    terms : tuple of bool
+        Use of the direction, length and distance factors.
+
+    Returns
+    -------
+    float
+        Weight in [0, 1].
     """
     direction, length, distance = terms
     weight = closeness if distance else 1.0
@@ -45,8 +53,22 @@ def displacement_weight(a: F64, b: F64, closeness: float, terms: tuple[bool, boo
 
 @njit(cache=True, nogil=True)
 def relative_difference_weight(a: F64, b: F64, apart: float, tolerance: float) -> float:
-    """exp(-1/2 (|a - b| / (tolerance apart + 1 px))^2), in (0, 1]: neighbours may move the more differently
-    the farther ``apart`` px they are, whatever the length of their displacements."""
+    """Compute exp(-1/2 (|a - b| / (tolerance apart + 1 px))^2), independent of displacement lengths.
+
+    Parameters
+    ----------
+    a, b : ndarray (2,)
+        Displacements, px.
+    apart : float
+        Distance of the two corners, px.
+    tolerance : float
+        Relative difference of displacements.
+
+    Returns
+    -------
+    float
+        Weight in (0, 1].
+    """
     strain = np.hypot(a[0] - b[0], a[1] - b[1]) / (tolerance * apart + 1.0)
     return float(np.exp(-0.5 * strain * strain))
 
@@ -59,14 +81,27 @@ def strength_of_match(
     search: tuple[float, int, float],
     weight: tuple[float, tuple[bool, bool, bool]],
 ) -> tuple[I64, F32]:
-    """Equation 4.1: for each corner of image 1 the candidate of largest SM_k = c_k sum_m max_n (c_mn
-    lambda_n).
+    """Find the candidate of largest strength of each corner, SM_k = c_k sum_m max_n (c_mn lambda_n) (4.1).
 
-    ``correlation`` (N1, N2); ``xy`` the corners of both images; ``near`` the neighbours (N1, M) and (N2, N)
-    of each corner in its own image, -1 where there are fewer; ``search`` = radius px, number of candidates,
-    correlation that a candidate must exceed; ``weight`` = tolerance of the relative difference (0: the
-    product of figure 4.4) and the factors of the product. Returns the corner of image 2 (N1,), -1 where no
-    candidate lies within the radius, and the strength (N1,).
+    Parameters
+    ----------
+    correlation : ndarray (N1, N2)
+        Correlations of all corners.
+    xy : tuple of ndarray
+        Corners of both images, px.
+    near : tuple of ndarray of int
+        Neighbours (N1, M) and (N2, N) of each corner in its image, -1 for none.
+    search : tuple
+        Radius px, number of candidates, correlation that a candidate must exceed.
+    weight : tuple
+        Tolerance of the relative difference (0: product of figure 4.4) and factors of the product.
+
+    Returns
+    -------
+    index : ndarray (N1,) of int
+        Corner of image 2, -1 without a candidate.
+    strength : ndarray (N1,)
+        Strength of match.
     """
     xy1, xy2 = xy
     index = np.full(len(xy1), -1, np.int64)
@@ -84,16 +119,16 @@ def strength_of_match(
 
 @njit(cache=True, nogil=True)
 def _best_candidates(
-    correlation: F32, place: F64, xy2: F64, search: tuple[float, int, float], held: I64
+    correlation: F32, position: F64, xy2: F64, search: tuple[float, int, float], held: I64
 ) -> int:
-    """How many corners of image 2 within the radius are candidates; the best, best first, go to ``held``."""
+    """Write the best corners of image 2 within the radius to ``held``, best first; return their number."""
     radius, candidates, least = search
     count = 0
     for v in range(len(xy2)):
         c = correlation[v]
         if c <= least or (count == candidates and c <= correlation[held[count - 1]]):
             continue
-        if (xy2[v, 0] - place[0]) ** 2 + (xy2[v, 1] - place[1]) ** 2 > radius * radius:
+        if (xy2[v, 0] - position[0]) ** 2 + (xy2[v, 1] - position[1]) ** 2 > radius * radius:
             continue
         count = min(count + 1, candidates)
         at = count - 1
@@ -125,7 +160,7 @@ def _neighbours_agree(
         apart = np.hypot(xy1[m, 0] - xy1[u, 0], xy1[m, 1] - xy1[u, 1])
         best = 0.0
         for n in near[1]:
-            # A weight is at most 1, so that only a correlation above the best can beat it.
+            # Weights are at most 1, so only a correlation above the best can improve it.
             if n >= 0 and correlation[m, n] > best:
                 other[0], other[1] = xy2[n, 0] - xy1[m, 0], xy2[n, 1] - xy1[m, 1]
                 if tolerance > 0.0:
@@ -139,29 +174,39 @@ def _neighbours_agree(
 
 @dataclass(frozen=True)
 class StrengthOfMatch:
-    """The thesis' matching: a corner goes with the one whose neighbours' displacements agree best.
+    """The thesis' matching: a corner matches the one whose neighbours' displacements agree best.
 
-    Every corner is compared with those within a radius; for its best candidates the strength SM_k = c_k sum_m
-    max_n (c_mn lambda_n) (4.1) is computed over its neighbours, and of matches that share a corner the
-    strongest stays. Figure 4.4 with the weight functions is lost; lambda is taken as the product of direction
-    max(0, cos), length min / max and distance 1 - d / radius, as the text tells it. The fields after
-    ``neighbours`` and ``weight`` = "relative-difference" go beyond the thesis, and are off.
+    Each corner is compared with those within a radius; the strength SM_k = c_k sum_m max_n (c_mn lambda_n)
+    (4.1) of its best candidates is computed over its neighbours, and of matches that share a corner the
+    strongest is kept. Figure 4.4 with the weight functions is lost; lambda is the product of direction max(0,
+    cos), length min / max and distance 1 - d / radius as in the text. The fields after ``neighbours`` and
+    ``weight`` = "relative-difference" extend the thesis and are off.
 
     Parameters
     ----------
-    radius_rel : search radius as a share of the long side of the photographs.
-    candidates : K, the corners of highest correlation whose strength is computed.
-    neighbours : M, the nearest corners around a corner that lend it strength, and half as many again on the
-        other side, because some of them have no partner.
-    window : K = L, side of the correlation window in pixels, odd.
-    colour : the correlation is the mean of those of red, green and blue, else that of the grey values.
-    weight : "product" is figure 4.4; "relative-difference" is exp(-1/2 (|d_m - d| / (tolerance |u_m - u| +
-        1 px))^2), d the displacements: right also where displacements are short or the scene is deep.
-    use_direction, use_length, use_distance : the factors of the product that take part.
-    tolerance : of the relative difference.
-    least_correlation : a candidate must correlate by more.
-    least_strength : of a match, as a share of what M neighbours that agree perfectly would lend; in [0, 1).
-    align : places in image 2 are moved to sub-pixel by least-squares matching.
+    radius_rel : float
+        Search radius, relative to the long side.
+    candidates : int
+        K, number of corners of highest correlation whose strength is computed.
+    neighbours : int
+        M, number of neighbours of a corner, and half as many again in the other image.
+    window : int
+        K = L, side of the correlation window, px, odd.
+    colour : bool
+        Mean correlation of red, green and blue instead of grey values.
+    weight : {"product", "relative-difference"}
+        Product of figure 4.4, or exp(-1/2 (|d_m - d| / (tolerance |u_m - u| + 1 px))^2) of displacements d,
+        which also suits short displacements and deep scenes.
+    use_direction, use_length, use_distance : bool
+        Factors of the product.
+    tolerance : float
+        Tolerance of the relative difference.
+    min_correlation : float
+        Correlation that a candidate must exceed.
+    min_strength : float
+        Minimum strength relative to M perfectly agreeing neighbours, in [0, 1).
+    align : bool
+        Align positions in image 2 by least-squares matching.
     """
 
     radius_rel: float = 0.16
@@ -174,8 +219,8 @@ class StrengthOfMatch:
     use_length: bool = True
     use_distance: bool = True
     tolerance: float = 0.3
-    least_correlation: float = 0.0
-    least_strength: float = 0.0
+    min_correlation: float = 0.0
+    min_strength: float = 0.0
     align: bool = False
 
     def __post_init__(self) -> None:
@@ -189,26 +234,52 @@ class StrengthOfMatch:
             raise ValueError(
                 f"radius_rel and tolerance must be above 0; got {self.radius_rel} and {self.tolerance}"
             )
-        if not 0.0 <= self.least_strength < 1.0:
-            raise ValueError(f"least_strength must lie in [0, 1); got {self.least_strength}")
+        if not 0.0 <= self.min_strength < 1.0:
+            raise ValueError(f"min_strength must lie in [0, 1); got {self.min_strength}")
 
-    def prepare(self, image: Image, features: Features) -> PreparedView:
-        """What is computed once for a photograph."""
-        return prepare_view(image, features, window=self.window, colour=self.colour)
+    def prepare(self, image: Image, features: Features) -> PreparedImage:
+        """Prepare an image for matching.
+
+        Parameters
+        ----------
+        image : Image
+            The image.
+        features : Features
+            Its features.
+
+        Returns
+        -------
+        PreparedImage
+            The prepared image.
+        """
+        return prepare_image(image, features, window=self.window, colour=self.colour)
 
     def match(
         self,
-        view1: PreparedView,
-        view2: PreparedView,
+        view1: PreparedImage,
+        view2: PreparedImage,
         *,
         pair: tuple[int, int],
         estimate_fundamental: FundamentalEstimator,
         rng: np.random.Generator,
     ) -> Matches:
-        """One-to-one matches at the corners themselves, identity maps; empty where either has under two
-        corners.
+        """Match the corners of two images one-to-one.
 
-        ``estimate_fundamental`` and ``rng`` belong to the stage's protocol; this variant uses neither.
+        Parameters
+        ----------
+        view1, view2 : PreparedImage
+            The images.
+        pair : tuple of int
+            Numbers of the views.
+        estimate_fundamental : callable
+            Not used by this variant.
+        rng : numpy.random.Generator
+            Not used by this variant.
+
+        Returns
+        -------
+        Matches
+            Matches at the corners with identity maps; none if an image has fewer than two corners.
         """
         del estimate_fundamental, rng
         if min(len(view1.features.xy), len(view2.features.xy)) < 2:
@@ -216,9 +287,9 @@ class StrengthOfMatch:
         matches = self._strongest(view1, view2, pair)
         if not self.align:
             return matches
-        return aligned_matches(view1, view2, matches, affine_std=0.02, least_correlation=0.8)
+        return align_matches(view1, view2, matches, affine_std=0.02, min_correlation=0.8)
 
-    def _strongest(self, view1: PreparedView, view2: PreparedView, pair: tuple[int, int]) -> Matches:
+    def _strongest(self, view1: PreparedImage, view2: PreparedImage, pair: tuple[int, int]) -> Matches:
         xy1, xy2 = view1.features.xy, view2.features.xy
         correlation = view1.patches @ view2.patches.T
         radius = self.radius_rel * max(view1.long_side, view2.long_side)
@@ -229,10 +300,10 @@ class StrengthOfMatch:
             correlation,
             (xy1, xy2),
             (near1, near2),
-            (radius, self.candidates, self.least_correlation),
+            (radius, self.candidates, self.min_correlation),
             (self.tolerance if self.weight == "relative-difference" else 0.0, terms),
         )
-        index[strength < self.least_strength * self.neighbours] = -1
+        index[strength < self.min_strength * self.neighbours] = -1
         rows = one_to_one(index, strength)
         two = index[rows]
         maps = np.tile(np.eye(2), (len(rows), 1, 1))
@@ -240,7 +311,7 @@ class StrengthOfMatch:
 
 
 def _nearest(xy: F64, count: int, radius: float) -> I64:
-    """(N, count) the nearest other corners within ``radius``, -1 where there are fewer."""
+    """Nearest other corners (N, count) within ``radius``, -1 for none."""
     distance, index = scipy.spatial.cKDTree(xy).query(xy, count + 1, distance_upper_bound=radius)
     near = np.where(np.isfinite(distance), index, -1)[:, 1:]
     return np.ascontiguousarray(near, dtype=np.int64)

@@ -1,9 +1,4 @@
-"""Chains of matches over many views: which corners belong together, and the maps along them.
-
-Chains of matches: union of the pairs without two corners in one view, and local maps along a chain.
-
-From pairs to scene points: chains of verified matches, each aligned towards its middle view.
-"""
+"""Tracks: chains of verified matches over many views, optionally aligned with their middle view."""
 
 from __future__ import annotations
 
@@ -15,24 +10,24 @@ from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.matching.alignment import align_corners
-from thesisrecon.matching.prepared import PreparedView
-from thesisrecon.numerics.morton_order import morton_pair_order
+from thesisrecon.matching.prepared import PreparedImage
+from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.records import Tracks, TwoView
 
 
 @njit(cache=True, nogil=True)
-def unite(edges: I64, view_of: I64, n_views: int) -> I64:
-    """(N,) the first corner of each corner's set, after uniting along ``edges`` (E, 2) in their order.
+def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
+    """First corner (N,) of the set of each corner after uniting along ``edges`` (E, 2) in their order.
 
-    An edge between two sets that share a view is refused. ``view_of`` (N,) is the view of each corner. Sets
-    that share a view are known by the views of the smaller one alone, so that an edge costs the same however
-    many photographs there are.
+    An edge between two sets that share a view is rejected. ``view_of`` (N,) is the view of each corner. Only
+    the views of the smaller set are compared, so that the cost of an edge does not grow with the number of
+    images.
     """
     count = len(view_of)
     parent = np.arange(count)
-    # Sets are lists linked through ``following``, the smaller one joins the larger.
+    # Sets are lists linked through ``following``; the smaller one joins the larger.
     following, last, size = np.full(count, -1, np.int64), np.arange(count), np.ones(count, np.int64)
-    # Which views the set of a root has: root times views plus view.
+    # Views of the set of a root: root times views plus view.
     has = {np.int64(-1)}
     for n in range(count):
         has.add(n * n_views + view_of[n])
@@ -75,14 +70,14 @@ def unite(edges: I64, view_of: I64, n_views: int) -> I64:
 
 
 @njit(cache=True, nogil=True)
-def chain_maps(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64) -> tuple[F64, F64]:
-    """Breadth-first from the middle observation of every track: x2 = xy2 + A (x1 - xy1) along each edge.
+def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64) -> tuple[F64, F64]:
+    """Chain x2 = xy2 + A (x1 - xy1) along the edges, breadth-first from the middle observations.
 
-    ``edges`` (E, 2) observations; ``middle`` (T,). Returns the place (K, 2) of the middle's point in every
-    observation's view and the map (K, 2, 2) to it; an observation out of reach keeps its own corner.
+    ``edges`` (E, 2) observations; ``middle`` (T,). Returns the position (K, 2) of the middle's point in the
+    view of every observation and the map (K, 2, 2) to it; an unreachable observation keeps its own corner.
     """
     count = len(xy)
-    place, maps = xy.copy(), np.zeros((count, 2, 2))
+    position, maps = xy.copy(), np.zeros((count, 2, 2))
     maps[:, 0, 0] = 1.0
     maps[:, 1, 1] = 1.0
     start = np.zeros(count + 1, np.int64)
@@ -115,7 +110,7 @@ def chain_maps(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64
                 continue
             a = affine[e]
             if forward:
-                place[other] = xy2[e] + a @ (place[k] - xy1[e])
+                position[other] = xy2[e] + a @ (position[k] - xy1[e])
                 maps[other] = a @ maps[k]
             else:
                 determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
@@ -123,20 +118,19 @@ def chain_maps(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64
                     continue
                 inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
                 inverse[1, 0], inverse[1, 1] = -a[1, 0] / determinant, a[0, 0] / determinant
-                place[other] = xy1[e] + inverse @ (place[k] - xy2[e])
+                position[other] = xy1[e] + inverse @ (position[k] - xy2[e])
                 maps[other] = inverse @ maps[k]
             reached[other] = True
             queue[tail] = other
             tail += 1
-    return place, maps
+    return position, maps
 
 
 @dataclass(frozen=True)
-class Chains:
-    """Corners that belong together: ``view, corner, track`` (K,), sorted by track, then view; ``count``
-    tracks.
+class _Chains:
+    """Corners ``view, corner, track`` (K,), sorted by track and view, and the ``count`` of tracks.
 
-    ``node`` (K,) the corner's number when all corners of all views are counted through.
+    ``node`` (K,) is the index of the corner among all corners of all views.
     """
 
     view: I64
@@ -146,25 +140,27 @@ class Chains:
     count: int
 
 
-def link_matches(corners: Sequence[int], pairs: Sequence[TwoView]) -> Chains:
-    """Unite the matches of all pairs, the best pairs first; a union that would put two corners of one view
-    into one track is refused, so the weaker link breaks and the track splits."""
+def _link_matches(corners: Sequence[int], pairs: Sequence[TwoView]) -> _Chains:
+    """Unite the matches of all pairs, best pairs first.
+
+    A union that puts two corners of one view into a track is rejected, so that the track splits at the weaker
+    link.
+    """
     first = np.concatenate([[0], np.cumsum(corners)]).astype(np.int64)
     view_of = np.repeat(np.arange(len(corners)), corners).astype(np.int64)
     edges = _edges(first, pairs)
-    parent = unite(edges, view_of, len(corners))
+    parent = _union_corners(edges, view_of, len(corners))
     used, size = np.unique(parent, return_counts=True)
     root = used[size >= 2]
     node = np.flatnonzero(np.isin(parent, root))
     track = np.searchsorted(root, parent[node])
     order = np.lexsort((node, track))
     node, track = node[order], track[order]
-    return Chains(view_of[node], node - first[view_of[node]], track, node, len(root))
+    return _Chains(view_of[node], node - first[view_of[node]], track, node, len(root))
 
 
 def _edges(first: I64, pairs: Sequence[TwoView]) -> I64:
-    """(E, 2) corner numbers of all matches; pairs with more verified matches, the more certain ones, come
-    first."""
+    """Corner numbers (E, 2) of all matches, pairs with more verified matches first."""
     order = sorted(range(len(pairs)), key=lambda n: (-pairs[n].inliers, pairs[n].i, pairs[n].j))
     if not order:
         return np.empty((0, 2), np.int64)
@@ -176,12 +172,13 @@ def _edges(first: I64, pairs: Sequence[TwoView]) -> I64:
     )
 
 
-def maps_to_views(chains: Chains, corners: Sequence[F64], pairs: Sequence[TwoView]) -> tuple[F64, F64, I64]:
-    """Where the corner of each track's middle view lies in the other views, by chaining the matches' local
-    maps.
+def _affines_from_middle_view(
+    chains: _Chains, corners: Sequence[F64], pairs: Sequence[TwoView]
+) -> tuple[F64, F64, I64]:
+    """Predict the corner of each track's middle view in the other views by chaining local affine maps.
 
-    Returns the place (K, 2) px, the map from the middle view (K, 2, 2) and the observation (K,) that is the
-    middle of its track: the one with most matches in the track, the first of equals.
+    Returns the position (K, 2) px, the map from the middle view (K, 2, 2) and the middle observation (K,) of
+    the track: the one with most matches in the track, the first of equals.
     """
     counts = [len(c) for c in corners]
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -194,7 +191,7 @@ def maps_to_views(chains: Chains, corners: Sequence[F64], pairs: Sequence[TwoVie
         return xy, np.tile(np.eye(2), (len(xy), 1, 1)), np.arange(len(xy))
     inside = chains.track[edges[:, 0]] == chains.track[edges[:, 1]]
     edges = edges[inside]
-    # Pair by pair: all matches of hundreds of photographs are gigabytes.
+    # Pair by pair: all matches of hundreds of images need gigabytes.
     used = np.split(inside, np.cumsum([len(pairs[n].xy1) for n in order])[:-1])
     xy1 = np.concatenate([pairs[n].xy1[rows] for n, rows in zip(order, used, strict=True)])
     xy2 = np.concatenate([pairs[n].xy2[rows] for n, rows in zip(order, used, strict=True)])
@@ -202,21 +199,36 @@ def maps_to_views(chains: Chains, corners: Sequence[F64], pairs: Sequence[TwoVie
     degree = np.bincount(edges.ravel(), minlength=len(xy))
     best = np.lexsort((np.arange(len(xy)), -degree, chains.track))
     middle_of = best[np.searchsorted(chains.track[best], np.arange(chains.count))]
-    start, maps = chain_maps(edges, xy1, xy2, affine, xy, middle_of)
+    start, maps = _chain_affines(edges, xy1, xy2, affine, xy, middle_of)
     return start, maps, middle_of[chains.track]
 
 
 @dataclass(frozen=True)
 class PlainTracks:
-    """Tracks as the matches give them: each observation stands at its corner."""
+    """Tracks with every observation at its corner."""
 
     def build(
-        self, prepared: Sequence[PreparedView], pairs: Sequence[TwoView], rng: np.random.Generator
+        self, prepared: Sequence[PreparedImage], pairs: Sequence[TwoView], rng: np.random.Generator
     ) -> Tracks:
-        """Scene points seen in at least two views; a track never has two corners in one view."""
+        """Build tracks from the matches of accepted pairs.
+
+        Parameters
+        ----------
+        prepared : sequence of PreparedImage
+            The images.
+        pairs : sequence of TwoView
+            The verified pairs.
+        rng : numpy.random.Generator
+            Not used by this variant.
+
+        Returns
+        -------
+        Tracks
+            Tracks of at least two views with at most one corner per view.
+        """
         del rng
         corners = [p.features.xy for p in prepared]
-        chains = link_matches([len(xy) for xy in corners], [p for p in pairs if p.accepted])
+        chains = _link_matches([len(xy) for xy in corners], [p for p in pairs if p.accepted])
         xy = np.concatenate([*corners, np.empty((0, 2))])[chains.node]
         return _tracks(chains, xy, np.ones(len(xy), np.bool_), len(prepared))
 
@@ -227,28 +239,45 @@ class AlignedTracks:
 
     Parameters
     ----------
-    least_correlation : after alignment; an observation below it is dropped.
-    affine_std : prior standard deviation of an affine coefficient in the alignment.
-    largest_shift : in pixels of the corner's scale.
+    min_correlation : float
+        Minimum correlation of an observation after alignment.
+    affine_std : float
+        Prior standard deviation of an affine coefficient in the alignment.
+    max_shift : float
+        Maximum shift, in pixels of the corner's scale.
     """
 
-    least_correlation: float = 0.8
+    min_correlation: float = 0.8
     affine_std: float = 0.02
-    largest_shift: float = 3.0
+    max_shift: float = 3.0
 
     def build(
-        self, prepared: Sequence[PreparedView], pairs: Sequence[TwoView], rng: np.random.Generator
+        self, prepared: Sequence[PreparedImage], pairs: Sequence[TwoView], rng: np.random.Generator
     ) -> Tracks:
-        """Scene points seen in at least two views, every observation of a track at the same sub-pixel spot.
+        """Build tracks whose observations show the same point to sub-pixel accuracy.
 
-        The middle view of a track is the one with most direct matches in it; the local maps to the other
-        views are chained along the matches.
+        The middle view of a track has most direct matches in it; local maps to the other views are chained
+        along the matches.
+
+        Parameters
+        ----------
+        prepared : sequence of PreparedImage
+            The images.
+        pairs : sequence of TwoView
+            The verified pairs.
+        rng : numpy.random.Generator
+            Not used by this variant.
+
+        Returns
+        -------
+        Tracks
+            Tracks of at least two views with at most one corner per view.
         """
         del rng
         accepted = [p for p in pairs if p.accepted]
         corners = [p.features.xy for p in prepared]
-        chains = link_matches([len(xy) for xy in corners], accepted)
-        start, affine, middle = maps_to_views(chains, corners, accepted)
+        chains = _link_matches([len(xy) for xy in corners], accepted)
+        start, affine, middle = _affines_from_middle_view(chains, corners, accepted)
         xy, kept = start.copy(), np.ones(len(start), np.bool_)
         for i, j, group in _groups(chains.view[middle], chains.view, len(prepared)):
             view1, view2 = prepared[i], prepared[j]
@@ -258,15 +287,14 @@ class AlignedTracks:
                 view2,
                 (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group]),
                 affine_std=self.affine_std,
-                largest_shift=self.largest_shift,
+                max_shift=self.max_shift,
             )
-            xy[group], kept[group] = found, score >= self.least_correlation
+            xy[group], kept[group] = found, score >= self.min_correlation
         return _tracks(chains, xy, kept, len(prepared))
 
 
 def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64]]:
-    """The observations of each two different views (i, j), found by one sort and not by a search per pair,
-    in an order in which what is prepared of a view serves again."""
+    """Observations of each two different views (i, j), in an order that reuses prepared images."""
     pair = first * views + second
     order = np.flatnonzero(first != second)
     order = order[np.argsort(pair[order], kind="stable")]
@@ -277,17 +305,17 @@ def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64
         yield int(i[k]), int(j[k]), groups[k]
 
 
-def _tracks(chains: Chains, xy: F64, kept: B8, n_views: int) -> Tracks:
-    """Observations of the tracks that still have two views, tracks numbered anew."""
+def _tracks(chains: _Chains, xy: F64, kept: B8, n_views: int) -> Tracks:
+    """Renumbered tracks of the observations that remain in at least two views."""
     sizes = np.bincount(chains.track[kept], minlength=chains.count)
     use = kept & (sizes[chains.track] >= 2)
     number = np.cumsum(sizes >= 2) - 1
-    point, view, place = number[chains.track[use]], chains.view[use], xy[use]
+    point, view, position = number[chains.track[use]], chains.view[use], xy[use]
     order = np.lexsort((view, point))
     return Tracks(
         view_index=view[order].astype(np.int64),
         point_index=point[order].astype(np.int64),
-        xy=np.ascontiguousarray(place[order]),
+        xy=np.ascontiguousarray(position[order]),
         n_views=n_views,
         n_points=int((sizes >= 2).sum()),
     )

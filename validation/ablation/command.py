@@ -9,7 +9,7 @@ from pathlib import Path
 from signal import SIGINT
 
 from thesisrecon.errors import UsageError, counted
-from thesisrecon.runtime.signals import CODES, advised
+from thesisrecon.runtime.signals import CODES, with_resume_advice
 from validation.ablation.analysis import analyse
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import Plan, plan_study
@@ -46,7 +46,7 @@ def run_command(told: argparse.Namespace) -> int:
         if told.read:
             rows = read_rows(study, told.out)
         else:
-            with advised(KEPT.format(told.out)), progress_view() as heard:
+            with with_resume_advice(KEPT.format(told.out)), progress_view() as heard:
                 rows = ablate(study, told.out, executor=told.executor, threads=told.threads, heard=heard)
         page = write_analysis(analyse(rows), told.out)
     except UsageError as error:

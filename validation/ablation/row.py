@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.errors import DISK, OutputError, StageFailure, UsageError
+from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError
 from validation.ablation.changes import Setting
 from validation.ablation.own import Source, sources_of
 from validation.ablation.store import SHARED, WORK, Outcome
@@ -88,7 +88,7 @@ def carry_out(job: Job) -> Outcome:
     except (StageFailure, UsageError) as error:
         failure = str(error)
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in DISK:
+        if isinstance(error, OSError) and error.errno in WRITE_ERRNOS:
             raise OutputError(error.filename or own, error) from None
         failure = f"{type(error).__name__}: {error}{_where(error)}"
     seconds, cpu_s = time.perf_counter() - start, clock() - cpu

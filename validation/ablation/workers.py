@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from thesisrecon.errors import UsageError
-from thesisrecon.runtime.dask_cluster import Cluster, connected, is_address
+from thesisrecon.runtime.dask_cluster import Cluster, connect_dask, is_dask_address
 from thesisrecon.runtime.executors import NAMES, ProcessPool, available_threads
 from thesisrecon.settings import unknown_word
 
@@ -66,8 +66,8 @@ def crew_of(wish: str | Executor, threads: int | None) -> Iterator[Crew]:
         crew = Crew(ThreadPoolExecutor(count) if count > 1 else _Here(), count, count > 1)
     elif wish == "processes":
         crew = Crew(_processes(count), count, False, lambda: _processes(count))
-    elif is_address(wish):
-        with connected(wish) as cluster:
+    elif is_dask_address(wish):
+        with connect_dask(wish) as cluster:
             yield Crew(cluster.executor, cluster.parallel(), True, cluster=cluster)
         return
     else:

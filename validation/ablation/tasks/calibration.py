@@ -14,6 +14,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.records import Reconstruction
 from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
+from validation.scenes.rigs import Rig
 from validation.studies.selfcalibration import (
     MODES,
     SCENES,
@@ -21,7 +22,6 @@ from validation.studies.selfcalibration import (
     assumptions,
     draw_cell,
 )
-from validation.scenes.rigs import Rig
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ class CalibrationOverNoise:
         place: Place,  # noqa: ARG002 (nothing is written)
     ) -> Mapping[str, float]:
         rig, projective = _drawn(Cell(scene, self.mode, self.noise_px, self.views), seed)
-        assumed, rng = assumptions(rig, self.mode), np.random.default_rng(seed)
-        calibration = config.selfcalibration.calibrate(projective, assumed=assumed, rng=rng)
+        prior, rng = assumptions(rig, self.mode), np.random.default_rng(seed)
+        calibration = config.selfcalibration.calibrate(projective, prior=prior, rng=rng)
         K = calibration.K
         if self.bundle:
-            refined = config.metric.refine(projective, calibration, assumed=assumed, rng=rng)
+            refined = config.metric.refine(projective, calibration, prior=prior, rng=rng)
             assert refined.reconstruction.K is not None
             K = refined.reconstruction.K
         judged = projective.registered

@@ -14,15 +14,15 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import read_images
 from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
 from thesisrecon.records import Image
 from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
-from validation.studies.front_end_pairs import MAX_SIZE_PX, Related
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS, camera_pairs
+from validation.studies.front_end_pairs import MAX_SIZE_PX, Related
 
 CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 
@@ -89,7 +89,7 @@ def numbers_of_pair(
 def _photographs(name: str, i: int, gap: int) -> tuple[tuple[Image, ...], F64]:
     scene = load_real_scene(name)
     assert scene is not None
-    images = read_photographs([scene.image_paths[i], scene.image_paths[i + gap]], max_size_px=MAX_SIZE_PX)
+    images = read_images([scene.image_paths[i], scene.image_paths[i + gap]], max_size_px=MAX_SIZE_PX)
     truths = [pair.truth for pair in camera_pairs(scene, CACHE, (gap,))]
     truth = truths[i]
     assert truth is not None

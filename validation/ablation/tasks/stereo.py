@@ -14,8 +14,8 @@ from thesisrecon.errors import UsageError
 from thesisrecon.settings import unknown_word
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.ablation.study import Measure, Place
-from validation.studies.stereo import bad_pixels
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
+from validation.studies.stereo import bad_pixels
 
 
 @dataclass(frozen=True)
