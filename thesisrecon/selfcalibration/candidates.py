@@ -284,7 +284,7 @@ def select_candidate(
         raise _no_candidate_failure(frame, reconstruction, len(candidates))
     candidate, best = chosen[0]
     theta = np.concatenate([candidate.plane, candidate.log_focals(frame)])
-    std_log_f, _ = focal_std(criterion, frame, theta)
+    std_log_f = focal_std(criterion, frame, theta)
     report = check_identifiability(reconstruction, best, frame.prior)
     K_std = _calibration_std(frame, best.K, candidate, np.minimum(std_log_f[frame.group], MAX_LOG_STD))
     return SelfCalibration(

@@ -104,7 +104,8 @@ def identifiability_without_calibration(
         "critical_motion_distance": distance,
         "excess_equations": float(excess_equations(prior, reconstruction.registered)),
     }
-    given = _given_focal_std(prior.std[reconstruction.registered, 0])
+    focal_std = prior.std[reconstruction.registered, 0]
+    given = float(focal_std.max()) if len(focal_std) else float("inf")
     sentences = motion_sentences(motion, evidence, identifiable=False, focal_std=given)
     return IdentifiabilityReport(False, motion, distance < 1.0, evidence, sentences)
 
@@ -319,16 +320,11 @@ def _report(
         and (rotated or known_focal)
         and evidence["noise_ratio_to_projective"] < MAX_NOISE_RATIO
     )
-    given = _given_focal_std(problem.prior.std[:, 0])
+    given = float(problem.prior.std[:, 0].max())
     sentences = motion_sentences(motion, evidence, identifiable=identifiable, focal_std=given)
     return IdentifiabilityReport(
         identifiable, motion, distance < 1.0, evidence, sentences, tuple(int(v) for v in undetermined)
     )
-
-
-def _given_focal_std(std: F64) -> float:
-    """Return the largest prior standard deviation of the focal lengths, inf without a view."""
-    return float(std.max(initial=0.0)) if len(std) else float("inf")
 
 
 def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:

@@ -241,7 +241,7 @@ def refine_hypotheses(
     )
 
 
-def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> tuple[F64, float]:
+def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> F64:
     """Estimate the standard deviations of the log focal lengths from the residuals.
 
     Parameters
@@ -255,10 +255,9 @@ def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -
 
     Returns
     -------
-    std : ndarray (G,)
-        Standard deviations from (J'J)^-1; inf if J'J is singular to rounding.
-    noise : float
-        Noise of a residual entry: five independent entries per camera, minus the unknowns.
+    ndarray (G,)
+        Standard deviations from (J'J)^-1 with the noise of the residuals (five independent entries per
+        camera, minus the unknowns); inf if J'J is singular to rounding.
     """
     row = theta[None]
     weights = criterion._weights(frame, row)
@@ -270,7 +269,7 @@ def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -
     S, Vt = np.linalg.svd(J / scale)[1:]
     with np.errstate(divide="ignore"):
         variance = np.sum((Vt / np.maximum(S, 1e-300)[:, None]) ** 2, axis=0) / scale**2
-    return noise * np.sqrt(variance[3:]), noise
+    return np.asarray(noise * np.sqrt(variance[3:]), dtype=np.float64)
 
 
 def minimize_batch(
