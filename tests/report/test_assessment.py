@@ -6,13 +6,13 @@ from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DegeneracyReport, IntrinsicInterval
 from thesisrecon.report.assessment import (
+    _interval_text,
+    _named_number,
     assess,
     decimals,
     duration,
     grouped,
-    interval_of,
     key_facts,
-    named_number,
     plus_minus,
 )
 from thesisrecon.report.data import ResidualSummary
@@ -37,9 +37,9 @@ def test_numbers_carry_as_many_digits_as_they_deserve(value, std, text):
 
 def test_shared_values_are_one_and_varying_ones_a_range():
     same = [IntrinsicInterval(800.0, 1.5, "a")] * 3
-    assert interval_of(same, "px") == "800.0 ± 1.5\u202fpx"
+    assert _interval_text(same, "px") == "800.0 ± 1.5\u202fpx"
     varying = [*same, IntrinsicInterval(900.0, 1.5, "a")]
-    assert interval_of(varying, "px") == "800.0 to 900.0\u202fpx (± 1.5)"
+    assert _interval_text(varying, "px") == "800.0 to 900.0\u202fpx (± 1.5)"
 
 
 def test_words_for_numbers():
@@ -49,10 +49,10 @@ def test_words_for_numbers():
     assert duration(3.04) == "3.0\u202fs"
     assert duration(125) == "2\u202fmin 05\u202fs"
     assert duration(7325) == "2\u202fh 02\u202fmin"
-    assert named_number("sigma_px", 0.19) == ("sigma", "0.19\u202fpx")
-    assert named_number("focal_spread_rel", 0.0008) == ("focal spread", "0.08\u202f%")
-    assert named_number("accepted", 26) == ("accepted", "26")
-    assert named_number("score", float("nan")) == ("score", "nan")
+    assert _named_number("sigma_px", 0.19) == ("sigma", "0.19\u202fpx")
+    assert _named_number("focal_spread_rel", 0.0008) == ("focal spread", "0.08\u202f%")
+    assert _named_number("accepted", 26) == ("accepted", "26")
+    assert _named_number("score", float("nan")) == ("score", "nan")
 
 
 def test_the_assessment_is_honest():

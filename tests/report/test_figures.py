@@ -17,18 +17,18 @@ from thesisrecon.report.drawing import (
     HUES,
     SCALE,
     UNKNOWN,
-    clip_line,
+    _clip_line,
+    _paint_scale,
+    _spread_matches,
     depth_side,
     draw_depth,
     draw_held_out,
     draw_pair,
-    paint_scale,
-    spread_matches,
     thumbnail,
 )
 from thesisrecon.report.figures import (
+    _histogram_path,
     build_scene,
-    histogram_path,
     pair_matrix_figure,
     scene_figure,
     upright_rotation,
@@ -79,7 +79,7 @@ def test_a_pair_without_matches_has_a_colour():
 
 
 def test_histogram_bars_stand_on_the_ground():
-    path = histogram_path(np.array([0.5, 0.0, 1.0, 0.25]), 1.0, width=40, height=10)
+    path = _histogram_path(np.array([0.5, 0.0, 1.0, 0.25]), 1.0, 40, 10)
     assert path.count("M") == 3
     assert path.startswith("M0.0 10.0v-5.0")
     assert "M20.0 10.0v-10.0" in path
@@ -112,7 +112,7 @@ def test_the_lines_pass_through_the_numbered_matches():
     assert drawn is not None
     pixels = np.asarray(opened(drawn.uri)).astype(int)
     s = 640 / max(SIZE)
-    chosen = spread_matches(pair.xy1, len(HUES))
+    chosen = _spread_matches(pair.xy1, len(HUES))
     for x, y in (pair.xy1[chosen] + 0.5) * s - 0.5:
         # A dot of the colour of its line: bright and coloured or at least far from the grey ground.
         spot = pixels[round(y), round(x)]
@@ -132,22 +132,22 @@ def test_a_pair_without_pixels_or_matches_is_no_error():
 
 
 def test_lines_are_cut_at_the_edges_of_the_photograph():
-    level = clip_line(np.array([0.0, 1.0, -10.0]), 100, 50)
+    level = _clip_line(np.array([0.0, 1.0, -10.0]), 100, 50)
     assert level == ((-0.5, 10.0), (99.5, 10.0))
-    upright = clip_line(np.array([1.0, 0.0, -10.0]), 100, 50)
+    upright = _clip_line(np.array([1.0, 0.0, -10.0]), 100, 50)
     assert upright == ((10.0, -0.5), (10.0, 49.5))
-    assert clip_line(np.array([0.0, 1.0, 20.0]), 100, 50) is None
-    assert clip_line(np.zeros(3), 100, 50) is None
+    assert _clip_line(np.array([0.0, 1.0, 20.0]), 100, 50) is None
+    assert _clip_line(np.zeros(3), 100, 50) is None
 
 
 def test_spread_matches_are_different_and_far_apart():
     xy = np.random.default_rng(0).uniform(0, 100, (500, 2))
-    chosen = spread_matches(xy, 12)
+    chosen = _spread_matches(xy, 12)
     assert len(set(chosen.tolist())) == 12
     gaps = np.linalg.norm(xy[chosen][:, None] - xy[chosen][None], axis=2) + np.eye(12) * 1e9
     assert gaps.min() > 20
-    assert len(spread_matches(xy[:5], 12)) == 5
-    assert len(spread_matches(np.zeros((0, 2)), 12)) == 0
+    assert len(_spread_matches(xy[:5], 12)) == 5
+    assert len(_spread_matches(np.zeros((0, 2)), 12)) == 0
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3)])
@@ -164,10 +164,10 @@ def lightness(rgb):
 
 
 def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness():
-    steps = np.diff(lightness(paint_scale(np.linspace(0, 1, 33)).astype(float)))
+    steps = np.diff(lightness(_paint_scale(np.linspace(0, 1, 33)).astype(float)))
     assert steps.min() > 1.8
     assert steps.max() < 1.6 * steps.min()
-    ends = paint_scale(np.array([-3.0, 0.0, 1.0, 7.0, np.nan]))
+    ends = _paint_scale(np.array([-3.0, 0.0, 1.0, 7.0, np.nan]))
     assert ["#" + bytes(c).hex() for c in ends[:4]] == [SCALE[0], SCALE[0], SCALE[-1], SCALE[-1]]
     assert tuple(ends[4]) == UNKNOWN
 

@@ -17,15 +17,13 @@ from tests.report.synthetic import NOISE_PX, SPHERE_NAMES, Witness, made_up_run,
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.records import HeldOut, IntrinsicInterval, TexturedMesh
 from thesisrecon.report.data import (
-    BINS,
     ReportData,
     ReportImage,
-    common_limit_px,
-    histogram_shares,
     reprojection_distances,
     summarize_distances,
     used_observations,
 )
+from thesisrecon.report.figures import _BINS, _common_limit_px, _histogram_shares
 from thesisrecon.report.page import render_report, strip_page, write_report
 
 EVIL = [
@@ -428,15 +426,15 @@ def test_without_distortion_the_projective_residuals_grow_by_what_it_moved():
 
 def test_histogram_holds_every_distance():
     distances = np.array([0.0, 0.1, 0.49, 0.5, 7.0])
-    shares = histogram_shares(distances, 0.5)
-    assert len(shares) == BINS
+    shares = _histogram_shares(distances, 0.5)
+    assert len(shares) == _BINS
     assert shares.sum() == pytest.approx(1.0)
     assert shares[-1] == pytest.approx(3 / 5)  # 0.49, 0.5 and the one beyond
-    assert histogram_shares(np.zeros(0), 1.0).sum() == 0
+    assert _histogram_shares(np.zeros(0), 1.0).sum() == 0
 
 
 def test_common_limit_is_round_and_covers_the_distances():
-    assert common_limit_px(np.full(100, 0.31)) == 0.5
-    assert common_limit_px(np.full(100, 250.2)) == 251.0
-    assert common_limit_px(np.zeros(0)) == 1.0
+    assert _common_limit_px(np.full(100, 0.31)) == 0.5
+    assert _common_limit_px(np.full(100, 250.2)) == 251.0
+    assert _common_limit_px(np.zeros(0)) == 1.0
     assert summarize_distances(np.zeros(0)) is None

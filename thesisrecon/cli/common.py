@@ -16,10 +16,10 @@ from typing import Annotated, Any
 
 import typer
 
-from thesisrecon.errors import DISK, OutputError, StageFailure, UsageError
+from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError
 from thesisrecon.io.files import printable, shorten_middle, shortened
 from thesisrecon.runtime.executors import available_threads
-from thesisrecon.runtime.signals import CODES, REASONS, advised
+from thesisrecon.runtime.signals import CODES, REASONS, with_resume_advice
 
 DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
 DEBUG_VARIABLE = "THESISRECON_DEBUG"
@@ -138,7 +138,7 @@ def interruptible(advice: str) -> Iterator[None]:
         Nothing.
     """
     try:
-        with advised(advice):
+        with with_resume_advice(advice):
             yield
     except KeyboardInterrupt as stop:
         raise _Interrupted(*stop.args) from None
@@ -165,12 +165,12 @@ def exit_code_of(command: Callable[[], object]) -> int:
     except StageFailure as failure:
         return _report(str(failure), IMPOSSIBLE)
     except (_Interrupted, KeyboardInterrupt) as stop:
-        # Only if another program called us: the installed command leaves in `obey_signals`.
+        # Only if another program called us: the installed command leaves in `install_signal_handlers`.
         return _report("; ".join((REASONS[SIGINT], *map(str, stop.args))), CODES[SIGINT])
     except MemoryError:
         return _report("out of memory; try a smaller --max-size or fewer --threads", IMPOSSIBLE)
     except OSError as error:
-        if error.errno in DISK:
+        if error.errno in WRITE_ERRNOS:
             # The kernel cache and redirected output can fill a disk too.
             return _report(str(OutputError(error.filename or "the output", error)), USAGE)
         if os.environ.get(DEBUG_VARIABLE):

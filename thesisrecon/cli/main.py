@@ -16,7 +16,7 @@ from thesisrecon.cli.inspect import inspect
 from thesisrecon.cli.interpolate import interpolate
 from thesisrecon.cli.reconstruct import demo, reconstruct
 from thesisrecon.cli.render import render
-from thesisrecon.runtime.signals import speak_through
+from thesisrecon.runtime.signals import set_error_stream
 
 app = typer.Typer(
     name="thesisrecon",
@@ -70,7 +70,7 @@ def _silence_c_libraries() -> None:
         return
     os.dup2(nowhere, 2)
     os.close(nowhere)
-    speak_through(ours)
+    set_error_stream(ours)
     encoding = getattr(sys.stderr, "encoding", None)
     sys.stderr = os.fdopen(ours, "w", buffering=1, encoding=encoding, errors="backslashreplace")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -55,14 +56,14 @@ def render(
     cap_threads(threads)
     if run.is_file():
         raise UsageError(f"render takes the output folder of a run; {run} is a file")
-    from thesisrecon.cli.view_files import RenderOptions, color_from_text, render_run, size_from_text
+    from thesisrecon.cli.view_files import RenderOptions, render_run
 
     options = RenderOptions(
         path.value,
         frames,
-        None if size is None else size_from_text(size),
+        None if size is None else _size(size),
         light.value,
-        color_from_text(background),
+        _color(background),
     )
     with interruptible("repeat the command to render all frames"), progress_bars() as progress:
         written = render_run(
@@ -73,3 +74,21 @@ def render(
             progress=progress,
         )
     typer.echo(str(written))
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Parse ``WIDTHxHEIGHT``."""
+    found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
+    if found is None:
+        raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def _color(text: str) -> tuple[int, int, int]:
+    """Parse a colour name, "#rrggbb" or "rgb(...)"."""
+    import PIL.ImageColor
+
+    try:
+        return PIL.ImageColor.getrgb(text.strip())[:3]
+    except ValueError:
+        raise UsageError(f"--background takes a colour as white or #20304f; got {text!r}") from None

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import combinations
 from pathlib import Path
 from typing import Any
-
-import PIL.ImageColor
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
@@ -162,54 +159,6 @@ class ViewFiles:
         width, height = self.size
         files = f"{counted(len(self.frames), 'frame')} of {width} x {height} px and {self.animation.name}"
         return f"{files} written to {printable(str(self.folder))}"
-
-
-def size_from_text(text: str) -> tuple[int, int]:
-    """Parse ``WIDTHxHEIGHT``.
-
-    Parameters
-    ----------
-    text : str
-        As "1000x700".
-
-    Returns
-    -------
-    tuple of int
-        (width, height).
-
-    Raises
-    ------
-    UsageError
-        For other text.
-    """
-    found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
-    if found is None:
-        raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")
-    return int(found[1]), int(found[2])
-
-
-def color_from_text(text: str) -> tuple[int, int, int]:
-    """Parse a colour.
-
-    Parameters
-    ----------
-    text : str
-        A name ("white"), "#rrggbb" or "rgb(...)".
-
-    Returns
-    -------
-    tuple of int
-        (red, green, blue), 0 to 255.
-
-    Raises
-    ------
-    UsageError
-        For other text.
-    """
-    try:
-        return PIL.ImageColor.getrgb(text.strip())[:3]
-    except ValueError:
-        raise UsageError(f"--background takes a colour as white or #20304f; got {text!r}") from None
 
 
 def render_run(

@@ -236,7 +236,7 @@ def _intrinsic_facts(data: ReportData) -> list[Fact]:
             else "images of several sizes"
         )
         note = f"horizontal field of view {np.median(angle):.1f}°; {where}. {_source_of(focal)}"
-        facts.append(Fact("Focal length", interval_of(focal, "px"), note))
+        facts.append(Fact("Focal length", _interval_text(focal, "px"), note))
     centre_x = [view["principal_x_px"] for view, _ in known if "principal_x_px" in view]
     centre_y = [view["principal_y_px"] for view, _ in known if "principal_y_px" in view]
     if centre_x and centre_y:
@@ -246,26 +246,13 @@ def _intrinsic_facts(data: ReportData) -> list[Fact]:
         offset = np.stack([[p.value for p in centre_x], [p.value for p in centre_y]], axis=1) - middles
         away = float(np.median(np.linalg.norm(offset, axis=1)))
         note = f"x, y; {away:.1f} px from the image centre. {_source_of([*centre_x, *centre_y])}"
-        value = f"{interval_of(centre_x, '')}, {interval_of(centre_y, 'px')}"
+        value = f"{_interval_text(centre_x, '')}, {_interval_text(centre_y, 'px')}"
         facts.append(Fact("Principal point", value, note))
     return facts
 
 
-def interval_of(intervals: Sequence[IntrinsicInterval], unit: str) -> str:
-    """Format one value ± its standard deviation, or the range if the views differ.
-
-    Parameters
-    ----------
-    intervals : sequence of IntrinsicInterval
-        One per view.
-    unit : str
-        Unit, or empty.
-
-    Returns
-    -------
-    str
-        As "1520.3 ± 1.8 px".
-    """
+def _interval_text(intervals: Sequence[IntrinsicInterval], unit: str) -> str:
+    """Format one value ± its standard deviation, or the range if the views differ."""
     values = np.array([interval.value for interval in intervals])
     std = float(np.median([interval.std for interval in intervals]))
     tail = f"{_THIN}{unit}" if unit else ""
@@ -344,21 +331,8 @@ def duration(seconds: float) -> str:
     return f"{hours}{_THIN}h {minutes:02d}{_THIN}min" if hours else f"{minutes}{_THIN}min {rest:02d}{_THIN}s"
 
 
-def named_number(name: str, value: float) -> tuple[str, str]:
-    """Format a key and its value with the unit of its suffix.
-
-    Parameters
-    ----------
-    name : str
-        As "sigma_px".
-    value : float
-        The number.
-
-    Returns
-    -------
-    tuple of str
-        As ("sigma", "0.31 px").
-    """
+def _named_number(name: str, value: float) -> tuple[str, str]:
+    """Format a key and its value with the unit of its suffix: sigma_px -> ("sigma", "0.31 px")."""
     stem, _, suffix = name.rpartition("_")
     text = grouped(int(value)) if float(value).is_integer() and abs(value) < 1e15 else _short(value)
     if stem and suffix in _UNITS:
@@ -374,7 +348,7 @@ def _short(value: float) -> str:
 
 
 def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tuple[str, str]]:
-    """Format a mapping of numbers by :func:`named_number`.
+    """Format the keys and values of a mapping with the units of their suffixes.
 
     Parameters
     ----------
@@ -386,7 +360,7 @@ def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tupl
     list of tuple of str
         In the order of the mapping.
     """
-    return [named_number(name, float(value)) for name, value in numbers.items()]
+    return [_named_number(name, float(value)) for name, value in numbers.items()]
 
 
 def count_of(number: int, noun: str) -> str:

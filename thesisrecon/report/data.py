@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.errors import StageFailure
@@ -187,11 +186,6 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
     return replace(interval, value=interval.value / scale + shift, std=interval.std / scale)
 
 
-BINS = 28
-# Possible ends of the common histogram axis.
-_ROUND_LIMITS_PX = (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 10.0, 15.0, 20.0, 50.0, 100.0)
-
-
 @dataclass(frozen=True)
 class ResidualSummary:
     """Statistics of reprojection distances.
@@ -289,39 +283,3 @@ def summarize_distances(distances: F64) -> ResidualSummary | None:
         return None
     median, q95 = np.quantile(distances, [0.5, 0.95])
     return ResidualSummary(len(distances), float(median), float(np.sqrt(np.mean(distances**2))), float(q95))
-
-
-def common_limit_px(distances: F64) -> float:
-    """Choose a round upper end of the histograms that contains 98 % of all distances.
-
-    Parameters
-    ----------
-    distances : ndarray (N,)
-        Pixels.
-
-    Returns
-    -------
-    float
-        Pixels.
-    """
-    needed = float(np.quantile(distances, 0.98)) if len(distances) else 1.0
-    return next((limit for limit in _ROUND_LIMITS_PX if limit >= needed), float(np.ceil(needed)))
-
-
-def histogram_shares(distances: F64, limit_px: float) -> NDArray[np.float64]:
-    """Compute the histogram of distances in [0, limit]; the last bin includes all larger ones.
-
-    Parameters
-    ----------
-    distances : ndarray (N,)
-        Pixels.
-    limit_px : float
-        Upper end.
-
-    Returns
-    -------
-    ndarray (28,)
-        Fraction of the distances in each bin.
-    """
-    counts, _ = np.histogram(np.minimum(distances, limit_px), bins=BINS, range=(0.0, limit_px))
-    return counts / max(len(distances), 1)

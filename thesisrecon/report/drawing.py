@@ -126,7 +126,7 @@ def draw_pair(pair: TwoView, first: ReportImage, second: ReportImage) -> Embedde
     """
     if first.rgb is None or second.rgb is None:
         return None
-    chosen = spread_matches(pair.xy1, len(HUES))
+    chosen = _spread_matches(pair.xy1, len(HUES))
     left = _draw_half(first, pair.xy1, chosen, pair.xy2[chosen] @ pair.F[:2] + pair.F[2])
     right = _draw_half(second, pair.xy2, chosen, pair.xy1[chosen] @ pair.F[:, :2].T + pair.F[:, 2])
     sheet = PillowImage.new("RGB", (left.width + _GAP + right.width, max(left.height, right.height)), "white")
@@ -135,21 +135,8 @@ def draw_pair(pair: TwoView, first: ReportImage, second: ReportImage) -> Embedde
     return embed_jpeg(sheet, quality=84)
 
 
-def spread_matches(xy: F64, count: int) -> I64:
-    """Select points far from each other: the most central one, then always the farthest.
-
-    Parameters
-    ----------
-    xy : ndarray (N, 2)
-        Points.
-    count : int
-        Largest number to select.
-
-    Returns
-    -------
-    ndarray (M,)
-        Their indices.
-    """
+def _spread_matches(xy: F64, count: int) -> I64:
+    """Select up to ``count`` indices of distant points (N, 2): the most central, then always the farthest."""
     if len(xy) == 0:
         return np.zeros(0, dtype=np.int64)
     chosen = [int(np.argmin(np.linalg.norm(xy - xy.mean(axis=0), axis=1)))]
@@ -160,23 +147,10 @@ def spread_matches(xy: F64, count: int) -> I64:
     return np.array(chosen, dtype=np.int64)
 
 
-def clip_line(
+def _clip_line(
     line: F64, width: float, height: float
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Clip a line to an image.
-
-    Parameters
-    ----------
-    line : ndarray (3,)
-        a x + b y + c = 0.
-    width, height : float
-        Image size (px).
-
-    Returns
-    -------
-    tuple of points or None
-        Both ends; None if the line misses the image.
-    """
+    """Clip a line a x + b y + c = 0 to an image; None if it misses the image."""
     a, b, c = (float(v) for v in line)
     low, right, bottom = -0.5, width - 0.5, height - 0.5
     hits: list[tuple[float, float]] = []
@@ -203,7 +177,7 @@ def _draw_half(image: ReportImage, xy: F64, chosen: I64, lines: F64) -> PillowIm
     for x, y in _to_drawing(xy, s):
         draw.ellipse((x - r, y - r, x + r, y + r), fill="#ffffff", outline="#1b2733")
     for n, line in enumerate(lines):
-        ends = clip_line(line, width, height)
+        ends = _clip_line(line, width, height)
         if ends is not None:
             draw.line([tuple(p) for p in _to_drawing(np.array(ends), s)], fill=HUES[n], width=3)
     font = ImageFont.load_default(size=30)
@@ -280,23 +254,12 @@ def draw_depth(depth: F32, *, side: int = _DEPTH_SIDE) -> DepthImage:
     known = np.isfinite(depth)
     near, far = np.quantile(depth[known], (0.01, 0.99)).tolist() if known.any() else (np.nan, np.nan)
     closeness = (far - depth.astype(np.float64)) / max(far - near, 1e-12 * abs(far), 1e-300)
-    colored = PillowImage.fromarray(paint_scale(closeness))
+    colored = PillowImage.fromarray(_paint_scale(closeness))
     return DepthImage(_small(colored, side), float(near), float(far), float(known.mean()))
 
 
-def paint_scale(values: F64) -> NDArray[np.uint8]:
-    """Colour numbers from 0 (dark) to 1 (bright).
-
-    Parameters
-    ----------
-    values : ndarray (...)
-        Clipped to [0, 1]; NaN becomes grey.
-
-    Returns
-    -------
-    ndarray (..., 3) uint8
-        RGB.
-    """
+def _paint_scale(values: F64) -> NDArray[np.uint8]:
+    """Colour numbers (...) from 0 (dark) to 1 (bright) as (..., 3); NaN becomes grey."""
     table = np.array([[int(code[k : k + 2], 16) for k in (1, 3, 5)] for code in SCALE], dtype=np.float64)
     at = np.linspace(0.0, 1.0, len(table))
     known = np.isfinite(values)
@@ -340,7 +303,7 @@ def draw_held_out(held_out: HeldOut) -> tuple[EmbeddedImage, EmbeddedImage, Embe
     rendered = np.where(held_out.compared[..., None], held_out.rendered, np.array(UNKNOWN, np.uint8))
     real, model, apart = (
         _small(PillowImage.fromarray(pixels), _HELD_OUT_SIDE)
-        for pixels in (held_out.real, rendered, paint_scale(difference))
+        for pixels in (held_out.real, rendered, _paint_scale(difference))
     )
     return real, model, apart
 

@@ -20,6 +20,9 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Reconstruction, TwoView
 
 MAX_POINTS = 25_000
+_BINS = 28
+# Possible ends of the common histogram axis.
+_ROUND_LIMITS_PX = (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 10.0, 15.0, 20.0, 50.0, 100.0)
 
 
 @dataclass(frozen=True)
@@ -347,23 +350,39 @@ def _count_bar() -> Figure:
     }
 
 
-def histogram_path(shares: F64, tallest: float, *, width: float, height: float) -> str:
-    """Draw the bars of a histogram as an SVG path.
+def histograms(distances: Sequence[F64], *, width: float, height: float) -> tuple[float, list[str]]:
+    """Draw histograms of distances on one scale as SVG paths.
 
     Parameters
     ----------
-    shares : ndarray (B,)
-        Heights of the bars.
-    tallest : float
-        Height that fills the box.
+    distances : sequence of ndarray (N,)
+        Pixels; the last bin of each histogram includes all larger distances.
     width, height : float
-        Size of the box.
+        Size of the box of each path.
 
     Returns
     -------
-    str
-        Path data.
+    tuple of float and list of str
+        Upper end (px), which contains 98 % of all distances, and the path data.
     """
+    limit_px = _common_limit_px(np.concatenate([np.zeros(0), *distances]))
+    shares = [_histogram_shares(d, limit_px) for d in distances]
+    tallest = max((float(s.max()) for s in shares if len(s)), default=1.0)
+    return limit_px, [_histogram_path(s, tallest, width, height) for s in shares]
+
+
+def _common_limit_px(distances: F64) -> float:
+    needed = float(np.quantile(distances, 0.98)) if len(distances) else 1.0
+    return next((limit for limit in _ROUND_LIMITS_PX if limit >= needed), float(np.ceil(needed)))
+
+
+def _histogram_shares(distances: F64, limit_px: float) -> F64:
+    counts, _ = np.histogram(np.minimum(distances, limit_px), bins=_BINS, range=(0.0, limit_px))
+    return counts / max(len(distances), 1)
+
+
+def _histogram_path(shares: F64, tallest: float, width: float, height: float) -> str:
+    """Draw the bars; the share ``tallest`` fills the box."""
     step = width / max(len(shares), 1)
     strokes = []
     for n, share in enumerate(shares.tolist()):

@@ -40,8 +40,6 @@ from thesisrecon.report.assessment import (
 from thesisrecon.report.data import (
     ReportData,
     ResidualSummary,
-    common_limit_px,
-    histogram_shares,
     reprojection_distances,
     summarize_distances,
 )
@@ -60,7 +58,7 @@ from thesisrecon.report.drawing import (
 from thesisrecon.report.figures import (
     MAX_POINTS,
     build_scene,
-    histogram_path,
+    histograms,
     pair_matrix_figure,
     scene_figure,
 )
@@ -264,7 +262,7 @@ def render_report(data: ReportData) -> str:
     distances = [d / photo.scale for d, photo in zip(working, data.images, strict=True)]
     everything = np.concatenate([np.zeros(0), *distances])
     overall = summarize_distances(everything)
-    limit_px = common_limit_px(everything)
+    limit_px, bars = histograms(distances, width=_HISTOGRAM_WIDTH, height=_HISTOGRAM_HEIGHT)
     figures, shown = _figures(data)
     model = _model(data)
     figure_scripts = [plotly_script(), page_resource("page.js")] if figures else []
@@ -277,7 +275,7 @@ def render_report(data: ReportData) -> str:
             assessment=assess(data),
             facts=key_facts(data, overall),
             overall=overall,
-            cards=_cards(data, distances, limit_px),
+            cards=_cards(data, distances, bars),
             intrinsic_columns=_intrinsic_columns(data),
             limit_px=limit_px,
             model=model,
@@ -354,9 +352,7 @@ def _depths(data: ReportData) -> list[tuple[int, str, DepthImage]]:
     ]
 
 
-def _cards(data: ReportData, distances: list[F64], limit_px: float) -> list[_Card]:
-    shares = [histogram_shares(d, limit_px) for d in distances]
-    tallest = max((float(s.max()) for s in shares if len(s)), default=1.0)
+def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[_Card]:
     intrinsics = data.original_intrinsics
     cards = []
     for i, image in enumerate(data.images):
@@ -371,7 +367,7 @@ def _cards(data: ReportData, distances: list[F64], limit_px: float) -> list[_Car
                 size=_size_text(image.original_size, image.size),
                 picture=thumbnail(image, len(data.images)),
                 residuals=summarize_distances(distances[i]),
-                bars=histogram_path(shares[i], tallest, width=_HISTOGRAM_WIDTH, height=_HISTOGRAM_HEIGHT),
+                bars=bars[i],
                 intrinsics={name: _interval_text(interval) for name, interval in intrinsics[i].items()},
             )
         )

@@ -55,7 +55,7 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     dict
         ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
         uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` a JPEG; ``viewpoints``
-        (see :func:`viewpoints`), the most central one as ``start``; ``directions``.
+        of the images, the most central one as ``start``; ``directions``.
         Faces farther from the median than 8 times the 95 % quantile are left out.
     """
     mesh = _without_strays(mesh)
@@ -67,7 +67,7 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     steps = np.where(high > low, high - low, 1.0) / LEVELS
     positions = np.rint(np.clip((vertices - low) / steps, 0, LEVELS)).astype("<u2")
     color, faces, vertex = _colored(mesh)
-    places = viewpoints(mesh, reconstruction, upright, names)
+    places = _viewpoints(mesh, reconstruction, upright, names)
     eyes = np.array([place["eye"] for place in places])
     middle = int(np.argmin(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1)))
     return {
@@ -121,27 +121,13 @@ def _within(texture: NDArray[np.uint8]) -> PillowImage.Image:
     return picture.resize(size, PillowImage.Resampling.BOX)
 
 
-def viewpoints(
+def _viewpoints(
     mesh: TexturedMesh, reconstruction: Reconstruction, upright: F64, names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Compute the viewpoints of the registered images in the viewer.
+    """Compute the viewpoints of the registered images, in the axes of the viewer.
 
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        Surface.
-    reconstruction : Reconstruction
-        Metric.
-    upright : ndarray (3, 3)
-        Rotation to the axes of the viewer.
-    names : sequence of str
-        File names of the V views.
-
-    Returns
-    -------
-    list of dict
-        ``eye`` (3,), ``target`` (3,) on the optical axis at the median depth of the visible vertices,
-        ``field`` the tangents of half the horizontal and vertical field of view.
+    ``target`` is the point of the optical axis at the median depth of the visible vertices, ``field`` the
+    tangents of half the horizontal and vertical field of view.
     """
     found = []
     for i in np.flatnonzero(reconstruction.registered).tolist():
