@@ -50,10 +50,18 @@ class Image:
 
 @dataclass(frozen=True)
 class Seeds:
-    """Corners of several scales with a small normalised patch each: matched without a search radius.
+    """Corners of several scales with a normalised patch each, matched without a search radius.
 
-    ``xy`` (S, 2) px; ``scale`` (S,) px per sample unit of the level they were found on; ``angle`` (S,) rad
-    of the patch (0 = upright); ``patches`` (S, D) float32, zero mean and unit norm.
+    Parameters
+    ----------
+    xy : ndarray (S, 2)
+        Positions, px.
+    scale : ndarray (S,)
+        Pixels per sample of the pyramid level.
+    angle : ndarray (S,)
+        Rotation of the patch, rad; 0 = upright.
+    patches : ndarray (S, D)
+        Patches of zero mean and unit norm, float32.
     """
 
     xy: F64
@@ -64,8 +72,18 @@ class Seeds:
 
 @dataclass(frozen=True)
 class Features:
-    """Corners of one photograph: ``xy`` (N, 2) px, ``scale`` (N,), ``response`` (N,) float32, strongest
-    first.
+    """Corners of one image, strongest first.
+
+    Parameters
+    ----------
+    xy : ndarray (N, 2)
+        Positions, px.
+    scale : ndarray (N,)
+        Scale of each corner.
+    response : ndarray (N,)
+        Corner response, float32.
+    seeds : Seeds, optional
+        Patches for matching without a search radius.
     """
 
     xy: F64
@@ -76,11 +94,20 @@ class Features:
 
 @dataclass(frozen=True)
 class Matches:
-    """Corners of view i taken for the same scene point as corners of view j.
+    """Matched corners of views i and j.
 
-    ``index1, index2`` (M,) into ``Features.xy``, each corner at most once; ``xy1, xy2`` (M, 2) px the
-    positions after sub-pixel alignment of the pair; ``score`` (M,) correlation in [-1, 1]; ``affine``
-    (M, 2, 2) the local map of image 1 to image 2 around the match (identity where it was not estimated).
+    Parameters
+    ----------
+    i, j : int
+        View numbers.
+    index1, index2 : ndarray (M,) of int
+        Indices into ``Features.xy``, each corner at most once.
+    xy1, xy2 : ndarray (M, 2)
+        Positions after sub-pixel alignment, px.
+    score : ndarray (M,)
+        Correlation in [-1, 1].
+    affine : ndarray (M, 2, 2)
+        Local map from image 1 to image 2; identity if it was not estimated.
     """
 
     i: int
@@ -95,9 +122,16 @@ class Matches:
 
 @dataclass(frozen=True)
 class PairChoice:
-    """Which pairs of views are matched: ``pairs`` (M, 2) view numbers, the smaller first, sorted.
+    """The pairs of views to match.
 
-    ``how`` says in a clause how they were chosen, ``compared`` of how many pairs the overlap was estimated.
+    Parameters
+    ----------
+    pairs : ndarray (M, 2) of int
+        View numbers, the smaller first, sorted.
+    how : str
+        How the pairs were selected.
+    compared : int
+        Number of pairs whose overlap was estimated.
     """
 
     pairs: I64
@@ -107,14 +141,26 @@ class PairChoice:
 
 @dataclass(frozen=True)
 class DegeneracyReport:
-    """Whether the matches of a pair determine its F, with the evidence; ``reasons`` say why not.
+    """Whether the matches of a pair determine its F, with the evidence.
 
-    ``off_plane`` is the number of inliers off the dominant plane (matches that share a place count as one),
-    ``contradicted`` how many of these lie amid matches of the plane where no surface could;
-    ``log10_false_alarms`` of how often chance gives as many. ``rival`` (3, 3) is the other F that comes
-    nearest to explaining as many matches, None without one, ``competing_margin`` by how many standard errors it
-    explains fewer; ``expected_error_px`` the RMS distance of exact matches to their lines after the
-    covariance of F.
+    Parameters
+    ----------
+    determined : bool
+        True if no other F explains the matches as well.
+    reasons : tuple of str
+        Why F is undetermined.
+    off_plane : float
+        Inliers off the dominant plane; matches at one position count once.
+    contradicted : float
+        Those among them that lie between matches of the plane, where no surface can be.
+    log10_false_alarms : float
+        log10 of how often chance gives as many inliers off the plane.
+    competing_margin : float
+        Standard errors by which the best competing model explains fewer matches.
+    competing_model : ndarray (3, 3), optional
+        That model.
+    expected_error_px : float
+        RMS distance of exact matches to their epipolar lines by the covariance of F.
     """
 
     determined: bool
@@ -129,11 +175,24 @@ class DegeneracyReport:
 
 @dataclass(frozen=True)
 class FundamentalFit:
-    """A robust estimate of F: ``F`` (3, 3) unit Frobenius norm, ``inliers`` (M,) bool, ``sigma_px`` the
-    standard deviation of one image coordinate estimated from the inliers, ``covariance`` (9, 9) of vec(F)
-    row-major. ``rivals`` (K, 3, 3) are other matrices that the search ended at, the best first: where they
-    explain about as many matches, F is one of several. ``certainty`` says whether the matches determine it,
-    None where nobody asked.
+    """A robust estimate of F.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3)
+        Fundamental matrix, unit Frobenius norm.
+    inliers : ndarray (M,) of bool
+        Inliers.
+    sigma_px : float
+        Standard deviation of one image coordinate, estimated from the inliers.
+    covariance : ndarray (9, 9)
+        Covariance of vec(F), row-major.
+    iterations : int
+        Number of samples.
+    competing_models : ndarray (K, 3, 3)
+        Other results of the search, best first; F is ambiguous if they explain as many matches.
+    degeneracy : DegeneracyReport, optional
+        Whether the matches determine F; None if not tested.
     """
 
     F: F64
@@ -147,13 +206,36 @@ class FundamentalFit:
 
 @dataclass(frozen=True)
 class TwoView:
-    """A pair of views with its epipolar geometry; the arrays hold the verified matches only.
+    """A pair of views with its epipolar geometry and its verified matches.
 
-    ``accepted`` says whether the pair enters the tracks, ``reason`` why not. ``homography_inlier_ratio`` is the
-    share of the verified matches that one homography explains (near 1: a plane or a pure rotation).
-    ``configuration`` names what the matches show ("general", "plane", "pure rotation", "pure translation"),
-    empty where they are too few to tell, and ``certainty`` whether they determine F, None where that was not
-    judged. A pair may be accepted with an F that is not determined: its matches are good all the same.
+    A pair may be accepted with an undetermined F: its matches are valid all the same.
+
+    Parameters
+    ----------
+    i, j : int
+        View numbers.
+    F : ndarray (3, 3)
+        Fundamental matrix.
+    sigma_px : float
+        Standard deviation of one image coordinate.
+    index1, index2 : ndarray (M,) of int
+        Corner indices of the verified matches.
+    xy1, xy2 : ndarray (M, 2)
+        Positions, px.
+    affine : ndarray (M, 2, 2)
+        Local maps from image 1 to image 2.
+    candidates : int
+        Number of matches before verification.
+    homography_inlier_ratio : float
+        Fraction of the verified matches that one homography explains; near 1 for a plane or a pure rotation.
+    accepted : bool
+        Whether the pair enters the tracks.
+    reason : str
+        Why it does not.
+    configuration : str
+        "general", "plane", "pure rotation" or "pure translation"; empty for too few matches.
+    degeneracy : DegeneracyReport, optional
+        Whether the matches determine F; None if not tested.
     """
 
     i: int
@@ -179,15 +261,22 @@ class TwoView:
 
     @property
     def undetermined(self) -> bool:
-        """Whether F was judged and found open: other epipolar geometries explain the matches as well."""
+        """Whether F was tested and other epipolar geometries explain the matches as well."""
         return self.degeneracy is not None and not self.degeneracy.determined
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Observations of scene points: K of them, sorted by (point, view).
+    """Observations of scene points, sorted by (point, view).
 
-    ``view_index, point_index`` (K,), ``xy`` (K, 2) px. A point is seen at most once in a view.
+    Parameters
+    ----------
+    view_index, point_index : ndarray (K,) of int
+        View and point of each observation; a point at most once per view.
+    xy : ndarray (K, 2)
+        Positions, px.
+    n_views, n_points : int
+        Number of views and points.
     """
 
     view_index: I64
