@@ -88,12 +88,14 @@ def _linear(*, normalized: bool, rank_two: bool = True) -> Estimate:
     return lambda xy1, xy2, _, __: estimate_eight_point(xy1, xy2, normalized=normalized, rank_two=rank_two)
 
 
-def _thesis(**variant: Any) -> Estimate:
-    def estimate(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64:
-        method = ThesisRansac(threshold_px=threshold_px, **variant)
-        return method.estimate(xy1, xy2, np.random.default_rng(seed)).F
+def _robust(
+    make: Callable[[float], LocallyOptimisedRansac | LeastMedianOfSquares | ThesisRansac],
+) -> Estimate:
+    return lambda xy1, xy2, t, seed: make(t).estimate(xy1, xy2, np.random.default_rng(seed)).F
 
-    return estimate
+
+def _thesis(threshold_px: float, **variant: Any) -> ThesisRansac:
+    return ThesisRansac(threshold_px=threshold_px, **variant)
 
 
 def _search_alone(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64 | None:
@@ -104,21 +106,12 @@ def _search_alone(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64 | N
     return None if found is None else frame.matrix_in_pixels(found.model)
 
 
-def _least_median(xy1: F64, xy2: F64, _: float, seed: int) -> F64:
-    return LeastMedianOfSquares().estimate(xy1, xy2, np.random.default_rng(seed)).F
+_default = _robust(lambda t: LocallyOptimisedRansac(threshold_px=t))
 
 
-def _default(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64:
-    method = LocallyOptimisedRansac(threshold_px=threshold_px)
-    return method.estimate(xy1, xy2, np.random.default_rng(seed)).F
-
-
-def _gold_from_default(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64:
-    return refine_reprojection(_default(xy1, xy2, threshold_px, seed), xy1, xy2)
-
-
-def _opencv_eight_point(xy1: F64, xy2: F64, _: float, __: int) -> F64 | None:
-    return opencv_eight_point(xy1, xy2)
+def _gold_from_default(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64 | None:
+    F = _default(xy1, xy2, threshold_px, seed)
+    return None if F is None else refine_reprojection(F, xy1, xy2)
 
 
 def _library(name: str) -> Estimate:
@@ -145,7 +138,7 @@ OWN = (
     Method(GOLD_FROM_DEFAULT, _gold_from_default),
     Method("Algorithm 2, seven-point search alone", _search_alone, robust=True, thresholded=True),
     *(
-        Method(f"Algorithm 2, {label}", _thesis(**variant), robust=True, thresholded=True)
+        Method(f"Algorithm 2, {label}", _robust(partial(_thesis, **variant)), robust=True, thresholded=True)
         for label, variant in (
             ("gradient", {}),
             ("epipolar distance", {"epipolar_distance": True}),
@@ -153,11 +146,11 @@ OWN = (
             ("gradient, test of the sum", {"inlier_test": "symmetric-distance"}),
         )
     ),
-    Method("least median of squares", _least_median, robust=True),
+    Method("least median of squares", _robust(lambda _: LeastMedianOfSquares()), robust=True),
     Method(DEFAULT, _default, robust=True, thresholded=True),
 )
 LIBRARIES = (
-    Method("OpenCV FM_8POINT", _opencv_eight_point),
+    Method("OpenCV FM_8POINT", lambda xy1, xy2, _, __: opencv_eight_point(xy1, xy2)),
     Method("OpenCV FM_LMEDS", _library("FM_LMEDS"), robust=True),
     *(
         Method(label, _library(name), robust=True, thresholded=True)

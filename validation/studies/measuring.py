@@ -16,7 +16,7 @@ import numpy as np
 from thesisrecon.io.files import write_text
 from validation.harness.process import Process, own_cores, run_process
 
-ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, float, float]:

@@ -150,10 +150,10 @@ def record_tracks(name: str, preset_name: str) -> dict[str, Any]:
         )
         r = metric.reconstruction
         digests["metric"] = arrays_of([r.P, r.X, r.K, r.inlier, r.registered])
-        for view, intervals in enumerate(metric.intrinsics):
+        for number, intervals in enumerate(metric.intrinsics):
             for key, interval in intervals.items():
-                summary[f"/cameras/{view}/{key}/value"] = interval.value
-                summary[f"/cameras/{view}/{key}/std"] = interval.std
+                summary[f"/cameras/{number}/{key}/value"] = interval.value
+                summary[f"/cameras/{number}/{key}/std"] = interval.std
         summary["/points"] = float(r.valid.sum())
     except StageFailure as failure:
         summary["/failed"] = 1.0
@@ -192,7 +192,7 @@ def compare(before: Path, after: Path) -> Iterator[tuple[str, bool]]:
 
 def summary_differences(a: dict[str, float], b: dict[str, float]) -> list[str]:
     """Return the numbers that differ; those with a standard deviation in units of it."""
-    lines = []
+    lines: list[str] = []
     worst = 0.0
     for key in sorted(set(a) & set(b)):
         if a[key] == b[key] or (np.isnan(a[key]) and np.isnan(b[key])):

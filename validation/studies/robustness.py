@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from thesisrecon.cli.main import run_command
@@ -480,7 +481,7 @@ def _count(scene: str, name: str, wrong: int, total: int) -> Rows:
 
 
 def kill_anywhere_study(
-    out: Path, kills: int = 20, writes: int = 5, max_size: int = 640, until: str = "model", threads: int = 2
+    kills: int = 20, writes: int = 5, max_size: int = 640, until: str = "model", threads: int = 2
 ) -> Iterator[Part]:
     """Kill runs anywhere, resume them and compare all bytes with an undisturbed run.
 
@@ -492,13 +493,13 @@ def kill_anywhere_study(
         Runs killed in the middle of a write.
     """
     options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
-    rows = _printed(kill_runs(Runs(out, options), kills, writes))
+    with TemporaryDirectory() as place:
+        rows = _printed(kill_runs(Runs(Path(place), options), kills, writes))
     yield kill_table(rows)
     yield _count("killed runs", "runs that differ", sum(bool(r.different) for r in rows), len(rows))
 
 
 def stop_anywhere_study(
-    out: Path,
     signal_: Literal["INT", "TERM"] = "INT",
     moments: int = 20,
     images: Path = COURTYARD / "images",
@@ -529,13 +530,14 @@ def stop_anywhere_study(
     asked = signal.Signals[f"SIG{signal_}"]
     options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
     options += ["--executor", executor, *(word for value in set_ for word in ("--set", value))]
-    rows = _printed(stop_runs(Runs(out, options, images), moments, asked, cold=cold))
+    with TemporaryDirectory() as place:
+        rows = _printed(stop_runs(Runs(Path(place), options, images), moments, asked, cold=cold))
     yield stop_table(rows, asked)
     yield _count("interrupted runs", "runs with faults", sum(bool(r.wrong(asked)) for r in rows), len(rows))
 
 
 def full_disk_study(
-    out: Path, every: int = 1, disks: int = 10, views: int = 3, max_size: int = 320, until: str = "model"
+    every: int = 1, disks: int = 10, views: int = 3, max_size: int = 320, until: str = "model"
 ) -> Iterator[Part]:
     """Fill the disk or make it read-only at every file; each run must say so and resume.
 
@@ -548,6 +550,8 @@ def full_disk_study(
     views : int
         Number of images.
     """
-    rows = _printed(refuse_runs(SmallRuns(out, views, max_size, until), every, disks))
+    with TemporaryDirectory() as place:
+        runs = SmallRuns(Path(place), views, max_size, until)
+        rows = _printed(refuse_runs(runs, every, disks))
     yield refusal_table(rows)
     yield _count("runs without room", "runs with faults", sum(bool(r.wrong) for r in rows), len(rows))

@@ -46,6 +46,7 @@ SHARE_OF_COLMAP = 0.5
 KINDS = {"one thread": (1, "local"), "two threads": (2, "local"), "two processes": (2, "processes")}
 LEAST_EFFICIENCY = 0.85
 OVERHEAD_PCT = 5.0
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 Seconds = tuple[float, float]
 """Wall and processor seconds."""
 
@@ -179,7 +180,7 @@ def parallel_study(out: Path, count: int = 30, long_side: int = 480, repeats: in
     found: dict[str, list[Seconds]] = {kind: [] for kind in KINDS}
     for _ in range(repeats):
         for kind, seconds in found.items():
-            seconds.append(tuple(call_apart(time_front_end, out, kind, count)[0]))
+            seconds.append(tuple(call_apart(time_front_end, out, kind, count, environment=ONE_THREAD)[0]))
     yield efficiency_rows(f"{count} images", found)
 
 
