@@ -255,8 +255,8 @@ def test_the_same_map_gives_the_same_bytes():
     "wrong", [{"knot_px": 1}, {"rounds": 0}, {"window": 0}, {"grazing_deg": 0.0}, {"grazing_deg": 90.0}]
 )
 def test_wrong_parameters_are_refused(wrong):
-    with pytest.raises(ValueError, match="needed"):
+    with pytest.raises(ValueError, match="must be"):
         BSplineSurface(**wrong)
     if "grazing_deg" in wrong:
-        with pytest.raises(ValueError, match="needed"):
+        with pytest.raises(ValueError, match="must be"):
             LinearSurface(**wrong)

@@ -1,10 +1,7 @@
-"""Compiled parts of the fit of B-splines: pieces of surface, their coefficients, sums and values.
+"""Connected pieces of a depth map, their spline coefficients, and compiled loops over the pixels.
 
-A piece is what hangs together of the pixels of one cell between knots. Cells are numbered row by row, pieces
-cell by cell. Node (a, b) is the a-th row and b-th column of coefficients; cell (p, q) has the nodes (p + i,
-q + j), i, j = 0 .. 3.
-
-Pixels that hang together: what of a depth map is fitted by which coefficients.
+A piece is a connected component of the pixels of one cell between knots. Cells are numbered row by row,
+pieces cell by cell. Cell (p, q) has the nodes (p + i, q + j), i, j = 0 .. 3.
 """
 
 from __future__ import annotations
@@ -24,8 +21,8 @@ from thesisrecon.surface.linear import max_depth_slope, same_surface
 
 
 @njit(cache=True, nogil=True)
-def root_of(parent: I64, k: int) -> int:
-    """The root of k in a forest, whose paths it halves."""
+def _root_of(parent: I64, k: int) -> int:
+    """Root of k in a union-find forest, with path halving."""
     while parent[k] != k:
         parent[k] = parent[parent[k]]
         k = parent[k]
@@ -33,9 +30,9 @@ def root_of(parent: I64, k: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def join(parent: I64, a: int, b: int) -> None:
-    """Make one tree of those of a and b, under the smaller root."""
-    a, b = root_of(parent, a), root_of(parent, b)
+def _join(parent: I64, a: int, b: int) -> None:
+    """Union of the trees of a and b under the smaller root."""
+    a, b = _root_of(parent, a), _root_of(parent, b)
     if a < b:
         parent[b] = a
     elif b < a:
@@ -44,10 +41,23 @@ def join(parent: I64, a: int, b: int) -> None:
 
 @njit(cache=True, nogil=True)
 def number_coefficients(first: I64, columns: int, start: I64, linked: I64, coefficient: I64) -> int:
-    """A coefficient for every node and every set of pieces that hang together within its sixteen cells.
+    """Assign a coefficient to every node and connected set of pieces within its sixteen cells.
 
-    ``linked[start[k]:start[k + 1]]`` are the pieces that go on from piece k in other cells. ``coefficient``
-    (pieces, 16) gets the numbers at node (i, j) of its cell in place 4 i + j. Returns how many there are.
+    Parameters
+    ----------
+    first : ndarray (cells + 1,)
+        First piece of each cell.
+    columns : int
+        Cells per row.
+    start, linked : ndarray
+        ``linked[start[k]:start[k + 1]]`` are the pieces of other cells connected to piece k.
+    coefficient : ndarray (N, 16)
+        Receives the coefficient of node (i, j) of each piece's cell at 4 i + j.
+
+    Returns
+    -------
+    int
+        Number of coefficients.
     """
     rows = (len(first) - 1) // columns
     parent = np.arange(len(coefficient))
@@ -67,11 +77,11 @@ def number_coefficients(first: I64, columns: int, start: I64, linked: I64, coeff
                     for n in range(start[k], start[k + 1]):
                         other = linked[n]
                         if other > k and _within(first, columns, other, p0, p1, q0, q1):
-                            join(parent, k, other)
+                            _join(parent, k, other)
             for p in range(p0, p1 + 1):
                 for q in range(q0, q1 + 1):
                     for k in range(first[p * columns + q], first[p * columns + q + 1]):
-                        root = root_of(parent, k)
+                        root = _root_of(parent, k)
                         if own[root] < 0:
                             own[root] = count
                             count += 1
@@ -92,10 +102,22 @@ def _within(first: I64, columns: int, k: int, p0: int, p1: int, q0: int, q1: int
 def sum_squares(
     piece: I64, value: F64, weight: F64, basis: F64, cell: int, matrix: F64, right_side: F64
 ) -> None:
-    """Add the normal equations of all pixels to those of their pieces.
+    """Accumulate the normal equations of all pixels.
 
-    ``value``, ``weight`` (H, W); ``basis`` (cell, 4) of the pixels of a cell along either axis; ``matrix``
-    (pieces, 16, 16) gets its upper half, ``right_side`` (pieces, 16).
+    Parameters
+    ----------
+    piece : ndarray (H, W)
+        Piece of each pixel, -1 for none.
+    value, weight : ndarray (H, W)
+        Observations and their weights.
+    basis : ndarray (cell, 4)
+        B-splines at the pixels of a cell.
+    cell : int
+        Pixels between knots.
+    matrix : ndarray (N, 16, 16)
+        Receives the upper triangles.
+    right_side : ndarray (N, 16)
+        Receives the right-hand sides.
     """
     height, width = piece.shape
     b = np.empty(16)
@@ -117,7 +139,23 @@ def sum_squares(
 
 @njit(cache=True, nogil=True)
 def evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int, value: F64) -> None:
-    """``value`` (H, W) of the surface at the pixels, NaN where they are of no piece."""
+    """Evaluate the spline at all pixels.
+
+    Parameters
+    ----------
+    piece : ndarray (H, W)
+        Piece of each pixel, -1 for none.
+    coefficient : ndarray (N, 16)
+        Coefficients of each piece.
+    c : ndarray (C,)
+        Values of the coefficients.
+    basis : ndarray (cell, 4)
+        B-splines at the pixels of a cell.
+    cell : int
+        Pixels between knots.
+    value : ndarray (H, W)
+        Receives the values, NaN for pixels without a piece.
+    """
     height, width = piece.shape
     for y in range(height):
         for x in range(width):
@@ -132,13 +170,22 @@ def evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int,
 
 
 STEP = 5.0
-"""Deviations by which a difference stands out that is a step."""
+"""Standard deviations of a significant depth step."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """What of a depth map a surface stands in front of: ``held`` (H, W), and ``speaks``, whose depths count;
-    ``right`` (H, W - 1), ``down`` (H - 1, W): whether neighbours are of one surface."""
+    """Support of a surface in a depth map.
+
+    Attributes
+    ----------
+    covered : ndarray (H, W) bool
+        Pixels with a surface.
+    reliable : ndarray (H, W) bool
+        Pixels whose depths are used.
+    right, down : ndarray (H, W - 1), (H - 1, W) bool
+        Whether neighbours belong to one surface.
+    """
 
     covered: B8
     reliable: B8
@@ -148,9 +195,21 @@ class Domain:
 
 @dataclass(frozen=True)
 class SplinePieces:
-    """``piece`` (H, W), the number of the piece that each pixel is of, -1 for none; ``coefficient`` (N, 16),
-    the coefficients of each piece; ``cell`` (N,), where it lies among the cells (``shape``); ``count`` of
-    coefficients."""
+    """Pieces of a depth map and their spline coefficients.
+
+    Attributes
+    ----------
+    piece : ndarray (H, W)
+        Piece of each pixel, -1 for none.
+    coefficient : ndarray (N, 16)
+        Coefficients of each piece.
+    cell : ndarray (N,)
+        Cell of each piece.
+    shape : tuple of int
+        Rows and columns of cells.
+    count : int
+        Number of coefficients.
+    """
 
     piece: I64
     coefficient: I64
@@ -160,10 +219,22 @@ class SplinePieces:
 
 
 def domain_of(depth_map: DepthMap, *, grazing_deg: float, least: int, reach: float) -> Domain:
-    """Depths joined to surfaces, cut where they break.
+    """Connect the depths of a map to surfaces.
 
-    Connected pixels fewer than ``least`` are no surface: their depths do not speak. Within ``reach`` px of
-    one they get its depth, beyond there is nothing.
+    Parameters
+    ----------
+    depth_map : DepthMap
+    grazing_deg : float
+        Surfaces break where they are seen at a smaller angle.
+    least : int
+        Connected regions of fewer pixels are unreliable.
+    reach : float
+        Distance in pixels within which unreliable pixels are covered by the nearest surface.
+
+    Returns
+    -------
+    Domain
+        Pixels with a surface and their connections.
     """
     depth, std = depth_map.depth.astype(np.float64), depth_map.std.astype(np.float64)
     slope = max_depth_slope(depth_map.P, grazing_deg)
@@ -179,10 +250,10 @@ def domain_of(depth_map: DepthMap, *, grazing_deg: float, least: int, reach: flo
     away, (y, x) = scipy.ndimage.distance_transform_edt(~reliable, return_indices=True)
     covered = known & (away <= reach)
     for axis in (0, 1):
-        # The depth of a pixel that does not speak is lent by the nearest that does.
-        lent = _alike(depth[y, x], std[y, x], slope * (1.0 + 2.0 * away), axis)
-        joined[axis] = np.where(_both(reliable, axis), joined[axis], lent) & _both(covered, axis)
-    # What was lent a depth must hang together with depths that speak.
+        # Unreliable pixels take the depth of the nearest reliable one.
+        extended = _alike(depth[y, x], std[y, x], slope * (1.0 + 2.0 * away), axis)
+        joined[axis] = np.where(_both(reliable, axis), joined[axis], extended) & _both(covered, axis)
+    # They must be connected to reliable pixels.
     covered &= _sizes(joined, reliable) >= least
     joined = [one & _both(covered, axis) for axis, one in enumerate(joined)]
     return Domain(covered, reliable & covered, joined[1], joined[0])
@@ -199,16 +270,16 @@ def _both(mask: B8, axis: int) -> B8:
 
 
 def _alike(depth: F64, std: F64, slope: F64, axis: int) -> B8:
-    """Whether depths are near enough to the next along an axis for one surface."""
+    """Whether neighbouring depths along an axis are close enough for one surface."""
     with np.errstate(invalid="ignore"):
         return same_surface(*_pairs(depth, axis), *_pairs(std, axis), np.maximum(*_pairs(slope, axis)))
 
 
 def _steps(rho: F64, deviation: F64, axis: int) -> B8:
-    """Whether inverse depth jumps from a pixel to the next: by another difference than before and after.
+    """Whether the inverse depth has a step to the next pixel: a difference unlike those before and after.
 
-    On a plane differences are equal. Those that stand out on both sides by ``STEP`` deviations, of noise as
-    it is told or, if that is more, as most differences show it, are steps.
+    Differences are equal on a plane. A step differs on both sides by ``STEP`` standard deviations, or by
+    ``STEP`` typical differences if these are larger.
     """
     rho, deviation = np.moveaxis(rho, axis, 0), np.moveaxis(deviation, axis, 0)
     step = np.diff(rho, axis=0)
@@ -216,23 +287,35 @@ def _steps(rho: F64, deviation: F64, axis: int) -> B8:
     with np.errstate(invalid="ignore", divide="ignore"):
         off = np.fmin(np.abs(step - padded[:-2]), np.abs(step - padded[2:]))
         off /= np.sqrt(3.0) * np.hypot(deviation[:-1], deviation[1:])
-        told = off[np.isfinite(off)]
-        usual = max(1.0, MAD_FACTOR * float(np.median(told))) if len(told) else 1.0
+        finite = off[np.isfinite(off)]
+        usual = max(1.0, MAD_FACTOR * float(np.median(finite))) if len(finite) else 1.0
         return np.asarray(np.moveaxis(off > STEP * usual, 0, axis))
 
 
 def _sizes(joined: Sequence[B8], counted: B8) -> I64:
-    """(H, W) number of pixels, of those that are ``counted``, that each hangs together with."""
+    """(H, W) number of ``counted`` pixels in the connected region of each pixel."""
     number = np.arange(counted.size).reshape(counted.shape)
     label = _components(number, joined, counted.size)
     return np.asarray(np.bincount(label, counted.ravel())[label].reshape(counted.shape), dtype=np.int64)
 
 
 def pieces_of(domain: Domain, cell: int) -> SplinePieces:
-    """The pieces of a domain in cells of ``cell`` px, and the coefficients of each.
+    """Divide a domain into pieces and number their coefficients.
 
-    A node of the spline has a coefficient for every part of the surface that hangs together within the
-    sixteen cells that it reaches: both sides of a cut have their own, and it is smooth round the end.
+    A node has one coefficient for every connected part of the surface within its sixteen cells, so that both
+    sides of a cut are separate and the surface is smooth around the end of a cut.
+
+    Parameters
+    ----------
+    domain : Domain
+        Pixels with a surface and their connections.
+    cell : int
+        Pixels between knots.
+
+    Returns
+    -------
+    SplinePieces
+        Pieces and coefficients.
     """
     height, width = domain.covered.shape
     shape = (-(-height // cell), -(-width // cell))
@@ -272,7 +355,7 @@ def _components(number: I64, joined: Sequence[B8], count: int) -> I64:
 
 
 def _links(piece: I64, domain: Domain, count: int) -> tuple[I64, I64]:
-    """Which pieces go on in which others: starts (count + 1,) and numbers."""
+    """Connections of pieces: starts (count + 1,) and numbers."""
     pairs = [
         np.stack([piece[:, :-1][domain.right], piece[:, 1:][domain.right]]),
         np.stack([piece[:-1][domain.down], piece[1:][domain.down]]),

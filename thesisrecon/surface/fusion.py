@@ -1,12 +1,8 @@
-"""Depth maps fused in a sparse grid of signed distances, and the surface in it.
+"""Fusion of depth maps to one surface (thesis, section 2.6): volumetric, or as a union of sheets.
 
-Each voxel holds the weighted mean of the distances that the views measure (Curless and Levoy 1996), across
-the surface and not along the rays, so that ground seen at a slant is as thick as a wall; views that look past
-it count as well, and the surface is where the mean is 0. Only blocks of voxels that a depth
-map comes near to exist. The surface is taken out as a net (Gibson 1998): one vertex a cell, which unlike
-the corners of marching cubes makes no slivers.
-
-Section 2.6 as it stands: the surfaces of the depth maps in triangles, put together.
+:class:`VolumetricFusion` averages signed distances in a sparse voxel grid (Curless and Levoy 1996), measured
+across the surface instead of along the rays, and extracts the zero level as a surface net (Gibson 1998): one
+vertex per cell, which avoids the slivers of marching cubes. :class:`DepthSheets` follows the thesis.
 """
 
 from __future__ import annotations
@@ -35,16 +31,19 @@ from thesisrecon.surface.linear import max_depth_slope, surface_from_depth, tria
 from thesisrecon.surface.mesh import remove_small_parts, remove_unused_vertices, select_faces
 
 MIN_COSINE = 0.1
-"""Surfaces seen more flatly than this count as seen so: what they measure across themselves is little."""
+"""Lower limit of the incidence cosine."""
 
 VOXEL_GROWTH = 1.15
-"""Factor by which voxels grow until their blocks fit into the memory that is allowed."""
+"""Factor by which voxels are enlarged until the blocks fit into memory."""
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """Where the blocks are: ``origin`` (3,) of the first voxel's centre, ``voxel`` side, ``blocks`` (B, 3)
-    grid places in their order, ``place`` (X, Y, Z) the number of the block at each place or -1."""
+    """Sparse voxel grid.
+
+    ``origin`` (3,) of the first voxel centre, ``voxel`` size, ``blocks`` (B, 3) grid positions, ``place``
+    (X, Y, Z) block number at each position or -1.
+    """
 
     origin: F64
     voxel: float
@@ -54,12 +53,20 @@ class _Grid:
 
 @dataclass(frozen=True)
 class VolumetricFusion:
-    """One surface from several depth maps.
+    """Fusion of depth maps in a truncated signed distance field.
 
-    ``voxel_px``: side of a voxel in pixels of the depth maps, at the median over all their pixels.
-    ``truncation_voxels``: distances are cut at this many voxels; depths that are less certain take no part.
-    ``max_blocks``: of 8 x 8 x 8 voxels, 4 kB each; voxels grow until that is enough. ``grazing_deg``:
-    surfaces seen more flatly break. ``least_part``: connected parts below this share of the area are dropped.
+    Parameters
+    ----------
+    voxel_px : float
+        Voxel size in pixels of the depth maps at their median depth.
+    truncation_voxels : float
+        Truncation of the distances in voxels; less certain depths are ignored.
+    max_blocks : int
+        Largest number of blocks of 8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
+    grazing_deg : float
+        Surfaces break where they are seen at a smaller angle.
+    min_part_share : float
+        Connected parts below this share of the area are removed.
     """
 
     voxel_px: float = 1.5
@@ -71,20 +78,34 @@ class VolumetricFusion:
     def __post_init__(self) -> None:
         if not (0.0 < self.voxel_px < np.inf and 0.0 < self.truncation_voxels < np.inf):
             raise ValueError(
-                "voxel_px > 0 and truncation_voxels > 0 are needed; got "
+                "voxel_px and truncation_voxels must be positive; got "
                 f"{self.voxel_px} and {self.truncation_voxels}"
             )
-        # However large voxels are, so many blocks may be about a single depth.
+        # A single depth may need so many blocks, however large the voxels are.
         least = int(np.ceil(2.0 * self.truncation_voxels / SIDE) + 1) ** 3
         if self.max_blocks < least:
-            raise ValueError(f"max_blocks >= {least} is needed; got {self.max_blocks}")
+            raise ValueError(f"max_blocks must be >= {least}; got {self.max_blocks}")
         if not 0.0 < self.grazing_deg < 90.0:
-            raise ValueError(f"0 < grazing_deg < 90 is needed; got {self.grazing_deg}")
+            raise ValueError(f"grazing_deg must be in (0, 90); got {self.grazing_deg}")
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
-        """The surface, without colours; faces anticlockwise seen from where the views look at it.
+        """Fuse depth maps to one surface.
 
-        The result does not depend on ``threads``. Raises :class:`StageFailure` where the maps have no depth.
+        Parameters
+        ----------
+        depth_maps : sequence of DepthMap
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        TexturedMesh
+            Surface without colours; faces are anticlockwise seen from the cameras.
+
+        Raises
+        ------
+        StageFailure
+            If the maps contain no depths.
         """
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             measured = list(pool.map(lambda m: _measured(m, self.grazing_deg), depth_maps))
@@ -106,8 +127,7 @@ class VolumetricFusion:
         return remove_small_parts(mesh, self.min_part_share)
 
     def _lay_out(self, measured: list[_FusionMap]) -> tuple[_Grid, float, list[_FusionMap]]:
-        """The blocks that the surface may pass, where distances are cut, and the depths that are sure enough
-        for that."""
+        """Voxel grid, truncation distance, and the depths that are certain enough for it."""
         footprints = [(m.samples.depth / np.float32(m.focal))[np.isfinite(m.samples.depth)] for m in measured]
         if not sum(map(len, footprints)):
             raise _nothing_to_fuse()
@@ -123,16 +143,14 @@ class VolumetricFusion:
 
 @dataclass(frozen=True)
 class _FusionMap:
-    """A depth map as the grid takes it: ``P`` (3, 4), ``focal`` in pixels, ``depth`` and ``std`` (H, W),
-    ``lean`` (H, W) how far a ray comes off the surface for a unit of depth, ``slope`` the largest step in
-    depth from one pixel to the next on one surface, in units of the depth."""
+    """A depth map prepared for fusion: camera ``P`` (3, 4), ``focal`` length in pixels, and ``samples``."""
 
     P: F64
     focal: float
     samples: MapSamples
 
     def sure(self, truncation: float) -> _FusionMap:
-        """Without depths whose deviation across the surface a grid of this resolution cannot hold."""
+        """Without depths whose standard deviation across the surface exceeds the truncation."""
         with np.errstate(invalid="ignore"):
             certain = self.samples.std * self.samples.cosine <= truncation
         depth = np.where(certain, self.samples.depth, np.float32(np.nan))
@@ -140,7 +158,7 @@ class _FusionMap:
 
     @property
     def rays(self) -> tuple[F64, F64]:
-        """What takes (x, y, 1) to the point at depth 1 less the centre (3, 3), and the centre (3,)."""
+        """Matrix (3, 3) from (x, y, 1) to the point at depth 1 minus the centre, and the centre (3,)."""
         K, R, t = decompose_camera(self.P)
         return np.ascontiguousarray(R.T @ np.linalg.inv(K)), -R.T @ t
 
@@ -163,19 +181,31 @@ def _integrate(grid: _Grid, truncation: float, one: _FusionMap, some: slice, val
 
 
 def _nothing_to_fuse() -> StageFailure:
-    """The refusal of depth maps without depths."""
+    """Failure of depth maps without depths."""
     return StageFailure(
-        "no surface could be made",
-        "the depth maps have no depths that agree",
-        "take photographs of a scene with texture, from places nearer to each other",
+        "no surface could be built",
+        "the depth maps contain no depths that agree",
+        "take images of a textured scene from positions closer to each other",
     )
 
 
 def incidence_cosines(depth: F32, K: F64) -> F32:
-    """(H, W) how far a ray comes off its surface for a unit of depth: 1 seen straight on, towards 0 along it.
+    """Compute n . r for the unit surface normal n and the ray r with unit depth.
 
-    Inverse depth is linear in the pixel on a plane, and its gradient with the ray gives the plane. Of the
-    steps to the two neighbours the gentler counts, meaned over 3 x 3 pixels; at least ``FLATTEST``.
+    It is the distance across the surface per unit of depth: 1 for frontal surfaces, towards 0 at grazing
+    incidence. The inverse depth of a plane is linear in the pixel, and its gradient determines the normal.
+    The smaller of the differences to both neighbours is averaged over 3 x 3 pixels.
+
+    Parameters
+    ----------
+    depth : ndarray (H, W) float32
+    K : ndarray (3, 3)
+        Camera matrix.
+
+    Returns
+    -------
+    ndarray (H, W) float32
+        Cosines, at least ``MIN_COSINE``.
     """
     with np.errstate(divide="ignore"):
         inverse = np.float32(1.0) / depth
@@ -185,7 +215,7 @@ def incidence_cosines(depth: F32, K: F64) -> F32:
         scipy.ndimage.uniform_filter(np.nan_to_num(_gentler(inverse, axis)), 3) / share for axis in (1, 0)
     )
     y, x = np.indices(inverse.shape, dtype=np.float32)
-    # Pixels (x, y, 1) of inverse depth (a, b, c) . (x, y, 1) are of the plane with the normal K' (a, b, c).
+    # The plane with inverse depth (a, b, c) . (x, y, 1) has the normal K' (a, b, c).
     c = inverse - a * x - b * y
     normal = np.einsum("ji,j...->i...", K.astype(np.float32), np.stack([a, b, c]))
     cosine = inverse / np.sqrt((normal**2).sum(axis=0))
@@ -193,7 +223,7 @@ def incidence_cosines(depth: F32, K: F64) -> F32:
 
 
 def _gentler(values: F32, axis: int) -> F32:
-    """(H, W) the smaller of the steps from the neighbour before and to the one after, NaN without either."""
+    """(H, W) the smaller of the differences to the previous and the next neighbour, NaN without either."""
     step = np.diff(values, axis=axis)
     before = np.insert(step, 0, np.nan, axis=axis)
     after = np.insert(step, step.shape[axis], np.nan, axis=axis)
@@ -202,9 +232,9 @@ def _gentler(values: F32, axis: int) -> F32:
 
 
 def _facing(depth_map: DepthMap, slope: float) -> DepthMap:
-    """The map without pixels whose surface is seen too flatly: their depths blend into what lies behind.
+    """Remove pixels at grazing incidence, whose depths blend into the background.
 
-    The gentler of the steps to the two neighbours counts, so that the border of something in front stays.
+    The smaller of the differences to both neighbours counts, which preserves occluding borders.
     """
     depth = depth_map.depth
     steepest = np.zeros_like(depth)
@@ -216,7 +246,7 @@ def _facing(depth_map: DepthMap, slope: float) -> DepthMap:
 
 
 def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid | None:
-    """The blocks within ``reach`` of any depth; None where the box about them is too large to be listed."""
+    """Blocks within ``reach`` of any depth; None if their bounding box is too large."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for one in measured:
         directions, centre = one.rays
@@ -243,7 +273,7 @@ def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid |
 
 
 def _extract_surface(grid: _Grid, value: F32, weight: F32) -> TexturedMesh:
-    """The zero of ``value`` (B, 8, 8, 8) where ``weight`` is positive, as a net of triangles."""
+    """Zero level of ``value`` (B, 8, 8, 8) where ``weight`` is positive, as a surface net."""
     vertex = np.empty(value.shape, dtype=np.int64)
     count = place_vertices(grid.blocks, grid.place, value, weight, vertex, np.zeros((0, 3)))
     points = np.zeros((count, 3))
@@ -258,12 +288,21 @@ def _extract_surface(grid: _Grid, value: F32, weight: F32) -> TexturedMesh:
 
 @dataclass(frozen=True)
 class DepthSheets:
-    """Every depth map is a sheet of triangles; what an earlier sheet shows too is left out of a later one.
+    """Union of the triangulated depth maps; regions that an earlier map shows are omitted.
 
-    The map with most depths comes first. Nothing is averaged: sheets overlap at their rims, a little apart.
-    ``step``: every so many rows and columns. ``same``: relative difference of depths up to which a place is
-    the same, beside three deviations. ``grazing_deg``: what is seen more flatly breaks. ``least_part``:
-    connected parts of a map below this share of its area are dropped.
+    The map with the most depths comes first. Nothing is averaged, so sheets overlap slightly at their
+    borders.
+
+    Parameters
+    ----------
+    step : int
+        Row and column step of the triangulation.
+    same : float
+        Relative depth difference, or three standard deviations, up to which a point is already shown.
+    grazing_deg : float
+        Surfaces break where they are seen at a smaller angle.
+    min_part_share : float
+        Connected parts of a map below this share of its area are removed.
     """
 
     step: int = 2
@@ -274,12 +313,29 @@ class DepthSheets:
     def __post_init__(self) -> None:
         if self.step < 1 or not self.same >= 0.0 or not 0.0 < self.grazing_deg < 90.0:
             raise ValueError(
-                "step >= 1, same >= 0 and 0 < grazing_deg < 90 are needed; got "
+                "step must be >= 1, same >= 0 and grazing_deg in (0, 90); got "
                 f"{self.step}, {self.same} and {self.grazing_deg}"
             )
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:  # noqa: ARG002
-        """The sheets as one mesh, without colours; :class:`StageFailure` where the maps have no depth."""
+        """Combine the depth maps to one mesh.
+
+        Parameters
+        ----------
+        depth_maps : sequence of DepthMap
+        threads : int
+            Ignored.
+
+        Returns
+        -------
+        TexturedMesh
+            Mesh without colours.
+
+        Raises
+        ------
+        StageFailure
+            If the maps contain no depths.
+        """
         order = sorted(depth_maps, key=lambda m: (-int(np.isfinite(m.depth).sum()), m.view))
         sheets: list[TexturedMesh] = []
         shows: list[Callable[[F64], B8]] = []
@@ -301,7 +357,7 @@ class DepthSheets:
         return TexturedMesh(vertices, np.concatenate(faces))
 
     def _shown_by(self, depth_map: DepthMap) -> Callable[[F64], B8]:
-        """Which of points (N, 3) lie on the sheet of a map: in a whole square of it, at its depth."""
+        """Function that tests whether points (N, 3) lie on the sheet of a map."""
         depth = depth_map.depth[:: self.step, :: self.step].astype(np.float64)
         std = depth_map.std[:: self.step, :: self.step].astype(np.float64)
         slope = self.step * max_depth_slope(depth_map.P, self.grazing_deg)

@@ -1,4 +1,4 @@
-"""Compiled loops of the fusion; each has a plain twin in the tests."""
+"""Compiled loops of volumetric fusion; the tests contain NumPy versions."""
 
 from __future__ import annotations
 
@@ -10,16 +10,24 @@ from numba import njit
 from thesisrecon.arrays import F32, F64, I64, U8
 
 SIDE = 8
-"""Voxels a side of a block."""
+"""Voxels per side of a block."""
 
 WEIGHT_BEYOND = 0.1
-"""Weight of a depth half a pixel and more beyond the last that is known."""
+"""Weight of a depth extrapolated by half a pixel or more."""
 
 
 class MapSamples(NamedTuple):
-    """What one depth map tells: ``depth`` and its deviation ``std`` (H, W), ``lean`` (H, W) how far a ray
-    comes off the surface for a unit of depth, and ``slope``, the largest relative step in depth from one
-    pixel to the next on one surface."""
+    """A depth map prepared for fusion.
+
+    Attributes
+    ----------
+    depth, std : ndarray (H, W) float32
+        Depth and its standard deviation, NaN = unknown.
+    cosine : ndarray (H, W) float32
+        Distance across the surface per unit of depth.
+    slope : float
+        Largest relative depth step between neighbours on one surface.
+    """
 
     depth: F32
     std: F32
@@ -28,7 +36,13 @@ class MapSamples(NamedTuple):
 
 
 class SignedDistances(NamedTuple):
-    """Of the voxels of blocks (B, 8, 8, 8): the weighted mean distance to the surface, and its weight."""
+    """Truncated signed distances of blocks.
+
+    Attributes
+    ----------
+    value, weight : ndarray (B, 8, 8, 8) float32
+        Weighted mean distance and total weight.
+    """
 
     value: F32
     weight: F32
@@ -38,12 +52,21 @@ class SignedDistances(NamedTuple):
 def touched_blocks(
     samples: MapSamples, rays: F64, centre: F64, reach: float, edge: float, marked: U8
 ) -> None:
-    """Mark the blocks (X, Y, Z) that the surface may pass: those on a ray before and behind its point as
-    long as the ray is within ``reach`` of the surface.
+    """Mark the blocks that the surface may pass.
 
-    ``lean`` (H, W) is how far a ray comes off the surface for a unit of depth. ``rays`` (3, 3) takes
-    (x, y, 1) to the point at depth 1 less ``centre`` (3,), which counts from the grid's origin; ``edge`` is
-    the side of a block. Points outside of the grid mark nothing.
+    Parameters
+    ----------
+    samples : MapSamples
+    rays : ndarray (3, 3)
+        From (x, y, 1) to the point at depth 1 relative to the centre.
+    centre : ndarray (3,)
+        Camera centre relative to the grid origin.
+    reach : float
+        Distance from the surface within which blocks are needed.
+    edge : float
+        Block size.
+    marked : ndarray (X, Y, Z) uint8
+        Receives 1; points outside are ignored.
     """
     depth, cosine = samples.depth, samples.cosine
     for y in range(depth.shape[0]):
@@ -71,11 +94,23 @@ def integrate_view(
 ) -> None:
     """Add one depth map to the signed distances of blocks (Curless and Levoy 1996).
 
-    ``blocks`` (B, 3) grid places; ``P`` (3, 4) = K [R t] of the map, the centre of the first voxel the
-    origin. ``sums`` are updated, in units of ``truncation`` and cut at 1. What lies more than ``truncation``
-    behind a surface is not seen. A view weighs by lean^4 / (s^2 + (truncation / 8)^2), s the deviation
-    across the surface: the surface is taken to be plane as far as the ray is near it, and the error of that
-    grows with 1 / lean^2.
+    Distances are in units of the truncation and limited to 1; voxels farther behind the surface are not
+    visible. The weight is cos^4 / (s^2 + (truncation / 8)^2) with the standard deviation s across the
+    surface: the surface is assumed to be plane near the ray, with an error that grows with 1 / cos^2.
+
+    Parameters
+    ----------
+    blocks : ndarray (B, 3)
+        Grid positions.
+    voxel : float
+        Voxel size.
+    P : ndarray (3, 4)
+        Camera K [R t] with the centre of the first voxel as origin.
+    surface : MapSamples
+    truncation : float
+        Truncation distance.
+    sums : SignedDistances
+        Distances and weights, updated.
     """
     depth, std, cosine, slope = surface
     value, weight = sums
@@ -113,11 +148,11 @@ def integrate_view(
 
 @njit(cache=True, nogil=True)
 def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[float, tuple[int, int], float]:
-    """Depth at (u, v), the row and column that it is of, and how far that can be trusted.
+    """Depth at (u, v), the row and column it is taken from, and its weight.
 
-    Bilinear in 1 / z where the four pixels are one surface, else that of the nearest pixel. Where that has
-    none, the next of the four is taken to go on: a net ends half a voxel before what is known does. NaN where
-    all four have none.
+    Bilinear in 1 / z if the four pixels lie on one surface, else that of the nearest pixel or, if unknown, of
+    the next of the four, because a surface net ends half a voxel before the last depth. NaN if all are
+    unknown.
     """
     x, y = min(int(u), depth.shape[1] - 2), min(int(v), depth.shape[0] - 2)
     x, y = max(x, 0), max(y, 0)
@@ -126,7 +161,7 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
     s, t = u - x, v - y
     row, column = (y1 if t > 0.5 else y), (x1 if s > 0.5 else x)
-    # Comparisons with NaN are false, so that any unknown pixel ends here too.
+    # Comparisons with NaN are false.
     whole = a == a and b == b and c == c and d == d
     if whole and high - low <= max(3.0 * std[row, column], slope * low):
         upper = (1.0 - s) / a + s / b
@@ -146,7 +181,7 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
 
 @njit(cache=True, nogil=True)
 def _find(place: I64, i: int, j: int, k: int) -> int:
-    """Number of the block at grid voxel (i, j, k), -1 where there is none."""
+    """Number of the block at grid voxel (i, j, k), -1 if there is none."""
     if i < 0 or j < 0 or k < 0:
         return -1
     bi, bj, bk = i // SIDE, j // SIDE, k // SIDE
@@ -157,11 +192,25 @@ def _find(place: I64, i: int, j: int, k: int) -> int:
 
 @njit(cache=True, nogil=True)
 def place_vertices(blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64) -> int:
-    """One vertex in each cell of eight voxels that the surface passes (surface nets, Gibson 1998).
+    """Place one vertex in each cell of eight voxels that the surface passes (surface nets, Gibson 1998).
 
-    It is the mean of where the cell's edges are crossed, in voxels. ``place`` (X, Y, Z) block numbers or -1;
-    ``vertex`` (B, 8, 8, 8) gets the number of the cell at each voxel or -1, ``points`` (N, 3) as many of
-    the vertices as it holds. Returns how many there are.
+    Parameters
+    ----------
+    blocks : ndarray (B, 3)
+        Grid positions.
+    place : ndarray (X, Y, Z)
+        Block numbers or -1.
+    value, weight : ndarray (B, 8, 8, 8) float32
+        Signed distances.
+    vertex : ndarray (B, 8, 8, 8)
+        Receives the vertex number of each cell or -1.
+    points : ndarray (N, 3)
+        Receives the first N vertices in voxels, each the mean of the zero crossings of the cell edges.
+
+    Returns
+    -------
+    int
+        Number of vertices.
     """
     count = 0
     corner = np.empty(8)
@@ -216,10 +265,27 @@ def _mean_crossing(corner: F64, point: F64) -> None:
 def join_vertices(
     blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64, faces: I64
 ) -> int:
-    """Two triangles across each edge between voxels that the surface crosses, anticlockwise from outside.
+    """Create two triangles across each voxel edge that the surface crosses, anticlockwise from outside.
 
-    ``faces`` (M, 3) gets as many as it holds; returns how many there are. Of the two diagonals the shorter is
-    taken.
+    Parameters
+    ----------
+    blocks : ndarray (B, 3)
+        Grid positions.
+    place : ndarray (X, Y, Z)
+        Block numbers or -1.
+    value, weight : ndarray (B, 8, 8, 8) float32
+        Signed distances.
+    vertex : ndarray (B, 8, 8, 8)
+        Vertex numbers of :func:`place_vertices`.
+    points : ndarray (N, 3)
+        Vertices.
+    faces : ndarray (M, 3)
+        Receives the first M faces; the shorter diagonal is used.
+
+    Returns
+    -------
+    int
+        Number of faces.
     """
     count = 0
     step = np.zeros(3, np.int64)
@@ -267,8 +333,7 @@ def _squared(points: F64, a: int, b: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _ring(place: I64, vertex: I64, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
-    """The vertices of the four cells about the edge from voxel ``at`` along ``axis``, anticlockwise seen
-    from its end; False where one of them has none."""
+    """Vertices of the four cells around an edge from voxel ``at``; False if one is missing."""
     second, third = (axis + 1) % 3, (axis + 2) % 3
     for t in range(4):
         back_second = 1 if t == 0 or t == 3 else 0

@@ -1,9 +1,4 @@
-"""Section 2.6: a depth map as a triangulated surface, linear between its points.
-
-What surfaces of depth maps have in common: inverse depth with its gradient, normals, maps and meshes.
-
-Section 2.6: the surface that is linear between the pixels of a depth map.
-"""
+"""Surfaces of single depth maps: triangulation and fitted surfaces (thesis, section 2.6)."""
 
 from __future__ import annotations
 
@@ -19,25 +14,33 @@ from thesisrecon.surface.mesh import remove_unused_vertices
 
 
 def surface_from_depth(depth_map: DepthMap, *, step: int = 1, grazing_deg: float = 10.0) -> TexturedMesh:
-    """Every pixel a vertex, neighbours joined by triangles unless the surface breaks between them.
+    """Triangulate a depth map.
 
-    Two pixels are taken for one surface where the line between their points leaves the rays by more than
-    ``grazing_deg``: seen so flatly a true surface is hardly ever matched, while at the edge of something in
-    front the line runs along the rays. Differences within three deviations of the depths do not break a
-    surface. Of the two diagonals of a square the one with the smaller step in depth is taken.
+    Two pixels belong to one surface if the line between their points deviates from the rays by more than
+    ``grazing_deg``, or if their depths differ by less than three standard deviations: true surfaces at
+    smaller angles are hardly ever matched, whereas the line across an occluding edge runs along the rays. Of
+    the two diagonals of a square the one with the smaller depth step is used.
 
     Parameters
     ----------
-    depth_map : with NaN where unknown.
-    step : every ``step``-th row and column, at least 1.
-    grazing_deg : in (0, 90).
+    depth_map : DepthMap
+    step : int
+        Row and column step, at least 1.
+    grazing_deg : float
+        Smallest viewing angle of a surface, in (0, 90).
 
     Returns
     -------
-    TexturedMesh : without colours, faces anticlockwise as the camera sees them, only vertices in use.
+    TexturedMesh
+        Mesh without colours; faces are anticlockwise seen from the camera, all vertices are used.
+
+    Raises
+    ------
+    ValueError
+        If ``step`` or ``grazing_deg`` is out of range.
     """
     if step < 1 or not 0.0 < grazing_deg < 90.0:
-        raise ValueError(f"step >= 1 and 0 < grazing_deg < 90 are needed; got {step} and {grazing_deg}")
+        raise ValueError(f"step must be >= 1 and grazing_deg in (0, 90); got {step} and {grazing_deg}")
     depth = depth_map.depth[::step, ::step].astype(np.float64)
     std = depth_map.std[::step, ::step].astype(np.float64)
     triangles = triangulate_grid(depth, std, step * max_depth_slope(depth_map.P, grazing_deg))
@@ -53,26 +56,59 @@ def surface_from_depth(depth_map: DepthMap, *, step: int = 1, grazing_deg: float
 
 
 RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))
-"""Corners (0 1 above, 2 3 below) of the triangles of a square by its diagonal, the one at the left first."""
+"""Corners (0 1 above, 2 3 below) of the triangles of a square by its diagonal, the left one first."""
 
 
 @dataclass(frozen=True)
 class GridTriangles:
-    """How the squares between pixels (H - 1, W - 1) are made of triangles: ``rising``, whether the diagonal
-    runs from the lower left to the upper right, and ``whole`` (H - 1, W - 1, 2), which triangles are."""
+    """Triangles of a grid of depths.
+
+    Attributes
+    ----------
+    rising : ndarray (H - 1, W - 1) bool
+        Whether the diagonal of a square runs from the lower left to the upper right.
+    whole : ndarray (H - 1, W - 1, 2) bool
+        Which of its triangles exist.
+    """
 
     rising: B8
     whole: B8
 
 
 def max_depth_slope(P: F64, grazing_deg: float) -> float:
-    """Largest step in depth from a pixel to the next, in units of depth, on a surface seen no more flatly."""
+    """Return the largest relative depth step between adjacent pixels on a surface.
+
+    Parameters
+    ----------
+    P : ndarray (3, 4)
+        Camera.
+    grazing_deg : float
+        Smallest viewing angle of a surface.
+
+    Returns
+    -------
+    float
+        Depth step per pixel, relative to the depth.
+    """
     K = decompose_camera(P)[0]
     return float(1.0 / (np.sqrt(K[0, 0] * K[1, 1]) * np.tan(np.radians(grazing_deg))))
 
 
 def triangulate_grid(depth: F64, std: F64, slope: float) -> GridTriangles:
-    """Triangles of a grid of depths (H, W) with deviations; ``slope``: the largest step in units of depth."""
+    """Divide the squares of a grid of depths into triangles.
+
+    Parameters
+    ----------
+    depth, std : ndarray (H, W)
+        Depths and standard deviations, NaN = unknown.
+    slope : float
+        Largest relative depth step on a surface.
+
+    Returns
+    -------
+    GridTriangles
+        Diagonals and existing triangles.
+    """
     corner = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
     z, spread = (np.stack([values[c] for c in corner], axis=-1) for values in (depth, std))
     falling_step = np.abs(z[..., 0] - z[..., 3])
@@ -86,7 +122,7 @@ def triangulate_grid(depth: F64, std: F64, slope: float) -> GridTriangles:
 
 
 def _whole(z: F64, spread: F64, slope: float) -> B8:
-    """Triangles (..., 3) with no side along which the surface breaks, and no corner without depth."""
+    """Triangles (..., 3) with known corners and no surface break along a side."""
     with np.errstate(invalid="ignore"):
         joined = same_surface(
             z, np.roll(z, 1, axis=-1), spread, np.roll(spread, 1, axis=-1), np.sqrt(2.0) * slope
@@ -95,15 +131,40 @@ def _whole(z: F64, spread: F64, slope: float) -> B8:
 
 
 def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> B8:
-    """Whether two depths may be of one surface: at most ``slope`` of the smaller, or three deviations,
-    apart."""
+    """Test whether two depths may belong to one surface.
+
+    Parameters
+    ----------
+    z1, z2, std1, std2 : ndarray
+        Depths and standard deviations.
+    slope : float or ndarray
+        Largest relative depth step.
+
+    Returns
+    -------
+    ndarray bool
+        True if they differ by at most ``slope`` of the smaller, or three standard deviations.
+    """
     limit = np.maximum(slope * np.minimum(z1, z2), 3.0 * np.hypot(std1, std2))
     return np.asarray(np.abs(z1 - z2) <= limit)
 
 
 def back_project(P: F64, depth: F64, step: int = 1) -> F64:
-    """Points (H W, 3) of pixels (step column, step row) at depths (H, W) of the camera P (3, 4) = K [R t];
-    NaN stays NaN."""
+    """Back-project a depth map to points.
+
+    Parameters
+    ----------
+    P : ndarray (3, 4)
+        Camera K [R t].
+    depth : ndarray (H, W)
+    step : int
+        Pixels between rows and columns of ``depth``.
+
+    Returns
+    -------
+    ndarray (H W, 3)
+        Points, NaN where unknown.
+    """
     K, R, t = decompose_camera(P)
     y, x = np.indices(depth.shape) * step
     rays = np.stack([x.ravel(), y.ravel(), np.ones(depth.size)], axis=1) @ np.linalg.inv(K).T
@@ -112,40 +173,58 @@ def back_project(P: F64, depth: F64, step: int = 1) -> F64:
 
 @dataclass(frozen=True)
 class SurfaceSample:
-    """A surface at places of its view: ``inverse_depth`` (N,) and its ``gradient`` (N, 2) per px along x and
-    y; NaN where there is no surface."""
+    """Values of a surface at pixels of its view.
+
+    Attributes
+    ----------
+    inverse_depth : ndarray (N,)
+        Inverse depth, NaN where there is no surface.
+    gradient : ndarray (N, 2)
+        Its derivatives along x and y per pixel.
+    """
 
     inverse_depth: F64
     gradient: F64
 
 
 class FittedSurface(Protocol):
-    """A surface in front of the pixels of the depth map ``given`` that it was made from."""
+    """Surface in front of the pixels of a depth map."""
 
     @property
-    def given(self) -> DepthMap: ...
+    def depth_map(self) -> DepthMap:
+        """The depth map it was fitted to."""
 
     @property
     def interpolates(self) -> bool:
-        """Whether the depths of ``given`` are on the surface as they are."""
+        """Whether the surface contains the depths of the map exactly."""
 
     def evaluate(self, xy: F64) -> SurfaceSample:
-        """The surface at places ``xy`` (N, 2) px, between pixels too."""
+        """Evaluate the surface at pixels ``xy`` (N, 2)."""
 
 
 class DepthSurface(Protocol):
-    """A way of making a surface of a depth map."""
+    """Method that fits a surface to a depth map."""
 
     def fit(self, depth_map: DepthMap) -> FittedSurface:
-        """The surface; NaN wherever it would have to be made up."""
+        """Fit the surface; NaN where there are no depths."""
 
 
 def surface_normals(surface: FittedSurface, xy: F64) -> F64:
-    """Unit normals (N, 3) in the world at ``xy`` (N, 2) px, towards the camera; NaN where no surface is.
+    """Compute the normals of a surface.
 
-    Near a pixel the surface is the plane a . (x, y, 1) = 1 / z, whose normal in the camera is -K' a.
+    Near a pixel the surface is the plane a . (x, y, 1) = 1 / z, with the normal -K' a in the camera frame.
+
+    Parameters
+    ----------
+    surface : FittedSurface
+    xy : ndarray (N, 2)
+
+    Returns
+    -------
+    ndarray (N, 3)
+        Unit normals in the world frame towards the camera, NaN where there is no surface.
     """
-    K, R, _ = decompose_camera(surface.given.P)
+    K, R, _ = decompose_camera(surface.depth_map.P)
     sample = surface.evaluate(xy)
     offset = sample.inverse_depth - np.sum(sample.gradient * xy, axis=1)
     normal = -np.column_stack([sample.gradient, offset]) @ K @ R
@@ -153,17 +232,31 @@ def surface_normals(surface: FittedSurface, xy: F64) -> F64:
 
 
 def resample_surface(surface: FittedSurface, scale: float = 1.0) -> DepthMap:
-    """The surface as a depth map of ``scale`` times as many rows and columns, 1 for those it was made from.
+    """Sample a surface as a depth map.
 
-    Deviations and counts of views are those of the nearest pixel that was given: what neighbouring pixels
-    share of their errors no fit can tell. Raises ``ValueError`` where ``scale`` is not positive.
+    Parameters
+    ----------
+    surface : FittedSurface
+    scale : float
+        Size relative to the original depth map.
+
+    Returns
+    -------
+    DepthMap
+        Depths of the surface; standard deviations and view counts are those of the nearest original pixel,
+        because a fit cannot reveal errors that neighbours share.
+
+    Raises
+    ------
+    ValueError
+        If ``scale`` is not positive.
     """
     if not scale > 0.0:
         raise ValueError(f"scale must be positive; got {scale}")
-    given = surface.given
+    depth_map = surface.depth_map
     if scale == 1.0 and surface.interpolates:
-        return given
-    shape = tuple(max(round(n * scale), 1) for n in given.depth.shape)
+        return depth_map
+    shape = tuple(max(round(n * scale), 1) for n in depth_map.depth.shape)
     places = [(np.arange(n) + 0.5) / scale - 0.5 for n in shape]
     xy = np.stack(np.meshgrid(places[1], places[0]), axis=-1).reshape(-1, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -172,44 +265,69 @@ def resample_surface(surface: FittedSurface, scale: float = 1.0) -> DepthMap:
     nearest = np.ix_(
         *(
             np.clip(np.rint(at), 0, n - 1).astype(np.int64)
-            for at, n in zip(places, given.depth.shape, strict=True)
+            for at, n in zip(places, depth_map.depth.shape, strict=True)
         )
     )
     known = np.isfinite(depth)
     zoom = np.array([[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]])
     return replace(
-        given,
-        P=zoom @ given.P,
+        depth_map,
+        P=zoom @ depth_map.P,
         depth=depth,
-        std=np.where(known, given.std[nearest], np.float32(np.nan)),
-        views=np.where(known, given.views[nearest], np.uint8(0)),
+        std=np.where(known, depth_map.std[nearest], np.float32(np.nan)),
+        views=np.where(known, depth_map.views[nearest], np.uint8(0)),
     )
 
 
 def triangulate_surface(
     surface: FittedSurface, scale: float = 1.0, *, grazing_deg: float = 10.0
 ) -> TexturedMesh:
-    """The surface in triangles, ``scale`` of them along the side of a pixel; it breaks where
-    :func:`~thesisrecon.surface.linear.surface_from_depth` says."""
+    """Triangulate a surface, see :func:`surface_from_depth`.
+
+    Parameters
+    ----------
+    surface : FittedSurface
+    scale : float
+        Vertices per pixel along rows and columns.
+    grazing_deg : float
+        Smallest viewing angle of a surface.
+
+    Returns
+    -------
+    TexturedMesh
+        Mesh without colours.
+    """
     return surface_from_depth(resample_surface(surface, scale), grazing_deg=grazing_deg)
 
 
 @dataclass(frozen=True)
 class LinearSurface:
-    """Every depth as it is, and triangles between: :func:`~thesisrecon.surface.linear.surface_from_depth`, in between.
+    """Piecewise linear surface through all depths, see :func:`surface_from_depth`.
 
-    ``grazing_deg``: what is seen more flatly breaks.
+    Parameters
+    ----------
+    grazing_deg : float
+        Surfaces break where they are seen at a smaller angle.
     """
 
     grazing_deg: float = 10.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.grazing_deg < 90.0:
-            raise ValueError(f"0 < grazing_deg < 90 is needed; got {self.grazing_deg}")
+            raise ValueError(f"grazing_deg must be in (0, 90); got {self.grazing_deg}")
 
     def fit(self, depth_map: DepthMap) -> LinearFit:
-        """The surface through all pixels of the map."""
-        # A row and a column of nothing give every pixel a square of its own.
+        """Triangulate the pixels of a depth map.
+
+        Parameters
+        ----------
+        depth_map : DepthMap
+
+        Returns
+        -------
+        LinearFit
+        """
+        # Padding gives every pixel its own square.
         depth, std = (
             np.pad(part.astype(np.float64), ((0, 1), (0, 1)), constant_values=np.nan)
             for part in (depth_map.depth, depth_map.std)
@@ -220,10 +338,19 @@ class LinearSurface:
 
 @dataclass(frozen=True)
 class LinearFit:
-    """Inverse depths (H + 1, W + 1), the last row and column nothing, and the triangles between them: planes
-    of space are linear in them."""
+    """Piecewise linear surface of a depth map; planes in space are linear in inverse depth.
 
-    given: DepthMap
+    Attributes
+    ----------
+    depth_map : DepthMap
+        The map it was fitted to.
+    inverse_depth : ndarray (H + 1, W + 1)
+        Inverse depths, the last row and column NaN.
+    triangles : GridTriangles
+        Triangles between the pixels.
+    """
+
+    depth_map: DepthMap
     inverse_depth: F64
     triangles: GridTriangles
 
@@ -233,8 +360,18 @@ class LinearFit:
         return True
 
     def evaluate(self, xy: F64) -> SurfaceSample:
-        """Linear within each whole triangle; at pixels their own inverse depth, whole triangles or not."""
-        height, width = self.given.depth.shape
+        """Interpolate linearly within the triangles.
+
+        Parameters
+        ----------
+        xy : ndarray (N, 2)
+
+        Returns
+        -------
+        SurfaceSample
+            Inverse depth and gradient; the inverse depth of a pixel is also known outside triangles.
+        """
+        height, width = self.depth_map.depth.shape
         inside = np.all((xy >= -1e-9) & (xy <= np.array([width, height]) - 1.0 + 1e-9), axis=1)
         at = np.where(inside[:, None], xy, 0.0)
         x, y = np.floor(at + 1e-9).astype(np.int64).T

@@ -1,4 +1,4 @@
-"""Upkeep of triangle meshes."""
+"""Operations on triangle meshes: selection, connectivity, simplification."""
 
 from __future__ import annotations
 
@@ -13,7 +13,17 @@ from thesisrecon.records import TexturedMesh
 
 
 def remove_unused_vertices(mesh: TexturedMesh) -> TexturedMesh:
-    """The same surface with only the vertices that its faces name, in their order."""
+    """Remove vertices that no face uses.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+
+    Returns
+    -------
+    TexturedMesh
+        The same surface with vertices in their previous order.
+    """
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[mesh.faces] = True
     number = np.cumsum(used) - 1
@@ -22,20 +32,53 @@ def remove_unused_vertices(mesh: TexturedMesh) -> TexturedMesh:
 
 
 def select_faces(mesh: TexturedMesh, keep: B8) -> TexturedMesh:
-    """The surface of the faces that ``keep`` (M,) marks."""
+    """Select faces of a mesh.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+    keep : ndarray (M,) bool
+        Faces to keep.
+
+    Returns
+    -------
+    TexturedMesh
+        The mesh of these faces.
+    """
     uv = None if mesh.uv is None else mesh.uv[keep]
     untextured = None if mesh.untextured is None else mesh.untextured[keep]
     return remove_unused_vertices(replace(mesh, faces=mesh.faces[keep], uv=uv, untextured=untextured))
 
 
 def face_areas(vertices: F64, faces: I64) -> F64:
-    """(M,) areas of triangles."""
+    """Compute the areas of triangles.
+
+    Parameters
+    ----------
+    vertices : ndarray (N, 3)
+    faces : ndarray (M, 3)
+
+    Returns
+    -------
+    ndarray (M,)
+        Areas.
+    """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
 def vertex_normals(mesh: TexturedMesh) -> F64:
-    """Unit normals (N, 3) of the vertices: the mean over their faces by area."""
+    """Compute vertex normals as the area-weighted mean of the face normals.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+
+    Returns
+    -------
+    ndarray (N, 3)
+        Unit normals.
+    """
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     total = np.zeros_like(mesh.vertices)
@@ -46,7 +89,20 @@ def vertex_normals(mesh: TexturedMesh) -> F64:
 
 
 def connected_parts(faces: I64, vertices: int) -> I64:
-    """(M,) number of the connected part that each face belongs to; faces connect by common vertices."""
+    """Label the connected parts of a mesh; faces are connected by common vertices.
+
+    Parameters
+    ----------
+    faces : ndarray (M, 3)
+        Vertex indices.
+    vertices : int
+        Number of vertices.
+
+    Returns
+    -------
+    ndarray (M,)
+        Part of each face.
+    """
     if not len(faces):
         return np.zeros(0, dtype=np.int64)
     row, column = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
@@ -58,9 +114,17 @@ def connected_parts(faces: I64, vertices: int) -> I64:
 
 
 def face_neighbours(faces: I64) -> I64:
-    """(M, 3) number of the face across the side from corner k to corner k + 1, -1 where there is none.
+    """Find the neighbours of each face.
 
-    Where more than two faces meet in a side, each has one of the others.
+    Parameters
+    ----------
+    faces : ndarray (M, 3)
+        Vertex indices.
+
+    Returns
+    -------
+    ndarray (M, 3)
+        Face across the side from corner k to k + 1, -1 for none; one of them if more than two faces meet.
     """
     start, stop = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(start, stop), np.maximum(start, stop)
@@ -74,7 +138,19 @@ def face_neighbours(faces: I64) -> I64:
 
 
 def remove_small_parts(mesh: TexturedMesh, min_share: float = 0.002) -> TexturedMesh:
-    """Without connected parts of less than ``least_share`` of the whole area: crumbs of wrong depths."""
+    """Remove small connected parts, which come from wrong depths.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+    min_share : float
+        Parts below this share of the total area are removed.
+
+    Returns
+    -------
+    TexturedMesh
+        The other parts.
+    """
     if not len(mesh.faces):
         return mesh
     part = connected_parts(mesh.faces, len(mesh.vertices))
@@ -83,15 +159,28 @@ def remove_small_parts(mesh: TexturedMesh, min_share: float = 0.002) -> Textured
 
 
 def simplify_mesh(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
-    """The same surface with at most ``max_faces`` triangles; a mesh that has no more is returned as it is.
+    """Simplify a mesh by vertex clustering.
 
-    Vertices that are connected within one cell of a cubic grid become one (Rossignac and Borrel 1993; two
-    sheets that only pass the same cell stay apart), placed where the squared distances to the planes of
-    their faces are least (Lindstrom 2000), so that edges and corners survive. Cells grow until the faces
-    are few enough. Faces keep their orientation; those that lose a corner or repeat another are dropped.
-    Colours of vertices are averaged; a texture does not survive.
+    Vertices that are connected within a cell of a cubic grid are merged (Rossignac and Borrel 1993; separate
+    sheets in one cell stay separate) at the point with the least squared distance to the planes of their
+    faces (Lindstrom 2000), which preserves edges and corners. Cells are enlarged until the faces are few
+    enough. Degenerate and duplicate faces are removed, the orientation is preserved.
 
-    Raises ``ValueError`` where ``max_faces`` is less than one.
+    Parameters
+    ----------
+    mesh : TexturedMesh
+    max_faces : int
+        Largest number of faces.
+
+    Returns
+    -------
+    TexturedMesh
+        The simplified mesh without texture; the mesh itself if it has no more faces.
+
+    Raises
+    ------
+    ValueError
+        If ``max_faces`` is less than 1.
     """
     if max_faces < 1:
         raise ValueError(f"max_faces must be at least 1; got {max_faces}")
@@ -112,7 +201,7 @@ def simplify_mesh(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
 
 
 def _clusters(mesh: TexturedMesh, cell: float) -> I64:
-    """(N,) number of the cluster of each vertex, dense: those that edges connect within a cell."""
+    """(N,) cluster of each vertex: vertices that edges connect within a cell."""
     place = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
     start, stop = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     within = (place[start] == place[stop]).all(axis=1)
@@ -124,9 +213,9 @@ def _clusters(mesh: TexturedMesh, cell: float) -> I64:
 
 
 def _distinct_faces(faces: I64) -> I64:
-    """Faces (M', 3) with three different corners, each cycle of corners once, in their first order.
+    """Faces (M', 3) with three different corners, without duplicates, in their first order.
 
-    Two faces on the same corners that look to opposite sides are the sides of a sheet: both stay.
+    Two faces on the same corners with opposite orientation are the sides of a sheet and both stay.
     """
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
@@ -136,10 +225,9 @@ def _distinct_faces(faces: I64) -> I64:
 
 
 def _cluster_places(mesh: TexturedMesh, cluster: I64, cell: float) -> F64:
-    """(C, 3) the point of each cluster that is nearest to the planes of its faces.
+    """(C, 3) point of each cluster that is nearest to the planes of its faces.
 
-    Directions in which the planes say little keep the mean of the vertices; a point that would leave it by
-    more than a cell is that mean.
+    Undetermined directions keep the mean of the vertices, as do points farther than a cell from it.
     """
     mean = _means(cluster, mesh.vertices)
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
@@ -154,8 +242,8 @@ def _cluster_places(mesh: TexturedMesh, cluster: I64, cell: float) -> F64:
             for j in range(3):
                 planes[:, i, j] += np.bincount(which, normal[:, i] * normal[:, j], len(mean))
     values, vectors = np.linalg.eigh(planes)
-    told = values > np.maximum(1e-2 * values[:, 2:], np.finfo(float).tiny)
-    along = np.einsum("nij,ni->nj", vectors, pull) * told / np.where(told, values, 1.0)
+    determined = values > np.maximum(1e-2 * values[:, 2:], np.finfo(float).tiny)
+    along = np.einsum("nij,ni->nj", vectors, pull) * determined / np.where(determined, values, 1.0)
     step = np.einsum("nij,nj->ni", vectors, along)
     return mean + np.where(np.linalg.norm(step, axis=1, keepdims=True) <= cell, step, 0.0)
 

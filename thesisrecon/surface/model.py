@@ -1,4 +1,4 @@
-"""The model of a scene: one surface of all depth maps, with the graphics of the photographs."""
+"""Textured surface model of a scene from all depth maps (thesis, section 2.6)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,18 @@ from thesisrecon.surface.texture_views import color_vertices
 
 @dataclass(frozen=True)
 class SurfaceModel:
-    """Depth maps fused to a surface, with a texture or with colours of its vertices.
+    """Fit, fuse and texture the surfaces of depth maps.
 
-    ``surface`` is what stands in front of each map, ``fusion`` makes one of all, ``atlas`` its texture;
-    ``colors`` "texture" or "vertices".
+    Parameters
+    ----------
+    surface : LinearSurface or BSplineSurface
+        Surface fitted to each depth map.
+    fusion : VolumetricFusion or DepthSheets
+        Fusion of the fitted surfaces.
+    atlas : TextureAtlas
+        Texture of the fused surface.
+    colors : {"texture", "vertices"}
+        Texture, or one colour per vertex.
     """
 
     surface: LinearSurface | BSplineSurface = field(default_factory=LinearSurface)
@@ -35,14 +43,46 @@ class SurfaceModel:
     def build(
         self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
     ) -> TexturedMesh:
-        """The textured surface; :class:`StageFailure` where the maps have no depths or no view sees any.
+        """Build the textured surface.
 
-        The result does not depend on ``threads``.
+        Parameters
+        ----------
+        depth_maps : sequence of DepthMap
+        views : sequence of PinholeView
+            Undistorted images with their cameras.
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        TexturedMesh
+            The model.
+
+        Raises
+        ------
+        StageFailure
+            If the maps contain no depths or no view sees the surface.
         """
         return self.color(self.surface_of(depth_maps, threads=threads), views, threads=threads)
 
     def surface_of(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
-        """The surface alone; :class:`StageFailure` where the maps have no depths."""
+        """Build the surface without colours.
+
+        Parameters
+        ----------
+        depth_maps : sequence of DepthMap
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        TexturedMesh
+
+        Raises
+        ------
+        StageFailure
+            If the maps contain no depths.
+        """
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             fitted = list(pool.map(lambda m: resample_surface(self.surface.fit(m)), depth_maps))
         return self.fusion.fuse(fitted, threads=threads)
@@ -55,11 +95,28 @@ class SurfaceModel:
         without: int | None = None,
         threads: int = 1,
     ) -> TexturedMesh:
-        """A surface with new graphics, for a model that is made already too.
+        """Texture a surface.
 
-        ``without`` is the number of a view (:attr:`PinholeView.view`) that gives none: rendered from there,
-        the model shows how like an unseen photograph it is. Its depths are in the surface all the same.
-        Raises :class:`StageFailure` where no view sees any of it.
+        Parameters
+        ----------
+        surface : TexturedMesh
+        views : sequence of PinholeView
+            Undistorted images with their cameras.
+        without : int, optional
+            Number of a view that is not used, for comparison of its image with a rendering of the model. Its
+            depths remain part of the surface.
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        TexturedMesh
+            The textured surface.
+
+        Raises
+        ------
+        StageFailure
+            If no view sees the surface.
         """
         used = [view for view in views if view.view != without]
         if self.colors == "vertices":

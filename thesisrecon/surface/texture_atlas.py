@@ -1,9 +1,8 @@
-"""The texture of a mesh: pieces in the outline of photographs, packed into one picture, without seams.
+"""Texture atlas of a mesh: charts in the geometry of an image, packed into one texture.
 
-Each chart (connected faces that one photograph shows best) has the outline and the resolution that it has in
-that photograph. What is painted there is either what all photographs agree on
-(:class:`~thesisrecon.surface.texture_blending.BlendedTexture`) or that photograph alone
-(:class:`~thesisrecon.surface.color_correction.SeamLeveledTexture`).
+A chart consists of connected faces that are assigned to one image and has the outline and resolution of that
+image. Its colours are blended from all images (:class:`BlendedTexture`) or taken from that image alone
+(:class:`SeamLeveledTexture`).
 """
 
 from __future__ import annotations
@@ -29,16 +28,15 @@ from thesisrecon.surface.texture_views import (
 )
 
 CHART_MARGIN = 2
-"""Pixels around each piece, so that what is drawn smaller does not mix pieces at once."""
+"""Pixels around each chart, so that reduced textures do not mix charts."""
 
 SWATCH = 3
-"""Texels a side for a face that no photograph sees."""
+"""Texels per side of the patch of an unseen face."""
 
 
 @dataclass(frozen=True)
 class _AtlasFaces:
-    """The faces of an atlas before packing: ``xy`` (M, 3, 2) corners in the photograph of the face, ``label``
-    (M,) its place among the views or -1, ``chart`` (M,)."""
+    """Faces before packing: ``xy`` (M, 3, 2) image corners, ``label`` (M,) view or -1, ``chart`` (M,)."""
 
     xy: F64
     label: I64
@@ -46,15 +44,21 @@ class _AtlasFaces:
 
 
 MIN_SCALE = 0.05
-"""Photographs reduced to less show nothing; the pieces' margins remain."""
+"""Smallest reduction of the images."""
 
 
 @dataclass(frozen=True)
 class TextureAtlas:
-    """Texture at the resolution of the view that shows each part of the surface largest.
+    """Texture at the resolution of the view that shows each part of the surface best.
 
-    ``max_texels``: photographs are reduced until the atlas has no more. ``smooth_rounds``, ``least_faces``:
-    see :func:`choose_views`. ``painter`` puts the colours on it.
+    Parameters
+    ----------
+    max_texels : int
+        Limit of the texture size; images are reduced to fit.
+    smooth_rounds, min_chart_faces : int
+        Parameters of :func:`choose_views`.
+    painter : BlendedTexture or SeamLeveledTexture
+        Method that computes the colours.
     """
 
     max_texels: int = 4096 * 4096
@@ -64,13 +68,28 @@ class TextureAtlas:
 
     def __post_init__(self) -> None:
         if self.max_texels < 1:
-            raise ValueError(f"max_texels >= 1 is needed; got {self.max_texels}")
+            raise ValueError(f"max_texels must be >= 1; got {self.max_texels}")
 
     def texture(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
-        """The mesh with ``uv``, ``texture`` and ``untextured``.
+        """Texture a mesh.
 
-        Faces that no view sees whole get the colour of their surroundings. Raises :class:`StageFailure` where
-        no face is seen at all, and where the atlas is too large with photographs of ``LEAST_SCALE``.
+        Parameters
+        ----------
+        mesh : TexturedMesh
+        views : sequence of PinholeView
+            Undistorted images with their cameras.
+        threads : int
+
+        Returns
+        -------
+        TexturedMesh
+            The mesh with ``uv``, ``texture`` and ``untextured``; unseen faces get the colour of their
+            surroundings.
+
+        Raises
+        ------
+        StageFailure
+            If no face is visible, or the atlas is too large even with images reduced to ``MIN_SCALE``.
         """
         neighbours = face_neighbours(mesh.faces)
         quality = face_quality(mesh, views, threads=threads)
@@ -78,7 +97,7 @@ class TextureAtlas:
             quality, neighbours, rounds=self.smooth_rounds, min_chart_faces=self.min_chart_faces
         )
         if not (label >= 0).any():
-            raise StageFailure("the surface has no texture", "no photograph sees any of it")
+            raise StageFailure("the surface has no texture", "no image shows any part of it")
         chart = label_charts(label, neighbours)
         scale = 1.0
         while True:
@@ -92,8 +111,8 @@ class TextureAtlas:
                 texels = size[0] * size[1]
                 raise StageFailure(
                     "the texture is too large",
-                    f"{len(rectangles)} pieces take {texels} texels, allowed are {self.max_texels}",
-                    "allow more texels, or fewer pieces (least_faces)",
+                    f"{len(rectangles)} charts need {texels} texels, the limit is {self.max_texels}",
+                    "increase max_texels or min_chart_faces",
                 )
             scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), MIN_SCALE)
         uv = faces.xy + (offsets - rectangles[:, :2])[chart][:, None, :]
@@ -104,7 +123,7 @@ class TextureAtlas:
 
 
 def _reduced(view: PinholeView, scale: float) -> PinholeView:
-    """The view with ``scale`` <= 1 times as many pixels a side."""
+    """The view with ``scale`` <= 1 times as many pixels per side."""
     if scale >= 1.0:
         return view
     height, width = (max(1, round(scale * n)) for n in view.rgb.shape[:2])
@@ -118,7 +137,7 @@ def _reduced(view: PinholeView, scale: float) -> PinholeView:
 
 
 def _corners(mesh: TexturedMesh, views: Sequence[PinholeView], label: I64) -> F64:
-    """(M, 3, 2) pixels of the corners of each face in its view, 0 where it has none."""
+    """(M, 3, 2) corners of each face in its view in pixels, 0 without a view."""
     xy = np.zeros((len(mesh.faces), 3, 2))
     for v, view in enumerate(views):
         mine = label == v
@@ -127,7 +146,7 @@ def _corners(mesh: TexturedMesh, views: Sequence[PinholeView], label: I64) -> F6
 
 
 def _rectangles(faces: _AtlasFaces, views: Sequence[PinholeView]) -> I64:
-    """(C, 4) left, top, right, bottom of each chart in its photograph, the last two exclusive."""
+    """(C, 4) left, top, right, bottom of each chart in its image, the last two exclusive."""
     charts = int(faces.chart.max()) + 1
     low = np.full((charts, 2), np.iinfo(np.int64).max)
     high = np.full((charts, 2), -1)
@@ -143,9 +162,19 @@ def _rectangles(faces: _AtlasFaces, views: Sequence[PinholeView]) -> I64:
 
 
 def pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
-    """Places (C, 2) of rectangles of ``sizes`` (C, 2) without overlap; (width, height) of what holds them.
+    """Pack rectangles on shelves of decreasing height.
 
-    On shelves, the highest first, in a width of about the square root of their area.
+    Parameters
+    ----------
+    sizes : ndarray (C, 2)
+        Width and height of the rectangles.
+
+    Returns
+    -------
+    ndarray (C, 2)
+        Positions of the upper left corners.
+    tuple of int
+        (width, height) of the bounding box, roughly square.
     """
     width = max(
         int(np.ceil(1.05 * np.sqrt(float(sizes.prod(axis=1).sum())))), int(sizes[:, 0].max(initial=1))
@@ -164,7 +193,7 @@ def pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
 def _fill(
     views: Sequence[PinholeView], faces: _AtlasFaces, rectangles: I64, offsets: I64, size: tuple[int, int]
 ) -> np.ndarray:
-    """(H, W, 3) uint8: every chart's rectangle of its photograph at its place."""
+    """(H, W, 3) uint8 texture with the image rectangle of every chart at its position."""
     texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
     first = np.unique(faces.chart, return_index=True)[1]
     for c, v in enumerate(faces.label[first]):
@@ -176,8 +205,7 @@ def _fill(
 
 
 def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> tuple[F64, np.ndarray]:
-    """Faces that no photograph sees, each with a patch of one colour below the atlas: that of the seen faces
-    nearest along the surface."""
+    """Append a patch of one colour for each unseen face: that of the nearest seen faces along the surface."""
     unseen = np.flatnonzero(label < 0)
     if not len(unseen):
         return uv, texture
@@ -196,7 +224,7 @@ def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> t
 
 
 def _surroundings(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> np.ndarray:
-    """(M, 3) uint8: the colour of seen faces, carried from face to face to those that are not."""
+    """(M, 3) uint8 colours of seen faces, propagated from face to face to unseen ones."""
     neighbours = face_neighbours(mesh.faces)
     x, y = np.clip(np.rint(uv.mean(axis=1)).astype(np.int64), 0, np.array(texture.shape[1::-1]) - 1).T
     color = np.where(label[:, None] >= 0, texture[y, x], 0).astype(np.float64)
@@ -204,12 +232,12 @@ def _surroundings(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) 
     while not known.all():
         open_ = np.flatnonzero(~known)
         around = neighbours[open_]
-        told = (around >= 0) & known[around]
-        reached = told.any(axis=1)
+        known_side = (around >= 0) & known[around]
+        reached = known_side.any(axis=1)
         if not reached.any():
             color[~known] = color[known].mean(axis=0)
             break
-        weights = told[reached].astype(np.float64)
+        weights = known_side[reached].astype(np.float64)
         mean = (color[around[reached]] * weights[..., None]).sum(axis=1) / weights.sum(axis=1)[:, None]
         color[open_[reached]] = mean
         known[open_[reached]] = True

@@ -1,10 +1,4 @@
-"""The colour of each point of a surface from all photographs that show it.
-
-What a photograph shows of a point counts by how many pixels it spends there, less towards its border and
-towards the outline of whatever stands in front, and hardly at all where it contradicts the others: something
-thin that the surface lacks, a reflection, a person. Since these shares change gradually over the surface, no
-seam is left between photographs.
-"""
+"""Colours of a texture: blended from all images, or from one image per chart with levelled seams."""
 
 from __future__ import annotations
 
@@ -31,54 +25,64 @@ from thesisrecon.surface.texture_kernels import (
 )
 from thesisrecon.surface.texture_views import DEPTH_TOLERANCE_PX, Charts, project, sample_view, view_camera
 
-CHUNK = 1 << 17
-"""Points at a time, so that memory stays bounded."""
+POINTS_PER_CHUNK = 1 << 17
+"""Points processed at a time, which bounds the memory."""
 
-STRIP = 64
-"""Rows of the texture at a time."""
+STRIP_ROWS = 64
+"""Rows of the texture processed at a time."""
 
-RIM = 1
-"""Texels beyond its outline that continue a piece as a surface: bilinear sampling reaches there."""
+RIM_TEXELS = 1
+"""Texels by which a chart is extrapolated for bilinear sampling."""
 
 BEYOND_FACE = 4.0
-"""How far beyond a face that may be, in its sides."""
+"""Limit of that extrapolation in sides of a face."""
 
-BEYOND = 3
-"""Texels around that which take the colours at the rim, for pictures that are drawn smaller."""
+GROWN_TEXELS = 3
+"""Further texels that take the colours of the rim, for reduced textures."""
 
 OUTLINE_PX = 10.0
-"""A step in depth of so many pixels' widths between neighbours is the outline of something in front."""
+"""Depth step in pixel sizes that marks the outline of a foreground object."""
 
-FAINT = 1e-3
-"""Trust in a pixel at an outline or the border of the photograph, where no other shows the place."""
+MIN_TRUST = 1e-3
+"""Weight of pixels at outlines and image borders, which count where no other image shows the point."""
 
 GAIN_POINTS = 50_000
-"""Points at which photographs are compared to find their gains."""
+"""Points at which image gains are estimated."""
 
 DARK, BRIGHT = 16.0, 240.0
-"""Colours outside are clipped or nothing but noise, and say nothing of gains."""
+"""Colours outside this range are clipped or noisy and not used for gains."""
 
 SMOOTHNESS = 0.1
-"""Weight of a step between neighbours within a chart against one left over at a seam."""
+"""Weight of a difference within a chart relative to one at a seam."""
 
 ANCHOR = 1e-4
-"""Weight of the correction itself: what nothing decides stays as it was photographed."""
+"""Weight of the correction itself."""
 
 BLUR_PX = 2.0
-"""Photographs are compared smoothed by this, since pieces fit to about a pixel."""
+"""Blur of the images before comparison: charts are aligned to about a pixel."""
 
 SEAM_TEXELS = 3
-"""Texels beyond a chart that share its corrections: sampling reaches there."""
+"""Texels beyond a chart that get its corrections."""
 
 
 @dataclass(frozen=True)
 class BlendedTexture:
-    """Colours from all views that show a point.
+    """Robust blend of all images that show a point.
 
-    ``power`` of the pixels that a view spends on a point: 0 counts all alike, much more than 1 leaves the
-    nearest view alone. ``scatter``: grey levels from the median of all at which a view's say is a quarter.
-    ``feather_px``: width of the border along which the say of a photograph fades. ``level``: photographs are
-    made equally bright first.
+    The weight of an image is its number of pixels per area, reduced towards image borders and outlines of
+    foreground objects and where its colour contradicts the others (thin objects missing from the surface,
+    reflections, people). Weights vary smoothly, so no seams occur.
+
+    Parameters
+    ----------
+    power : float
+        Exponent of the pixels per area: 0 weighs all images equally, large values select the best one.
+    scatter : float
+        Distance from the median colour in grey levels at which the weight is a quarter.
+    feather_px : float
+        Width of the border in which the weight decreases.
+    level : bool
+        Equalise the brightness of the images first.
     """
 
     power: float = 2.0
@@ -89,16 +93,29 @@ class BlendedTexture:
     def __post_init__(self) -> None:
         if not (self.power >= 0.0 and self.scatter > 0.0 and self.feather_px > 0.0):
             raise ValueError(
-                "power >= 0, scatter > 0 and feather_px > 0 are needed; got "
+                "power must be >= 0, scatter and feather_px positive; got "
                 f"{self.power}, {self.scatter} and {self.feather_px}"
             )
 
     def paint(
         self, mesh: TexturedMesh, views: Sequence[PinholeView], charts: Charts, *, threads: int = 1
     ) -> U8:
-        """The texture (H, W, 3); what no view shows well stays as it was cut out.
+        """Compute the colours of a texture.
 
-        The result does not depend on ``threads``.
+        Parameters
+        ----------
+        mesh : TexturedMesh
+        views : sequence of PinholeView
+            Undistorted images with their cameras.
+        charts : Charts
+            Layout of the texture.
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        ndarray (H, W, 3) uint8
+            The texture; texels that no image shows well keep the colours of ``charts``.
         """
         prepared = self.prepare(mesh, views, threads=threads)
         normals = vertex_normals(mesh)
@@ -106,7 +123,7 @@ class BlendedTexture:
         drawn = np.zeros(texture.shape[:2], dtype=bool)
 
         def work(first: int) -> None:
-            rows = slice(first, min(first + STRIP, len(texture)))
+            rows = slice(first, min(first + STRIP_ROWS, len(texture)))
             at, points, towards = _points_of_rows(mesh, normals, charts, rows)
             color, shown = prepared.colors(points, towards)
             at = at[shown]
@@ -114,13 +131,26 @@ class BlendedTexture:
             drawn[at[:, 0], at[:, 1]] = True
 
         with ThreadPoolExecutor(max(threads, 1)) as pool:
-            list(pool.map(work, range(0, len(texture), STRIP)))
-        for _ in range(BEYOND):
+            list(pool.map(work, range(0, len(texture), STRIP_ROWS)))
+        for _ in range(GROWN_TEXELS):
             grow_colors(texture, drawn)
         return texture
 
     def prepare(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> ViewBlender:
-        """What the views show of ``mesh``, ready for :meth:`PreparedBlending.colors`."""
+        """Prepare the views for colour queries.
+
+        Parameters
+        ----------
+        mesh : TexturedMesh
+        views : sequence of PinholeView
+            Undistorted images with their cameras.
+        threads : int
+
+        Returns
+        -------
+        ViewBlender
+            The prepared views with their gains.
+        """
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             prepared = list(pool.map(lambda view: _prepared(mesh, view, self.feather_px), views))
         gains = np.ones((len(views), 3), dtype=np.float32)
@@ -134,20 +164,22 @@ class BlendedTexture:
 
 
 def _points_of_rows(mesh: TexturedMesh, normals: F64, charts: Charts, rows: slice) -> tuple[I64, F64, F64]:
-    """Texels (N, 2) as row and column, points (N, 3) and normals (N, 3) of what is drawn in some rows."""
+    """Texels (N, 2) as row and column, points (N, 3) and normals (N, 3) of some rows of the texture."""
     uv = charts.uv
     top, bottom = uv[..., 1].min(axis=1), uv[..., 1].max(axis=1)
-    some = np.flatnonzero((charts.label >= 0) & (bottom >= rows.start - RIM) & (top <= rows.stop + RIM))
+    some = np.flatnonzero(
+        (charts.label >= 0) & (bottom >= rows.start - RIM_TEXELS) & (top <= rows.stop + RIM_TEXELS)
+    )
     corners = np.concatenate([uv[some], np.ones((len(some), 3, 1))], axis=2)
-    corners[..., 1] -= rows.start - RIM
-    shape = (rows.stop - rows.start + 2 * RIM, charts.cut_out.shape[1])
+    corners[..., 1] -= rows.start - RIM_TEXELS
+    shape = (rows.stop - rows.start + 2 * RIM_TEXELS, charts.cut_out.shape[1])
     depth = np.full(shape, np.inf, dtype=np.float32)
     face = np.full(shape, -1, dtype=np.int64)
     weights = np.zeros((*shape, 2), dtype=np.float32)
     rasterize_rows(corners, 1e-3, (0, shape[0]), depth, face, weights)
-    for _ in range(RIM):
+    for _ in range(RIM_TEXELS):
         continue_faces(corners, BEYOND_FACE, face, weights)
-    face, weights = face[RIM:-RIM], weights[RIM:-RIM]
+    face, weights = face[RIM_TEXELS:-RIM_TEXELS], weights[RIM_TEXELS:-RIM_TEXELS]
     y, x = np.nonzero(face >= 0)
     share = weights[y, x].astype(np.float64)
     share = np.column_stack([1.0 - share.sum(axis=1), share])[:, :, None]
@@ -158,14 +190,35 @@ def _points_of_rows(mesh: TexturedMesh, normals: F64, charts: Charts, rows: slic
 
 @dataclass(frozen=True)
 class ViewBlender:
-    """Views of one surface with the gains (V, 3) that make them equally bright."""
+    """Views of one surface with brightness gains.
+
+    Attributes
+    ----------
+    blending : BlendedTexture
+        Parameters.
+    views : tuple of ViewSurface
+        Prepared views.
+    gains : ndarray (V, 3) float32
+        Gains that equalise the brightness.
+    """
 
     blending: BlendedTexture
     views: tuple[ViewSurface, ...]
     gains: F32
 
     def observe(self, points: F64, normals: F64) -> tuple[F32, F32]:
-        """Weights (V, N), 0 where a view does not show a point, and colours (V, N, 3)."""
+        """Observe points in all views.
+
+        Parameters
+        ----------
+        points, normals : ndarray (N, 3)
+            Points and outward normals.
+
+        Returns
+        -------
+        tuple of ndarray (V, N), (V, N, 3)
+            Weights, 0 where a view does not show a point, and colours.
+        """
         weight = np.zeros((len(self.views), len(points)), dtype=np.float32)
         color = np.zeros((len(self.views), len(points), 3), dtype=np.float32)
         for v, one in enumerate(self.views):
@@ -173,11 +226,22 @@ class ViewBlender:
         return weight, color
 
     def colors(self, points: F64, normals: F64) -> tuple[F32, B8]:
-        """Colours (N, 3) of points (N, 3) with outer normals (N, 3), and which of them any view shows."""
+        """Blend the colours of points.
+
+        Parameters
+        ----------
+        points, normals : ndarray (N, 3)
+            Points and outward normals.
+
+        Returns
+        -------
+        tuple of ndarray (N, 3), (N,)
+            Colours, and whether any view shows the point.
+        """
         out = np.zeros((len(points), 3), dtype=np.float32)
         shown = np.zeros(len(points), dtype=bool)
-        for first in range(0, len(points), CHUNK):
-            some = slice(first, first + CHUNK)
+        for first in range(0, len(points), POINTS_PER_CHUNK):
+            some = slice(first, first + POINTS_PER_CHUNK)
             weight, color = self.observe(points[some], normals[some])
             combine_colors(weight, color, self.blending.power, self.blending.scatter, out[some])
             shown[some] = weight.max(axis=0, initial=0.0) > 0.0
@@ -188,32 +252,43 @@ def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> ViewS
     camera = view_camera(view)
     depth = rasterize(mesh.vertices, mesh.faces, camera).depth
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-    # Pixels without a surface say nothing: something may stand there, or there is only a hole.
+    # Pixels without a surface are no outline: they may be holes.
     far = scipy.ndimage.maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)
     near = scipy.ndimage.minimum_filter(depth, 3)
     with np.errstate(invalid="ignore"):
         outline = far - near > OUTLINE_PX / focal * near
     inside = np.pad(np.ones_like(view.seen[1:-1, 1:-1]), 1)
     distance = scipy.ndimage.distance_transform_edt(inside & view.seen & ~outline)
-    trust = np.clip(distance / feather_px, FAINT, 1.0)
-    # Between pixels, colours are mixed: none of the four may be one that the photograph lacks.
+    trust = np.clip(distance / feather_px, MIN_TRUST, 1.0)
+    # Bilinear interpolation must not use missing pixels.
     trust[scipy.ndimage.minimum_filter(view.seen, 3) == 0] = 0.0
     tolerance = DEPTH_TOLERANCE_PX / focal
     return ViewSurface(view.P, depth, trust.astype(np.float32), tolerance, view.rgb, np.ones(3, np.float32))
 
 
 def equalizing_gains(weight: F32, color: F32) -> F32:
-    """(V, 3) factors that make V views equally bright at common points, their geometric mean 1.
+    """Estimate gains that equalise the brightness of the views.
 
-    Least squares over the medians of the logarithm of the ratio of every two views. ``weight`` (V, N) 0 where
-    a view does not show a point, ``color`` (V, N, 3).
+    Least squares over the median log ratios of all pairs of views, with geometric mean 1.
+
+    Parameters
+    ----------
+    weight : ndarray (V, N)
+        Weights, 0 where a view does not show a point.
+    color : ndarray (V, N, 3)
+        Colours.
+
+    Returns
+    -------
+    ndarray (V, 3) float32
+        Gains.
     """
     views = len(weight)
     usable = (weight[..., None] > 0.0) & (color > DARK) & (color < BRIGHT)
     log = np.log(np.maximum(color, 1.0))
     gains = np.ones((views, 3), dtype=np.float32)
     for k in range(3):
-        # The constant ties the mean to 0, which the ratios leave open.
+        # The constant fixes the mean to 0, which the ratios leave undetermined.
         A, b = np.full((views, views), 1e-6), np.zeros(views)
         for i, j in combinations(range(views), 2):
             both = usable[i, :, k] & usable[j, :, k]
@@ -230,7 +305,16 @@ def equalizing_gains(weight: F32, color: F32) -> F32:
 
 @dataclass(frozen=True)
 class SeamLeveledTexture:
-    """Each piece as its own photograph shows it; ``level``: differences between photographs are taken out."""
+    """Colours of one image per chart with levelled seams (Lempitsky and Ivanov 2007).
+
+    Each vertex of each chart has a correction; corrections compensate the differences at seams and vary as
+    slowly as possible within a chart.
+
+    Parameters
+    ----------
+    level : bool
+        Apply the corrections.
+    """
 
     level: bool = True
 
@@ -242,7 +326,23 @@ class SeamLeveledTexture:
         *,
         threads: int = 1,  # noqa: ARG002 - one linear system for all
     ) -> NDArray[np.uint8]:
-        """The texture (H, W, 3)."""
+        """Compute the colours of a texture.
+
+        Parameters
+        ----------
+        mesh : TexturedMesh
+        views : sequence of PinholeView
+            Undistorted images with their cameras.
+        charts : Charts
+            Layout of the texture.
+        threads : int
+            Ignored.
+
+        Returns
+        -------
+        ndarray (H, W, 3) uint8
+            The texture.
+        """
         if not self.level:
             return charts.cut_out
         return _level_seams(mesh, views, charts.label, charts.chart, uv=charts.uv, texture=charts.cut_out)
@@ -251,9 +351,9 @@ class SeamLeveledTexture:
 def _level_seams(
     mesh: TexturedMesh, views: Sequence[PinholeView], label: I64, chart: I64, *, uv: F64, texture: np.ndarray
 ) -> np.ndarray:
-    """The texture (H, W, 3) uint8 with the corrections of all charts added."""
+    """Texture (H, W, 3) with the corrections of all charts added."""
     seen = np.flatnonzero(label >= 0)
-    # A node is a vertex of a chart.
+    # One node per vertex and chart.
     key = chart[seen][:, None] * len(mesh.vertices) + mesh.faces[seen]
     nodes, number = np.unique(key, return_inverse=True)
     number = number.reshape(key.shape)
@@ -271,7 +371,7 @@ def _level_seams(
 
 
 def _colors(mesh: TexturedMesh, views: Sequence[PinholeView], view: I64, vertex: I64) -> F64:
-    """(N, 3) colour of every node in its own photograph."""
+    """(N, 3) colour of every node in its own image."""
     color = np.zeros((len(view), 3))
     for v, one in enumerate(views):
         mine = view == v
@@ -283,14 +383,14 @@ def _colors(mesh: TexturedMesh, views: Sequence[PinholeView], view: I64, vertex:
 
 
 def _meeting(vertex: I64) -> tuple[I64, I64]:
-    """Pairs of nodes at one vertex: each with the next of those that meet there."""
+    """Pairs of nodes at one vertex."""
     order = np.argsort(vertex, kind="stable")
     same = vertex[order][1:] == vertex[order][:-1]
     return order[:-1][same], order[1:][same]
 
 
 def _sides(number: I64) -> tuple[I64, I64]:
-    """The sides of all faces as pairs of nodes, each once."""
+    """Sides of all faces as pairs of nodes, each once."""
     start, stop = number.ravel(), np.roll(number, -1, axis=1).ravel()
     pairs = np.unique(np.stack([np.minimum(start, stop), np.maximum(start, stop)], axis=1), axis=0)
     return pairs[:, 0], pairs[:, 1]
@@ -317,7 +417,7 @@ def _solve(color: F64, seams: tuple[I64, I64], sides: tuple[I64, I64]) -> F32:
 
 
 def _added(texture: np.ndarray, uv: F64, values: F32, seen: I64) -> np.ndarray:
-    """The texture with values (M, 3, 3) of the corners of the faces ``seen`` added over these faces."""
+    """Texture with the corner values (M, 3, 3) added over the faces ``seen``."""
     height, width = texture.shape[:2]
     corners = np.concatenate([uv[seen], np.ones((len(seen), 3, 1))], axis=2)
     depth = np.full((height, width), np.inf, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Compiled loops of the texture; each has a plain twin in the tests."""
+"""Compiled loops of texturing; the tests contain NumPy versions."""
 
 from __future__ import annotations
 
@@ -11,9 +11,23 @@ from thesisrecon.arrays import B8, F32, F64, I64, U8
 
 
 class ViewSurface(NamedTuple):
-    """A view of a surface: ``P`` (3, 4) = K [R t]; ``depth`` (H, W) nearest surface, inf where none;
-    ``clear`` (H, W) 0..1 trust in each pixel; ``slack``, the part of its depth by which a point may lie
-    behind what is seen; ``rgb`` (H, W, 3), and ``gain`` (3,) by which its colours are multiplied."""
+    """A surface seen by one view.
+
+    Attributes
+    ----------
+    P : ndarray (3, 4)
+        Camera K [R t].
+    depth : ndarray (H, W) float32
+        Nearest depth, inf without a surface.
+    trust : ndarray (H, W) float32
+        Weight of each pixel in 0 .. 1.
+    tolerance : float
+        Relative depth by which visible points may lie behind ``depth``.
+    rgb : ndarray (H, W, 3) uint8
+        Image.
+    gain : ndarray (3,) float32
+        Brightness gain.
+    """
 
     P: F64
     depth: F32
@@ -25,8 +39,21 @@ class ViewSurface(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> None:
-    """One round: ``out`` (M, V) is ``keep`` of ``share`` and the rest from the mean of ``spread`` over the
-    faces across the sides, 0 for views that do not see a face."""
+    """Diffuse shares over neighbouring faces by one step.
+
+    Parameters
+    ----------
+    share : ndarray (M, V) float32
+        Initial share of each view, 0 where it does not see the face.
+    neighbours : ndarray (M, 3)
+        Adjacent faces, -1 for none.
+    keep : float
+        Weight of the initial share against the mean of the neighbours.
+    spread : ndarray (M, V) float32
+        Shares before the step.
+    out : ndarray (M, V) float32
+        Receives the shares after the step.
+    """
     for m in range(share.shape[0]):
         count = 0
         for k in range(3):
@@ -44,11 +71,20 @@ def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> 
 
 @njit(cache=True, nogil=True)
 def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, color: F32) -> None:
-    """What one view shows at points (N, 3) with outer normals (N, 3).
+    """Observe points in one view.
 
-    A point is seen where it lies at most ``view.slack`` of its depth behind the farthest of the four pixels
-    around it. ``weight`` (N,) gets the pixels a unit of area covers, times the trust in them, 0 where the
-    point is not seen from outside; ``color`` (N, 3) its bilinear colour times the gain.
+    A point is visible if it is at most ``view.tolerance`` of its depth behind the farthest of the four pixels
+    around.
+
+    Parameters
+    ----------
+    points, normals : ndarray (N, 3)
+        Points and outward normals.
+    view : ViewSurface
+    weight : ndarray (N,) float32
+        Receives pixels per area times trust, 0 if not visible.
+    color : ndarray (N, 3) float32
+        Receives the bilinear colour times the gain.
     """
     P, depth, trust, tolerance, rgb, gain = view
     height, width = depth.shape
@@ -89,7 +125,7 @@ def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, co
 
 @njit(cache=True, nogil=True)
 def _weighted_median(values: F32, weights: F64, order: I64) -> float:
-    """Lower weighted median of values (V,) with weights (V,) that are not all 0; ``order`` is scratch."""
+    """Lower weighted median of values (V,) with weights (V,) that are not all 0; ``order`` is work space."""
     count, total = 0, 0.0
     for v in range(len(values)):
         if weights[v] > 0.0:
@@ -110,12 +146,21 @@ def _weighted_median(values: F32, weights: F64, order: I64) -> float:
 
 @njit(cache=True, nogil=True)
 def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F32) -> None:
-    """One colour for each of N points from V views that show it.
+    """Blend the colours of points.
 
-    ``weight`` (V, N) 0 where a view does not, ``color`` (V, N, 3). Weights relative to the largest are raised
-    to ``power``, and fall by 1 / (1 + (d / scatter)^2)^2 with the distance d of a view's colour from the
-    median of all (root mean square over the channels, weights to the first power). ``out`` (N, 3); points
-    that no view shows stay.
+    Relative weights are raised to ``power`` and multiplied by 1 / (1 + (d / scatter)^2)^2 with the RMS
+    distance d from the weighted median colour.
+
+    Parameters
+    ----------
+    weight : ndarray (V, N) float32
+        Weights, 0 where a view does not show a point.
+    color : ndarray (V, N, 3) float32
+        Colours.
+    power, scatter : float
+        See :class:`BlendedTexture`.
+    out : ndarray (N, 3) float32
+        Receives the colours; points that no view shows are unchanged.
     """
     views = weight.shape[0]
     relative = np.empty(views)
@@ -150,8 +195,15 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
 
 @njit(cache=True, nogil=True)
 def grow_colors(texture: U8, drawn: B8) -> None:
-    """Texels (H, W, 3) at the rim of what is ``drawn`` (H, W) take the mean of those of their eight
-    neighbours that are, and count as drawn."""
+    """Extend the drawn texels by the mean of their neighbours.
+
+    Parameters
+    ----------
+    texture : ndarray (H, W, 3) uint8
+        Texture, updated.
+    drawn : ndarray (H, W) bool
+        Drawn texels, updated.
+    """
     height, width = drawn.shape
     before = drawn.copy()
     total = np.zeros(3)
@@ -175,11 +227,18 @@ def grow_colors(texture: U8, drawn: B8) -> None:
 
 @njit(cache=True, nogil=True)
 def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
-    """Texels beside a face that have none continue it: the rim of a piece, a texel wide.
+    """Extrapolate faces to adjacent empty texels.
 
-    ``corners`` (M, 3, 3) texels of the corners, their last entry 1; ``face`` (H, W) -1 where none;
-    ``weights`` (H, W, 2) barycentric coordinates of corners 1 and 2, which beyond the face may go to
-    ``farthest``. The neighbours before, after, above and below are asked in this order.
+    Parameters
+    ----------
+    corners : ndarray (M, 3, 3)
+        Corners in homogeneous texels.
+    farthest : float
+        Limit of the barycentric coordinates.
+    face : ndarray (H, W)
+        Face of each texel, -1 for none; updated from the left, right, upper or lower neighbour.
+    weights : ndarray (H, W, 2) float32
+        Barycentric coordinates of corners 1 and 2, updated.
     """
     height, width = face.shape
     before = face.copy()

@@ -1,9 +1,4 @@
-"""What each photograph sees of a surface, and how well.
-
-Which photograph each face takes its texture from.
-
-A texture that is laid out and waits for its colours.
-"""
+"""Visibility of a surface in the images, and the choice of one image for each face."""
 
 from __future__ import annotations
 
@@ -21,17 +16,37 @@ from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface.texture_kernels import diffuse
 
 DEPTH_TOLERANCE_PX = 3.0
-"""How far behind what is seen a vertex may lie and still be seen, in pixels at its depth: the z-buffer holds
-one depth a pixel, and of a slanted surface a pixel sees many."""
+"""Depth tolerance of visible vertices in pixel sizes: the z-buffer holds one depth per pixel."""
 
 
 def view_camera(view: PinholeView) -> Camera:
-    """The camera of a view with the size of its picture."""
+    """Return the camera of a view.
+
+    Parameters
+    ----------
+    view : PinholeView
+
+    Returns
+    -------
+    Camera
+        Camera with the image size.
+    """
     return Camera.from_matrix(view.P, (view.rgb.shape[1], view.rgb.shape[0]))
 
 
 def project(camera: Camera, vertices: F64) -> tuple[F64, F64]:
-    """Pixels (N, 2), NaN behind the camera, and depths (N,)."""
+    """Project vertices.
+
+    Parameters
+    ----------
+    camera : Camera
+    vertices : ndarray (N, 3)
+
+    Returns
+    -------
+    tuple of ndarray (N, 2), (N,)
+        Pixels, NaN behind the camera, and depths.
+    """
     xyz = (vertices @ camera.R.T + camera.t) @ camera.K.T
     depth = xyz[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -40,7 +55,7 @@ def project(camera: Camera, vertices: F64) -> tuple[F64, F64]:
 
 
 def _visible_vertices(mesh: TexturedMesh, view: PinholeView, xy: F64, depth: F64, *, threads: int = 1) -> B8:
-    """(N,) vertices with pixels ``xy`` and ``depth`` that lie in the picture and behind nothing."""
+    """(N,) vertices with pixels ``xy`` and ``depth`` that lie inside the image and are not occluded."""
     camera = view_camera(view)
     buffer = rasterize(mesh.vertices, mesh.faces, camera, threads=threads).depth
     width, height = camera.size
@@ -56,13 +71,25 @@ def _visible_vertices(mesh: TexturedMesh, view: PinholeView, xy: F64, depth: F64
 
 
 def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> F32:
-    """(M, V) pixels that each face covers in each view, 0 where a view does not see all of its outside."""
+    """Count the pixels that each face covers in each view.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+    views : sequence of PinholeView
+    threads : int
+
+    Returns
+    -------
+    ndarray (M, V) float32
+        Pixels, 0 if the outside of the face is not completely visible.
+    """
     quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
     for v, view in enumerate(views):
         xy, depth = project(view_camera(view), mesh.vertices)
         seen = _visible_vertices(mesh, view, xy, depth, threads=threads)
         a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
-        # Pixels run downwards: what is anticlockwise outside has a negative area here.
+        # y points down: faces that are anticlockwise from outside have a negative area.
         area = 0.5 * ((c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]) - (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]))
         whole = seen[mesh.faces].all(axis=1) & (np.nan_to_num(area) > 0.0)
         quality[whole, v] = area[whole]
@@ -70,7 +97,20 @@ def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: i
 
 
 def sample_view(view: PinholeView, xy: F64, image: F32 | None = None) -> F32:
-    """Bilinear colours (N, 3) of a view, or of ``image`` (H, W, 3) in its place, at pixels (N, 2)."""
+    """Sample colours bilinearly.
+
+    Parameters
+    ----------
+    view : PinholeView
+    xy : ndarray (N, 2)
+    image : ndarray (H, W, 3) float32, optional
+        Image used instead of that of the view.
+
+    Returns
+    -------
+    ndarray (N, 3) float32
+        Colours.
+    """
     color = np.zeros((1, len(xy), 3), dtype=np.float32)
     source = view.rgb.astype(np.float32) if image is None else image
     drawn = np.zeros((1, len(xy)), dtype=np.int64)
@@ -80,8 +120,19 @@ def sample_view(view: PinholeView, xy: F64, image: F32 | None = None) -> F32:
 
 
 def color_vertices(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
-    """The mesh with colours of its vertices: the mean over the views that see a vertex, nearer ones and those
-    that look at it straight counting more. Grey where none does."""
+    """Colour the vertices of a mesh.
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+    views : sequence of PinholeView
+    threads : int
+
+    Returns
+    -------
+    TexturedMesh
+        Vertex colours averaged over the views by covered pixels; grey where no view sees the vertex.
+    """
     total = np.zeros((len(mesh.vertices), 3))
     weight = np.zeros(len(mesh.vertices))
     quality = face_quality(mesh, views, threads=threads)
@@ -96,18 +147,32 @@ def color_vertices(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads:
     return replace(mesh, colors=np.rint(mean).astype(np.uint8), uv=None, texture=None)
 
 
-OWN = 0.1
-"""Weight of a face's own shares against those of its neighbours."""
+OWN_WEIGHT = 0.1
+"""Weight of a face's own share relative to those of its neighbours."""
 
 
 def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, min_chart_faces: int = 30) -> I64:
-    """(M,) view of each face, -1 where none sees it.
+    """Choose the view from which each face is textured.
 
-    Each face alone would take the view that shows it largest, and the surface would be a patchwork. Shares of
-    the largest are therefore spread over neighbouring faces, ``rounds`` faces far, among views that see them;
-    charts of fewer than ``least_faces`` faces then join the neighbour with the longest common border that
-    sees them.
-    ``quality`` (M, V) pixels covered, ``neighbours`` (M, 3) across each side or -1.
+    Choosing the best view of each face alone would give many small charts. Shares of the best quality are
+    therefore diffused over ``rounds`` faces among the views that see them; small charts then join the
+    neighbour with the longest common border.
+
+    Parameters
+    ----------
+    quality : ndarray (M, V) float32
+        Pixels covered by each face in each view.
+    neighbours : ndarray (M, 3)
+        Adjacent faces, -1 for none.
+    rounds : int
+        Diffusion steps.
+    min_chart_faces : int
+        Faces of the smallest chart.
+
+    Returns
+    -------
+    ndarray (M,)
+        View of each face, -1 if no view sees it.
     """
     if not quality.size:
         return np.full(len(quality), -1, dtype=np.int64)
@@ -115,10 +180,10 @@ def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, min_chart_f
     share = quality / np.maximum(quality.max(axis=1, keepdims=True), np.float32(1e-20))
     spread, other = share.copy(), np.empty_like(share)
     for _ in range(rounds):
-        diffuse(share, neighbours, OWN, spread, other)
+        diffuse(share, neighbours, OWN_WEIGHT, spread, other)
         spread, other = other, spread
     label = np.where(visible.any(axis=1), spread.argmax(axis=1), -1)
-    # Where spreading left nothing of any view, the largest decides.
+    # Faces that the diffusion left without shares take their best view.
     lost = visible.any(axis=1) & (spread.max(axis=1) <= 0.0)
     label[lost] = share[lost].argmax(axis=1)
     for _ in range(3):
@@ -127,7 +192,20 @@ def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, min_chart_f
 
 
 def label_charts(label: I64, neighbours: I64) -> I64:
-    """(M,) number of the chart of each face: connected faces of one label."""
+    """Label the connected faces of one view.
+
+    Parameters
+    ----------
+    label : ndarray (M,)
+        View of each face.
+    neighbours : ndarray (M, 3)
+        Adjacent faces, -1 for none.
+
+    Returns
+    -------
+    ndarray (M,)
+        Chart of each face.
+    """
     face = np.repeat(np.arange(len(label)), 3)
     other = neighbours.ravel()
     same = (other >= 0) & (label[face] == label[other])
@@ -156,11 +234,18 @@ def _join_small(label: I64, visible: np.ndarray, neighbours: I64, min_chart_face
 
 @dataclass(frozen=True)
 class Charts:
-    """Where the M faces of a mesh lie in their texture.
+    """Layout of a texture.
 
-    ``label`` (M,) the view that each face is cut out of, -1 for none; ``chart`` (M,) its piece; ``uv``
-    (M, 3, 2) texels of its corners; ``cut_out`` (H, W, 3) uint8 the texture with the rectangle about each
-    piece as its photograph has it.
+    Attributes
+    ----------
+    label : ndarray (M,)
+        View of each face, -1 for none.
+    chart : ndarray (M,)
+        Chart of each face.
+    uv : ndarray (M, 3, 2)
+        Corners in texels.
+    cut_out : ndarray (H, W, 3) uint8
+        Texture with the image rectangle of each chart.
     """
 
     label: I64
