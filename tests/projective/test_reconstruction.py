@@ -20,14 +20,9 @@ from thesisrecon.projective.incremental import (
     resect_ransac,
 )
 from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs
-from thesisrecon.projective.model import (
-    ProjectiveModel,
-    consistent_observations,
-    retriangulate_points,
-    select_tracks,
-    select_tracks_with_parallax,
-)
+from thesisrecon.projective.model import ProjectiveModel, consistent_observations, retriangulate_points
 from thesisrecon.projective.sequential import SequentialProjective
+from thesisrecon.projective.track_selection import select_tracks, select_tracks_with_parallax
 from thesisrecon.records import DegeneracyReport, Tracks
 
 VARIANTS = [IncrementalProjective(), SequentialProjective(), Factorization()]

@@ -23,15 +23,12 @@ from thesisrecon.geometry.two_view import epipoles, estimate_homography, homogra
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.projective.initial_pair import NO_PARALLAX, rank_initial_pairs, require_pair_with_parallax
-from thesisrecon.projective.model import (
-    ProjectiveModel,
-    adjust_all,
+from thesisrecon.projective.model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
+from thesisrecon.projective.track_selection import (
     expand_to_all_tracks,
-    retriangulate_points,
     select_tracks,
     select_tracks_with_parallax,
     subset_tracks,
-    to_reconstruction,
 )
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 

@@ -30,13 +30,15 @@ from thesisrecon.projective.model import (
     ProjectiveModel,
     adjust_all,
     adjust_locally,
+    retriangulate_points,
+    to_reconstruction,
+)
+from thesisrecon.projective.track_selection import (
     coverage_of_views,
     expand_to_all_tracks,
-    retriangulate_points,
     select_tracks,
     select_tracks_with_parallax,
     subset_tracks,
-    to_reconstruction,
 )
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
@@ -324,7 +326,8 @@ class IncrementalProjective:
         """
         best, left, half = None, list(starts), len(sizes) // 2 + 1
         for tried in range(self.max_initial_pairs):
-            found = self._from_pair(tracks, pairs, left.pop(0), sizes, rng)
+            found = self.begin(tracks, left.pop(0), sizes)
+            self.complete(found, pairs, rng)
             if best is None or _rank(found) > _rank(best):
                 best = found
             out = [v for v in np.flatnonzero(~best.registered) if not best.deferred[v]]
@@ -333,18 +336,6 @@ class IncrementalProjective:
                 break
         assert best is not None
         return best
-
-    def _from_pair(
-        self,
-        tracks: Tracks,
-        pairs: Sequence[TwoView],
-        start: TwoView,
-        sizes: I64,
-        rng: np.random.Generator,
-    ) -> ProjectiveModel:
-        model = self.begin(tracks, start, sizes)
-        self.complete(model, pairs, rng)
-        return model
 
     def complete(self, model: ProjectiveModel, pairs: Sequence[TwoView], rng: np.random.Generator) -> None:
         """Add views to a model in place and remove those that prove wrong.
