@@ -47,7 +47,7 @@ def interpolate(
     ] = None,
     threads: Threads = 0,
 ) -> None:
-    """Compute views between two or three images, as frames, an animation and a page."""
+    """Compute views between two or three images."""
     cap_threads(threads)
     if max_size is not None and max_size < 64:
         raise UsageError(f"--max-size takes at least 64 px; got {max_size}")

@@ -88,7 +88,7 @@ def reconstruct(
         bool, typer.Option("--overwrite", help="Replace another run in the output folder.")
     ] = False,
 ) -> None:
-    """Reconstruct metric cameras, points and a textured model from a folder of images."""
+    """Reconstruct cameras, points and a textured model from images."""
     cap_threads(threads)
     chosen = _config(
         preset.value if preset else None,

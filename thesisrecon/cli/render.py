@@ -52,7 +52,7 @@ def render(
     ] = None,
     threads: Threads = 0,
 ) -> None:
-    """Render the model of a finished run along a camera path, as frames and an animation."""
+    """Render the model of a run along a camera path."""
     cap_threads(threads)
     if run.is_file():
         raise UsageError(f"render takes the output folder of a run; {run} is a file")

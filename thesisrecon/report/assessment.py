@@ -132,7 +132,7 @@ def key_facts(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
         scales = {image.scale for image in data.images}
         if len(scales) == 1 and scales != {1.0}:
             note += f"; at working size {overall.median_px * scales.pop():.2f} px median"
-        facts.append(Fact("Reprojection error", f"{overall.median_px:.2f} px median", note))
+        facts.append(Fact("Reprojection residual", f"{overall.median_px:.2f} px median", note))
     best = data.best_reconstruction
     if best is not None:
         facts.append(_point_fact(int(best.valid.sum()), overall))
@@ -156,7 +156,7 @@ def _registered(data: ReportData) -> Fact:
     if best is None:
         return Fact("Images", str(total), unread)
     registered = int(best.registered.sum())
-    refused = f"{total - registered} not registered" if registered < total else "all"
+    refused = f"{total - registered} not registered" if registered < total else ""
     label = "Cameras registered" if data.metric is not None else "Projective cameras"
     note = ", ".join(part for part in (refused, unread) if part)
     return Fact(label, f"{registered} of {total}", note)
