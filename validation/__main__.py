@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from thesisrecon.runtime.signals import obey_signals
+import sys
+
+from thesisrecon.runtime.signals import install_signal_handlers, with_resume_advice
 
 
 def main() -> int:
-    """The command; the rest is loaded when Ctrl-C is already obeyed."""
-    obey_signals("validation")
+    """Run the command; its modules are imported after the signal handlers are set."""
+    install_signal_handlers("validation")
+    if sys.argv[1:2] == ["study"]:
+        # A study needs neither the stages nor the ablation.
+        from validation.studies.runner import run_studies
+
+        with with_resume_advice("run the same command again"):
+            return run_studies(sys.argv[2:])
     from validation.command import main as run
 
     return run()

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.runtime.signals import advised
+from thesisrecon.runtime.signals import with_resume_advice
 from validation.ablation import command as ablation
 from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
@@ -22,7 +22,6 @@ from validation.harness.results import Results, collect, compare, read_results, 
 from validation.harness.scenes import load_photographs
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
-from validation.studies.runner import run_studies
 
 LEAST_SIDE_PX = 64
 """Smallest long side of depth maps: smaller ones hold no matching window."""
@@ -30,11 +29,7 @@ LEAST_SIDE_PX = 64
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command: 0 if all is well, 1 if a gate or a bound is missed, 2 for a wrong option."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] == ["study"]:
-        with advised("run the same command again"):
-            return run_studies(given[1:])
-    options = _parser().parse_args(given)
+    options = _parser().parse_args(arguments)
     if options.command == "ablate":
         return ablation.run_command(options)
     try:
@@ -46,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, StageFailure) as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2
-    with advised("the same command begins again"):
+    with with_resume_advice("the same command begins again"):
         for words in ask_canaries(wishes).values():
             print(f"validation: {words}", file=sys.stderr)
         try:

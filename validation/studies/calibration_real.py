@@ -34,6 +34,7 @@ from validation.studies.calibration_parts import (
     MODES,
     SUCCESS_PCT,
     Cameras,
+    add_intervals,
     check_parts,
     named,
 )
@@ -168,13 +169,7 @@ class CameraRows(Rows):
         """Add the coverage and the width of the 95 % intervals."""
         if run is None or run.metric is None:
             return
-        scores = interval_scores(run.metric, self.K)
-        for name, columns in COLUMNS.items():
-            row = f"95 % intervals of the {name} that hold the truth"
-            self.add(row, scores.holding(columns), at_least=least)
-            self.add(f"largest error, {name}", scores.worst(columns), "stated standard deviations")
-        width = float(np.nanmedian(100.0 * scores.std_rel))
-        self.add("stated standard deviation of the focal, median", width, "%")
+        add_intervals(self, interval_scores(run.metric, self.K), least)
         self.add("trusted by the self-check", run.metric.trusted, at_least=1.0)
 
 
