@@ -234,7 +234,7 @@ def _find_competing_models(
 
     [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005), right or wrong, is scored
     on all matches off the plane; the best distinct ones are refined on all ``points`` (N, 4). In half of the
-    pairs one match agrees with ``f`` and the other does not, since a wrong F often ratios most of its inliers
+    pairs one match agrees with ``f`` and the other does not, since a wrong F often shares most of its inliers
     with the right one. Matches have ``weights`` (N,) and agree within ``band``.
     """
     distances = np.asarray(sampson_distances(f, points))
@@ -379,12 +379,12 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
         chance=max(by_model_chance, by_chance),
         free=2,
     )
-    matters_px = max(LARGEST_ERROR_PX, 2.0 * fit.sigma_px)
+    relevant_px = max(LARGEST_ERROR_PX, 2.0 * fit.sigma_px)
     least = _least_gain(support, by_chance)
-    different = [r for r in competing_models if r.gained >= least and _differs(r, matters_px * frame.scale)]
+    different = [r for r in competing_models if r.gained >= least and _differs(r, relevant_px * frame.scale)]
     other = min(different, key=lambda r: r.margin, default=None)
     return DegeneracyReport(
-        determined=not (reasons := tuple(_reasons(support, chance, other, error_px, matters_px))),
+        determined=not (reasons := tuple(_reasons(support, chance, other, error_px, relevant_px))),
         reasons=reasons,
         off_plane=support.agreeing,
         contradicted=support.contradicted,
@@ -401,14 +401,14 @@ def _least_gain(support: _Support, chance: float) -> float:
     return float(max(LEAST_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
 
 
-def _differs(competing_model: _CompetingModel, matters: float) -> bool:
+def _differs(competing_model: _CompetingModel, relevant: float) -> bool:
     """Return whether F is wrong if the competing model is right.
 
     A model that explains all inliers of F must explain much more, since a wrong match or two that it gains
     are far from F.
     """
-    return competing_model.apart > matters or (
-        competing_model.error > matters and competing_model.margin < -LEAST_MARGIN
+    return competing_model.apart > relevant or (
+        competing_model.error > relevant and competing_model.margin < -LEAST_MARGIN
     )
 
 
@@ -436,7 +436,7 @@ def _reasons(
     chance: float,
     competing_model: _CompetingModel | None,
     error_px: float,
-    matters_px: float,
+    relevant_px: float,
 ) -> list[str]:
     off = f"{support.agreeing:.0f} of {support.tried:.0f} matches off the dominant plane agree with F"
     reasons = []
@@ -452,6 +452,6 @@ def _reasons(
             f"another F explains {competing_model.gained:.0f} matches that this F does not explain, and "
             f"misses {competing_model.lost:.0f} of its inliers"
         )
-    if error_px > matters_px:
+    if error_px > relevant_px:
         reasons.append(f"the covariance of F allows epipolar line errors of {error_px:.2g} px")
     return reasons

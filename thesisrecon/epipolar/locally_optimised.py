@@ -154,20 +154,20 @@ class LocallyOptimisedRansac:
         frame = PairFrame.of(xy1, xy2)
         points = frame.points(xy1, xy2)
         gate = self.threshold_px * frame.scale
-        found = self._candidate(points, gate, rng)
+        found = self._best_of_searches(points, gate, rng)
         if found.noise is None or _noise_exceeds_gate(found.residuals, found.noise, gate):
-            wide = self._candidate(points, WIDER * gate, rng)
+            wide = self._best_of_searches(points, WIDER * gate, rng)
             samples = found.samples + wide.samples
             found = replace(wide if wide.explains_more_than(found) else found, samples=samples)
         return self._finish(frame, found, points)
 
-    def _candidate(self, points: F64, gate: float, rng: Generator) -> _Candidate:
-        ends, samples = self._starts(points, gate, rng)
-        f, competing_models = _best_and_competing(ends, _chance_of_scores(points))
+    def _best_of_searches(self, points: F64, gate: float, rng: Generator) -> _Candidate:
+        ends, samples = self._repeat_search(points, gate, rng)
+        f, others = _best_and_competing(ends, _score_tolerance(points))
         noise, loss = _refine_to_noise(f, points, gate) if f.any() else (None, (0.0, 0.0))
-        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, competing_models)
+        return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, others)
 
-    def _starts(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
+    def _repeat_search(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
         """Return the score and F (9,) of each search until enough agree, and the number of samples."""
         found: list[tuple[float, F64]] = []
         samples = 0
@@ -180,7 +180,7 @@ class LocallyOptimisedRansac:
                 score, _, _ = truncated_score(f, np.ascontiguousarray(shuffled.T), gate, 1.0, (0.0, 0.0))
                 found.append((score * len(points), f))
             best = min((score for score, _ in found), default=np.inf)
-            agreeing = sum(score - best < _chance_of_scores(points) for score, _ in found)
+            agreeing = sum(score - best < _score_tolerance(points) for score, _ in found)
             if agreeing >= self.starts + (len(found) - agreeing) // 2 or samples >= self.max_samples:
                 break
         return found, samples
@@ -198,10 +198,8 @@ class LocallyOptimisedRansac:
         drawn = 0
         while drawn < most:
             uniforms = rng.random((min(BATCH, most - drawn), 7))
-            before, drawn = (
-                drawn,
-                search_fundamental(points, uniforms, gate, (drawn, least, confidence), state, f),
-            )
+            before = drawn
+            drawn = search_fundamental(points, uniforms, gate, (drawn, least, confidence), state, f)
             if drawn < before + len(uniforms):
                 break
         return f, drawn
@@ -222,12 +220,8 @@ class LocallyOptimisedRansac:
         effective = effective_noise(r[fitted], found.loss[1], parameters=PARAMETERS)
         covariance = fundamental_covariance(frame, found.f, points[fitted], effective)
         F = frame.matrix_in_pixels(found.f)
-        competing_models = np.array([frame.matrix_in_pixels(f) for f in found.competing_models]).reshape(
-            -1, 3, 3
-        )
-        return FundamentalFit(
-            F, inliers, noise.sigma / frame.scale, covariance, found.samples, competing_models
-        )
+        others = np.array([frame.matrix_in_pixels(f) for f in found.competing_models]).reshape(-1, 3, 3)
+        return FundamentalFit(F, inliers, noise.sigma / frame.scale, covariance, found.samples, others)
 
 
 @dataclass(frozen=True)
@@ -261,7 +255,7 @@ class _Candidate:
         return few and self.noise.log_likelihood > other.noise.log_likelihood
 
 
-def _chance_of_scores(points: F64) -> float:
+def _score_tolerance(points: F64) -> float:
     """Maximum difference between two sums of truncated squares of the same minimum."""
     return float(SAME_SCORE * len(points) ** 0.5)
 

@@ -3,7 +3,7 @@
 Three steps, each the start of the next: linear equations; the least algebraic error among tensors that have
 cameras, over the two epipoles (HZ, algorithm 16.2); the least reprojection error over cameras, points and
 lines (HZ 16.4) by Levenberg-Marquardt with points and lines eliminated. P1 = [I 0] stays fixed; P2 and P3
-move with all their 24 entries, 18 of which matter (damping handles the scales and the frame of space). A
+move with all their 24 entries; only 18 of them matter (damping handles the scales and the frame of space). A
 point moves in the 3 directions orthogonal to its vector, a line, represented by two orthonormal points, in 4:
 both without singularities.
 """
