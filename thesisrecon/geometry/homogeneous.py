@@ -3,9 +3,43 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.arrays import F64
+
+
+def require_shapes(caller: str, **arrays: tuple[ArrayLike, tuple[int | str, ...]]) -> None:
+    """Raise ``ValueError`` if an array has a wrong shape.
+
+    Parameters
+    ----------
+    caller : str, name of the public function, for the message
+    **arrays : (ndarray, tuple), array and shape; equal letters are equal sizes
+
+    Raises
+    ------
+    ValueError
+        A shape does not match.
+
+    Examples
+    --------
+    >>> require_shapes("f", xy1=(np.ones((5, 2)), ("N", 2)), xy2=(np.ones((4, 2)), ("N", 2)))
+    Traceback (most recent call last):
+    ValueError: f needs xy1 (N, 2), xy2 (N, 2); got (5, 2), (4, 2)
+    """
+    sizes: dict[str, int] = {}
+    for array, shape in arrays.values():
+        actual = np.shape(array)
+        expected = (
+            sizes.setdefault(d, n) if isinstance(d, str) else d for d, n in zip(shape, actual, strict=False)
+        )
+        if len(actual) != len(shape) or tuple(expected) != actual:
+            break
+    else:
+        return
+    needed = ", ".join(f"{name} ({', '.join(map(str, shape))})" for name, (_, shape) in arrays.items())
+    got = ", ".join(str(np.shape(array)) for array, _ in arrays.values())
+    raise ValueError(f"{caller} needs {needed}; got {got}")
 
 
 def require_finite(caller: str, *arrays: F64) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix, require_finite
+from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix, require_finite, require_shapes
 
 Two = tuple[float, float]
 Four = tuple[float, float, float, float]
@@ -382,9 +382,7 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     ([[10.0, 21.0]], [[5.0, 21.0]])
     """
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    if xy1.ndim != 2 or xy1.shape[1:] != (2,) or xy1.shape != xy2.shape or np.shape(F) != (3, 3):
-        shapes = f"{np.shape(F)}, {xy1.shape} and {xy2.shape}"
-        raise ValueError(f"correct_matches needs F (3, 3) and two (N, 2) arrays; got {shapes}")
+    require_shapes("correct_matches", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_finite("correct_matches", xy1, xy2)
     F = checked_unit(np.asarray(F, dtype=np.float64), "correct_matches")
     xy = np.stack([xy1, xy2])
@@ -470,8 +468,7 @@ def triangulate_polynomial(P: F64, xy: F64) -> F64:
     """
     if P.shape != (2, 3, 4):
         raise ValueError(f"the polynomial method needs exactly two cameras; got P of shape {P.shape}")
-    if xy.ndim != 3 or xy.shape[0] != 2 or xy.shape[2] != 2:
-        raise ValueError(f"the polynomial method needs xy (2, N, 2); got {xy.shape}")
+    require_shapes("triangulate_polynomial", xy=(xy, (2, "N", 2)))
     require_finite("triangulate_polynomial", P)
     frame = _frame(xy)
     p, moved = _pencil(P, frame.to), frame.conditioned(xy)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import require_finite
+from thesisrecon.geometry.homogeneous import require_finite, require_shapes
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,9 @@ def estimate_similarity(source: F64, target: F64) -> Similarity:
     >>> round(similarity.scale, 9), similarity.t.round(9).tolist()
     (2.0, [1.0, 2.0, 3.0])
     """
-    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) < 3:
-        raise ValueError(
-            f"estimate_similarity needs two (N >= 3, 3) arrays; got {source.shape} and {target.shape}"
-        )
+    require_shapes("estimate_similarity", source=(source, ("N", 3)), target=(target, ("N", 3)))
+    if len(source) < 3:
+        raise ValueError(f"estimate_similarity needs at least 3 points; got {len(source)}")
     require_finite("estimate_similarity", source, target)
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - mean_s, target - mean_t

@@ -25,6 +25,7 @@ from thesisrecon.geometry.homogeneous import (
     homogenize,
     normalizing_transform,
     require_finite,
+    require_shapes,
 )
 from thesisrecon.geometry.lines_and_planes import unit_normals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
@@ -533,13 +534,8 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
     if np.iscomplexobj(points) or np.iscomplexobj(segments):
         raise ValueError("points and segments must be real numbers; got complex ones")
     points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
-    right = points.ndim == 3 and points.shape[::2] == (3, 2)
-    if not right or segments.ndim != 4 or (segments.shape[0], *segments.shape[2:]) != (3, 2, 2):
-        raise ValueError(
-            f"needed points (3, N, 2) and segments (3, M, 2, 2); got {points.shape} and {segments.shape}"
-        )
-    if not (np.isfinite(points).all() and np.isfinite(segments).all()):
-        raise ValueError("points and segments must be finite; some are NaN or infinite")
+    require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
+    require_finite("a trifocal tensor", points, segments)
     if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > LARGEST_PX:
         raise ValueError(f"points and segments must be pixels of an image; some are beyond {LARGEST_PX:g}")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():

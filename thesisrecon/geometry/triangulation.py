@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry.homogeneous import require_finite
+from thesisrecon.geometry.homogeneous import require_finite, require_shapes
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
@@ -500,8 +500,7 @@ def _checked(P: F64, xy: F64) -> tuple[F64, F64]:
     if np.iscomplexobj(P) or np.iscomplexobj(xy):
         raise ValueError("triangulate needs real numbers; got complex ones")
     P, xy = np.ascontiguousarray(P, dtype=np.float64), np.ascontiguousarray(xy, dtype=np.float64)
-    if P.ndim != 3 or P.shape[1:] != (3, 4) or xy.ndim != 3 or xy.shape[0] != len(P) or xy.shape[2] != 2:
-        raise ValueError(f"triangulate needs P (V, 3, 4) and xy (V, N, 2); got {P.shape} and {xy.shape}")
+    require_shapes("triangulate", P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
     if len(P) < 2:
         raise ValueError(f"triangulate needs at least two cameras; got {len(P)}")
     require_finite("triangulate, for its cameras,", P)

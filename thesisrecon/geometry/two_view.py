@@ -17,6 +17,7 @@ from thesisrecon.geometry.homogeneous import (
     homogenize,
     normalizing_transform,
     require_finite,
+    require_shapes,
 )
 
 
@@ -36,8 +37,7 @@ def unit_norm(F: F64) -> F64:
 
 
 def _check(F: F64, caller: str) -> None:
-    if F.shape != (3, 3):
-        raise ValueError(f"{caller} needs a fundamental matrix (3, 3); got {F.shape}")
+    require_shapes(caller, F=(F, (3, 3)))
     require_finite(caller, F)
 
 
@@ -261,8 +261,9 @@ def estimate_homography(xy1: F64, xy2: F64) -> F64:
     >>> np.allclose(H / H[2, 2], [[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [0.0, 0.0, 1.0]])
     True
     """
-    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2 or len(xy1) < 4:
-        raise ValueError(f"estimate_homography needs two (N >= 4, 2) arrays; got {xy1.shape} and {xy2.shape}")
+    require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
+    if len(xy1) < 4:
+        raise ValueError(f"estimate_homography needs at least 4 matches; got {len(xy1)}")
     T1, T2 = normalizing_transform(xy1), normalizing_transform(xy2)
     x1, (u, v) = homogenize(xy1) @ T1.T, (xy2 @ T2[:2, :2].T + T2[:2, 2]).T
     zero = np.zeros_like(x1)

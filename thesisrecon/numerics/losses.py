@@ -18,49 +18,23 @@ from numba import njit
 from thesisrecon.arrays import F64
 
 LossName = Literal["squared", "huber", "soft_l1", "cauchy", "truncated"]
-
-
 LossFunction = Callable[[F64, float], tuple[F64, F64]]
 
 
-def squared(s: F64, delta: float) -> tuple[F64, F64]:  # noqa: ARG001 - one signature for all losses
-    """Evaluate rho = s, least squares.
-
-    Parameters
-    ----------
-    s : ndarray, squared residuals
-    delta : float, no effect
-
-    Returns
-    -------
-    rho, weight : ndarray, loss and its derivative
-    """
+def _squared(s: F64, delta: float) -> tuple[F64, F64]:  # noqa: ARG001 - one signature for all losses
+    """Return rho = s, least squares; ``delta`` has no effect."""
     return s, np.ones_like(s)
 
 
-def huber(s: F64, delta: float) -> tuple[F64, F64]:
-    """Evaluate rho = s below delta^2, 2 delta sqrt(s) - delta^2 above; convex.
-
-    Parameters
-    ----------
-    s : ndarray, squared residuals
-    delta : float, turning point
-
-    Returns
-    -------
-    rho, weight : ndarray, loss and its derivative
-
-    References
-    ----------
-    Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35, 1964.
-    """
+def _huber(s: F64, delta: float) -> tuple[F64, F64]:
+    """Return rho = s below delta^2, 2 delta sqrt(s) - delta^2 above (Huber 1964); convex."""
     root = np.sqrt(np.maximum(s, delta**2))
     inside = s <= delta**2
     return np.where(inside, s, 2.0 * delta * root - delta**2), np.where(inside, 1.0, delta / root)
 
 
 def soft_l1(s: F64, delta: float) -> tuple[F64, F64]:
-    """Evaluate rho = 2 delta^2 (sqrt(1 + s / delta^2) - 1), the smooth relative of Huber's loss; convex.
+    """Return rho = 2 delta^2 (sqrt(1 + s / delta^2) - 1), the smooth relative of Huber's loss; convex.
 
     Parameters
     ----------
@@ -75,46 +49,24 @@ def soft_l1(s: F64, delta: float) -> tuple[F64, F64]:
     return 2.0 * delta**2 * (root - 1.0), 1.0 / root
 
 
-def cauchy(s: F64, delta: float) -> tuple[F64, F64]:
-    """Evaluate rho = delta^2 log(1 + s / delta^2): not convex, needs a good start.
-
-    Parameters
-    ----------
-    s : ndarray, squared residuals
-    delta : float, turning point
-
-    Returns
-    -------
-    rho, weight : ndarray, loss and its derivative
-    """
+def _cauchy(s: F64, delta: float) -> tuple[F64, F64]:
+    """Return rho = delta^2 log(1 + s / delta^2); not convex, needs a good start."""
     ratio = s / delta**2
     return delta**2 * np.log1p(ratio), 1.0 / (1.0 + ratio)
 
 
-def truncated(s: F64, delta: float) -> tuple[F64, F64]:
-    """Evaluate rho = min(s, delta^2), the score of MSAC (Torr and Zisserman 2000).
-
-    Parameters
-    ----------
-    s : ndarray, squared residuals
-    delta : float, turning point
-
-    Returns
-    -------
-    rho, weight : ndarray, loss and its derivative
-    """
+def _truncated(s: F64, delta: float) -> tuple[F64, F64]:
+    """Return rho = min(s, delta^2), the score of MSAC (Torr and Zisserman 2000)."""
     return np.minimum(s, delta**2), np.where(s <= delta**2, 1.0, 0.0)
 
 
 LOSSES: dict[str, LossFunction] = {
-    "squared": squared,
-    "huber": huber,
+    "squared": _squared,
+    "huber": _huber,
     "soft_l1": soft_l1,
-    "cauchy": cauchy,
-    "truncated": truncated,
+    "cauchy": _cauchy,
+    "truncated": _truncated,
 }
-
-
 LOSS_CODES = {name: code for code, name in enumerate(LOSSES)}
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry.homogeneous import require_finite, require_shapes
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.losses import loss_curvature, loss_value, loss_weight
 from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
@@ -266,24 +267,19 @@ def check_cameras(cameras: MetricCameras, X: F64, free: B8) -> None:
     ValueError
         A shape is wrong, a value is not finite or a focal length is not positive.
     """
-    n_views, n_rows, width = len(cameras.R), len(cameras.intrinsics), cameras.intrinsics.shape[-1]
-    shapes = (cameras.R.shape, cameras.t.shape, cameras.intrinsics.shape, cameras.group.shape, X.shape[1:])
-    if width not in INTRINSIC_DOFS or shapes != (
-        (n_views, 3, 3), (n_views, 3), (n_rows, width), (n_views,), (3,)
-    ):  # fmt: skip
-        raise ValueError(
-            f"a metric bundle needs R (V, 3, 3), t (V, 3), intrinsics (G, 6 or 8), group (V,); got {shapes}"
-        )
-    if np.shape(free) != (width,):
-        raise ValueError(
-            f"free needs one flag for each of the {width} intrinsics; got shape {np.shape(free)}"
-        )
-    if cameras.shared is not None and np.shape(cameras.shared) != cameras.intrinsics.shape:
-        raise ValueError(f"shared needs the shape of the intrinsics; got shape {np.shape(cameras.shared)}")
-    finite = (np.isfinite(a).all() for a in (cameras.R, cameras.t, cameras.intrinsics, X))
-    if not all(finite) or not (cameras.intrinsics[:, FOCAL] > 0.0).all():
-        raise ValueError("cameras and points must be finite and focal lengths positive")
-    if n_views and (cameras.group.min() < 0 or cameras.group.max() >= n_rows):
+    require_shapes(
+        "a metric bundle", R=(cameras.R, ("V", 3, 3)), t=(cameras.t, ("V", 3)), group=(cameras.group, ("V",)),
+        intrinsics=(cameras.intrinsics, ("G", "C")), free=(free, ("C",)), X=(X, ("N", 3)),
+    )  # fmt: skip
+    n_rows, width = cameras.intrinsics.shape
+    if width not in INTRINSIC_DOFS:
+        raise ValueError(f"a metric bundle needs 6 or 8 intrinsics; got {width}")
+    if cameras.shared is not None:
+        require_shapes("a metric bundle", shared=(cameras.shared, (n_rows, width)))
+    require_finite("a metric bundle", cameras.R, cameras.t, cameras.intrinsics, X)
+    if not (cameras.intrinsics[:, FOCAL] > 0.0).all():
+        raise ValueError("a metric bundle needs positive focal lengths")
+    if len(cameras.group) and (cameras.group.min() < 0 or cameras.group.max() >= n_rows):
         raise ValueError(f"groups must lie in 0..{n_rows - 1}")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry.homogeneous import require_finite, require_shapes
 
 
 class Observations(NamedTuple):
@@ -86,12 +87,8 @@ def sort_observations(
     view = np.ascontiguousarray(view_index, dtype=np.int64)
     point = np.ascontiguousarray(point_index, dtype=np.int64)
     xy = np.ascontiguousarray(xy, dtype=np.float64)
-    if view.ndim != 1 or view.shape != point.shape or xy.shape != (len(view), 2):
-        raise ValueError(
-            f"observations need (K,), (K,) and (K, 2) arrays; got {view.shape}, {point.shape} and {xy.shape}"
-        )
-    if not np.isfinite(xy).all():
-        raise ValueError("observations must be finite")
+    require_shapes("observations", view_index=(view, ("K",)), point_index=(point, ("K",)), xy=(xy, ("K", 2)))
+    require_finite("observations", xy)
     if len(view) and (view.min() < 0 or view.max() >= n_views or point.min() < 0 or point.max() >= n_points):
         raise ValueError(f"observation indices are beyond the {n_views} views or {n_points} points")
     key = point * max(n_views, 1) + view

@@ -9,7 +9,12 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
+from thesisrecon.geometry.homogeneous import (
+    pixel_conditioning,
+    require_finite,
+    require_shapes,
+    whitening_transform,
+)
 from thesisrecon.numerics.levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
 from thesisrecon.numerics.losses import loss_code, loss_value, loss_weight
 from thesisrecon.numerics.metric_cameras import (
@@ -297,8 +302,7 @@ def _checked_points(
 ) -> tuple[F64, F64, SortedObservations]:
     """Check cameras, points and observations."""
     P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
-    if P.ndim != 3 or P.shape[1:] != (3, 4) or X.ndim != 2 or X.shape[1] != 4:
-        raise ValueError(f"{caller} needs (V, 3, 4) cameras and (N, 4) points; got {P.shape}, {X.shape}")
+    require_shapes(caller, P=(P, ("V", 3, 4)), X=(X, ("N", 4)))
     return P, X, sort_observations(*observations, len(P), len(X))
 
 
@@ -388,14 +392,11 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
         Wrong shapes, or values that are zero or not finite.
     """
     P, X, xy = (np.array(a, dtype=np.float64) for a in (P, X, xy))
-    if P.shape != (3, 4) or X.ndim != 2 or X.shape[1] != 4 or xy.shape != (len(X), 2) or len(X) == 0:
-        raise ValueError(
-            f"refine_camera needs (3, 4), (M, 4) and (M, 2); got {P.shape}, {X.shape}, {xy.shape}"
-        )
+    require_shapes("refine_camera", P=(P, (3, 4)), X=(X, ("M", 4)), xy=(xy, ("M", 2)))
     norms, size = np.linalg.norm(X, axis=1), float(np.linalg.norm(P))
-    finite = np.isfinite(norms).all() and np.isfinite(size) and np.isfinite(xy).all()
-    if not finite or not (norms > 0.0).all() or not size > 0.0:
-        raise ValueError("refine_camera needs finite points and a finite camera that are not zero")
+    require_finite("refine_camera", P, X, xy)
+    if not len(X) or not (norms > 0.0).all() or not size > 0.0:
+        raise ValueError("refine_camera needs points and a camera that are not zero")
     T, M = pixel_conditioning(xy), whitening_transform(X)
     points = X @ M.T
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -494,13 +495,18 @@ def refine_pose(
         Wrong shapes, values that are not finite, or a focal length that is not positive.
     """
     R, t, q, X, xy = (np.array(a, dtype=np.float64) for a in (R, t, intrinsics, X, xy))
-    shapes = R.shape, t.shape, q.shape, X.shape
-    if shapes != ((3, 3), (3,), (8 if q.shape == (8,) else 6,), (len(xy), 3)) or len(X) == 0:
-        raise ValueError(f"refine_pose got R {R.shape}, t {t.shape}, intrinsics {q.shape}, X {X.shape}")
-    if xy.shape != (len(X), 2) or not all(np.isfinite(a).all() for a in (R, t, q, X, xy)) or not q[0] > 0.0:
-        raise ValueError(
-            f"refine_pose needs finite (M, 2) pixels and a positive focal; got {xy.shape}, {q[0]}"
-        )
+    width = 8 if q.shape == (8,) else 6
+    require_shapes(
+        "refine_pose",
+        R=(R, (3, 3)),
+        t=(t, (3,)),
+        intrinsics=(q, (width,)),
+        X=(X, ("M", 3)),
+        xy=(xy, ("M", 2)),
+    )
+    require_finite("refine_pose", R, t, q, X, xy)
+    if not len(X) or not q[0] > 0.0:
+        raise ValueError(f"refine_pose needs points and a positive focal length; got {len(X)} and {q[0]}")
     columns = np.flatnonzero(np.zeros(len(q), bool) if free is None else free)
     # With centred and scaled points the pose unknowns are well conditioned.
     origin = X.mean(axis=0)

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
+from thesisrecon.geometry.homogeneous import pixel_conditioning, require_shapes, whitening_transform
 from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.numerics.losses import loss_code, loss_value, loss_weight
 from thesisrecon.numerics.observations import (
@@ -307,10 +307,7 @@ def refine_projective_bundle(
         Wrong shapes, values that are not finite, or an observed camera or point that is all zero.
     """
     P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
-    if P.ndim != 3 or P.shape[1:] != (3, 4) or X.ndim != 2 or X.shape[1] != 4:
-        raise ValueError(
-            f"a projective bundle needs (V, 3, 4) cameras and (N, 4) points; got {P.shape}, {X.shape}"
-        )
+    require_shapes("refine_projective_bundle", P=(P, ("V", 3, 4)), X=(X, ("N", 4)))
     observations = sort_observations(view_index, point_index, xy, len(P), len(X))
     observed = np.bincount(observations.view_index, minlength=len(P)) > 0
     seen_points = np.diff(observations.start) > 0
