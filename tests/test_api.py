@@ -13,8 +13,9 @@ from tests.synthetic import reconstruction_of
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions
+from thesisrecon.io.exports import _original_from_working
 from thesisrecon.records import Image, TexturedMesh, Tracks
-from thesisrecon.report.summary import _original_from_working, point_colors
+from thesisrecon.report.summary import point_colors
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 

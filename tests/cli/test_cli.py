@@ -298,7 +298,9 @@ def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, cap
     assert "of 2 image pairs accepted (15 are possible)" in capsys.readouterr().out
     pairs = json.loads((out / "summary.json").read_text(encoding="utf-8"))["pairs"]
     assert (pairs["matched"], pairs["possible"], pairs["selection"]) == (2, 15, "the listed pairs")
-    assert "2 of 15 pairs were tried: the listed pairs." in (out / "report.html").read_text(encoding="utf-8")
+    assert "2 of 15 pairs were matched: the listed pairs." in (out / "report.html").read_text(
+        encoding="utf-8"
+    )
     for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is not among"), ("", "leaves no pair")):
         knowledge.write_text(line, encoding="utf-8")
         assert run_command([*given, "--pairs", str(knowledge), "--overwrite"]) == 2

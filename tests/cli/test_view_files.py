@@ -14,10 +14,10 @@ from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import RenderOptions, render_run
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.io.exports import cameras_table
 from thesisrecon.io.files import write_json
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.records import Image, TexturedMesh
-from thesisrecon.report.summary import cameras_table
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.texture_atlas import TextureAtlas
 

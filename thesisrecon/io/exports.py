@@ -1,4 +1,4 @@
-"""Point clouds as PLY, and the cameras of a finished run from its ``cameras.json``."""
+"""Point clouds as PLY, and ``cameras.json``: the cameras of a run in original pixels."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError
 from thesisrecon.io.files import read_json, write_atomically
+from thesisrecon.records import Image, Reconstruction
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 _MAX_SIDE_PX = 2**24
@@ -58,6 +59,57 @@ def write_point_cloud(path: Path, xyz: F64, rgb: NDArray[np.uint8]) -> None:
     write_atomically(path, "".join(f"{line}\n" for line in header).encode("ascii") + vertices.tobytes())
 
 
+def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> dict[str, Any]:
+    """Build ``cameras.json``: K, R (world-to-camera), t, centre and distortion of every registered view.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Metric, with K and distortion.
+    images : tuple of Image
+        The V views.
+
+    Returns
+    -------
+    dict
+        Content of the file, in original pixels.
+
+    Raises
+    ------
+    ValueError
+        If the reconstruction is not metric.
+    """
+    if reconstruction.K is None or reconstruction.distortion is None:
+        raise ValueError(f"cameras_table needs a metric reconstruction; got {reconstruction.stratum}")
+    cameras = []
+    for i in np.flatnonzero(reconstruction.registered).tolist():
+        K, image = reconstruction.K[i], images[i]
+        Rt = np.linalg.solve(K, reconstruction.P[i])
+        cameras.append(
+            {
+                "name": image.name,
+                "width": image.original_size[0],
+                "height": image.original_size[1],
+                "K": _original_from_working(image.scale) @ K,
+                "distortion": reconstruction.distortion[i],
+                "R": Rt[:, :3],
+                "t": Rt[:, 3],
+                "centre": -Rt[:, :3].T @ Rt[:, 3],
+            }
+        )
+    convention = (
+        "x ~ K d(R X + t), d(u) = u (1 + k1 |u|^2 + k2 |u|^4 + k3 |u|^6), distortion = (k1, k2, k3); "
+        "(0, 0) is the centre of the top-left pixel"
+    )
+    return {"convention": convention, "cameras": cameras}
+
+
+def _original_from_working(scale: float) -> F64:
+    """Return the (3, 3) map from working to original pixels, (x + 0.5) / scale - 0.5."""
+    offset = 0.5 / scale - 0.5
+    return np.array([[1 / scale, 0.0, offset], [0.0, 1 / scale, offset], [0.0, 0.0, 1.0]])
+
+
 def read_cameras(path: Path) -> dict[str, Camera]:
     """Read the registered cameras of a run, in original pixels and without lens distortion.
 
@@ -82,7 +134,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     try:
         cameras = {str(entry["name"]): _camera(entry) for entry in content["cameras"]}
     except (TypeError, KeyError, ValueError, OverflowError):
-        raise UsageError(f"{path} does not hold valid cameras written by thesisrecon") from None
+        raise UsageError(f"{path} does not hold cameras written by thesisrecon") from None
     if not cameras:
         raise UsageError(f"{path} holds no camera; no image of this run was registered")
     return cameras

@@ -159,57 +159,6 @@ def _median(distances: F64) -> float | None:
     return float(np.median(distances)) if len(distances) else None
 
 
-def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> dict[str, Any]:
-    """Build ``cameras.json``: K, R (world-to-camera), t, centre and distortion of every registered view.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Metric, with K and distortion.
-    images : tuple of Image
-        The V views.
-
-    Returns
-    -------
-    dict
-        Content of the file, in original pixels.
-
-    Raises
-    ------
-    ValueError
-        If the reconstruction is not metric.
-    """
-    if reconstruction.K is None or reconstruction.distortion is None:
-        raise ValueError(f"cameras_table needs a metric reconstruction; got {reconstruction.stratum}")
-    cameras = []
-    for i in np.flatnonzero(reconstruction.registered).tolist():
-        K, image = reconstruction.K[i], images[i]
-        Rt = np.linalg.solve(K, reconstruction.P[i])
-        cameras.append(
-            {
-                "name": image.name,
-                "width": image.original_size[0],
-                "height": image.original_size[1],
-                "K": _original_from_working(image.scale) @ K,
-                "distortion": reconstruction.distortion[i],
-                "R": Rt[:, :3],
-                "t": Rt[:, 3],
-                "centre": -Rt[:, :3].T @ Rt[:, 3],
-            }
-        )
-    convention = (
-        "x ~ K d(R X + t), d(u) = u (1 + k1 |u|^2 + k2 |u|^4 + k3 |u|^6), distortion = (k1, k2, k3); "
-        "(0, 0) is the centre of the top-left pixel"
-    )
-    return {"convention": convention, "cameras": cameras}
-
-
-def _original_from_working(scale: float) -> F64:
-    """Return the (3, 3) map from working to original pixels, (x + 0.5) / scale - 0.5."""
-    offset = 0.5 / scale - 0.5
-    return np.array([[1 / scale, 0.0, offset], [0.0, 1 / scale, offset], [0.0, 0.0, 1.0]])
-
-
 def point_colors(reconstruction: Reconstruction, images: tuple[Image, ...]) -> NDArray[np.uint8]:
     """Average the colours of the observations of each point.
 
