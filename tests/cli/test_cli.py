@@ -239,7 +239,7 @@ def test_ctrl_c_states_how_to_resume(photographs, tmp_path, monkeypatch, capsys)
 
     monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", interrupt)
     assert run_command(["reconstruct", str(photographs), "-o", str(tmp_path / "out")]) == 130
-    assert "repeat the command to continue" in capsys.readouterr().err
+    assert "repeat the command to resume" in capsys.readouterr().err
 
 
 def test_an_error_in_the_program_is_a_sentence_too(photographs, tmp_path, monkeypatch, capsys):

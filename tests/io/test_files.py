@@ -106,7 +106,7 @@ def test_a_disk_that_is_full_or_read_only(tmp_path):
         with small_disk(tmp_path / "disk", "64k") as disk:
             write_json(disk / "a.json", [1])
             for name in ("a.json", "b.json"):
-                with pytest.raises(OutputError, match="No space left on device; make room there"):
+                with pytest.raises(OutputError, match="No space left on device; free space there"):
                     write_text(disk / name, "x" * 100_000)
             assert list(entries(disk)) == ["a.json"]
             assert read_json(disk / "a.json") == [1]
@@ -147,7 +147,7 @@ def test_the_sentence_survives_the_way_from_a_worker():
     refused = OutputError(Path("a"), OSError(errno.ENOSPC, "No space left on device"), kept="out")
     again = pickle.loads(pickle.dumps(refused))
     assert str(again) == str(refused)
-    assert str(refused).endswith("make room there, then the same command goes on from what is kept in out")
+    assert str(refused).endswith("free space there, then repeat the command to resume from out")
     assert set(WRITE_ERRNOS) <= set(REMEDIES)
 
 

@@ -131,7 +131,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(tmp_path):
         environment={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert (stop.code, stop.left) == (130, 0)
-    advice = f"repeat the command to continue from the results cached in {out}"
+    advice = f"repeat the command to resume from {out}"
     assert stop.said == f"thesisrecon: interrupted; {advice}\n"
     assert run_command([*arguments, "-o", str(out)]) == 0
     assert run_command([*arguments, "-o", str(tmp_path / "whole")]) == 0

@@ -164,7 +164,7 @@ def _run(
     from thesisrecon.pipeline.reconstruction import reconstruct as run_pipeline
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    advice = f"repeat the command to continue from the results cached in {printable(str(out))}"
+    advice = f"repeat the command to resume from {printable(str(out))}"
     with interruptible(advice), progress_bars() as progress:
         result: RunResult = run_pipeline(images, out, config=config, seed=seed, progress=progress, **options)
     typer.echo(summary_text(result.summary, out))
