@@ -18,8 +18,6 @@ from thesisrecon.geometry.triangulation import triangulate_linear
 from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
 from thesisrecon.records import Tracks, TwoView
 
-# Share of a pair's matches that one homography explains beyond which the pair shows no parallax: what is left
-# is of the size of the wrong matches that verification lets through.
 # Homography inlier ratio beyond which a pair shows no parallax: the rest are as many as undetected wrong
 # matches.
 NO_PARALLAX = 0.95

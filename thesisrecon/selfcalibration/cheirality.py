@@ -263,7 +263,7 @@ def _unit_rows(A: F64) -> F64:
 
 
 def _deepest_plane(X: F64, C: F64) -> F64 | None:
-    """Return the plane v with X v >= d, C v >= d, |v| <= 1 and the largest d (HZ 21.7); None unless d > 0."""
+    """Return the plane v with X v >= d, C v >= d, |v| <= 1 and the largest d (HZ 21); None unless d > 0."""
     rows = np.concatenate([X, C])
     A = np.column_stack([-rows, np.ones(len(rows))])
     solution = scipy.optimize.linprog(

@@ -1,4 +1,4 @@
-"""Critical motions: distance of the cameras from motions that self-calibration cannot resolve (HZ 19.11).
+"""Critical motions: how close cameras are to motions that self-calibration cannot resolve (HZ 19.8, 19.9).
 
 P. Sturm, "Critical motion sequences for monocular self-calibration and uncalibrated Euclidean
 reconstruction", CVPR 1997, and BMVC 1999 for varying focal lengths; F. Kahl, B. Triggs, K. Astrom, "Critical

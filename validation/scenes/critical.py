@@ -105,12 +105,12 @@ def _turntable(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
     return R @ turn.swapaxes(1, 2), turn @ start
 
 
-def _planar(w: _Wishes, rng: np.random.Generator, climb: float = 0.0) -> tuple[F64, F64]:
+def _planar(w: _Wishes, rng: np.random.Generator, axial: float = 0.0) -> tuple[F64, F64]:
     """A tripod rolled over the floor: headings of its own at every place, the tilt as it was."""
     azimuth = rng.uniform(-0.6, 0.6, w.views)
     C = w.distance * np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=1)
     C *= rng.uniform(0.75, 1.25, (w.views, 1))
-    C[:, 2] = w.distance * (rng.uniform(-0.1, 0.4) + climb * rng.uniform(-0.5, 0.5, w.views))
+    C[:, 2] = w.distance * (rng.uniform(-0.1, 0.4) + axial * rng.uniform(-0.5, 0.5, w.views))
     start = look_at(
         np.array([w.distance, 0.0, C[:, 2].mean()]), 0.1 * rng.normal(size=3), rng.uniform(-0.3, 0.3)
     )
@@ -121,7 +121,7 @@ def _planar(w: _Wishes, rng: np.random.Generator, climb: float = 0.0) -> tuple[F
 
 def _parallel_axes(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
     """The same with a lift."""
-    return _planar(w, rng, climb=rng.uniform(0.2, 0.6))
+    return _planar(w, rng, axial=rng.uniform(0.2, 0.6))
 
 
 def _optical_axis(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
