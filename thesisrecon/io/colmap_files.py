@@ -40,20 +40,24 @@ class _Table(NamedTuple):
     """Layout of one file.
 
     ``fields``: I, Q, B unsigned integers of 4, 8, 1 bytes; d double; M camera model, S sensor type (int32 in
-    binary files, words in text); N name. ``entry`` is the element of the list at the end of a record, which
-    is ``counted`` in binary files and stands on a ``second_line`` of text files.
+    binary files, words in text); N name. ``header`` and ``total`` begin a text file. ``entry`` is the element
+    of the list at the end of a record, which stands on a ``second_line`` of text files or not.
     """
 
     fields: str
-    entry: np.dtype[Any] | None
-    counted: bool
-    second_line: bool
     header: str
-    total: str
+    total: str = ""
+    entry: np.dtype[Any] | None = None
+    second_line: bool = False
 
     @property
     def packing(self) -> struct.Struct:
         return struct.Struct("<" + self.fields.replace("M", "i").replace("S", "i").replace("N", ""))
+
+    @property
+    def counted(self) -> bool:
+        """Whether a binary record holds the length of its list; that of the parameters follows from M."""
+        return self.entry is not None and self.entry.names is not None
 
     @property
     def smallest(self) -> int:
@@ -66,47 +70,34 @@ _TRACK_ENTRY = np.dtype([("image", "<u4"), ("row", "<u4")])
 _TABLES = {
     "rigs": _Table(
         "IISI",
-        None,
-        False,
-        False,
         "# Rig list, one line each:\n#   RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]\n",
-        "",
     ),
     "cameras": _Table(
         "IMQQ",
-        np.dtype("<f8"),
-        False,
-        False,
         "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n",
         "# Number of cameras: {}\n",
+        np.dtype("<f8"),
     ),
     "frames": _Table(
         "IIdddddddISIQ",
-        None,
-        False,
-        False,
         "# Frame list, one line each:\n#   FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], "
         "NUM_DATA_IDS, DATA_IDS[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)\n",
-        "",
     ),
     "images": _Table(
         "IdddddddIN",
-        _POINT_2D,
-        True,
-        True,
         "# Image list with two lines of data per image:\n"
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
         "#   POINTS2D[] as (X, Y, POINT3D_ID)\n",
         "# Number of images: {}\n",
+        _POINT_2D,
+        second_line=True,
     ),
     "points3D": _Table(
         "QdddBBBd",
-        _TRACK_ENTRY,
-        True,
-        False,
         "# 3D point list with one line of data per point:\n"
         "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n",
         "# Number of points: {}\n",
+        _TRACK_ENTRY,
     ),
 }
 
