@@ -144,7 +144,7 @@ def dual_line(L: F64) -> F64:
 
     Parameters
     ----------
-    L : ndarray (..., 4, 4), pluecker matrices
+    L : ndarray (..., 4, 4), Pluecker matrices
 
     Returns
     -------
@@ -162,7 +162,7 @@ def meet_of_line_and_plane(L: F64, plane: F64) -> F64:
 
     Parameters
     ----------
-    L : ndarray (..., 4, 4), pluecker matrices of lines
+    L : ndarray (..., 4, 4), Pluecker matrices of lines
     plane : ndarray (..., 4), planes
 
     Returns
@@ -184,7 +184,7 @@ def join_of_line_and_point(L: F64, X: F64) -> F64:
 
     Parameters
     ----------
-    L : ndarray (..., 4, 4), pluecker matrices of lines
+    L : ndarray (..., 4, 4), Pluecker matrices of lines
     X : ndarray (..., 4), homogeneous points
 
     Returns
@@ -199,7 +199,7 @@ def lines_meet_residual(L: F64, M: F64) -> F64:
 
     Parameters
     ----------
-    L, M : ndarray (..., 4, 4), pluecker matrices of lines of space
+    L, M : ndarray (..., 4, 4), Pluecker matrices of lines of space
 
     Returns
     -------
@@ -215,7 +215,7 @@ def project_line(P: F64, L: F64) -> F64:
     Parameters
     ----------
     P : ndarray (3, 4), camera
-    L : ndarray (..., 4, 4), pluecker matrices of lines
+    L : ndarray (..., 4, 4), Pluecker matrices of lines
 
     Returns
     -------

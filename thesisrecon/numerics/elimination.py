@@ -95,7 +95,7 @@ def eliminate_points(
     Parameters
     ----------
     first, last : int, range of points
-    damping : float, levenberg-Marquardt damping
+    damping : float, Levenberg-Marquardt damping
     J : Jacobians, residuals and Jacobians
     index : BlockIndex, blocks
     sums : ReducedSums, reduced system, updated
@@ -339,7 +339,7 @@ def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
     Parameters
     ----------
     start : ndarray (N + 1,) of int, first observation of each point
-    B : ndarray (K, 2, 3), jacobians by the points
+    B : ndarray (K, 2, 3), Jacobians by the points
     leverage : ndarray (K, 2), output
     """
     M = np.empty((3, 3))

@@ -75,8 +75,8 @@ def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
     Parameters
     ----------
     p : ndarray (n, d), unit rows
-    v : ndarray (n, d), householder vectors
-    beta : ndarray (n,), householder factors
+    v : ndarray (n, d), Householder vectors
+    beta : ndarray (n,), Householder factors
     step : ndarray (n, d - 1), steps
     out : ndarray (n, d), output: moved unit rows
     """

@@ -103,7 +103,7 @@ def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
     ----------
     H : ndarray (n, n), symmetric matrix J'J
     g : ndarray (n,), gradient J'r
-    damping : float, levenberg-Marquardt damping
+    damping : float, Levenberg-Marquardt damping
     step : ndarray (n,), output
 
     Returns
