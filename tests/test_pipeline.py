@@ -252,7 +252,7 @@ def test_another_run_is_rejected_and_overwrite_keeps_equal_records(tmp_path):
     changed = fake_config(
         projective=fakes.FakeProjective(), selfcalibration=fakes.FakeCalibrator(identifiable=False)
     )
-    with pytest.raises(UsageError, match=r"selfcalibration\.identifiable was true there and is false here"):
+    with pytest.raises(UsageError, match=r"selfcalibration\.identifiable was true and is now false"):
         run(tmp_path, config=changed)
     assert CALLS == []
     result = run(tmp_path, config=changed, overwrite=True)
@@ -268,7 +268,7 @@ def test_the_folder_is_judged_before_any_photograph_is_read(tmp_path, monkeypatc
         raise AssertionError("photographs were read")
 
     monkeypatch.setattr("thesisrecon.io.images.read_images", read_nothing)
-    with pytest.raises(UsageError, match="seed was 0 there and is 1 here"):
+    with pytest.raises(UsageError, match="seed was 0 and is now 1"):
         run(tmp_path / "out", seed=1)
     with pytest.raises(UsageError, match="cannot be written"):
         run(tmp_path / "file" / "out")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from thesisrecon.runtime.signals import obey_signals
+from thesisrecon.runtime.signals import install_signal_handlers
 
 
 def main() -> None:
     """The entry point of the command; the rest is loaded when Ctrl-C is already obeyed."""
-    obey_signals("thesisrecon")
+    install_signal_handlers("thesisrecon")
     from thesisrecon.cli.main import main as run
 
     run()

@@ -18,8 +18,7 @@ from thesisrecon.pipeline.features_to_tracks import ImageInput, match_pair
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import DisparityMap, Image, Reconstruction, SelfCalibration, Tracks
 from thesisrecon.runtime.run import stream
-from thesisrecon.selfcalibration.affine import upgrade_to_affine
-from thesisrecon.selfcalibration.stratified import Stratified
+from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine
 from thesisrecon.view_interpolation import interpolate_view
 from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render

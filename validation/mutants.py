@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon.errors import counted
-from thesisrecon.runtime.signals import obey_signals
+from thesisrecon.runtime.signals import install_signal_handlers
 from validation.harness.planting import CopiedTree, imports_of
 from validation.harness.process import own_cores, run_process
 from validation.scenes.real import ROOT
@@ -373,5 +373,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    obey_signals("mutants")
+    install_signal_handlers("mutants")
     raise SystemExit(main())

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from thesisrecon.errors import counted
-from thesisrecon.runtime.signals import obey_signals
+from thesisrecon.runtime.signals import install_signal_handlers
 from validation.harness.gates import Gate, read_gates
 from validation.harness.planting import CopiedTree
 from validation.harness.process import last_words, own_cores, run_process
@@ -252,5 +252,5 @@ def _chosen(mutations: Mapping[str, Mutation], only: Sequence[str] | None) -> li
 
 
 if __name__ == "__main__":
-    obey_signals("mutations")
+    install_signal_handlers("mutations")
     raise SystemExit(main())

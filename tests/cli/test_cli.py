@@ -147,7 +147,7 @@ def test_a_finished_run_is_not_touched_by_another_config(killed_and_resumed, pho
     before = (out / "summary.json").read_bytes()
     arguments = ["reconstruct", str(photographs), "-o", str(out), "--max-size", "700"]
     assert run_command(arguments) == 2
-    assert "images.max_size_px was 640 there and is 700 here" in capsys.readouterr().err
+    assert "images.max_size_px was 640 and is now 700" in capsys.readouterr().err
     assert (out / "summary.json").read_bytes() == before
 
 

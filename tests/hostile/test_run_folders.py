@@ -134,7 +134,7 @@ def test_an_invalid_manifest_is_rewritten(make, tmp_path, run_cli):
 
 
 RUN_FILES = [
-    ("another version", writes('{"version": 2, "seed": 0}'), "version was 2 there and is 1 here"),
+    ("another version", writes('{"version": 2, "seed": 0}'), "version was 2 and is now 1"),
     ("a list", writes("[1, 2]"), "holds another run"),
     ("wrong types", writes('{"version": 1, "seed": {}, "settings": []}'), "seed was {} there"),
     ("wrong photographs", writes('{"version": 1, "photographs": [3]}'), "holds another run"),

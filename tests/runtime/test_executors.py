@@ -130,7 +130,7 @@ def test_a_killed_worker_process_is_reported_and_the_run_continues(tmp_path):
     whole, config = undisturbed(tmp_path), deadly(tmp_path)
     given = {"config": config, "until": "metric", "threads": 2, "executor": "processes"}
     with pytest.raises(
-        WorkersLost, match=r"ended unexpectedly .* \(in the stage matches\).* goes on from there"
+        WorkersLost, match=r"ended unexpectedly .* \(in the stage matches\).* repeat the command to resume"
     ):
         reconstruct(photographs(4), tmp_path / "out", **given)
     reconstruct(photographs(4), tmp_path / "out", **given)
@@ -157,7 +157,7 @@ def lonely():
 def test_a_scheduler_that_dies_is_reported_and_the_run_continues(lonely, tmp_path, monkeypatch):
     executor, running = lonely
     monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
-    monkeypatch.setattr(workers, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(workers, "CHECK_S", 0.5)
 
     def close_at_matches(stage, done, _):
         if stage == "matches" and done == 2:
@@ -187,7 +187,7 @@ class SlowMatcher(fakes.FakeMatcher):
 
 @pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])
 def test_an_invalid_address_is_rejected_before_any_output(port, tmp_path):
-    with pytest.raises(UsageError, match=r"dask://HOST:PORT, for instance .* got 'dask://there"):
+    with pytest.raises(UsageError, match=r"dask://HOST:PORT, for example .* got 'dask://there"):
         reconstruct(photographs(2), tmp_path / "out", config=fake_config(), executor=f"dask://there:{port}")
     assert not (tmp_path / "out").exists()
 
@@ -260,7 +260,7 @@ def test_workers_may_become_fewer_in_the_middle():
     there, done = iter([4]), list[int]()
     with futures.ThreadPoolExecutor(1) as pool:
         remote = workers._Remote(pool, lambda: next(there, 1))
-        workers._hand_out(remote, (abs, False), [(n,) for n in range(20)], lambda n, _: done.append(n))
+        workers._run_all(remote, (abs, False), [(n,) for n in range(20)], lambda n, _: done.append(n))
     assert sorted(done) == list(range(20))
 
 
@@ -273,7 +273,7 @@ def test_prepared_views_stay_within_their_memory_bound(monkeypatch):
             made.append(features)
             return np.zeros(100)
 
-    monkeypatch.setattr(preparing, "KEPT_BYTES", 4 * 800)
+    monkeypatch.setattr(preparing, "CACHE_BYTES", 4 * 800)
     views = PreparedViews(Counting(), {i: (None, i) for i in range(6)})
     assert [len(view) for view in views] == [100] * 6
     assert [views[5] is views[5], made] == [True, [0, 1, 2, 3, 4, 5]]
@@ -294,5 +294,5 @@ def test_batches_hold_every_pair_once_and_few_views(pairs, workers_there):
     assert len(dealt) >= min(len(numbers), 8 * workers_there)
     assert min(len(batch) for batch in dealt[:-1]) == max(len(batch) for batch in dealt)
     for batch in dealt:
-        assert len(batch) <= preparing.LARGEST_BATCH
+        assert len(batch) <= preparing.MAX_BATCH
         assert len({view for n in batch for view in every[n]}) <= 6 * len(batch) ** 0.5

@@ -137,8 +137,8 @@ def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp
     with directory.claim(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
     changed = [
-        ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 there and is 6 here"),
-        ({**IDENTITY, "seed": 1}, "seed was 0 there and is 1"),
+        ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 and is now 6"),
+        ({**IDENTITY, "seed": 1}, "seed was 0 and is now 1"),
         ({**IDENTITY, "photographs": {"a.jpg": "1"}}, "without 'b.jpg'"),
         ({**IDENTITY, "photographs": {"a.jpg": "1", "b.jpg": "3"}}, "a changed 'b.jpg'"),
         (
@@ -193,7 +193,7 @@ def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_p
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
     with (
-        pytest.raises(UsageError, match=r"holds 'letter\.txt', which is of no run"),
+        pytest.raises(UsageError, match=r"holds 'letter\.txt', which thesisrecon did not create"),
         RunDirectory(tmp_path).claim(IDENTITY, overwrite=True),
     ):
         pass
@@ -366,8 +366,8 @@ def test_a_run_stopped_by_a_full_disk_resumes(share, whole, tmp_path):
     with disk_ends(1 + round(share * (count - 1)), errno.ENOSPC), pytest.raises(OutputError) as refused:
         run(out)
     assert str(refused.value).endswith(
-        "cannot be written: No space left on device; make room there, then the same command goes on from "
-        f"what is kept in {out}"
+        "cannot be written: No space left on device; free space there, then repeat the command to resume from "
+        f"{out}"
     )
     there = outputs(out)
     assert {name: wanted.get(name) for name in there} == there
@@ -409,7 +409,7 @@ def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, capsys):
     except PermissionError:
         refusal = refused_at(runs, 3, errno.ENOSPC, wanted)
     assert refusal.wrong == ""
-    assert "No space left on device; make room there" in refusal.said
+    assert "No space left on device; free space there" in refusal.said
 
     def compile_kernels(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device", "kernels/index.nbi")
@@ -418,7 +418,7 @@ def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, capsys):
     assert run_command(["reconstruct", str(runs.images), "-o", str(tmp_path / "other")]) == 2
     said = capsys.readouterr().err
     assert said == (
-        "thesisrecon: kernels/index.nbi cannot be written: No space left on device; make room there\n"
+        "thesisrecon: kernels/index.nbi cannot be written: No space left on device; free space there\n"
     )
 
 

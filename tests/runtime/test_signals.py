@@ -25,7 +25,7 @@ import hashlib, sys, time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from thesisrecon.runtime.signals import with_resume_advice, install_signal_handlers
-from thesisrecon.workers import ProcessPool
+from thesisrecon.runtime.executors import ProcessPool
 if __name__ == "__main__":
     install_signal_handlers("toy")
     with with_resume_advice("it goes on\\nlater"):
@@ -89,7 +89,7 @@ def test_a_program_stops_at_any_time(what, asked, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ready = tmp_path / "ready"
     stop = stopped(program(tmp_path, AT_WORK[what]), ready.exists, asked, environment=environment)
-    word = "interrupted" if asked == signal.SIGINT else "told to end"
+    word = "interrupted" if asked == signal.SIGINT else "terminated"
     assert (stop.code, stop.said, stop.left) == (CODES[asked], f"toy: {word}; it goes on later\n", 0)
 
 
@@ -99,9 +99,9 @@ def test_a_command_is_ended_while_it_is_loaded(name, slow, asked, tmp_path):
     ready = tmp_path / "ready"
     program = [sys.executable, "-c", LOADING, str(ready), name, f"{name}.{slow}"]
     stop = stopped(program, ready.exists, asked, environment={**os.environ, "PYTHONPATH": str(ROOT)})
-    word = "interrupted" if asked == signal.SIGINT else "told to end"
+    word = "interrupted" if asked == signal.SIGINT else "terminated"
     assert stop.code == CODES[asked]
-    assert stop.said == f"{name}: {word}; give the same command again\n"
+    assert stop.said == f"{name}: {word}; repeat the command to resume\n"
 
 
 def test_signals_ignored_at_start_stay_ignored(tmp_path):

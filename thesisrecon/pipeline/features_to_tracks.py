@@ -1,4 +1,4 @@
-"""Corners, matches and tracks: 4.2.1, 4.2.2 and chapter 5."""
+"""Features, matches, epipolar geometry and tracks: 4.2.1, 4.2.2 and chapter 5."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io.images import read_image
-from thesisrecon.pipeline.state import PreparedViews, Work, batches_of_pairs, near_in_pairs
+from thesisrecon.pipeline.state import PipelineState, PreparedViews, batch_pairs, cache_friendly_order
 from thesisrecon.records import Features, Image, PairChoice, TwoView
 from thesisrecon.runtime.run import Batch, stream
 
@@ -22,17 +22,23 @@ MIN_CORNERS = 16
 # ---------------------------------------------------------------- 4.2.1: features
 
 
-def find_features(work: Work) -> None:
-    run, images = work.run, work.result.images
+def find_features(state: PipelineState) -> None:
+    """Detect the features of all images (4.2.1).
+
+    Parameters
+    ----------
+    state : PipelineState
+        ``result.features`` is set.
+    """
+    run, images = state.run, state.result.images
     variant = run.variant_key("features")
     keys = {
-        f"{i:05d}": run.key("features", variant, photograph.digest)
-        for i, photograph in enumerate(work.photographs.decoded)
+        f"{i:05d}": run.key("features", variant, image.digest) for i, image in enumerate(state.inputs.decoded)
     }
-    features = run.kept_all(
-        "features", keys, _detect_all, lambda missing: (([i], (work.config, [images[i]])) for i in missing)
+    features = run.map_cached(
+        "features", keys, _detect_all, lambda missing: (([i], (state.config, [images[i]])) for i in missing)
     )
-    work.result = replace(work.result, features=tuple(features))
+    state.result = replace(state.result, features=tuple(features))
     counts = [len(f.xy) for f in features]
     poor = [
         f"{image.name} has only {counted(n, 'corner')}"
@@ -51,35 +57,62 @@ def _detect_all(config: PipelineConfig, images: Sequence[Image]) -> list[Feature
 
 
 def detect_features(config: PipelineConfig, image: Image) -> Features:
-    """Detect the features of one image (4.2.1)."""
+    """Detect the features of one image (4.2.1).
+
+    Parameters
+    ----------
+    config : PipelineConfig
+        Settings.
+    image : Image
+        The image.
+
+    Returns
+    -------
+    Features
+        Corners and patches.
+    """
     return config.features.detect(image)
 
 
 # ---------------------------------------------------------------- 4.2.2 and chapter 5: pairs of views
 
 
-def choose_pairs(work: Work) -> None:
-    run, images, features = work.run, work.result.images, work.result.features
+def select_pairs(state: PipelineState) -> None:
+    """Select the pairs of images to match.
+
+    Parameters
+    ----------
+    state : PipelineState
+        ``result.pair_choice`` is set.
+    """
+    run, images, features = state.run, state.result.images, state.result.features
     names = [image.name for image in images]
     key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
     run.progress("pairs", 0, 1)
-    choice: PairChoice = run.kept(
+    choice: PairChoice = run.cached(
         "pairs",
         "choice",
         key,
-        lambda: work.config.pairs.select(
+        lambda: state.config.pairs.select(
             names, features, map_all=run.workers.map_all, rng=stream(run.seed, "pairs")
         ),
     )
-    work.result = replace(work.result, pair_choice=choice)
+    state.result = replace(state.result, pair_choice=choice)
     possible = len(images) * (len(images) - 1) // 2
     counts = {"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
     run.finish("pairs", counts=counts)
     run.progress("pairs", 1, 1)
 
 
-def match_pairs(work: Work) -> None:
-    run, result = work.run, work.result
+def match_pairs(state: PipelineState) -> None:
+    """Match the selected pairs and estimate their epipolar geometry (4.2.2 and chapter 5).
+
+    Parameters
+    ----------
+    state : PipelineState
+        ``result.pairs`` is set.
+    """
+    run, result = state.run, state.result
     assert result.pair_choice is not None
     pairs = [(int(i), int(j)) for i, j in result.pair_choice.pairs]
     variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
@@ -90,44 +123,47 @@ def match_pairs(work: Work) -> None:
     }
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
-        views = _prepared(work)
+        views = _prepared(state)
         if run.workers.in_process:
-            dealt = [[n] for n in near_in_pairs(pairs, missing)]
+            groups = [[n] for n in cache_friendly_order(pairs, missing)]
         else:
-            dealt = batches_of_pairs(pairs, missing, run.workers.parallel())
-        for numbers in dealt:
+            groups = batch_pairs(pairs, missing, run.workers.parallel())
+        for numbers in groups:
             some = [pairs[n] for n in numbers]
-            given = views if run.workers.in_process else views.part({view for pair in some for view in pair})
-            yield numbers, (work.config, given, some, run.seed)
+            if run.workers.in_process:
+                given = views
+            else:
+                given = views.subset({view for pair in some for view in pair})
+            yield numbers, (state.config, given, some, run.seed)
 
-    two_views: list[TwoView] = run.kept_all("matches", keys, _match_all, batches)
-    work.result = replace(result, pairs=tuple(two_views))
+    two_views: list[TwoView] = run.map_cached("matches", keys, _match_all, batches)
+    state.result = replace(result, pairs=tuple(two_views))
     accepted = [pair for pair in two_views if pair.accepted]
     counts = {"pairs": len(pairs), "accepted": len(accepted), "verified": sum(p.inliers for p in accepted)}
     counts["undetermined"] = sum(pair.undetermined for pair in accepted)
     metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
-    run.finish("matches", counts=counts, metrics=metrics, warnings=_open_pairs(accepted))
+    run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
 
 
-def _open_pairs(accepted: Sequence[TwoView]) -> list[str]:
-    """A sentence where the geometry of most pairs is open: what follows rests on few."""
+def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
+    """A warning if the epipolar geometry of most pairs is degenerate."""
     undetermined = [pair for pair in accepted if pair.undetermined]
     if 2 * len(undetermined) <= len(accepted):
         return []
     kinds = Counter(pair.configuration for pair in undetermined)
-    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     return [
-        f"{len(undetermined)} of {len(accepted)} accepted pairs leave their epipolar geometry undetermined "
-        f"({told})"
+        f"The epipolar geometry of {len(undetermined)} of {len(accepted)} accepted pairs is degenerate "
+        f"({listed})"
     ]
 
 
-def _prepared(work: Work) -> PreparedViews:
-    """What matching needs of each view, made only when something must be computed from it."""
-    if work.prepared is None:
-        given = zip(work.result.images, work.result.features, strict=True)
-        work.prepared = PreparedViews(work.config.matching, dict(enumerate(given)))
-    return work.prepared
+def _prepared(state: PipelineState) -> PreparedViews:
+    """Prepared views, made only if a pair must be computed."""
+    if state.prepared is None:
+        given = zip(state.result.images, state.result.features, strict=True)
+        state.prepared = PreparedViews(state.config.matching, dict(enumerate(given)))
+    return state.prepared
 
 
 def _match_all(
@@ -187,7 +223,24 @@ def match_pair(
 
 
 def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
-    """Match, estimate F, verify; a pair that cannot give an F is a refused pair, not an end of the run."""
+    """Match two prepared views, estimate F and verify it.
+
+    Parameters
+    ----------
+    config : PipelineConfig
+        Settings.
+    view1, view2 : object
+        Views prepared by ``config.matching``.
+    pair : tuple of int
+        Their numbers.
+    seed : int
+        Random seed.
+
+    Returns
+    -------
+    TwoView
+        The pair, rejected with a reason if no F can be estimated.
+    """
     rng = stream(seed, "matches", *pair)
     candidates = 0
     try:
@@ -198,10 +251,10 @@ def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int,
         fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
         return config.verification.verify(matches, fit, rng)
     except StageFailure as failure:
-        return _refused_pair(pair, candidates, str(failure))
+        return _rejected_pair(pair, candidates, str(failure))
 
 
-def _refused_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:
+def _rejected_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:
     nothing = np.zeros(0, dtype=np.int64)
     return TwoView(
         i=pair[0],
@@ -220,25 +273,37 @@ def _refused_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoVie
     )
 
 
-def build_tracks(work: Work) -> None:
-    run, result = work.run, work.result
+def build_tracks(state: PipelineState) -> None:
+    """Build tracks from the accepted pairs.
+
+    Parameters
+    ----------
+    state : PipelineState
+        ``result.tracks`` is set.
+
+    Raises
+    ------
+    StageFailure
+        If no pair was accepted.
+    """
+    run, result = state.run, state.result
     accepted = [pair for pair in result.pairs if pair.accepted]
     if not accepted:
         best = max(result.pairs, key=lambda pair: pair.inliers)
         raise StageFailure(
-            "no two photographs could be matched",
+            "no two images could be matched",
             f"the best of {counted(len(result.pairs), 'pair')} has "
             f"{counted(best.inliers, 'verified match')}: {best.reason}",
-            "take photographs with more overlap of a scene with texture, all of the same scene",
+            "add images with more overlap, all of one textured scene",
         )
     key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
-    tracks = run.kept(
+    tracks = run.cached(
         "tracks",
         "tracks",
         key,
-        lambda: work.config.tracks.build(_prepared(work), result.pairs, stream(run.seed, "tracks")),
+        lambda: state.config.tracks.build(_prepared(state), result.pairs, stream(run.seed, "tracks")),
     )
-    work.result = replace(result, tracks=tracks)
+    state.result = replace(result, tracks=tracks)
     seen = np.bincount(tracks.point_index, minlength=tracks.n_points)
     counts = {
         "points": tracks.n_points,

@@ -1,7 +1,4 @@
-"""The affine stratum of a reconstruction: the front door to it, and what a run keeps of it.
-
-What a run leaves for its user: the COLMAP model, points, cameras, summary and page.
-"""
+"""Output files of a run: COLMAP model, points, cameras, surface model, summary and report."""
 
 from __future__ import annotations
 
@@ -19,44 +16,19 @@ from thesisrecon.config import toml_from_config
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views
 from thesisrecon.io.colmap_files import write_colmap_model
-from thesisrecon.io.exports import write_point_cloud
+from thesisrecon.io.exports import cameras_table, write_point_cloud
 from thesisrecon.io.files import read_json, write_json, write_text
 from thesisrecon.io.meshes import write_mesh
+from thesisrecon.pipeline.state import name_images
 from thesisrecon.records import Image, Reconstruction, RunResult, TexturedMesh
 from thesisrecon.report.data import ReportData, ReportImage
 from thesisrecon.report.page import write_report
-from thesisrecon.report.summary import cameras_table, point_colors, summarize
+from thesisrecon.report.summary import point_colors, summarize
 from thesisrecon.runtime.run import Run, Until
 from thesisrecon.runtime.run_folder import RunDirectory
 from thesisrecon.selfcalibration.stratified import affine_camera_centres, upgrade_to_affine
 from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
-
-FARTHEST_AFFINE = 1e3
-"""Points of the affine file are within this many standard deviations of the bulk of them."""
-
-
-def affine_of(result: RunResult) -> Reconstruction | None:
-    """The affine stratum that the run passed through, None where it got to none.
-
-    That is its projective reconstruction under the plane at infinity of self-calibration."""
-    if result.projective is None or result.calibration is None:
-        return None
-    return upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
-
-
-def write_affine(path: Path, affine: Reconstruction | None, colours: U8) -> None:
-    """Points in their colours (N, 3) and the camera centres in red, in an affine frame; the nearer part of
-    them, since points near infinity have no place in a viewer. Nothing without a reconstruction."""
-    if affine is None:
-        return
-    X = affine.X[:, :3]
-    near = affine.valid & (np.abs(X) < FARTHEST_AFFINE).all(axis=1)
-    centres = affine_camera_centres(affine)
-    centres = centres[np.isfinite(centres).all(axis=1)]
-    red = np.tile(np.array([255, 0, 0], dtype=np.uint8), (len(centres), 1))
-    write_point_cloud(path, np.concatenate([X[near], centres]), np.concatenate([colours[near], red]))
-
 
 THUMBNAIL_PX = 800
 DEPTH_PX = 400
@@ -68,26 +40,97 @@ MODEL_FILES = (
     *("points.ply", "affine.ply", "cameras.json", "model.glb"),
 )
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
+MAX_AFFINE = 1e3
+"""Largest affine coordinate written to affine.ply, in standard deviations of the points."""
+
+
+def _affine_stratum(result: RunResult) -> Reconstruction | None:
+    """The projective reconstruction upgraded by the plane at infinity of self-calibration."""
+    if result.projective is None or result.calibration is None:
+        return None
+    return upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
+
+
+def write_affine(path: Path, affine: Reconstruction | None, colors: U8) -> None:
+    """Write the affine points and the camera centres (red) as a PLY file.
+
+    Parameters
+    ----------
+    path : Path
+        Output file.
+    affine : Reconstruction or None
+        Affine reconstruction; None: write nothing. Points beyond ``MAX_AFFINE`` are left out.
+    colors : ndarray (N, 3) uint8
+        Colors of the points.
+    """
+    if affine is None:
+        return
+    X = affine.X[:, :3]
+    near = affine.valid & (np.abs(X) < MAX_AFFINE).all(axis=1)
+    centres = affine_camera_centres(affine)
+    centres = centres[np.isfinite(centres).all(axis=1)]
+    red = np.tile(np.array([255, 0, 0], dtype=np.uint8), (len(centres), 1))
+    write_point_cloud(path, np.concatenate([X[near], centres]), np.concatenate([colors[near], red]))
 
 
 def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFailure | None) -> RunResult:
-    """Write whatever was found, and return it with its summary.
+    """Write all results of a run.
 
-    A run that ends early, as asked, leaves the files of a longer one that has ended in this folder; files of
-    a model are removed where there is none. Raises :class:`OutputError` where the output folder cannot be
-    written.
+    A run with an earlier last stage keeps the files of a longer one in the folder.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    result : RunResult
+        Its results.
+    until : str
+        Last stage.
+    failure : StageFailure or None
+        The failure that ended the run.
+
+    Returns
+    -------
+    RunResult
+        The result with warnings, reports and summary; sentences name images by file name.
+
+    Raises
+    ------
+    OutputError
+        If the output folder cannot be written.
     """
+    result = _with_image_names(result)
     later = _later_end(run.directory.path, until) if failure is None else None
     if later is None:
         return _write(run, result, until, failure)
     run.warnings.append(
-        f"the folder holds the result of this run up to {later}: its summary and page are kept"
+        f"the folder holds the result of this run up to {later}: its summary and report are kept"
     )
     return _described(run, result, until, failure)
 
 
+def _with_image_names(result: RunResult) -> RunResult:
+    """Sentences about images by file name."""
+    names = [image.name for image in result.images]
+
+    def named(texts: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(name_images(text, names) for text in texts)
+
+    metric, calibration = result.metric, result.calibration
+    if metric is not None:
+        failed = named(metric.failed_checks)
+        metric = replace(metric, failed_checks=failed, warnings=named(metric.warnings))
+    if calibration is not None:
+        calibration = replace(calibration, reasons=named(calibration.reasons))
+        if calibration.identifiability is not None:
+            report = calibration.identifiability
+            report = replace(report, sentences=named(report.sentences))
+            calibration = replace(calibration, identifiability=report)
+    return replace(result, metric=metric, calibration=calibration)
+
+
 def _later_end(out: Path, until: str) -> str | None:
-    """The stage up to which this run has already ended well here, where that is a later one."""
+    """The last stage of an earlier, longer run in this folder, if there is one."""
     summary = read_json(out / SUMMARY)
     if not isinstance(summary, dict) or summary.get("failure"):
         return None
@@ -99,7 +142,7 @@ def _described(run: Run, result: RunResult, until: str, failure: StageFailure | 
     """The result with its warnings, reports and summary."""
     result = replace(
         result,
-        warnings=(*run.warnings, *_doubts(result)),
+        warnings=(*run.warnings, *_failure_warnings(result)),
         reports=tuple(run.reports.values()),
         failure=str(failure) if failure is not None else "",
     )
@@ -107,12 +150,12 @@ def _described(run: Run, result: RunResult, until: str, failure: StageFailure | 
 
 
 def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
-    out, colours = run.directory.path, None
+    out, colors = run.directory.path, None
     with run.clock("outputs"):
         if result.metric is not None:
-            colours = point_colors(result.metric.reconstruction, result.images)
-            run.warnings.extend(write_model(run.directory, result, result.metric.reconstruction, colours))
-            write_affine(out / "affine.ply", affine_of(result), colours)
+            colors = point_colors(result.metric.reconstruction, result.images)
+            run.warnings.extend(_write_model(run.directory, result, result.metric.reconstruction, colors))
+            write_affine(out / "affine.ply", _affine_stratum(result), colors)
             if result.mesh is not None:
                 write_mesh(out / "model.glb", result.mesh)
             else:
@@ -121,7 +164,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             run.directory.remove(MODEL_FILES)
         result = _described(run, result, until, failure)
         write_text(out / "config.toml", toml_from_config(run.config))
-        page = _report_data(run, result, colours, failure)
+        page = _report_data(run, result, colors, failure)
         write_report(out / PAGE, replace(page, until=None if until == "model" else until))
     run.finish("outputs", counts={})
     result = replace(
@@ -131,54 +174,51 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
     return result
 
 
-def _doubts(result: RunResult) -> list[str]:
-    """The sentences nobody may overlook."""
+def _failure_warnings(result: RunResult) -> list[str]:
+    """Warnings that the result is not trusted or the calibration not identifiable."""
     failed_checks: list[str] = []
     own: tuple[str, ...] = ()
     if result.metric is not None and not result.metric.trusted:
         own = tuple(dict.fromkeys(result.metric.failed_checks))
-        failed_checks.append(f"the result failed its self-check and is not to be trusted: {'; '.join(own)}")
+        failed_checks.append(f"The result failed its self-check and cannot be trusted: {'; '.join(own)}")
     if result.calibration is not None and not result.calibration.identifiable:
-        # The self-check repeats the reasons of the calibration it was given.
+        # The self-check repeats the reasons of its calibration.
         rest = [reason for reason in dict.fromkeys(result.calibration.reasons) if reason not in own]
         if rest or not own:
-            failed_checks.append(f"these views do not determine the calibration: {'; '.join(rest)}")
+            failed_checks.append(f"The images do not determine the calibration: {'; '.join(rest)}")
     return failed_checks
 
 
-def write_model(
-    directory: RunDirectory, result: RunResult, reconstruction: Reconstruction, colours: U8
+def _write_model(
+    directory: RunDirectory, result: RunResult, reconstruction: Reconstruction, colors: U8
 ) -> list[str]:
-    """``sparse/0``, ``points.ply`` and ``cameras.json`` of a metric reconstruction, in original pixels.
-
-    Returns what is to be said of a file that could not be written: COLMAP has no camera with skew.
-    """
-    said: list[str] = []
+    """Write ``sparse/0``, ``points.ply`` and ``cameras.json`` in original pixels; return warnings."""
+    warnings: list[str] = []
     skewed = skewed_views(reconstruction)
     if len(skewed):
         directory.remove(COLMAP_FILES)
-        said.append(
-            f"sparse/0 is not written: COLMAP has no camera with skew, as {len(skewed)} of "
-            f"{counted(int(reconstruction.registered.sum()), 'camera')} would need; cameras.json holds them"
+        warnings.append(
+            f"sparse/0 is not written: COLMAP has no camera model with skew, but {len(skewed)} of "
+            f"{counted(int(reconstruction.registered.sum()), 'camera')} have skew; see cameras.json"
         )
     else:
         model = colmap_from_reconstruction(
             reconstruction,
             [image.name for image in result.images],
-            colors=colours,
+            colors=colors,
             groups=result.groups,
             scales=np.array([1 / image.scale for image in result.images]),
             original_sizes=np.array([image.original_size for image in result.images]),
         )
         write_colmap_model(directory.path / "sparse" / "0", model)
     X = reconstruction.X[reconstruction.valid]
-    write_point_cloud(directory.path / "points.ply", X[:, :3] / X[:, 3:], colours[reconstruction.valid])
+    write_point_cloud(directory.path / "points.ply", X[:, :3] / X[:, 3:], colors[reconstruction.valid])
     write_json(directory.path / "cameras.json", cameras_table(reconstruction, result.images))
-    return said
+    return warnings
 
 
 def _run_facts(run: Run, until: str) -> dict[str, Any]:
-    """What the summary says of the run itself."""
+    """Summary entries about the run itself."""
     seconds = {stage: round(report.seconds, 3) for stage, report in run.reports.items()}
     return {
         "version": __version__,
@@ -198,7 +238,7 @@ def _peak_memory_mb() -> float:
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: StageFailure | None) -> ReportData:
+def _report_data(run: Run, result: RunResult, colors: U8 | None, failure: StageFailure | None) -> ReportData:
     images = tuple(
         ReportImage(image.name, image.size, image.original_size, _thumbnail(image)) for image in result.images
     )
@@ -214,8 +254,8 @@ def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: Stage
         pair_choice=result.pair_choice,
         reconstruction=result.projective,
         metric=result.metric,
-        colors=colours,
-        affine=affine_of(result) if result.metric is not None else None,
+        colors=colors,
+        affine=_affine_stratum(result) if result.metric is not None else None,
         failure=failure,
         model=_model_for_page(run, result),
         held_out=result.held_out,
@@ -224,7 +264,7 @@ def _report_data(run: Run, result: RunResult, colours: U8 | None, failure: Stage
 
 
 def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:
-    """The model in a size that a page can carry."""
+    """The model, simplified for the report."""
     if result.mesh is None:
         return None
     coarse = simplify_mesh(result.mesh, PAGE_FACES)
@@ -232,12 +272,12 @@ def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:
 
 
 def _thinned(depth: F32) -> F32:
-    """Every n-th pixel, as many as a picture on the page has."""
+    """Every n-th pixel, for the report."""
     step = max(1, -(-max(depth.shape) // DEPTH_PX))
     return depth[::step, ::step]
 
 
 def _thumbnail(image: Image) -> U8:
-    """Every n-th pixel; the page shrinks it further, with care."""
+    """Every n-th pixel; the report resamples it further."""
     step = max(1, max(image.size) // THUMBNAIL_PX)
     return image.rgb[::step, ::step]

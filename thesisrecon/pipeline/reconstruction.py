@@ -1,34 +1,30 @@
-"""Algorithm 1 of the thesis, from photographs to a textured model: the only place that composes stages."""
+"""Algorithm 1 of the thesis, from images to a textured model: the only place that composes all stages."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
-from thesisrecon.config import PipelineConfig
+from thesisrecon.config import PipelineConfig, tables_from_config
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.images import ImageSource, list_images, scene_name
+from thesisrecon.intrinsics import camera_numbers, check_sizes, prior_warnings
+from thesisrecon.io.images import ImageSet, ImageSource, list_images, read_images, scene_name
 from thesisrecon.pipeline.cameras import reconstruct_metric, reconstruct_projective
-from thesisrecon.pipeline.features_to_tracks import (
-    build_tracks,
-    choose_pairs,
-    find_features,
-    match_pairs,
-)
-from thesisrecon.pipeline.inputs import check_pairs, empty_result, identity, read_set, wishes
+from thesisrecon.pipeline.features_to_tracks import build_tracks, find_features, match_pairs, select_pairs
 from thesisrecon.pipeline.outputs import RESULT_FILES, write_outputs
-from thesisrecon.pipeline.state import Work
-from thesisrecon.pipeline.surface import build_model, match_densely
+from thesisrecon.pipeline.state import PipelineState
+from thesisrecon.pipeline.surface import build_model, estimate_depth_maps
 from thesisrecon.records import RunResult
-from thesisrecon.runtime.run import Progress, RunOptions, start_run
+from thesisrecon.runtime.run import Progress, Run, RunOptions, start_run
 
 STEPS = {
     "features": (find_features,),
-    "matches": (find_features, choose_pairs, match_pairs),
-    "projective": (find_features, choose_pairs, match_pairs, build_tracks, reconstruct_projective),
-    "metric": (find_features, choose_pairs, match_pairs, build_tracks, reconstruct_metric),
+    "matches": (find_features, select_pairs, match_pairs),
+    "projective": (find_features, select_pairs, match_pairs, build_tracks, reconstruct_projective),
+    "metric": (find_features, select_pairs, match_pairs, build_tracks, reconstruct_metric),
 }
-SURFACE_STEPS = (match_densely, build_model)
+"""Algorithm 1: the steps up to each last stage."""
+SURFACE_STEPS = (estimate_depth_maps, build_model)
 STEPS["dense"] = (*STEPS["metric"], *SURFACE_STEPS[:1])
 STEPS["model"] = (*STEPS["metric"], *SURFACE_STEPS)
 
@@ -42,58 +38,120 @@ def reconstruct(
     progress: Progress | None = None,
     **options: Unpack[RunOptions],
 ) -> RunResult:
-    """Reconstruct metric cameras, points and a textured model from photographs of one scene.
+    """Reconstruct metric cameras, points and a textured model from images of one scene.
 
     Parameters
     ----------
-    images : a folder, or a sequence of files, uint8 arrays (H, W) or (H, W, 3), or :class:`Image` records.
-    out : the output folder; made where absent, resumed where it holds the same run.
-    config : what runs; the preset ``default`` where None.
-    seed : of all random steps, at least 0. The same photographs, config and seed give the same bytes,
-        whatever the number of workers.
-    progress : hears (stage, done, total) as parts of stages are done.
-    **options : see :class:`RunOptions`.
+    images : path, or sequence of path, ndarray (H, W) or (H, W, 3) uint8, or Image
+        A folder, or the images.
+    out : path
+        Output folder: created if missing, resumed if it holds the same run.
+    config : PipelineConfig, optional
+        Settings; None: the preset ``default``.
+    seed : int
+        Random seed, at least 0. The same images, settings and seed give the same bytes for any number of
+        workers.
+    progress : callable, optional
+        Called with (stage, done, total).
+    **options
+        ``until``, ``threads``, ``executor``, ``overwrite``, ``shared``: see
+        :class:`~thesisrecon.runtime.run.RunOptions`.
 
     Returns
     -------
-    RunResult : everything that was found, as it also stands in ``out``. The length unit of a reconstruction
-        is free: photographs do not tell it.
+    RunResult
+        All results, as written to ``out``. The scale of a reconstruction is arbitrary.
 
     Raises
     ------
-    UsageError : no such folder of photographs, no photographs in it, an output folder that cannot be
-        written or holds another run, workers that cannot be reached or are lost (:class:`WorkersLost`).
-    StageFailure : these photographs cannot be reconstructed. What was computed, the summary and the page are
-        in ``out`` all the same.
+    UsageError
+        If there are no images, the output folder cannot be used, or the workers are lost.
+    StageFailure
+        If the images cannot be reconstructed; intermediate results, summary and report are in ``out``.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from thesisrecon import reconstruct
+    >>> rng = np.random.default_rng(0)
+    >>> images = [rng.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(2)]
+    >>> with TemporaryDirectory() as out:
+    ...     result = reconstruct(images, out, until="features")
+    >>> len(result.features), result.failure
+    (2, '')
     """
     until, run, overwrite = start_run(out, config or PipelineConfig(), seed, progress, options)
     if isinstance(images, str | Path):
         if not list_images(Path(images)):
-            raise UsageError(f"there are no photographs in {images} (folders in it are not searched)")
+            raise UsageError(f"there are no images in {images} (subfolders are not searched)")
         run.title = scene_name(Path(images)) or run.title
-    # Reading photographs takes long: whether the folder is free for this run is asked before.
-    claim = run.directory.claimed(wishes(run), overwrite=overwrite)
-    with run.workers, claim, run.kept_in_folder():
-        photographs = read_set(run, images)
-        check_pairs(run, photographs, until)
-        run.directory.adopt(identity(run, photographs), overwrite=overwrite, results=RESULT_FILES)
-        work = Work(run, photographs, empty_result(run, photographs), until)
+    # Claim the folder first: reading images takes long.
+    claim = run.directory.claim(_settings_identity(run), overwrite=overwrite)
+    with run.workers, claim, run.with_resume_path():
+        inputs = _read_inputs(run, images)
+        if until != "features" and len(inputs.images) >= 2:
+            # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
+            run.config.pairs.check([image.name for image in inputs.images], inputs.refused)
+        run.directory.adopt(_identity(run, inputs), overwrite=overwrite, results=RESULT_FILES)
+        state = PipelineState(run, inputs, _empty_result(run, inputs), until)
         try:
-            work.check_photographs()
-            _take_steps(work, surface_asked=options.get("until") is not None)
+            state.require_images()
+            _run_steps(state, surface_required=options.get("until") is not None)
         except StageFailure as failure:
-            write_outputs(run, work.result, until=until, failure=failure)
+            write_outputs(run, state.result, until=until, failure=failure)
             raise
-        return write_outputs(run, work.result, until=until, failure=None)
+        return write_outputs(run, state.result, until=until, failure=None)
 
 
-def _take_steps(work: Work, *, surface_asked: bool) -> None:
-    """Cameras and points are a result by themselves: only who asks for a surface is refused without it."""
-    for step in STEPS[work.until]:
+def _run_steps(state: PipelineState, *, surface_required: bool) -> None:
+    """Run the steps; a surface that fails is only a warning unless it was asked for."""
+    for step in STEPS[state.until]:
         try:
-            step(work)
+            step(state)
         except StageFailure as failure:
-            if surface_asked or step not in SURFACE_STEPS:
+            if surface_required or step not in SURFACE_STEPS:
                 raise
-            work.run.warnings.append(f"No surface model was built: {failure}")
+            state.run.warnings.append(f"No surface model was built: {failure}")
             return
+
+
+def _read_inputs(run: Run, images: ImageSource) -> ImageSet:
+    with run.clock("images"):
+        size = run.config.images.max_size_px
+        inputs = read_images(images, max_size_px=size, map_all=run.workers.map_all)
+    found, refused = len(inputs.decoded), len(inputs.refused)
+    if found + refused == 0:
+        raise UsageError("no images")
+    check_sizes(run.config.intrinsics, [image.original_size for image in inputs.images])
+    notes = [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
+    refusals = [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
+    warnings = [*notes, *refusals, *prior_warnings(run.config.intrinsics, inputs.exif_focal_px)]
+    run.finish("images", counts={"read": found, "refused": refused}, warnings=warnings)
+    return inputs
+
+
+def _settings_identity(run: Run) -> dict[str, Any]:
+    """The part of a run's identity that is known before its images are read."""
+    return {"version": 1, "seed": run.seed, "settings": tables_from_config(run.config)}
+
+
+def _identity(run: Run, inputs: ImageSet) -> dict[str, Any]:
+    """Settings, seed and content of the images: runs with equal identity are the same."""
+    digests = {p.image.name: p.digest for p in inputs.decoded}
+    refused = {name: f"refused: {reason}" for name, reason in inputs.refused.items()}
+    return _settings_identity(run) | {"photographs": digests | refused}
+
+
+def _empty_result(run: Run, inputs: ImageSet) -> RunResult:
+    sizes = [image.original_size for image in inputs.images]
+    groups = camera_numbers(sizes, run.config.intrinsics, inputs.exif_focal_px)
+    return RunResult(
+        out=run.directory.path,
+        images=inputs.images,
+        refused=inputs.refused,
+        features=(),
+        pairs=(),
+        groups=groups,
+        settings=tables_from_config(run.config),
+    )

@@ -1,10 +1,8 @@
-"""What matching needs of the photographs, made when it is asked for and kept within bounds.
-
-What the steps of one run hand on.
-"""
+"""The state that the steps of a run pass on, and the prepared views of the matching stage."""
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,16 +19,23 @@ from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.records import Features, Image, RunResult
 from thesisrecon.runtime.run import Run
 
-KEPT_BYTES = 2**30
-"""What is prepared takes several times the room of its photograph, and takes little time to make again."""
-LARGEST_BATCH = 64
+CACHE_BYTES = 2**30
+"""Prepared views take several times the memory of their image and are quickly prepared again."""
+MAX_BATCH = 64
 BATCHES_PER_WORKER = 8
 
 
 class PreparedViews(Sequence[Any]):
-    """What ``matching`` prepares of each view: those asked for last stay, as far as ``KEPT_BYTES`` go.
+    """Views prepared for matching on demand, in a least-recently-used cache of ``CACHE_BYTES``.
 
-    It travels without what it has prepared, and :meth:`part` of it with some of its photographs alone.
+    Pickled without the cache; :meth:`subset` reduces what is sent to a worker.
+
+    Parameters
+    ----------
+    matching : Matcher
+        Its ``prepare`` makes the views.
+    given : mapping
+        View -> (image, features).
     """
 
     def __init__(self, matching: Matcher, given: Mapping[int, tuple[Image, Features]]) -> None:
@@ -62,23 +67,34 @@ class PreparedViews(Sequence[Any]):
         if isinstance(view, slice):
             return [self[v] for v in sorted(self._given)[view]]
         if view not in self._given:
-            raise IndexError(f"there is no view {view} here")
+            raise IndexError(f"view {view} is not among those given")
         with self._lock:
             if view in self._kept:
                 self._kept.move_to_end(view)
                 return self._kept[view][0]
-        # Two threads may both make it: that costs less than one that waits for the other.
+        # Two threads may both prepare a view: cheaper than one waiting for the other.
         made = self._matching.prepare(*self._given[view])
         with self._lock:
             if view not in self._kept:
                 self._kept[view] = made, _size_of(made)
                 self._bytes += self._kept[view][1]
-            while self._bytes > KEPT_BYTES and len(self._kept) > 2:
+            while self._bytes > CACHE_BYTES and len(self._kept) > 2:
                 self._bytes -= self._kept.popitem(last=False)[1][1]
         return made
 
-    def part(self, views: Iterable[int]) -> PreparedViews:
-        """The same for these views alone."""
+    def subset(self, views: Iterable[int]) -> PreparedViews:
+        """Return the same for some views, with an empty cache.
+
+        Parameters
+        ----------
+        views : iterable of int
+            The views.
+
+        Returns
+        -------
+        PreparedViews
+            The subset.
+        """
         return PreparedViews(self._matching, {view: self._given[view] for view in views})
 
 
@@ -91,52 +107,124 @@ def _size_of(value: Any) -> int:
     return 0
 
 
-def near_in_pairs(pairs: Sequence[tuple[int, int]], numbers: Sequence[int]) -> list[int]:
-    """The numbers in an order in which what was prepared of a view serves again."""
+def cache_friendly_order(pairs: Sequence[tuple[int, int]], numbers: Sequence[int]) -> list[int]:
+    """Sort pairs so that consecutive pairs share views (Morton order).
+
+    Parameters
+    ----------
+    pairs : sequence of (i, j)
+        All pairs.
+    numbers : sequence of int
+        Which of them.
+
+    Returns
+    -------
+    list of int
+        The numbers, sorted.
+    """
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
     return [numbers[k] for k in morton_pair_order(first, second)]
 
 
-def batches_of_pairs(
-    pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int
-) -> list[list[int]]:
-    """The numbers dealt into batches whose pairs have views in common, enough of them for all workers."""
-    size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), LARGEST_BATCH)
-    ordered = near_in_pairs(pairs, numbers)
+def batch_pairs(pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int) -> list[list[int]]:
+    """Divide pairs into batches that share views, several per worker.
+
+    Parameters
+    ----------
+    pairs, numbers
+        As for :func:`cache_friendly_order`.
+    workers : int
+        Number of workers.
+
+    Returns
+    -------
+    list of list of int
+        The batches.
+    """
+    size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
+    ordered = cache_friendly_order(pairs, numbers)
     return [ordered[k : k + size] for k in range(0, len(ordered), size)]
 
 
 @dataclass
-class Work:
-    """What the steps of one run hand on: ``result`` grows, the rest is what they need beside it."""
+class PipelineState:
+    """What the steps of one run pass on.
+
+    Parameters
+    ----------
+    run : Run
+        Settings, workers, cache and reports.
+    inputs : ImageSet
+        The images as read.
+    result : RunResult
+        Grows with each step.
+    until : str
+        The last stage.
+    prepared : PreparedViews, optional
+        Views prepared for matching.
+    """
 
     run: Run
-    photographs: ImageSet
+    inputs: ImageSet
     result: RunResult
     until: str
     prepared: PreparedViews | None = None
 
     @property
     def config(self) -> PipelineConfig:
+        """The run's settings."""
         return self.run.config
 
     @property
+    def names(self) -> list[str]:
+        """File names of the images."""
+        return [image.name for image in self.result.images]
+
+    @property
     def prior(self) -> IntrinsicsPrior:
-        """What the user lets us assume of the cameras."""
+        """Prior of the intrinsics at working size."""
         scales = np.array([image.scale for image in self.result.images])
         sizes = [image.original_size for image in self.result.images]
-        return prior_from_options(self.config.intrinsics, sizes, self.photographs.exif_focal_px, scales)
+        return prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
 
-    def check_photographs(self) -> None:
-        """Refuse what is too little before anything is computed."""
+    def require_images(self) -> None:
+        """Check the number of images before anything is computed.
+
+        Raises
+        ------
+        StageFailure
+            If there are fewer than two (one, if only features are detected).
+        """
         found, needed = len(self.result.images), 1 if self.until == "features" else 2
         if found < needed:
-            refused = list(self.result.refused.items())
-            told = [f"{name} {reason}" for name, reason in refused[:3]]
-            why = "; ".join([*told, f"and {len(refused) - 3} more"] if len(refused) > 3 else told)
+            refused = [f"{name} {reason}" for name, reason in self.result.refused.items()]
+            why = "; ".join([*refused[:3], f"and {len(refused) - 3} more"] if len(refused) > 3 else refused)
             wanted = "two different ones are" if needed == 2 else "one is"
             raise StageFailure(
-                counted(found, "usable photograph") if found else "no usable photographs",
+                counted(found, "usable image") if found else "no usable images",
                 f"at least {wanted} needed{'; ' + why if why else ''}",
-                "take more photographs of the scene from other places",
+                "add images of the scene from other places",
             )
+
+
+def name_images(text: str, names: Sequence[str]) -> str:
+    """Replace the image numbers in a sentence of a stage by file names.
+
+    Parameters
+    ----------
+    text : str
+        Sentence with images as ``#number``.
+    names : sequence of str
+        File names.
+
+    Returns
+    -------
+    str
+        The sentence for the user.
+
+    Examples
+    --------
+    >>> name_images("Images #0 and #2: too few inliers", ["a.jpg", "b.jpg", "c.jpg"])
+    'Images a.jpg and c.jpg: too few inliers'
+    """
+    return re.sub(r"#(\d+)", lambda m: names[int(m[1])] if int(m[1]) < len(names) else m[0], text)

@@ -1,7 +1,4 @@
-"""How like an unseen photograph the model is: one photograph gives no texture and is compared with it.
-
-Sections 2.5 and 2.6: depth maps of all views, and the model.
-"""
+"""Depth maps of all views and the textured model (2.5 and 2.6), compared with one held-out image."""
 
 from __future__ import annotations
 
@@ -14,40 +11,41 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.pipeline.state import Work
+from thesisrecon.pipeline.state import PipelineState
 from thesisrecon.records import DepthMap, HeldOut, Image, PinholeView, Reconstruction, TexturedMesh
 from thesisrecon.runtime.run_folder import code_key
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 
-FEWEST_VIEWS = 3
-"""With fewer, what the photograph left out shows may be seen by nobody else."""
+MIN_VIEWS = 3
+"""With fewer views, others may not see the surface of the held-out one."""
+RENDERER = "thesisrecon.views.render"
+"""Module whose code the held-out comparison depends on, besides that of the model."""
 
 
-def middle_view(views: Sequence[PinholeView]) -> PinholeView:
-    """The view whose camera is nearest to all the others: what it shows, others see too."""
+def _middle_view(views: Sequence[PinholeView]) -> PinholeView:
+    """The view with the smallest sum of distances to the other cameras."""
     C = np.array([camera_centre(view.P) for view in views])
     centres = C[:, :3] / C[:, 3:]
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2).sum(axis=1)
     return views[int(np.argmin(apart))]
 
 
-def compare_held_out(
+def _compare_held_out(
     mesh: TexturedMesh,
     views: Sequence[PinholeView],
     color: Callable[[int], TexturedMesh],
     *,
     threads: int = 1,
 ) -> HeldOut | None:
-    """The middle view beside the model that ``color`` (number of a view) paints without it.
+    """Compare the middle view with the model that ``color(view)`` textures without it.
 
-    The picture of the model is made as bright as the photograph, one factor a channel. None where there are
-    too few views, or the camera sees nothing of the model.
+    The rendering is exposure-matched, one factor per channel. None with too few views or no common pixels.
     """
-    if len(views) < FEWEST_VIEWS or not len(mesh.faces):
+    if len(views) < MIN_VIEWS or not len(mesh.faces):
         return None
-    view = middle_view(views)
+    view = _middle_view(views)
     try:
         painted = color(view.view)
     except StageFailure:
@@ -68,10 +66,6 @@ def compare_held_out(
     )
 
 
-RENDERER = "thesisrecon.views.render"
-"""What a held-out picture depends on beside the model."""
-
-
 def _depths(config: PipelineConfig, scene: MultiViewScene, view: int) -> list[DepthMap]:
     return [config.dense.depth_map(scene, view)]
 
@@ -82,38 +76,50 @@ def _confirmed(
     return config.dense.confirm(scene, maps, view)
 
 
-def match_densely(work: Work) -> None:
-    run, result = work.run, work.result
+def estimate_depth_maps(state: PipelineState) -> None:
+    """Estimate and cross-check the depth maps of all registered views (2.5).
+
+    Parameters
+    ----------
+    state : PipelineState
+        ``result.views`` and ``result.depth_maps`` are set.
+
+    Raises
+    ------
+    StageFailure
+        If no view has any depth.
+    """
+    run, result = state.run, state.result
     assert result.metric is not None
     reconstruction = result.metric.reconstruction
     with run.clock("dense"):
-        scene = work.config.dense.prepare(result.images, reconstruction)
+        scene = state.config.dense.prepare(result.images, reconstruction)
     order = sorted(scene.views)
-    given = _given(reconstruction, result.images)
+    given = _depth_inputs(reconstruction, result.images)
     keys = {f"{i:05d}": run.key("dense", run.variant_key("dense"), given, i) for i in order}
 
     def seen_from(view: int) -> tuple[MultiViewScene, frozenset[int]]:
-        """What is sent for one view; in this process, everything as it is."""
-        near = work.config.dense.required_views(scene, view)
+        """Part of the scene that the depth map of one view needs."""
+        near = state.config.dense.required_views(scene, view)
         return (scene if run.workers.in_process else scene.subset(near)), near
 
-    found = run.kept_all(
+    found = run.map_cached(
         "dense",
         keys,
         _depths,
-        lambda missing: (([n], (work.config, seen_from(order[n])[0], order[n])) for n in missing),
+        lambda missing: (([n], (state.config, seen_from(order[n])[0], order[n])) for n in missing),
     )
     maps, confirmed = dict(zip(order, found, strict=True)), dict[int, DepthMap]()
 
     def confirmations() -> Iterator[tuple[object, ...]]:
         for view in order:
             part, near = seen_from(view)
-            yield work.config, part, {j: maps[j] for j in sorted(near)}, view
+            yield state.config, part, {j: maps[j] for j in sorted(near)}, view
 
     with run.clock("dense"), run.resumable("dense"):
         run.workers.run(_confirmed, confirmations(), lambda n, depths: confirmed.update({order[n]: depths}))
     final = [confirmed[i] for i in order]
-    work.result = replace(result, depth_maps=tuple(final), views=tuple(scene.views[i] for i in order))
+    state.result = replace(result, depth_maps=tuple(final), views=tuple(scene.views[i] for i in order))
     known = [float(np.isfinite(m.depth).mean()) for m in final]
     counts = {"views": len(order), "depths": int(sum(np.isfinite(m.depth).sum() for m in final))}
     empty = [i for i, share in zip(order, known, strict=True) if not share]
@@ -121,44 +127,51 @@ def match_densely(work: Work) -> None:
         "dense",
         counts=counts,
         metrics={"median_share_known": float(np.median(known))},
-        warnings=[f"{result.images[i].name} has no depths" for i in empty],
+        warnings=[f"Image {result.images[i].name} has no depth values" for i in empty],
     )
     if not counts["depths"]:
         raise StageFailure(
-            "no depths were found",
+            "no depth was found",
             f"none of {len(order)} views agrees with another on any surface",
-            "take photographs with more overlap of a scene with texture",
+            "add images with more overlap of a textured scene",
         )
 
 
-def _given(reconstruction: Reconstruction, images: tuple[Image, ...]) -> list[object]:
-    """What depths are made from: cameras, points and pixels."""
+def _depth_inputs(reconstruction: Reconstruction, images: tuple[Image, ...]) -> list[object]:
+    """Inputs of the depth maps: cameras, points and pixels."""
     r = reconstruction
     return [r.P, r.K, r.distortion, r.X, r.registered, r.valid, r.inlier, [image.rgb for image in images]]
 
 
-def build_model(work: Work) -> None:
-    run, result = work.run, work.result
+def build_model(state: PipelineState) -> None:
+    """Fuse the depth maps to a textured mesh (2.6) and compare it with a held-out view.
+
+    Parameters
+    ----------
+    state : PipelineState
+        ``result.mesh`` and ``result.held_out`` are set.
+    """
+    run, result = state.run, state.result
     key = run.key("model", run.variant_key("model"), list(run.logs["dense"].keys.values()))
     run.progress("model", 0, 1)
-    mesh = run.kept(
+    mesh = run.cached(
         "model",
         "model",
         key,
-        lambda: work.config.model.build(result.depth_maps, result.views, threads=run.workers.threads),
+        lambda: state.config.model.build(result.depth_maps, result.views, threads=run.workers.threads),
     )
-    model, threads = work.config.model, run.workers.threads
+    model, threads = state.config.model, run.workers.threads
 
     def without(view: int) -> TexturedMesh:
         return model.color(mesh, result.views, without=view, threads=threads)
 
-    held_out = run.kept(
+    held_out = run.cached(
         "model",
         "held-out",
         run.key("model", key, "held-out", code_key(RENDERER)),
-        lambda: compare_held_out(mesh, result.views, without, threads=threads),
+        lambda: _compare_held_out(mesh, result.views, without, threads=threads),
     )
-    work.result = replace(work.result, mesh=mesh, held_out=held_out)
+    state.result = replace(state.result, mesh=mesh, held_out=held_out)
     without_texture = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())
     counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     run.finish("model", counts=counts, metrics={"share_untextured": without_texture})

@@ -1,4 +1,4 @@
-"""A Dask cluster as workers: the extra ``distributed``, imported only when an address is given."""
+"""A Dask cluster as workers; needs the extra ``distributed``, imported only when an address is given."""
 
 from __future__ import annotations
 
@@ -15,23 +15,50 @@ from thesisrecon.errors import UsageError, WorkersLost
 
 SCHEME = "dask://"
 ANSWER_S = 10.0
-"""How long a scheduler may take to answer, and a cluster to show a worker."""
+"""Timeout of the scheduler, and of the first worker."""
 WORKERLESS_S = 60.0
-"""How long a cluster may have no worker in the middle of a run: one that died is started again meanwhile."""
+"""Time a cluster may be without workers during a run, so that they can be restarted."""
 _ADDRESS = re.compile(r"(?P<host>[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
 
 
-def is_address(executor: object) -> bool:
-    """Whether the name of an executor is meant as that of a Dask scheduler."""
+def is_dask_address(executor: object) -> bool:
+    """Return whether an executor is given as a Dask address.
+
+    Parameters
+    ----------
+    executor : object
+        Value of the option.
+
+    Returns
+    -------
+    bool
+        True for text that begins with ``dask:``.
+    """
     return isinstance(executor, str) and executor.partition(":")[0].lower() == "dask"
 
 
-def address_of(executor: str) -> str:
-    """``tcp://HOST:PORT`` of ``dask://HOST:PORT``; :class:`UsageError` for anything else."""
+def tcp_address(executor: str) -> str:
+    """Convert ``dask://HOST:PORT`` to ``tcp://HOST:PORT``.
+
+    Parameters
+    ----------
+    executor : str
+        Value of the option.
+
+    Returns
+    -------
+    str
+        Address of the scheduler.
+
+    Raises
+    ------
+    UsageError
+        If it is no such address.
+    """
     found = _ADDRESS.fullmatch(executor.removeprefix(SCHEME)) if executor.startswith(SCHEME) else None
     if found is None or not 0 < int(found["port"]) < 65536:
         raise UsageError(
-            "a Dask scheduler is given as dask://HOST:PORT, for instance dask://localhost:8786; "
+            "a Dask scheduler must be given as dask://HOST:PORT, for example dask://localhost:8786; "
             f"got {executor!r}"
         )
     return f"tcp://{found[0]}"
@@ -39,7 +66,17 @@ def address_of(executor: str) -> str:
 
 @dataclass
 class Cluster:
-    """A connection to a scheduler, and its executor."""
+    """A connection to a scheduler, and its executor.
+
+    Attributes
+    ----------
+    address : str
+        HOST:PORT.
+    client : distributed.Client
+        The connection.
+    executor : concurrent.futures.Executor
+        Its executor.
+    """
 
     address: str
     client: Any
@@ -47,11 +84,23 @@ class Cluster:
     _alone_since: float | None = field(default=None, repr=False)
 
     def parallel(self) -> int:
-        """How many tasks its workers do at a time; at least 1, for a worker may come back."""
+        """Return the number of worker threads.
+
+        Returns
+        -------
+        int
+            At least 1: a worker may come back.
+        """
         return max(1, sum(self._threads().values()))
 
     def check(self) -> None:
-        """:class:`WorkersLost` where the scheduler is gone, or has had no worker for long."""
+        """Check the connection.
+
+        Raises
+        ------
+        WorkersLost
+            If the scheduler is gone or has had no worker for ``WORKERLESS_S``.
+        """
         if self._threads():
             self._alone_since = None
             return
@@ -63,25 +112,44 @@ class Cluster:
             )
 
     def lost(self) -> WorkersLost:
-        """What is to be said when tasks come back undone."""
+        """Return the error for tasks that were cancelled.
+
+        Returns
+        -------
+        WorkersLost
+            The error.
+        """
         return WorkersLost(f"the Dask scheduler at {self.address} is gone")
 
     def _threads(self) -> dict[str, int]:
         try:
             found: dict[str, int] = self.client.nthreads()
         except Exception:
-            # Whatever a broken connection makes the client raise.
+            # A broken connection raises many types.
             raise self.lost() from None
         return found
 
 
 @contextmanager
-def connected(executor: str) -> Iterator[Cluster]:
-    """The cluster of ``dask://HOST:PORT`` while the block lasts.
+def connect_dask(executor: str) -> Iterator[Cluster]:
+    """Connect to a Dask scheduler for the duration of a block.
 
-    Raises :class:`UsageError` where the extra is not installed, nobody answers, or there is no worker.
+    Parameters
+    ----------
+    executor : str
+        ``dask://HOST:PORT``.
+
+    Yields
+    ------
+    Cluster
+        The connection.
+
+    Raises
+    ------
+    UsageError
+        If the extra is not installed, or no scheduler or worker answers.
     """
-    address = address_of(executor)
+    address = tcp_address(executor)
     try:
         import dask
         from distributed import Client
@@ -90,7 +158,7 @@ def connected(executor: str) -> Iterator[Cluster]:
             f"--executor {executor} needs the package distributed, which is not installed; install "
             "thesisrecon[distributed]"
         ) from None
-    # Its messages are told as sentences of our own; tasks are large by intent.
+    # Errors are reported by this module; large tasks are intended.
     settings = {"distributed.admin.large-graph-warning-threshold": "1TiB"}
     with _quiet("distributed"), dask.config.set(settings):
         try:
@@ -98,11 +166,11 @@ def connected(executor: str) -> Iterator[Cluster]:
         except (OSError, futures.TimeoutError):
             raise UsageError(
                 f"no Dask scheduler answers at {address.removeprefix('tcp://')} within {ANSWER_S:.0f} s; "
-                "start one there (dask scheduler) and its workers (dask worker), or mend the address"
+                "start one there (dask scheduler) and its workers (dask worker), or correct the address"
             ) from None
         try:
             _wait_for_worker(client, address)
-            # Tasks are told apart by what they are, not by a hash of all their bytes.
+            # pure=False: do not hash all bytes of the tasks.
             yield Cluster(address.removeprefix("tcp://"), client, client.get_executor(pure=False))
         finally:
             with suppress(Exception):
@@ -121,7 +189,7 @@ def _wait_for_worker(client: Any, address: str) -> None:
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """No messages of these loggers below the worst."""
+    """Silence a logger and its children."""
     loggers = [logging.getLogger(name)]
     loggers += [logging.getLogger(n) for n in logging.root.manager.loggerDict if n.startswith(f"{name}.")]
     levels = [logger.level for logger in loggers]

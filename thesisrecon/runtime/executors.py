@@ -1,11 +1,7 @@
-"""Which code this is.
+"""Independent tasks on threads, processes or a cluster, with results independent of the workers.
 
-Many independent tasks on a few workers, the same answers whatever their number and wherever they are.
-
-Threads serve by default: the compiled kernels release the interpreter. Any other
-:class:`concurrent.futures.Executor` serves too: a pool of processes, a Dask cluster, one of the caller's own.
-What such an executor is given is bytes, and bytes come back, so neither shared memory nor a shared disk is
-needed; a task that is given anew after its worker died finds all it needs in what it was given.
+Threads are the default, since compiled kernels release the GIL. Other :class:`concurrent.futures.Executor`
+objects receive and return pickled bytes, so no shared memory or disk is needed and tasks can be repeated.
 """
 
 from __future__ import annotations
@@ -29,14 +25,20 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from thesisrecon.errors import UsageError, WorkersLost
-from thesisrecon.runtime.dask_cluster import Cluster, address_of, connected, is_address
+from thesisrecon.runtime.dask_cluster import Cluster, connect_dask, is_dask_address, tcp_address
 from thesisrecon.runtime.signals import CODES, starting_processes
 from thesisrecon.settings import unknown_word
 
 
 @cache
 def package_key() -> str:
-    """A short name for the code of the whole package: workers with another one would give other results."""
+    """Return a digest of the code of the package, to detect workers with another version.
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits.
+    """
     package = Path(__file__).parent.parent
     content = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
@@ -47,11 +49,11 @@ def package_key() -> str:
 
 NAMES = ("local", "processes", "dask://HOST:PORT")
 AHEAD = 2
-"""Tasks an executor is given at a time, per worker: none waits for work, and few are in memory."""
-TOLD_S = 1.0
-"""How long a worker process that is told to end waits for the end of its program."""
-PATIENCE_S = 5.0
-"""How long nothing may end before it is asked whether the workers are still there."""
+"""Submitted tasks per worker: enough to keep it busy, few in memory."""
+SIGTERM_DELAY_S = 1.0
+"""Time a worker process waits for its parent to end after SIGTERM."""
+CHECK_S = 5.0
+"""Time without results after which the workers are checked."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -60,28 +62,41 @@ Finished = Callable[[int, Any], None]
 
 
 def available_threads() -> int:
-    """How many processors this process may use."""
+    """Return the number of processors this process may use.
+
+    Returns
+    -------
+    int
+        At least 1.
+    """
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 @dataclass
 class Workers:
-    """Who does the tasks: ``threads`` workers of one kind.
+    """Workers for independent tasks.
 
-    ``executor`` : threads of this process ("local"), "processes" of their own, a Dask cluster
-    ("dask://HOST:PORT"), or any :class:`concurrent.futures.Executor`, which is not shut down. Of a cluster or
-    an executor of the caller's, ``threads`` is how many of this process do what is not worth sending; the
-    latter is given twice as many tasks at a time. As a context manager it holds its processes or connection
-    from one :meth:`run` to the next; else each run has its own.
+    As a context manager it keeps its processes or connection between calls of :meth:`run`.
 
-    Raises :class:`UsageError` for a number below 1, an unknown name or an address that is none.
+    Parameters
+    ----------
+    threads : int
+        Number of threads or processes. With a cluster or a custom executor: threads of this process for small
+        tasks; a custom executor gets twice as many tasks at a time.
+    executor : str or concurrent.futures.Executor
+        "local" (threads), "processes", "dask://HOST:PORT" or an executor, which is not shut down.
+
+    Raises
+    ------
+    UsageError
+        If ``threads`` is below 1 or the executor is unknown.
     """
 
     threads: int
     executor: str | futures.Executor = "local"
     _remote: _Remote | None = field(default=None, repr=False)
-    _kept: ExitStack | None = field(default=None, repr=False)
+    _open_stack: ExitStack | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.threads < 1:
@@ -90,78 +105,108 @@ class Workers:
             return
         if not isinstance(self.executor, str):
             raise UsageError(
-                f"an executor is {', '.join(NAMES)} or a concurrent.futures.Executor; got {self.executor!r}"
+                f"executor must be {', '.join(NAMES)} or a concurrent.futures.Executor; got {self.executor!r}"
             )
-        if is_address(self.executor):
-            address_of(self.executor)
+        if is_dask_address(self.executor):
+            tcp_address(self.executor)
         elif self.executor not in NAMES:
             raise UsageError(unknown_word("executor", self.executor, NAMES))
 
     @property
     def name(self) -> str:
-        """The executor in a word, for the summary."""
+        """Name of the executor, for the summary."""
         return self.executor if isinstance(self.executor, str) else type(self.executor).__name__
 
     @property
     def in_process(self) -> bool:
-        """Whether tasks see the memory of this process: then nothing is copied for them."""
+        """Whether tasks share the memory of this process, so that nothing is copied."""
         return self.executor == "local" or isinstance(self.executor, futures.ThreadPoolExecutor)
 
     def __enter__(self) -> Workers:
-        """Connect to the cluster; :class:`UsageError` where nobody answers. Processes start when needed."""
-        self._kept = ExitStack()
-        if isinstance(self.executor, str) and is_address(self.executor):
-            self._remote = self._kept.enter_context(self._opened(1))
+        """Connect to the cluster; processes start when needed."""
+        self._open_stack = ExitStack()
+        if isinstance(self.executor, str) and is_dask_address(self.executor):
+            self._remote = self._open_stack.enter_context(self._opened(1))
         return self
 
     def __exit__(self, *error: object) -> None:
-        kept, self._kept, self._remote = self._kept, None, None
-        if kept is not None:
-            kept.__exit__(*error)  # type: ignore[arg-type]
+        stack, self._open_stack, self._remote = self._open_stack, None, None
+        if stack is not None:
+            stack.__exit__(*error)  # type: ignore[arg-type]
 
     def parallel(self) -> int:
-        """How many tasks are worked on at a time."""
+        """Return the number of tasks processed at a time.
+
+        Returns
+        -------
+        int
+            At least 1.
+        """
         return self.threads if self._remote is None else self._remote.parallel()
 
     def run(self, function: Callable[..., Any], tasks: Iterable[Task], finished: Finished) -> None:
-        """Call ``function(*task)`` for all tasks; ``finished(n, answer)`` hears of the n-th as it ends, in
-        this thread.
+        """Call a function for all tasks.
 
-        The first error ends the rest and is raised. Elsewhere than in this process the function must stand in
-        a module that the workers can import, and tasks are asked for only as workers become free.
-        :class:`WorkersLost` where the workers are gone.
+        The first error cancels the rest and is raised.
+
+        Parameters
+        ----------
+        function : callable
+            Must be importable by the workers unless they share this process.
+        tasks : iterable of tuple
+            Arguments of the calls, consumed as workers become free.
+        finished : callable
+            Called with (number, result) in this thread when a task ends.
+
+        Raises
+        ------
+        WorkersLost
+            If the workers are gone.
         """
         if self.executor == "local" and self.threads == 1:
             for n, given in enumerate(tasks):
                 finished(n, function(*given))
         elif self.executor == "local":
             with futures.ThreadPoolExecutor(self.threads) as pool:
-                _hand_out(_Remote(pool, lambda: self.threads), (function, False), tasks, finished)
+                _run_all(_Remote(pool, lambda: self.threads), (function, False), tasks, finished)
         else:
             with self._remote_for(tasks) as remote:
-                _hand_out(remote, (function, not self.in_process), tasks, finished)
+                _run_all(remote, (function, not self.in_process), tasks, finished)
 
     def map_all(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """``function`` of each item in order, always in threads: for reading files and what is soon done."""
+        """Map a function over items in threads, for short tasks such as reading files.
+
+        Parameters
+        ----------
+        function : callable
+            Function of one item.
+        items : iterable
+            The items.
+
+        Returns
+        -------
+        list
+            Results in order.
+        """
         with futures.ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(function, items))
 
     @contextmanager
     def _remote_for(self, tasks: Iterable[Task]) -> Iterator[_Remote]:
-        if self._kept is None:
+        if self._open_stack is None:
             with self._opened(len(tasks) if isinstance(tasks, Sequence) else self.threads) as remote:
                 yield remote
             return
         if self._remote is None:
-            self._remote = self._kept.enter_context(self._opened(self.threads))
+            self._remote = self._open_stack.enter_context(self._opened(self.threads))
         yield self._remote
 
     @contextmanager
     def _opened(self, tasks: int) -> Iterator[_Remote]:
         if isinstance(self.executor, futures.Executor):
             yield _Remote(self.executor, lambda: self.threads)
-        elif is_address(self.executor):
-            with connected(self.executor) as cluster:
+        elif is_dask_address(self.executor):
+            with connect_dask(self.executor) as cluster:
                 yield _Remote(cluster.executor, cluster.parallel, cluster)
         else:
             count = max(1, min(self.threads, tasks))
@@ -171,39 +216,38 @@ class Workers:
 
 @dataclass(frozen=True)
 class _Remote:
-    """An executor that is ready: ``parallel`` tells its workers, ``cluster`` is what stands behind it."""
+    """A running executor, its number of workers and its cluster, if any."""
 
     executor: futures.Executor
     parallel: Callable[[], int]
     cluster: Cluster | None = None
 
 
-def _hand_out(
-    remote: _Remote, wanted: tuple[Callable[..., Any], bool], tasks: Iterable[Task], finished: Finished
+def _run_all(
+    remote: _Remote, call: tuple[Callable[..., Any], bool], tasks: Iterable[Task], finished: Finished
 ) -> None:
-    """Keep the executor in work until all tasks are done; ``wanted`` is the function, and whether tasks
-    travel as bytes."""
-    function, travels = wanted
+    """Keep the executor busy until all tasks are done; ``call`` (function, whether to pickle its tasks)."""
+    function, pickled = call
     waiting: dict[futures.Future[Any], int] = {}
     left = enumerate(tasks)
     try:
         while True:
-            # Where workers have died, more may be waiting than are now wanted.
+            # After workers died, more tasks may be waiting than AHEAD allows.
             for n, given in islice(left, max(AHEAD * remote.parallel() - len(waiting), 0)):
                 what = (
                     (_answer, package_key(), pickle.dumps((function, given), 5))
-                    if travels
+                    if pickled
                     else (function, *given)
                 )
                 waiting[remote.executor.submit(*what)] = n
             if not waiting:
                 return
-            done, _ = futures.wait(waiting, PATIENCE_S, return_when=futures.FIRST_COMPLETED)
+            done, _ = futures.wait(waiting, CHECK_S, return_when=futures.FIRST_COMPLETED)
             if not done and remote.cluster is not None:
                 remote.cluster.check()
             for future in sorted(done, key=waiting.__getitem__):
                 answer = future.result()
-                finished(waiting.pop(future), pickle.loads(answer) if travels else answer)
+                finished(waiting.pop(future), pickle.loads(answer) if pickled else answer)
     except (futures.BrokenExecutor, futures.CancelledError) as error:
         raise _lost(remote, error) from None
     finally:
@@ -216,15 +260,15 @@ def _lost(remote: _Remote, error: BaseException) -> WorkersLost:
         return remote.cluster.lost()
     if isinstance(error, futures.BrokenExecutor):
         return WorkersLost("a worker process ended unexpectedly (killed, or out of memory)")
-    return WorkersLost(f"the executor ({type(remote.executor).__name__}) cancelled what it was given")
+    return WorkersLost(f"the executor ({type(remote.executor).__name__}) cancelled its tasks")
 
 
 def _answer(key: str, task: bytes) -> bytes:
-    """Do a task somewhere else; both sides must run the same code, or what is kept would have a wrong key."""
+    """Run a pickled task in a worker; other code would give results with a wrong cache key."""
     if package_key() != key:
         raise UsageError(
             f"a worker ({multiprocessing.current_process().name} on {os.uname().nodename}) runs another "
-            "version of thesisrecon than this program; install the same one there"
+            "version of thesisrecon than this program; install the same version there"
         )
     try:
         function, given = pickle.loads(task)
@@ -234,30 +278,49 @@ def _answer(key: str, task: bytes) -> bytes:
 
 
 class ProcessPool(futures.ProcessPoolExecutor):
-    """``count`` processes that Ctrl-C does not reach, and that end with this process, however that ends."""
+    """Processes that ignore Ctrl-C and end with this process.
+
+    Parameters
+    ----------
+    count : int
+        Number of processes.
+    """
 
     def __init__(self, count: int) -> None:
         # Forking a process that runs threads can deadlock.
         context = multiprocessing.get_context("spawn")
-        # Else the first process starts it, and lets signals through again with that.
+        # Otherwise the first worker starts it and unblocks the signals.
         multiprocessing.resource_tracker.ensure_running()
         watched, self._held = context.Pipe(duplex=False)
-        super().__init__(count, mp_context=context, initializer=_obey, initargs=(watched,))
+        super().__init__(count, mp_context=context, initializer=_end_with_parent, initargs=(watched,))
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
-        """As of any executor."""
+        """Submit a call with signals blocked while processes start.
+
+        Parameters
+        ----------
+        fn : callable
+            Function.
+        *args, **kwargs
+            Its arguments.
+
+        Returns
+        -------
+        concurrent.futures.Future
+            The result to come.
+        """
         with starting_processes():
             return super().submit(fn, *args, **kwargs)
 
     def abandon(self) -> None:
-        """End the processes at once, whatever they are at."""
+        """Kill the processes at once."""
         self._held.close()
         self.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
 def _processes(count: int) -> Iterator[futures.Executor]:
-    """Processes that end with the block, at once where it ends by an error."""
+    """Processes that end with the block, at once after an error."""
     pool = ProcessPool(count)
     try:
         yield pool
@@ -266,20 +329,19 @@ def _processes(count: int) -> Iterator[futures.Executor]:
         pool.abandon()
 
 
-def _obey(watched: multiprocessing.connection.Connection) -> None:
-    """Of a worker process: signals are for the process that hands out the tasks, and when that closes its end
-    of the pipe, or dies, there is nobody to work for."""
+def _end_with_parent(watched: multiprocessing.connection.Connection) -> None:
+    """In a worker process: ignore Ctrl-C, and end when the parent closes the pipe or dies."""
 
     def end_with_program() -> None:
         multiprocessing.connection.wait([watched])
         os._exit(1)
 
-    def end_when_told() -> None:
+    def end_on_sigterm() -> None:
         signal.sigwait({signal.SIGTERM})
-        # Where the whole program is told, it is the first to go, and takes this process along.
-        time.sleep(TOLD_S)
+        # If the whole program is terminated, the parent ends first and kills this process.
+        time.sleep(SIGTERM_DELAY_S)
         os._exit(CODES[signal.SIGTERM])
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for end in (end_with_program, end_when_told):
+    for end in (end_with_program, end_on_sigterm):
         threading.Thread(target=end, daemon=True).start()

@@ -1,10 +1,8 @@
-"""Records of :mod:`thesisrecon.records` as npz files with a JSON description inside: plain arrays and plain
-text, nothing that a reader would have to run.
+"""Records of :mod:`thesisrecon.records` as npz files with a JSON description, without pickles.
 
-A record is used as it was written or not at all, for kernels do not ask whether what they are given fits.
-Its seal, in the comment of the archive, is made of the checksums that a zip file keeps of its parts. A
-damaged part contradicts its checksum, as reading finds out anyway; a part that another program has written
-anew, with a checksum of its own, contradicts the seal. Who knows how a seal is made can still make one.
+A record is used only if it is unchanged, since kernels do not check their input. A seal in the comment of the
+archive is a digest of the checksums of its parts: damaged parts fail their checksum, rewritten parts the
+seal. The seal detects accidents, not forgery.
 """
 
 from __future__ import annotations
@@ -27,11 +25,29 @@ _DESCRIPTION = "description"
 
 
 class ChangedRecord(Exception):
-    """What stands in the place of a record is not as it was written."""
+    """The file of a record is damaged or was changed."""
 
 
 def bytes_from_record(record: Any, key: str) -> bytes:
-    """A record of :mod:`thesisrecon.records` as the bytes of an npz file; equal records give equal bytes."""
+    """Serialize a record; equal records give equal bytes.
+
+    Parameters
+    ----------
+    record : object
+        A record of :mod:`thesisrecon.records`.
+    key : str
+        Its key.
+
+    Returns
+    -------
+    bytes
+        Content of an npz file.
+
+    Raises
+    ------
+    TypeError
+        If the record contains other values than arrays, numbers, text and records.
+    """
     arrays: dict[str, np.ndarray[Any, Any]] = {}
     description = json.dumps({"key": key, "record": _describe(record, arrays)}, sort_keys=True)
     stream = io.BytesIO()
@@ -43,13 +59,13 @@ def bytes_from_record(record: Any, key: str) -> bytes:
 
 
 def _seal(archive: zipfile.ZipFile) -> bytes:
-    """A short name for the content of all parts."""
+    """Digest of the checksums of all parts."""
     parts = [(part.filename, part.CRC, part.file_size) for part in archive.infolist()]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32].encode()
 
 
 def _describe(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
-    """``value`` as JSON in which an array is ``{"array": name}``; the arrays themselves go to ``arrays``."""
+    """JSON of a value in which an array is ``{"array": name}``; arrays are collected in ``arrays``."""
     if isinstance(value, np.ndarray):
         arrays[f"array{len(arrays)}"] = value
         return {"array": f"array{len(arrays) - 1}"}
@@ -64,7 +80,7 @@ def _describe(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
         return {"tuple": [_describe(v, arrays) for v in value]}
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise TypeError(f"a record holds arrays, numbers, text and records; got {type(value).__name__}")
+    raise TypeError(f"a record contains arrays, numbers, text and records; got {type(value).__name__}")
 
 
 def _rebuild(value: Any, arrays: Mapping[str, Any]) -> Any:
@@ -83,17 +99,31 @@ def _rebuild(value: Any, arrays: Mapping[str, Any]) -> Any:
 
 
 def read_record(path: Path, key: str) -> Any:
-    """The record kept in ``path`` under ``key``; None where it is absent or made from something else.
+    """Read a record.
 
-    Raises :class:`ChangedRecord` where something stands there that is no record as :func:`bytes_from_record`
-    makes them: damaged, written by another program, or no file at all.
+    Parameters
+    ----------
+    path : Path
+        Its file.
+    key : str
+        The expected key.
+
+    Returns
+    -------
+    object or None
+        None if the file is missing or has another key.
+
+    Raises
+    ------
+    ChangedRecord
+        If the file is damaged, changed or not a regular file.
     """
     if not os.path.lexists(path):
         return None
     try:
-        # A pipe would be waited for.
+        # Opening a pipe would block.
         _require(path.is_file(), "a record is a file")
-        # np.load would leave a file it cannot understand open.
+        # np.load leaves an unreadable file open.
         with path.open("rb") as stream:
             seal = _seal_of_plain(stream)
             with np.load(stream, allow_pickle=False) as file:
@@ -103,7 +133,7 @@ def read_record(path: Path, key: str) -> Any:
                 _require(file.zip.comment == seal, "a record has the seal of its content")
                 return _rebuild(description["record"], {name: file[name] for name in file.files})
     except Exception as error:
-        # Whatever a damaged or edited file makes the readers raise.
+        # The readers raise many types for damaged files.
         raise ChangedRecord(f"{path}: {error}") from None
 
 
@@ -113,10 +143,7 @@ def _require(holds: bool, rule: str) -> None:
 
 
 def _seal_of_plain(stream: BinaryIO) -> bytes:
-    """The seal that the content of an archive should have.
-
-    Refused is what is larger unpacked than packed: ours are not compressed.
-    """
+    """Expected seal of an archive; compressed ones, which may be bombs, are refused."""
     with zipfile.ZipFile(stream) as archive:
         packed = [entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()]
         size = sum(entry.file_size for entry in archive.infolist())

@@ -1,6 +1,4 @@
-"""One run while it goes on: its settings, workers and folder, and the clock, cache and reports of its
-stages.
-"""
+"""One run: its settings, workers and folder, and the clock, cache and reports of its stages."""
 
 from __future__ import annotations
 
@@ -24,7 +22,7 @@ from thesisrecon.runtime.run_folder import RunDirectory, code_key, key_of
 from thesisrecon.settings import table_from_dataclass, unknown_word
 
 Progress = Callable[[str, int, int], None]
-"""Hears (stage, done, total) whenever a part of a stage is done; called from the thread of the caller."""
+"""Called with (stage, done, total) in the caller's thread when a part of a stage is done."""
 
 FOLDERS: Mapping[str, str] = {
     "features": "01-features",
@@ -38,19 +36,25 @@ FOLDERS: Mapping[str, str] = {
     "model": "08-model",
 }
 
-
 Until = Literal["features", "matches", "projective", "metric", "dense", "model"]
 
 
 class RunOptions(TypedDict, total=False):
-    """How a run is carried out, none of which changes what it finds.
+    """Options of :func:`thesisrecon.reconstruct` that do not change its results.
 
-    ``until`` : the last stage. None = "model", and a run that finds cameras and points but no surface ends
-    well, with a warning. ``threads`` : workers (all processors). ``executor`` : who works on photographs,
-    pairs and depth maps: "local" threads, "processes", a Dask cluster ("dask://HOST:PORT", which needs the
-    extra ``distributed``), or any :class:`concurrent.futures.Executor`; see :class:`Workers`. ``overwrite`` :
-    take over a folder that holds another run (False). ``shared`` : a folder where results of stages are kept
-    for other runs, and taken from where another run has found the same.
+    Attributes
+    ----------
+    until : {"features", "matches", "projective", "metric", "dense", "model"}, optional
+        Last stage. None: "model", where a surface that fails is only a warning.
+    threads : int, optional
+        Number of workers; None: all processors.
+    executor : str or concurrent.futures.Executor
+        "local" (threads), "processes", "dask://HOST:PORT" (needs the extra ``distributed``) or an executor;
+        see :class:`~thesisrecon.runtime.executors.Workers`.
+    overwrite : bool
+        Replace another run in the output folder.
+    shared : path, optional
+        Folder in which runs share cached results of stages.
     """
 
     until: Until | None
@@ -61,17 +65,38 @@ class RunOptions(TypedDict, total=False):
 
 
 Batch = tuple[Sequence[int], tuple[Any, ...]]
-"""The numbers of some items, and the arguments of the function that computes their records."""
+"""Numbers of some items, and the arguments of the function that computes their records."""
 
 
 def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
-    """The random numbers of one task: they depend on (seed, stage, ids) and on nothing that ran before."""
+    """Return the random generator of one task, which depends only on the arguments.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the run.
+    stage : str
+        Name of the stage.
+    *ids : int
+        Numbers of the task, such as view or pair.
+
+    Returns
+    -------
+    numpy.random.Generator
+        The generator.
+
+    Examples
+    --------
+    >>> from thesisrecon.runtime.run import stream
+    >>> stream(0, "matches", 1, 2).integers(100) == stream(0, "matches", 1, 2).integers(100)
+    np.True_
+    """
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(stage.encode()), *ids]))
 
 
 @dataclass
-class StageLog:
-    """What is known of a stage so far."""
+class _StageLog:
+    """Time, keys and number of computed items of a stage."""
 
     seconds: float = 0.0
     keys: dict[str, str] = field(default_factory=dict)
@@ -80,7 +105,31 @@ class StageLog:
 
 @dataclass
 class Run:
-    """The settings and the state of one run; the only thing here that changes."""
+    """Settings and state of one run.
+
+    Attributes
+    ----------
+    config : PipelineConfig
+        Settings.
+    seed : int
+        Random seed.
+    workers : Workers
+        The workers.
+    directory : RunDirectory
+        Output folder.
+    progress : callable
+        See :data:`Progress`.
+    title : str
+        Title of the report.
+    logs, reports : dict
+        Times and keys, and reports, of the stages.
+    resumed : list of str
+        Stages read from the cache.
+    warnings : list of str
+        All warnings.
+    started : float
+        Start time.
+    """
 
     config: PipelineConfig
     seed: int
@@ -88,7 +137,7 @@ class Run:
     directory: RunDirectory
     progress: Progress
     title: str
-    logs: dict[str, StageLog] = field(default_factory=dict)
+    logs: dict[str, _StageLog] = field(default_factory=dict)
     reports: dict[str, StageReport] = field(default_factory=dict)
     resumed: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -96,13 +145,24 @@ class Run:
 
     @property
     def elapsed_s(self) -> float:
-        """Wall time (s) since the run was started; the clocks of kept stages tell of older ones."""
+        """Wall time (s) since the start; times of cached stages are those of the run that computed them."""
         return time.perf_counter() - self.started
 
     @contextmanager
-    def clock(self, stage: str) -> Iterator[StageLog]:
-        """Count the time of the block to the stage."""
-        log = self.logs.setdefault(stage, StageLog())
+    def clock(self, stage: str) -> Iterator[_StageLog]:
+        """Add the time of the block to a stage.
+
+        Parameters
+        ----------
+        stage : str
+            Name of the stage.
+
+        Yields
+        ------
+        _StageLog
+            Log of the stage.
+        """
+        log = self.logs.setdefault(stage, _StageLog())
         start = time.perf_counter()
         try:
             yield log
@@ -110,14 +170,36 @@ class Run:
             log.seconds += time.perf_counter() - start
 
     def variant_key(self, stage: str) -> list[Any]:
-        """What names the variant of a stage in a key: its kind, its parameters and its code."""
+        """Return the part of a key that identifies the method of a stage.
+
+        Parameters
+        ----------
+        stage : str
+            Field of the config.
+
+        Returns
+        -------
+        list
+            Class, parameters and code of the method.
+        """
         variant = getattr(self.config, stage)
         module = type(variant).__module__
         return [module, type(variant).__qualname__, table_from_dataclass(variant), code_key(module)]
 
-    def kept(self, stage: str, item: str, key: str, compute: Callable[[], Any]) -> Any:
-        """The record of one item of a stage: read where it was kept under this key, else computed and
-        kept.
+    def cached(self, stage: str, item: str, key: str, compute: Callable[[], Any]) -> Any:
+        """Return the record of one item, from the cache or computed.
+
+        Parameters
+        ----------
+        stage, item, key : str
+            Name of the stage and the item, and its key.
+        compute : callable
+            Returns the record.
+
+        Returns
+        -------
+        object
+            The record.
         """
         with self.clock(stage) as log:
             log.keys[item] = key
@@ -129,7 +211,7 @@ class Run:
             return record
 
     def _loaded(self, stage: str, keys: Mapping[str, str]) -> list[Any]:
-        """What was kept of these items, None where nothing was; of records that were changed is told."""
+        """Cached records of items, None if missing; warns of changed ones."""
         folder = self.directory.stage(FOLDERS[stage])
         records: list[Any] = []
         changed: list[str] = []
@@ -140,23 +222,36 @@ class Run:
                 records.append(None)
                 changed.append(f"{FOLDERS[stage]}/{item}.npz")
         if changed:
-            more = f" and {len(changed) - 1} more were" if len(changed) > 1 else " was"
-            again = "are computed again" if len(changed) > 1 else "is computed again"
-            self.warnings.append(f"{changed[0]}{more} damaged or changed by another program, and {again}")
+            more, were = (f" and {len(changed) - 1} more", "were") if len(changed) > 1 else ("", "was")
+            self.warnings.append(
+                f"{changed[0]}{more} {were} damaged or changed by another program and {were} computed again"
+            )
         return records
 
-    def kept_all(
+    def map_cached(
         self,
         stage: str,
         keys: Mapping[str, str],
         function: Callable[..., Sequence[Any]],
         batches: Callable[[Sequence[int]], Iterable[Batch]],
     ) -> list[Any]:
-        """The records of all items of a stage, in order; those that were not kept are computed by the
-        workers.
+        """Return the records of all items of a stage, missing ones computed by the workers.
 
-        ``batches`` is given the numbers of the missing items and deals them out: the numbers of some, and
-        what ``function`` takes to make their records.
+        Parameters
+        ----------
+        stage : str
+            Name of the stage.
+        keys : mapping
+            Item -> key.
+        function : callable
+            Computes the records of a batch.
+        batches : callable
+            Divides the numbers of the missing items into batches (numbers, arguments of ``function``).
+
+        Returns
+        -------
+        list
+            Records in the order of ``keys``.
         """
         with self.clock(stage) as log:
             log.keys.update(keys)
@@ -166,16 +261,16 @@ class Run:
             missing = [n for n, record in enumerate(records) if record is None]
             done = len(names) - len(missing)
             self.progress(stage, done, len(names))
-            dealt: list[Sequence[int]] = []
+            submitted: list[Sequence[int]] = []
 
             def tasks() -> Iterator[tuple[Any, ...]]:
                 for numbers, given in batches(missing) if missing else ():
-                    dealt.append(numbers)
+                    submitted.append(numbers)
                     yield given
 
             def finished(k: int, found: Sequence[Any]) -> None:
                 nonlocal done
-                for n, record in zip(dealt[k], found, strict=True):
+                for n, record in zip(submitted[k], found, strict=True):
                     records[n] = record
                     folder.save(names[n], keys[names[n]], record)
                 done, log.computed = done + len(found), log.computed + len(found)
@@ -187,18 +282,35 @@ class Run:
 
     @contextmanager
     def resumable(self, stage: str) -> Iterator[None]:
-        """Whoever loses the workers in this block is told how the run goes on."""
+        """Add resume advice to the error if the workers are lost in the block.
+
+        Parameters
+        ----------
+        stage : str
+            Name of the stage.
+
+        Raises
+        ------
+        WorkersLost
+            With the advice.
+        """
         try:
             yield
         except WorkersLost as lost:
             raise WorkersLost(
-                f"{lost} (in the stage {stage}); what was done is kept in {self.directory.path}, and the "
-                "same command goes on from there, with this executor or another"
+                f"{lost} (in the stage {stage}). Finished work is kept in {self.directory.path}: repeat the "
+                "command to resume, with this executor or another"
             ) from None
 
     @contextmanager
-    def kept_in_folder(self) -> Iterator[None]:
-        """Whoever cannot write in this block is told how the run goes on."""
+    def with_resume_path(self) -> Iterator[None]:
+        """Add resume advice to the error if a file cannot be written in the block.
+
+        Raises
+        ------
+        OutputError
+            With the advice.
+        """
         try:
             yield
         except OutputError as refused:
@@ -212,10 +324,18 @@ class Run:
         metrics: Mapping[str, float] | None = None,
         warnings: Sequence[str] = (),
     ) -> None:
-        """End a stage: its report, and in its folder the manifest. A stage that was only read keeps its old
-        report.
+        """End a stage: write its manifest and report; a cached stage keeps its old report.
+
+        Parameters
+        ----------
+        stage : str
+            Name of the stage.
+        counts, metrics : mapping
+            Name -> number.
+        warnings : sequence of str
+            Sentences.
         """
-        log = self.logs.setdefault(stage, StageLog())
+        log = self.logs.setdefault(stage, _StageLog())
         report = StageReport(stage, log.seconds, dict(counts), dict(metrics or {}), tuple(warnings))
         if stage in FOLDERS:
             folder = self.directory.stage(FOLDERS[stage])
@@ -229,21 +349,62 @@ class Run:
         self.warnings.extend(w for w in warnings if w not in self.warnings)
 
     def _settings_of(self, stage: str) -> dict[str, Any]:
-        """The tables a stage runs by."""
+        """Settings tables of a stage."""
         stages = ("matching", "epipolar", "verification") if stage == "matches" else (stage,)
         tables = tables_from_config(self.config)
         return {s: {"kind": kind_of(s, getattr(self.config, s))} | tables[s] for s in stages}
 
     def key(self, stage: str, *parts: Any) -> str:
-        """The key of an item of this stage made from these parts."""
+        """Return the cache key of an item.
+
+        Parameters
+        ----------
+        stage : str
+            Name of the stage.
+        *parts : object
+            Everything the item depends on: settings, code and inputs.
+
+        Returns
+        -------
+        str
+            The key.
+        """
         return key_of(FOLDERS[stage], *parts)
 
 
 def start_run(
     out: str | Path, config: PipelineConfig, seed: int, progress: Progress | None, options: Mapping[str, Any]
 ) -> tuple[Until, Run, bool]:
-    """The checked wishes of a call as (last stage, run, overwrite); :class:`UsageError` names a wrong
-    one.
+    """Check the options of a call and set up the run.
+
+    Parameters
+    ----------
+    out : path
+        Output folder.
+    config : PipelineConfig
+        Settings.
+    seed : int
+        Random seed.
+    progress : callable or None
+        See :data:`Progress`.
+    options : mapping
+        See :class:`RunOptions`.
+
+    Returns
+    -------
+    until : str
+        Last stage.
+    run : Run
+        The run.
+    overwrite : bool
+        Whether another run may be replaced.
+
+    Raises
+    ------
+    UsageError
+        If an option is invalid.
+    TypeError
+        If an option is unknown.
     """
     unknown = sorted(set(options) - set(RunOptions.__annotations__))
     if unknown:
@@ -252,13 +413,13 @@ def start_run(
     if until not in get_args(Until):
         raise UsageError(unknown_word("stage", str(until), get_args(Until)))
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
+        raise UsageError(f"the seed must be an integer of at least 0; got {seed!r}")
     threads = options.get("threads") or available_threads()
     workers = Workers(threads, options.get("executor", "local"))
     if not str(out).strip():
         raise UsageError("the output folder has no name; write . for the current one")
     shared = options.get("shared")
     directory = RunDirectory(Path(out), None if shared is None else Path(shared))
-    hear = progress or (lambda *_: None)
-    run = Run(config, seed, workers, directory, hear, directory.path.absolute().name)
+    report = progress or (lambda *_: None)
+    run = Run(config, seed, workers, directory, report, directory.path.absolute().name)
     return until, run, bool(options.get("overwrite", False))

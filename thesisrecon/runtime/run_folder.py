@@ -1,8 +1,7 @@
-"""The run directory: what a stage computed, kept so that a kill at any point loses little.
+"""The run folder: cached results of stages, so that an interrupted run loses little.
 
-Each result is one npz file with a JSON description inside, written whole or not at all. It carries the key
-of what it was made from (settings, code and inputs, all the way up), and is used again only under that key
-and as it was written.
+Each result is one npz file with a JSON description, written atomically. It is reused only if it is unchanged
+and its key, made from settings, code and all inputs, is the same.
 """
 
 from __future__ import annotations
@@ -33,11 +32,31 @@ except ImportError:  # pragma: no cover - only where there is no POSIX
 
 FORMAT = 2
 RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
-_CODE_OF_ALL_STAGES = ("arrays.py", "camera.py", "errors.py", "records.py", "geometry", "numerics")
+_FOUNDATIONS = (
+    *("arrays.py", "camera.py", "errors.py", "intrinsics.py", "records.py"),
+    *("geometry", "numerics"),
+)
+"""Code that every stage may use."""
 
 
 def key_of(*parts: Any) -> str:
-    """A short name for JSON-like parts: equal parts give equal keys, on every machine."""
+    """Return a digest of JSON-like parts and arrays, equal on every machine.
+
+    Parameters
+    ----------
+    *parts : object
+        Plain values, sequences, mappings and arrays.
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits.
+
+    Raises
+    ------
+    TypeError
+        If a part is of another type.
+    """
     text = json.dumps(parts, sort_keys=True, default=_json_value, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
@@ -47,46 +66,71 @@ def _json_value(value: Any) -> Any:
         return [str(value.dtype), value.shape, hashlib.sha256(np.ascontiguousarray(value).data).hexdigest()]
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"a key is made of plain values and arrays; got {type(value).__name__}")
+    raise TypeError(f"a key consists of plain values and arrays; got {type(value).__name__}")
 
 
 @cache
 def code_key(module: str) -> str:
-    """A short name for the code a variant of ``module`` runs: its stage folder and what all stages share.
+    """Return a digest of the code behind a method, so that results of other code are not reused.
 
-    Results of other code are thus never taken for results of this one. A module of the caller counts by its
-    own file alone.
+    Parameters
+    ----------
+    module : str
+        Module of the method. In this package its stage folder and the foundations count; elsewhere its file.
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits.
     """
     package = Path(__file__).parent.parent
     parts = module.split(".")
     own = [package / parts[1]] if parts[0] == package.name and len(parts) > 1 else _file_of(module)
     content = hashlib.sha256(f"{module} {FORMAT}".encode())
-    for root in [*own, *(package / part for part in _CODE_OF_ALL_STAGES)]:
+    for root in [*own, *(package / part for part in _FOUNDATIONS)]:
         for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
             content.update(path.read_bytes())
     return content.hexdigest()[:32]
 
 
 def _file_of(module: str) -> list[Path]:
-    """The file of a loaded module of the caller; none where it was typed into a prompt."""
+    """The file of a loaded module, if it has one."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return [Path(file)] if file is not None and Path(file).is_file() else []
 
 
 @dataclass(frozen=True)
 class StageFolder:
-    """The folder of one stage: a file per item, and a manifest that people can read.
+    """The folder of one stage: a file per item, and a readable manifest.
 
-    ``shared`` is a folder of results of several runs, each named by its key; None where a run stands alone.
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    shared : Path, optional
+        Folder of results of several runs, named by their keys.
     """
 
     path: Path
     shared: Path | None = None
 
     def load(self, item: str, key: str) -> Any:
-        """The kept record of this item, from this run or another; None where it must be computed.
+        """Return the cached record of an item, from this run or the shared folder.
 
-        Raises :class:`ChangedRecord` where it must be computed since a file of it is not as it was written.
+        Parameters
+        ----------
+        item, key : str
+            Name and key of the item.
+
+        Returns
+        -------
+        object or None
+            None if it must be computed.
+
+        Raises
+        ------
+        ChangedRecord
+            If its file was changed or damaged.
         """
         own, changed = self.path / f"{item}.npz", None
         places = [own] if self.shared is None else [own, self.shared / f"{key}.npz"]
@@ -105,15 +149,36 @@ class StageFolder:
         return None
 
     def save(self, item: str, key: str, record: Any) -> None:
-        """Keep the record of this item."""
+        """Write the record of an item.
+
+        Parameters
+        ----------
+        item, key : str
+            Name and key of the item.
+        record : object
+            The record.
+        """
         own = self.path / f"{item}.npz"
         write_atomically(own, bytes_from_record(record, key))
         if self.shared is not None:
             link(own, self.shared / f"{key}.npz")
 
     def finish(self, report: StageReport, settings: Mapping[str, Any], keys: Mapping[str, str]) -> None:
-        """Write the manifest of a stage that is done; files of items that are no longer part of it, and what
-        a kill left of one that was being written, are removed.
+        """Write the manifest of a finished stage and remove stale and partial files.
+
+        Parameters
+        ----------
+        report : StageReport
+            Report of the stage.
+        settings : mapping
+            Its settings.
+        keys : mapping
+            Item -> key.
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be removed or written.
         """
         try:
             for stale in [*self.path.glob("*.npz"), *self.path.glob(".*.partial")]:
@@ -125,7 +190,18 @@ class StageFolder:
         write_json(self.path / MANIFEST_FILE, content)
 
     def finished(self, keys: Mapping[str, str]) -> StageReport | None:
-        """The report of the run that computed exactly these items, None where it did not end."""
+        """Return the report of the run that computed these items.
+
+        Parameters
+        ----------
+        keys : mapping
+            Item -> key.
+
+        Returns
+        -------
+        StageReport or None
+            None if the stage was not finished with the same keys.
+        """
         content = read_json(self.path / MANIFEST_FILE)
         try:
             if content["keys"] != dict(keys):
@@ -136,51 +212,100 @@ class StageFolder:
 
 
 def _report(*, seconds: Any, counts: Any, metrics: Any, warnings: Any, stage: Any) -> StageReport:
-    """A report of these values as JSON has them; ``TypeError`` where one is not what it should be."""
+    """A report from JSON values, checked."""
     numbers = [seconds, *counts.values(), *(value for value in metrics.values() if value is not None)]
     if not all(isinstance(number, int | float) for number in numbers):
-        raise TypeError("a report counts in numbers")
+        raise TypeError("counts and metrics must be numbers")
     if not all(isinstance(word, str) for word in (stage, *warnings)):
-        raise TypeError("a report warns in words")
+        raise TypeError("stage and warnings must be text")
     return StageReport(stage, seconds, counts, metrics, tuple(warnings))
 
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """The output folder of one run, and the folder of results it ``shared`` with others (None: it shares
-    none)."""
+    """The output folder of one run.
+
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    shared : Path, optional
+        Folder of results shared with other runs.
+    """
 
     path: Path
     shared: Path | None = None
 
     def stage(self, folder: str) -> StageFolder:
-        """The folder of one stage, as ``01-features``."""
+        """Return the folder of a stage.
+
+        Parameters
+        ----------
+        folder : str
+            Its name, such as ``01-features``.
+
+        Returns
+        -------
+        StageFolder
+            The folder.
+        """
         return StageFolder(self.path / folder, None if self.shared is None else self.shared / folder)
 
     @contextmanager
-    def claimed(self, wishes: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
-        """Hold the folder for a run of these ``wishes``: as much of its identity as is known before its
-        photographs are read.
+    def claim(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
+        """Lock the folder for a run.
 
-        Raises :class:`UsageError` where the folder cannot be written, is in use, holds things of no run, or
-        holds another run, unless ``overwrite``; nothing in it is changed then.
+        Parameters
+        ----------
+        identity : mapping
+            The part of the run's identity that is known before its images are read.
+        overwrite : bool
+            Allow another run in the folder.
+
+        Raises
+        ------
+        UsageError
+            If the folder cannot be written, is in use, or holds other files or another run. Nothing is
+            changed.
         """
         with _locked(self.path):
-            self._check(wishes, overwrite)
+            self._check(identity, overwrite)
             yield
 
     def adopt(self, identity: Mapping[str, Any], *, overwrite: bool, results: Sequence[str] = ()) -> None:
-        """Make the claimed folder that of the run of this ``identity`` (settings, seed, photographs).
+        """Make the claimed folder that of a run; the same run is resumed, another one replaced.
 
-        A folder of the same run is resumed. Where another run is replaced, its ``results`` (paths in the
-        folder) are removed: they must not stand beside those of this one. Raises as :meth:`claimed` does.
+        Parameters
+        ----------
+        identity : mapping
+            Settings, seed and digests of the images.
+        overwrite : bool
+            Allow another run in the folder.
+        results : sequence of str
+            Files of a replaced run to remove.
+
+        Raises
+        ------
+        UsageError
+            As for :meth:`claim`.
         """
         if self._check(identity, overwrite):
             self.remove(results)
         write_json(self.path / RUN_FILE, identity)
 
     def remove(self, names: Sequence[str]) -> None:
-        """Remove these files of the folder, where they are there, and the folders that are empty then."""
+        """Remove files and the folders that are empty afterwards.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Paths in the folder; missing ones are ignored.
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be removed.
+        """
         try:
             for path in (self.path / name for name in names):
                 path.unlink(missing_ok=True)
@@ -189,20 +314,20 @@ class RunDirectory:
                         parent.rmdir()
         except OSError as error:
             raise OutputError(
-                f"the output folder {self.path}, of which old results must go,", error
+                f"the output folder {self.path}, whose old results must be removed,", error
             ) from None
 
     def _check(self, identity: Mapping[str, Any], overwrite: bool) -> bool:
-        """Whether the folder holds a run that differs in what ``identity`` tells."""
+        """Whether the folder holds another run."""
         there = read_json(self.path / RUN_FILE)
         if there is None:
             strange = sorted(p.name for p in self.path.iterdir() if p.name != LOCK_FILE)
             if strange and RUN_FILE not in strange and not all(map(is_partial, strange)):
                 raise UsageError(
-                    f"the output folder {self.path} holds {strange[0]!r}, which is of no run; "
+                    f"the output folder {self.path} holds {strange[0]!r}, which thesisrecon did not create; "
                     "choose an empty or a new folder"
                 )
-            # A damaged run file names no run, so whatever stands beside it is another one's.
+            # A damaged run file identifies no run: other files count as another run.
             return bool(strange)
         if isinstance(there, dict):
             there = {name: value for name, value in there.items() if name in identity}
@@ -210,30 +335,30 @@ class RunDirectory:
         if difference and not overwrite:
             raise UsageError(
                 f"the output folder {self.path} holds another run ({difference}); choose another folder, or "
-                "--overwrite to replace what differs and keep the rest"
+                "use --overwrite to replace it (unaffected stages are reused)"
             )
         return bool(difference)
 
 
 def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
-    """Where two JSON values differ, one sentence part each."""
+    """Differences of two JSON values in words."""
     if isinstance(there, dict) and isinstance(here, dict):
         if place == "photographs":
-            yield from _photograph_difference(there, here)
+            yield from _image_differences(there, here)
             return
         for name in [*here, *(k for k in there if k not in here)]:
             yield from _differences(there.get(name), here.get(name), f"{place}.{name}" if place else name)
     elif there != here:
-        yield f"{place.removeprefix('settings.')} was {_short(there)} there and is {_short(here)} here"
+        yield f"{place.removeprefix('settings.')} was {_short(there)} and is now {_short(here)}"
 
 
-def _photograph_difference(there: dict[str, str], here: dict[str, str]) -> Iterator[str]:
+def _image_differences(there: dict[str, str], here: dict[str, str]) -> Iterator[str]:
     missing, new = [n for n in there if n not in here], [n for n in here if n not in there]
     changed = [n for n in here if n in there and there[n] != here[n]]
     for what, names in (("without", missing), ("with a new", new), ("with a changed", changed)):
         if names:
             more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            yield f"its photographs are not these: this run is {what} {names[0]!r}{more}"
+            yield f"other images: this run is {what} {names[0]!r}{more}"
 
 
 def _short(value: Any) -> str:
@@ -243,9 +368,7 @@ def _short(value: Any) -> str:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Make the folder, and hold it against a second run; the lock ends with the process, however that
-    ends.
-    """
+    """Create and lock the folder; the lock ends with the process."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)

@@ -1,11 +1,9 @@
-"""Ctrl-C, and being told to end (SIGTERM), obeyed at any moment of a command.
+"""Prompt termination by Ctrl-C and SIGTERM.
 
-Python hears of a signal on its main thread, between two steps of the interpreter: not while a kernel, a
-decoder or a wait for other threads goes on there, and the end of a pool of threads is such a wait. So the
-signal writes its number into a pipe, which it does whatever the main thread is at, and a thread that only
-reads from that pipe ends the program: it says one sentence, kills the processes the program has started, and
-leaves at once. Nothing is lost by leaving in the middle of anything: a file appears under its name when it is
-whole (:mod:`thesisrecon.io.files`), so what a run has kept is what it goes on from.
+Python handles signals in the main thread between two bytecodes, not during a kernel, an image decoder or a
+wait for a thread pool. The signal therefore writes its number to a pipe, and a watching thread prints a
+message, kills the child processes and exits. Nothing is lost: files are written atomically
+(:mod:`thesisrecon.io.files`), and a run resumes from its cache.
 """
 
 from __future__ import annotations
@@ -20,10 +18,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
-"""Exit codes, 128 and the number of the signal, as shells have them."""
-REASONS = {signal.SIGINT: "interrupted", signal.SIGTERM: "told to end"}
+"""Exit codes: 128 plus the number of the signal, as in shells."""
+REASONS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 START_S = 0.5
-"""How long a process that is just being started is waited for, so that it can be killed."""
+"""Time to wait for a starting process, so that it can be killed."""
 STDERR = 2
 _SHOW_CURSOR = "\x1b[?25h\n"
 
@@ -34,36 +32,53 @@ _leaving: list[signal.Signals] = []
 _starting = threading.RLock()
 
 
-def obey_signals(program: str, advice: str = "give the same command again") -> None:
-    """From now on SIGINT and SIGTERM end this process, with what :func:`advised` says and an exit code of
-    :data:`CODES`.
+def install_signal_handlers(program: str, advice: str = "repeat the command to resume") -> None:
+    """Let SIGINT and SIGTERM end this process at once, with an exit code of :data:`CODES`.
 
-    To be called once, by a program and not by a library, from the main thread; ``advice`` is said where
-    nothing else is to be. A signal that this process was started to ignore (``nohup``, a command in the
-    background of a script) stays ignored.
+    Call it once, from the main thread of a program (not of a library). Signals that the process ignores
+    (``nohup``, background jobs) stay ignored.
+
+    Parameters
+    ----------
+    program : str
+        Name of the program in the message.
+    advice : str
+        What to do, unless :func:`with_resume_advice` says otherwise.
     """
     _advice.append(advice)
-    heard, written = os.pipe()
-    # The handler of the signal may not wait.
+    pipe, written = os.pipe()
+    # A signal handler must not block.
     os.set_blocking(written, False)
     signal.set_wakeup_fd(written, warn_on_full_buffer=False)
     for number in CODES:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda *_: None)
-    # The helper of multiprocessing would tell of what it clears away behind a program that has left.
+    # The resource tracker of multiprocessing would warn about what it cleans up afterwards.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
     os.register_at_fork(after_in_child=_forget)
-    threading.Thread(target=_obey, args=(program, heard), daemon=True).start()
+    threading.Thread(target=_watch, args=(program, pipe), daemon=True).start()
 
 
-def speak_through(descriptor: int) -> None:
-    """The error stream of the program is from now on this descriptor."""
+def set_error_stream(descriptor: int) -> None:
+    """Set the file descriptor for messages.
+
+    Parameters
+    ----------
+    descriptor : int
+        Replaces standard error.
+    """
     _stderr.append(descriptor)
 
 
 @contextmanager
-def advised(advice: str) -> Iterator[None]:
-    """Whoever ends the program in this block is told this; a ``KeyboardInterrupt`` carries it."""
+def with_resume_advice(advice: str) -> Iterator[None]:
+    """Set the advice printed if the program is ended in the block.
+
+    Parameters
+    ----------
+    advice : str
+        What to do; a ``KeyboardInterrupt`` also carries it.
+    """
     _advice.append(advice)
     try:
         yield
@@ -75,9 +90,14 @@ def advised(advice: str) -> Iterator[None]:
 
 
 @contextmanager
-def killed_by(kill: Callable[[], object]) -> Iterator[None]:
-    """Call ``kill`` when the program is ended in this block; processes of :mod:`multiprocessing` are killed
-    anyway."""
+def kill_on_exit(kill: Callable[[], object]) -> Iterator[None]:
+    """Call a function if the program is ended in the block.
+
+    Parameters
+    ----------
+    kill : callable
+        Kills processes other than those of :mod:`multiprocessing`, which are killed anyway.
+    """
     _kills.append(kill)
     try:
         yield
@@ -87,8 +107,7 @@ def killed_by(kill: Callable[[], object]) -> Iterator[None]:
 
 @contextmanager
 def starting_processes() -> Iterator[None]:
-    """Processes started in this block leave both signals waiting from their first moment on, for a terminal
-    sends them to all of a program; and the program does not end before they can be killed."""
+    """Block both signals in processes started in this block, and delay the end until they can be killed."""
     while _leaving:
         time.sleep(START_S)
     with _starting:
@@ -100,34 +119,33 @@ def starting_processes() -> Iterator[None]:
 
 
 def _forget() -> None:
-    """In a fork: its signals are not those of the program."""
+    """Reset signal handling in a fork."""
     signal.set_wakeup_fd(-1)
     for number in CODES:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)
 
 
-def _obey(program: str, heard: int) -> None:
+def _watch(program: str, pipe: int) -> None:
     number = 0
     while number not in CODES:
-        # Other handlers of the program write here too.
-        number = os.read(heard, 1)[0]
-    asked = signal.Signals(number)
-    # Nothing more is started from here on; what is being started is waited for.
-    _leaving.append(asked)
+        # Other handlers of the program also write to the pipe.
+        number = os.read(pipe, 1)[0]
+    received = signal.Signals(number)
+    # No process is started from here on; wait for the one being started.
+    _leaving.append(received)
     _starting.acquire(timeout=START_S)
-    _say(f"{program}: {REASONS[asked]}; {_advice[-1]}")
+    _say(f"{program}: {REASONS[received]}; {_advice[-1]}")
     for kill in [*_kills, _kill_children]:
         with suppress(Exception):
             kill()
-    os._exit(CODES[asked])
+    os._exit(CODES[received])
 
 
 def _say(sentence: str) -> None:
-    """To the error stream itself: the main thread may hold the lock of Python's. Nobody is waited for who
-    does not read."""
+    """Write to the descriptor: the main thread may hold the lock of ``sys.stderr``, the reader may hang."""
     with suppress(OSError, ValueError):
-        # A bar of progress has hidden the cursor and stands in the middle of a line.
+        # A progress bar hides the cursor and leaves it in the middle of a line.
         start = _SHOW_CURSOR if os.isatty(_stderr[-1]) else ""
         if select.select([], [_stderr[-1]], [], START_S)[1]:
             os.write(

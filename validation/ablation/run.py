@@ -15,7 +15,7 @@ from typing import Any, overload
 from thesisrecon.config import tables_from_config
 from thesisrecon.errors import WorkersLost
 from thesisrecon.io.files import write_json
-from thesisrecon.runtime.executors import PATIENCE_S
+from thesisrecon.runtime.executors import CHECK_S
 from thesisrecon.settings import table_from_dataclass
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.row import Job, carry_out, pack
@@ -240,7 +240,7 @@ class _Session:
                 running[self._submit(part, packed[part.row.key])] = part
                 if len(running) >= self.crew.most:
                     break
-            done, _ = wait(running, PATIENCE_S, return_when=FIRST_COMPLETED)
+            done, _ = wait(running, CHECK_S, return_when=FIRST_COMPLETED)
             if not done and self.crew.cluster is not None:
                 self.crew.cluster.check()
             outcomes = [(running.pop(f), self._outcome(f)) for f in done if not f.cancelled()]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from thesisrecon.runtime.signals import killed_by
+from thesisrecon.runtime.signals import kill_on_exit
 from validation.scenes.real import ROOT
 
 POLL_S = 0.02
@@ -67,7 +67,7 @@ def run_process(
         )
         kill = partial(os.killpg, child.pid, signal.SIGKILL)
         try:
-            with killed_by(kill):
+            with kill_on_exit(kill):
                 while True:
                     pid, status, usage = os.wait4(child.pid, os.WNOHANG)
                     if pid:

@@ -188,7 +188,7 @@ def test_a_killed_study_loses_no_more_than_the_rows_in_flight(tmp_path):
 def test_a_row_on_a_full_disk_has_not_failed(executor, tmp_path):
     log, out = tmp_path / "log", tmp_path / "out"
     crowded = study(log, scenes=["full"], seeds=1)
-    with pytest.raises(OutputError, match=r"throws\.txt cannot be written: .* make room there"):
+    with pytest.raises(OutputError, match=r"throws\.txt cannot be written: .* free space there"):
         ablate(crowded, out, executor=executor, threads=1)
     assert len(read_rows(crowded, out)) == 0
     (tmp_path / "log.room").touch()
